@@ -1,0 +1,37 @@
+# Entry of the workflow: configuration, rules and targets. The mathematics is in siq/, the steps are in
+# workflow/rules/, what a study asks is in config/studies/.
+from snakemake.utils import min_version
+
+min_version("9.0")
+
+
+configfile: "config/config.yaml"
+
+
+include: "workflow/rules/common.smk"
+include: "workflow/rules/examples.smk"
+include: "workflow/rules/data.smk"
+include: "workflow/rules/train.smk"
+include: "workflow/rules/regress.smk"
+include: "workflow/rules/score.smk"
+include: "workflow/rules/collect.smk"
+include: "workflow/rules/report.smk"
+
+
+report: "workflow/report/workflow.rst"
+
+
+localrules:
+    statistics,
+    examples,
+
+
+rule statistics:
+    default_target: True
+    input:
+        expand("results/{study}/report.html", study=statistics_studies()),
+
+
+rule examples:
+    input:
+        "results/archetype3d-recordings/report.html",

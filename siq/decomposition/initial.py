@@ -1,0 +1,70 @@
+"""Networks before training: random, normalised and rescaled to the data (paper, Eqs. eta_v and eta_g)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from siq.decomposition.data import TrainingData
+from siq.decomposition.networks import Networks, evaluate, initial_layers, select_run
+from siq.decomposition.options import TrainingOptions
+from siq.errors import NumericalFailure
+
+
+def initial_networks(
+    data: Sequence[TrainingData],
+    *,
+    options: TrainingOptions,
+    diffusion: np.ndarray,
+    generators: Sequence[np.random.Generator],
+) -> Networks:
+    """Random networks, normalised and rescaled to the data of each run (paper, Eqs. eta_v, eta_g).
+
+    η_v and η_g bring the initial ∣∇V∣ and ∣g∣ to the size of the observed velocities.
+
+    Raises
+    ------
+    NumericalFailure
+        When a state does not vary in the data.
+    """
+    dtype = getattr(torch, options.precision)
+    dimension = diffusion.shape[0]
+    sources = [run.training if options.normalise_on == "pairs" else run.representative for run in data]
+    means = np.stack([pairs.x0.mean(axis=0) for pairs in sources])[:, None]
+    scales = np.stack([pairs.x0.std(axis=0) for pairs in sources])[:, None]
+    if not (scales > 0).all():
+        raise NumericalFailure("a state does not vary in the recordings; leave it out or record it in motion")
+    ones = torch.ones(len(data), 1, 1, dtype=dtype)
+    networks = Networks(
+        potential=initial_layers((dimension, *options.widths, 1), generators=generators, dtype=dtype),
+        circulatory=initial_layers(
+            (dimension, *options.widths, dimension), generators=generators, dtype=dtype
+        ),
+        mean=torch.from_numpy(means).to(dtype),
+        scale=torch.from_numpy(scales).to(dtype),
+        potential_scale=ones,
+        circulatory_scale=ones,
+        diffusion=torch.from_numpy(diffusion).to(dtype),
+    )
+    potential_scales, circulatory_scales = [], []
+    for run, pairs in enumerate(sources):
+        one = select_run(networks, run)
+        # A few thousand pairs fix a single number well; the whole data would only cost memory.
+        rows = np.linspace(0, len(pairs.h) - 1, min(len(pairs.h), 20_000)).astype(int)
+        components = evaluate(one, torch.from_numpy(pairs.x0[rows]).to(dtype)[None])
+        speed = np.linalg.norm((pairs.xh[rows] - pairs.x0[rows]) / pairs.h[rows, None], axis=1)
+        # ∇ with respect to y = (x - μ)/σ, as the paper writes it. Where the σ differ this makes V several
+        # times larger than ∇ with respect to x would, and V then learns as fast as g does; with the
+        # smaller scale training ends in a V that is flat along x.
+        downhill = torch.linalg.norm(components.gradient * one.scale, dim=-1)[0].numpy()
+        circulatory = torch.linalg.norm(components.circulatory, dim=-1)[0].numpy()
+        potential_scales.append(float(downhill @ speed / (downhill @ downhill)))
+        circulatory_scales.append(float(circulatory @ speed / (circulatory @ circulatory)))
+    return replace(
+        networks,
+        potential_scale=options.potential_gain * torch.tensor(potential_scales, dtype=dtype)[:, None, None],
+        circulatory_scale=torch.tensor(circulatory_scales, dtype=dtype)[:, None, None],
+    )

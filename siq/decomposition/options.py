@@ -1,0 +1,72 @@
+"""What a training is told: every option of it changes the result."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from siq.decomposition.matching import Kind, Order
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class TrainingOptions:
+    """How the networks are trained; every one of these changes the result.
+
+    Attributes
+    ----------
+    widths
+        Neurons in the hidden layers of both networks.
+    steps
+        Steps of Adam.
+    batch_size
+        Pairs in the first term of the loss, and representative points in the second, per step.
+    representative_share
+        Share of the pairs of a batch that are drawn from the representative ones, the rest from all. The
+        paper has 0; above it the loss weighs the region away from the attractors more, where pairs are
+        few and fast.
+    learning_rate, decay_rate, decay_steps
+        The rate is ``learning_rate * decay_rate ** (step / decay_steps)``.
+    orthogonality_weight
+        λ.
+    asymmetry
+        δ of w(z, δ).
+    matching, matching_order
+        The pair-matching rule, see `siq.decomposition.matching`.
+    relative_dynamics
+        Divide the first term of the loss by the mean square of the observed velocities, so that λ means
+        the same for every system and in any units. The paper does not.
+    thinning_distance
+        r, the distance between representative points, in the units of the states.
+    normalise_on
+        The points from which μ, σ, η_v and η_g are estimated. ``pairs``: all training pairs, as the paper
+        does. ``representative``: the evenly spread ones. Trajectories crowd at attractors, where f is
+        small and some states hardly vary: estimated there, the scales start V several times too small and
+        too narrow, and a short training ends in a V that is flat along a direction.
+    potential_gain
+        Factor on η_v; the paper has 1. A larger one lets V learn faster beside g, which a short training
+        needs: otherwise g takes over what V has not yet learned, and V stays flat along a direction.
+    training_share
+        Share of the recordings that train; the others measure the held-out loss.
+    precision
+        Floating-point type of the networks.
+    """
+
+    widths: Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1)] = (50, 50, 50)
+    steps: Annotated[int, Field(ge=1)] = 150_000
+    batch_size: Annotated[int, Field(ge=1)] = 5000
+    representative_share: Annotated[float, Field(ge=0, le=1)] = 0.0
+    learning_rate: Annotated[float, Field(gt=0)] = 5e-3
+    decay_rate: Annotated[float, Field(gt=0, le=1)] = 0.95
+    decay_steps: Annotated[float, Field(gt=0)] = 1000.0
+    orthogonality_weight: Annotated[float, Field(ge=0)] = 10.0
+    asymmetry: Annotated[float, Field(ge=0)] = 0.1
+    matching: Kind = "explicit"
+    matching_order: Order = 2
+    relative_dynamics: bool = False
+    thinning_distance: Annotated[float, Field(gt=0)] = 0.1
+    normalise_on: Literal["pairs", "representative"] = "pairs"
+    potential_gain: Annotated[float, Field(gt=0)] = 1.0
+    training_share: Annotated[float, Field(gt=0, lt=1)] = 0.7
+    precision: Literal["float32", "float64"] = "float64"

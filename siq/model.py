@@ -1,0 +1,108 @@
+"""`model.json`: a result as a file that anything can evaluate without this library.
+
+Polynomials stand as ``{"center", "scale", "exponents", "coefficients"}``, meaning
+``Σ c Π ((x - center)/scale)^e`` in the states' own units; anything else as ``{"formula": "text"}``.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import sympy
+
+from siq.errors import InputError
+from siq.expressions import FormulaError, parse_formula
+from siq.symbolic import SymbolicDecomposition
+
+
+def expression_to_data(expression: sympy.Expr, symbols: Sequence[sympy.Symbol]) -> dict[str, Any]:
+    """A formula as plain data: a polynomial by its coefficients, anything else by its text."""
+    # "is polynomial" must not simplify: 1/x*x**2 is what the library said it is.
+    if expression.is_polynomial(*symbols):
+        polynomial = sympy.Poly(expression, *symbols)
+        pairs = [(list(map(int, e)), float(c)) for e, c in polynomial.terms() if c != 0]
+        return {
+            "center": [0.0] * len(symbols),
+            "scale": [1.0] * len(symbols),
+            "exponents": [exponents for exponents, _ in pairs],
+            "coefficients": [coefficient for _, coefficient in pairs],
+        }
+    return {"formula": str(expression)}
+
+
+def expression_from_data(data: Mapping[str, Any], symbols: Sequence[sympy.Symbol]) -> sympy.Expr:
+    """The formula that `expression_to_data` wrote; text goes through the whitelist of formulas."""
+    if "formula" in data:
+        return parse_formula(data["formula"], {symbol.name: symbol for symbol in symbols})
+    scaled = [
+        symbol if (center, scale) == (0, 1) else (symbol - center) / scale
+        for symbol, center, scale in zip(symbols, data["center"], data["scale"], strict=True)
+    ]
+    return sympy.Add(
+        *(
+            sympy.Float(float(coefficient), 17)
+            * sympy.Mul(*(s ** int(e) for s, e in zip(scaled, exponents, strict=True)))
+            for exponents, coefficient in zip(data["exponents"], data["coefficients"], strict=True)
+        )
+    )
+
+
+def model_to_data(
+    decompositions: Mapping[str, SymbolicDecomposition], certificates: Mapping[str, Mapping[str, Any]]
+) -> dict[str, Any]:
+    """Decompositions by method, with a certificate for each, as plain data."""
+    if not decompositions:
+        return {"states": [], "methods": {}, "certificate": {}}
+    symbols = next(iter(decompositions.values())).symbols
+    methods = {
+        method: {
+            "V": expression_to_data(one.potential, symbols),
+            "g": [expression_to_data(component, symbols) for component in one.circulatory],
+            "f": [expression_to_data(component, symbols) for component in one.vector_field],
+        }
+        for method, one in decompositions.items()
+    }
+    return {
+        "states": [symbol.name for symbol in symbols],
+        "methods": methods,
+        "certificate": {method: dict(certificates[method]) for method in decompositions},
+    }
+
+
+def write_model(path: str | Path, model: Mapping[str, Any]) -> None:
+    """Write a model whole or not at all."""
+    partial = Path(f"{path}.partial")
+    partial.parent.mkdir(parents=True, exist_ok=True)
+    partial.write_text(json.dumps(model, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    os.replace(partial, path)
+
+
+def read_model(path: str | Path) -> tuple[dict[str, SymbolicDecomposition], dict[str, Any]]:
+    """Read a model: its decompositions by method, and their certificates.
+
+    Raises
+    ------
+    InputError
+        When the file is not a model, or a formula in it is refused.
+    """
+    try:
+        data = json.loads(Path(path).read_text(encoding="utf-8"))
+        symbols = tuple(sympy.Symbol(name, real=True) for name in data["states"])
+        decompositions = {
+            method: SymbolicDecomposition(
+                symbols=symbols,
+                potential=expression_from_data(one["V"], symbols),
+                circulatory=tuple(expression_from_data(part, symbols) for part in one["g"]),
+                vector_field=tuple(expression_from_data(part, symbols) for part in one["f"]),
+            )
+            for method, one in data["methods"].items()
+        }
+        return decompositions, data["certificate"]
+    except FormulaError as error:
+        raise InputError(path, "", error.fault, error.remedy) from None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(path, "", f"it is not a model ({type(error).__name__})", "make it again") from None

@@ -1,0 +1,168 @@
+"""How all figures look: fonts, colours, and the names of terms and components on them."""
+
+from __future__ import annotations
+
+import functools
+import math
+import re
+from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager
+from typing import ParamSpec
+
+import matplotlib.style
+from cycler import cycler
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+COLUMN_WIDTH = 3.5  # inches; one column of a journal page
+PAGE_WIDTH = 7.0
+
+# The palette of Okabe and Ito, which readers with any common colour blindness can tell apart.
+BLACK = "#000000"
+ORANGE = "#E69F00"
+SKY_BLUE = "#56B4E9"
+GREEN = "#009E73"
+BLUE = "#0072B2"
+VERMILLION = "#D55E00"
+PURPLE = "#CC79A7"
+GREY = "#6E6E6E"
+
+_SETTINGS = {
+    "font.family": "DejaVu Sans",  # comes with matplotlib: the same on every machine
+    "font.size": 8,
+    "axes.titlesize": 8,
+    "axes.labelsize": 8,
+    "xtick.labelsize": 7,
+    "ytick.labelsize": 7,
+    "legend.fontsize": 7,
+    "legend.frameon": False,
+    "figure.titlesize": 9,
+    "figure.constrained_layout.use": True,
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.prop_cycle": cycler(color=[BLUE, VERMILLION, GREEN, ORANGE, PURPLE]),
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "lines.linewidth": 1.0,
+    "mathtext.fontset": "dejavusans",
+    "svg.fonttype": "path",
+    "svg.hashsalt": "siq",  # otherwise the identifiers in an SVG are drawn by lot
+}
+
+_GREEK = re.compile(
+    "alpha|beta|gamma|delta|epsilon|zeta|eta|theta|iota|kappa|lambda|mu|nu|xi|pi|rho|sigma|tau|upsilon|phi|chi|psi"
+    "|omega|Gamma|Delta|Theta|Lambda|Xi|Pi|Sigma|Upsilon|Phi|Psi|Omega"
+)
+
+Parameters = ParamSpec("Parameters")
+
+
+def drawing_style() -> AbstractContextManager[None]:
+    """Make matplotlib's defaults and the settings of this module hold for a ``with`` block only."""
+    context: AbstractContextManager[None] = matplotlib.style.context(["default", _SETTINGS])
+    return context
+
+
+def drawn_in_style(function: Callable[Parameters, Figure]) -> Callable[Parameters, Figure]:
+    """Decorate a plot function: common style while it draws, fixed layout afterwards."""
+
+    @functools.wraps(function)
+    def draw(*arguments: Parameters.args, **options: Parameters.kwargs) -> Figure:
+        with drawing_style():
+            figure = function(*arguments, **options)
+            # The constrained layout moves on a little with every drawing. Worked out once and then
+            # frozen, the same figure gives the same file however often it is saved.
+            figure.get_layout_engine().execute(figure)
+            figure.set_layout_engine("none")
+        return figure
+
+    return draw
+
+
+def sentence_figure(sentence: str) -> Figure:
+    """Make a figure that says in words why there is nothing to draw."""
+    figure = Figure(figsize=(COLUMN_WIDTH, 1.2))
+    say(figure.add_subplot(), sentence)
+    return figure
+
+
+def say(axes: Axes, sentence: str) -> None:
+    """Write a sentence in place of a panel's curves."""
+    axes.set_axis_off()
+    axes.text(0.5, 0.5, sentence, transform=axes.transAxes, ha="center", va="center", wrap=True, color=GREY)
+
+
+def counted(number: int, noun: str) -> str:
+    """Write a number with its noun: ``1 run``, ``2 runs``."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def name_label(name: str) -> str:
+    """Typeset a name without dollar signs: ``f_x`` with an index, ``omega`` as a Greek letter."""
+    numbered = re.fullmatch(r"([^\W\d_])(\d+)", name)
+    stem, _, index = name.partition("_") if not numbered else (numbered[1], "", numbered[2])
+    if not stem:
+        return r"\mathrm{" + name.replace("_", r"\_") + "}"
+    letter = rf"\{stem}" if _GREEK.fullmatch(stem) else stem if len(stem) == 1 else rf"\mathrm{{{stem}}}"
+    return f"{letter}_{{{name_label(index) if index[:1].isalpha() else index}}}" if index else letter
+
+
+def term_label(term: str) -> str:
+    """Typeset a term such as ``x**2*y``; anything but a monomial is left as it is."""
+    powers = _powers(term)
+    if powers is None:
+        return term.replace("$", r"\$")
+    typeset = (name_label(name) + (f"^{{{power}}}" if power > 1 else "") for name, power in powers)
+    return "$" + r"\,".join(typeset) + "$"
+
+
+def degree(term: str) -> int:
+    """Count the factors of a monomial; a term that is none comes after all monomials."""
+    powers = _powers(term)
+    return 1000 if powers is None else sum(power for name, power in powers if name != "1")
+
+
+def _powers(term: str) -> list[tuple[str, int]] | None:
+    factors = [
+        re.fullmatch(r"([^\W\d]\w*|1)(?:\^(\d+))?", factor)
+        for factor in term.replace(" ", "").replace("**", "^").split("*")
+    ]
+    if not all(factors):
+        return None
+    return [(factor[1], int(factor[2] or 1)) for factor in factors if factor]
+
+
+def sorted_terms(terms: Iterable[str]) -> list[str]:
+    """Order different terms by degree, otherwise as they first appear in the table."""
+    return sorted(dict.fromkeys(terms), key=degree)
+
+
+def unit_label(unit: str) -> str:
+    """Write a unit behind a name: ``(mV)``; the unit ``1`` means a plain number."""
+    return "(dimensionless)" if unit in ("1", "") else f"({unit})"
+
+
+def magnitude_label(value: float, *, digits: int = 2) -> str:
+    """Typeset a number with so many significant digits."""
+    if value != 0 and not 1e-2 <= abs(value) < 1e4:
+        mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+        return rf"${mantissa} \times 10^{{{int(exponent)}}}$"
+    return f"${value:.{digits}g}$"
+
+
+def mean_and_spread(mean: float, spread: float, *, digits: int = 2) -> str:
+    """Typeset mean ± standard deviation, both to so many significant digits of the deviation."""
+    scale = max(abs(mean), spread if math.isfinite(spread) else 0.0)
+    exponent = math.floor(math.log10(scale)) if scale > 0 else 0
+    exponent = 0 if -2 <= exponent < 4 else exponent
+    mean, spread = mean / 10.0**exponent, spread / 10.0**exponent
+    decimals = 4
+    if math.isfinite(spread) and spread > 0:
+        decimals = min(max(digits - 1 - math.floor(math.log10(spread)), 0), 12)
+    mean = round(mean, decimals) + 0.0  # no "−0.0"
+    numbers = f"{mean:.{decimals}f}" + (f" \\pm {spread:.{decimals}f}" if math.isfinite(spread) else "")
+    if exponent == 0:
+        return f"${numbers}$"
+    bracketed = f"({numbers})" if math.isfinite(spread) else numbers
+    return rf"${bracketed} \times 10^{{{exponent}}}$"

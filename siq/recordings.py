@@ -1,0 +1,299 @@
+"""Recordings: trajectories as measured, in one long table.
+
+A table has the columns ``recording`` (a label), ``t`` (the time) and one column per measured quantity.
+Here such a table is read and checked, written, cut into snapshot pairs, and resampled. Whatever cannot be
+used is refused with its row and column; rows are counted from 1 without the header.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from siq.errors import InputError
+from siq.recording_files import agree_on_unit, find_columns, open_columns, parse_labels, parse_numbers
+
+
+@dataclass(frozen=True)
+class Recordings:
+    """Trajectories as measured, checked: finite numbers, and times that increase within every recording.
+
+    Not to be confused with `SnapshotPairs`, which have lost the order in time.
+
+    Attributes
+    ----------
+    names
+        The d measured columns.
+    units
+        The unit of each measured column, None where the file does not say.
+    labels
+        One label per recording, in order of first appearance.
+    recording
+        Shape ``(n,)``: the index of each row's recording in `labels`; it never decreases.
+    t
+        Shape ``(n,)``: the time of each row, in `time_unit`.
+    values
+        Shape ``(n, d)``: what was measured, in `units`.
+    time_unit
+        The unit of `t`, None where the file does not say.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str | None, ...]
+    labels: tuple[str, ...]
+    recording: np.ndarray
+    t: np.ndarray
+    values: np.ndarray
+    time_unit: str | None = None
+
+
+@dataclass(frozen=True)
+class SnapshotPairs:
+    """States a short time apart, each pair with its own step. See `snapshot_pairs`.
+
+    Attributes
+    ----------
+    x0, xh
+        Shape ``(n, d)``: the earlier and the later state.
+    h
+        Shape ``(n,)``: the time between the two.
+    recording
+        Shape ``(n,)``: the index of the recording that the pair is from.
+    """
+
+    x0: np.ndarray
+    xh: np.ndarray
+    h: np.ndarray
+    recording: np.ndarray
+
+
+def read_recordings(
+    path: str | Path, *, columns: Sequence[str] | None = None, units: Mapping[str, str] | None = None
+) -> Recordings:
+    """Read a long table of trajectories and check it.
+
+    Rows of one recording need not stand together; they are grouped, in order of first appearance.
+
+    Parameters
+    ----------
+    path
+        A file that `siq.recording_files.open_columns` can read. A unit may stand behind a name
+        (``x [mm]``), in the file's metadata, or in every cell of a column (``1.2 mm``).
+    columns
+        The measured columns wanted, in the order of the state vector; the file's others are then ignored.
+        Default: all columns but ``recording`` and ``t``, in the order of the file.
+    units
+        The units that are expected, by column, ``t`` included. Nothing is converted: another unit in the
+        file is refused. A column without a unit in the file is taken as it is.
+
+    Raises
+    ------
+    InputError
+        For the first thing in the file that cannot be used, with its row and column.
+    """
+    file = str(path)
+    source = open_columns(path)
+    positions = find_columns(file, source.names, columns)
+    used = [source.names[position] for position in positions]
+    cells = source.load(positions)
+    if len(cells[0]) == 0:
+        raise InputError(file, "", "the table has no rows", "write at least two samples of one recording")
+
+    numbers = np.empty((len(used) - 1, len(cells[0])))
+    found_units: list[str | None] = []
+    faults = []
+    for index, name in enumerate(used[1:]):
+        numbers[index], cell_unit, fault = parse_numbers(file, name, cells[index + 1])
+        faults += [fault] if fault else []
+        stated = {**source.units[positions[index + 1]], "cells": cell_unit}
+        found_units.append(agree_on_unit(file, name, stated, (units or {}).get(name)))
+    recording, labels, fault = parse_labels(file, cells[0])
+    faults += [fault] if fault else []
+    if faults:
+        first = min(faults, key=lambda each: each.row)
+        raise InputError(file, f"row {first.row}, column {first.column}", first.fault, first.remedy)
+
+    order = np.argsort(recording, kind="stable")
+    recording, numbers = recording[order], numbers[:, order]
+    _check_times(file, numbers[0], recording, labels, order)
+    return Recordings(
+        names=tuple(used[2:]),
+        units=tuple(found_units[1:]),
+        labels=labels,
+        recording=recording,
+        t=numbers[0].copy(),
+        values=np.ascontiguousarray(numbers[1:].T),
+        time_unit=found_units[0],
+    )
+
+
+def write_recordings(path: str | Path, recordings: Recordings) -> None:
+    """Write recordings as Parquet; `read_recordings` gives them back to the last bit.
+
+    The file appears complete or not at all, and the same recordings give the same bytes.
+
+    Parameters
+    ----------
+    path
+        A file named ``.parquet``; one that exists is replaced.
+    recordings
+        What to write.
+
+    Raises
+    ------
+    ValueError
+        When the path has another suffix.
+    """
+    from pyarrow import parquet
+
+    path = Path(path)
+    if path.suffix.lower() != ".parquet":
+        raise ValueError(f"recordings are written as .parquet, not as '{path.name}'")
+
+    def field(name: str, unit: str | None) -> pa.Field:
+        return pa.field(name, pa.float64(), metadata=None if unit is None else {"unit": unit})
+
+    label = pa.DictionaryArray.from_arrays(
+        pa.array(recordings.recording.astype(np.int32)), pa.array(recordings.labels, type=pa.string())
+    )
+    names, units = ("t", *recordings.names), (recordings.time_unit, *recordings.units)
+    fields = [field(name, unit) for name, unit in zip(names, units, strict=True)]
+    table = pa.table(
+        [label, pa.array(recordings.t), *(pa.array(column) for column in recordings.values.T)],
+        schema=pa.schema([pa.field("recording", label.type), *fields]),
+    )
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        parquet.write_table(table, temporary, compression="zstd", use_dictionary=["recording"])
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def snapshot_pairs(recordings: Recordings, *, pair_step: float | None = None) -> SnapshotPairs:
+    """Pair every sample with the next one of the same recording.
+
+    Parameters
+    ----------
+    recordings
+        The trajectories.
+    pair_step
+        The longest gap that still makes a pair, in the unit of `t`; default: no limit. This is a limit,
+        not the step h of the pairs, of which each has its own.
+
+    Raises
+    ------
+    ValueError
+        When no pair results.
+    """
+    if pair_step is not None and not pair_step > 0:
+        raise ValueError(f"pair_step is {pair_step}, but it must be positive")
+    t, recording = recordings.t, recordings.recording
+    gap = np.diff(t)
+    keep = recording[1:] == recording[:-1]
+    if pair_step is not None:
+        # Times such as 0.1·k, or seconds since 1970, carry rounding errors into their differences.
+        keep &= gap <= pair_step * (1 + 1e-6) + 2 * np.spacing(np.abs(t[1:]))
+    if not keep.any():
+        limit = "" if pair_step is None else f" that are at most pair_step = {pair_step} apart"
+        raise ValueError(f"no recording has two consecutive samples{limit}")
+    return SnapshotPairs(
+        x0=recordings.values[:-1][keep],
+        xh=recordings.values[1:][keep],
+        h=gap[keep],
+        recording=recording[:-1][keep],
+    )
+
+
+def select_recordings(recordings: Recordings, indices: Sequence[int] | np.ndarray) -> Recordings:
+    """Take whole recordings, in the order given.
+
+    Parameters
+    ----------
+    recordings
+        The trajectories.
+    indices
+        Indices into ``recordings.labels``, not of rows. One that stands twice gives copies, told apart by
+        their labels: ``r07``, ``r07#2``.
+
+    Raises
+    ------
+    ValueError
+        When `indices` is empty, is a mask, or points outside the recordings.
+    """
+    chosen = np.asarray(indices)
+    count = len(recordings.labels)
+    if chosen.ndim != 1 or chosen.dtype.kind not in "iu" or chosen.size == 0:
+        raise ValueError("recordings are selected by a list of at least one index")
+    if chosen.min() < 0 or chosen.max() >= count:
+        raise ValueError(f"a selected recording is not one of 0 ... {count - 1}")
+    bounds = np.searchsorted(recordings.recording, np.arange(count + 1))
+    lengths = np.diff(bounds)[chosen]
+    begins = np.cumsum(lengths) - lengths
+    rows = np.arange(lengths.sum()) + np.repeat(bounds[chosen] - begins, lengths)
+    return Recordings(
+        names=recordings.names,
+        units=recordings.units,
+        labels=_distinct_labels(recordings.labels, chosen),
+        recording=np.repeat(np.arange(len(chosen)), lengths),
+        t=recordings.t[rows],
+        values=recordings.values[rows],
+        time_unit=recordings.time_unit,
+    )
+
+
+def resample_recordings(recordings: Recordings, *, generator: np.random.Generator) -> Recordings:
+    """Draw as many recordings as there are, with replacement: one bootstrap sample.
+
+    Whole recordings are drawn, not rows, since the samples of one recording are not independent.
+
+    Parameters
+    ----------
+    recordings
+        The trajectories.
+    generator
+        Where the draw comes from; the only source of chance.
+    """
+    count = len(recordings.labels)
+    return select_recordings(recordings, generator.integers(count, size=count))
+
+
+def _distinct_labels(labels: tuple[str, ...], chosen: np.ndarray) -> tuple[str, ...]:
+    taken = set(labels)  # a label of the file may itself look like that of a copy
+    copies: dict[int, int] = {}
+    distinct = []
+    for index in chosen.tolist():
+        label, copy = labels[index], copies.get(index, 0) + 1
+        while copy > 1 and f"{label}#{copy}" in taken:
+            copy += 1
+        copies[index] = copy
+        distinct.append(label if copy == 1 else f"{label}#{copy}")
+        taken.add(distinct[-1])
+    return tuple(distinct)
+
+
+def _check_times(
+    file: str, t: np.ndarray, recording: np.ndarray, labels: tuple[str, ...], rows: np.ndarray
+) -> None:
+    """Refuse times that do not increase; `rows` are the rows of the file, before they were grouped."""
+    same = recording[1:] == recording[:-1]
+    if not same.any():
+        remedy = "give the rows of one recording the same label"
+        raise InputError(file, "", "no recording has two samples", remedy)
+    wrong = np.flatnonzero(same & (t[1:] <= t[:-1]))
+    if wrong.size == 0:
+        return
+    earlier = wrong[np.argmin(rows[wrong + 1])]
+    label, before, now = labels[recording[earlier]], float(t[earlier]), float(t[earlier + 1])
+    if now == before:
+        fault = f"the time {now} of recording '{label}' is repeated (row {rows[earlier] + 1} has it too)"
+        remedy = "keep one of the two rows, or label them as two recordings"
+    else:
+        fault = f"the times of recording '{label}' are unsorted ({now} comes after {before})"
+        remedy = "sort its rows by t, or begin a new label where a new recording begins"
+    raise InputError(file, f"row {rows[earlier + 1] + 1}, column t", fault, remedy)

@@ -1,0 +1,197 @@
+"""Symbolic decompositions: the formulas of V, g and f, what they evaluate to, and their terms.
+
+A formula is a sympy expression of the states. `model.json` (`siq.model`) is how it travels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.optimize
+import sympy
+
+from siq.errors import NumericalFailure
+from siq.expressions import compile_formulas
+from siq.library import CandidateLibrary, linear_combination
+from siq.systems import System
+
+
+@dataclass(frozen=True)
+class SymbolicDecomposition:
+    """Formulas of ``f = -D∇V + g``.
+
+    Attributes
+    ----------
+    symbols
+        The d states.
+    potential
+        V, zero at its minimum.
+    circulatory, vector_field
+        Components of g and of f.
+    """
+
+    symbols: tuple[sympy.Symbol, ...]
+    potential: sympy.Expr
+    circulatory: tuple[sympy.Expr, ...]
+    vector_field: tuple[sympy.Expr, ...]
+
+    @property
+    def quasipotential(self) -> sympy.Expr:
+        """U = 2V, zero at its minimum: the action is ½∫∣φ̇ - f∣²dt, and p ~ exp(-U/ε) for √ε dW."""
+        return sympy.expand(2 * self.potential)
+
+    @property
+    def gradient(self) -> tuple[sympy.Expr, ...]:
+        """∇V."""
+        return tuple(self.potential.diff(symbol) for symbol in self.symbols)
+
+    @cached_property
+    def evaluate(self) -> Callable[[np.ndarray], np.ndarray]:
+        """V, g_1 … g_d, f_1 … f_d: points as components ``(d, ...)`` to values ``(2d + 1, ...)``."""
+        return compile_formulas([self.potential, *self.circulatory, *self.vector_field], self.symbols)
+
+    @cached_property
+    def evaluate_gradient(self) -> Callable[[np.ndarray], np.ndarray]:
+        """∇V: points as components ``(d, ...)`` to components ``(d, ...)``."""
+        return compile_formulas(self.gradient, self.symbols)
+
+    def components(self) -> dict[str, sympy.Expr]:
+        """The formulas by the names that tables give them: ``U``, ``V``, ``f_x``, ``g_x`` …"""
+        formulas = {"U": self.quasipotential, "V": self.potential}
+        formulas |= {f"f_{s}": f for s, f in zip(self.symbols, self.vector_field, strict=True)}
+        formulas |= {f"g_{s}": g for s, g in zip(self.symbols, self.circulatory, strict=True)}
+        return formulas
+
+
+def decomposition_of_system(
+    symbols: Sequence[sympy.Symbol],
+    equations: Sequence[sympy.Expr],
+    quasipotential: sympy.Expr,
+    diffusion: np.ndarray,
+) -> SymbolicDecomposition:
+    """The decomposition of a known vector field with a known quasipotential; g = f + D∇V."""
+    potential = sympy.expand(quasipotential / 2)
+    gradient = [potential.diff(symbol) for symbol in symbols]
+    circulatory = [
+        sympy.expand(equation + sum(exact_number(diffusion[i, j]) * gradient[j] for j in range(len(symbols))))
+        for i, equation in enumerate(equations)
+    ]
+    return SymbolicDecomposition(
+        symbols=tuple(symbols),
+        potential=potential,
+        circulatory=tuple(circulatory),
+        vector_field=tuple(sympy.expand(equation) for equation in equations),
+    )
+
+
+def exact_decomposition(system: System) -> SymbolicDecomposition | None:
+    """The exact decomposition of a system whose card knows U, otherwise None. For scoring only."""
+    if system.exact_quasipotential is None:
+        return None
+    return decomposition_of_system(
+        system.symbols, system.equations, system.exact_quasipotential, system.diffusion
+    )
+
+
+def decomposition_from_coefficients(
+    library: CandidateLibrary,
+    *,
+    potential: np.ndarray,
+    circulatory: np.ndarray,
+    vector_field: np.ndarray,
+    points: np.ndarray,
+) -> SymbolicDecomposition:
+    """Formulas from coefficients over a library, with V shifted to be zero at its minimum.
+
+    Parameters
+    ----------
+    library
+        The q functions.
+    potential
+        Coefficients of V, shape ``(q,)``.
+    circulatory, vector_field
+        Coefficients of g and f, shape ``(q, d)``.
+    points
+        Shape ``(n, d)``; the minimum is sought within their box, from the lowest of them.
+
+    Raises
+    ------
+    NumericalFailure
+        When V is nowhere finite on the points.
+    """
+
+    def expression(coefficients: np.ndarray) -> sympy.Expr:
+        chosen = np.flatnonzero(coefficients)
+        return sympy.Add(*(sympy.Float(float(coefficients[k]), 17) * library.terms[k] for k in chosen))
+
+    value = expression(potential)
+    lowest = minimum(value, library.symbols, points)
+    return SymbolicDecomposition(
+        symbols=library.symbols,
+        potential=value - sympy.Float(lowest, 17),
+        circulatory=tuple(expression(column) for column in circulatory.T),
+        vector_field=tuple(expression(column) for column in vector_field.T),
+    )
+
+
+def minimum(
+    expression: sympy.Expr, symbols: Sequence[sympy.Symbol], points: np.ndarray, *, starts: int = 8
+) -> float:
+    """Smallest value of an expression within the box of some points.
+
+    Parameters
+    ----------
+    expression
+        A function of `symbols`.
+    symbols
+        The d states.
+    points
+        Shape ``(n, d)``. Descents start from the lowest of them that do not lie side by side.
+    starts
+        Number of descents.
+
+    Returns
+    -------
+    float
+    """
+    together = compile_formulas([expression, *(expression.diff(s) for s in symbols)], tuple(symbols))
+    values = together(points.T)[0]
+    if not np.isfinite(values).any():
+        raise NumericalFailure("the formula of V is nowhere finite on the recorded points")
+    scale = points.std(axis=0)
+    scale[scale == 0] = 1.0
+    order = np.argsort(values)
+    chosen: list[np.ndarray] = []
+    for point in points[order[: 200 * starts : starts]]:
+        if all(np.linalg.norm((point - other) / scale) > 0.3 for other in chosen):
+            chosen.append(point)
+        if len(chosen) == starts:
+            break
+    bounds = np.stack([points.min(axis=0), points.max(axis=0)], axis=1) / scale[:, None]
+    unit = float(np.ptp(values[np.isfinite(values)])) or 1.0
+
+    def function(y: np.ndarray) -> tuple[float, np.ndarray]:
+        result = together((y * scale)[:, None])[:, 0]
+        return result[0] / unit, result[1:] * scale / unit
+
+    best = float(np.nanmin(values))
+    for point in chosen:
+        found = scipy.optimize.minimize(
+            function, point / scale, jac=True, bounds=bounds, method="L-BFGS-B",
+            options={"ftol": 1e-15, "gtol": 1e-12},
+        )  # fmt: skip
+        best = min(best, float(found.fun) * unit)
+    return best
+
+
+def term_coefficients(expression: sympy.Expr) -> dict[str, float]:
+    """Coefficients by term as text, such as ``{"x**2": -2.0, "1": 1.0}``; zeros left out."""
+    return {str(term): value for term, value in linear_combination(expression).items()}
+
+
+def exact_number(value: float) -> sympy.Expr:
+    """A float as an integer where it is one, so that exact formulas stay exact."""
+    return sympy.Integer(int(value)) if float(value).is_integer() else sympy.Float(float(value), 17)

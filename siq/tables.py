@@ -1,0 +1,99 @@
+"""Tables as files: Parquet with a CSV beside it, whole or not at all."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import pandas as pd
+
+from siq.errors import InputError
+
+COLUMNS: Mapping[str, Mapping[str, str]] = {
+    "coefficients": {
+        "run": "int64",
+        "method": "str",
+        "component": "str",
+        "term": "str",
+        "estimate": "float64",
+        "exact": "float64",
+    },
+    "rrmse": {
+        "run": "int64",
+        "method": "str",
+        "rrmse": "float64",
+        "support_correct": "boolean",
+        "certified": "bool",
+        "network_error": "float64",
+    },
+    "outcomes": {"run": "int64", "step": "str", "status": "str", "reason": "str"},
+    "timings": {"run": "int64", "step": "str", "seconds": "float64"},
+    "training": {
+        "run": "int64",
+        "step": "int64",
+        "training_loss": "float64",
+        "held_out_loss": "float64",
+        "dynamics": "float64",
+        "orthogonality": "float64",
+        "learning_rate": "float64",
+    },
+    "summary": {
+        "method": "str",
+        "quantity": "str",
+        "exact": "float64",
+        "mean": "float64",
+        "standard_deviation": "float64",
+        "median": "float64",
+        "inclusion_frequency": "float64",
+        "runs": "int64",
+        "published": "float64",
+        "published_standard_deviation": "float64",
+        "source": "str",
+    },
+}
+"""Columns of every table, in order, with their types: the contract with whoever reads the results."""
+
+
+def as_table(name: str, rows: pd.DataFrame | list[dict[str, object]]) -> pd.DataFrame:
+    """Rows in the columns and types of a table of the contract; further columns are refused."""
+    columns = COLUMNS[name]
+    frame = pd.DataFrame(rows, columns=None if len(rows) else list(columns))
+    unknown = set(frame.columns) - set(columns)
+    if unknown:
+        raise ValueError(f"the table '{name}' has no columns {sorted(unknown)}; see siq.tables.COLUMNS")
+    return frame.reindex(columns=list(columns)).astype(dict(columns)).reset_index(drop=True)
+
+
+def concatenate(name: str, tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    """Tables of one kind below each other, in the order given; also of none."""
+    filled = [table for table in tables if len(table)]
+    return as_table(name, pd.concat(filled, ignore_index=True) if filled else [])
+
+
+def write_table(path: str | Path, table: pd.DataFrame) -> None:
+    """Write a table as Parquet to `path`, and as CSV beside it.
+
+    Numbers in the CSV have as many digits as it takes to read the same numbers back.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    table.to_csv(partial, index=False)
+    os.replace(partial, path.with_suffix(".csv"))
+    table.to_parquet(partial, index=False)
+    os.replace(partial, path)
+
+
+def read_table(path: str | Path) -> pd.DataFrame:
+    """Read a table that `write_table` wrote.
+
+    Raises
+    ------
+    InputError
+        When the file is missing or is not Parquet.
+    """
+    try:
+        return pd.read_parquet(path)
+    except (OSError, ValueError):
+        raise InputError(path, "", "it is not a Parquet table", "make it again") from None

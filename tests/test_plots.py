@@ -1,0 +1,226 @@
+import itertools
+
+import matplotlib
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.figure import Figure
+
+from siq.plots import (
+    ComponentFields,
+    plot_coefficient_distributions,
+    plot_components,
+    plot_error_distribution,
+    plot_inclusion,
+    plot_training,
+    save_figure,
+)
+from siq.plots.style import mean_and_spread, name_label, sorted_terms, term_label
+
+EXACT = {
+    "U": {"1": 1.0, "x**2": -2.0, "y**2": 1.0, "z**2": 1.0, "x**4": 1.0},
+    "g_x": {"y": -1.0, "z": -1.0},
+}
+TERMS = [
+    "*".join(
+        name if power == 1 else f"{name}**{power}" for name, power in zip("xyz", powers, strict=True) if power
+    )
+    or "1"
+    for powers in itertools.product(range(6), repeat=3)
+    if sum(powers) <= 5
+]
+
+
+def synthetic_coefficients(runs: int, *, known: bool = True, scatter: float = 1e-3) -> pd.DataFrame:
+    rng = np.random.default_rng(0)
+    rows = [
+        (run, "regression", component, term, exact * (1 + scatter * rng.normal()), exact if known else np.nan)
+        for run in range(runs)
+        for component, formula in EXACT.items()
+        for term in TERMS
+        for exact in [formula.get(term, 0.0)]
+    ]
+    return pd.DataFrame(rows, columns=["run", "method", "component", "term", "estimate", "exact"])
+
+
+def words(figure: Figure) -> str:
+    return "\n".join(text.get_text() for text in figure.findobj(matplotlib.text.Text))
+
+
+@pytest.mark.parametrize("runs", [1, 50])
+@pytest.mark.parametrize("known", [True, False])
+def test_a_panel_for_each_nontrivial_term_and_one_for_the_others(runs: int, known: bool) -> None:
+    table = synthetic_coefficients(runs, known=known)
+    table = table[table["run"] != 7]  # a failed run has no rows
+    figure = plot_coefficient_distributions(table, method="regression")
+    assert len(figure.axes) == 5 + 1
+    bars = [sum(patch.get_height() for patch in axes.patches) for axes in figure.axes[:5]]
+    assert bars == [max(runs - 1, 1)] * 5
+    assert "the other 51 terms" in words(figure)
+
+
+def test_falsely_nonzero_terms_are_drawn_with_their_frequency() -> None:
+    table = synthetic_coefficients(4)
+    false = (table["component"] == "U") & (table["term"] == "x*y") & (table["run"] < 2)
+    table.loc[false, "estimate"] = [0.02, -0.3]
+    last = plot_coefficient_distributions(table, method="regression").axes[-1]
+    assert [patch.get_height() for patch in last.patches] == [0.5]
+    assert "0.3" in last.texts[0].get_text()
+    assert "falsely" in last.get_title()
+
+
+def test_a_missing_term_is_counted_and_not_averaged() -> None:
+    table = synthetic_coefficients(5)
+    table.loc[(table["term"] == "x**2") & (table["run"] == 0), "estimate"] = 0.0
+    assert "zero in 1 run" in words(plot_coefficient_distributions(table, method="regression"))
+
+
+def test_tiny_scatter_is_drawn_as_deviation() -> None:
+    table = synthetic_coefficients(6, scatter=1e-9)
+    assert "coefficient + $2$" in words(plot_coefficient_distributions(table, method="regression"))
+
+
+def test_terms_that_most_runs_use_are_nontrivial_where_nothing_is_known() -> None:
+    table = synthetic_coefficients(2, known=False)
+    table = table[(table["component"] == "U") & table["term"].isin(TERMS[:12])].assign(estimate=1.0)
+    assert len(plot_coefficient_distributions(table, method="regression").axes) == 12 + 1
+
+
+def test_no_rows_at_all_are_told_in_words() -> None:
+    table = synthetic_coefficients(1)
+    assert "No run" in words(plot_coefficient_distributions(table, method="refined"))
+    assert "No run" in words(plot_inclusion(table, method="refined"))
+
+
+def test_inclusion_collapses_unused_terms_and_outlines_exact_ones() -> None:
+    figure = plot_inclusion(synthetic_coefficients(3), method="regression")
+    (axes,) = figure.axes
+    assert len(axes.get_yticks()) == 7
+    assert len(axes.patches) == 5 + 2
+    assert "the other 49 terms" in words(figure)
+
+
+def synthetic_errors() -> pd.DataFrame:
+    return pd.DataFrame(
+        {
+            "run": [0, 1, 2, 0, 1, 2],
+            "method": ["regression"] * 3 + ["refined"] * 3,
+            "rrmse": [1e-3, 2e-3, np.nan, 1e-7, 2e-7, 0.1],
+            "support_correct": [True, False, None, True, True, False],
+            "certified": [False, False, None, True, True, False],
+            "network_error": 4e-3,
+        }
+    )
+
+
+def test_every_measured_run_is_a_dot_and_the_others_are_counted() -> None:
+    figure = plot_error_distribution(synthetic_errors(), published=(8.87e-4, 3.48e-4))
+    dots = [line for line in figure.axes[0].lines if line.get_marker() in ("o", "^")]
+    assert sum(len(line.get_xdata()) for line in dots) == 5
+    text = words(figure)
+    assert "regression: 1 run without an error" in text
+    assert "8.87" in text and "3.48" in text and "not certified" in text
+
+
+def test_errors_that_nobody_knows_are_told_in_words() -> None:
+    assert "none of 6 formulas" in words(plot_error_distribution(synthetic_errors().assign(rrmse=np.nan)))
+
+
+def archetype_fields() -> ComponentFields:
+    x, y = np.linspace(-2, 2, 21), np.linspace(-1.5, 1.5, 17)
+    X, Y = np.meshgrid(x, y)
+    U = X**4 - 2 * X**2 + Y**2 + 1
+    return ComponentFields(
+        x1=x,
+        x2=y,
+        minus_gradient=np.array([2 * X - 2 * X**3, -Y]),
+        circulatory=np.array([-Y, 2 * X**3 - 2 * X]),
+        quasipotential=1.01 * U,
+        exact_quasipotential=U,
+        trajectories=[np.column_stack([np.linspace(-1, 0, 9), np.full(9, level)]) for level in range(5)],
+    )
+
+
+def test_both_landscapes_share_one_colour_scale() -> None:
+    domain = np.array([[-2.0, 2.0], [-1.5, 1.5], [-1.5, 1.5]])
+    figure = plot_components(archetype_fields(), states="xyz", units=("mV", "1", "1"), domain=domain)
+    exact, identified = (axes.collections[0] for axes in figure.axes[3:5])
+    assert list(exact.norm.boundaries) == list(identified.norm.boundaries)
+    assert figure.axes[0].get_xlabel() == "$x$ (mV)"
+
+
+def test_panels_without_data_say_so() -> None:
+    fields = ComponentFields(
+        x1=np.linspace(0, 1, 5), x2=np.linspace(0, 1, 5), circulatory=np.zeros((2, 5, 5))
+    )
+    text = words(plot_components(fields, states="xy", units="11", domain=np.array([[0, 1], [0, 1]])))
+    for sentence in ("no trajectories", "zero everywhere", "not known", "not identified"):
+        assert sentence in text
+
+
+def test_one_state_gives_curves() -> None:
+    x = np.linspace(-2, 2, 11)
+    fields = ComponentFields(
+        x1=x,
+        x2=np.zeros(1),
+        circulatory=np.zeros((1, 1, 11)),
+        quasipotential=(x**2)[None],
+        exact_quasipotential=(1.5 * x**2)[None],
+        trajectories=[np.ones((4, 1))],
+    )
+    figure = plot_components(fields, states=["x"], units=["V"], domain=np.array([[-2, 2]]))
+    np.testing.assert_allclose(figure.axes[1].lines[0].get_ydata(), x**2 / 2)
+    assert figure.axes[3].get_ylim() == figure.axes[4].get_ylim()
+
+
+def test_training_has_a_line_for_every_run_and_the_median() -> None:
+    steps = np.arange(0, 500, 100)
+    table = pd.concat(
+        pd.DataFrame({"run": run, "step": steps, "training_loss": (run + 1.0) / (1 + steps)})
+        for run in range(3)
+    ).assign(held_out_loss=np.nan, dynamics=1.0, orthogonality=1.0, learning_rate=1e-3)
+    figure = plot_training(table)
+    panel = next(axes for axes in figure.axes if axes.get_title() == "loss on the training pairs")
+    assert len(panel.lines) == 3 + 1
+    np.testing.assert_allclose(panel.lines[-1].get_ydata(), 2 / (1 + steps[1:]))
+    assert "not recorded" in words(figure)
+
+
+def test_the_same_figure_gives_the_same_files(tmp_path) -> None:
+    figure = plot_inclusion(synthetic_coefficients(2), method="regression")
+    first = [path.read_bytes() for path in save_figure(figure, tmp_path / "new" / "first")]
+    with matplotlib.rc_context(
+        {"font.size": 20, "svg.hashsalt": None}
+    ):  # settings of the machine do not matter
+        again = plot_inclusion(synthetic_coefficients(2), method="regression")
+        second = [path.read_bytes() for path in save_figure(again, tmp_path / "second")]
+    third = [path.read_bytes() for path in save_figure(figure, tmp_path / "second")]
+    assert first == second == third
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["new", "second.png", "second.svg"]
+
+
+@pytest.mark.parametrize(
+    ("name", "label"),
+    [
+        ("x", "x"),
+        ("x1", "x_{1}"),
+        ("f_x", "f_{x}"),
+        ("omega_0", r"\omega_{0}"),
+        ("f_theta_1", r"f_{\theta_{1}}"),
+        ("heat", r"\mathrm{heat}"),
+    ],
+)
+def test_names_are_typeset(name: str, label: str) -> None:
+    assert name_label(name) == label
+
+
+def test_terms_are_typeset_and_sorted_by_degree() -> None:
+    assert term_label("x**2*y") == r"$x^{2}\,y$"
+    assert term_label("sin(x)") == "sin(x)"
+    assert sorted_terms(["x**4", "1", "sin(x)", "x*y", "y"]) == ["1", "y", "x*y", "x**4", "sin(x)"]
+
+
+def test_mean_and_spread_share_their_digits() -> None:
+    assert mean_and_spread(8.87e-4, 3.48e-4, digits=3) == r"$(8.87 \pm 3.48) \times 10^{-4}$"
+    assert mean_and_spread(-1.99987, 0.0012) == r"$-1.9999 \pm 0.0012$"
+    assert mean_and_spread(-1e-9, 0.01) == r"$0.000 \pm 0.010$"

@@ -1,0 +1,1 @@
+"""The workflow: rules, scripts, and what the rules know of the configuration."""

@@ -1,0 +1,48 @@
+# All runs of a study as tables.
+
+
+def all_outcomes(wildcards):
+    """What became of every step of every run."""
+    runs = "results/{study}/runs/{run}/"
+    return [
+        *all_runs(runs + "draw.json")(wildcards),
+        *all_blocks("results/{study}/training/{block}/train.json")(wildcards),
+        *all_runs(runs + "regress.json")(wildcards),
+        *all_runs(runs + "score.json")(wildcards),
+    ]
+
+
+rule collect:
+    input:
+        coefficients=all_runs("results/{study}/runs/{run}/coefficients.parquet"),
+        rrmse=all_runs("results/{study}/runs/{run}/rrmse.parquet"),
+        histories=all_blocks("results/{study}/training/{block}/history.parquet"),
+        outcomes=all_outcomes,
+        published=lambda wildcards: study_of(wildcards).published() or [],
+    output:
+        coefficients="results/{study}/tables/coefficients.parquet",
+        rrmse="results/{study}/tables/rrmse.parquet",
+        training="results/{study}/tables/training.parquet",
+        outcomes="results/{study}/tables/outcomes.parquet",
+        timings="results/{study}/tables/timings.parquet",
+        summary="results/{study}/tables/summary.parquet",
+        csv=report(
+            "results/{study}/tables/summary.csv",
+            caption="../report/summary.rst",
+            category="{study}",
+            subcategory="tables",
+        ),
+    log:
+        "results/{study}/logs/collect.log",
+    benchmark:
+        "results/{study}/benchmarks/collect.tsv"
+    conda:
+        "../envs/siq.yaml"
+    threads: 1
+    params:
+        code=code("collect.py"),
+        benchmarks="results/{study}/benchmarks",
+    message:
+        "{wildcards.study}: collecting the tables of all runs"
+    script:
+        "../scripts/collect.py"

@@ -1,0 +1,34 @@
+# Where the data of a run come from: a simulation of the system, or recordings.
+
+
+def data_source(wildcards):
+    """Recordings by their content; a card only as what it says of the dynamics, which is a parameter."""
+    study = study_of(wildcards)
+    return (
+        study.source()
+        if study.study.recordings is not None
+        else ancient(study.source())
+    )
+
+
+rule draw:
+    # One rule for both entrances: whatever follows cannot tell them apart.
+    input:
+        source=data_source,
+    output:
+        recordings="results/{study}/runs/{run}/recordings.parquet",
+        outcome="results/{study}/runs/{run}/draw.json",
+    log:
+        "results/{study}/logs/{run}/draw.log",
+    benchmark:
+        "results/{study}/benchmarks/{run}/draw.tsv"
+    conda:
+        "../envs/siq.yaml"
+    threads: 1
+    params:
+        code=code("draw.py"),
+        study=parameters("seed", "recordings", "simulation", "dynamics", "metric"),
+    message:
+        "{wildcards.study}, run {wildcards.run}: drawing trajectories"
+    script:
+        "../scripts/draw.py"

@@ -1,0 +1,25 @@
+# Sparse formulas of V, g and f from the networks.
+
+
+rule regress:
+    input:
+        recordings="results/{study}/runs/{run}/recordings.parquet",
+        networks=lambda wildcards: f"results/{wildcards.study}/training/{block_of(wildcards)}/networks.npz",
+        outcome=lambda wildcards: f"results/{wildcards.study}/training/{block_of(wildcards)}/train.json",
+    output:
+        model="results/{study}/runs/{run}/model.json",
+        outcome="results/{study}/runs/{run}/regress.json",
+    log:
+        "results/{study}/logs/{run}/regress.log",
+    benchmark:
+        "results/{study}/benchmarks/{run}/regress.tsv"
+    conda:
+        "../envs/siq.yaml"
+    threads: 1
+    params:
+        code=code("regress.py"),
+        study=parameters("recordings", "simulation", "regression", "metric"),
+    message:
+        "{wildcards.study}, run {wildcards.run}: regressing formulas"
+    script:
+        "../scripts/regress.py"

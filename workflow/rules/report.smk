@@ -1,0 +1,93 @@
+# Figures, and the page that people read.
+
+FIGURES = {
+    "coefficient_distributions": "coefficients.rst",
+    "error_distribution": "error.rst",
+    "inclusion_frequency": "inclusion.rst",
+    "components": "components.rst",
+    "training": "training.rst",
+}
+
+
+def figure_output(name):
+    return report(
+        f"results/{{study}}/figures/{name}.svg",
+        caption=f"../report/{FIGURES[name]}",
+        category="{study}",
+        subcategory="figures",
+    )
+
+
+rule figures:
+    input:
+        coefficients="results/{study}/tables/coefficients.parquet",
+        rrmse="results/{study}/tables/rrmse.parquet",
+        training="results/{study}/tables/training.parquet",
+        models=all_runs("results/{study}/runs/{run}/model.json"),
+        recordings=all_runs("results/{study}/runs/{run}/recordings.parquet"),
+        card=card_if_any,
+        published=lambda wildcards: study_of(wildcards).published() or [],
+    output:
+        [figure_output(name) for name in FIGURES],
+        expand("results/{{study}}/figures/{name}.png", name=FIGURES),
+    log:
+        "results/{study}/logs/figures.log",
+    benchmark:
+        "results/{study}/benchmarks/figures.tsv"
+    conda:
+        "../envs/siq.yaml"
+    threads: 1
+    params:
+        code=code("figures.py"),
+        study=parameters("metric", "dynamics", "exact", "simulation"),
+        folder="results/{study}/figures",
+    message:
+        "{wildcards.study}: drawing the figures"
+    script:
+        "../scripts/figures.py"
+
+
+rule html:
+    input:
+        summary="results/{study}/tables/summary.parquet",
+        rrmse="results/{study}/tables/rrmse.parquet",
+        outcomes="results/{study}/tables/outcomes.parquet",
+        timings="results/{study}/tables/timings.parquet",
+        models=all_runs("results/{study}/runs/{run}/model.json"),
+        figures=expand("results/{{study}}/figures/{name}.png", name=FIGURES),
+        card=card_if_any,
+        published=lambda wildcards: study_of(wildcards).published() or [],
+    output:
+        html=report(
+            "results/{study}/report.html",
+            caption="../report/report.rst",
+            category="{study}",
+        ),
+    log:
+        "results/{study}/logs/html.log",
+    benchmark:
+        "results/{study}/benchmarks/html.tsv"
+    conda:
+        "../envs/siq.yaml"
+    threads: 1
+    params:
+        code=code("html.py"),
+        study=parameters(
+            "name",
+            "title",
+            "system",
+            "recordings",
+            "runs",
+            "seed",
+            "published",
+            "simulation",
+            "training",
+            "regression",
+            "metric",
+            "dynamics",
+            "exact",
+        ),
+    message:
+        "{wildcards.study}: writing the report"
+    script:
+        "../scripts/html.py"

@@ -1,0 +1,32 @@
+# How close a run comes to exact answers, where these are known.
+
+
+def card_if_any(wildcards):
+    card = study_of(wildcards).card()
+    return [] if card is None else ancient(card)
+
+
+rule score:
+    input:
+        model="results/{study}/runs/{run}/model.json",
+        training=lambda wildcards: f"results/{wildcards.study}/training/{block_of(wildcards)}/train.json",
+        networks=lambda wildcards: f"results/{wildcards.study}/training/{block_of(wildcards)}/networks.npz",
+        card=card_if_any,
+    output:
+        coefficients="results/{study}/runs/{run}/coefficients.parquet",
+        rrmse="results/{study}/runs/{run}/rrmse.parquet",
+        outcome="results/{study}/runs/{run}/score.json",
+    log:
+        "results/{study}/logs/{run}/score.log",
+    benchmark:
+        "results/{study}/benchmarks/{run}/score.tsv"
+    conda:
+        "../envs/siq.yaml"
+    threads: 1
+    params:
+        code=code("score.py"),
+        study=parameters("dynamics", "metric", "exact", "regression"),
+    message:
+        "{wildcards.study}, run {wildcards.run}: scoring"
+    script:
+        "../scripts/score.py"

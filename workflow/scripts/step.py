@@ -1,0 +1,93 @@
+"""What every script shares: its log, how it fails, and the outcome of a run that it leaves behind."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from siq.errors import InputError
+from siq.recordings import Recordings, read_recordings
+
+
+@contextmanager
+def job(snakemake: Any) -> Iterator[None]:
+    """Run the body of a script: log to the rule's file, tell bad input in one sentence.
+
+    An `InputError` ends the script with exit code 1 and its sentence, without a traceback. Any other
+    exception is a fault of ours and shows where it happened.
+    """
+    log = Path(snakemake.log[0])
+    log.parent.mkdir(parents=True, exist_ok=True)
+    logging.basicConfig(
+        filename=log, filemode="w", level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s"
+    )
+    logging.captureWarnings(True)
+    try:
+        yield
+    except InputError as error:
+        logging.error("%s", error)
+        print(error, file=sys.stderr)
+        sys.exit(1)
+    except BaseException:
+        logging.exception("the step stopped")
+        raise
+
+
+def outcome(run: int, step: str, status: str = "ok", reason: str = "", **details: Any) -> dict[str, Any]:
+    """What became of one step of one run.
+
+    `status` is ``ok``, ``warning`` (a result, with a reservation), ``failed`` (no result) or ``skipped``
+    (a step before it failed).
+    """
+    if status != "ok":
+        logging.warning("run %d, %s: %s, %s", run, step, status, reason)
+    return {"run": run, "step": step, "status": status, "reason": reason, **details}
+
+
+def write_outcomes(path: str | Path, outcomes: Sequence[dict[str, Any]]) -> None:
+    """Write outcomes whole or not at all."""
+    write_text(path, json.dumps(list(outcomes), indent=1) + "\n")
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write a text file whole or not at all."""
+    partial = Path(f"{path}.partial")
+    partial.write_text(text, encoding="utf-8")
+    os.replace(partial, path)
+
+
+def read_outcomes(path: str | Path) -> list[dict[str, Any]]:
+    """Read what `write_outcomes` wrote."""
+    return json.loads(Path(path).read_text(encoding="utf-8"))
+
+
+def position_of(run: int, training: str | Path) -> tuple[int | None, str]:
+    """Where a run stands among the networks of its block, or None and the reason."""
+    mine = next(entry for entry in read_outcomes(training) if entry["run"] == run)
+    return (mine["position"], "") if mine["status"] == "ok" else (None, mine["reason"])
+
+
+def pair_step(study: dict[str, Any]) -> float | None:
+    """Largest time between the two samples of a pair: what the simulation had, or the study says."""
+    if study["recordings"] is None:
+        return study["simulation"]["pair_step"]
+    return study["recordings"]["pair_step"]
+
+
+def read_run(path: str | Path) -> Recordings | None:
+    """The trajectories of a run, or None where drawing them failed and left an empty file."""
+    return read_recordings(path) if Path(path).stat().st_size else None
+
+
+def first_model(models: Sequence[str]) -> int | None:
+    """The first run that has formulas, by its place in the list; None where no run has."""
+    for place, path in enumerate(models):
+        if json.loads(Path(path).read_text(encoding="utf-8"))["methods"]:
+            return place
+    return None

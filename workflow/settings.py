@@ -1,0 +1,230 @@
+"""What the rules know of the configuration: studies, their parameters, and the code of every step."""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter
+
+from siq.documents import Document, read_document, validate
+from siq.errors import InputError
+from siq.study import Study, load_published, load_study_system, system_path
+from siq.systems import System
+
+WORKFLOW_KEYS = ("statistics", "device", "runs_per_training")
+SYSTEMS = Path("config/systems")
+STUDIES = Path("config/studies")
+PUBLISHED = Path("config/published")
+
+
+@dataclass(frozen=True)
+class CheckedStudy:
+    """A study with its system, as the rules use it.
+
+    Attributes
+    ----------
+    study
+        The checked study.
+    file
+        Where it stands.
+    system
+        Its system, where it names one.
+    runs_per_training
+        Runs that one training job takes.
+    """
+
+    study: Study
+    file: str
+    system: System | None
+    runs_per_training: int
+
+    def run_names(self) -> list[str]:
+        """``000``, ``001``, …, one for every run."""
+        return [f"{run:03d}" for run in range(self.study.runs)]
+
+    def block(self, run: int) -> str:
+        """Name of the block of runs that trains a run, such as ``000-049``."""
+        first = run - run % self.runs_per_training
+        last = min(first + self.runs_per_training, self.study.runs) - 1
+        return f"{first:03d}-{max(last, run):03d}"
+
+    def block_names(self) -> list[str]:
+        """Every block once."""
+        return list(dict.fromkeys(self.block(run) for run in range(self.study.runs)))
+
+    def source(self) -> str:
+        """The file that the data come from: the recordings, or the card that is simulated."""
+        if self.study.recordings is not None:
+            return self.study.recordings.file
+        assert self.study.system is not None  # the schema asks for one of the two
+        return str(system_path(self.study.system, systems=SYSTEMS))
+
+    def card(self) -> str | None:
+        """The system card, where the study names one."""
+        return None if self.study.system is None else str(system_path(self.study.system, systems=SYSTEMS))
+
+    def published(self) -> str | None:
+        """The file of published figures, where the study names one."""
+        return None if self.study.published is None else str(PUBLISHED / f"{self.study.published}.yaml")
+
+    def parameters(self, *keys: str) -> dict[str, Any]:
+        """Parts of the study as plain data.
+
+        Beside the study's own keys there are ``dynamics`` (what a simulation depends on), ``metric`` (the
+        states and D) and ``exact`` (what scoring depends on), so that a change of a card's title, or of
+        its exact answer, simulates nothing again.
+        """
+        return {key: self._part(key) for key in keys}
+
+    def _part(self, key: str) -> Any:
+        system = self.system
+        if key == "dynamics":
+            if system is None:
+                return None
+            formulas = [str(equation) for equation in system.equations]
+            return [list(system.states), system.domain.tolist(), formulas]
+        if key == "metric":
+            recordings = self.study.recordings
+            if system is not None:
+                diffusion: Any = system.diffusion.tolist()
+                states: Any = list(system.states)
+                units: Any = dict(zip(system.states, system.units, strict=True)) | {"t": system.time_unit}
+            else:
+                assert recordings is not None  # the schema asks for one of the two
+                diffusion, states, units = recordings.diffusion, recordings.states, None
+            return {"states": states and list(states), "diffusion": diffusion, "units": units}
+        if key == "exact":
+            return None if system is None else str(system.exact_quasipotential)
+        value = getattr(self.study, key)
+        return TypeAdapter(type(value)).dump_python(value, mode="json")
+
+
+class Studies(Mapping[str, CheckedStudy]):
+    """Every study of the configuration by name; each is checked when it is first asked for.
+
+    Parameters
+    ----------
+    config
+        The configuration as Snakemake merged it. A study given by ``--configfile`` stands in it beside
+        the workflow's own keys.
+    configfiles
+        The files that it was merged from, for messages.
+
+    Raises
+    ------
+    InputError
+        When the configuration itself is at fault.
+    """
+
+    def __init__(self, config: Mapping[str, Any], *, configfiles: Sequence[str]) -> None:
+        self._checked: dict[str, CheckedStudy] = {}
+        self._runs_per_training = config.get("runs_per_training", 1)
+        if not isinstance(self._runs_per_training, int) or self._runs_per_training < 1:
+            raise InputError(
+                "config/config.yaml", "runs_per_training", f"{self._runs_per_training!r} is not a number of runs",
+                "write 1 or more",
+            )  # fmt: skip
+        self._defaults = config.get("statistics", [])
+        self._own: str | None = None
+        if any(key not in WORKFLOW_KEYS for key in config):
+            self._own = self._user_study(config, configfiles)
+
+    def _user_study(self, config: Mapping[str, Any], configfiles: Sequence[str]) -> str:
+        for file in reversed([str(name) for name in configfiles]):
+            document = read_document(file)
+            data = {key: value for key, value in document.data.items() if key not in WORKFLOW_KEYS}
+            if data:
+                # What --config adds on the command line wins over the file.
+                data = {key: value for key, value in config.items() if key not in WORKFLOW_KEYS}
+                return self._check(Document(document.file, data, document.lines), None)
+        unknown = next(key for key in config if key not in WORKFLOW_KEYS)
+        raise InputError(
+            "--config", unknown, f"the key '{unknown}' is unknown without a study",
+            "give the study by --configfile, or use one of " + ", ".join(WORKFLOW_KEYS),
+        )  # fmt: skip
+
+    def _check(self, document: Document, name: str | None) -> str:
+        study = validate(document, Study)
+        if name is not None and study.name != name:
+            raise InputError(
+                document.file, document.place(("name",)), f"the study is named '{study.name}'",
+                f"name it '{name}' as its file, or rename the file",
+            )  # fmt: skip
+        system = load_study_system(study, file=document.file, systems=SYSTEMS)
+        checked = CheckedStudy(study, document.file, system, self._runs_per_training)
+        if (published := checked.published()) is not None:
+            load_published(published)
+        self._checked[study.name] = checked
+        return study.name
+
+    def default_names(self) -> list[str]:
+        """The studies that ``statistics`` makes: the user's own, or those of the configuration."""
+        return [self._own] if self._own is not None else list(self._defaults)
+
+    def __getitem__(self, name: str) -> CheckedStudy:
+        if name not in self._checked:
+            self._check(read_document(STUDIES / f"{name}.yaml"), name)
+        return self._checked[name]
+
+    def __iter__(self):  # type: ignore[no-untyped-def]
+        own = [] if self._own is None else [self._own]
+        yield from dict.fromkeys([*own, *sorted(path.stem for path in STUDIES.glob("*.yaml"))])
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
+
+
+@cache
+def code_digest(base: Path, script: str) -> dict[str, str]:
+    """The script and every module of this project that it imports, directly or not, by content.
+
+    Snakemake reruns a job when its script or a parameter changes, but does not see a module that the
+    script imports. As a parameter of the rule, this tells it.
+    """
+    digests = {}
+    for file in imported_files(base, base / "workflow" / "scripts" / script):
+        digests[str(file.relative_to(base))] = hashlib.sha256(file.read_bytes()).hexdigest()[:12]
+    return digests
+
+
+def imported_files(base: Path, script: Path) -> list[Path]:
+    """The Python files of this project that a script runs, itself included, found from its imports.
+
+    Imports within functions count as well, and so do the packages that a module lies in. Imports for
+    type checking alone count too; they are read as text, nothing is run.
+    """
+    found: dict[Path, None] = {}
+    waiting = [script]
+    while waiting:
+        file = waiting.pop()
+        if file in found:
+            continue
+        found[file] = None
+        for module in _imported_modules(file):
+            waiting += _module_files(base, module)
+    return sorted(found)
+
+
+def _imported_modules(file: Path) -> list[str]:
+    modules = []
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            modules += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            modules += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+    return modules
+
+
+def _module_files(base: Path, module: str) -> list[Path]:
+    parts = module.split(".")
+    files = []
+    for length in range(1, len(parts) + 1):
+        place = base.joinpath(*parts[:length])
+        files += [path for path in (place.with_suffix(".py"), place / "__init__.py") if path.is_file()]
+    return files
