@@ -33,8 +33,7 @@ def answer_sentences(
     found = terms[(terms["inclusion_frequency"] >= 0.5) & (terms["quantity"] != "U:1")]
     if len(found):
         listed = ", ".join(
-            f"{row.quantity.removeprefix('U:')} ({row.mean_text})"
-            for row in found.assign(mean_text=found.apply(_mean_text, axis=1)).itertuples()
+            f"{str(row['quantity']).removeprefix('U:')} ({_mean_text(row)})" for _, row in found.iterrows()
         )
         sentences.append(f"The quasipotential U has, in most runs, the terms {listed}.")
         rare = terms[(terms["inclusion_frequency"] > 0) & (terms["inclusion_frequency"] < 0.5)]

@@ -98,14 +98,14 @@ def parse_formula(text: str | float, names: Mapping[str, sympy.Expr]) -> sympy.E
 
 def _build(node: ast.expr, names: Mapping[str, sympy.Expr]) -> sympy.Expr:
     match node:
-        case ast.Constant(value=bool()):
-            raise FormulaError(f"'{node.value}' is not a number", "write 0 or 1")
-        case ast.Constant(value=int()):
-            return sympy.Integer(node.value)
-        case ast.Constant(value=float()):
-            if not np.isfinite(node.value):
+        case ast.Constant(value=bool() as value):
+            raise FormulaError(f"'{value}' is not a number", "write 0 or 1")
+        case ast.Constant(value=int() as value):
+            return sympy.Integer(value)
+        case ast.Constant(value=float() as value):
+            if not np.isfinite(value):
                 raise FormulaError("a number is too large", "write a finite number")
-            return sympy.Float(node.value)
+            return sympy.Float(value)
         case ast.Name(id=name):
             return _look_up(name, names)
         case ast.UnaryOp(op=ast.USub(), operand=operand):

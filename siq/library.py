@@ -172,7 +172,7 @@ def constraint_matrix(
     Returns
     -------
     numpy.ndarray
-        Shape ``(rows, (2d + 1) q)``; of full row rank without `columns`. Ξ is flattened by target, in the order
+        Shape ``(rows, (2d + 1) q)``; of full row rank without `columns`. Ξ is flattened by target, in order
         f_1 … f_d, V, g_1 … g_d, with the library's order within each.
     """
     q, d = library.size, library.dimension

@@ -7,7 +7,6 @@ Polynomials stand as ``{"center", "scale", "exponents", "coefficients"}``, meani
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ import sympy
 
 from siq.errors import InputError
 from siq.expressions import FormulaError, parse_formula
+from siq.files import whole_file
 from siq.symbolic import SymbolicDecomposition
 
 
@@ -75,10 +75,8 @@ def model_to_data(
 
 def write_model(path: str | Path, model: Mapping[str, Any]) -> None:
     """Write a model whole or not at all."""
-    partial = Path(f"{path}.partial")
-    partial.parent.mkdir(parents=True, exist_ok=True)
-    partial.write_text(json.dumps(model, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    os.replace(partial, path)
+    with whole_file(path) as partial:
+        partial.write_text(json.dumps(model, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def read_model(path: str | Path) -> tuple[dict[str, SymbolicDecomposition], dict[str, Any]]:

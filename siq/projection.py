@@ -41,7 +41,7 @@ def project(
     """
     dimension = len(domain)
     shown = min(dimension, 2)
-    axes = [np.linspace(*domain[axis], resolution) for axis in range(shown)]
+    axes = [np.linspace(domain[axis, 0], domain[axis, 1], resolution) for axis in range(shown)]
     x1 = axes[0]
     x2 = axes[1] if shown == 2 else np.array([at[0]])
     mesh = np.meshgrid(x1, x2)

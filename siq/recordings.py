@@ -7,7 +7,6 @@ used is refused with its row and column; rows are counted from 1 without the hea
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ import numpy as np
 import pyarrow as pa
 
 from siq.errors import InputError
+from siq.files import whole_file
 from siq.recording_files import agree_on_unit, find_columns, open_columns, parse_labels, parse_numbers
 
 
@@ -167,12 +167,8 @@ def write_recordings(path: str | Path, recordings: Recordings) -> None:
         [label, pa.array(recordings.t), *(pa.array(column) for column in recordings.values.T)],
         schema=pa.schema([pa.field("recording", label.type), *fields]),
     )
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        parquet.write_table(table, temporary, compression="zstd", use_dictionary=["recording"])
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with whole_file(path) as partial:
+        parquet.write_table(table, partial, compression="zstd", use_dictionary=["recording"])
 
 
 def snapshot_pairs(recordings: Recordings, *, pair_step: float | None = None) -> SnapshotPairs:
@@ -208,6 +204,34 @@ def snapshot_pairs(recordings: Recordings, *, pair_step: float | None = None) ->
         h=gap[keep],
         recording=recording[:-1][keep],
     )
+
+
+def read_pairs(
+    path: str | Path,
+    *,
+    states: Sequence[str] | None,
+    units: Mapping[str, str] | None,
+    pair_step: float | None,
+) -> tuple[Recordings, SnapshotPairs]:
+    """Read recordings that something is to be learned from, and their pairs.
+
+    Parameters
+    ----------
+    path, states, units
+        See `read_recordings`.
+    pair_step
+        See `snapshot_pairs`.
+
+    Raises
+    ------
+    InputError
+        As `read_recordings` does, and when no two samples are close enough to be a pair.
+    """
+    recordings = read_recordings(path, columns=states, units=units)
+    try:
+        return recordings, snapshot_pairs(recordings, pair_step=pair_step)
+    except ValueError as error:
+        raise InputError(path, "", str(error), "raise recordings.pair_step in the study") from None
 
 
 def select_recordings(recordings: Recordings, indices: Sequence[int] | np.ndarray) -> Recordings:

@@ -153,7 +153,8 @@ def sparse_decomposition(
         )
     term_scale, target_scale = _scales(library, values, targets, options)
     # The problem depends on the points through a small triangular matrix only.
-    triangle = np.linalg.qr(np.column_stack([values / term_scale, targets / target_scale]), mode="r")
+    stacked = np.column_stack([values / term_scale, targets / target_scale])
+    triangle = np.asarray(np.linalg.qr(stacked, mode="r"))
     if options.scaling == "columns":
         triangle = triangle / np.sqrt(len(x))
     q = library.size
@@ -218,13 +219,14 @@ def _initial_coefficients(
     """Ξ⁰ of Appendix A: V and g regressed on their own, f from both."""
     d = library.dimension
     scaled = np.zeros_like(goals)
-    for columns, allowed in (
-        (slice(d, d + 1), library.in_potential),
-        (slice(d + 1, None), library.in_circulatory),
+    targets = np.arange(goals.shape[1])
+    for chosen, allowed in (
+        (targets[d : d + 1], library.in_potential),
+        (targets[d + 1 :], library.in_circulatory),
     ):
-        scaled[np.ix_(allowed, np.arange(goals.shape[1])[columns])] = _relaxed_regression(
-            matrix[:, allowed], goals[:, columns], thresholds[allowed, columns], options
-        )[0]
+        rows = np.flatnonzero(allowed)
+        block = (rows[:, None], chosen[None, :])
+        scaled[block] = _relaxed_regression(matrix[:, rows], goals[:, chosen], thresholds[block], options)[0]
     coefficients = scaled / ratio
     gradient = np.einsum("kij,j->ki", library.derivatives, coefficients[:, d])
     coefficients[:, :d] = coefficients[:, d + 1 :] - gradient @ diffusion

@@ -59,7 +59,7 @@ class SymbolicDecomposition:
         return compile_formulas(self.gradient, self.symbols)
 
     def components(self) -> dict[str, sympy.Expr]:
-        """The formulas by the names that tables give them: ``U``, ``V``, ``f_x``, ``g_x`` …"""
+        """The formulas by the names that tables give them: ``U``, ``V``, ``f_x``, ``g_x`` and so on."""
         formulas = {"U": self.quasipotential, "V": self.potential}
         formulas |= {f"f_{s}": f for s, f in zip(self.symbols, self.vector_field, strict=True)}
         formulas |= {f"g_{s}": g for s, g in zip(self.symbols, self.circulatory, strict=True)}

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import pandas as pd
 
 from siq.errors import InputError
+from siq.files import whole_file
 
 COLUMNS: Mapping[str, Mapping[str, str]] = {
     "coefficients": {
@@ -77,12 +77,10 @@ def write_table(path: str | Path, table: pd.DataFrame) -> None:
     Numbers in the CSV have as many digits as it takes to read the same numbers back.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    table.to_csv(partial, index=False)
-    os.replace(partial, path.with_suffix(".csv"))
-    table.to_parquet(partial, index=False)
-    os.replace(partial, path)
+    with whole_file(path.with_suffix(".csv")) as partial:
+        table.to_csv(partial, index=False)
+    with whole_file(path) as partial:
+        table.to_parquet(partial, index=False)
 
 
 def read_table(path: str | Path) -> pd.DataFrame:

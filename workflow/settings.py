@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -14,6 +15,7 @@ from pydantic import TypeAdapter
 
 from siq.documents import Document, read_document, validate
 from siq.errors import InputError
+from siq.recordings import read_pairs
 from siq.study import Study, load_published, load_study_system, system_path
 from siq.systems import System
 
@@ -64,6 +66,25 @@ class CheckedStudy:
             return self.study.recordings.file
         assert self.study.system is not None  # the schema asks for one of the two
         return str(system_path(self.study.system, systems=SYSTEMS))
+
+    def check_recordings(self) -> None:
+        """Refuse recordings that cannot be used before any job starts; those that a rule makes come later.
+
+        Raises
+        ------
+        InputError
+            With the file, the row and the column at fault.
+        """
+        recordings = self.study.recordings
+        if recordings is None or recordings.file.startswith("results/"):
+            return
+        metric = self._part("metric")
+        read_pairs(
+            recordings.file,
+            states=metric["states"],
+            units=metric["units"],
+            pair_step=recordings.pair_step,
+        )
 
     def card(self) -> str | None:
         """The system card, where the study names one."""
@@ -127,9 +148,11 @@ class Studies(Mapping[str, CheckedStudy]):
         self._runs_per_training = config.get("runs_per_training", 1)
         if not isinstance(self._runs_per_training, int) or self._runs_per_training < 1:
             raise InputError(
-                "config/config.yaml", "runs_per_training", f"{self._runs_per_training!r} is not a number of runs",
+                "config/config.yaml",
+                "runs_per_training",
+                f"{self._runs_per_training!r} is not a number of runs",
                 "write 1 or more",
-            )  # fmt: skip
+            )
         self._defaults = config.get("statistics", [])
         self._own: str | None = None
         if any(key not in WORKFLOW_KEYS for key in config):
@@ -178,6 +201,18 @@ class Studies(Mapping[str, CheckedStudy]):
 
     def __len__(self) -> int:
         return len(list(iter(self)))
+
+
+def prepare_environment() -> None:
+    """Set what every job inherits.
+
+    Jobs run side by side, each on the threads that its rule names and the same whatever ``--cores`` says;
+    the numerical libraries' own threads would only be in each other's way. Training takes and frees arrays
+    of some 100 kB all the time, which glibc would return to the system each time: a fifth of every step.
+    """
+    os.environ["OMP_NUM_THREADS"] = "1"
+    os.environ.setdefault("MALLOC_MMAP_THRESHOLD_", str(2**30))
+    os.environ.setdefault("MALLOC_TRIM_THRESHOLD_", str(2**33))
 
 
 @cache

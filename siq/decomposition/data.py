@@ -122,8 +122,10 @@ class Batches:
                 np.linspace(0, len(run.representative_rows) - 1, HELD_OUT_PAIRS).astype(int)
             ]
             points.append(torch.from_numpy(run.training.x0[rows]))
-        there = {"device": self.device, "dtype": self.dtype}
-        return torch.stack(pairs).to(**there), torch.stack(points).to(**there)
+        return (
+            torch.stack(pairs).to(self.device, self.dtype),
+            torch.stack(points).to(self.device, self.dtype),
+        )
 
     def _draw(self, chunk: int) -> Tensor:
         """Rows of a chunk of steps, shape ``(runs, steps, pairs + points)``."""

@@ -9,6 +9,7 @@ the chain of products that it is, so that training needs first-order automatic d
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -100,7 +101,7 @@ def initial_layers(
         Floating-point type of the tensors.
     """
     layers = []
-    for inputs, outputs in zip(sizes[:-1], sizes[1:], strict=True):
+    for inputs, outputs in itertools.pairwise(sizes):
         bound = inputs**-0.5
         weights = np.stack([draw.uniform(-bound, bound, (inputs, outputs)) for draw in generators])
         biases = np.stack([draw.uniform(-bound, bound, (1, outputs)) for draw in generators])

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import json
-import os
 import zipfile
 from pathlib import Path
 
@@ -15,6 +13,7 @@ import torch
 from siq.decomposition.networks import Layer, Networks
 from siq.decomposition.training import HISTORY, TrainingState
 from siq.errors import InputError
+from siq.files import whole_file
 
 
 def save_networks(path: str | Path, networks: Networks) -> None:
@@ -105,12 +104,8 @@ def _unpack(arrays: dict[str, np.ndarray]) -> Networks:
 
 
 def _write(path: str | Path, arrays: dict[str, np.ndarray]) -> None:
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **arrays)
-    partial = Path(f"{path}.partial")
-    partial.parent.mkdir(parents=True, exist_ok=True)
-    partial.write_bytes(buffer.getvalue())
-    os.replace(partial, path)
+    with whole_file(path) as partial, partial.open("wb") as file:  # given a name, savez would add .npz
+        np.savez(file, allow_pickle=False, **arrays)
 
 
 def _read(path: str | Path) -> dict[str, np.ndarray]:

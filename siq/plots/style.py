@@ -10,9 +10,9 @@ from contextlib import AbstractContextManager
 from typing import ParamSpec
 
 import matplotlib.style
-from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.rcsetup import cycler
 
 COLUMN_WIDTH = 3.5  # inches; one column of a journal page
 PAGE_WIDTH = 7.0
@@ -73,7 +73,7 @@ def drawn_in_style(function: Callable[Parameters, Figure]) -> Callable[Parameter
             figure = function(*arguments, **options)
             # The constrained layout moves on a little with every drawing. Worked out once and then
             # frozen, the same figure gives the same file however often it is saved.
-            figure.get_layout_engine().execute(figure)
+            figure.draw_without_rendering()
             figure.set_layout_engine("none")
         return figure
 
@@ -105,7 +105,11 @@ def name_label(name: str) -> str:
     if not stem:
         return r"\mathrm{" + name.replace("_", r"\_") + "}"
     letter = rf"\{stem}" if _GREEK.fullmatch(stem) else stem if len(stem) == 1 else rf"\mathrm{{{stem}}}"
-    return f"{letter}_{{{name_label(index) if index[:1].isalpha() else index}}}" if index else letter
+    index = index.strip("_")
+    if index:
+        # Two indices on one letter, as in x_1_2, are no valid mathematical text.
+        letter += f"_{{{name_label(index) if index[0].isalpha() else index.replace('_', ',')}}}"
+    return letter
 
 
 def term_label(term: str) -> str:

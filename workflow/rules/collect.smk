@@ -1,24 +1,13 @@
 # All runs of a study as tables.
 
 
-def all_outcomes(wildcards):
-    """What became of every step of every run."""
-    runs = "results/{study}/runs/{run}/"
-    return [
-        *all_runs(runs + "draw.json")(wildcards),
-        *all_blocks("results/{study}/training/{block}/train.json")(wildcards),
-        *all_runs(runs + "regress.json")(wildcards),
-        *all_runs(runs + "score.json")(wildcards),
-    ]
-
-
 rule collect:
     input:
         coefficients=all_runs("results/{study}/runs/{run}/coefficients.parquet"),
         rrmse=all_runs("results/{study}/runs/{run}/rrmse.parquet"),
         histories=all_blocks("results/{study}/training/{block}/history.parquet"),
         outcomes=all_outcomes,
-        published=lambda wildcards: study_of(wildcards).published() or [],
+        published=published_if_any,
     output:
         coefficients="results/{study}/tables/coefficients.parquet",
         rrmse="results/{study}/tables/rrmse.parquet",

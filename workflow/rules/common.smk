@@ -1,18 +1,11 @@
 # Helpers of the rules: studies and their parameters, code dependencies by content, one workflow at a time.
 import fcntl
-import os
 import sys
+from functools import cache
 from pathlib import Path
 
-from workflow.settings import Studies, code_digest
 from siq.errors import InputError
-
-# Jobs run side by side, each on the threads that its rule names, and the same whatever --cores says.
-os.environ["OMP_NUM_THREADS"] = "1"
-# Training frees and takes arrays of some 100 kB all the time; glibc would return them to the system each
-# time, which costs a fifth of a step.
-os.environ.setdefault("MALLOC_MMAP_THRESHOLD_", str(2**30))
-os.environ.setdefault("MALLOC_TRIM_THRESHOLD_", str(2**33))
+from workflow.settings import Studies, code_digest, prepare_environment
 
 
 def say_and_stop(error):
@@ -21,10 +14,21 @@ def say_and_stop(error):
     sys.exit(1)
 
 
+prepare_environment()
+
 try:
     STUDIES = Studies(config, configfiles=workflow.configfiles)
 except InputError as error:
     say_and_stop(error)
+
+
+FIGURES = {
+    "coefficient_distributions": "coefficients.rst",
+    "error_distribution": "error.rst",
+    "inclusion_frequency": "inclusion.rst",
+    "components": "components.rst",
+    "training": "training.rst",
+}
 
 
 wildcard_constraints:
@@ -71,6 +75,69 @@ def all_blocks(pattern):
     """Input function: one file for every block of runs that train side by side."""
     return lambda wildcards: expand(
         pattern, study=wildcards.study, block=study_of(wildcards).block_names()
+    )
+
+
+def data_source(wildcards):
+    """Recordings by their content; a card only as what it says of the dynamics, which is a parameter."""
+    study = study_of(wildcards)
+    if study.study.recordings is None:
+        return ancient(study.source())
+    check_recordings(wildcards.study)
+    return study.source()
+
+
+@cache
+def check_recordings(name):
+    """Refuse bad recordings once, before any job starts."""
+    try:
+        STUDIES[name].check_recordings()
+    except InputError as error:
+        say_and_stop(error)
+
+
+def recordings_of_block(wildcards):
+    first, last = (int(run) for run in wildcards.block.split("-"))
+    return [
+        f"results/{wildcards.study}/runs/{run:03d}/recordings.parquet"
+        for run in range(first, last + 1)
+    ]
+
+
+def card_if_any(wildcards):
+    card = study_of(wildcards).card()
+    return [] if card is None else ancient(card)
+
+
+def published_if_any(wildcards):
+    """Input function: the published figures that the study is compared with."""
+    return study_of(wildcards).published() or []
+
+
+def of_block(name):
+    """Input function: a file of the block of runs that trained this run."""
+    return (
+        lambda wildcards: f"results/{wildcards.study}/training/{block_of(wildcards)}/{name}"
+    )
+
+
+def all_outcomes(wildcards):
+    """Input function: what became of every step of every run."""
+    patterns = {
+        "results/{study}/runs/{run}/draw.json": all_runs,
+        "results/{study}/training/{block}/train.json": all_blocks,
+        "results/{study}/runs/{run}/regress.json": all_runs,
+        "results/{study}/runs/{run}/score.json": all_runs,
+    }
+    return [path for pattern, of in patterns.items() for path in of(pattern)(wildcards)]
+
+
+def figure_output(name):
+    return report(
+        f"results/{{study}}/figures/{name}.svg",
+        caption=f"../report/{FIGURES[name]}",
+        category="{study}",
+        subcategory="figures",
     )
 
 

@@ -1,16 +1,6 @@
 # Where the data of a run come from: a simulation of the system, or recordings.
 
 
-def data_source(wildcards):
-    """Recordings by their content; a card only as what it says of the dynamics, which is a parameter."""
-    study = study_of(wildcards)
-    return (
-        study.source()
-        if study.study.recordings is not None
-        else ancient(study.source())
-    )
-
-
 rule draw:
     # One rule for both entrances: whatever follows cannot tell them apart.
     input:

@@ -4,8 +4,8 @@
 rule regress:
     input:
         recordings="results/{study}/runs/{run}/recordings.parquet",
-        networks=lambda wildcards: f"results/{wildcards.study}/training/{block_of(wildcards)}/networks.npz",
-        outcome=lambda wildcards: f"results/{wildcards.study}/training/{block_of(wildcards)}/train.json",
+        networks=of_block("networks.npz"),
+        outcome=of_block("train.json"),
     output:
         model="results/{study}/runs/{run}/model.json",
         outcome="results/{study}/runs/{run}/regress.json",

@@ -1,22 +1,5 @@
 # Figures, and the page that people read.
 
-FIGURES = {
-    "coefficient_distributions": "coefficients.rst",
-    "error_distribution": "error.rst",
-    "inclusion_frequency": "inclusion.rst",
-    "components": "components.rst",
-    "training": "training.rst",
-}
-
-
-def figure_output(name):
-    return report(
-        f"results/{{study}}/figures/{name}.svg",
-        caption=f"../report/{FIGURES[name]}",
-        category="{study}",
-        subcategory="figures",
-    )
-
 
 rule figures:
     input:
@@ -26,7 +9,7 @@ rule figures:
         models=all_runs("results/{study}/runs/{run}/model.json"),
         recordings=all_runs("results/{study}/runs/{run}/recordings.parquet"),
         card=card_if_any,
-        published=lambda wildcards: study_of(wildcards).published() or [],
+        published=published_if_any,
     output:
         [figure_output(name) for name in FIGURES],
         expand("results/{{study}}/figures/{name}.png", name=FIGURES),
@@ -56,7 +39,7 @@ rule html:
         models=all_runs("results/{study}/runs/{run}/model.json"),
         figures=expand("results/{{study}}/figures/{name}.png", name=FIGURES),
         card=card_if_any,
-        published=lambda wildcards: study_of(wildcards).published() or [],
+        published=published_if_any,
     output:
         html=report(
             "results/{study}/report.html",

@@ -1,16 +1,11 @@
 # How close a run comes to exact answers, where these are known.
 
 
-def card_if_any(wildcards):
-    card = study_of(wildcards).card()
-    return [] if card is None else ancient(card)
-
-
 rule score:
     input:
         model="results/{study}/runs/{run}/model.json",
-        training=lambda wildcards: f"results/{wildcards.study}/training/{block_of(wildcards)}/train.json",
-        networks=lambda wildcards: f"results/{wildcards.study}/training/{block_of(wildcards)}/networks.npz",
+        training=of_block("train.json"),
+        networks=of_block("networks.npz"),
         card=card_if_any,
     output:
         coefficients="results/{study}/runs/{run}/coefficients.parquet",

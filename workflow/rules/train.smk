@@ -1,14 +1,6 @@
 # The decomposition f = -D∇V + g by two networks; runs of one block train side by side.
 
 
-def recordings_of_block(wildcards):
-    first, last = (int(run) for run in wildcards.block.split("-"))
-    return [
-        f"results/{wildcards.study}/runs/{run:03d}/recordings.parquet"
-        for run in range(first, last + 1)
-    ]
-
-
 rule train:
     input:
         recordings=recordings_of_block,

@@ -3,15 +3,9 @@
 from pathlib import Path
 from typing import Any
 
-from siq.errors import InputError, NumericalFailure
+from siq.errors import NumericalFailure
 from siq.randomness import generator
-from siq.recordings import (
-    Recordings,
-    read_recordings,
-    resample_recordings,
-    snapshot_pairs,
-    write_recordings,
-)
+from siq.recordings import Recordings, read_pairs, resample_recordings, write_recordings
 from siq.simulate import SimulationOptions, simulate_snapshots
 from siq.systems import load_system
 from step import job, outcome, pair_step, write_outcomes
@@ -24,11 +18,10 @@ def draw(source: str, run: int, study: dict[str, Any]) -> Recordings:
         return simulate_snapshots(
             load_system(source), options=options, generator=generator(study["seed"], run, "simulate")
         )
-    recordings = read_recordings(source, columns=study["metric"]["states"], units=study["metric"]["units"])
-    try:
-        snapshot_pairs(recordings, pair_step=pair_step(study))
-    except ValueError as error:
-        raise InputError(source, "", str(error), "raise recordings.pair_step in the study") from None
+    metric = study["metric"]
+    recordings, _ = read_pairs(
+        source, states=metric["states"], units=metric["units"], pair_step=pair_step(study)
+    )
     if run == 0:
         return recordings
     return resample_recordings(recordings, generator=generator(study["seed"], run, "resample"))

@@ -10,20 +10,21 @@ import pandas as pd
 import yaml
 
 from siq.answer import answer_sentences
+from siq.files import whole_file
 from siq.formatting import formula_mathml, vector_mathml
 from siq.model import read_model
 from siq.report import FormulaRow, ReportContent, ReportFigure, ReportTable, render_report
 from siq.symbolic import SymbolicDecomposition, exact_decomposition
 from siq.systems import load_system
 from siq.tables import read_table
-from step import first_model, job, write_text
+from step import first_model, job
 
 METHOD = "regression"
 CAPTIONS = {
     "components": "Trajectories, downhill component −∇V, circulatory component g, exact and identified U of"
     " the run shown above, projected on the first two states (the paper: Fig. 1).",
-    "coefficient_distributions": "Coefficients of U over the runs, one panel for each term that belongs there;"
-    " the last panel shows the terms that do not (the paper: Fig. 2).",
+    "coefficient_distributions": "Coefficients of U over the runs, one panel for each term that belongs"
+    " there; the last panel shows the terms that do not (the paper: Fig. 2).",
     "error_distribution": "Relative root mean square error of the coefficients of U, one dot a run"
     " (the paper: Fig. 3).",
     "inclusion_frequency": "How often each term was found, by component.",
@@ -83,8 +84,8 @@ def question(study: dict[str, Any]) -> list[str]:
     )
     training, regression = study["training"], study["regression"]
     return [
-        f"From {source} alone: which orthogonal decomposition f = −D∇V + g, with ∇V·g = 0, and which formula of"
-        " the quasipotential U = 2V lie behind them, and how much does the answer vary over"
+        f"From {source} alone: which orthogonal decomposition f = −D∇V + g, with ∇V·g = 0, and which"
+        " formula of the quasipotential U = 2V lie behind them, and how much does the answer vary over"
         f" {study['runs']} independent run{'s' if study['runs'] > 1 else ''}?",
         f"Each run trained two tanh networks for {training['steps']} steps on batches of"
         f" {training['batch_size']}, then sought formulas of degree {regression['degree']} at most, dropping"
@@ -120,8 +121,8 @@ def main(snakemake: Any) -> None:
         formulas = formula_rows(decompositions[METHOD], exact, certificates[METHOD])
     answer = answer_sentences(rrmse, outcomes, summary, runs=study["runs"], method=METHOD)
     if run is not None:
-        answer.append(f"The formulas below are those of run {run}, the median of the runs by error."
-                      if rrmse["rrmse"].notna().any() else f"The formulas below are those of run {run}.")  # fmt: skip
+        which = ", the median of the runs by error" if rrmse["rrmse"].notna().any() else ""
+        answer.append(f"The formulas below are those of run {run}{which}.")
     name = study["name"]
     tables = f"results/{name}/tables"
     figures = {Path(path).stem: Path(path).read_bytes() for path in source.figures}
@@ -161,7 +162,8 @@ def main(snakemake: Any) -> None:
         study=yaml.safe_dump(chosen, sort_keys=False, allow_unicode=True),
         provenance=provenance(timings),
     )
-    write_text(snakemake.output.html, render_report(content))
+    with whole_file(snakemake.output.html) as partial:
+        partial.write_text(render_report(content), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from siq.errors import InputError
+from siq.files import whole_file
 from siq.recordings import Recordings, read_recordings
 
 
@@ -52,14 +52,8 @@ def outcome(run: int, step: str, status: str = "ok", reason: str = "", **details
 
 def write_outcomes(path: str | Path, outcomes: Sequence[dict[str, Any]]) -> None:
     """Write outcomes whole or not at all."""
-    write_text(path, json.dumps(list(outcomes), indent=1) + "\n")
-
-
-def write_text(path: str | Path, text: str) -> None:
-    """Write a text file whole or not at all."""
-    partial = Path(f"{path}.partial")
-    partial.write_text(text, encoding="utf-8")
-    os.replace(partial, path)
+    with whole_file(path) as partial:
+        partial.write_text(json.dumps(list(outcomes), indent=1) + "\n", encoding="utf-8")
 
 
 def read_outcomes(path: str | Path) -> list[dict[str, Any]]:
