@@ -1,0 +1,94 @@
+"""A copy of the project in which workflows run, so that tests may edit it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+STUDY = """\
+name: mini
+title: A miniature
+system: archetype3d
+runs: {runs}
+seed: 7
+published: archetype3d
+simulation: {{trajectories: 80, pairs: 20}}
+training:
+  widths: [12, 12]
+  steps: {steps}
+  batch_size: 64
+  precision: float32
+  matching: symmetric
+  thinning_distance: 0.2
+regression:
+  degree: 4
+  threshold: {threshold}
+"""
+
+
+@dataclass(frozen=True)
+class Project:
+    """A checkout of its own."""
+
+    folder: Path
+
+    def write_study(self, *, runs: int = 1, steps: int = 120, threshold: float = 0.1) -> None:
+        self.path("study.yaml").write_text(STUDY.format(runs=runs, steps=steps, threshold=threshold))
+
+    def path(self, name: str) -> Path:
+        return self.folder / name
+
+    def start(self, *arguments: str, study: str = "study.yaml") -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", "snakemake", "--cores", "2", *arguments, "--configfile", study]
+        return subprocess.Popen(
+            command,
+            cwd=self.folder,
+            env=os.environ | {"PYTHONPATH": str(self.folder)},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,
+        )
+
+    def run(self, *arguments: str, study: str = "study.yaml") -> subprocess.CompletedProcess[str]:
+        process = self.start(*arguments, study=study)
+        output, _ = process.communicate(timeout=600)
+        return subprocess.CompletedProcess(process.args, process.returncode, output)
+
+    def make(self, *arguments: str, study: str = "study.yaml") -> str:
+        done = self.run(*arguments, study=study)
+        assert done.returncode == 0, done.stdout[-4000:]
+        return done.stdout
+
+    def modified(self, *names: str) -> list[int]:
+        return [self.path(name).stat().st_mtime_ns for name in names]
+
+
+def copy_project(folder: Path) -> Project:
+    folder.mkdir(parents=True)
+    shutil.copy(ROOT / "Snakefile", folder)
+    for name in ("workflow", "profiles", "siq", "config"):
+        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+    return Project(folder)
+
+
+@pytest.fixture
+def fresh_project(tmp_path: Path) -> Project:
+    """A project in which nothing has been run."""
+    return copy_project(tmp_path / "project")
+
+
+@pytest.fixture(scope="session")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Project:
+    """A project whose miniature of two runs has ended; tests look at it and leave it as it is."""
+    project = copy_project(tmp_path_factory.mktemp("finished") / "project")
+    project.write_study(runs=2)
+    project.make("results/mini/report.html")
+    return project

@@ -1,0 +1,80 @@
+"""The workflow from the card to the report, as a user runs it."""
+
+import json
+import re
+
+import pandas as pd
+import pytest
+
+from siq.model import read_model
+from siq.tables import COLUMNS
+
+pytestmark = pytest.mark.workflow
+
+
+def table(project, name):
+    return pd.read_parquet(project.path(f"results/mini/tables/{name}.parquet"))
+
+
+@pytest.mark.parametrize("name", COLUMNS)
+def test_every_table_of_the_contract_is_there_twice(finished, name):
+    parquet = table(finished, name)
+    assert list(parquet.columns) == list(COLUMNS[name])
+    csv = pd.read_csv(finished.path(f"results/mini/tables/{name}.csv"))
+    assert len(csv) == len(parquet)
+
+
+def test_every_step_of_every_run_has_an_outcome(finished):
+    outcomes = table(finished, "outcomes")
+    assert list(zip(outcomes["run"], outcomes["step"], strict=True)) == [
+        (run, step) for run in (0, 1) for step in ("simulate", "train", "regress", "score")
+    ]
+    assert set(outcomes["status"]) <= {"ok", "warning"}
+    timings = table(finished, "timings")
+    assert set(timings["run"]) == {0, 1} and (timings["seconds"] > 0).all()
+
+
+def test_coefficients_cover_every_term_of_every_component_of_every_run(finished):
+    coefficients = table(finished, "coefficients")
+    assert set(coefficients["component"]) == {"U", "V", "f_x", "f_y", "f_z", "g_x", "g_y", "g_z"}
+    sizes = coefficients.groupby(["run", "component"])["term"].nunique()
+    assert set(sizes) == {35}  # monomials up to degree 4 in three states
+
+
+def test_the_runs_are_independent(finished):
+    estimates = table(finished, "coefficients").pivot_table(
+        index=["component", "term"], columns="run", values="estimate"
+    )
+    assert (estimates[0] != estimates[1]).any()
+
+
+def test_nothing_is_said_to_be_certified(finished):
+    assert not table(finished, "rrmse")["certified"].any()
+    model = json.loads(finished.path("results/mini/runs/000/model.json").read_text())
+    assert model["certificate"]["regression"]["certified"] is False
+
+
+def test_the_model_alone_gives_back_the_identity_of_the_decomposition(finished):
+    decomposition = read_model(finished.path("results/mini/runs/000/model.json"))[0]["regression"]
+    for f, g, gradient in zip(
+        decomposition.vector_field, decomposition.circulatory, decomposition.gradient, strict=True
+    ):
+        difference = (f - (g - gradient)).expand()
+        largest = max((abs(float(c)) for c in difference.as_coefficients_dict().values()), default=0)
+        assert largest < 1e-10
+
+
+def test_the_report_needs_nothing_from_outside(finished):
+    page = finished.path("results/mini/report.html").read_text(encoding="utf-8")
+    assert not re.search(r"(src|href)\s*=\s*[\"']?(https?:)?//", page)
+    assert "not certified" in page and "<math" in page and "data:image" in page
+
+
+def test_nothing_is_run_twice(finished):
+    assert "Nothing to be done" in finished.make("results/mini/report.html")
+
+
+def test_snakemakes_own_report_is_written_with_captions(finished):
+    done = finished.run("results/mini/report.html", "--report", "workflow-report.html")
+    assert done.returncode == 0, done.stdout[-2000:]
+    assert "inclusion frequency" in finished.path("workflow-report.html").read_text(encoding="utf-8")

@@ -1,0 +1,45 @@
+"""Recordings in the place of a simulation: the same data, the same answer."""
+
+import shutil
+
+import pytest
+
+pytestmark = pytest.mark.workflow
+
+STUDY = """\
+name: measured
+system: archetype3d
+recordings: {file: measured.parquet, pair_step: 0.01}
+runs: 2
+seed: 7
+training:
+  widths: [12, 12]
+  steps: 120
+  batch_size: 64
+  precision: float32
+  matching: symmetric
+  thinning_distance: 0.2
+regression: {degree: 4, threshold: 0.1}
+"""
+
+
+def test_both_entrances_give_the_same_answer_on_the_same_data(fresh_project, finished):
+    project = fresh_project
+    shutil.copy(finished.path("results/mini/runs/000/recordings.parquet"), project.path("measured.parquet"))
+    project.path("study.yaml").write_text(STUDY)
+    models = [f"results/measured/runs/{run}/model.json" for run in ("000", "001")]
+    project.make(*models)
+    measured, resampled = (project.path(model).read_text() for model in models)
+    assert measured == finished.path("results/mini/runs/000/model.json").read_text()
+    assert measured != resampled
+
+
+def test_recordings_without_a_card_are_enough(fresh_project, finished):
+    project = fresh_project
+    shutil.copy(finished.path("results/mini/runs/000/recordings.parquet"), project.path("measured.parquet"))
+    project.path("study.yaml").write_text(
+        STUDY.replace("system: archetype3d\n", "").replace("runs: 2", "runs: 1")
+    )
+    project.make("results/measured/report.html")
+    page = project.path("results/measured/report.html").read_text(encoding="utf-8")
+    assert "No exact answer is known" in page

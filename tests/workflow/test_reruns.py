@@ -1,0 +1,104 @@
+"""What runs again after a change, and what does not; what an interruption costs."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from workflow.settings import code_digest
+
+pytestmark = pytest.mark.workflow
+
+ROOT = Path(__file__).resolve().parents[2]
+SCRIPTS = sorted(path.name for path in (ROOT / "workflow" / "scripts").glob("*.py") if path.name != "step.py")
+DATA = "results/mini/runs/000/recordings.parquet"
+NETWORKS = "results/mini/training/000-000/networks.npz"
+MODEL = "results/mini/runs/000/model.json"
+
+
+def changed(project, edit):
+    """Which of data, networks and model an edit makes again."""
+    before = project.modified(DATA, NETWORKS, MODEL)
+    edit()
+    project.make(MODEL)
+    return [new != old for new, old in zip(project.modified(DATA, NETWORKS, MODEL), before, strict=True)]
+
+
+def append(path, text="\n# edited\n"):
+    path.write_text(path.read_text() + text)
+
+
+def test_only_what_depends_on_a_change_runs_again(fresh_project):
+    project = fresh_project
+    project.write_study()
+    project.make(MODEL)
+    assert changed(project, lambda: project.write_study(threshold=0.2)) == [False, False, True]
+    assert changed(project, lambda: append(project.path("siq/regression.py"))) == [False, False, True]
+    assert changed(project, lambda: append(project.path("siq/answer.py"))) == [False, False, False]
+    card = project.path("config/systems/archetype3d.yaml")
+    renamed = card.read_text().replace("Archetypal model", "Renamed model")
+    assert changed(project, lambda: card.write_text(renamed)) == [False, False, False]
+    assert changed(project, lambda: os.utime(project.path("siq/simulate.py"))) == [False, False, False]
+    assert changed(project, lambda: project.write_study(threshold=0.2, steps=130)) == [False, True, True]
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_a_rule_names_every_module_that_its_script_imports(script):
+    program = (
+        "import runpy, sys, pathlib\n"
+        f"runpy.run_path({str(ROOT / 'workflow' / 'scripts' / script)!r}, run_name='imported')\n"
+        "files = {getattr(module, '__file__', None) for module in list(sys.modules.values())}\n"
+        "print('\\n'.join(sorted(str(pathlib.Path(f).resolve()) for f in files if f)))\n"
+    )
+    environment = os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'workflow' / 'scripts'}"}
+    done = subprocess.run(
+        [sys.executable, "-c", program], env=environment, cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    used = {
+        str(Path(line).relative_to(ROOT))
+        for line in done.stdout.splitlines()
+        if line.startswith((f"{ROOT}/siq/", f"{ROOT}/workflow/"))
+    }
+    assert used, "the script imports nothing of the project"
+    assert used <= set(code_digest(ROOT, script))
+
+
+def wait_for(path, process, seconds=120):
+    deadline = time.monotonic() + seconds
+    while not path.exists():
+        assert process.poll() is None and time.monotonic() < deadline, f"{path} never appeared"
+        time.sleep(0.02)
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_an_interrupted_workflow_resumes_and_gives_the_same_tables(fresh_project, finished, how):
+    project = fresh_project
+    project.write_study(runs=2)
+    process = project.start("results/mini/report.html")
+    wait_for(project.path("results/mini/training/000-000/checkpoint.npz"), process)
+    os.killpg(process.pid, how)
+    process.communicate(timeout=60)
+    assert process.returncode != 0
+    project.make("results/mini/tables/summary.parquet")
+    for name in ("coefficients", "rrmse", "outcomes", "training", "summary"):
+        path = f"results/mini/tables/{name}.parquet"
+        pd.testing.assert_frame_equal(
+            pd.read_parquet(project.path(path)), pd.read_parquet(finished.path(path)), check_exact=True
+        )
+        assert project.path(path).read_bytes() == finished.path(path).read_bytes()
+
+
+def test_a_second_snakemake_waits_for_nobody_and_says_so(fresh_project):
+    project = fresh_project
+    project.write_study()
+    process = project.start(NETWORKS)
+    wait_for(project.path("results/mini/logs/000/draw.log"), process)
+    second = project.run(MODEL)
+    assert second.returncode != 0 and "Another snakemake is at work" in second.stdout
+    process.communicate(timeout=120)
+    assert process.returncode == 0
