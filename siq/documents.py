@@ -16,6 +16,7 @@ from pydantic import BaseModel, ValidationError
 
 from siq.errors import InputError
 
+UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")
 Keys = tuple[str | int, ...]
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -67,8 +68,18 @@ def read_document(path: str | Path) -> Document:
             file, "", f"it cannot be read ({_reason(error)})", "check the name and permissions"
         ) from None
     try:
+        for event in yaml.parse(text, Loader=yaml.SafeLoader):
+            if isinstance(event, yaml.AliasEvent):  # may refer to itself, or multiply without bound
+                raise InputError(
+                    file,
+                    f"line {event.start_mark.line + 1}" if event.start_mark else "",
+                    f"the alias '*{event.anchor}' is not allowed",
+                    "write the value out",
+                )
         root = yaml.compose(text, Loader=yaml.SafeLoader)
         data = yaml.safe_load(text)
+    except InputError:
+        raise
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         place = f"line {mark.line + 1}" if mark is not None else ""
@@ -96,7 +107,9 @@ def validate(document: Document, model: type[Model]) -> Model:
     try:
         return model.model_validate(document.data)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
+        # A misspelt key is also a missing one; the misspelling is what to tell.
+        faults = error.errors(include_url=False)
+        first = next((fault for fault in faults if fault["type"] in UNKNOWN_KEY), faults[0])
     keys = tuple(first["loc"])
     # The loc of a union member ends in the member's name; the document has no such entry.
     while len(keys) > 1 and keys not in document.lines and first["type"] not in ("missing",):
@@ -108,7 +121,7 @@ def validate(document: Document, model: type[Model]) -> Model:
 def _explain(error: Any, keys: Keys, model: type[BaseModel]) -> tuple[str, str]:
     name = keys[-1] if keys else ""
     kind = error["type"]
-    if kind in ("extra_forbidden", "unexpected_keyword_argument"):
+    if kind in UNKNOWN_KEY:
         known = _known_keys(model, keys[:-1])
         near = difflib.get_close_matches(str(name), known, n=1)
         remedy = (
@@ -132,6 +145,9 @@ def _known_keys(model: Any, keys: Keys) -> list[str]:
         options = [node, *node.get("anyOf", []), *node.get("allOf", [])]
         options = [_resolve(schema, option) for option in options]
         found = [option["properties"][key] for option in options if key in option.get("properties", {})]
+        # Entries of a mapping of names, such as the states of a card, share one schema.
+        found += [option["additionalProperties"] for option in options if option.get("additionalProperties")]
+        found += [part for option in options for part in option.get("patternProperties", {}).values()]
         if not found:
             return []
         node = found[0]

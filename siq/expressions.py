@@ -35,6 +35,8 @@ CONSTANTS: Mapping[str, sympy.Expr] = {"pi": sympy.pi}
 
 LARGEST_EXPONENT = 32
 LARGEST_BASE = 1e9
+LARGEST_VALUE = 1e300
+DIGITS = 17  # of decimal digits, that a double is read back exactly
 LONGEST_FORMULA = 20_000
 
 _OPERATORS: Mapping[type[ast.operator], Callable[[sympy.Expr, sympy.Expr], sympy.Expr]] = {
@@ -87,7 +89,7 @@ def parse_formula(text: str | float, names: Mapping[str, sympy.Expr]) -> sympy.E
     try:
         tree = ast.parse(text.strip(), mode="eval")
         expression = _build(tree.body, names)
-    except (SyntaxError, ValueError, MemoryError, RecursionError) as error:
+    except (ArithmeticError, SyntaxError, TypeError, ValueError, MemoryError, RecursionError) as error:
         if isinstance(error, FormulaError):
             raise
         raise FormulaError(f"'{_short(text)}' is not a formula", "check brackets and operators") from None
@@ -101,11 +103,11 @@ def _build(node: ast.expr, names: Mapping[str, sympy.Expr]) -> sympy.Expr:
         case ast.Constant(value=bool() as value):
             raise FormulaError(f"'{value}' is not a number", "write 0 or 1")
         case ast.Constant(value=int() as value):
-            return sympy.Integer(value)
+            return sympy.Integer(value) if abs(value) < LARGEST_BASE else sympy.Float(float(value), DIGITS)
         case ast.Constant(value=float() as value):
             if not np.isfinite(value):
                 raise FormulaError("a number is too large", "write a finite number")
-            return sympy.Float(value)
+            return sympy.Float(value, DIGITS)
         case ast.Name(id=name):
             return _look_up(name, names)
         case ast.UnaryOp(op=ast.USub(), operand=operand):
@@ -143,6 +145,10 @@ def _power(base: sympy.Expr, exponent: sympy.Expr) -> sympy.Expr:
             raise FormulaError(f"the exponent {exponent} is too large", f"keep it below {LARGEST_EXPONENT}")
         if base.is_number and abs(complex(base)) > LARGEST_BASE:
             raise FormulaError("a power of a very large number is taken", "write the number out as a float")
+        if base.is_number and base.is_negative and not exponent.is_integer:
+            raise FormulaError(
+                f"the power {exponent} of the negative number {base} is not real", "correct it"
+            )
     return base**exponent
 
 
@@ -154,6 +160,11 @@ def _call(name: str, arguments: Sequence[sympy.Expr]) -> sympy.Expr:
     wanted = "at least two arguments" if name in ("Max", "Min") else "one argument"
     if (len(arguments) < 2) if name in ("Max", "Min") else (len(arguments) != 1):
         raise FormulaError(f"'{name}' has {len(arguments)} arguments", f"give it {wanted}")
+    if all(argument.is_number for argument in arguments):
+        # Worked out at once: sympy would keep a tower such as exp(exp(exp(100))) and choke on it later.
+        value = complex(FUNCTIONS[name](*(sympy.Float(float(a), DIGITS) for a in arguments)))
+        if value.imag != 0 or not np.isfinite(value.real) or abs(value.real) > LARGEST_VALUE:
+            raise FormulaError(f"'{name}' of a number is not a real number of usable size", "correct it")
     return FUNCTIONS[name](*arguments)
 
 
@@ -179,7 +190,12 @@ def compile_formulas(
         each is contiguous in memory.
     """
     function = sympy.lambdify(
-        list(variables), list(expressions), modules="numpy", printer=_ProductPrinter(), cse=True, dummify=True
+        list(variables),
+        list(expressions),
+        modules=[{"integer_power": _integer_power}, "numpy"],
+        printer=_ProductPrinter(),
+        cse=True,
+        dummify=True,
     )
 
     def evaluate(components: np.ndarray) -> np.ndarray:
@@ -191,6 +207,11 @@ def compile_formulas(
     return evaluate
 
 
+def exact_number(value: float) -> sympy.Expr:
+    """A float as an integer where it is one, so that exact formulas stay exact."""
+    return sympy.Integer(int(value)) if float(value).is_integer() else sympy.Float(float(value), DIGITS)
+
+
 class _ProductPrinter(NumPyPrinter):
     """Writes integer powers as products: numpy's own power is tens of times slower."""
 
@@ -200,10 +221,20 @@ class _ProductPrinter(NumPyPrinter):
     def _print_Pow(self, expr: sympy.Pow, rational: bool = False) -> str:  # noqa: N802 (sympy's name)
         base, exponent = expr.args
         if exponent.is_Integer and 2 <= abs(exponent) <= LARGEST_EXPONENT:
-            factor = f"({self._print(base)})"
-            product = "*".join([factor] * abs(int(exponent)))
-            return f"({product})" if exponent > 0 else f"(1.0/({product}))"
+            power = f"integer_power({self._print(base)}, {abs(int(exponent))})"
+            return power if exponent > 0 else f"(1.0/{power})"
         return super()._print_Pow(expr, rational=rational)
+
+    def _print_DiracDelta(self, expr: sympy.Expr) -> str:  # noqa: N802
+        # The derivative of sign, which a Jacobian has; it is zero but on a set of measure zero.
+        return "0.0"
+
+
+def _integer_power(base: np.ndarray, exponent: int) -> np.ndarray:
+    product = base
+    for _ in range(exponent - 1):
+        product = product * base
+    return product
 
 
 def _short(text: str) -> str:

@@ -196,7 +196,10 @@ def linear_combination(expression: sympy.Expr) -> dict[sympy.Expr, float]:
     """Split a derivative into functions and their numerical coefficients."""
     combination: dict[sympy.Expr, float] = {}
     for part in sympy.Add.make_args(sympy.expand(expression)):
-        coefficient, function = part.as_coeff_Mul()
+        if not part.free_symbols:
+            coefficient, function = part, sympy.S.One
+        else:  # π and roots belong to the coefficient as well
+            coefficient, function = part.as_independent(*part.free_symbols, as_Add=False)
         if coefficient != 0:
             combination[function] = combination.get(function, 0.0) + float(coefficient)
     return combination

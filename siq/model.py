@@ -102,5 +102,5 @@ def read_model(path: str | Path) -> tuple[dict[str, SymbolicDecomposition], dict
         return decompositions, data["certificate"]
     except FormulaError as error:
         raise InputError(path, "", error.fault, error.remedy) from None
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(path, "", f"it is not a model ({type(error).__name__})", "make it again") from None

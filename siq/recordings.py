@@ -16,7 +16,9 @@ import pyarrow as pa
 
 from siq.errors import InputError
 from siq.files import whole_file
-from siq.recording_files import agree_on_unit, find_columns, open_columns, parse_labels, parse_numbers
+from siq.recording_cells import agree_on_unit, distinct_labels, parse_labels, parse_numbers, sources
+from siq.recording_checks import check_times, find_columns
+from siq.recording_files import open_columns
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,8 @@ class SnapshotPairs:
     h
         Shape ``(n,)``: the time between the two.
     recording
-        Shape ``(n,)``: the index of the recording that the pair is from.
+        Shape ``(n,)``: the index of the recording that the pair is from. Copies of a resampled recording
+        share one, so that none is held out while another trains.
     """
 
     x0: np.ndarray
@@ -120,7 +123,7 @@ def read_recordings(
 
     order = np.argsort(recording, kind="stable")
     recording, numbers = recording[order], numbers[:, order]
-    _check_times(file, numbers[0], recording, labels, order)
+    check_times(file, numbers[0], recording, labels, order)
     return Recordings(
         names=tuple(used[2:]),
         units=tuple(found_units[1:]),
@@ -202,7 +205,7 @@ def snapshot_pairs(recordings: Recordings, *, pair_step: float | None = None) ->
         x0=recordings.values[:-1][keep],
         xh=recordings.values[1:][keep],
         h=gap[keep],
-        recording=recording[:-1][keep],
+        recording=sources(recordings.labels)[recording[:-1][keep]],
     )
 
 
@@ -263,7 +266,7 @@ def select_recordings(recordings: Recordings, indices: Sequence[int] | np.ndarra
     return Recordings(
         names=recordings.names,
         units=recordings.units,
-        labels=_distinct_labels(recordings.labels, chosen),
+        labels=distinct_labels(recordings.labels, chosen),
         recording=np.repeat(np.arange(len(chosen)), lengths),
         t=recordings.t[rows],
         values=recordings.values[rows],
@@ -285,39 +288,3 @@ def resample_recordings(recordings: Recordings, *, generator: np.random.Generato
     """
     count = len(recordings.labels)
     return select_recordings(recordings, generator.integers(count, size=count))
-
-
-def _distinct_labels(labels: tuple[str, ...], chosen: np.ndarray) -> tuple[str, ...]:
-    taken = set(labels)  # a label of the file may itself look like that of a copy
-    copies: dict[int, int] = {}
-    distinct = []
-    for index in chosen.tolist():
-        label, copy = labels[index], copies.get(index, 0) + 1
-        while copy > 1 and f"{label}#{copy}" in taken:
-            copy += 1
-        copies[index] = copy
-        distinct.append(label if copy == 1 else f"{label}#{copy}")
-        taken.add(distinct[-1])
-    return tuple(distinct)
-
-
-def _check_times(
-    file: str, t: np.ndarray, recording: np.ndarray, labels: tuple[str, ...], rows: np.ndarray
-) -> None:
-    """Refuse times that do not increase; `rows` are the rows of the file, before they were grouped."""
-    same = recording[1:] == recording[:-1]
-    if not same.any():
-        remedy = "give the rows of one recording the same label"
-        raise InputError(file, "", "no recording has two samples", remedy)
-    wrong = np.flatnonzero(same & (t[1:] <= t[:-1]))
-    if wrong.size == 0:
-        return
-    earlier = wrong[np.argmin(rows[wrong + 1])]
-    label, before, now = labels[recording[earlier]], float(t[earlier]), float(t[earlier + 1])
-    if now == before:
-        fault = f"the time {now} of recording '{label}' is repeated (row {rows[earlier] + 1} has it too)"
-        remedy = "keep one of the two rows, or label them as two recordings"
-    else:
-        fault = f"the times of recording '{label}' are unsorted ({now} comes after {before})"
-        remedy = "sort its rows by t, or begin a new label where a new recording begins"
-    raise InputError(file, f"row {rows[earlier + 1] + 1}, column t", fault, remedy)

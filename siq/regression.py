@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import scipy.linalg
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from siq.errors import NumericalFailure
@@ -64,9 +64,18 @@ class RegressionOptions:
     threshold: Annotated[float, Field(ge=0)] = 0.1
     threshold_on: Literal["coefficient", "contribution"] = "coefficient"
     scaling: Literal["columns", "none"] = "columns"
-    relaxation: Annotated[float, Field(gt=0)] = 1.0
-    iterations: Annotated[int, Field(ge=1)] = 100
+    relaxation: Annotated[float, Field(gt=0)] = 100.0
+    iterations: Annotated[int, Field(ge=10)] = 100  # PySINDy reports on every tenth, and divides by it
     tolerance: Annotated[float, Field(gt=0)] = 1e-8
+
+    @model_validator(mode="after")
+    def _consistent(self) -> RegressionOptions:
+        if self.scaling == "none" and self.threshold_on == "contribution":
+            raise ValueError(
+                "contributions can be judged in scaled columns only; write 'scaling: columns', or"
+                " 'threshold_on: coefficient'"
+            )
+        return self
 
 
 @plain_dataclass(frozen=True)
@@ -196,7 +205,7 @@ def _scales(
     library: CandidateLibrary, values: np.ndarray, targets: np.ndarray, options: RegressionOptions
 ) -> tuple[np.ndarray, np.ndarray]:
     """Scale of every function, shape ``(q,)``, and of every target, shape ``(2d + 1,)``."""
-    if options.scaling == "none" and options.threshold_on == "coefficient":
+    if options.scaling == "none":
         return np.ones(values.shape[1]), np.ones(targets.shape[1])
     d = library.dimension
     term_scale = np.sqrt((values**2).mean(axis=0))

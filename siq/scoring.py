@@ -110,17 +110,17 @@ def summary_table(
     for method, errors in rrmse.groupby("method", sort=True):
         for quantity in ("rrmse", "network_error", "support_correct"):
             rows.append(_summary(str(method), quantity, errors[quantity].astype("float64"), published))
-        chosen = coefficients[coefficients["method"] == method]
+        chosen = coefficients[coefficients["method"] == method].dropna(subset="estimate")
+        runs = chosen["run"].unique()
         for (component, term), group in chosen.groupby(["component", "term"], sort=False):
             quantity = f"{component}:{term}"
-            if (
-                (group["estimate"] != 0).any()
-                or (group["exact"].fillna(0) != 0).any()
-                or quantity in published
-            ):
-                row = _summary(str(method), quantity, group["estimate"], published)
-                row["exact"] = group["exact"].iloc[0]
-                row["inclusion_frequency"] = float((group["estimate"] != 0).mean())
+            # A run with formulas that does not list a term has it with coefficient zero.
+            estimates = group.set_index("run")["estimate"].reindex(runs, fill_value=0.0)
+            exact = group["exact"].iloc[0]
+            if (estimates != 0).any() or (pd.notna(exact) and exact != 0) or quantity in published:
+                row = _summary(str(method), quantity, estimates, published)
+                row["exact"] = exact
+                row["inclusion_frequency"] = float((estimates != 0).mean())
                 rows.append(row)
     return as_table("summary", rows)
 

@@ -7,6 +7,7 @@ out takes the schema's defaults. The options of a step stand beside the step (`s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -19,7 +20,7 @@ from siq.expressions import FormulaError
 from siq.library import candidate_library
 from siq.regression import RegressionOptions
 from siq.simulate import SimulationOptions, sampling_stride
-from siq.systems import Diffusion, System, diffusion_matrix, load_system
+from siq.systems import Diffusion, Name, System, diffusion_matrix, load_system
 
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"
 
@@ -31,21 +32,28 @@ class RecordingsOptions(BaseModel):
     ----------
     file
         Parquet, CSV, HDF5 or MATLAB file with columns ``recording``, ``t`` and the states; a relative
-        path starts from the folder in which the workflow runs.
+        path starts from the folder in which the workflow runs, or else from ``SIQ_RESOURCES``.
     states
         The columns that are states, in order; by default the system's, or all of the file's.
     pair_step
         Consecutive samples no further apart than this are pairs; by default all are.
     diffusion
-        D, in the recordings' units, where no system gives it.
+        D, in the recordings' units, where no system gives it; by default the identity.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     file: str
-    states: tuple[str, ...] | None = None
+    states: Annotated[tuple[Name, ...], Field(min_length=1)] | None = None
     pair_step: Annotated[float, Field(gt=0)] | None = None
-    diffusion: Diffusion = "identity"
+    diffusion: Diffusion | None = None
+
+    @field_validator("states")
+    @classmethod
+    def _distinct(cls, states: tuple[str, ...] | None) -> tuple[str, ...] | None:
+        if states is not None and len(set(states)) < len(states):
+            raise ValueError("a state is named twice; name each once")
+        return states
 
 
 class Study(BaseModel):
@@ -96,6 +104,8 @@ class Study(BaseModel):
     def _has_data(self) -> Study:
         if self.system is None and self.recordings is None:
             raise ValueError("the study names no data; add 'system: NAME' or 'recordings: {file: ...}'")
+        if self.system is not None and self.recordings is not None and self.recordings.diffusion is not None:
+            raise ValueError("the diffusion is the system's; remove 'recordings.diffusion'")
         sampling_stride(self.simulation)
         return self
 
@@ -154,24 +164,35 @@ def load_study_system(study: Study, *, file: str, systems: Path) -> System | Non
     """
     system = None if study.system is None else load_system(system_path(study.system, systems=systems))
     states = system.states if system is not None else None
-    if study.recordings is not None:
-        states = study.recordings.states or states
-        if system is not None and set(states or ()) != set(system.states):
+    if study.recordings is not None and study.recordings.states is not None:
+        if system is not None and study.recordings.states != system.states:
             raise InputError(
                 file, "recordings.states", f"the states are not those of the system '{system.name}'",
-                f"name {', '.join(system.states)}",
+                f"name {', '.join(system.states)}, in this order, or leave them out",
             )  # fmt: skip
+        states = study.recordings.states
     if states is not None:
-        try:
-            if study.recordings is not None and system is None:
-                diffusion_matrix(study.recordings.diffusion, len(states))
-            candidate_library(states, degree=1, further=study.regression.functions)
-        except FormulaError as error:
-            raise InputError(file, "regression.functions", error.fault, error.remedy) from None
-        except ValueError as error:
-            fault, remedy = str(error).split("; ", 1)
-            raise InputError(file, "recordings.diffusion", fault, remedy) from None
+        check_states(study, states, file=file)
     return system
+
+
+def check_states(study: Study, states: Sequence[str], *, file: str) -> None:
+    """Check what a study says of its states, once these are known.
+
+    Raises
+    ------
+    InputError
+        When the library's functions or D do not fit the states.
+    """
+    try:
+        if study.recordings is not None and study.system is None:
+            diffusion_matrix(study.recordings.diffusion or "identity", len(states))
+        candidate_library(states, degree=1, further=study.regression.functions)
+    except FormulaError as error:
+        raise InputError(file, "regression.functions", error.fault, error.remedy) from None
+    except ValueError as error:
+        fault, remedy = str(error).split("; ", 1)
+        raise InputError(file, "recordings.diffusion", fault, remedy) from None
 
 
 def system_path(system: str, *, systems: Path) -> Path:

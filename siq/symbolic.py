@@ -14,7 +14,7 @@ import scipy.optimize
 import sympy
 
 from siq.errors import NumericalFailure
-from siq.expressions import compile_formulas
+from siq.expressions import compile_formulas, exact_number
 from siq.library import CandidateLibrary, linear_combination
 from siq.systems import System
 
@@ -161,15 +161,15 @@ def minimum(
     values = together(points.T)[0]
     if not np.isfinite(values).any():
         raise NumericalFailure("the formula of V is nowhere finite on the recorded points")
-    scale = points.std(axis=0)
+    scale = np.ptp(points, axis=0)
     scale[scale == 0] = 1.0
-    order = np.argsort(values)
+    # Spread over all points, not among the lowest only: one well may be recorded far more often than a
+    # deeper one.
+    order = points[np.argsort(np.where(np.isfinite(values), values, np.inf))]
     chosen: list[np.ndarray] = []
-    for point in points[order[: 200 * starts : starts]]:
-        if all(np.linalg.norm((point - other) / scale) > 0.3 for other in chosen):
-            chosen.append(point)
-        if len(chosen) == starts:
-            break
+    while len(order) and len(chosen) < starts:
+        chosen.append(order[0])
+        order = order[np.linalg.norm((order - order[0]) / scale, axis=1) > 0.15]
     bounds = np.stack([points.min(axis=0), points.max(axis=0)], axis=1) / scale[:, None]
     unit = float(np.ptp(values[np.isfinite(values)])) or 1.0
 
@@ -190,8 +190,3 @@ def minimum(
 def term_coefficients(expression: sympy.Expr) -> dict[str, float]:
     """Coefficients by term as text, such as ``{"x**2": -2.0, "1": 1.0}``; zeros left out."""
     return {str(term): value for term, value in linear_combination(expression).items()}
-
-
-def exact_number(value: float) -> sympy.Expr:
-    """A float as an integer where it is one, so that exact formulas stay exact."""
-    return sympy.Integer(int(value)) if float(value).is_integer() else sympy.Float(float(value), 17)

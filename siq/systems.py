@@ -21,10 +21,18 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validat
 
 from siq.documents import Document, read_document, validate
 from siq.errors import InputError
-from siq.expressions import CONSTANTS, FUNCTIONS, FormulaError, compile_formulas, parse_formula
+from siq.expressions import (
+    CONSTANTS,
+    FUNCTIONS,
+    FormulaError,
+    compile_formulas,
+    exact_number,
+    parse_formula,
+)
 
 
-def _name(text: str) -> str:
+def check_name(text: str) -> str:
+    """Return a name that formulas can use; raises ValueError for any other."""
     if not text.isidentifier() or keyword.iskeyword(text):
         raise ValueError(f"'{text}' cannot be a name in a formula; use letters, digits and underscores")
     if text in FUNCTIONS or text in CONSTANTS or text in ("recording", "t"):
@@ -32,7 +40,7 @@ def _name(text: str) -> str:
     return text
 
 
-Name = Annotated[str, AfterValidator(_name)]
+Name = Annotated[str, AfterValidator(check_name)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Formula = str | Number
 Diffusion = Literal["identity"] | list[Number] | list[list[Number]]
@@ -207,7 +215,7 @@ def build_system(document: Document, card: SystemCard) -> System:
     """Build the system that a checked card describes; `document` says where its formulas stand."""
     symbols = {name: sympy.Symbol(name, real=True) for name in card.states}
     names: dict[str, Any] = dict(symbols)
-    names |= {name: sympy.Float(entry.value) for name, entry in card.parameters.items()}
+    names |= {name: exact_number(entry.value) for name, entry in card.parameters.items()}
 
     def parse(keys: tuple[str, ...], text: Formula) -> sympy.Expr:
         try:

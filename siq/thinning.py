@@ -56,6 +56,7 @@ def representative_subset(
 
 def _sequential_visit(points: np.ndarray, distance: float) -> np.ndarray:
     pairs = cKDTree(points).query_pairs(distance, output_type="ndarray")
+    pairs = pairs[np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1) < distance]
     pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
     alive = np.ones(len(points), dtype=bool)
     starts = np.searchsorted(pairs[:, 0], np.arange(len(points) + 1))

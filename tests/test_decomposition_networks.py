@@ -171,6 +171,5 @@ def test_a_state_that_does_not_vary_is_a_numerical_failure() -> None:
     pairs = some_pairs()
     pairs.x0[:, 1] = 3.0
     options = TrainingOptions(widths=(3,), thinning_distance=1.0)
-    data = prepare_data(pairs, options=options, generator=generator(0))
     with pytest.raises(NumericalFailure, match="does not vary"):
-        initial_networks([data], options=options, diffusion=np.eye(2), generators=[generator(1)])
+        prepare_data(pairs, options=options, generator=generator(0))

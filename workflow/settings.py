@@ -16,8 +16,8 @@ from pydantic import TypeAdapter
 from siq.documents import Document, read_document, validate
 from siq.errors import InputError
 from siq.recordings import read_pairs
-from siq.study import Study, load_published, load_study_system, system_path
-from siq.systems import System
+from siq.study import Study, check_states, load_published, load_study_system, system_path
+from siq.systems import System, check_name
 
 WORKFLOW_KEYS = ("statistics", "device", "runs_per_training")
 SYSTEMS = Path("config/systems")
@@ -46,6 +46,12 @@ class CheckedStudy:
     system: System | None
     runs_per_training: int
 
+    def command(self) -> str:
+        """How to make this study's report again."""
+        own = Path(self.file) != STUDIES / f"{self.study.name}.yaml"
+        option = f" --configfile {self.file}" if own else ""
+        return f"snakemake --cores 2 results/{self.study.name}/report.html{option}"
+
     def run_names(self) -> list[str]:
         """``000``, ``001``, …, one for every run."""
         return [f"{run:03d}" for run in range(self.study.runs)]
@@ -63,7 +69,7 @@ class CheckedStudy:
     def source(self) -> str:
         """The file that the data come from: the recordings, or the card that is simulated."""
         if self.study.recordings is not None:
-            return self.study.recordings.file
+            return find_resource(self.study.recordings.file)
         assert self.study.system is not None  # the schema asks for one of the two
         return str(system_path(self.study.system, systems=SYSTEMS))
 
@@ -79,12 +85,21 @@ class CheckedStudy:
         if recordings is None or recordings.file.startswith("results/"):
             return
         metric = self._part("metric")
-        read_pairs(
-            recordings.file,
+        found, _ = read_pairs(
+            self.source(),
             states=metric["states"],
             units=metric["units"],
             pair_step=recordings.pair_step,
         )
+        for name in found.names:
+            try:
+                check_name(name)
+            except ValueError as error:
+                fault, remedy = str(error).split("; ", 1)
+                raise InputError(
+                    self.source(), f"column {name}", fault, f"{remedy}, or name the states in the study"
+                ) from None
+        check_states(self.study, found.names, file=self.file)
 
     def card(self) -> str | None:
         """The system card, where the study names one."""
@@ -118,8 +133,10 @@ class CheckedStudy:
                 units: Any = dict(zip(system.states, system.units, strict=True)) | {"t": system.time_unit}
             else:
                 assert recordings is not None  # the schema asks for one of the two
-                diffusion, states, units = recordings.diffusion, recordings.states, None
+                diffusion, states, units = recordings.diffusion or "identity", recordings.states, None
             return {"states": states and list(states), "diffusion": diffusion, "units": units}
+        if key == "simulation" and self.study.recordings is not None:
+            return None  # nothing is simulated, and nothing shall run again for it
         if key == "exact":
             return None if system is None else str(system.exact_quasipotential)
         value = getattr(self.study, key)
@@ -203,6 +220,14 @@ class Studies(Mapping[str, CheckedStudy]):
         return len(list(iter(self)))
 
 
+def find_resource(file: str) -> str:
+    """A file of the user's: where it says, or else in the folder that ``SIQ_RESOURCES`` names."""
+    folder = os.environ.get("SIQ_RESOURCES")
+    if folder and not Path(file).exists() and (found := Path(folder) / file).exists():
+        return str(found)
+    return file
+
+
 def prepare_environment() -> None:
     """Set what every job inherits.
 
@@ -242,7 +267,8 @@ def imported_files(base: Path, script: Path) -> list[Path]:
             continue
         found[file] = None
         for module in _imported_modules(file):
-            waiting += _module_files(base, module)
+            # A script finds its neighbours by their bare names.
+            waiting += [*_module_files(base, module), *_module_files(script.parent, module)]
     return sorted(found)
 
 
@@ -256,10 +282,10 @@ def _imported_modules(file: Path) -> list[str]:
     return modules
 
 
-def _module_files(base: Path, module: str) -> list[Path]:
+def _module_files(folder: Path, module: str) -> list[Path]:
     parts = module.split(".")
     files = []
     for length in range(1, len(parts) + 1):
-        place = base.joinpath(*parts[:length])
+        place = folder.joinpath(*parts[:length])
         files += [path for path in (place.with_suffix(".py"), place / "__init__.py") if path.is_file()]
     return files

@@ -15,6 +15,8 @@ from siq.recordings import SnapshotPairs
 from siq.thinning import representative_subset
 
 CHUNK = 100  # steps whose batches are drawn together; part of what a seed means
+STANDARD_THINNING = 0.1  # distance of representative points, in standard deviations of the states
+FEWEST_REPRESENTATIVE = 10  # below this, orthogonality is asked for almost nowhere
 HELD_OUT_PAIRS = 4096  # pairs on which the held-out loss is measured
 
 
@@ -57,7 +59,8 @@ def prepare_data(
     Raises
     ------
     NumericalFailure
-        When there are fewer than two recordings to divide.
+        When there are fewer than two recordings to divide, a state does not vary, or hardly any
+        representative points remain.
     """
     names = np.unique(pairs.recording)
     if len(names) < 2:
@@ -65,7 +68,18 @@ def prepare_data(
     count = min(max(round(options.training_share * len(names)), 1), len(names) - 1)
     trains = np.isin(pairs.recording, generator.permutation(names)[:count])
     training, held_out = _select(pairs, trains), _select(pairs, ~trains)
-    rows = representative_subset(training.x0, distance=options.thinning_distance, generator=generator)
+    spread = training.x0.std(axis=0)
+    if not (spread > 0).all():
+        raise NumericalFailure("a state does not vary in the recordings; leave it out or record it in motion")
+    distance, points = options.thinning_distance, training.x0
+    if distance is None:
+        distance, points = STANDARD_THINNING, points / spread
+    rows = representative_subset(points, distance=distance, generator=generator)
+    if len(rows) < FEWEST_REPRESENTATIVE:
+        raise NumericalFailure(
+            f"only {len(rows)} representative points are {distance} apart;"
+            " lower training.thinning_distance or leave it out"
+        )
     return TrainingData(training, held_out, rows)
 
 

@@ -11,7 +11,6 @@ import torch
 from siq.decomposition.data import TrainingData
 from siq.decomposition.networks import Networks, evaluate, initial_layers, select_run
 from siq.decomposition.options import TrainingOptions
-from siq.errors import NumericalFailure
 
 
 def initial_networks(
@@ -24,19 +23,12 @@ def initial_networks(
     """Random networks, normalised and rescaled to the data of each run (paper, Eqs. eta_v, eta_g).
 
     η_v and η_g bring the initial ∣∇V∣ and ∣g∣ to the size of the observed velocities.
-
-    Raises
-    ------
-    NumericalFailure
-        When a state does not vary in the data.
     """
     dtype = getattr(torch, options.precision)
     dimension = diffusion.shape[0]
     sources = [run.training if options.normalise_on == "pairs" else run.representative for run in data]
     means = np.stack([pairs.x0.mean(axis=0) for pairs in sources])[:, None]
     scales = np.stack([pairs.x0.std(axis=0) for pairs in sources])[:, None]
-    if not (scales > 0).all():
-        raise NumericalFailure("a state does not vary in the recordings; leave it out or record it in motion")
     ones = torch.ones(len(data), 1, 1, dtype=dtype)
     networks = Networks(
         potential=initial_layers((dimension, *options.widths, 1), generators=generators, dtype=dtype),

@@ -54,6 +54,8 @@ def orthogonality_loss(
     downhill_square = ((gradient @ diffusion) * gradient).sum(dim=-1)
     circulatory_square = ((circulatory @ precision) * circulatory).sum(dim=-1)
     # Both vectors may vanish (g does everywhere in a gradient system): no angle, no penalty.
-    tiny = torch.finfo(product.dtype).tiny ** 0.5
-    cosine = product / (downhill_square * circulatory_square).clamp_min(tiny).sqrt()
-    return (torch.where(cosine < 0, asymmetry, 1.0) * cosine * cosine).mean(dim=-1)
+    # The roots are taken apart, for the product of the squares would underflow in single precision.
+    tiny = torch.finfo(product.dtype).tiny
+    lengths = downhill_square.clamp_min(tiny).sqrt() * circulatory_square.clamp_min(tiny).sqrt()
+    cosine = product / lengths
+    return (torch.where(cosine < 0, asymmetry * cosine, cosine) * cosine).mean(dim=-1)

@@ -38,7 +38,8 @@ class TrainingOptions:
         Divide the first term of the loss by the mean square of the observed velocities, so that λ means
         the same for every system and in any units. The paper does not.
     thinning_distance
-        r, the distance between representative points, in the units of the states.
+        r, the distance between representative points, in the units of the states. Left out: a tenth of
+        each state's standard deviation, whatever the units.
     normalise_on
         The points from which μ, σ, η_v and η_g are estimated. ``pairs``: all training pairs, as the paper
         does. ``representative``: the evenly spread ones. Trajectories crowd at attractors, where f is
@@ -65,7 +66,7 @@ class TrainingOptions:
     matching: Kind = "explicit"
     matching_order: Order = 2
     relative_dynamics: bool = False
-    thinning_distance: Annotated[float, Field(gt=0)] = 0.1
+    thinning_distance: Annotated[float, Field(gt=0)] | None = None
     normalise_on: Literal["pairs", "representative"] = "pairs"
     potential_gain: Annotated[float, Field(gt=0)] = 1.0
     training_share: Annotated[float, Field(gt=0, lt=1)] = 0.7

@@ -29,7 +29,10 @@ def load_networks(path: str | Path) -> Networks:
     InputError
         When the file is missing or is no such archive.
     """
-    return _unpack(_read(path))
+    try:
+        return _unpack(_read(path))
+    except KeyError:
+        raise InputError(path, "", "it is not an archive of networks", "make it again") from None
 
 
 def save_checkpoint(path: str | Path, state: TrainingState, *, fingerprint: str) -> None:
@@ -112,5 +115,5 @@ def _read(path: str | Path) -> dict[str, np.ndarray]:
     try:
         with np.load(path, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, zipfile.BadZipFile):
+    except (OSError, ValueError, EOFError, NotImplementedError, zipfile.BadZipFile):
         raise InputError(path, "", "it is not an archive of networks", "make it again") from None

@@ -92,7 +92,7 @@ def check_recordings(name):
     """Refuse bad recordings once, before any job starts."""
     try:
         STUDIES[name].check_recordings()
-    except InputError as error:
+    except (InputError, ValueError) as error:
         say_and_stop(error)
 
 

@@ -30,7 +30,7 @@ rule figures:
         "../scripts/figures.py"
 
 
-rule html:
+rule page:
     input:
         summary="results/{study}/tables/summary.parquet",
         rrmse="results/{study}/tables/rrmse.parquet",
@@ -47,14 +47,16 @@ rule html:
             category="{study}",
         ),
     log:
-        "results/{study}/logs/html.log",
+        "results/{study}/logs/page.log",
     benchmark:
-        "results/{study}/benchmarks/html.tsv"
+        "results/{study}/benchmarks/page.tsv"
     conda:
         "../envs/siq.yaml"
     threads: 1
     params:
-        code=code("html.py"),
+        code=code("page.py"),
+        tables="results/{study}/tables",
+        command=lambda wildcards: study_of(wildcards).command(),
         study=parameters(
             "name",
             "title",
@@ -73,4 +75,4 @@ rule html:
     message:
         "{wildcards.study}: writing the report"
     script:
-        "../scripts/html.py"
+        "../scripts/page.py"

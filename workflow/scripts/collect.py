@@ -12,14 +12,24 @@ from siq.tables import as_table, concatenate, read_table, write_table
 from step import job, read_outcomes
 
 
-def timings(folder: Path, runs: Iterable[int]) -> pd.DataFrame:
-    """Seconds of every step of every run; runs that trained side by side share their time evenly."""
+def timings(folder: Path, runs: Iterable[int], *, drawing: str) -> pd.DataFrame:
+    """Seconds of every step of every run; runs that trained side by side share their time evenly.
+
+    `drawing` is what the outcomes call the step that draws trajectories.
+    """
     rows = []
     for path in sorted(folder.glob("*/*.tsv")):
         first, _, last = path.parent.name.partition("-")
         together = [run for run in range(int(first), int(last or first) + 1) if run in runs]
         seconds = float(pd.read_csv(path, sep="\t")["s"].iloc[0])
-        rows += [{"run": run, "step": path.stem, "seconds": seconds / len(together)} for run in together]
+        rows += [
+            {
+                "run": run,
+                "step": drawing if path.stem == "draw" else path.stem,
+                "seconds": seconds / len(together),
+            }
+            for run in together
+        ]
     return as_table("timings", rows).sort_values(["run", "step"], ignore_index=True)
 
 
@@ -39,7 +49,10 @@ def main(snakemake: Any) -> None:
     write_table(target.rrmse, rrmse)
     write_table(target.training, training)
     write_table(target.outcomes, outcomes)
-    write_table(target.timings, timings(Path(snakemake.params.benchmarks), set(outcomes["run"])))
+    write_table(
+        target.timings,
+        timings(Path(snakemake.params.benchmarks), set(outcomes["run"]), drawing=entries[0]["step"]),
+    )
     write_table(target.summary, summary_table(coefficients, rrmse, published))
 
 

@@ -124,7 +124,7 @@ def main(snakemake: Any) -> None:
         which = ", the median of the runs by error" if rrmse["rrmse"].notna().any() else ""
         answer.append(f"The formulas below are those of run {run}{which}.")
     name = study["name"]
-    tables = f"results/{name}/tables"
+    tables = snakemake.params.tables
     figures = {Path(path).stem: Path(path).read_bytes() for path in source.figures}
     troubled = outcomes[outcomes["status"].isin(["failed", "warning"])]
     uncertified = rrmse[~rrmse["certified"]][["run", "method"]]
@@ -156,7 +156,7 @@ def main(snakemake: Any) -> None:
         ],
         failures=failures.sort_values(["run", "step"]),
         commands=[
-            f"snakemake --cores 2 results/{name}/report.html",
+            snakemake.params.command,
             "# change one parameter of the study and run it again: only what depends on it is made again",
         ],
         study=yaml.safe_dump(chosen, sort_keys=False, allow_unicode=True),
