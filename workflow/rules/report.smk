@@ -55,7 +55,6 @@ rule page:
     threads: 1
     params:
         code=code("page.py"),
-        tables="results/{study}/tables",
         command=lambda wildcards: study_of(wildcards).command(),
         study=parameters(
             "name",

@@ -124,7 +124,7 @@ def main(snakemake: Any) -> None:
         which = ", the median of the runs by error" if rrmse["rrmse"].notna().any() else ""
         answer.append(f"The formulas below are those of run {run}{which}.")
     name = study["name"]
-    tables = snakemake.params.tables
+    tables = Path(source.summary).parent
     figures = {Path(path).stem: Path(path).read_bytes() for path in source.figures}
     troubled = outcomes[outcomes["status"].isin(["failed", "warning"])]
     uncertified = rrmse[~rrmse["certified"]][["run", "method"]]
