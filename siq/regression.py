@@ -296,4 +296,6 @@ def _constrained_least_squares(
             design[target, :, column] = matrix[:, term]
         reduced = design.reshape(targets * q, len(chosen)) @ basis
         solution[chosen] = basis @ np.linalg.lstsq(reduced, goals.T.ravel(), rcond=None)[0]
+    # A term of the support that the constraints force to vanish does so to rounding; it is no term.
+    solution[np.abs(solution) < 1e-12 * np.abs(solution).max()] = 0.0
     return solution.reshape(targets, q).T

@@ -30,9 +30,20 @@ CAPTIONS = {
     "inclusion_frequency": "How often each term was found, by component.",
     "training": "Loss on held-out recordings during training, one line a run.",
 }
+SUMMARY_COLUMNS = (
+    "quantity",
+    "exact",
+    "mean",
+    "standard_deviation",
+    "median",
+    "inclusion_frequency",
+    "published",
+    "published_standard_deviation",
+    "runs",
+)
 SUMMARY_HELP = {
-    "quantity": "component:term for coefficients",
-    "inclusion_frequency": "share of runs in which the term was found",
+    "quantity": "component:term for coefficients; those of V = U/2 and of f are in the file",
+    "inclusion frequency": "share of runs in which the term was found",
     "runs": "runs that have a value",
     "published": "the published figure, with its source",
 }
@@ -44,6 +55,13 @@ def shown_run(rrmse: pd.DataFrame, models: list[str]) -> int | None:
     if len(ranked):
         return int(ranked["run"].iloc[(len(ranked) - 1) // 2])
     return first_model(models)
+
+
+def summary_shown(summary: pd.DataFrame) -> pd.DataFrame:
+    """Errors, U and g; the headings in words, so that they wrap."""
+    shown = summary[~summary["quantity"].str.match("V:|f_")]
+    columns = [name for name in SUMMARY_COLUMNS if shown[name].notna().any()]
+    return shown[columns].rename(columns=lambda name: name.replace("_", " "))
 
 
 def formula_rows(
@@ -143,7 +161,7 @@ def main(snakemake: Any) -> None:
         tables=[
             ReportTable(
                 "Every figure over the runs, beside the exact and the published one.",
-                summary[~summary["quantity"].str.startswith("V:")].dropna(axis=1, how="all"),
+                summary_shown(summary),
                 SUMMARY_HELP,
                 f"{tables}/summary.csv",
                 rows_shown=60,
