@@ -43,8 +43,8 @@ def fingerprint(data: dict[int, TrainingData], study: dict[str, Any]) -> str:
     """What a checkpoint must share with the training that goes on from it."""
     digest = hashlib.sha256(json.dumps([list(data), study], sort_keys=True).encode())
     for run in data.values():
-        digest.update(np.ascontiguousarray(run.training.x0).tobytes())
-        digest.update(np.ascontiguousarray(run.training.xh).tobytes())
+        for values in (run.training.x0, run.training.xh, run.training.h):
+            digest.update(np.ascontiguousarray(values).tobytes())
     return digest.hexdigest()
 
 

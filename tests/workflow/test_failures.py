@@ -1,0 +1,26 @@
+"""A run that fails is shown as such: kept in every table, in no mean, and said in the report."""
+
+import pandas as pd
+import pytest
+
+pytestmark = pytest.mark.workflow
+
+
+def test_a_study_whose_every_training_fails_still_ends_in_a_report_that_says_so(fresh_project):
+    project = fresh_project
+    project.write_study(steps=30)
+    study = project.path("study.yaml")
+    study.write_text(study.read_text().replace("  steps: 30\n", "  steps: 30\n  learning_rate: 1.0e+30\n"))
+    project.make("results/mini/report.html")
+    outcomes = pd.read_parquet(project.path("results/mini/tables/outcomes.parquet")).set_index("step")
+    assert outcomes["status"].to_dict() == {
+        "simulate": "ok",
+        "train": "failed",
+        "regress": "skipped",
+        "score": "skipped",
+    }
+    assert "no longer finite" in outcomes.loc["train", "reason"]
+    rrmse = pd.read_parquet(project.path("results/mini/tables/rrmse.parquet"))
+    assert rrmse["rrmse"].isna().all() and not rrmse["certified"].any()
+    page = project.path("results/mini/report.html").read_text(encoding="utf-8")
+    assert "0 of 1 independent runs ended with formulas" in page and "no longer finite" in page
