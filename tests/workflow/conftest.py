@@ -48,7 +48,8 @@ class Project:
     def start(self, *arguments: str, study: str = "study.yaml") -> subprocess.Popen[str]:
         # The profile's longer span would only let each of these short workflows end later.
         span = ("--max-jobs-per-timespan", "100/1s")
-        command = [sys.executable, "-m", "snakemake", "--cores", "2", *span, *arguments, "--configfile", study]
+        command = [sys.executable, "-m", "snakemake", "--cores", "2", *span, *arguments]
+        command += ["--configfile", study]
         return subprocess.Popen(
             command,
             cwd=self.folder,
