@@ -1,7 +1,7 @@
 """Simulate: trajectories of a system, sampled as snapshot pairs (paper, Appendix B).
 
-Time runs in steps of the Runge–Kutta rule, all trajectories at once; the arrays hold components first,
-``(d, trajectories)``, so that each component is contiguous.
+Time runs in steps of the Runge–Kutta rule, or of Euler and Maruyama's where there is noise, all trajectories
+at once; the arrays hold components first, ``(d, trajectories)``, so that each component is contiguous.
 """
 
 from __future__ import annotations
@@ -35,7 +35,11 @@ class SimulationOptions:
     interval
         The time between pairs: they start at t_j = interval·j, j = 1 … M.
     substeps
-        Steps of the fourth-order Runge–Kutta rule within h; the paper has 5.
+        Steps of the fourth-order Runge–Kutta rule within h; the paper has 5. With noise they are steps of
+        the Euler–Maruyama rule, whose drift is that of the continuous process but for O(h/substeps).
+    noise_intensity
+        ε of ``dx = f dt + sqrt(ε) D^(1/2) dW``; 0 is the equation without noise. The paper's section 3.1.1
+        has another convention, ``⟨ξ_j(t) ξ_k(0)⟩ = 2ε δ_jk δ(t)`` with ε = 0.01: that is 0.02 here.
     """
 
     trajectories: Annotated[int, Field(ge=2)] = 5000
@@ -43,6 +47,7 @@ class SimulationOptions:
     pair_step: Annotated[float, Field(gt=0)] = 0.01
     interval: Annotated[float, Field(gt=0)] = 0.1
     substeps: Annotated[int, Field(ge=1)] = 5
+    noise_intensity: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
 
 
 def sampling_stride(options: SimulationOptions) -> int:
@@ -93,6 +98,61 @@ def runge_kutta_step(vector_field: VectorField, x: np.ndarray, step: float) -> n
     return k2
 
 
+def euler_maruyama_step(
+    vector_field: VectorField, x: np.ndarray, step: float, increments: np.ndarray
+) -> np.ndarray:
+    """One step of the Euler–Maruyama rule, ``x + f(x) Δt + sqrt(ε) D^(1/2) ΔW``.
+
+    Parameters
+    ----------
+    vector_field
+        f, mapping components ``(d, n)`` to components ``(d, n)``.
+    x
+        States, shape ``(d, n)``.
+    step
+        Time step Δt.
+    increments
+        ``sqrt(ε) D^(1/2) ΔW``, shape ``(d, n)``: the noise over the step, see `noise_factor`.
+
+    Returns
+    -------
+    numpy.ndarray
+        States one step later, shape ``(d, n)``. As the noise is additive, the rule is of strong order 1.
+    """
+    result = vector_field(x)
+    result *= step
+    result += x
+    result += increments
+    return result
+
+
+def noise_factor(diffusion: np.ndarray, *, intensity: float, step: float) -> np.ndarray:
+    """L with ``L Lᵀ = ε D Δt``: L times standard normal numbers is the noise over one step.
+
+    Parameters
+    ----------
+    diffusion
+        D, shape ``(d, d)``, symmetric and positive definite.
+    intensity
+        ε of ``dx = f dt + sqrt(ε) D^(1/2) dW``.
+    step
+        Time step Δt.
+
+    Returns
+    -------
+    numpy.ndarray
+        Shape ``(d, d)``, lower triangular (Cholesky). Every root of D gives the same process in law.
+
+    Raises
+    ------
+    ValueError
+        When ε or Δt is negative.
+    """
+    if intensity < 0 or step < 0:
+        raise ValueError(f"the noise intensity ({intensity}) and the step ({step}) must not be negative")
+    return np.sqrt(intensity * step) * np.linalg.cholesky(diffusion)
+
+
 def simulate_snapshots(
     system: System, *, options: SimulationOptions, generator: np.random.Generator
 ) -> Recordings:
@@ -105,7 +165,8 @@ def simulate_snapshots(
     options
         Sampling (paper, Appendix B).
     generator
-        Source of the initial states; a run passes its own.
+        Source of the initial states, and then of the noise; a run passes its own. The initial states are
+        the same with and without noise.
 
     Returns
     -------
@@ -126,13 +187,21 @@ def simulate_snapshots(
     count = options.trajectories
     x = generator.uniform(lower[:, None], upper[:, None], size=(system.dimension, count))
     samples = np.empty((count, 2 * options.pairs, system.dimension))
+    factor = noise_factor(system.diffusion, intensity=options.noise_intensity, step=step)
+
+    def advance(x: np.ndarray) -> np.ndarray:
+        if options.noise_intensity == 0:
+            return runge_kutta_step(system.vector_field, x, step)
+        increments = factor @ generator.standard_normal(x.shape)
+        return euler_maruyama_step(system.vector_field, x, step, increments)
+
     with np.errstate(over="ignore", invalid="ignore"):  # a runaway trajectory is told below, by name
         for pair in range(options.pairs):
             for _ in range(stride - (options.substeps if pair else 0)):
-                x = runge_kutta_step(system.vector_field, x, step)
+                x = advance(x)
             samples[:, 2 * pair] = x.T
             for _ in range(options.substeps):
-                x = runge_kutta_step(system.vector_field, x, step)
+                x = advance(x)
             samples[:, 2 * pair + 1] = x.T
     lost = ~np.isfinite(samples).all(axis=(1, 2))
     if lost.any():
@@ -151,3 +220,71 @@ def simulate_snapshots(
         t=np.tile(times, count),
         values=samples.reshape(-1, system.dimension),
     )
+
+
+def simulate_stationary(
+    vector_field: VectorField,
+    *,
+    diffusion: np.ndarray,
+    intensity: float,
+    start: np.ndarray,
+    step: float,
+    burn_in: int,
+    steps: int,
+    thin: int = 1,
+    generator: np.random.Generator,
+) -> np.ndarray:
+    """Simulate walkers in noise for a long time, to compare with the invariant distribution.
+
+    The walkers share nothing but the equation ``dx = f dt + sqrt(ε) D^(1/2) dW``; the spread among them
+    therefore tells the sampling error, whatever the correlation in time. Where ε is small a walker stays
+    in the well in which it starts, and the shares of the wells are then those of `start`.
+
+    Parameters
+    ----------
+    vector_field
+        f, mapping components ``(d, walkers)`` to components ``(d, walkers)``.
+    diffusion
+        D, shape ``(d, d)``.
+    intensity
+        ε, in the unit of U.
+    start
+        Initial states, shape ``(d, walkers)``.
+    step
+        Step of the Euler–Maruyama rule; the samples' distribution is biased by O(step).
+    burn_in
+        Number of steps before the first sample.
+    steps
+        Number of steps from then on.
+    thin
+        Every how many steps a sample is kept.
+    generator
+        Source of the noise.
+
+    Returns
+    -------
+    numpy.ndarray
+        Samples, shape ``(d, steps // thin, walkers)``, in the states' units.
+
+    Raises
+    ------
+    ValueError
+        When ε is negative, or no sample would be kept.
+    NumericalFailure
+        When walkers run to infinity.
+    """
+    if not 1 <= thin <= steps or burn_in < 0:
+        raise ValueError(f"of {steps} steps after {burn_in}, every {thin}th leaves no sample")
+    factor = noise_factor(diffusion, intensity=intensity, step=step)
+    x = np.array(start, dtype=float)
+    samples = np.empty((len(x), steps // thin, x.shape[1]))
+    with np.errstate(over="ignore", invalid="ignore"):  # told below
+        for index in range(1 - burn_in, samples.shape[1] * thin + 1):
+            increments = factor @ generator.standard_normal(x.shape)
+            x = euler_maruyama_step(vector_field, x, step, increments)
+            if index > 0 and index % thin == 0:
+                samples[:, index // thin - 1] = x
+    lost = int((~np.isfinite(x).all(axis=0)).sum())  # what once is not finite stays so
+    if lost:
+        raise NumericalFailure(f"{lost} of {x.shape[1]} walkers run to infinity; take a smaller step")
+    return samples

@@ -1,0 +1,203 @@
+"""Equilibria of an identified vector field, and where its trajectories end.
+
+Equilibria are sought from the recorded points alone; nobody says how many there are, or where.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import scipy.linalg
+
+from siq.simulate import runge_kutta_step
+from siq.vector_field import VectorField
+
+Kind = Literal["attractor", "saddle", "repeller", "degenerate"]
+
+NEWTON_STEPS = 60
+MARGIN = 0.05  # of the recorded box, by which an equilibrium may lie outside
+SAME = 1e-6  # of the recorded box: closer equilibria are one
+SLOWEST_TIMES = 25.0  # trajectories are followed for so many of the slowest relaxation times
+
+
+@dataclass(frozen=True)
+class Equilibrium:
+    """A state at which f vanishes.
+
+    Attributes
+    ----------
+    position
+        Shape ``(d,)``.
+    eigenvalues
+        Of the Jacobian, by falling real part.
+    kind
+        ``attractor``: all real parts are negative. ``repeller``: all positive. ``saddle``: some of
+        each. ``degenerate``: a real part is zero to rounding, and the linearisation decides nothing.
+    """
+
+    position: np.ndarray
+    eigenvalues: np.ndarray
+    kind: Kind
+
+    @property
+    def unstable(self) -> int:
+        """Number of unstable directions."""
+        return int((self.eigenvalues.real > 0).sum())
+
+
+@dataclass(frozen=True)
+class Descents:
+    """Trajectories of f from recorded points to where they end.
+
+    Attributes
+    ----------
+    paths
+        Shape ``(n, k, d)``: k states along each of the n trajectories, the first being the start.
+    ends
+        Shape ``(n,)``: index of the attractor at which each ends, -1 where it ends at none.
+    escaped
+        Shape ``(n,)``: whether it left the recorded box for good.
+    """
+
+    paths: np.ndarray
+    ends: np.ndarray
+    escaped: np.ndarray
+
+
+def find_equilibria(field: VectorField, points: np.ndarray) -> list[Equilibrium]:
+    """All equilibria in the box of some points that Newton's method finds from these.
+
+    Parameters
+    ----------
+    field
+        f.
+    points
+        Shape ``(n, d)``: recorded states, from all over the recorded region.
+
+    Returns
+    -------
+    list of Equilibrium
+        By their position along the first state. Only roots of f that are isolated are found.
+    """
+    low, high = points.min(axis=0), points.max(axis=0)
+    width = np.where(high > low, high - low, 1.0)
+    x = points.copy()
+    for _ in range(NEWTON_STEPS):
+        value, jacobian = field(x), field.jacobian(x)
+        size = np.linalg.norm(jacobian, axis=(1, 2))[:, None, None] + 1e-300
+        # A little damping keeps singular Jacobians harmless and does not spoil convergence to rounding.
+        normal = np.einsum("nji,njk->nik", jacobian, jacobian) + 1e-14 * size**2 * np.eye(x.shape[1])
+        step = -np.linalg.solve(normal, np.einsum("nji,nj->ni", jacobian, value)[..., None])[..., 0]
+        longest = np.abs(step / width).max(axis=1, keepdims=True)
+        x = x + step * np.minimum(1.0, 0.2 / np.maximum(longest, 1e-300))
+        x = x[np.isfinite(x).all(axis=1) & (np.abs((x - low) / width - 0.5) < 2.0).all(axis=1)]
+        if not len(x):
+            return []
+    inside = ((x > low - MARGIN * width) & (x < high + MARGIN * width)).all(axis=1)
+    speed = np.linalg.norm(field(points) / width, axis=1)
+    converged = np.linalg.norm(field(x) / width, axis=1) < 1e-9 * np.median(speed)
+    found: list[np.ndarray] = []
+    for candidate in x[inside & converged]:
+        if all(np.abs((candidate - other) / width).max() > SAME for other in found):
+            found.append(candidate)
+    found.sort(key=lambda position: tuple(np.round(position / width, 6)))
+    return [classify(field, position) for position in found]
+
+
+def classify(field: VectorField, position: np.ndarray) -> Equilibrium:
+    """The equilibrium at a position, by the eigenvalues of the Jacobian there."""
+    eigenvalues = np.linalg.eigvals(field.jacobian(position[None])[0])
+    eigenvalues = eigenvalues[np.argsort(-eigenvalues.real)]
+    kind: Kind = "saddle"
+    if np.abs(eigenvalues.real).min() < 1e-9 * np.abs(eigenvalues).max():
+        kind = "degenerate"
+    elif eigenvalues.real.max() < 0:
+        kind = "attractor"
+    elif eigenvalues.real.min() > 0:
+        kind = "repeller"
+    return Equilibrium(position, eigenvalues, kind)
+
+
+def hessian_at(field: VectorField, attractor: np.ndarray, *, diffusion: np.ndarray) -> np.ndarray:
+    """M, the Hessian of V at an attractor: ``M = W⁻¹`` with ``J W + W Jᵀ = -2D``, shape ``(d, d)``.
+
+    It follows from f near the attractor alone, and is what tells the true V from false solutions of the
+    Hamilton–Jacobi equation.
+    """
+    jacobian = field.jacobian(attractor[None])[0]
+    covariance = scipy.linalg.solve_continuous_lyapunov(jacobian, -2 * diffusion)
+    hessian = np.linalg.inv(covariance)
+    return (hessian + hessian.T) / 2
+
+
+def follow(
+    field: VectorField,
+    starts: np.ndarray,
+    attractors: Sequence[Equilibrium],
+    *,
+    box: np.ndarray,
+    states: int = 48,
+) -> Descents:
+    """Follow f from some points to the attractors.
+
+    Parameters
+    ----------
+    field
+        f.
+    starts
+        Shape ``(n, d)``.
+    attractors
+        Where trajectories may end.
+    box
+        Shape ``(d, 2)``: the recorded region. What leaves a box of three times this size has escaped.
+    states
+        States kept along each trajectory, close together at first and later farther apart.
+    """
+    width = box[:, 1] - box[:, 0]
+    middle = box.mean(axis=1)
+    fastest = np.quantile(np.linalg.norm(field.jacobian(starts), axis=(1, 2)), 0.99)
+    rates = [-one.eigenvalues.real.max() for one in attractors]
+    slowest = min(rates) if rates else float(np.median(np.linalg.norm(field(starts) / width, axis=1)))
+    horizon = SLOWEST_TIMES / slowest
+    count = int(min(max(np.ceil(horizon * fastest / 0.25), 200), 6000))
+    step = horizon / count
+    kept = np.geomspace(1, count, states - 1).astype(int)
+    x = np.ascontiguousarray(starts.T)
+    paths = [x.T.copy()]
+    escaped = np.zeros(len(starts), dtype=bool)
+
+    def velocity(components: np.ndarray) -> np.ndarray:
+        return field(components.T).T
+
+    for done in range(1, count + 1):
+        with np.errstate(over="ignore", invalid="ignore"):
+            moved = runge_kutta_step(velocity, x, step)
+        out = ~(np.abs((moved - middle[:, None]) / width[:, None]) < 1.5).all(axis=0)
+        escaped |= out
+        x = np.where(escaped, x, moved)
+        paths += [x.T.copy()] * int((kept == done).sum())
+    ends = np.full(len(starts), -1)
+    for index, one in enumerate(attractors):
+        near = np.abs((x.T - one.position) / width).max(axis=1) < 1e-3
+        ends[near & ~escaped] = index
+    return Descents(np.stack(paths, axis=1), ends, escaped)
+
+
+def neighbours(
+    field: VectorField,
+    saddle: Equilibrium,
+    attractors: Sequence[Equilibrium],
+    *,
+    box: np.ndarray,
+) -> set[int]:
+    """The attractors that lie below a saddle, on either side of its unstable directions."""
+    values, vectors = np.linalg.eig(field.jacobian(saddle.position[None])[0])
+    width = box[:, 1] - box[:, 0]
+    starts = []
+    for vector in vectors[:, values.real > 0].T:
+        direction = vector.real / np.abs(vector.real / width).max()
+        starts += [saddle.position + 1e-3 * direction, saddle.position - 1e-3 * direction]
+    return {int(end) for end in follow(field, np.array(starts), attractors, box=box).ends if end >= 0}

@@ -1,0 +1,194 @@
+"""The network route: one formula of V over the whole recorded region, from the networks' formula.
+
+Gauss–Newton on the Hamilton–Jacobi equation starts from the regression's V with all functions of the library,
+then drops, one by one, those that their own standard errors do not tell from zero. Neither M nor anything
+else that the local route uses takes part.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.stats
+
+from siq.bases import LibraryBasis, potential_basis
+from siq.hamilton_jacobi import HamiltonJacobi, Solution, equation_at, gauss_newton, sensitivity
+from siq.identification import IdentifiedField
+from siq.library import CandidateLibrary
+
+
+@dataclass(frozen=True)
+class GlobalPotential:
+    """V over one library, refined.
+
+    Attributes
+    ----------
+    library
+        The q functions.
+    coefficients
+        Of V, shape ``(q,)``.
+    sensitivity
+        ∂ξ/∂c, shape ``(q, p)``: how they follow the p coefficients of f.
+    covariance
+        Shape ``(q, q)``, zero for terms that are not there.
+    residual
+        Relative Hamilton–Jacobi residual on the points of the fit.
+    converged
+        Whether Gauss–Newton settled.
+    """
+
+    library: CandidateLibrary
+    coefficients: np.ndarray
+    sensitivity: np.ndarray
+    covariance: np.ndarray
+    residual: float
+    converged: bool
+
+
+def fit_values(library: CandidateLibrary, x: np.ndarray, potential: np.ndarray) -> np.ndarray:
+    """Coefficients of V, shape ``(q,)``, by least squares of its values at points ``(n, d)``."""
+    basis = potential_basis(library)
+    values = np.column_stack([basis.values(x), np.ones(len(x))])
+    scale = np.sqrt((values**2).mean(axis=0))
+    solution = np.linalg.lstsq(values / scale, potential, rcond=1e-10)[0] / scale
+    coefficients = np.zeros(library.size)
+    coefficients[basis.chosen] = solution[:-1]
+    return coefficients
+
+
+def refine_globally(
+    start: np.ndarray,
+    library: CandidateLibrary,
+    found: IdentifiedField,
+    points: np.ndarray,
+    *,
+    diffusion: np.ndarray,
+    false_terms: float = 0.01,
+    precision: float = 1e-7,
+    sparse: bool = True,
+) -> GlobalPotential:
+    """Refine V from a start, and keep only the terms that the data support.
+
+    Parameters
+    ----------
+    start
+        Coefficients of V over the library, shape ``(q,)``.
+    library
+        The functions that V may use.
+    found
+        The identified f with its uncertainty.
+    points
+        Where the equation is asked for, shape ``(n, d)``.
+    diffusion
+        D.
+    false_terms
+        Probability that the uncertainty of f alone brings any false term into V.
+    precision
+        Terms that contribute less than this share of V are dropped in any case.
+    sparse
+        Whether to drop terms at all.
+    """
+    basis = potential_basis(library)
+    flow = found.field(points)
+    equation = equation_at(basis, points, flow, diffusion=diffusion)
+    solution = gauss_newton(equation, start[basis.chosen])
+    active = np.arange(basis.size)
+    if sparse:
+        # Dropping terms changes the others, hence the errors: repeat until nothing more can go.
+        for _ in range(6):
+            kept = _eliminate(
+                equation, basis.restricted(active), solution, found,
+                critical=float(scipy.stats.norm.isf(false_terms / (2 * basis.size))), precision=precision,
+            )  # fmt: skip
+            if len(kept) == len(active) or not len(kept):
+                break
+            equation = equation.restricted(kept)
+            active = active[kept]
+            solution = gauss_newton(equation, solution.coefficients[kept])
+    return _assemble(library, basis.restricted(active), equation, solution, found)
+
+
+def _assemble(
+    library: CandidateLibrary,
+    basis: LibraryBasis,
+    equation: HamiltonJacobi,
+    solution: Solution,
+    found: IdentifiedField,
+) -> GlobalPotential:
+    q, p = library.size, len(found.support)
+    terms = field_terms(found, equation.points)
+    response = sensitivity(
+        equation, solution.coefficients, field_terms=terms, components=found.support[:, 0]
+    )
+    coefficients, sensitivities, covariance = np.zeros(q), np.zeros((q, p)), np.zeros((q, q))
+    coefficients[basis.chosen] = solution.coefficients
+    sensitivities[basis.chosen] = response
+    misfit = _misfit_covariance(equation, solution)
+    covariance[np.ix_(basis.chosen, basis.chosen)] = response @ found.covariance @ response.T + misfit
+    return GlobalPotential(
+        library, coefficients, sensitivities, covariance, solution.residual, solution.converged
+    )
+
+
+def field_terms(found: IdentifiedField, points: np.ndarray) -> np.ndarray:
+    """The function of each of the p coefficients of f at points, shape ``(n, p)``."""
+    return found.library.evaluate(points)[:, found.support[:, 1]]
+
+
+def _misfit_covariance(equation: HamiltonJacobi, solution: Solution) -> np.ndarray:
+    """What a residual that no V in this library can remove adds to the uncertainty."""
+    jacobian = equation.jacobian(solution.coefficients)
+    scale = np.linalg.norm(jacobian, axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    inverse = np.linalg.pinv(jacobian / scale, rcond=1e-11)
+    residual = equation.residual(solution.coefficients)
+    freedom = max(len(residual) - len(scale), 1)
+    return float(residual @ residual) / freedom * (inverse @ inverse.T) / np.outer(scale, scale)
+
+
+def _eliminate(
+    equation: HamiltonJacobi,
+    basis: LibraryBasis,
+    solution: Solution,
+    found: IdentifiedField,
+    *,
+    critical: float,
+    precision: float,
+) -> np.ndarray:
+    """Backward elimination in the linearised equation: positions of the terms to be kept."""
+    coefficients = solution.coefficients
+    jacobian = equation.jacobian(coefficients)
+    goal = jacobian @ coefficients - equation.residual(coefficients)
+    gradient = equation.gradients @ coefficients
+    forcing = -(
+        equation.weight[:, None]
+        * gradient[:, found.support[:, 0]]
+        * field_terms(found, equation.points)
+    )
+    # Everything depends on the points through a triangular matrix only.
+    triangle = np.linalg.qr(np.column_stack([jacobian, goal, forcing]), mode="r")
+    m = len(coefficients)
+    spread = np.sqrt(((equation.gradients**2).sum(axis=1)).mean(axis=0))
+    size = np.sqrt((gradient**2).sum(axis=1).mean())
+    rows = max(len(equation.points) - m, 1)
+    active = np.arange(m)
+    while len(active):
+        columns = triangle[:, active]
+        scale = np.linalg.norm(columns, axis=0)
+        scale = np.where(scale > 0, scale, 1.0)
+        inverse = np.linalg.pinv(columns / scale, rcond=1e-11) / scale[:, None]
+        current = inverse @ triangle[:, m]
+        misfit = triangle[:, m] - columns @ current
+        response = inverse @ triangle[:, m + 1 :]
+        variance = np.einsum("mp,pq,mq->m", response, found.covariance, response)
+        variance = variance + misfit @ misfit / rows * (inverse**2).sum(axis=1)
+        contribution = np.abs(current) * spread[active] / size
+        strength = np.minimum(
+            np.abs(current) / (critical * np.sqrt(variance) + 1e-300), contribution / precision
+        )
+        weakest = int(np.argmin(strength))
+        if strength[weakest] >= 1:
+            break
+        active = np.delete(active, weakest)
+    return active

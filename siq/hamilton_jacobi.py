@@ -1,0 +1,161 @@
+"""Gauss–Newton on the Hamilton–Jacobi equation ``∇V·(f + D∇V) = 0`` for V in a basis.
+
+The equation has false solutions that are just as exact as the true one: V flat along a direction, V = 0, and
+one for every invariant subspace of the linearisation. Where the iteration ends depends on where it starts;
+what it found must be tested by what does not know of this equation (`siq.certificate`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from siq.bases import Basis
+
+
+@dataclass(frozen=True)
+class HamiltonJacobi:
+    """The equation at some points.
+
+    Attributes
+    ----------
+    points
+        Shape ``(n, d)``.
+    gradients
+        ∂θ_j/∂x_i at the points, shape ``(n, d, m)``.
+    flow
+        f at the points, shape ``(n, d)``.
+    diffusion
+        D, shape ``(d, d)``.
+    weight
+        Shape ``(n,)``: one over ∣f∣ in the metric of the noise, so that fast regions do not rule.
+    """
+
+    points: np.ndarray
+    gradients: np.ndarray
+    flow: np.ndarray
+    diffusion: np.ndarray
+    weight: np.ndarray
+
+    def residual(self, coefficients: np.ndarray) -> np.ndarray:
+        """Weighted ``∇V·(f + D∇V)``, shape ``(n,)``."""
+        gradient = self.gradients @ coefficients
+        return self.weight * (gradient * (self.flow + gradient @ self.diffusion)).sum(axis=1)
+
+    def jacobian(self, coefficients: np.ndarray) -> np.ndarray:
+        """Derivative of the residual with respect to the coefficients, shape ``(n, m)``."""
+        gradient = self.gradients @ coefficients
+        along = self.weight[:, None] * (self.flow + 2 * gradient @ self.diffusion)
+        return np.einsum("nd,ndm->nm", along, self.gradients)
+
+    def restricted(self, rows: np.ndarray) -> HamiltonJacobi:
+        """The equation with some of the functions only."""
+        return replace(self, gradients=self.gradients[:, :, rows])
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Where Gauss–Newton ended.
+
+    Attributes
+    ----------
+    coefficients
+        Shape ``(m,)``.
+    residual
+        Root mean square of the weighted residual, divided by that of ∇V: the mean of
+        ``∣∇V·(f + D∇V)∣ / (∣∇V∣ ∣f∣)``.
+    converged
+        Whether the last step was too small to matter.
+    """
+
+    coefficients: np.ndarray
+    residual: float
+    converged: bool
+
+
+def equation_at(basis: Basis, x: np.ndarray, flow: np.ndarray, *, diffusion: np.ndarray) -> HamiltonJacobi:
+    """The equation at those of some points where f does not vanish; points and f are ``(n, d)`` each."""
+    speed = np.sqrt(np.einsum("ni,ij,nj->n", flow, np.linalg.inv(diffusion), flow))
+    moving = speed > 1e-9 * speed.max()
+    return HamiltonJacobi(x[moving], basis.gradients(x[moving]), flow[moving], diffusion, 1 / speed[moving])
+
+
+def gauss_newton(
+    equation: HamiltonJacobi,
+    start: np.ndarray,
+    *,
+    free: np.ndarray | None = None,
+    steps: int = 60,
+    tolerance: float = 1e-13,
+) -> Solution:
+    """Minimise the sum of squares of the residual.
+
+    Parameters
+    ----------
+    equation
+        At points.
+    start
+        Coefficients to start from, shape ``(m,)``.
+    free
+        Which coefficients may change, as a mask; default all.
+    steps, tolerance
+        Most steps, and the relative change of the coefficients at which to end.
+    """
+    coefficients = start.copy()
+    free = np.ones(len(start), dtype=bool) if free is None else free
+    scale = np.sqrt((equation.gradients**2).sum(axis=1).mean(axis=0))
+    scale = np.where(scale > 0, scale, 1.0)
+    residual = equation.residual(coefficients)
+    converged = not free.any()
+    for _ in range(steps if free.any() else 0):
+        jacobian = equation.jacobian(coefficients)[:, free] / scale[free]
+        # Directions that the points do not determine are left as they are.
+        step = np.linalg.lstsq(jacobian, -residual, rcond=1e-11)[0] / scale[free]
+        length = 1.0
+        while True:
+            trial = coefficients.copy()
+            trial[free] += length * step
+            attempt = equation.residual(trial)
+            if np.linalg.norm(attempt) < np.linalg.norm(residual) or length < 1e-3:
+                break
+            length /= 2
+        improved = np.linalg.norm(attempt) < np.linalg.norm(residual)
+        change = np.linalg.norm(length * step * scale[free])
+        size = np.linalg.norm(coefficients * scale)
+        if improved:
+            gain = 1 - np.linalg.norm(attempt) / max(np.linalg.norm(residual), 1e-300)
+            coefficients, residual = trial, attempt
+        if not improved or change <= tolerance * size or gain < 1e-7:
+            converged = True
+            break
+    return Solution(coefficients, relative_residual(equation, coefficients), converged)
+
+
+def relative_residual(equation: HamiltonJacobi, coefficients: np.ndarray) -> float:
+    """Rms of the weighted residual over rms of ∇V; infinite for V = 0."""
+    gradient = equation.gradients @ coefficients
+    size = np.sqrt(np.einsum("ni,ij,nj->n", gradient, equation.diffusion, gradient).mean())
+    return float(np.sqrt((equation.residual(coefficients) ** 2).mean()) / size) if size > 0 else np.inf
+
+
+def sensitivity(
+    equation: HamiltonJacobi, coefficients: np.ndarray, *, field_terms: np.ndarray, components: np.ndarray
+) -> np.ndarray:
+    """How the coefficients of V follow those of f, to first order: ∂ξ/∂c, shape ``(m, p)``.
+
+    Parameters
+    ----------
+    equation, coefficients
+        A solution.
+    field_terms
+        The functions of the p coefficients of f at the points, shape ``(n, p)``.
+    components
+        Shape ``(p,)``: the component of f that each belongs to.
+    """
+    gradient = equation.gradients @ coefficients
+    forcing = equation.weight[:, None] * gradient[:, components] * field_terms
+    jacobian = equation.jacobian(coefficients)
+    scale = np.linalg.norm(jacobian, axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    return -np.linalg.lstsq(jacobian / scale, forcing, rcond=1e-11)[0] / scale[:, None]

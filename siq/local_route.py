@@ -1,0 +1,249 @@
+"""The local route: V about one attractor, from f alone, grown outwards to the lowest saddle.
+
+At the attractor the Hessian of V is M, which follows from the Jacobian of f, and it is kept. The higher powers
+are found by Gauss–Newton on the Hamilton–Jacobi equation in a sublevel set that grows from a small ellipsoid.
+No network takes part. Beyond the lowest saddle the well ends, and nothing is claimed there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import sympy
+
+from siq.errors import NumericalFailure
+from siq.bases import PowerBasis, power_basis
+from siq.equilibria import Descents, Equilibrium, follow, hessian_at
+from siq.hamilton_jacobi import equation_at, gauss_newton
+from siq.thinning import representative_subset
+from siq.vector_field import VectorField
+
+GROWTH = 1.5  # of the level, from one fit to the next
+MOST_POINTS = 6000  # of one fit
+NEAREST = 600  # descents that start close to the attractor, where recordings leave directions out
+HIGHEST = 0.9  # share of the recorded starts below the level, where no saddle limits it
+CLOSE = 0.1  # of the recorded box: a saddle so close to the points of the fit has been reached
+
+
+@dataclass(frozen=True)
+class Well:
+    """V about an attractor, up to a level.
+
+    Attributes
+    ----------
+    attractor
+        Shape ``(d,)``. V is zero there.
+    basis, coefficients
+        The powers about the attractor, and their coefficients, shape ``(m,)``.
+    level
+        V of the lowest saddle, or, where there is none, of the last point that recordings reach.
+    saddle
+        Position of that saddle, None where recordings end before one.
+    residual
+        Relative Hamilton–Jacobi residual within the level.
+    points
+        The points of the last fit, shape ``(n, d)``.
+    """
+
+    attractor: np.ndarray
+    basis: PowerBasis
+    coefficients: np.ndarray
+    level: float
+    saddle: np.ndarray | None
+    residual: float
+    points: np.ndarray
+
+    @property
+    def potential(self) -> sympy.Expr:
+        """V as a formula."""
+        return self.basis.expression(self.coefficients)
+
+    def values(self, x: np.ndarray) -> np.ndarray:
+        """V at points ``(n, d)``."""
+        return self.basis.values(x) @ self.coefficients
+
+
+@dataclass(frozen=True)
+class Region:
+    """Points along descents to one attractor; what follows each point on its way is known.
+
+    Attributes
+    ----------
+    states
+        Shape ``(n, k, d)``: descents that end at the attractor.
+    chosen
+        Shape ``(s, 2)``: descent and place of evenly spread points among them.
+    """
+
+    states: np.ndarray
+    chosen: np.ndarray
+
+    def below(self, values: np.ndarray, level: float) -> np.ndarray:
+        """Rows of `chosen` from which the way down stays below a level.
+
+        Parameters
+        ----------
+        values
+            V along the descents, shape ``(n, k)``.
+        level
+            The level.
+        """
+        highest = np.maximum.accumulate(values[:, ::-1], axis=1)[:, ::-1]
+        return np.flatnonzero(highest[self.chosen[:, 0], self.chosen[:, 1]] < level)
+
+    def points(self, rows: np.ndarray) -> np.ndarray:
+        """The states of some rows of `chosen`."""
+        return self.states[self.chosen[rows, 0], self.chosen[rows, 1]]
+
+
+def region_of(
+    field: VectorField,
+    descents: Descents,
+    index: int,
+    attractors: Sequence[Equilibrium],
+    *,
+    diffusion: np.ndarray,
+    box: np.ndarray,
+    generator: np.random.Generator,
+) -> Region:
+    """The points from which f leads to an attractor.
+
+    Parameters
+    ----------
+    field
+        f.
+    descents
+        From recorded points.
+    index, attractors
+        Which of the attractors.
+    diffusion
+        D.
+    box
+        Shape ``(d, 2)``: the recorded region.
+    generator
+        Draws further starts close to the attractor.
+    """
+    center, d = attractors[index].position, len(box)
+    width = box[:, 1] - box[:, 0]
+    recorded = descents.paths[descents.ends == index]
+    # Recordings approach an attractor along its slow directions; V needs all of them.
+    hessian = hessian_at(field, center, diffusion=diffusion)
+    offsets = recorded[:, 0] - center
+    reach = np.quantile(np.einsum("ni,ij,nj->n", offsets, hessian, offsets), 0.3)
+    directions = generator.standard_normal((NEAREST, d))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    radii = np.sqrt(reach) * generator.uniform(0.02, 1.0, (NEAREST, 1))
+    starts = center + (radii * directions) @ np.linalg.inv(np.linalg.cholesky(hessian))
+    starts = starts[((starts > box[:, 0]) & (starts < box[:, 1])).all(axis=1)]
+    near = follow(field, starts, attractors, box=box)
+    states = np.concatenate([recorded, near.paths[near.ends == index]])
+    # Evenly spread, and denser towards the attractor, from where the fit grows.
+    flat = (states.reshape(-1, d) - center) / width
+    warped = flat / np.sqrt(np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-6))
+    rows = representative_subset(warped, distance=0.6 * MOST_POINTS ** (-1 / d), generator=generator)
+    return Region(states, np.stack(np.divmod(rows, states.shape[1]), axis=1))
+
+
+def grow_well(
+    field: VectorField,
+    attractor: Equilibrium,
+    region: Region,
+    saddles: Sequence[Equilibrium],
+    *,
+    diffusion: np.ndarray,
+    degree: int,
+    generator: np.random.Generator,
+) -> Well:
+    """V about an attractor up to its lowest saddle.
+
+    Parameters
+    ----------
+    field
+        f.
+    attractor
+        Where V is zero.
+    region
+        Recorded points that lead to it; the well cannot reach beyond them.
+    saddles
+        The saddles next to it.
+    diffusion
+        D.
+    degree
+        Highest power.
+    generator
+        Decides which points are used where there are too many.
+    """
+    hessian = hessian_at(field, attractor.position, diffusion=diffusion)
+    extent = np.sqrt(np.diag(np.linalg.inv(hessian)))
+    flat = region.states.reshape(-1, region.states.shape[2])
+    offsets = flat - attractor.position
+    quadratic = 0.5 * np.einsum("ni,ij,nj->n", offsets, hessian, offsets).reshape(region.states.shape[:2])
+    basis = power_basis(
+        field.symbols, attractor.position, extent * np.sqrt(2 * np.quantile(quadratic[:, 0], 0.5)), degree=degree
+    )
+    order = basis.exponents.sum(axis=1)
+    free = order > 2
+    coefficients = np.zeros(basis.size)
+    for index in np.flatnonzero(~free):
+        i, j = np.repeat(np.arange(len(extent)), basis.exponents[index])
+        factor = 0.5 if i == j else 1.0
+        coefficients[index] = factor * hessian[i, j] * basis.scale[i] * basis.scale[j]
+    functions = basis.values(flat)
+
+    def along(current: np.ndarray) -> np.ndarray:
+        return (functions @ current).reshape(region.states.shape[:2])
+
+    tops = np.array([one.position for one in saddles]).reshape(-1, len(extent))
+    width = np.ptp(flat, axis=0)
+    values = along(coefficients)
+    # The first level has points enough for all coefficients.
+    reached = np.sort(np.maximum.accumulate(values[:, ::-1], axis=1)[:, ::-1][tuple(region.chosen.T)])
+    level = float(reached[min(4 * basis.size, len(reached) - 1)])
+    residual, points, final = np.inf, np.zeros((0, len(extent))), 0
+    for _ in range(80):
+        rows = region.below(values, level)
+        if len(rows) > MOST_POINTS:
+            rows = np.sort(generator.choice(rows, MOST_POINTS, replace=False))
+        points = region.points(rows)
+        if len(points) < 2 * basis.size:
+            raise NumericalFailure(
+                f"only {len(points)} recorded states lead to the attractor near {attractor.position.round(4)}"
+            )
+        equation = equation_at(basis, points, field(points), diffusion=diffusion)
+        solution = gauss_newton(equation, coefficients, free=free, steps=8 if final == 0 else 40)
+        coefficients, residual = solution.coefficients, solution.residual
+        if final >= 3:
+            break
+        values = along(coefficients)
+        limit = min(_lowest(basis.values(tops) @ coefficients, tops, points, width, level),
+                    float(np.quantile(values[:, 0], HIGHEST)))  # fmt: skip
+        if GROWTH * level >= limit:
+            final += 1
+            level = limit
+        else:
+            level *= GROWTH
+    saddle = None
+    if len(tops):
+        heights = basis.values(tops) @ coefficients
+        nearest = int(np.argmin(np.abs(heights - level)))
+        if abs(heights[nearest] - level) < 0.05 * level:
+            saddle, level = tops[nearest], float(heights[nearest])
+    return Well(attractor.position, basis, coefficients, level, saddle, residual, points)
+
+
+def _lowest(
+    heights: np.ndarray, tops: np.ndarray, points: np.ndarray, width: np.ndarray, level: float
+) -> float:
+    """V of the lowest saddle, as far as the current V can be believed there.
+
+    Far from the points of the fit it is an extrapolation: a saddle that seems to lie lower than points
+    already reached does not count, unless they are close to it.
+    """
+    believed = [
+        height
+        for height, top in zip(heights, tops, strict=True)
+        if height > level or np.abs((points - top) / width).max(axis=1).min() < CLOSE
+    ]
+    return float(min((height for height in believed if height > 0), default=np.inf))
