@@ -2,7 +2,7 @@
 
 With ``R = ∇V·(f + D∇V)``, and V* the true one, both zero at an attractor:
 
-- following ``dx/dt = f + 2D∇V`` up to x costs the action ``V(x) - ∫R dt``, so that V*(x) is no more than that;
+- following ``dx/dt = f + 2D∇V`` up to x costs the action ``V(x) - ∫R dt``, so that V*(x) is not more;
 - along the true minimum action path, Young's inequality gives ``V*(x) ≥ V(x) - ∫R dt``.
 
 The first integral can be computed. Where residuals are small the two paths are close, and the integral of

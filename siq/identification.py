@@ -19,7 +19,7 @@ from typing import Annotated
 
 import numpy as np
 import scipy.linalg
-import scipy.stats
+import scipy.special
 import sympy
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
@@ -100,7 +100,7 @@ class IdentifiedField:
 
     @cached_property
     def field(self) -> VectorField:
-        """f as formulas."""
+        """F as formulas."""
         return self.with_coefficients(self.coefficients[self.support[:, 1], self.support[:, 0]])
 
     @property
@@ -116,7 +116,7 @@ class IdentifiedField:
         return errors
 
     def with_coefficients(self, values: np.ndarray) -> VectorField:
-        """f with other values of its p coefficients, such as a draw from their distribution."""
+        """F with other values of its p coefficients, such as a draw from their distribution."""
         equations = [sympy.S.Zero] * self.library.dimension
         for (component, term), value in zip(self.support, values, strict=True):
             equations[component] += sympy.Float(float(value), 17) * self.library.terms[term]
@@ -267,7 +267,7 @@ def _identify(
         velocity = full.corrected(values, flow, rate)
         triangle = _triangle(full.theta, velocity, weight)
         solution = np.linalg.lstsq(triangle[:q, :q], triangle[:q, q:], rcond=1e-14)[0]
-        change = np.abs((solution.T.ravel() - values))
+        change = np.abs(solution.T.ravel() - values)
         values = solution.T.ravel()
         leftover = triangle[q:, q:]
         rate = leftover.T @ leftover / n
@@ -295,9 +295,7 @@ def _identify(
     support = np.array(chosen)
     for i, k in chosen:
         coefficients[k, i] = values[i * q + k]
-    found = IdentifiedField(
-        library, coefficients, support, np.eye(len(support)), rate, float(ratio), flow
-    )
+    found = IdentifiedField(library, coefficients, support, np.eye(len(support)), rate, float(ratio), flow)
     found = _fit_support(found, _Problem(library, pairs, support))
     # With the final support and flow a term may turn out to be superfluous after all.
     while (weak := _weakest(found, options)) is not None:
@@ -319,7 +317,7 @@ def _triangle(theta: np.ndarray, velocity: np.ndarray, weight: np.ndarray) -> np
 
 
 def _critical(options: IdentificationOptions, candidates: int) -> float:
-    return float(scipy.stats.norm.isf(options.false_terms / (2 * candidates)))
+    return float(-scipy.special.ndtri(options.false_terms / (2 * candidates)))
 
 
 def _significant(

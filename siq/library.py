@@ -146,6 +146,29 @@ def candidate_library(
     )
 
 
+def joint_library(
+    of_field: CandidateLibrary, *, degree: int, potential_degree: int, further: Sequence[str] = ()
+) -> CandidateLibrary:
+    """A library for V that also holds every function of f's library.
+
+    Parameters
+    ----------
+    of_field
+        The functions of f.
+    degree, potential_degree, further
+        As for `candidate_library`. V may also use the functions of f that are no monomials.
+    """
+    highest, others = degree, list(further)
+    for name, term in zip(of_field.names, of_field.terms, strict=True):
+        if term.is_polynomial(*of_field.symbols):
+            highest = max(highest, sum(int(power) for power in term.as_poly(*of_field.symbols).monoms()[0]))
+        elif name not in others:
+            others.append(name)
+    return candidate_library(
+        of_field.states, degree=highest, potential_degree=potential_degree, further=others
+    )
+
+
 def monomial_exponents(dimension: int, degree: int) -> list[tuple[int, ...]]:
     """Exponents of all monomials up to a total degree, by degree and then as a dictionary would."""
     return [

@@ -1,21 +1,21 @@
 """The local route: V about one attractor, from f alone, grown outwards to the lowest saddle.
 
-At the attractor the Hessian of V is M, which follows from the Jacobian of f, and it is kept. The higher powers
-are found by Gauss–Newton on the Hamilton–Jacobi equation in a sublevel set that grows from a small ellipsoid.
+At the attractor the Hessian of V is M, which follows from the Jacobian of f, and it is kept. The higher
+powers are found by Gauss–Newton on the Hamilton–Jacobi equation in a sublevel set that grows from a small ellipsoid.
 No network takes part. Beyond the lowest saddle the well ends, and nothing is claimed there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import sympy
 
-from siq.errors import NumericalFailure
 from siq.bases import PowerBasis, power_basis
 from siq.equilibria import Descents, Equilibrium, follow, hessian_at
+from siq.errors import NumericalFailure
 from siq.hamilton_jacobi import equation_at, gauss_newton
 from siq.thinning import representative_subset
 from siq.vector_field import VectorField
@@ -63,6 +63,14 @@ class Well:
     def values(self, x: np.ndarray) -> np.ndarray:
         """V at points ``(n, d)``."""
         return self.basis.values(x) @ self.coefficients
+
+    def gradients(self, x: np.ndarray) -> np.ndarray:
+        """∇V at points, shape ``(n, d)``."""
+        return self.basis.gradients(x) @ self.coefficients
+
+    def hessians(self, x: np.ndarray) -> np.ndarray:
+        """∇²V at points, shape ``(n, d, d)``."""
+        return self.basis.hessians(x) @ self.coefficients
 
 
 @dataclass(frozen=True)
@@ -181,7 +189,10 @@ def grow_well(
     offsets = flat - attractor.position
     quadratic = 0.5 * np.einsum("ni,ij,nj->n", offsets, hessian, offsets).reshape(region.states.shape[:2])
     basis = power_basis(
-        field.symbols, attractor.position, extent * np.sqrt(2 * np.quantile(quadratic[:, 0], 0.5)), degree=degree
+        field.symbols,
+        attractor.position,
+        extent * np.sqrt(2 * np.quantile(quadratic[:, 0], 0.5)),
+        degree=degree,
     )
     order = basis.exponents.sum(axis=1)
     free = order > 2
@@ -247,3 +258,50 @@ def _lowest(
         if height > level or np.abs((points - top) / width).max(axis=1).min() < CLOSE
     ]
     return float(min((height for height in believed if height > 0), default=np.inf))
+
+
+def fit_well(
+    field: VectorField,
+    attractor: Equilibrium,
+    region: Region,
+    saddles: Sequence[Equilibrium],
+    potential: Callable[[np.ndarray], np.ndarray],
+    *,
+    diffusion: np.ndarray,
+    degree: int,
+    generator: np.random.Generator,
+) -> Well:
+    """V about an attractor by the network route: from values of V, refined without M.
+
+    Where one formula cannot hold over several wells, the network route takes each for itself, within what
+    the network says is its level.
+
+    Parameters
+    ----------
+    potential
+        V_θ, points ``(n, d)`` to values ``(n,)``, up to a constant.
+    field, attractor, region, saddles, diffusion, degree, generator
+        As for `grow_well`.
+    """
+    lowest = float(potential(attractor.position[None])[0])
+    flat = region.states.reshape(-1, region.states.shape[2])
+    along = (potential(flat) - lowest).reshape(region.states.shape[:2])
+    tops = np.array([one.position for one in saddles]).reshape(-1, flat.shape[1])
+    heights = potential(tops) - lowest if len(tops) else np.array([np.inf])
+    level = min(float(heights.min()), float(np.quantile(along[:, 0], HIGHEST)))
+    rows = region.below(along, level)
+    if len(rows) > MOST_POINTS:
+        rows = np.sort(generator.choice(rows, MOST_POINTS, replace=False))
+    points = region.points(rows)
+    scale = np.abs(points - attractor.position).max(axis=0) if len(points) else np.ones(flat.shape[1])
+    basis = power_basis(field.symbols, attractor.position, np.where(scale > 0, scale, 1.0), degree=degree)
+    if len(points) < 2 * basis.size:
+        raise NumericalFailure(
+            f"the networks leave only {len(points)} recorded states below the saddle of the attractor near"
+            f" {attractor.position.round(4)}"
+        )
+    start = np.linalg.lstsq(basis.values(points), potential(points) - lowest, rcond=1e-10)[0]
+    equation = equation_at(basis, points, field(points), diffusion=diffusion)
+    solution = gauss_newton(equation, start)
+    nearest = tops[int(np.argmin(heights))] if len(tops) else None
+    return Well(attractor.position, basis, solution.coefficients, level, nearest, solution.residual, points)

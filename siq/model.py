@@ -11,12 +11,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import sympy
 
+from siq.bases import PowerBasis
 from siq.errors import InputError
 from siq.expressions import FormulaError, parse_formula
 from siq.files import whole_file
-from siq.symbolic import SymbolicDecomposition
+from siq.symbolic import SymbolicDecomposition, WellFormula
 
 
 def expression_to_data(expression: sympy.Expr, symbols: Sequence[sympy.Symbol]) -> dict[str, Any]:
@@ -58,19 +60,49 @@ def model_to_data(
     if not decompositions:
         return {"states": [], "methods": {}, "certificate": {}}
     symbols = next(iter(decompositions.values())).symbols
-    methods = {
-        method: {
-            "V": expression_to_data(one.potential, symbols),
-            "g": [expression_to_data(component, symbols) for component in one.circulatory],
-            "f": [expression_to_data(component, symbols) for component in one.vector_field],
-        }
-        for method, one in decompositions.items()
-    }
+    methods = {method: _decomposition_to_data(one) for method, one in decompositions.items()}
     return {
         "states": [symbol.name for symbol in symbols],
         "methods": methods,
         "certificate": {method: dict(certificates[method]) for method in decompositions},
     }
+
+
+def _decomposition_to_data(one: SymbolicDecomposition) -> dict[str, Any]:
+    symbols = one.symbols
+    data: dict[str, Any] = {
+        "V": None if one.potential is None else expression_to_data(one.potential, symbols),
+        "g": [expression_to_data(component, symbols) for component in one.circulatory],
+        "f": [expression_to_data(component, symbols) for component in one.vector_field],
+    }
+    if one.wells:
+        data["wells"] = [
+            {"attractor": list(well.attractor), "level": well.level, "V": _powers_to_data(well)}
+            for well in one.wells
+        ]
+    if one.standard_errors:
+        data["standard_errors"] = {name: dict(errors) for name, errors in one.standard_errors.items()}
+    return data
+
+
+def _powers_to_data(well: WellFormula) -> dict[str, Any]:
+    basis = well.basis
+    return {
+        "center": basis.center.tolist(),
+        "scale": basis.scale.tolist(),
+        "exponents": basis.exponents.tolist(),
+        "coefficients": well.coefficients.tolist(),
+    }
+
+
+def _well_from_data(data: Mapping[str, Any], symbols: tuple[sympy.Symbol, ...]) -> WellFormula:
+    powers = data["V"]
+    basis = PowerBasis(
+        symbols, np.array(powers["center"]), np.array(powers["scale"]), np.array(powers["exponents"])
+    )
+    return WellFormula(
+        tuple(data["attractor"]), float(data["level"]), basis, np.array(powers["coefficients"], dtype=float)
+    )
 
 
 def write_model(path: str | Path, model: Mapping[str, Any]) -> None:
@@ -93,9 +125,11 @@ def read_model(path: str | Path) -> tuple[dict[str, SymbolicDecomposition], dict
         decompositions = {
             method: SymbolicDecomposition(
                 symbols=symbols,
-                potential=expression_from_data(one["V"], symbols),
+                potential=None if one["V"] is None else expression_from_data(one["V"], symbols),
                 circulatory=tuple(expression_from_data(part, symbols) for part in one["g"]),
                 vector_field=tuple(expression_from_data(part, symbols) for part in one["f"]),
+                wells=tuple(_well_from_data(well, symbols) for well in one.get("wells", [])),
+                standard_errors=one.get("standard_errors", {}),
             )
             for method, one in data["methods"].items()
         }

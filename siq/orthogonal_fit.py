@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
-import scipy.stats
+import scipy.special
 
 from siq.identification import IdentifiedField
 from siq.library import CandidateLibrary
@@ -49,7 +49,7 @@ class OrthogonalFit:
     @property
     def probability(self) -> float:
         """Probability of so large a distance by chance: tiny where no such V and g exist."""
-        return float(scipy.stats.chi2.sf(self.chi_square, self.freedom)) if self.freedom else 1.0
+        return float(scipy.special.chdtrc(self.freedom, self.chi_square)) if self.freedom else 1.0
 
 
 def fit_orthogonal(

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import sympy
-from scipy.linalg import solve_continuous_lyapunov
 
+from siq.equilibria import classify, hessian_at
 from siq.expressions import compile_formulas
 from siq.library import monomial_exponents
 from siq.vector_field import VectorField
@@ -89,35 +89,6 @@ class PowerSeries:
         return coefficients @ values
 
 
-def attractor_hessian(jacobian: np.ndarray, diffusion: np.ndarray) -> np.ndarray:
-    """Hessian of V at an attractor: ``M = W⁻¹`` with ``J W + W Jᵀ = -2 D``.
-
-    Parameters
-    ----------
-    jacobian
-        J = ∂f_i/∂x_j at the attractor, shape ``(d, d)``.
-    diffusion
-        D, shape ``(d, d)``.
-
-    Returns
-    -------
-    numpy.ndarray
-        M, shape ``(d, d)``, symmetric and positive definite. The quasipotential U = 2V has Hessian 2M, and
-        the stationary distribution near the attractor the covariance εW/2.
-
-    Raises
-    ------
-    ValueError
-        When J is not stable: then there is no attractor.
-    """
-    rates = np.linalg.eigvals(jacobian).real
-    if not rates.max() < 0:
-        raise ValueError(f"the equilibrium is not stable: its Jacobian has the rate {rates.max():.3g}")
-    spread = solve_continuous_lyapunov(jacobian, -2 * diffusion)
-    hessian = np.linalg.inv((spread + spread.T) / 2)
-    return (hessian + hessian.T) / 2
-
-
 def quasipotential_series(
     field: VectorField, attractor: np.ndarray, *, diffusion: np.ndarray, degree: int
 ) -> PowerSeries:
@@ -151,7 +122,11 @@ def quasipotential_series(
     basis = _Homogeneous(field.dimension, degree)
     force = _taylor(field, center, basis, degree - 1)
     jacobian = field.jacobian(center[None])[0]
-    hessian = attractor_hessian(jacobian, diffusion)
+    if classify(field, center).kind != "attractor":
+        raise ValueError(
+            f"{center.tolist()} is no attractor: its Jacobian has an eigenvalue that does not decay"
+        )
+    hessian = hessian_at(field, center, diffusion=diffusion)
     # States in units of their spread: without this the systems mix coefficients of very different sizes.
     scale = np.sqrt(np.diag(np.linalg.inv(hessian)))
     _check_equilibrium(force[0][:, 0], jacobian, center, scale)

@@ -38,7 +38,8 @@ def coefficient_table(
     Returns
     -------
     pandas.DataFrame
-        Columns ``run method component term estimate exact``; `exact` is missing where nothing is known.
+        Columns ``run method component term estimate exact standard_error``; `exact` and
+        `standard_error` are missing where nothing is known.
     """
     rows: list[dict[str, object]] = []
     known = exact.components() if exact is not None else {}
@@ -55,6 +56,7 @@ def coefficient_table(
                     "term": term,
                     "estimate": estimates.get(term, 0.0),
                     "exact": np.nan if truths is None else truths.get(term, 0.0),
+                    "standard_error": identified.standard_errors.get(component, {}).get(term, np.nan),
                 }
             )
     return as_table("coefficients", rows)

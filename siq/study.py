@@ -13,11 +13,14 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from siq.certificate import CertificateOptions
 from siq.decomposition.options import TrainingOptions
 from siq.documents import read_document, validate
 from siq.errors import InputError
 from siq.expressions import FormulaError
+from siq.identification import IdentificationOptions
 from siq.library import candidate_library
+from siq.refinement import RefinementOptions
 from siq.regression import RegressionOptions
 from siq.simulate import SimulationOptions, sampling_stride
 from siq.systems import Diffusion, Name, System, diffusion_matrix, load_system
@@ -39,6 +42,9 @@ class RecordingsOptions(BaseModel):
         Consecutive samples no further apart than this are pairs; by default all are.
     diffusion
         D, in the recordings' units, where no system gives it; by default the identity.
+    integrator_step
+        Step of the Euler–Maruyama simulation that made the recordings, where one did: its increments are
+        those of a map, from which the continuous process is then found. Leave it out for measurements.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -47,6 +53,7 @@ class RecordingsOptions(BaseModel):
     states: Annotated[tuple[Name, ...], Field(min_length=1)] | None = None
     pair_step: Annotated[float, Field(gt=0)] | None = None
     diffusion: Diffusion | None = None
+    integrator_step: Annotated[float, Field(gt=0)] | None = None
 
     @field_validator("states")
     @classmethod
@@ -76,8 +83,10 @@ class Study(BaseModel):
         Seed of everything random.
     published
         Name of a file of published figures to be set beside the results.
-    simulation, training, regression
+    simulation, identification, training, regression, refinement, certificate
         The parameters of the steps.
+    invariant
+        Noise intensities ε for which the invariant distribution is computed, and simulated.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -90,8 +99,12 @@ class Study(BaseModel):
     seed: Annotated[int, Field(ge=0)] = 0
     published: str | None = None
     simulation: SimulationOptions = SimulationOptions()
+    identification: IdentificationOptions = IdentificationOptions()
     training: TrainingOptions = TrainingOptions()
     regression: RegressionOptions = RegressionOptions()
+    refinement: RefinementOptions = RefinementOptions()
+    certificate: CertificateOptions = CertificateOptions()
+    invariant: tuple[Annotated[float, Field(gt=0)], ...] = ()
 
     @field_validator("published")
     @classmethod
@@ -187,12 +200,17 @@ def check_states(study: Study, states: Sequence[str], *, file: str) -> None:
     try:
         if study.recordings is not None and study.system is None:
             diffusion_matrix(study.recordings.diffusion or "identity", len(states))
-        candidate_library(states, degree=1, further=study.regression.functions)
-    except FormulaError as error:
-        raise InputError(file, "regression.functions", error.fault, error.remedy) from None
     except ValueError as error:
         fault, remedy = str(error).split("; ", 1)
         raise InputError(file, "recordings.diffusion", fault, remedy) from None
+    for step, functions in (
+        ("identification", study.identification.functions),
+        ("regression", study.regression.functions),
+    ):
+        try:
+            candidate_library(states, degree=1, further=functions)
+        except FormulaError as error:
+            raise InputError(file, f"{step}.functions", error.fault, error.remedy) from None
 
 
 def system_path(system: str, *, systems: Path) -> Path:

@@ -5,18 +5,44 @@ A formula is a sympy expression of the states. `model.json` (`siq.model`) is how
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 import scipy.optimize
 import sympy
 
+from siq.bases import PowerBasis
 from siq.errors import NumericalFailure
 from siq.expressions import compile_formulas, exact_number
 from siq.library import CandidateLibrary, linear_combination
 from siq.systems import System
+
+
+@dataclass(frozen=True)
+class WellFormula:
+    """V about one attractor.
+
+    Attributes
+    ----------
+    attractor
+        Where V is zero.
+    level
+        V of the lowest saddle, up to which the formula holds.
+    basis, coefficients
+        V in powers about the attractor.
+    """
+
+    attractor: tuple[float, ...]
+    level: float
+    basis: PowerBasis
+    coefficients: np.ndarray
+
+    @property
+    def potential(self) -> sympy.Expr:
+        """V."""
+        return self.basis.expression(self.coefficients)
 
 
 @dataclass(frozen=True)
@@ -28,30 +54,43 @@ class SymbolicDecomposition:
     symbols
         The d states.
     potential
-        V, zero at its minimum.
-    circulatory, vector_field
-        Components of g and of f.
+        V, zero at its minimum; None where no single formula holds over the wells.
+    circulatory
+        Components of g; none where there is no V.
+    vector_field
+        Components of f.
+    wells
+        V about each attractor, zero there and valid below a level, where it was found.
+    standard_errors
+        Of the coefficients, by component (``U``, ``V``, ``f_x``, ``g_x``) and term, where they are known.
     """
 
     symbols: tuple[sympy.Symbol, ...]
-    potential: sympy.Expr
+    potential: sympy.Expr | None
     circulatory: tuple[sympy.Expr, ...]
     vector_field: tuple[sympy.Expr, ...]
+    wells: tuple[WellFormula, ...] = ()
+    standard_errors: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     @property
     def quasipotential(self) -> sympy.Expr:
         """U = 2V, zero at its minimum: the action is ½∫∣φ̇ - f∣²dt, and p ~ exp(-U/ε) for √ε dW."""
-        return sympy.expand(2 * self.potential)
+        return sympy.expand(2 * self._potential())
 
     @property
     def gradient(self) -> tuple[sympy.Expr, ...]:
         """∇V."""
-        return tuple(self.potential.diff(symbol) for symbol in self.symbols)
+        return tuple(self._potential().diff(symbol) for symbol in self.symbols)
+
+    def _potential(self) -> sympy.Expr:
+        if self.potential is None:
+            raise ValueError("no single formula of V was found; each well has its own")
+        return self.potential
 
     @cached_property
     def evaluate(self) -> Callable[[np.ndarray], np.ndarray]:
         """V, g_1 … g_d, f_1 … f_d: points as components ``(d, ...)`` to values ``(2d + 1, ...)``."""
-        return compile_formulas([self.potential, *self.circulatory, *self.vector_field], self.symbols)
+        return compile_formulas([self._potential(), *self.circulatory, *self.vector_field], self.symbols)
 
     @cached_property
     def evaluate_gradient(self) -> Callable[[np.ndarray], np.ndarray]:
@@ -60,9 +99,10 @@ class SymbolicDecomposition:
 
     def components(self) -> dict[str, sympy.Expr]:
         """The formulas by the names that tables give them: ``U``, ``V``, ``f_x``, ``g_x`` and so on."""
-        formulas = {"U": self.quasipotential, "V": self.potential}
+        formulas = {} if self.potential is None else {"U": self.quasipotential, "V": self.potential}
         formulas |= {f"f_{s}": f for s, f in zip(self.symbols, self.vector_field, strict=True)}
-        formulas |= {f"g_{s}": g for s, g in zip(self.symbols, self.circulatory, strict=True)}
+        if self.circulatory:
+            formulas |= {f"g_{s}": g for s, g in zip(self.symbols, self.circulatory, strict=True)}
         return formulas
 
 

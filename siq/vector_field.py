@@ -33,7 +33,7 @@ class VectorField:
         return len(self.symbols)
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
-        """f at points: ``(n, d)`` to ``(n, d)``."""
+        """F at points: ``(n, d)`` to ``(n, d)``."""
         return self._values(_components(x)).T
 
     def jacobian(self, x: np.ndarray) -> np.ndarray:

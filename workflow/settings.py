@@ -113,8 +113,8 @@ class CheckedStudy:
         """Parts of the study as plain data.
 
         Beside the study's own keys there are ``dynamics`` (what a simulation depends on), ``metric`` (the
-        states and D) and ``exact`` (what scoring depends on), so that a change of a card's title, or of
-        its exact answer, simulates nothing again.
+        states and D), ``prediction`` (the certificate's limit for f) and ``exact`` (what scoring depends on),
+        so that a change of a card's title, or of its exact answer, simulates nothing again.
         """
         return {key: self._part(key) for key in keys}
 
@@ -137,6 +137,8 @@ class CheckedStudy:
             return {"states": states and list(states), "diffusion": diffusion, "units": units}
         if key == "simulation" and self.study.recordings is not None:
             return None  # nothing is simulated, and nothing shall run again for it
+        if key == "prediction":
+            return self.study.certificate.prediction
         if key == "exact":
             return None if system is None else str(system.exact_quasipotential)
         value = getattr(self.study, key)

@@ -152,6 +152,26 @@ def select_run(networks: Networks, run: int) -> Networks:
     )
 
 
+def join_runs(parts: Sequence[Networks]) -> Networks:
+    """Networks of several runs side by side; the inverse of `select_run`."""
+
+    def together(layers: Sequence[tuple[Layer, ...]]) -> tuple[Layer, ...]:
+        return tuple(
+            (torch.cat([weights for weights, _ in layer]), torch.cat([biases for _, biases in layer]))
+            for layer in zip(*layers, strict=True)
+        )
+
+    return Networks(
+        potential=together([part.potential for part in parts]),
+        circulatory=together([part.circulatory for part in parts]),
+        mean=torch.cat([part.mean for part in parts]),
+        scale=torch.cat([part.scale for part in parts]),
+        potential_scale=torch.cat([part.potential_scale for part in parts]),
+        circulatory_scale=torch.cat([part.circulatory_scale for part in parts]),
+        diffusion=parts[0].diffusion,
+    )
+
+
 def move(networks: Networks, device: torch.device | str) -> Networks:
     """The same networks on another device, detached from any gradient."""
 

@@ -11,6 +11,35 @@ from siq.decomposition.matching import Kind, Order
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class CheckOptions:
+    """When a training may end before its last step: as soon as refinement will succeed from where it is.
+
+    The check refines the networks' V by itself, with parameters of its own, so that other parameters of
+    the regression or of the refinement train nothing again.
+
+    Attributes
+    ----------
+    first, every
+        Steps before the first check, and between checks.
+    degree
+        Highest power of V in the check.
+    residual
+        Largest relative Hamilton–Jacobi residual after it.
+    branch
+        Largest relative difference of the curvature of V from M at any attractor.
+    attempts
+        Trainings from fresh networks, if a training ends without having passed.
+    """
+
+    first: Annotated[int, Field(ge=1)] = 1000
+    every: Annotated[int, Field(ge=1)] = 500
+    degree: Annotated[int, Field(ge=2, le=12)] = 4
+    residual: Annotated[float, Field(gt=0)] = 0.05
+    branch: Annotated[float, Field(gt=0)] = 0.05
+    attempts: Annotated[int, Field(ge=1)] = 2
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class TrainingOptions:
     """How the networks are trained; every one of these changes the result.
 
@@ -19,7 +48,9 @@ class TrainingOptions:
     widths
         Neurons in the hidden layers of both networks.
     steps
-        Steps of Adam.
+        Steps of Adam, at most.
+    check
+        When a training may end earlier; left out, it takes all its steps.
     batch_size
         Pairs in the first term of the loss, and representative points in the second, per step.
     representative_share
@@ -56,6 +87,7 @@ class TrainingOptions:
 
     widths: Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1)] = (50, 50, 50)
     steps: Annotated[int, Field(ge=1)] = 150_000
+    check: CheckOptions | None = None
     batch_size: Annotated[int, Field(ge=1)] = 5000
     representative_share: Annotated[float, Field(ge=0, le=1)] = 0.0
     learning_rate: Annotated[float, Field(gt=0)] = 5e-3

@@ -96,8 +96,9 @@ def train(
     log_every: int = 500,
     checkpoint_every: int = 1000,
     checkpoint: Callable[[TrainingState], None] | None = None,
+    finished: Callable[[int, Networks], bool] | None = None,
 ) -> TrainingState:
-    """Train from a state to the last step.
+    """Train from a state to the last step, or until it is finished.
 
     Parameters
     ----------
@@ -115,11 +116,13 @@ def train(
         Steps between rows of the history, and between calls of `checkpoint`.
     checkpoint
         Called with the state as it stands; keeps it where it likes.
+    finished
+        Called at the steps of the check with the step and the networks; training ends when it says so.
 
     Returns
     -------
     TrainingState
-        After ``options.steps`` steps. Its history has one row a run and logged step: `training_loss` on
+        After ``options.steps`` steps, or when finished. Its history has one row a run and logged step: `training_loss` on
         the last batch, and on held-out pairs `held_out_loss`, the sum of `dynamics` and
         λ·`orthogonality`. A run whose loss is no longer finite keeps such rows and harms no other run.
     """
@@ -181,9 +184,17 @@ def train(
                 "step %d of %d, held-out loss %.3e, %.0f s left",
                 done, options.steps, float(total.mean()), left,
             )  # fmt: skip
+        if finished is not None and is_check(done, options) and finished(done, move(networks, "cpu")):
+            return snapshot(done)
         if checkpoint is not None and done % checkpoint_every == 0 and done < options.steps:
             checkpoint(snapshot(done))
-    return snapshot(options.steps)
+    return snapshot(max(options.steps, state.step))
+
+
+def is_check(step: int, options: TrainingOptions) -> bool:
+    """Whether training pauses at a step to see whether it may end."""
+    check = options.check
+    return check is not None and step >= check.first and (step - check.first) % check.every == 0
 
 
 class _Objective:

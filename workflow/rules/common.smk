@@ -96,12 +96,17 @@ def check_recordings(name):
         say_and_stop(error)
 
 
-def recordings_of_block(wildcards):
-    first, last = (int(run) for run in wildcards.block.split("-"))
-    return [
-        f"results/{wildcards.study}/runs/{run:03d}/recordings.parquet"
-        for run in range(first, last + 1)
-    ]
+def of_every_run(name):
+    """Input function: a file of each run that trains in a block."""
+
+    def files(wildcards):
+        first, last = (int(run) for run in wildcards.block.split("-"))
+        return [
+            f"results/{wildcards.study}/runs/{run:03d}/{name}"
+            for run in range(first, last + 1)
+        ]
+
+    return files
 
 
 def card_if_any(wildcards):
@@ -125,8 +130,10 @@ def all_outcomes(wildcards):
     """Input function: what became of every step of every run."""
     patterns = {
         "results/{study}/runs/{run}/draw.json": all_runs,
+        "results/{study}/runs/{run}/identify.json": all_runs,
         "results/{study}/training/{block}/train.json": all_blocks,
         "results/{study}/runs/{run}/regress.json": all_runs,
+        "results/{study}/runs/{run}/refine.json": all_runs,
         "results/{study}/runs/{run}/score.json": all_runs,
     }
     return [path for pattern, of in patterns.items() for path in of(pattern)(wildcards)]

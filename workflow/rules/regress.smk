@@ -7,7 +7,7 @@ rule regress:
         networks=of_block("networks.npz"),
         outcome=of_block("train.json"),
     output:
-        model="results/{study}/runs/{run}/model.json",
+        model="results/{study}/runs/{run}/regression.json",
         outcome="results/{study}/runs/{run}/regress.json",
     log:
         "results/{study}/logs/{run}/regress.log",

@@ -3,7 +3,8 @@
 
 rule train:
     input:
-        recordings=recordings_of_block,
+        recordings=of_every_run("recordings.parquet"),
+        fields=of_every_run("vector_field.json"),
     output:
         networks="results/{study}/training/{block}/networks.npz",
         history="results/{study}/training/{block}/history.parquet",
@@ -18,8 +19,6 @@ rule train:
     params:
         code=code("train.py"),
         study=parameters("seed", "recordings", "simulation", "training", "metric"),
-        # Not an output: a killed job keeps it, and the same command goes on from it.
-        checkpoint="results/{study}/training/{block}/checkpoint.npz",
     message:
         "{wildcards.study}, runs {wildcards.block}: training the networks"
     script:

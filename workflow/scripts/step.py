@@ -64,7 +64,8 @@ def read_outcomes(path: str | Path) -> list[dict[str, Any]]:
 def position_of(run: int, training: str | Path) -> tuple[int | None, str]:
     """Where a run stands among the networks of its block, or None and the reason."""
     mine = next(entry for entry in read_outcomes(training) if entry["run"] == run)
-    return (mine["position"], "") if mine["status"] == "ok" else (None, mine["reason"])
+    usable = mine["status"] in ("ok", "warning")
+    return (mine["position"], "") if usable else (None, mine["reason"])
 
 
 def pair_step(study: dict[str, Any]) -> float | None:
@@ -72,6 +73,14 @@ def pair_step(study: dict[str, Any]) -> float | None:
     if study["recordings"] is None:
         return study["simulation"]["pair_step"]
     return study["recordings"]["pair_step"]
+
+
+def integrator_step(study: dict[str, Any]) -> float | None:
+    """Step of the Euler–Maruyama simulation that made the recordings, None where none did."""
+    if study["recordings"] is not None:
+        return study["recordings"]["integrator_step"]
+    simulation = study["simulation"]
+    return simulation["pair_step"] / simulation["substeps"] if simulation["noise_intensity"] > 0 else None
 
 
 def read_run(path: str | Path) -> Recordings | None:

@@ -1,0 +1,246 @@
+"""Certificates of the formulas of a run: which tests apply to each, and on which points.
+
+`siq.certificate` has the tests themselves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from siq.certificate import (
+    Candidate,
+    CertificateOptions,
+    Verdict,
+    check_agreement,
+    check_branch,
+    check_descent,
+    check_error,
+    check_hamilton_jacobi,
+    check_identity,
+    stated_error,
+)
+from siq.expressions import compile_formulas
+from siq.identification import IdentifiedField
+from siq.local_route import Well
+from siq.outline import Outline
+from siq.refinement import Refined
+from siq.symbolic import SymbolicDecomposition
+
+HARMLESS = 1e-6  # a difference of the routes that no error needs to explain
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Whether a method's formulas may be believed, and why.
+
+    Attributes
+    ----------
+    tests
+        By name.
+    error
+        Relative error of V that has to be stated; infinite where unknown.
+    reason
+        What refused it, or what to know of it, in words.
+    scope
+        ``region``: one formula for the recorded region; ``wells``: one for each attractor.
+    """
+
+    tests: Mapping[str, Verdict]
+    error: float
+    reason: str
+    scope: str = "region"
+
+    @property
+    def certified(self) -> bool:
+        """Whether every test passed."""
+        return bool(self.tests) and all(verdict.passed for verdict in self.tests.values())
+
+    def as_data(self) -> dict[str, Any]:
+        """As it stands in model.json."""
+        return {
+            "certified": self.certified,
+            "scope": self.scope,
+            "stated_error": float(self.error) if np.isfinite(self.error) else None,
+            "reason": self.reason,
+            "tests": {name: verdict.as_data() for name, verdict in self.tests.items()},
+        }
+
+
+def certify_formulas(
+    formulas: SymbolicDecomposition,
+    found: IdentifiedField,
+    outline: Outline,
+    points: np.ndarray,
+    *,
+    diffusion: np.ndarray,
+    options: CertificateOptions,
+    prediction: Verdict,
+    relative_error: float = 0.0,
+    wells: Sequence[Well] = (),
+    seed: int = 0,
+) -> Certificate:
+    """Certificate of one formula for the whole region.
+
+    Parameters
+    ----------
+    formulas
+        V and g.
+    found, outline
+        The independently identified f, and the landscape's outline that follows from it.
+    points
+        Held-out states of the region for which the formula claims to hold, shape ``(n, d)``.
+    diffusion
+        D.
+    options
+        The limits.
+    prediction
+        The verdict on f.
+    relative_error
+        Relative standard error of V from the uncertainty of f.
+    wells
+        By the local route, to be compared with; without them there is no agreement to test.
+    seed
+        Draws of f, and the points on which the error is estimated.
+    """
+    candidate = _of_formulas(formulas, points, outline, relative_error)
+    tests = _common(candidate, found, diffusion, options, seed)
+    tests["identity"] = check_identity(candidate, found, diffusion=diffusion, limit=options.identity)
+    error, worst = stated_error(candidate, found, diffusion=diffusion, seed=seed)
+    tests["error"] = check_error(error, limit=options.error)
+    if wells:
+        # The local route shares the error of f, and has the rest of its own.
+        own = [_error_of(well, found, outline, diffusion, seed)[0] for well in wells]
+        tests["agreement"] = check_agreement(
+            candidate.values, wells, _sublevel_points(wells),
+            limit=HARMLESS + error + max(own) + 6 * relative_error,
+        )  # fmt: skip
+    tests["prediction"] = prediction
+    return _conclude(tests, error, worst, outline, "region")
+
+
+def certify_wells(
+    refined: Refined,
+    outline: Outline,
+    *,
+    options: CertificateOptions,
+    prediction: Verdict,
+    seed: int = 0,
+) -> Certificate:
+    """Certificate of one formula for each attractor, the worst of them deciding.
+
+    The Hessian of the local route is M by construction, so that its branch test passes by itself; what
+    tests it is the agreement with the network route, which does not know M.
+    """
+    found, diffusion = refined.found, refined.diffusion
+    wells = refined.wells or refined.network_wells
+    tests: dict[str, Verdict] = {}
+    error, worst = (0.0, None) if wells else (np.inf, None)
+    for well in wells:
+        candidate = _of_well(well, outline)
+        for name, verdict in _common(candidate, found, diffusion, options, seed).items():
+            tests[name] = _worse(tests.get(name), verdict)
+        mine, place = _error_of(well, found, outline, diffusion, seed)
+        if mine >= error:
+            error, worst = mine, place
+    missing = len(outline.attractors) - len(wells)
+    if missing or not wells:
+        reason = f"{missing} of {len(outline.attractors)} attractors have no formula"
+        tests["branch"] = Verdict(np.inf, options.branch, False, reason)
+    tests["error"] = check_error(error, limit=options.error)
+    if refined.wells and refined.network_wells:
+        pairs = [
+            (one, two)
+            for one in refined.network_wells
+            for two in refined.wells
+            if np.array_equal(one.attractor, two.attractor)
+        ]
+        for one, two in pairs:
+            own = _error_of(one, found, outline, diffusion, seed)[0]
+            verdict = check_agreement(
+                one.values, [two], _sublevel_points([two]), limit=HARMLESS + error + own
+            )
+            tests["agreement"] = _worse(tests.get("agreement"), verdict)
+        if len(pairs) < len(outline.attractors):
+            tests["agreement"] = Verdict(
+                np.inf, 0.0, False, "the network route found no formula for some well"
+            )
+    tests["prediction"] = prediction
+    return _conclude(tests, error, worst, outline, "wells")
+
+
+def uncertified(reason: str) -> dict[str, Any]:
+    """The certificate of formulas that could not be tested."""
+    return {"certified": False, "scope": "region", "stated_error": None, "reason": reason, "tests": {}}
+
+
+def _common(
+    candidate: Candidate,
+    found: IdentifiedField,
+    diffusion: np.ndarray,
+    options: CertificateOptions,
+    seed: int,
+) -> dict[str, Verdict]:
+    noise = 0.0
+    if not found.noise_free:  # V of thermal fluctuations: half the intensity
+        noise = 0.5 * float(np.trace(np.linalg.solve(diffusion, found.noise_rate))) / len(diffusion)
+    return {
+        "hamilton_jacobi": check_hamilton_jacobi(
+            candidate, found, diffusion=diffusion, limit=options.hamilton_jacobi
+        ),
+        "branch": check_branch(candidate, found, diffusion=diffusion, limit=options.branch, seed=seed),
+        "descent": check_descent(candidate, found, limit=options.descent, noise=noise),
+    }
+
+
+def _of_formulas(
+    formulas: SymbolicDecomposition, points: np.ndarray, outline: Outline, relative_error: float
+) -> Candidate:
+    symbols, d = formulas.symbols, len(formulas.symbols)
+    second = [slope.diff(symbol) for slope in formulas.gradient for symbol in symbols]
+    hessian = compile_formulas(second, symbols)
+    together, gradient = formulas.evaluate, formulas.evaluate_gradient
+    return Candidate(
+        values=lambda x: together(np.ascontiguousarray(x.T))[0],
+        gradients=lambda x: gradient(np.ascontiguousarray(x.T)).T,
+        hessians=lambda x: hessian(np.ascontiguousarray(x.T)).T.reshape(-1, d, d),
+        circulatory=lambda x: together(np.ascontiguousarray(x.T))[1 : d + 1].T,
+        points=points,
+        attractors=outline.attractors,
+        relative_error=relative_error,
+    )
+
+
+def _of_well(well: Well, outline: Outline) -> Candidate:
+    mine = [one for one in outline.attractors if np.array_equal(one.position, well.attractor)]
+    return Candidate(well.values, well.gradients, well.hessians, None, _sublevel_points([well])[0], mine)
+
+
+def _sublevel_points(wells: Sequence[Well]) -> list[np.ndarray]:
+    """Points of each well below nine tenths of its level: at the saddle itself V is stationary."""
+    return [well.points[well.values(well.points) < 0.9 * well.level] for well in wells]
+
+
+def _error_of(
+    well: Well, found: IdentifiedField, outline: Outline, diffusion: np.ndarray, seed: int
+) -> tuple[float, np.ndarray | None]:
+    return stated_error(_of_well(well, outline), found, diffusion=diffusion, seed=seed)
+
+
+def _worse(one: Verdict | None, two: Verdict) -> Verdict:
+    if one is None:
+        return two
+    return max(one, two, key=lambda verdict: (not verdict.passed, verdict.value / (verdict.limit or 1.0)))
+
+
+def _conclude(
+    tests: dict[str, Verdict], error: float, worst: np.ndarray | None, outline: Outline, scope: str
+) -> Certificate:
+    fault = outline.fault()
+    if fault is not None:
+        tests["branch"] = Verdict(np.inf, tests["branch"].limit, False, fault)
+    refused = [verdict.reason for verdict in tests.values() if not verdict.passed]
+    return Certificate(tests, error, "; ".join(dict.fromkeys(refused)), scope)

@@ -1,0 +1,68 @@
+"""One step of order eight for many trajectories at once, each with a step of its own.
+
+Library integrators take one trajectory, or many with the step that the most difficult of them needs. Here
+every row of a state array has its own step, so that a whole fan costs hardly more than one trajectory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.integrate import DOP853
+
+Rates = Callable[[np.ndarray], np.ndarray]
+"""Time derivative of states: ``(n, s)`` to ``(n, s)``, row by row."""
+
+SAFETY = 0.9
+SMALLEST_FACTOR, LARGEST_FACTOR = 0.2, 5.0
+ORDER = 8
+
+
+def dormand_prince_step(rates: Rates, state: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Advance every row by its own step with the rule of Dormand and Prince of order 8.
+
+    Parameters
+    ----------
+    rates
+        Time derivative, row by row, not depending on time.
+    state
+        Shape ``(n, s)``.
+    step
+        Shape ``(n,)``, in time units.
+
+    Returns
+    -------
+    tuple
+        The new state, and the estimate of its local error by component, both of shape ``(n, s)``.
+
+    Notes
+    -----
+    The coefficients, and the estimate from embedded rules of order 5 and 3, are those of Hairer, Nørsett and
+    Wanner as `scipy.integrate.DOP853` holds them.
+    """
+    h = step[:, None]
+    stages = np.empty((DOP853.n_stages + 1, state.size))
+
+    def combine(weights: np.ndarray) -> np.ndarray:
+        return (weights @ stages[: len(weights)]).reshape(state.shape)
+
+    stages[0] = rates(state).ravel()
+    for index in range(1, DOP853.n_stages):
+        stages[index] = rates(state + h * combine(DOP853.A[index, :index])).ravel()
+    new = state + h * combine(DOP853.B)
+    stages[-1] = rates(new).ravel()
+    fifth, third = combine(DOP853.E5), combine(DOP853.E3)
+    norm = np.hypot(fifth, 0.1 * third)
+    return new, h * fifth * np.abs(fifth) / np.where(norm == 0, 1, norm)
+
+
+def next_step(step: np.ndarray, error: np.ndarray) -> np.ndarray:
+    """Steps after the ones whose errors, relative to what is allowed, are given: ``(n,)`` to ``(n,)``.
+
+    An error that is not finite counts as a very large one.
+    """
+    error = np.where(np.isfinite(error), error, np.inf)
+    with np.errstate(divide="ignore"):
+        factor = SAFETY * error ** (-1 / ORDER)
+    return step * np.clip(factor, SMALLEST_FACTOR, LARGEST_FACTOR)

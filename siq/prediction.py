@@ -1,0 +1,65 @@
+"""Long-term prediction: trajectories of an identified f beside those that were recorded."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from siq.recordings import Recordings
+from siq.simulate import runge_kutta_step
+from siq.vector_field import VectorField
+
+ACCURACY = 0.05  # step times the norm of the Jacobian, per step of the integrator
+
+
+def predict(field: VectorField, recordings: Recordings) -> np.ndarray:
+    """Follow f from the first sample of every recording through all its times.
+
+    Parameters
+    ----------
+    field
+        f.
+    recordings
+        The trajectories; each keeps its own times.
+
+    Returns
+    -------
+    numpy.ndarray
+        Predicted states in the order of ``recordings.values``, shape ``(n, d)``; not finite where the
+        prediction runs away.
+    """
+    starts = np.flatnonzero(np.diff(recordings.recording, prepend=-1))
+    lengths = np.diff(np.append(starts, len(recordings.t)))
+    rate = float(np.quantile(np.linalg.norm(field.jacobian(recordings.values), axis=(1, 2)), 0.999))
+    predicted = np.full_like(recordings.values, np.nan)
+    predicted[starts] = recordings.values[starts]
+    x = recordings.values[starts].T.copy()
+
+    def velocity(components: np.ndarray) -> np.ndarray:
+        return field(components.T).T
+
+    with np.errstate(over="ignore", invalid="ignore"):
+        for place in range(1, int(lengths.max())):
+            going = lengths > place
+            rows = starts[going] + place
+            gap = recordings.t[rows] - recordings.t[rows - 1]
+            steps = max(int(np.ceil(gap.max() * rate / ACCURACY)), 1)
+            part = x[:, going]
+            for _ in range(steps):
+                part = runge_kutta_step(velocity, part, gap / steps)
+            x[:, going] = part
+            predicted[rows] = part.T
+    return predicted
+
+
+def prediction_errors(field: VectorField, recordings: Recordings) -> np.ndarray:
+    """``E_k = ‖X_predicted(t) - X_k(t)‖ / ‖X_k(t)‖`` of every recording k (paper, Eq. error), shape ``(K,)``.
+
+    The norms are over all samples of a recording and all states. A prediction that runs away has an
+    infinite error.
+    """
+    difference = ((predict(field, recordings) - recordings.values) ** 2).sum(axis=1)
+    size = (recordings.values**2).sum(axis=1)
+    count = len(recordings.labels)
+    difference = np.where(np.isfinite(difference), difference, np.inf)
+    total = np.bincount(recordings.recording, weights=difference, minlength=count)
+    return np.sqrt(total / np.bincount(recordings.recording, weights=size, minlength=count))

@@ -1,0 +1,293 @@
+"""Refinement: from the identified f, and from what the networks found, to formulas of V and g.
+
+Two routes lead to V and share nothing but f and the recorded points. The *network route* starts from the
+networks and seeks one formula for the whole recorded region; where no single formula can hold, since V has a
+kink between its wells, it takes each well for itself. The *local route* grows V from each attractor, and
+needs no network. Whether to believe either is decided by `siq.certificate`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass as plain_dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+import scipy.special
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from siq.errors import NumericalFailure
+from siq.global_route import GlobalPotential, fit_values, refine_globally
+from siq.identification import IdentifiedField
+from siq.library import CandidateLibrary, monomial_exponents
+from siq.local_route import Well, fit_well, grow_well
+from siq.orthogonal_fit import OrthogonalFit, fit_orthogonal
+from siq.outline import Outline
+
+Route = Literal["network", "local"]
+
+IMPLAUSIBLE = 1e-4  # a probability below which no orthogonal fit is believed
+FIT_POINTS = 400  # where ∇V·g is asked to vanish in a joint fit
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class RefinementOptions:
+    """How V is refined.
+
+    Attributes
+    ----------
+    routes
+        ``network``, ``local``, or both, which are then compared with each other.
+    degree
+        Highest power of the local route; by default it rises from 4 by 2 to 8 until the Hamilton–Jacobi
+        residual is below `accuracy` or a well would need too many coefficients.
+    accuracy
+        Residual at which the local route asks for no higher power.
+    single_formula
+        Largest relative Hamilton–Jacobi residual with which one formula stands for the whole region.
+    false_terms
+        Probability that the uncertainty of f brings any false term into V.
+    precision
+        Terms that contribute less than this share are dropped in any case.
+    """
+
+    routes: Annotated[tuple[Route, ...], Field(min_length=1)] = ("network", "local")
+    degree: Annotated[int, Field(ge=2, le=12)] | None = None
+    accuracy: Annotated[float, Field(gt=0)] = 1e-5
+    single_formula: Annotated[float, Field(gt=0)] = 0.005
+    false_terms: Annotated[float, Field(gt=0, lt=0.5)] = 0.01
+    precision: Annotated[float, Field(gt=0, lt=0.1)] = 1e-7
+
+
+@plain_dataclass(frozen=True)
+class Refined:
+    """What both routes found.
+
+    Attributes
+    ----------
+    found
+        The identified f.
+    diffusion
+        D.
+    library
+        The functions of the formulas below: those of f and of V together.
+    potential
+        Coefficients of V over it, shape ``(q,)``, where one formula holds over the whole region; else None.
+    circulatory
+        Those of g, shape ``(q, d)``.
+    potential_covariance
+        Shape ``(q, q)``.
+    circulatory_errors
+        Standard errors of g, shape ``(q, d)``.
+    residual
+        Relative Hamilton–Jacobi residual of V.
+    joint
+        Whether V and g were fitted together at the Cramér–Rao bound.
+    wells
+        By the local route, one for each attractor.
+    network_wells
+        By the network route, where it found no single formula.
+    notes
+        What could not be done, in words.
+    """
+
+    found: IdentifiedField
+    diffusion: np.ndarray
+    library: CandidateLibrary
+    potential: np.ndarray | None
+    circulatory: np.ndarray | None
+    potential_covariance: np.ndarray | None
+    circulatory_errors: np.ndarray | None
+    residual: float
+    joint: bool
+    wells: tuple[Well, ...]
+    network_wells: tuple[Well, ...]
+    notes: tuple[str, ...]
+
+
+def refine(
+    found: IdentifiedField,
+    outline: Outline,
+    *,
+    library: CandidateLibrary,
+    formula: np.ndarray | None,
+    network: Callable[[np.ndarray], np.ndarray] | None,
+    points: np.ndarray,
+    diffusion: np.ndarray,
+    options: RefinementOptions,
+    seed: int = 0,
+) -> Refined:
+    """Follow the routes that the options name.
+
+    Parameters
+    ----------
+    found
+        The identified f.
+    outline
+        Attractors, saddles and regions of f.
+    library
+        The functions that f, V and g may use. It must hold all of f's.
+    formula
+        The regression's coefficients of V over the library, shape ``(q,)``: the start of the network route.
+    network
+        V_θ, points ``(n, d)`` to values ``(n,)``: its second start, where the formula leads nowhere.
+    points
+        Recorded states over which one formula is sought, shape ``(n, d)``.
+    diffusion
+        D.
+    options
+        The routes, and what they keep.
+    seed
+        Decides which points are used where there are too many.
+    """
+    notes: list[str] = []
+    found = over_library(found, library)
+    wells: list[Well] = []
+    if "local" in options.routes:
+        for index in range(len(outline.attractors)):
+            try:
+                wells.append(_local_well(found, outline, index, diffusion, options, seed))
+            except NumericalFailure as error:
+                notes.append(f"local route: {error}")
+    best: GlobalPotential | None = None
+    if "network" in options.routes:
+        starts = [] if formula is None else [formula]
+        if network is not None:
+            starts.append(fit_values(library, points, network(points)))
+        for start in starts:
+            trial = refine_globally(
+                start, library, found, points, diffusion=diffusion,
+                false_terms=options.false_terms, precision=options.precision,
+            )  # fmt: skip
+            if best is None or trial.residual < best.residual:
+                best = trial
+            if best.residual < allowed_residual(found, options):
+                break
+    elif wells:
+        # Without the network route the wells themselves may turn out to be one formula.
+        start = fit_values(library, wells[0].points, wells[0].values(wells[0].points))
+        best = refine_globally(
+            start, library, found, points, diffusion=diffusion,
+            false_terms=options.false_terms, precision=options.precision,
+        )  # fmt: skip
+    if best is not None and best.coefficients.any() and best.residual < allowed_residual(found, options):
+        return _with_circulation(best, found, points, diffusion, options, wells, notes)
+    notes.append("no single formula in this library holds over the whole recorded region")
+    network_wells: list[Well] = []
+    if "network" in options.routes and network is not None:
+        degree = max((int(well.basis.exponents.sum(axis=1).max()) for well in wells), default=8)
+        for index, attractor in enumerate(outline.attractors):
+            try:
+                network_wells.append(
+                    fit_well(
+                        found.field,
+                        attractor,
+                        outline.regions[index],
+                        outline.saddles[index],
+                        network,
+                        diffusion=diffusion,
+                        degree=degree,
+                        generator=np.random.default_rng(seed),
+                    )
+                )
+            except NumericalFailure as error:
+                notes.append(f"network route: {error}")
+    return Refined(
+        found, diffusion, library, None, None, None, None,
+        np.inf if best is None else best.residual, False, tuple(wells), tuple(network_wells), tuple(notes),
+    )  # fmt: skip
+
+
+def allowed_residual(found: IdentifiedField, options: RefinementOptions) -> float:
+    """Residual up to which one formula is believed to hold: the errors of f make some of it."""
+    errors = np.abs(np.sqrt(np.diag(found.covariance)) / found.values)
+    noise = 0.0 if found.noise_free else 3 * float(np.sqrt((errors**2).mean()))
+    return options.single_formula + noise
+
+
+def over_library(found: IdentifiedField, library: CandidateLibrary) -> IdentifiedField:
+    """The same f over another library that holds all its functions."""
+    if found.library is library:
+        return found
+    position = {term: k for k, term in enumerate(library.terms)}
+    coefficients = np.zeros((library.size, library.dimension))
+    support = np.empty_like(found.support)
+    for row, (component, term) in enumerate(found.support):
+        place = position[found.library.terms[term]]
+        support[row] = component, place
+        coefficients[place, component] = found.coefficients[term, component]
+    return IdentifiedField(
+        library, coefficients, support, found.covariance, found.noise_rate, found.residual_ratio, found.flow
+    )
+
+
+def _local_well(
+    found: IdentifiedField,
+    outline: Outline,
+    index: int,
+    diffusion: np.ndarray,
+    options: RefinementOptions,
+    seed: int,
+) -> Well:
+    dimension = found.library.dimension
+    degrees = [4, 6, 8] if options.degree is None else [options.degree]
+    best: Well | None = None
+    for degree in degrees:
+        if best is not None and len(monomial_exponents(dimension, degree)) > 250:
+            break
+        trial = grow_well(
+            found.field, outline.attractors[index], outline.regions[index], outline.saddles[index],
+            diffusion=diffusion, degree=degree, generator=np.random.default_rng(seed),
+        )  # fmt: skip
+        if best is None or trial.residual < best.residual:
+            best = trial
+        if best.residual < options.accuracy:
+            break
+    assert best is not None  # there is at least one degree
+    return best
+
+
+def _with_circulation(
+    best: GlobalPotential,
+    found: IdentifiedField,
+    points: np.ndarray,
+    diffusion: np.ndarray,
+    options: RefinementOptions,
+    wells: list[Well],
+    notes: list[str],
+) -> Refined:
+    """G = f + D∇V with its uncertainty, on the terms that differ from zero; jointly with V under noise."""
+    library = best.library
+    q, d = library.size, library.dimension
+    downhill = np.einsum("il,klj->ikj", diffusion, library.derivatives)
+    circulatory = found.coefficients + np.einsum("ikj,j->ki", downhill, best.coefficients)
+    # δg = δf + D∇δV with δV = S δf, coefficient by coefficient
+    response = np.einsum("ikj,jp->ikp", downhill, best.sensitivity)
+    for column, (component, term) in enumerate(found.support):
+        response[component, term, column] += 1.0
+    errors = np.sqrt(np.einsum("ikp,pr,ikr->ki", response, found.covariance, response))
+    values = library.evaluate(points)
+    size = np.sqrt((values**2).mean(axis=0))[:, None]
+    speed = np.sqrt((found.field(points) ** 2).mean(axis=0))[None, :]
+    critical = float(-scipy.special.ndtri(options.false_terms / (2 * q * d)))
+    weak = np.abs(circulatory) * size < options.precision * speed.max()
+    if not found.noise_free:
+        weak |= np.abs(circulatory) < critical * errors
+    circulatory = np.where(weak, 0.0, circulatory)
+    fit: OrthogonalFit | None = None
+    if not found.noise_free:
+        rows = np.unique(np.linspace(0, len(points) - 1, FIT_POINTS).astype(int))
+        fit = fit_orthogonal(found, best.coefficients, circulatory, points[rows], diffusion=diffusion)
+        if fit is None or fit.probability < IMPLAUSIBLE:
+            fit = None
+            notes.append("V and g have no exactly orthogonal form on their terms: they are fitted one by one")
+    if fit is not None:
+        return Refined(
+            found, diffusion, library, fit.potential, fit.circulatory, fit.potential_covariance,
+            fit.circulatory_errors, best.residual, True, tuple(wells), (), tuple(notes),
+        )  # fmt: skip
+    return Refined(
+        found, diffusion, library, best.coefficients, circulatory, best.covariance,
+        np.where(weak, 0.0, errors), best.residual, False, tuple(wells), (), tuple(notes),
+    )  # fmt: skip
