@@ -4,8 +4,9 @@ From the Hamiltonian ``H = p·f + p·Dp`` with ``p = ∇V``:
 
     ẋ = f + 2Dp,    ṗ = -Jᵀp,    V̇ = p·Dp,
 
-started on a small ellipsoid around the attractor A, where ``p = M (x - A)`` and ``V = ½ (x - A)·M (x - A)``.
-No ansatz enters: within its limits this is a reference against which formulas are judged.
+started on a small ellipsoid around the attractor A, where ``p = M (x - A)`` and ``V = ½ (x - A)·M (x - A)``
+with the first few corrections. No ansatz enters: within its limits this is a reference against which formulas
+are judged.
 
 Neighbouring curves may meet. With the curves go their tangents ``X = ∂x, P = ∂p`` with respect to the start,
 
@@ -108,7 +109,7 @@ def characteristics(
     box: np.ndarray,
     directions: np.ndarray,
     start: float = 1e-6,
-    start_degree: int = 2,
+    start_degree: int = 4,
     spacing: float = 0.05,
     time_limit: float | None = None,
     tolerance: float = 1e-10,
@@ -132,8 +133,9 @@ def characteristics(
     start
         V on the first ellipsoid, as a share of the level.
     start_degree
-        Degree of the power series that gives p and V there; 2 is the quadratic form of M. A larger ellipsoid
-        with a higher degree keeps curves apart that would otherwise collapse on the slowest directions.
+        Degree of the power series that gives p, V and the tangents there; 2 is the quadratic form of M
+        alone. With it V is nearly as good, but the tangents are off by ``start ** ½``, which can grow to a
+        false caustic where curves draw together. Where f has kinks close to A, 2 is what remains.
     spacing
         Largest distance between points along a curve; the level is at about 1.
     time_limit
@@ -143,8 +145,9 @@ def characteristics(
 
     Notes
     -----
-    Two neighbouring curves that cross without a caustic between are not noticed here. Near an attractor
-    with different rates most directions end close together: see `siq.fans.adapted_fan`.
+    Curves that cross without a caustic of their own are not noticed here: see `siq.fans.lowest_sheet`. Near
+    an attractor with different rates most directions end close together: see `siq.fans.adapted_fan`. Past
+    another equilibrium errors grow, so that a level far above the barrier gives less accurate curves.
     """
     flow = HamiltonianFlow(field, np.asarray(attractor, dtype=float), diffusion, level)
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
@@ -179,14 +182,22 @@ def characteristics(
 def join(first: Fan, second: Fan) -> Fan:
     """Two fans of the same attractor and level as one; the curves of the second are counted on."""
     shift = len(first.directions)
-    names = ("points", "momenta", "values", "hessians", "directions", "ends")
-    names += ("caustic_points", "caustic_values")
-    together = {name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in names}
+
+    def both(name: str) -> np.ndarray:
+        return np.concatenate([getattr(first, name), getattr(second, name)])
+
     return replace(
         first,
+        points=both("points"),
+        momenta=both("momenta"),
+        values=both("values"),
+        hessians=both("hessians"),
         curve=np.concatenate([first.curve, second.curve + shift]),
+        directions=both("directions"),
+        ends=both("ends"),
+        caustic_points=both("caustic_points"),
+        caustic_values=both("caustic_values"),
         caustic_curves=np.concatenate([first.caustic_curves, second.caustic_curves + shift]),
-        **together,
     )
 
 

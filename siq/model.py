@@ -56,7 +56,10 @@ def expression_from_data(data: Mapping[str, Any], symbols: Sequence[sympy.Symbol
 def model_to_data(
     decompositions: Mapping[str, SymbolicDecomposition], certificates: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, Any]:
-    """Decompositions by method, with a certificate for each, as plain data."""
+    """Decompositions by method, with a certificate for each, as plain data.
+
+    Certificates of what is no method, such as a randomised network, stand beside them.
+    """
     if not decompositions:
         return {"states": [], "methods": {}, "certificate": {}}
     symbols = next(iter(decompositions.values())).symbols
@@ -64,7 +67,7 @@ def model_to_data(
     return {
         "states": [symbol.name for symbol in symbols],
         "methods": methods,
-        "certificate": {method: dict(certificates[method]) for method in decompositions},
+        "certificate": {method: dict(one) for method, one in certificates.items()},
     }
 
 

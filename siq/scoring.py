@@ -100,18 +100,25 @@ def relative_error(estimate: np.ndarray, exact: np.ndarray) -> float:
 
 
 def summary_table(
-    coefficients: pd.DataFrame, rrmse: pd.DataFrame, published: dict[str, PublishedFigure]
+    coefficients: pd.DataFrame,
+    rrmse: pd.DataFrame,
+    prediction: pd.DataFrame,
+    published: dict[str, PublishedFigure],
 ) -> pd.DataFrame:
     """Every figure over the runs, beside the exact and the published one.
 
-    Quantities are ``rrmse``, ``support_correct``, ``network_error`` and every coefficient that is not
+    Quantities are ``rrmse``, ``support_correct``, ``certified``, ``network_error``, ``stated_error``,
+    ``prediction_error`` (over all trajectories of all runs) and every coefficient that is not
     zero in some run, exactly or in print, as ``U:x**2``. A run that has no value is not counted in `runs`,
     and therefore shows there.
     """
     rows: list[dict[str, object]] = []
-    for method, errors in rrmse.groupby("method", sort=True):
-        for quantity in ("rrmse", "network_error", "support_correct"):
+    for method, errors in rrmse.groupby("method", sort=False):
+        for quantity in ("rrmse", "network_error", "stated_error", "support_correct", "certified"):
             rows.append(_summary(str(method), quantity, errors[quantity].astype("float64"), published))
+        predicted = prediction[prediction["method"] == method]["error"]
+        if len(predicted):
+            rows.append(_summary(str(method), "prediction_error", predicted, published))
         chosen = coefficients[coefficients["method"] == method].dropna(subset="estimate")
         runs = chosen["run"].unique()
         for (component, term), group in chosen.groupby(["component", "term"], sort=False):

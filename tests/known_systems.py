@@ -45,7 +45,7 @@ def potential_gradient(known: KnownSystem, x: np.ndarray) -> np.ndarray:
     return compile_formulas(gradient, known.field.symbols)(np.ascontiguousarray(x.T)).T
 
 
-def linear_system(dimension: int, *, seed: int = 0, rotation: float = 3.0) -> KnownSystem:
+def linear_system(dimension: int, *, seed: int = 0, rotation: float = 6.0) -> KnownSystem:
     """``f = -(D - Q) M x`` with random M, D and antisymmetric Q of size `rotation`; V = ½ xᵀMx."""
     draw = np.random.default_rng([seed, dimension])
     symbols = _symbols(dimension)
@@ -93,6 +93,7 @@ def double_well(dimension: int) -> KnownSystem:
     # The other states follow x, whose wells are the outer roots of x³ - x + 1/10.
     roots = np.sort(np.roots([1, 0, -1, 0.1]).real)[[0, 2]]
     attractors = np.outer(roots, np.r_[1.0, np.full(dimension - 1, 0.5)])
+    potential -= _rational((roots[0] ** 2 - 1) ** 2 / 4 + roots[0] / 10)
     return _known(
         symbols, potential, diffusion, sympy.zeros(dimension), attractors, [[-2.0, 2.0]] * dimension
     )
@@ -124,9 +125,9 @@ def polynomial_system(
     """
     draw = np.random.default_rng([seed, dimension, 4])
     symbols = _symbols(dimension)
-    # The quadratic part must be able to turn downwards, or one well is all that ever comes.
-    size = {1: 0.1, 2: 1.2, 3: 0.25}
-    potential = sum((s**4 for s in symbols), sympy.S.Zero) / 4
+    # The quadratic part mostly turns downwards, or one well is all that ever comes.
+    size = {1: 0.1, 2: 0.3, 3: 0.25}
+    potential = sum((s**4 / 4 - s**2 / 2 for s in symbols), sympy.S.Zero)
     for powers in monomial_exponents(dimension, 3)[1:]:
         coefficient = _rounded(draw.normal(size=1) * size[sum(powers)] / np.sqrt(dimension))[0]
         potential += coefficient * sympy.Mul(*(s**e for s, e in zip(symbols, powers, strict=True)))
@@ -172,7 +173,9 @@ def _definite(draw: np.random.Generator, dimension: int) -> sympy.Matrix:
 
 
 def _antisymmetric(draw: np.random.Generator, dimension: int, size: float) -> sympy.Matrix:
-    matrix = draw.normal(scale=size, size=(dimension, dimension))
+    # Away from zero, or a draw now and then hardly turns at all.
+    signs = draw.choice([-1, 1], size=(dimension, dimension))
+    matrix = size * signs * draw.uniform(0.5, 1.5, size=(dimension, dimension))
     return _rounded(np.tril(matrix, -1) - np.tril(matrix, -1).T)
 
 

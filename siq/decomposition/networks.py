@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -150,6 +150,22 @@ def select_run(networks: Networks, run: int) -> Networks:
         circulatory_scale=networks.circulatory_scale[pick],
         diffusion=networks.diffusion,
     )
+
+
+def shuffled(networks: Networks, *, generator: np.random.Generator) -> Networks:
+    """The same weights in random order: a network that knows nothing, for comparison."""
+
+    def layers(source: tuple[Layer, ...]) -> tuple[Layer, ...]:
+        return tuple(
+            (_shuffle(weights, generator), _shuffle(biases, generator)) for weights, biases in source
+        )
+
+    return replace(networks, potential=layers(networks.potential), circulatory=layers(networks.circulatory))
+
+
+def _shuffle(tensor: Tensor, generator: np.random.Generator) -> Tensor:
+    order = torch.from_numpy(generator.permutation(tensor.numel()))
+    return tensor.flatten()[order].reshape(tensor.shape)
 
 
 def join_runs(parts: Sequence[Networks]) -> Networks:

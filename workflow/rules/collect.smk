@@ -5,12 +5,16 @@ rule collect:
     input:
         coefficients=all_runs("results/{study}/runs/{run}/coefficients.parquet"),
         rrmse=all_runs("results/{study}/runs/{run}/rrmse.parquet"),
+        prediction=all_runs("results/{study}/runs/{run}/prediction.parquet"),
+        certificates=all_runs("results/{study}/runs/{run}/certificates.parquet"),
         histories=all_blocks("results/{study}/training/{block}/history.parquet"),
         outcomes=all_outcomes,
         published=published_if_any,
     output:
         coefficients="results/{study}/tables/coefficients.parquet",
         rrmse="results/{study}/tables/rrmse.parquet",
+        prediction="results/{study}/tables/prediction.parquet",
+        certificates="results/{study}/tables/certificates.parquet",
         training="results/{study}/tables/training.parquet",
         outcomes="results/{study}/tables/outcomes.parquet",
         timings="results/{study}/tables/timings.parquet",

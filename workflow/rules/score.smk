@@ -10,6 +10,8 @@ rule score:
     output:
         coefficients="results/{study}/runs/{run}/coefficients.parquet",
         rrmse="results/{study}/runs/{run}/rrmse.parquet",
+        prediction="results/{study}/runs/{run}/prediction.parquet",
+        certificates="results/{study}/runs/{run}/certificates.parquet",
         outcome="results/{study}/runs/{run}/score.json",
     log:
         "results/{study}/logs/{run}/score.log",
@@ -20,7 +22,9 @@ rule score:
     threads: 1
     params:
         code=code("score.py"),
-        study=parameters("dynamics", "metric", "exact", "regression"),
+        study=parameters(
+            "seed", "dynamics", "metric", "exact", "simulation", "regression"
+        ),
     message:
         "{wildcards.study}, run {wildcards.run}: scoring"
     script:

@@ -12,6 +12,9 @@ from siq.tables import as_table, concatenate, read_table, write_table
 from step import job, read_outcomes
 
 
+STEPS = ("simulate", "resample", "identify", "train", "regress", "refine", "score")
+
+
 def timings(folder: Path, runs: Iterable[int], *, drawing: str) -> pd.DataFrame:
     """Seconds of every step of every run; runs that trained side by side share their time evenly.
 
@@ -40,20 +43,24 @@ def main(snakemake: Any) -> None:
     rrmse = concatenate("rrmse", [read_table(path) for path in source.rrmse])
     training = concatenate("training", [read_table(path) for path in source.histories])
     entries = [entry for path in source.outcomes for entry in read_outcomes(path)]
-    order = {step: place for place, step in enumerate(("simulate", "resample", "train", "regress", "score"))}
+    order = {step: place for place, step in enumerate(STEPS)}
     entries.sort(key=lambda entry: (entry["run"], order[entry["step"]]))
     columns = ("run", "step", "status", "reason")
     outcomes = as_table("outcomes", [{key: entry[key] for key in columns} for entry in entries])
+    prediction = concatenate("prediction", [read_table(path) for path in source.prediction])
+    certificates = concatenate("certificates", [read_table(path) for path in source.certificates])
     published = load_published(source.published).figures if source.get("published") else {}
     write_table(target.coefficients, coefficients)
     write_table(target.rrmse, rrmse)
+    write_table(target.prediction, prediction)
+    write_table(target.certificates, certificates)
     write_table(target.training, training)
     write_table(target.outcomes, outcomes)
     write_table(
         target.timings,
         timings(Path(snakemake.params.benchmarks), set(outcomes["run"]), drawing=entries[0]["step"]),
     )
-    write_table(target.summary, summary_table(coefficients, rrmse, published))
+    write_table(target.summary, summary_table(coefficients, rrmse, prediction, published))
 
 
 if __name__ == "__main__":

@@ -7,10 +7,11 @@ import torch
 
 from siq.certificate import CertificateOptions, Verdict
 from siq.certification import Certificate, certify_formulas, certify_wells, uncertified
-from siq.decomposition.networks import evaluate_points, select_run
+from siq.decomposition.networks import evaluate_points, select_run, shuffled
 from siq.decomposition.storage import load_networks
 from siq.errors import NumericalFailure
 from siq.field_file import read_field
+from siq.global_route import fit_values
 from siq.held_out import held_out_recordings
 from siq.library import joint_library
 from siq.model import model_to_data, read_model, write_model
@@ -20,9 +21,9 @@ from siq.recordings import snapshot_pairs
 from siq.refined_formulas import refined_decomposition, relative_error_of
 from siq.refinement import RefinementOptions, refine
 from siq.regression import RegressionOptions, points_below
-from siq.symbolic import SymbolicDecomposition, term_coefficients
+from siq.symbolic import SymbolicDecomposition, decomposition_from_coefficients, term_coefficients
 from siq.systems import diffusion_matrix
-from step import job, outcome, pair_step, position_of, read_outcomes, read_run, write_outcomes
+from step import CONTROL, job, outcome, pair_step, position_of, read_outcomes, read_run, write_outcomes
 
 
 class Run:
@@ -105,6 +106,19 @@ def refine_run(
     return formulas, certificate, refined.notes
 
 
+def control(own: Run) -> Certificate:
+    """Certificate of the U of a randomised network: one that must be refused, or the tests are no tests."""
+    networks = shuffled(own.networks, generator=generator(own.study["seed"], own.run, "shuffle"))
+    library = own.record.found.library
+    coefficients = fit_values(library, own.below, evaluate_points(networks, own.below).potential)
+    downhill = np.einsum("il,klj,j->ki", own.diffusion, library.derivatives, coefficients)
+    formulas = decomposition_from_coefficients(
+        library, potential=coefficients, circulatory=own.record.found.coefficients + downhill,
+        vector_field=own.record.found.coefficients, points=own.below,
+    )  # fmt: skip
+    return own.certify(formulas)
+
+
 def main(snakemake: Any) -> None:
     """Run as a rule's script."""
     run, study, source = int(snakemake.wildcards.run), snakemake.params.study, snakemake.input
@@ -123,6 +137,7 @@ def main(snakemake: Any) -> None:
             own = Run(source, position, run, study)
             if "regression" in models:
                 certificates["regression"] = own.certify(models["regression"]).as_data()
+            certificates[CONTROL] = control(own).as_data()
             models["refined"], certificate, notes = refine_run(own, models.get("regression"))
             certificates["refined"] = certificate.as_data() | {"notes": list(notes)}
             status = "ok" if certificate.certified else "warning"

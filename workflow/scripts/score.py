@@ -1,13 +1,17 @@
-"""Score the formulas of a run against exact answers, where the card knows any."""
+"""Score the formulas of a run against exact answers and unseen trajectories, where these are known."""
 
 from typing import Any
 
+import numpy as np
+import pandas as pd
 import torch
 
-from siq.decomposition.networks import evaluate_points, select_run
+from siq.decomposition.networks import evaluate_points, select_run, shuffled
 from siq.decomposition.storage import load_networks
 from siq.library import candidate_library
 from siq.model import read_model
+from siq.prediction import prediction_errors
+from siq.randomness import generator
 from siq.regression import RegressionOptions
 from siq.scoring import (
     coefficient_table,
@@ -16,59 +20,106 @@ from siq.scoring import (
     relative_root_mean_square_error,
     support_is_correct,
 )
-from siq.symbolic import exact_decomposition
+from siq.simulate import SimulationOptions, simulate_snapshots
+from siq.symbolic import SymbolicDecomposition, exact_decomposition
 from siq.systems import System, load_system
 from siq.tables import as_table, concatenate, write_table
-from step import job, outcome, position_of, write_outcomes
+from siq.vector_field import VectorField
+from step import CONTROL, METHODS, job, outcome, position_of, write_outcomes
+
+UNSEEN = 1000  # trajectories that no run learns from (paper, section 3.1)
 
 
-def network_error(system: System, networks_path: str, position: int) -> float:
-    """Relative L2 error of the network's U on a grid over Ω, U zero at its minimum."""
+def network_errors(
+    system: System, networks_path: str, position: int, run: int, seed: int
+) -> dict[str, float]:
+    """Relative L2 error on a grid over Ω of the U of the trained network, and of a randomised one."""
     grid = domain_grid(system.domain)
     exact = system.exact_values(grid)
-    networks = select_run(load_networks(networks_path), position)
-    return relative_error(2 * evaluate_points(networks, grid.T).potential, exact)
+    trained = select_run(load_networks(networks_path), position)
+    randomised = shuffled(trained, generator=generator(seed, run, "shuffle"))
+    error, chance = (
+        relative_error(2 * evaluate_points(networks, grid.T).potential, exact)
+        for networks in (trained, randomised)
+    )
+    return dict.fromkeys(METHODS, error) | {CONTROL: chance}
+
+
+def predictions(
+    system: System, models: dict[str, SymbolicDecomposition], run: int, study: dict[str, Any]
+) -> pd.DataFrame:
+    """Errors of long-term prediction of unseen trajectories of the system without noise."""
+    options = SimulationOptions(**(study["simulation"] | {"trajectories": UNSEEN, "noise_intensity": 0.0}))
+    unseen = simulate_snapshots(system, options=options, generator=generator(study["seed"], "unseen"))
+    tables = [
+        pd.DataFrame(
+            {
+                "run": run,
+                "method": method,
+                "trajectory": np.arange(UNSEEN),
+                "error": prediction_errors(VectorField(one.symbols, one.vector_field), unseen),
+            }
+        )
+        for method, one in models.items()
+    ]
+    return concatenate("prediction", tables)
+
+
+def certificate_table(run: int, certificates: dict[str, Any]) -> pd.DataFrame:
+    """Every test of every formula, with its figure."""
+    rows = [
+        {"run": run, "method": method, "test": test} | verdict
+        for method, one in certificates.items()
+        for test, verdict in one["tests"].items()
+    ]
+    return as_table("certificates", rows)
 
 
 def main(snakemake: Any) -> None:
     """Run as a rule's script."""
-    run = int(snakemake.wildcards.run)
+    run, study, target = int(snakemake.wildcards.run), snakemake.params.study, snakemake.output
     torch.set_num_threads(snakemake.threads)
     system = load_system(snakemake.input.card) if snakemake.input.get("card") else None
     exact = exact_decomposition(system) if system is not None else None
     decompositions, certificates = read_model(snakemake.input.model)
-    options = RegressionOptions(**snakemake.params.study["regression"])
-    tables, errors = [], []
+    options = RegressionOptions(**study["regression"])
+    tables = []
+    position, _ = position_of(run, snakemake.input.training)
+    errors: dict[str, dict[str, Any]] = {
+        # A method without a formula stays in the table, without an error to boast of.
+        method: {"run": run, "method": method, "certified": False}
+        for method in (*METHODS, *([CONTROL] if CONTROL in certificates else []))
+    }
+    for method, one in certificates.items():
+        errors[method] |= {"certified": one["certified"], "stated_error": one["stated_error"]}
     for method, identified in decompositions.items():
         library = candidate_library(
             [symbol.name for symbol in identified.symbols], degree=options.degree, further=options.functions
         )
         table = coefficient_table(run, method, identified, exact, terms=library.names)
         tables.append(table)
-        errors.append(
-            {
-                "run": run,
-                "method": method,
-                "rrmse": relative_root_mean_square_error(table),
-                "support_correct": support_is_correct(table),
-                "certified": certificates[method]["certified"],
-            }
-        )
-    if not decompositions:  # the run stays in the table, without an error to boast of
-        errors.append({"run": run, "method": "regression", "certified": False})
-    position, _ = position_of(run, snakemake.input.training)
+        errors[method] |= {
+            "rrmse": relative_root_mean_square_error(table),
+            "support_correct": support_is_correct(table),
+        }
     if exact is not None and system is not None and position is not None:
-        for row in errors:
-            row["network_error"] = network_error(system, snakemake.input.networks, position)
-    write_table(snakemake.output.coefficients, concatenate("coefficients", tables))
-    write_table(snakemake.output.rrmse, as_table("rrmse", errors))
+        known = network_errors(system, snakemake.input.networks, position, run, study["seed"])
+        for method, row in errors.items():
+            row["network_error"] = known[method]
+    predicted = as_table("prediction", [])
+    if system is not None and study["simulation"] is not None and decompositions:
+        predicted = predictions(system, decompositions, run, study)
+    write_table(target.coefficients, concatenate("coefficients", tables))
+    write_table(target.rrmse, as_table("rrmse", list(errors.values())))
+    write_table(target.prediction, predicted)
+    write_table(target.certificates, certificate_table(run, certificates))
     if not decompositions:
         result = outcome(run, "score", "skipped", "there is no formula to score")
     elif exact is None:
         result = outcome(run, "score", "skipped", "no exact answer is known")
     else:
         result = outcome(run, "score")
-    write_outcomes(snakemake.output.outcome, [result])
+    write_outcomes(target.outcome, [result])
 
 
 if __name__ == "__main__":

@@ -15,6 +15,13 @@ from siq.files import whole_file
 from siq.recordings import Recordings, read_recordings
 
 
+METHODS = ("regression", "refined")
+"""The paper's formulas, and ours, in the order of the tables."""
+
+CONTROL = "randomised network"
+"""What must never be certified: the U of a network with its weights in random order."""
+
+
 @contextmanager
 def job(snakemake: Any) -> Iterator[None]:
     """Run the body of a script: log to the rule's file, tell bad input in one sentence.
