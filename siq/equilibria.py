@@ -20,7 +20,8 @@ Kind = Literal["attractor", "saddle", "repeller", "degenerate"]
 NEWTON_STEPS = 60
 MARGIN = 0.05  # of the recorded box, by which an equilibrium may lie outside
 SAME = 1e-6  # of the recorded box: closer equilibria are one
-SLOWEST_TIMES = 25.0  # trajectories are followed for so many of the slowest relaxation times
+SLOWEST_TIMES = 25.0  # trajectories are followed for so many of the slowest relaxation times, and those ...
+LONGER = 8  # ... that have not settled by then so many times as long: some pass slow places
 
 
 @dataclass(frozen=True)
@@ -164,25 +165,34 @@ def follow(
     horizon = SLOWEST_TIMES / slowest
     count = int(min(max(np.ceil(horizon * fastest / 0.25), 200), 6000))
     step = horizon / count
-    kept = np.geomspace(1, count, states - 1).astype(int)
+    later = np.geomspace(count, LONGER * count, states // 4 + 1).astype(int)
+    kept = np.append(np.geomspace(1, count, states - 1 - states // 4).astype(int), later[1:])
     x = np.ascontiguousarray(starts.T)
     paths = [x.T.copy()]
     escaped = np.zeros(len(starts), dtype=bool)
 
+    ends = np.full(len(starts), -1)
+
     def velocity(components: np.ndarray) -> np.ndarray:
         return field(components.T).T
 
-    for done in range(1, count + 1):
+    going = np.arange(len(starts))
+    for done in range(1, LONGER * count + 1):
         with np.errstate(over="ignore", invalid="ignore"):
-            moved = runge_kutta_step(velocity, x, step)
+            moved = runge_kutta_step(velocity, x[:, going], step)
         out = ~(np.abs((moved - middle[:, None]) / width[:, None]) < 1.5).all(axis=0)
-        escaped |= out
-        x = np.where(escaped, x, moved)
+        escaped[going[out]] = True
+        x[:, going[~out]] = moved[:, ~out]
         paths += [x.T.copy()] * int((kept == done).sum())
-    ends = np.full(len(starts), -1)
-    for index, one in enumerate(attractors):
-        near = np.abs((x.T - one.position) / width).max(axis=1) < 1e-3
-        ends[near & ~escaped] = index
+        if done >= count and (done - count) % (count // 4) == 0:
+            for index, one in enumerate(attractors):
+                near = np.abs((x.T - one.position) / width).max(axis=1) < 1e-3
+                ends[near & ~escaped] = index
+        if out.any() or done >= count:
+            going = np.flatnonzero(~escaped & (ends < 0))
+            if not len(going) or not attractors and done >= count:
+                break
+    paths += [x.T.copy()] * (states - len(paths))
     return Descents(np.stack(paths, axis=1), ends, escaped)
 
 

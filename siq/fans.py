@@ -145,6 +145,8 @@ def lowest_sheet(fan: Fan, *, distance: float = 0.06, margin: float = 2e-3) -> n
     upper = np.zeros(len(scaled), dtype=bool)
     # So close to the attractor V is smooth, and all curves are neighbours of each other.
     asked = np.flatnonzero(np.linalg.norm(scaled, axis=1) > 2 * distance)
+    if not len(asked):
+        return ~upper
     tree = cKDTree(scaled[asked])
     for block in np.array_split(asked, max(len(asked) // CHUNK, 1)):
         near = tree.query_ball_point(scaled[block], distance)

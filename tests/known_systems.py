@@ -15,7 +15,11 @@ import sympy
 from scipy.optimize import minimize
 
 from siq.expressions import compile_formulas
-from siq.library import monomial_exponents
+from siq.flow import FlowMap
+from siq.identification import IdentifiedField
+from siq.library import candidate_library, monomial_exponents
+from siq.outline import Outline, outline
+from siq.systems import System
 from siq.vector_field import VectorField
 
 
@@ -141,6 +145,47 @@ def polynomial_system(
     domain = [[-3.0, 3.0]] * dimension
     attractors, levels = _wells(potential, symbols, draw)
     return _known(symbols, potential - _rational(levels.min()), diffusion, turning, attractors, domain)
+
+
+def exact_field(known: KnownSystem, degree: int, *, relative_error: float = 0.0) -> IdentifiedField:
+    """The field as if identified: its own coefficients, each with the same relative standard error.
+
+    Without an error it counts as free of noise; with one, its coefficients are still the exact ones.
+    """
+    library = candidate_library([symbol.name for symbol in known.field.symbols], degree=degree)
+    position = {term: k for k, term in enumerate(library.terms)}
+    coefficients = np.zeros((library.size, library.dimension))
+    for i, equation in enumerate(known.field.equations):
+        for powers, value in sympy.Poly(equation, *known.field.symbols).terms():
+            term = sympy.Mul(*(s**e for s, e in zip(known.field.symbols, powers, strict=True)))
+            coefficients[position[term], i] = float(value)
+    support = np.argwhere(coefficients.T)
+    errors = (relative_error or 1e-12) * coefficients[support[:, 1], support[:, 0]]
+    return IdentifiedField(
+        library, coefficients, support, np.diag(errors**2), known.diffusion * relative_error**2,
+        relative_error or 1e-10, FlowMap(),
+    )  # fmt: skip
+
+
+def uniform_points(known: KnownSystem, count: int, *, seed: int = 0, share: float = 1.0) -> np.ndarray:
+    """States drawn uniformly from the domain, or from a part of it about its middle; shape ``(count, d)``."""
+    middle, half = known.domain.mean(axis=1), share * np.diff(known.domain, axis=1)[:, 0] / 2
+    return np.random.default_rng(seed).uniform(middle - half, middle + half, size=(count, len(middle)))
+
+
+def outline_of(known: KnownSystem, count: int = 800, *, share: float = 1.0) -> Outline:
+    """The outline that recordings from all over the domain would give."""
+    return outline(known.field, uniform_points(known, count, share=share), diffusion=known.diffusion)
+
+
+def as_system(known: KnownSystem) -> System:
+    """The same as a system to be simulated."""
+    symbols = known.field.symbols
+    return System(
+        name="known", title="", time_unit="1", states=tuple(s.name for s in symbols),
+        units=("1",) * len(symbols), domain=known.domain, symbols=symbols,
+        equations=known.field.equations, diffusion=known.diffusion,
+    )  # fmt: skip
 
 
 def hamilton_jacobi_residual(known: KnownSystem) -> sympy.Expr:

@@ -43,7 +43,7 @@ def escape(beta: float, *, level: float) -> Fan:
         generator=np.random.default_rng(0),
         count=48,
         most=200,
-        rounds=3,
+        rounds=4,
     )
 
 
@@ -116,8 +116,8 @@ def focus_on_the_axis(beta: float) -> float:
 
     def rates(_: float, state: np.ndarray) -> list[float]:
         x, (sine, cosine) = state[0], (np.sin(state[1]), np.cos(state[1]))
-        forcing = -2 * beta * x**2 * (1 - x**2)
-        return [x**3 - x, 2 * (1 + x**2) * sine * cosine - 2 * sine**2 - forcing * -1 * cosine**2]
+        bend = 2 * beta * x * (x**3 - x)  # -p ∂²f_x/∂y² with p = x³ - x
+        return [x**3 - x, 2 * (1 + x**2) * sine * cosine - 2 * sine**2 + bend * cosine**2]
 
     def diverges(_: float, state: np.ndarray) -> float:
         return float(state[1] + np.pi / 2)
@@ -171,13 +171,13 @@ def test_directions_that_focus_at_once_are_seen_though_the_determinant_keeps_its
 
 
 def test_the_barrier_beyond_the_caustic_is_that_of_minimum_action(strong: Fan) -> None:
-    barrier = 2 * value_near(strong, np.zeros((1, 2)), sheet=lowest_sheet(strong))[0]
+    barrier = 2 * value_near(strong, np.zeros((1, 2)), sheet=lowest_sheet(strong), distance=0.2)[0]
     assert barrier == pytest.approx(0.3401, rel=1e-3)
 
 
 def test_the_barrier_a_little_above_the_critical_strength() -> None:
     fan = escape(5, level=0.245)
-    barrier = 2 * value_near(fan, np.zeros((1, 2)), sheet=lowest_sheet(fan))[0]
+    barrier = 2 * value_near(fan, np.zeros((1, 2)), sheet=lowest_sheet(fan), distance=0.2)[0]
     assert barrier == pytest.approx(0.4831, rel=1e-3)
 
 

@@ -1,0 +1,294 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import sympy
+from known_systems import KnownSystem, archetype, as_system, double_well, maier_stein, uniform_points
+from scipy.integrate import solve_ivp
+
+from siq.errors import NumericalFailure
+from siq.field_file import field_library
+from siq.identification import (
+    IdentificationOptions,
+    IdentifiedField,
+    evenly,
+    identify_vector_field,
+    refit,
+    residuals,
+)
+from siq.recordings import Recordings, SnapshotPairs, select_recordings, snapshot_pairs
+from siq.simulate import SimulationOptions, simulate_snapshots
+from siq.vector_field import VectorField
+
+x, y = (sympy.Symbol(name, real=True) for name in "xy")
+CORRELATED = np.array([[1.0, 0.9], [0.9, 1.0]])
+
+
+def flow_pairs(known: KnownSystem, count: int, *, h: tuple[float, float], seed: int = 0) -> SnapshotPairs:
+    """Pairs of the exact flow, to rounding, each with a step of its own."""
+    x0 = uniform_points(known, count, seed=seed)
+    steps = np.random.default_rng(seed + 1).uniform(*h, size=count)
+
+    def rates(_: float, flat: np.ndarray) -> np.ndarray:
+        return (steps[:, None] * known.field(flat.reshape(x0.shape))).ravel()
+
+    end = solve_ivp(rates, [0, 1], x0.ravel(), method="DOP853", rtol=1e-13, atol=1e-14).y[:, -1]
+    return SnapshotPairs(x0, end.reshape(x0.shape), steps, np.zeros(count, dtype=int))
+
+
+def noisy(
+    known: KnownSystem, *, seed: int, intensity: float = 0.05, trajectories: int = 60, pairs: int = 30,
+    pair_step: float = 0.02, substeps: int = 2, interval: float = 0.1,
+) -> Recordings:  # fmt: skip
+    options = SimulationOptions(
+        trajectories=trajectories, pairs=pairs, pair_step=pair_step, substeps=substeps,
+        interval=interval, noise_intensity=intensity,
+    )  # fmt: skip
+    return simulate_snapshots(as_system(known), options=options, generator=np.random.default_rng(seed))
+
+
+def identified(
+    known: KnownSystem, pairs: SnapshotPairs, *, integrator_step: float | None = None, **options: object
+) -> IdentifiedField:
+    settings = IdentificationOptions(**{"degree": 3, **options})
+    library = field_library([symbol.name for symbol in known.field.symbols], settings)
+    return identify_vector_field(library, pairs, options=settings, integrator_step=integrator_step)
+
+
+def terms(found: IdentifiedField) -> list[dict[str, float]]:
+    return [
+        {name: float(value) for name, value in zip(found.library.names, column, strict=True) if value != 0}
+        for column in found.coefficients.T
+    ]
+
+
+def exact_terms(known: KnownSystem) -> list[dict[str, float]]:
+    return [
+        {str(term): float(value) for term, value in sympy.expand(equation).as_coefficients_dict().items()}
+        for equation in known.field.equations
+    ]
+
+
+def assert_same(found: IdentifiedField, known: KnownSystem, tolerance: float) -> None:
+    for mine, wanted in zip(terms(found), exact_terms(known), strict=True):
+        assert set(mine) == set(wanted)
+        for name, value in wanted.items():
+            assert mine[name] == pytest.approx(value, abs=tolerance), name
+
+
+def scores(found: IdentifiedField, known: KnownSystem) -> np.ndarray:
+    """Errors of the coefficients in their standard errors; fails where terms are missing or false."""
+    exact = [exact_terms(known)[i][found.library.names[k]] for i, k in found.support]
+    assert len(exact) == sum(map(len, exact_terms(known)))
+    return (found.values - exact) / np.sqrt(np.diag(found.covariance))
+
+
+def planar(*equations: sympy.Expr, diffusion: np.ndarray | None = None, width: float = 1.5) -> KnownSystem:
+    symbols = (x, y)[: len(equations)]
+    diffusion = np.eye(len(symbols)) if diffusion is None else diffusion
+    box = np.array([[-width, width]] * len(symbols))
+    return KnownSystem(
+        VectorField(symbols, equations), None, diffusion, np.zeros((0, len(symbols))), box
+    )
+
+
+UNCOUPLED = planar(x - x**3, -2 * y, diffusion=CORRELATED)
+TURNING = planar(x - x**3 - 2 * y, 2 * x - y)
+
+
+@pytest.mark.parametrize("h", [(0.01, 0.01), (0.005, 0.08)], ids=["one step", "varying steps"])
+@pytest.mark.parametrize(
+    "known", [archetype(3), maier_stein(5), double_well(2)], ids=["archetype", "Maier-Stein", "double well"]
+)
+def test_pairs_without_noise_give_the_coefficients(known: KnownSystem, h: tuple[float, float]) -> None:
+    found = identified(known, flow_pairs(known, 600, h=h))
+    assert_same(found, known, 1e-7)
+    assert found.noise_free
+    assert found.residual_ratio < 1e-8
+    points = uniform_points(known, 20, seed=5)
+    np.testing.assert_allclose(found.field(points), known.field(points), atol=1e-6)
+
+
+def test_terms_that_are_no_monomials_are_found() -> None:
+    fraction, root = x / (x**2 + 1), sympy.sqrt(y**2 + 1)
+    known = planar(3 * fraction - x - y, x - 2 * root)
+    pairs = flow_pairs(known, 500, h=(0.01, 0.03))
+    found = identified(known, pairs, degree=2, functions=("x/(1+x**2)", "sqrt(1+y**2)"))
+    assert_same(found, known, 1e-7)
+    # Without them f is not in the library, which shows.
+    assert identified(known, pairs, degree=2).residual_ratio > 1e-4
+
+
+def test_the_paths_of_the_flow_need_no_small_steps() -> None:
+    known = archetype(2)
+    found = identified(known, flow_pairs(known, 400, h=(0.1, 0.25)))
+    assert_same(found, known, 1e-7)
+    assert found.flow.steps > 1
+
+
+def test_the_residuals_and_a_second_fit_use_the_same_terms() -> None:
+    known = maier_stein(5)
+    first, second = flow_pairs(known, 400, h=(0.01, 0.02)), flow_pairs(known, 300, h=(0.02, 0.03), seed=9)
+    found = identified(known, first)
+    assert np.abs(residuals(found, second)).max() < 1e-7
+    again = refit(found, second)
+    np.testing.assert_array_equal(again.support, found.support)
+    np.testing.assert_allclose(again.values, found.values, atol=1e-6)
+
+
+def test_the_order_of_pairs_does_not_matter() -> None:
+    pairs = flow_pairs(TURNING, 500, h=(0.01, 0.03))
+    noise = np.random.default_rng(0).normal(size=pairs.xh.shape) * 0.02
+    order = np.random.default_rng(1).permutation(500)
+    for spread in (0.0, 1.0):
+        mine = replace(pairs, xh=pairs.xh + spread * noise)
+        other = SnapshotPairs(mine.x0[order], mine.xh[order], mine.h[order], mine.recording)
+        one, two = identified(TURNING, mine), identified(TURNING, other)
+        np.testing.assert_array_equal(one.support, two.support)
+        np.testing.assert_allclose(one.values, two.values, rtol=1e-7)
+        np.testing.assert_allclose(one.noise_rate, two.noise_rate, rtol=1e-6, atol=1e-18)
+
+
+def test_the_order_of_recordings_does_not_matter() -> None:
+    recordings = noisy(TURNING, seed=4)
+    order = np.random.default_rng(1).permutation(len(recordings.labels))
+    one, two = (
+        identified(TURNING, snapshot_pairs(each, pair_step=0.02), integrator_step=0.01)
+        for each in (recordings, select_recordings(recordings, order))
+    )
+    np.testing.assert_array_equal(one.support, two.support)
+    np.testing.assert_allclose(one.values, two.values, rtol=1e-9)
+    np.testing.assert_allclose(one.covariance, two.covariance, rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize("units", [(1e-3, 40.0), (1e-6, 1.0), (1e4, 1e4)])
+@pytest.mark.parametrize("spread", [0.0, 0.03])
+def test_other_units_scale_the_coefficients_and_keep_the_terms(
+    units: tuple[float, float], spread: float
+) -> None:
+    known = maier_stein(5)
+    pairs = flow_pairs(known, 800, h=(0.01, 0.03))
+    pairs = replace(pairs, xh=pairs.xh + spread * np.random.default_rng(3).normal(size=pairs.xh.shape))
+    scale = np.array(units)
+    scaled = replace(pairs, x0=pairs.x0 * scale, xh=pairs.xh * scale)
+    before, after = identified(known, pairs, degree=5), identified(known, scaled, degree=5)
+    np.testing.assert_array_equal(after.support, before.support)
+    powers = [[sympy.degree(term, s) for s in known.field.symbols] for term in before.library.terms]
+    factors = np.prod(scale ** np.array(powers, dtype=float), axis=1)
+    expected = before.coefficients * scale / factors[:, None]
+    np.testing.assert_allclose(after.coefficients, expected, rtol=1e-6)
+    np.testing.assert_allclose(
+        after.noise_rate, before.noise_rate * np.outer(scale, scale), rtol=1e-3 if spread else np.inf
+    )
+    if spread:
+        np.testing.assert_allclose(
+            after.standard_errors, before.standard_errors * scale / factors[:, None], rtol=1e-3
+        )
+
+
+def repeated(known: KnownSystem, repetitions: int, *, step: float | None, **sampling: float) -> np.ndarray:
+    """Standardised errors of all coefficients, shape ``(repetitions, p)``."""
+    rows = []
+    for seed in range(repetitions):
+        pairs = snapshot_pairs(
+            noisy(known, seed=seed, **sampling), pair_step=sampling.get("pair_step", 0.02)
+        )
+        rows.append(scores(identified(known, pairs, integrator_step=step), known))
+    return np.array(rows)
+
+
+@pytest.mark.parametrize(
+    ("known", "repetitions"),
+    [(planar(x - x**3), 30), (TURNING, 20), (UNCOUPLED, 20)],
+    ids=["one state", "rotation", "correlated noise"],
+)
+def test_errors_under_noise_are_as_large_as_the_standard_errors_say(
+    known: KnownSystem, repetitions: int
+) -> None:
+    z = repeated(known, repetitions, step=0.01)
+    assert 0.85 < np.sqrt((z**2).mean()) < 1.2
+    covered = (np.abs(z) < 1.96).mean()
+    slack = 3 * np.sqrt(0.05 * 0.95 / z.size)
+    assert 0.95 - slack < covered
+    assert np.abs(z.mean(axis=0)).max() < 3.5 / np.sqrt(repetitions)
+
+
+def test_the_standard_errors_are_those_of_cramer_and_rao() -> None:
+    # With one step of Euler's rule per pair the increments are linear in the coefficients.
+    recordings = noisy(UNCOUPLED, seed=1, pair_step=0.01, substeps=1)
+    pairs = snapshot_pairs(recordings, pair_step=0.01)
+    found = identified(UNCOUPLED, pairs, integrator_step=0.01)
+    theta = found.library.evaluate(pairs.x0)[:, found.support[:, 1]]
+    precision = np.linalg.inv(0.05 * CORRELATED)[np.ix_(found.support[:, 0], found.support[:, 0])]
+    information = precision * (theta.T @ (theta * pairs.h[:, None]))
+    np.testing.assert_allclose(found.covariance, np.linalg.inv(information), rtol=0.15, atol=1e-4)
+
+
+def test_correlated_noise_is_recovered_and_used() -> None:
+    generalised, ordinary = [], []
+    exact = np.array([1.0, -1.0, -2.0])
+    for seed in range(12):
+        pairs = snapshot_pairs(noisy(UNCOUPLED, seed=seed, pair_step=0.01, substeps=1), pair_step=0.01)
+        found = identified(UNCOUPLED, pairs, integrator_step=0.01)
+        np.testing.assert_allclose(found.noise_rate, 0.05 * CORRELATED, rtol=0.12)
+        generalised.append(found.values - exact)
+        theta, slope = found.library.evaluate(pairs.x0), (pairs.xh - pairs.x0) / pairs.h[:, None]
+        estimate = [
+            np.linalg.lstsq(theta[:, found.support[found.support[:, 0] == i, 1]], slope[:, i])[0]
+            for i in range(2)
+        ]
+        ordinary.append(np.concatenate(estimate) - exact)
+    gain = np.sqrt((np.array(generalised) ** 2).mean(axis=0) / (np.array(ordinary) ** 2).mean(axis=0))
+    assert gain.max() < 0.8
+
+
+def test_without_the_integrators_step_f_is_that_of_the_continuous_process() -> None:
+    z = repeated(TURNING, 16, step=None, pair_step=0.1, substeps=40, interval=0.2, intensity=0.2)
+    assert 0.8 < np.sqrt((z**2).mean()) < 1.25
+    assert np.abs(z.mean(axis=0)).max() < 3.5 / 4
+
+
+def test_the_integrators_step_says_which_f_is_meant() -> None:
+    coarse = snapshot_pairs(
+        noisy(TURNING, seed=0, pair_step=0.1, substeps=1, interval=0.2, trajectories=600, intensity=0.01),
+        pair_step=0.1,
+    )
+    exact = identified(TURNING, coarse, integrator_step=0.1)
+    other = identified(TURNING, coarse)
+    assert np.abs(scores(exact, TURNING)).max() < 4
+    assert other.values.shape != exact.values.shape or np.abs(other.values - exact.values).max() > 0.1
+
+
+def test_too_few_pairs_are_a_numerical_failure() -> None:
+    with pytest.raises(NumericalFailure, match="only 19 pairs for 10 candidate functions"):
+        identified(TURNING, flow_pairs(TURNING, 19, h=(0.01, 0.01)))
+
+
+def test_a_function_that_is_not_finite_is_a_numerical_failure() -> None:
+    pairs = flow_pairs(TURNING, 50, h=(0.01, 0.01))
+    with pytest.raises(NumericalFailure, match="not finite"), np.errstate(invalid="ignore"):
+        identified(TURNING, pairs, degree=2, functions=("log(x)",))
+
+
+def test_an_equation_without_a_significant_term_is_a_numerical_failure() -> None:
+    pairs = flow_pairs(TURNING, 200, h=(0.01, 0.01))
+    drift = pairs.x0 + 0.1 * np.random.default_rng(0).normal(size=pairs.x0.shape)
+    with pytest.raises(NumericalFailure, match="no term of the equation of"):
+        identified(TURNING, replace(pairs, xh=drift))
+
+
+def test_noise_free_pairs_beyond_the_limit_are_not_used_and_noisy_ones_are() -> None:
+    pairs = flow_pairs(TURNING, 400, h=(0.01, 0.02))
+    chosen = evenly(400, 150)
+    assert len(chosen) == 150
+    assert (chosen[0], chosen[-1]) == (0, 399)
+    some = SnapshotPairs(pairs.x0[chosen], pairs.xh[chosen], pairs.h[chosen], pairs.recording[chosen])
+    np.testing.assert_array_equal(
+        identified(TURNING, pairs, pairs=150).values, identified(TURNING, some).values
+    )
+    disturbed = replace(pairs, xh=pairs.xh + 0.005 * np.random.default_rng(0).normal(size=pairs.xh.shape))
+    np.testing.assert_array_equal(
+        identified(TURNING, disturbed, pairs=150).values, identified(TURNING, disturbed).values
+    )
