@@ -63,10 +63,22 @@ def answer_sentences(
             " domain, which reaches beyond the recorded points)."
         )
     certified = int(mine["certified"].sum())
+    stated = mine[mine["certified"]]["stated_error"].dropna()
+    if certified:
+        within = f", to within {stated.max():.1e} of V at worst" if len(stated) else ""
+        sentences.append(f"{certified} of {runs} runs are certified{within}.")
     if certified < runs:
         sentences.append(
-            f"{certified} of {runs} runs are certified. A formula that is not certified may belong to a false"
-            " decomposition that fits just as well: do not build on it without an independent test."
+            f"{runs - certified} of {runs} runs are not certified. A formula that is not certified may"
+            " belong to a false decomposition that fits just as well: do not build on it without an"
+            " independent test."
+        )
+    predicted = summary[(summary["method"] == method) & (summary["quantity"] == "prediction_error")]
+    if len(predicted):
+        row = predicted.iloc[0]
+        sentences.append(
+            f"f predicts unseen trajectories with a relative error of {row['mean']:.2e} in the mean"
+            f" (median {row['median']:.2e})."
         )
     return sentences
 

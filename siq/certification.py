@@ -24,12 +24,15 @@ from siq.certificate import (
     stated_error,
 )
 from siq.expressions import compile_formulas
+from siq.fans import adapted_fan, first_caustic
 from siq.identification import IdentifiedField
 from siq.local_route import Well
 from siq.outline import Outline
 from siq.refinement import Refined
 from siq.symbolic import SymbolicDecomposition
 
+NOTICEABLE = 1e-3  # a stated error above this is worth an explanation
+FAN = 200  # characteristics in search of a caustic
 HARMLESS = 1e-6  # a difference of the routes that no error needs to explain
 
 
@@ -170,6 +173,39 @@ def certify_wells(
             )
     tests["prediction"] = prediction
     return _conclude(tests, error, worst, outline, "wells")
+
+
+def caustic_notes(refined: Refined, outline: Outline, error: float, *, seed: int = 0) -> tuple[str, ...]:
+    """Where characteristics cross below the saddle of a well, in words: no smooth V exists there.
+
+    Only sought where the stated error leaves room for one. A kink of V is no fault of the method, but no
+    polynomial follows it, and the error that is stated comes from there.
+    """
+    if not error > NOTICEABLE:
+        return ()
+    notes = []
+    for well in refined.wells or refined.network_wells:
+        fan = adapted_fan(
+            refined.found.field, well.attractor, diffusion=refined.diffusion, level=0.98 * well.level,
+            box=_widened(outline.box), generator=np.random.default_rng(seed), most=FAN, rounds=3,
+        )  # fmt: skip
+        caustic = first_caustic(fan)
+        if caustic is not None:
+            where = np.array2string(caustic.position, precision=4, suppress_small=True, separator=", ")
+            notes.append(
+                f"characteristics from the attractor {_place(well.attractor)} cross at a caustic from {where}"
+                f" on, where U = {2 * caustic.value:.4g}: V has no smooth form there, and no formula follows it"
+            )
+    return tuple(notes)
+
+
+def _place(position: np.ndarray) -> str:
+    return np.array2string(position, precision=4, suppress_small=True, separator=", ")
+
+
+def _widened(box: np.ndarray) -> np.ndarray:
+    width = box[:, 1] - box[:, 0]
+    return np.stack([box[:, 0] - width / 4, box[:, 1] + width / 4], axis=1)
 
 
 def uncertified(reason: str) -> dict[str, Any]:

@@ -190,7 +190,7 @@ def follow(
                 ends[near & ~escaped] = index
         if out.any() or done >= count:
             going = np.flatnonzero(~escaped & (ends < 0))
-            if not len(going) or not attractors and done >= count:
+            if not len(going) or (not attractors and done >= count):
                 break
     paths += [x.T.copy()] * (states - len(paths))
     return Descents(np.stack(paths, axis=1), ends, escaped)

@@ -69,7 +69,7 @@ def flow_map(
     integrator_step
         Step of the Euler–Maruyama simulation that made the data; None for everything else.
     tolerance
-        Accuracy of the increments wanted, relative to their root mean square.
+        Accuracy of the increments wanted, relative to their root mean square, state by state.
     """
     if integrator_step is not None:
         return FlowMap(steps=max(round(float(np.median(h)) / integrator_step), 1), euler=True)
@@ -77,9 +77,9 @@ def flow_map(
     coarse = FlowMap(steps)(field, x0, h)
     while steps < LARGEST_REFINEMENT:
         fine = FlowMap(2 * steps)(field, x0, h)
-        size = np.sqrt(((fine - x0) ** 2).mean())
+        size = np.sqrt(((fine - x0) ** 2).mean(axis=1))
         # The error of the coarse result; that of the fine one is sixteen times smaller.
-        if not np.sqrt(((fine - coarse) ** 2).mean()) > tolerance * size:
+        if not (np.sqrt(((fine - coarse) ** 2).mean(axis=1)) > tolerance * size).any():
             break
         steps, coarse = 2 * steps, fine
     return FlowMap(steps)

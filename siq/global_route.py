@@ -164,7 +164,7 @@ def _eliminate(
         equation.weight[:, None] * gradient[:, found.support[:, 0]] * field_terms(found, equation.points)
     )
     # Everything depends on the points through a triangular matrix only.
-    triangle: np.ndarray = np.linalg.qr(np.column_stack([jacobian, goal, forcing]), mode="r")
+    triangle = np.asarray(np.linalg.qr(np.column_stack([jacobian, goal, forcing]), mode="r"))
     m = len(coefficients)
     spread = np.sqrt(((equation.gradients**2).sum(axis=1)).mean(axis=0))
     size = np.sqrt((gradient**2).sum(axis=1).mean())

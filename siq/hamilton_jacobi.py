@@ -124,7 +124,7 @@ def gauss_newton(
         change = np.linalg.norm(length * step * scale[free])
         size = np.linalg.norm(coefficients * scale)
         if improved:
-            gain = 1 - np.linalg.norm(attempt) / max(np.linalg.norm(residual), 1e-300)
+            gain = 1 - float(np.linalg.norm(attempt)) / max(float(np.linalg.norm(residual)), 1e-300)
             coefficients, residual = trial, attempt
         if not improved or change <= tolerance * size or gain < 1e-7:
             converged = True

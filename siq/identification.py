@@ -155,11 +155,25 @@ def identify_vector_field(
     pairs. Those of noise-free pairs are the error of integrators, the same in neighbouring pairs: their
     standard errors are given without that gain, as a bound.
     """
-    some = evenly(len(pairs.h), options.pairs)
-    found = _identify(library, _rows(pairs, some), options, integrator_step)
-    if not found.noise_free and len(some) < len(pairs.h):
-        found = _identify(library, pairs, options, integrator_step)
-    return found
+    if not carries_noise(library, pairs, options=options, integrator_step=integrator_step):
+        pairs = _rows(pairs, evenly(len(pairs.h), options.pairs))
+    return _identify(library, pairs, options, integrator_step)
+
+
+def carries_noise(
+    library: CandidateLibrary,
+    pairs: SnapshotPairs,
+    *,
+    options: IdentificationOptions,
+    integrator_step: float | None = None,
+) -> bool:
+    """Whether pairs are more than an integrator's error away from any f in the library.
+
+    The arguments are those of `identify_vector_field`.
+    """
+    _check_count(library, pairs)
+    some = _rows(pairs, evenly(len(pairs.h), max(options.pairs // 4, 4 * library.size)))
+    return _fit_everything(library, some, integrator_step).ratio >= NOISE_FREE
 
 
 def refit(found: IdentifiedField, pairs: SnapshotPairs) -> IdentifiedField:
@@ -183,8 +197,7 @@ class _Problem:
     """Pairs with the active library functions at X0, and what the current f makes of them."""
 
     def __init__(self, library: CandidateLibrary, pairs: SnapshotPairs, support: np.ndarray) -> None:
-        self.library = library
-        self.support = support
+        self.library, self.pairs, self.support = library, pairs, support
         self.active, self.position = np.unique(support[:, 1], return_inverse=True)
         terms = [library.terms[k] for k in self.active]
         self._terms = compile_formulas(terms, library.symbols)
@@ -216,12 +229,11 @@ class _Problem:
         if flow is None:
             return quotient.T
         matrix, field = self.matrix(values), self.field(values)
-        noisy = noise_rate is not None and bool(np.any(noise_rate))
         for begin in range(0, len(self.h), CHUNK):  # small enough to stay in the processor's cache
             part = slice(begin, begin + CHUNK)
             x0, h = self.x0[:, part], self.h[part]
             correction = (flow(field, x0, h) - x0) / h - matrix @ self.theta[:, part]
-            if noisy:
+            if noise_rate is not None and np.any(noise_rate):
                 curvature = self._curvature(x0, noise_rate)
                 correction += flow.curvature_weight * h / 4 * (matrix @ curvature)
             # A trial f may run away on a few pairs; one round without their correction does no harm.
@@ -229,7 +241,7 @@ class _Problem:
             quotient[:, part] -= correction
         return quotient.T
 
-    def _curvature(self, x0: np.ndarray, noise_rate: np.ndarray | None) -> np.ndarray:
+    def _curvature(self, x0: np.ndarray, noise_rate: np.ndarray) -> np.ndarray:
         """Σ_jk (εD)_jk ∂²θ/∂x_j∂x_k of the active functions, shape ``(active, n)``."""
         symbols = self.library.symbols
         d = len(symbols)
@@ -251,11 +263,58 @@ def _identify(
     options: IdentificationOptions,
     integrator_step: float | None,
 ) -> IdentifiedField:
+    _check_count(library, pairs)
     q, d, n = library.size, library.dimension, len(pairs.h)
-    if n < 2 * q:
+    dense = _fit_everything(library, pairs, integrator_step)
+    triangle, values, noise_free = dense.triangle, dense.values, dense.ratio < NOISE_FREE
+    chosen = [
+        (i, k)
+        for i in range(d)
+        for k in _significant(triangle, q, i, n, options=options, noise_free=noise_free, candidates=d * q)
+    ]
+    if len({i for i, _ in chosen}) < d:
+        missing = next(i for i in range(d) if i not in {j for j, _ in chosen})
+        raise NumericalFailure(f"no term of the equation of {library.states[missing]} is significant")
+    coefficients = np.zeros((q, d))
+    support = np.array(chosen)
+    for i, k in chosen:
+        coefficients[k, i] = values[i * q + k]
+    found = IdentifiedField(
+        library, coefficients, support, np.eye(len(support)), dense.rate, dense.ratio, dense.flow
+    )
+    problem = _Problem(library, pairs, support)
+    found = _fit_support(found, problem)
+    # With the final support and flow a term may turn out to be superfluous after all.
+    while (weak := _weakest(found, problem, options)) is not None:
+        support = np.delete(found.support, weak, axis=0)
+        coefficients = np.zeros_like(found.coefficients)
+        coefficients[support[:, 1], support[:, 0]] = found.coefficients[support[:, 1], support[:, 0]]
+        problem = _Problem(library, pairs, support)
+        found = _fit_support(replace(found, coefficients=coefficients, support=support), problem)
+    return found
+
+
+def _check_count(library: CandidateLibrary, pairs: SnapshotPairs) -> None:
+    if len(pairs.h) < 2 * library.size:
         raise NumericalFailure(
-            f"only {n} pairs for {q} candidate functions of f; lower identification.degree or record more"
+            f"only {len(pairs.h)} pairs for {library.size} candidate functions of f;"
+            " lower identification.degree or record more"
         )
+
+
+@plain_dataclass(frozen=True)
+class _Dense:
+    """The fit of all functions of a library: coefficients, and the triangle of the last least squares."""
+
+    values: np.ndarray
+    triangle: np.ndarray
+    rate: np.ndarray
+    ratio: float
+    flow: FlowMap
+
+
+def _fit_everything(library: CandidateLibrary, pairs: SnapshotPairs, integrator_step: float | None) -> _Dense:
+    q, d, n = library.size, library.dimension, len(pairs.h)
     everything = np.array([(i, k) for i in range(d) for k in range(q)])
     full = _Problem(library, pairs, everything)
     weight = np.sqrt(pairs.h)
@@ -266,45 +325,26 @@ def _identify(
     for done in range(ROUNDS):
         velocity = full.corrected(values, flow, rate)
         triangle = _triangle(full.theta, velocity, weight)
-        solution = np.linalg.lstsq(triangle[:q, :q], triangle[:q, q:], rcond=1e-14)[0]
-        change = np.abs(solution.T.ravel() - values)
-        values = solution.T.ravel()
+        # Scaled columns, for functions differ by many orders of magnitude where units are small or large.
+        scale = _positive(np.linalg.norm(triangle[:q, :q], axis=0))
+        solution = np.linalg.lstsq(triangle[:q, :q] / scale, triangle[:q, q:], rcond=1e-14)[0]
+        change = np.abs(solution - values.reshape(d, q).T * scale[:, None])
+        settled = np.all(change <= 1e-13 * np.abs(solution).max(axis=0))
+        values = (solution / scale[:, None]).T.ravel()
         leftover = triangle[q:, q:]
         rate = leftover.T @ leftover / n
-        ratio = np.sqrt(np.trace(rate) * n / ((pairs.xh - pairs.x0) ** 2 / pairs.h[:, None]).sum())
+        ratio = _residual_ratio(rate, pairs)
         if flow is None or ratio > NOISE_FREE:
             flow = flow_map(
                 full.field(values), full.x0[:, :: max(n // 500, 1)], pairs.h[:: max(n // 500, 1)],
                 integrator_step=integrator_step, tolerance=1e-10 if ratio < 1e-2 else 1e-6,
             )  # fmt: skip
-        elif np.all(change <= 1e-13 * np.abs(values).max()):
+        elif settled:
             break
         if ratio > 0.1 and done >= 3:
             break  # noise hides what further rounds would change
-    noise_free = ratio < NOISE_FREE
-    chosen = [
-        (i, k)
-        for i in range(d)
-        for k in _significant(triangle, q, i, n, options=options, noise_free=noise_free, candidates=d * q)
-    ]
-    if len({i for i, _ in chosen}) < d:
-        missing = next(i for i in range(d) if i not in {j for j, _ in chosen})
-        raise NumericalFailure(f"no term of the equation of {library.states[missing]} is significant")
     assert flow is not None and rate is not None
-    coefficients = np.zeros((q, d))
-    support = np.array(chosen)
-    for i, k in chosen:
-        coefficients[k, i] = values[i * q + k]
-    found = IdentifiedField(library, coefficients, support, np.eye(len(support)), rate, float(ratio), flow)
-    found = _fit_support(found, _Problem(library, pairs, support))
-    # With the final support and flow a term may turn out to be superfluous after all.
-    while (weak := _weakest(found, options)) is not None:
-        support = np.delete(found.support, weak, axis=0)
-        coefficients = np.zeros_like(found.coefficients)
-        coefficients[support[:, 1], support[:, 0]] = found.coefficients[support[:, 1], support[:, 0]]
-        found = replace(found, coefficients=coefficients, support=support)
-        found = _fit_support(found, _Problem(library, pairs, support))
-    return found
+    return _Dense(values, triangle, rate, float(ratio), flow)
 
 
 def _triangle(theta: np.ndarray, velocity: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -353,14 +393,17 @@ def _significant(
     return active
 
 
-def _weakest(found: IdentifiedField, options: IdentificationOptions) -> int | None:
+def _weakest(found: IdentifiedField, problem: _Problem, options: IdentificationOptions) -> int | None:
     """The least significant term, if it is not significant, and not the last of its equation."""
     if found.noise_free:
-        return None
-    critical = _critical(options, found.library.size * found.library.dimension)
-    strength = np.abs(found.values) / np.sqrt(np.diag(found.covariance))
+        terms = np.sqrt(problem.theta**2 @ problem.h)[problem.position]
+        sizes = np.sqrt(problem.h @ problem.predicted(found.values) ** 2)
+        strength = np.abs(found.values) * terms / _positive(sizes)[found.support[:, 0]] / options.precision
+    else:
+        critical = _critical(options, found.library.size * found.library.dimension)
+        strength = np.abs(found.values) / np.sqrt(np.diag(found.covariance)) / critical
     for index in np.argsort(strength):
-        if strength[index] >= critical:
+        if strength[index] >= 1:
             return None
         if np.sum(found.support[:, 0] == found.support[index, 0]) > 1:
             return int(index)
@@ -398,7 +441,7 @@ def _fit_support(found: IdentifiedField, problem: _Problem) -> IdentifiedField:
         # Scaled columns, for functions may differ by many orders of magnitude.
         scale = np.linalg.norm(design, axis=0)
         solution = np.linalg.lstsq(design / scale, goal, rcond=None)[0] / scale
-        change = np.abs(solution - values).max() / np.abs(solution).max()
+        change = (np.abs(solution - values) * scale).max() / (np.abs(solution) * scale).max()
         values = solution
         misfit = triangle[:, active:] - triangle[:, :active] @ problem.matrix(values).T
         rate = misfit.T @ misfit / n
@@ -413,15 +456,25 @@ def _fit_support(found: IdentifiedField, problem: _Problem) -> IdentifiedField:
         # alike in neighbouring pairs and do not average out, hence the number of pairs.
         relative = float(np.trace(np.linalg.solve(spread, rate))) / d
         covariance = covariance * relative * n
-    size = ((problem.xh - problem.x0) ** 2 / problem.h).sum()
     return replace(
         found,
         coefficients=coefficients,
         covariance=covariance,
         noise_rate=rate,
-        residual_ratio=float(np.sqrt(np.trace(rate) * n / size)),
+        residual_ratio=_residual_ratio(rate, problem.pairs),
         flow=flow,
     )
+
+
+def _positive(sizes: np.ndarray) -> np.ndarray:
+    """Sizes to divide by: one where they vanish."""
+    return np.where(sizes > 0, sizes, 1.0)
+
+
+def _residual_ratio(rate: np.ndarray, pairs: SnapshotPairs) -> float:
+    """Rms of the residuals over rms of the increments, each component by its own."""
+    size = ((pairs.xh - pairs.x0) ** 2 / pairs.h[:, None]).mean(axis=0)
+    return float(np.sqrt((np.diag(rate) / _positive(size)).mean()))
 
 
 def _rows(pairs: SnapshotPairs, rows: np.ndarray) -> SnapshotPairs:

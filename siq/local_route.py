@@ -1,8 +1,8 @@
 """The local route: V about one attractor, from f alone, grown outwards to the lowest saddle.
 
 At the attractor the Hessian of V is M, which follows from the Jacobian of f, and it is kept. The higher
-powers are found by Gauss–Newton on the Hamilton–Jacobi equation in a sublevel set that grows from a small ellipsoid.
-No network takes part. Beyond the lowest saddle the well ends, and nothing is claimed there.
+powers are found by Gauss–Newton on the Hamilton–Jacobi equation, in a sublevel set that grows from a small
+ellipsoid. No network takes part. Beyond the lowest saddle the well ends, and nothing is claimed there.
 """
 
 from __future__ import annotations

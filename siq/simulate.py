@@ -68,7 +68,7 @@ def sampling_stride(options: SimulationOptions) -> int:
     return stride
 
 
-def runge_kutta_step(vector_field: VectorField, x: np.ndarray, step: float) -> np.ndarray:
+def runge_kutta_step(vector_field: VectorField, x: np.ndarray, step: float | np.ndarray) -> np.ndarray:
     """One step of the classical fourth-order Runge–Kutta rule.
 
     Parameters
@@ -78,7 +78,7 @@ def runge_kutta_step(vector_field: VectorField, x: np.ndarray, step: float) -> n
     x
         States, shape ``(d, n)``.
     step
-        Time step.
+        Time step, one for all or one for each, shape ``(n,)``.
 
     Returns
     -------

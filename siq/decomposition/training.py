@@ -122,8 +122,8 @@ def train(
     Returns
     -------
     TrainingState
-        After ``options.steps`` steps, or when finished. Its history has one row a run and logged step: `training_loss` on
-        the last batch, and on held-out pairs `held_out_loss`, the sum of `dynamics` and
+        After ``options.steps`` steps, or when finished. Its history has one row a run and logged step:
+        `training_loss` on the last batch, and on held-out pairs `held_out_loss`, the sum of `dynamics` and
         λ·`orthogonality`. A run whose loss is no longer finite keeps such rows and harms no other run.
     """
     dtype = getattr(torch, options.precision)

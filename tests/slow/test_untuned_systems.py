@@ -9,8 +9,18 @@ import time
 import numpy as np
 import pytest
 import torch
+from known_systems import (
+    KnownSystem,
+    archetype,
+    double_well,
+    limit_cycle,
+    linear_system,
+    maier_stein,
+    polynomial_system,
+    potential_values,
+)
 
-from siq.certificate import CertificateOptions, Verdict, check_prediction
+from siq.certificate import CertificateOptions, check_prediction
 from siq.certification import certify_formulas, certify_wells
 from siq.decomposition.check import training_check
 from siq.decomposition.data import prepare_data
@@ -27,16 +37,6 @@ from siq.refined_formulas import refined_decomposition
 from siq.refinement import RefinementOptions, refine
 from siq.simulate import SimulationOptions, simulate_snapshots
 from siq.systems import System
-from known_systems import (
-    KnownSystem,
-    archetype,
-    double_well,
-    limit_cycle,
-    linear_system,
-    maier_stein,
-    polynomial_system,
-    potential_values,
-)
 
 TRAINING = TrainingOptions(
     steps=8000,
@@ -141,7 +141,11 @@ def trained_until_certified(known: KnownSystem, seed: int = 0):
 SYSTEMS = {
     **{f"linear in {d} dimensions": linear_system(d) for d in range(2, 7)},
     "Maier–Stein, β = 1": maier_stein(1),
-    **{f"polynomial in {d} dimensions, draw {s}": polynomial_system(d, seed=s) for d in (2, 3) for s in (0, 1, 2)},
+    **{
+        f"polynomial in {d} dimensions, draw {s}": polynomial_system(d, seed=s)
+        for d in (2, 3)
+        for s in (0, 1, 2)
+    },
     "archetype in 3 dimensions": archetype(3),
     "gradient system": double_well(2),
 }
@@ -153,7 +157,7 @@ def test_systems_with_a_known_formula_are_certified_and_right(name):
     torch.set_num_threads(1)
     known = SYSTEMS[name]
     began = time.perf_counter()
-    refined, formulas, certificate, below, steps = trained_until_certified(known)
+    _, formulas, certificate, below, steps = trained_until_certified(known)
     print(f"\n{name}: {steps} steps, {time.perf_counter() - began:.0f} s, stated {certificate.error:.1e}")
     assert certificate.certified, certificate.reason
     assert formulas.potential is not None
@@ -169,7 +173,7 @@ def test_systems_with_a_known_formula_are_certified_and_right(name):
 @pytest.mark.parametrize("beta", [5, 10])
 def test_maier_stein_with_a_caustic_states_an_error(beta):
     torch.set_num_threads(1)
-    refined, formulas, certificate, _, steps = trained_until_certified(maier_stein(beta))
+    refined, _, certificate, _, steps = trained_until_certified(maier_stein(beta))
     levels = [2 * well.level for well in refined.wells]
     print(f"\nβ = {beta}: {steps} steps, stated {certificate.error:.2e}, barriers of U {levels}")
     print({name: (v.value, v.limit) for name, v in certificate.tests.items()})

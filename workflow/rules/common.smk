@@ -23,9 +23,11 @@ except InputError as error:
 
 
 FIGURES = {
-    "coefficient_distributions": "coefficients.rst",
     "error_distribution": "error.rst",
-    "inclusion_frequency": "inclusion.rst",
+    "coefficients_refined": "coefficients.rst",
+    "coefficients_regression": "coefficients.rst",
+    "inclusion_refined": "inclusion.rst",
+    "inclusion_regression": "inclusion.rst",
     "components": "components.rst",
     "training": "training.rst",
 }

@@ -11,7 +11,6 @@ from siq.study import load_published
 from siq.tables import as_table, concatenate, read_table, write_table
 from step import job, read_outcomes
 
-
 STEPS = ("simulate", "resample", "identify", "train", "regress", "refine", "score")
 
 

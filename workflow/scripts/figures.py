@@ -21,7 +21,7 @@ from siq.study import load_published
 from siq.symbolic import SymbolicDecomposition, exact_decomposition
 from siq.systems import System, load_system
 from siq.tables import read_table
-from step import first_model, job, read_run
+from step import METHODS, job, read_run, shown_formula
 
 TRAJECTORIES = 5
 
@@ -51,20 +51,21 @@ def main(snakemake: Any) -> None:
     band = None
     if published is not None and published.standard_deviation is not None:
         band = (published.mean, published.standard_deviation)
-    save_figure(
-        plot_coefficient_distributions(coefficients, method="regression"),
-        folder / "coefficient_distributions",
-    )
+    rrmse = rrmse[rrmse["method"].isin(METHODS)]
+    for method in METHODS:
+        save_figure(
+            plot_coefficient_distributions(coefficients, method=method), folder / f"coefficients_{method}"
+        )
+        save_figure(plot_inclusion(coefficients, method=method), folder / f"inclusion_{method}")
     save_figure(plot_error_distribution(rrmse, published=band), folder / "error_distribution")
-    save_figure(plot_inclusion(coefficients, method="regression"), folder / "inclusion_frequency")
     save_figure(plot_training(read_table(source.training)), folder / "training")
 
     system = load_system(source.card) if source.get("card") else None
-    run = first_model(source.models)
+    run, method = shown_formula(rrmse, source.models)
     recordings = read_run(source.recordings[run or 0])
     if recordings is None:
         recordings = Recordings(("x",), (None,), ("none",), np.zeros(1, int), np.zeros(1), np.zeros((1, 1)))
-    identified = None if run is None else read_model(source.models[run])[0]["regression"]
+    identified = None if run is None else read_model(source.models[run])[0][method]
     fields, domain = component_fields(recordings, identified, system)
     units = system.units if system is not None else tuple(unit or "1" for unit in recordings.units)
     figure = plot_components(fields, states=recordings.names, units=units, domain=domain)

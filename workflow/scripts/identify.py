@@ -9,7 +9,14 @@ from siq.certificate import Verdict, check_prediction
 from siq.errors import NumericalFailure
 from siq.field_file import FieldRecord, field_library, write_field
 from siq.held_out import held_out_recordings
-from siq.identification import IdentificationOptions, IdentifiedField, identify_vector_field, refit, residuals
+from siq.identification import (
+    IdentificationOptions,
+    IdentifiedField,
+    carries_noise,
+    identify_vector_field,
+    refit,
+    residuals,
+)
 from siq.noise import diagnose, mean_residual_probability
 from siq.prediction import prediction_errors
 from siq.randomness import generator
@@ -59,12 +66,13 @@ def identify(recordings: Recordings, run: int, study: dict[str, Any]) -> FieldRe
     parts = snapshot_pairs(training, pair_step=step), snapshot_pairs(held_out, pair_step=step)
     library = field_library(recordings.names, options)
     maker = integrator_step(study)
-    found = fitted = identify_vector_field(library, parts[0], options=options, integrator_step=maker)
-    if not found.noise_free:
-        # Under noise every recording counts: all give the result, and the others only its test.
+    if carries_noise(library, parts[0], options=options, integrator_step=maker):
+        # Under noise every recording counts: all give the result, a part of them its test.
         everything = snapshot_pairs(recordings, pair_step=step)
         found = identify_vector_field(library, everything, options=options, integrator_step=maker)
         fitted = refit(found, parts[0])
+    else:
+        found = fitted = identify_vector_field(library, parts[0], options=options, integrator_step=maker)
     diffusion = diffusion_matrix(study["metric"]["diffusion"], len(recordings.names))
     noise = diagnose(found, recordings, diffusion=diffusion, pair_step=step)
     verdict = held_out_verdict(

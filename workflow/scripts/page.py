@@ -17,20 +17,22 @@ from siq.report import FormulaRow, ReportContent, ReportFigure, ReportTable, ren
 from siq.symbolic import SymbolicDecomposition, exact_decomposition
 from siq.systems import load_system
 from siq.tables import read_table
-from step import first_model, job
+from step import METHODS, job, shown_formula
 
-METHOD = "regression"
 CAPTIONS = {
     "components": "Trajectories, downhill component −∇V, circulatory component g, exact and identified U of"
     " the run shown above, projected on the first two states (the paper: Fig. 1).",
-    "coefficient_distributions": "Coefficients of U over the runs, one panel for each term that belongs"
+    "coefficients_refined": "Refined: coefficients of U over the runs, one panel for each term that belongs"
     " there; the last panel shows the terms that do not (the paper: Fig. 2).",
+    "coefficients_regression": "The same by the published regression, from the networks as they are.",
     "error_distribution": "Relative root mean square error of the coefficients of U, one dot a run"
     " (the paper: Fig. 3).",
-    "inclusion_frequency": "How often each term was found, by component.",
+    "inclusion_refined": "Refined: how often each term was found, by component.",
+    "inclusion_regression": "The same by the published regression.",
     "training": "Loss on held-out recordings during training, one line a run.",
 }
 SUMMARY_COLUMNS = (
+    "method",
     "quantity",
     "exact",
     "mean",
@@ -49,14 +51,6 @@ SUMMARY_HELP = {
 }
 
 
-def shown_run(rrmse: pd.DataFrame, models: list[str]) -> int | None:
-    """The run whose formulas are shown: the median by error, otherwise the first with formulas."""
-    ranked = rrmse[rrmse["method"] == METHOD].dropna(subset="rrmse").sort_values("rrmse")
-    if len(ranked):
-        return int(ranked["run"].iloc[(len(ranked) - 1) // 2])
-    return first_model(models)
-
-
 def summary_shown(summary: pd.DataFrame) -> pd.DataFrame:
     """Errors, U and g; the headings in words, so that they wrap."""
     shown = summary[~summary["quantity"].str.match("V:|f_")]
@@ -65,13 +59,24 @@ def summary_shown(summary: pd.DataFrame) -> pd.DataFrame:
 
 
 def formula_rows(
-    identified: SymbolicDecomposition, exact: SymbolicDecomposition | None, certificate: dict[str, Any]
+    method: str,
+    identified: SymbolicDecomposition,
+    exact: SymbolicDecomposition | None,
+    certificate: dict[str, Any],
 ) -> list[FormulaRow]:
-    """U, ∇V, g and f, exact and identified."""
+    """U, ∇V, g and f, exact and identified; U of each well where no single formula holds."""
 
     def typeset(one: SymbolicDecomposition | None) -> dict[str, Any]:
         if one is None:
             return {}
+        if one.potential is None:
+            wells = {
+                f"U about {place(well.attractor)}, up to {2 * well.level:.4g}": formula_mathml(
+                    2 * well.potential
+                )
+                for well in one.wells
+            }
+            return wells | {"f": vector_mathml(one.vector_field)}
         return {
             "U": formula_mathml(one.quasipotential),
             "∇V": vector_mathml(one.gradient),
@@ -83,14 +88,27 @@ def formula_rows(
     return [
         FormulaRow(
             quantity=name,
-            method=METHOD,
+            method=method,
             identified=formula,
             exact=truths.get(name),
             certified=certificate["certified"],
-            reason=certificate.get("reason", ""),
+            reason=certificate_sentence(certificate),
         )
         for name, formula in typeset(identified).items()
     ]
+
+
+def place(position: tuple[float, ...]) -> str:
+    """A point as text."""
+    return "(" + ", ".join(f"{value:.4g}" for value in position) + ")"
+
+
+def certificate_sentence(certificate: dict[str, Any]) -> str:
+    """What a certificate says, in words."""
+    said = [certificate["reason"]] if certificate["reason"] else []
+    if certificate["certified"]:
+        said.append(f"all tests passed; stated relative error of V {certificate['stated_error']:.1e}")
+    return "; ".join([*said, *certificate.get("notes", [])])
 
 
 def question(study: dict[str, Any]) -> list[str]:
@@ -105,10 +123,72 @@ def question(study: dict[str, Any]) -> list[str]:
         f"From {source} alone: which orthogonal decomposition f = −D∇V + g, with ∇V·g = 0, and which"
         " formula of the quasipotential U = 2V lie behind them, and how much does the answer vary over"
         f" {study['runs']} independent run{'s' if study['runs'] > 1 else ''}?",
-        f"Each run trained two tanh networks for {training['steps']} steps on batches of"
-        f" {training['batch_size']}, then sought formulas of degree {regression['degree']} at most, dropping"
-        f" terms below {regression['threshold']} (acting on the {regression['threshold_on']}).",
+        f"Each run identified f from the pairs alone, and trained two tanh networks for at most"
+        f" {training['steps']} steps on batches of {training['batch_size']}. The published method,"
+        f" “regression”, seeks formulas of the networks, of degree {regression['degree']} at most, dropping"
+        f" terms below {regression['threshold']} (acting on the {regression['threshold_on']}). “Refined” are"
+        f" the formulas that solve the Hamilton–Jacobi equation of f, by the"
+        f" {' and the '.join(study['refinement']['routes'])} route, and that have to pass a certificate.",
     ]
+
+
+def first_wells(models: list[str]) -> tuple[int | None, str]:
+    """The first run that has a formula about each attractor, where none has a single one."""
+    for run, path in enumerate(models):
+        for method, one in read_model(path)[0].items():
+            if one.wells:
+                return run, method
+    return None, METHODS[0]
+
+
+def refusals(rrmse: pd.DataFrame, certificates: pd.DataFrame) -> pd.DataFrame:
+    """Every refined formula that is not certified, with the tests that refused it."""
+    refused = certificates[(certificates["method"] == "refined") & ~certificates["passed"]]
+    reasons = refused.groupby("run")["reason"].agg(lambda texts: "; ".join(dict.fromkeys(texts)))
+    rows = rrmse[(rrmse["method"] == "refined") & ~rrmse["certified"]]
+    return pd.DataFrame(
+        {
+            "run": rows["run"],
+            "step": "certify",
+            "status": "not certified",
+            "reason": rows["run"].map(reasons).fillna("there is no refined formula"),
+        }
+    )
+
+
+def certificate_tables(
+    certificates: pd.DataFrame, coefficients: pd.DataFrame, run: int | None, method: str, folder: Path
+) -> list[ReportTable]:
+    """How often each test passed, and for the run shown its figures and its standard errors."""
+    if run is None:
+        return []
+    counted = certificates.groupby(["method", "test"], sort=False).agg(
+        passed=("passed", "sum"), runs=("passed", "size"), median=("value", "median"), worst=("value", "max")
+    )
+    mine = certificates[certificates["run"] == run].drop(columns="run")
+    chosen = coefficients[
+        (coefficients["run"] == run)
+        & (coefficients["method"] == method)
+        & coefficients["component"].str.match("U$|g_")
+        & (coefficients["estimate"] != 0)
+    ]
+    shown = chosen[["component", "term", "estimate", "standard_error", "exact"]].rename(
+        columns={"standard_error": "standard error"}
+    )
+    return [
+        ReportTable(
+            "The certificate: how many runs passed each test. The U of a randomised network is the control,"
+            " and has to be refused.",
+            counted.reset_index(), {}, f"{folder}/certificates.csv", rows_shown=40,
+        ),
+        ReportTable(
+            f"The certificate of run {run}, with its limits.", mine, {}, f"{folder}/certificates.csv", 40
+        ),
+        ReportTable(
+            f"Coefficients of run {run} with their standard errors.", shown, {},
+            f"{folder}/coefficients.csv", 60,
+        ),
+    ]  # fmt: skip
 
 
 def provenance(timings: pd.DataFrame) -> dict[str, str]:
@@ -130,28 +210,28 @@ def main(snakemake: Any) -> None:
     source, study = snakemake.input, snakemake.params.study
     rrmse, outcomes = read_table(source.rrmse), read_table(source.outcomes)
     summary, timings = read_table(source.summary), read_table(source.timings)
-    run = shown_run(rrmse, source.models)
+    certificates = read_table(source.certificates)
+    run, method = shown_formula(rrmse, source.models)
+    if run is None:
+        run, method = first_wells(source.models)
     formulas: list[FormulaRow] = []
     if run is not None:
-        decompositions, certificates = read_model(source.models[run])
+        decompositions, verdicts = read_model(source.models[run])
         system = load_system(source.card) if source.get("card") else None
         exact = exact_decomposition(system) if system is not None else None
-        formulas = formula_rows(decompositions[METHOD], exact, certificates[METHOD])
-    answer = answer_sentences(rrmse, outcomes, summary, runs=study["runs"], method=METHOD)
+        for name in reversed(METHODS):
+            if name in decompositions:
+                formulas += formula_rows(name, decompositions[name], exact, verdicts[name])
+    answer = answer_sentences(rrmse, outcomes, summary, runs=study["runs"], method=method)
     if run is not None:
         which = ", the median of the runs by error" if rrmse["rrmse"].notna().any() else ""
         answer.append(f"The formulas below are those of run {run}{which}.")
+    coefficients = read_table(source.coefficients)
     name = study["name"]
     tables = Path(source.summary).parent
     figures = {Path(path).stem: Path(path).read_bytes() for path in source.figures}
     troubled = outcomes[outcomes["status"].isin(["failed", "warning"])]
-    uncertified = rrmse[~rrmse["certified"]][["run", "method"]]
-    failures = pd.concat(
-        [
-            troubled,
-            uncertified.assign(step="certify", status="not certified", reason="no certificate was computed"),
-        ]
-    )[["run", "step", "status", "reason"]]
+    failures = pd.concat([troubled, refusals(rrmse, certificates)])[["run", "step", "status", "reason"]]
     chosen = {key: study[key] for key in study if key not in ("metric", "dynamics", "exact")}
     content = ReportContent(
         title=study["title"] or name,
@@ -166,6 +246,7 @@ def main(snakemake: Any) -> None:
                 f"{tables}/summary.csv",
                 rows_shown=60,
             ),
+            *certificate_tables(certificates, coefficients, run, method, tables),
             ReportTable("Errors by run.", rrmse, {}, f"{tables}/rrmse.csv", rows_shown=50),
             ReportTable("What became of each step of each run.", outcomes, {}, f"{tables}/outcomes.csv", 12),
         ],

@@ -6,7 +6,13 @@ import numpy as np
 import torch
 
 from siq.certificate import CertificateOptions, Verdict
-from siq.certification import Certificate, certify_formulas, certify_wells, uncertified
+from siq.certification import (
+    Certificate,
+    caustic_notes,
+    certify_formulas,
+    certify_wells,
+    uncertified,
+)
 from siq.decomposition.networks import evaluate_points, select_run, shuffled
 from siq.decomposition.storage import load_networks
 from siq.errors import NumericalFailure
@@ -103,7 +109,8 @@ def refine_run(
             refined, own.outline, options=CertificateOptions(**own.study["certificate"]),
             prediction=own.prediction(), seed=own.run,
         )  # fmt: skip
-    return formulas, certificate, refined.notes
+    caustics = caustic_notes(refined, own.outline, certificate.error, seed=own.run)
+    return formulas, certificate, (*refined.notes, *caustics)
 
 
 def control(own: Run) -> Certificate:

@@ -10,10 +10,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from siq.errors import InputError
 from siq.files import whole_file
 from siq.recordings import Recordings, read_recordings
-
 
 METHODS = ("regression", "refined")
 """The paper's formulas, and ours, in the order of the tables."""
@@ -95,9 +96,21 @@ def read_run(path: str | Path) -> Recordings | None:
     return read_recordings(path) if Path(path).stat().st_size else None
 
 
-def first_model(models: Sequence[str]) -> int | None:
-    """The first run that has formulas, by its place in the list; None where no run has."""
-    for place, path in enumerate(models):
-        if json.loads(Path(path).read_text(encoding="utf-8"))["methods"]:
-            return place
-    return None
+def shown_formula(rrmse: pd.DataFrame, models: Sequence[str]) -> tuple[int | None, str]:
+    """The run and the method whose formula is shown: refined where any run has one, otherwise as published.
+
+    Of the runs with such a formula it is the median by error where errors are known, otherwise the first.
+    """
+    for method in reversed(METHODS):
+        with_formula = [
+            place
+            for place, path in enumerate(models)
+            if json.loads(Path(path).read_text(encoding="utf-8"))["methods"].get(method, {}).get("V")
+        ]
+        if with_formula:
+            mine = rrmse[(rrmse["method"] == method) & rrmse["run"].isin(with_formula)]
+            ranked = mine.dropna(subset="rrmse").sort_values("rrmse")
+            if len(ranked):
+                return int(ranked["run"].iloc[(len(ranked) - 1) // 2]), method
+            return with_formula[0], method
+    return None, METHODS[0]

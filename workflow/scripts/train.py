@@ -183,7 +183,7 @@ class Block:
         """The loss of the last training of every run."""
         latest: dict[int, pd.DataFrame] = {}
         for table in self.histories:
-            latest |= {int(run): rows for run, rows in table.groupby("run")}
+            latest |= {int(run): table[table["run"] == run] for run in table["run"].unique()}
         return pd.concat([latest[run] for run in sorted(latest)]) if latest else as_table("training", [])
 
     def clean(self) -> None:
