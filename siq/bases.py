@@ -6,6 +6,7 @@ them.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
@@ -15,6 +16,8 @@ import sympy
 
 from siq.expressions import compile_formulas
 from siq.library import CandidateLibrary, monomial_exponents
+
+MOST_POWERS = 260  # more make every Gauss–Newton step take seconds
 
 
 class Basis(Protocol):
@@ -175,6 +178,13 @@ class PowerBasis:
         for axis in range(powers.shape[1]):
             result *= powers[exponents[:, axis], axis]
         return result.T
+
+
+def affordable_degree(dimension: int, degree: int) -> int:
+    """The highest degree up to `degree`, but at least 2, with no more than `MOST_POWERS` powers."""
+    while degree > 2 and math.comb(dimension + degree, degree) > MOST_POWERS:
+        degree -= 1
+    return degree
 
 
 def power_basis(

@@ -32,7 +32,7 @@ from siq.refinement import Refined
 from siq.symbolic import SymbolicDecomposition
 
 NOTICEABLE = 1e-3  # a stated error above this is worth an explanation
-FAN = 200  # characteristics in search of a caustic
+FAN = 512  # characteristics in search of a caustic
 HARMLESS = 1e-6  # a difference of the routes that no error needs to explain
 
 
@@ -187,14 +187,15 @@ def caustic_notes(refined: Refined, outline: Outline, error: float, *, seed: int
     for well in refined.wells or refined.network_wells:
         fan = adapted_fan(
             refined.found.field, well.attractor, diffusion=refined.diffusion, level=0.98 * well.level,
-            box=_widened(outline.box), generator=np.random.default_rng(seed), most=FAN, rounds=3,
+            box=_widened(outline.box), generator=np.random.default_rng(seed), most=FAN,
         )  # fmt: skip
         caustic = first_caustic(fan)
         if caustic is not None:
             where = np.array2string(caustic.position, precision=4, suppress_small=True, separator=", ")
             notes.append(
                 f"characteristics from the attractor {_place(well.attractor)} cross at a caustic from {where}"
-                f" on, where U = {2 * caustic.value:.4g}: V has no smooth form there, and no formula follows it"
+                f" on, where U = {2 * caustic.value:.4g}: V has no smooth form there, and no formula"
+                " follows it"
             )
     return tuple(notes)
 

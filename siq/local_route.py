@@ -270,6 +270,7 @@ def fit_well(
     diffusion: np.ndarray,
     degree: int,
     generator: np.random.Generator,
+    steps: int = 60,
 ) -> Well:
     """V about an attractor by the network route: from values of V, refined without M.
 
@@ -282,6 +283,8 @@ def fit_well(
         V_θ, points ``(n, d)`` to values ``(n,)``, up to a constant.
     field, attractor, region, saddles, diffusion, degree, generator
         As for `grow_well`.
+    steps
+        Most steps of Gauss–Newton.
     """
     lowest = float(potential(attractor.position[None])[0])
     flat = region.states.reshape(-1, region.states.shape[2])
@@ -302,6 +305,6 @@ def fit_well(
         )
     start = np.linalg.lstsq(basis.values(points), potential(points) - lowest, rcond=1e-10)[0]
     equation = equation_at(basis, points, field(points), diffusion=diffusion)
-    solution = gauss_newton(equation, start)
+    solution = gauss_newton(equation, start, steps=steps)
     nearest = tops[int(np.argmin(heights))] if len(tops) else None
     return Well(attractor.position, basis, solution.coefficients, level, nearest, solution.residual, points)

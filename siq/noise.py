@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 import scipy.special
 
-from siq.identification import IdentifiedField, residuals
+from siq.identification import IdentifiedField, refit, residuals
 from siq.recordings import Recordings, SnapshotPairs, snapshot_pairs
 
 Kind = Literal["none", "process", "measurement", "coloured"]
@@ -111,9 +111,7 @@ def diagnose(
     if found.noise_free:
         return NoiseDiagnosis("none", 0.0, diffusion, 0.0, 0.0, 0.0, 0.0, np.zeros(d))
     rest = residuals(found, sample)
-    # Neighbours share a sample: the later state of one is the earlier one of the next.
-    joined = (sample.recording[1:] == sample.recording[:-1]) & (sample.xh[:-1] == sample.x0[1:]).all(axis=1)
-    # Robust against the few pairs that start far out, where f is fast and its error large.
+    joined = _joined(sample, rest)
     first, second = rest[:-1][joined], rest[1:][joined]
     product = first * second
     size = np.sqrt((first**2).mean(axis=0) * (second**2).mean(axis=0))
@@ -125,11 +123,36 @@ def diagnose(
     if abs(scores[worst]) > SIGNIFICANT and abs(correlations[worst]) > LARGE:
         kind = "measurement" if scores[worst] < 0 else "coloured"
         if kind == "measurement":
-            measurement = np.sqrt(np.maximum(-product.mean(axis=0), 0.0))
+            measurement = _measurement_errors(found, sample)
     return NoiseDiagnosis(
         kind, intensity, covariance, deviation, score,
         float(correlations[worst]), float(scores[worst]), measurement,
     )  # fmt: skip
+
+
+def _joined(sample: SnapshotPairs, rest: np.ndarray) -> np.ndarray:
+    """Which pairs share a sample with the next: the later state of one is the earlier one of the other.
+
+    Without the few that an inaccurate f carries far away, by which everything else would be hidden.
+    """
+    usual = (np.abs(rest) < 20 * np.median(np.abs(rest), axis=0)).all(axis=1)
+    same = (sample.recording[1:] == sample.recording[:-1]) & (sample.xh[:-1] == sample.x0[1:]).all(axis=1)
+    return np.asarray(same & usual[1:] & usual[:-1])
+
+
+def _measurement_errors(found: IdentifiedField, sample: SnapshotPairs) -> np.ndarray:
+    """Standard deviations of measurement noise, from the covariance of neighbouring residuals.
+
+    Errors of X0 bias f by the inverse of the step, so that f is fitted to the long steps as well. An error
+    of the sample that two pairs share is carried on by the flow of the second.
+    """
+    found = refit(found, sample)
+    rest = residuals(found, sample)
+    joined = _joined(sample, rest)
+    covariance = (rest[:-1][joined] * rest[1:][joined]).mean(axis=0)
+    rates = np.einsum("nii->ni", found.field.jacobian(sample.x0[1:][joined]))
+    carried = np.exp(np.minimum(rates * sample.h[1:][joined, None], 1.0)).mean(axis=0)
+    return np.sqrt(np.maximum(-covariance / carried, 0.0))
 
 
 def mean_residual_probability(found: IdentifiedField, pairs: SnapshotPairs) -> float:

@@ -17,10 +17,11 @@ import scipy.special
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
+from siq.bases import affordable_degree
 from siq.errors import NumericalFailure
 from siq.global_route import GlobalPotential, fit_values, refine_globally
 from siq.identification import IdentifiedField
-from siq.library import CandidateLibrary, monomial_exponents
+from siq.library import CandidateLibrary
 from siq.local_route import Well, fit_well, grow_well
 from siq.orthogonal_fit import OrthogonalFit, fit_orthogonal
 from siq.outline import Outline
@@ -176,7 +177,8 @@ def refine(
     notes.append("no single formula in this library holds over the whole recorded region")
     network_wells: list[Well] = []
     if "network" in options.routes and network is not None:
-        degree = max((int(well.basis.exponents.sum(axis=1).max()) for well in wells), default=8)
+        degree = max((int(well.basis.exponents.sum(axis=1).max()) for well in wells), default=0)
+        degree = degree or affordable_degree(found.library.dimension, 8)
         for index, attractor in enumerate(outline.attractors):
             try:
                 network_wells.append(
@@ -234,7 +236,7 @@ def _local_well(
     degrees = [4, 6, 8] if options.degree is None else [options.degree]
     best: Well | None = None
     for degree in degrees:
-        if best is not None and len(monomial_exponents(dimension, degree)) > 250:
+        if best is not None and affordable_degree(dimension, degree) < degree:
             break
         trial = grow_well(
             found.field, outline.attractors[index], outline.regions[index], outline.saddles[index],

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from siq.bases import potential_basis
+from siq.bases import affordable_degree, potential_basis
 from siq.decomposition.networks import Networks, evaluate_points
 from siq.decomposition.options import CheckOptions
 from siq.equilibria import hessian_at
@@ -26,6 +26,7 @@ from siq.refinement import over_library
 
 logger = logging.getLogger(__name__)
 
+WELL_STEPS = 15  # of Gauss–Newton: what does not converge quickly is not ready
 SHARE = 0.75  # of the recorded points, the lowest in V, on which one formula is tried
 
 
@@ -84,8 +85,9 @@ class TrainingCheck:
             try:
                 well = fit_well(
                     self.found.field, one, self.outline.regions[index], self.outline.saddles[index],
-                    potential, diffusion=self.diffusion, degree=max(self.options.degree, 6),
-                    generator=np.random.default_rng(0),
+                    potential, diffusion=self.diffusion,
+                    degree=affordable_degree(len(one.position), max(self.options.degree, 6)),
+                    generator=np.random.default_rng(0), steps=WELL_STEPS,
                 )  # fmt: skip
             except NumericalFailure:
                 return False
