@@ -119,7 +119,7 @@ def certify_formulas(
         own = [_error_of(well, found, outline, diffusion, seed)[0] for well in wells]
         tests["agreement"] = check_agreement(
             candidate.values, wells, _sublevel_points(wells),
-            limit=HARMLESS + error + max(own) + 6 * relative_error,
+            limit=_explained(options, error, max(own)) + 6 * relative_error,
         )  # fmt: skip
     tests["prediction"] = prediction
     return _conclude(tests, error, worst, outline, "region")
@@ -164,7 +164,7 @@ def certify_wells(
         for one, two in pairs:
             own = _error_of(one, found, outline, diffusion, seed)[0]
             verdict = check_agreement(
-                one.values, [two], _sublevel_points([two]), limit=HARMLESS + error + own
+                one.values, [two], _sublevel_points([two]), limit=_explained(options, error, own)
             )
             tests["agreement"] = _worse(tests.get("agreement"), verdict)
         if len(pairs) < len(outline.attractors):
@@ -265,6 +265,11 @@ def _error_of(
     well: Well, found: IdentifiedField, outline: Outline, diffusion: np.ndarray, seed: int
 ) -> tuple[float, np.ndarray | None]:
     return stated_error(_of_well(well, outline), found, diffusion=diffusion, seed=seed)
+
+
+def _explained(options: CertificateOptions, *errors: float) -> float:
+    """Difference of two routes that their errors explain; one that cannot be stated explains nothing."""
+    return HARMLESS + sum(min(error, options.error) for error in errors)
 
 
 def _worse(one: Verdict | None, two: Verdict) -> Verdict:

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 import scipy.linalg
 
-from siq.simulate import runge_kutta_step
+from siq.integration import dormand_prince_step, next_step
 from siq.vector_field import VectorField
 
 Kind = Literal["attractor", "saddle", "repeller", "degenerate"]
@@ -20,8 +20,13 @@ Kind = Literal["attractor", "saddle", "repeller", "degenerate"]
 NEWTON_STEPS = 60
 MARGIN = 0.05  # of the recorded box, by which an equilibrium may lie outside
 SAME = 1e-6  # of the recorded box: closer equilibria are one
-SLOWEST_TIMES = 25.0  # trajectories are followed for so many of the slowest relaxation times, and those ...
-LONGER = 8  # ... that have not settled by then so many times as long: some pass slow places
+MARGINAL = 1e-6  # of the largest eigenvalue: multiple roots are only found to the root of rounding
+SLOWEST_TIMES = 200.0  # trajectories are followed for so many of the slowest relaxation times, ...
+UNSETTLED_TIMES = 25.0  # ... or times to cross the box where there is no attractor
+MOST_STEPS = 3000
+SPACING = 0.04  # of the recorded box: longest step
+ACCURACY = 1e-7  # of the recorded box: local error of a step
+ARRIVED = 1e-4  # of the recorded box: trajectories so close to an attractor end there
 
 
 @dataclass(frozen=True)
@@ -113,7 +118,7 @@ def classify(field: VectorField, position: np.ndarray) -> Equilibrium:
     eigenvalues = np.linalg.eigvals(field.jacobian(position[None])[0])
     eigenvalues = eigenvalues[np.argsort(-eigenvalues.real)]
     kind: Kind = "saddle"
-    if np.abs(eigenvalues.real).min() < 1e-9 * np.abs(eigenvalues).max():
+    if np.abs(eigenvalues.real).min() < MARGINAL * np.abs(eigenvalues).max():
         kind = "degenerate"
     elif eigenvalues.real.max() < 0:
         kind = "attractor"
@@ -155,45 +160,43 @@ def follow(
     box
         Shape ``(d, 2)``: the recorded region. What leaves a box of three times this size has escaped.
     states
-        States kept along each trajectory, close together at first and later farther apart.
+        States kept along each trajectory, about evenly spread.
     """
     width = box[:, 1] - box[:, 0]
     middle = box.mean(axis=1)
-    fastest = np.quantile(np.linalg.norm(field.jacobian(starts), axis=(1, 2)), 0.99)
     rates = [-one.eigenvalues.real.max() for one in attractors]
     slowest = min(rates) if rates else float(np.median(np.linalg.norm(field(starts) / width, axis=1)))
-    horizon = SLOWEST_TIMES / slowest
-    count = int(min(max(np.ceil(horizon * fastest / 0.25), 200), 6000))
-    step = horizon / count
-    later = np.geomspace(count, LONGER * count, states // 4 + 1).astype(int)
-    kept = np.append(np.geomspace(1, count, states - 1 - states // 4).astype(int), later[1:])
-    x = np.ascontiguousarray(starts.T)
-    paths = [x.T.copy()]
-    escaped = np.zeros(len(starts), dtype=bool)
-
-    ends = np.full(len(starts), -1)
-
-    def velocity(components: np.ndarray) -> np.ndarray:
-        return field(components.T).T
-
-    going = np.arange(len(starts))
-    for done in range(1, LONGER * count + 1):
+    horizon = (SLOWEST_TIMES if rates else UNSETTLED_TIMES) / slowest
+    count = len(starts)
+    x, times, steps = starts.copy(), np.zeros(count), np.full(count, 0.01 / slowest)
+    ends, escaped = np.full(count, -1), np.zeros(count, dtype=bool)
+    passed, whose = [starts], [np.arange(count)]
+    running = np.arange(count)
+    for _ in range(MOST_STEPS):
+        speed = np.abs(field(x[running]) / width).max(axis=1)
+        step = np.minimum(steps[running], np.minimum(0.5 / slowest, SPACING / np.maximum(speed, 1e-300)))
         with np.errstate(over="ignore", invalid="ignore"):
-            moved = runge_kutta_step(velocity, x[:, going], step)
-        out = ~(np.abs((moved - middle[:, None]) / width[:, None]) < 1.5).all(axis=0)
-        escaped[going[out]] = True
-        x[:, going[~out]] = moved[:, ~out]
-        paths += [x.T.copy()] * int((kept == done).sum())
-        if done >= count and (done - count) % (count // 4) == 0:
-            for index, one in enumerate(attractors):
-                near = np.abs((x.T - one.position) / width).max(axis=1) < 1e-3
-                ends[near & ~escaped] = index
-        if out.any() or done >= count:
-            going = np.flatnonzero(~escaped & (ends < 0))
-            if not len(going) or (not attractors and done >= count):
-                break
-    paths += [x.T.copy()] * (states - len(paths))
-    return Descents(np.stack(paths, axis=1), ends, escaped)
+            moved, error = dormand_prince_step(field, x[running], step)
+            relative = np.abs(error / width).max(axis=1) / ACCURACY
+        steps[running] = next_step(step, relative)
+        on, moved, step = running[relative <= 1], moved[relative <= 1], step[relative <= 1]
+        inside = (np.abs((moved - middle) / width) < 1.5).all(axis=1)
+        escaped[on[~inside]] = True
+        on, moved, step = on[inside], moved[inside], step[inside]
+        x[on] = moved
+        times[on] += step
+        passed.append(moved)
+        whose.append(on)
+        for index, one in enumerate(attractors):
+            ends[on[np.abs((moved - one.position) / width).max(axis=1) < ARRIVED]] = index
+        running = running[~escaped[running] & (ends[running] < 0) & (times[running] < horizon)]
+        if not len(running):
+            break
+    order = np.argsort(np.concatenate(whose), kind="stable")
+    last = np.cumsum(np.bincount(np.concatenate(whose), minlength=count)) - 1
+    first = np.append(0, last[:-1] + 1)
+    kept = np.round(np.linspace(first, last, states, axis=1)).astype(int)
+    return Descents(np.concatenate(passed)[order][kept], ends, escaped)
 
 
 def neighbours(

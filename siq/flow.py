@@ -40,8 +40,9 @@ class FlowMap:
         """The state after h without noise: components ``(d, n)`` and steps ``(n,)`` to ``(d, n)``."""
         step = h / self.steps
         x = x0
-        for _ in range(self.steps):
-            x = x + step * field(x) if self.euler else runge_kutta_step(field, x, step)
+        with np.errstate(over="ignore", invalid="ignore"):  # a trial f may run away
+            for _ in range(self.steps):
+                x = x + step * field(x) if self.euler else runge_kutta_step(field, x, step)
         return x
 
     @property

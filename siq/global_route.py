@@ -7,6 +7,7 @@ else that the local route uses takes part.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,8 @@ from siq.bases import LibraryBasis, potential_basis
 from siq.hamilton_jacobi import HamiltonJacobi, Solution, equation_at, gauss_newton, sensitivity
 from siq.identification import IdentifiedField
 from siq.library import CandidateLibrary
+
+LOWER_PARTS = (0.7, 0.5, 0.3)  # of the points, by V
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,36 @@ def fit_values(library: CandidateLibrary, x: np.ndarray, potential: np.ndarray) 
     coefficients = np.zeros(library.size)
     coefficients[basis.chosen] = solution[:-1]
     return coefficients
+
+
+def network_starts(
+    library: CandidateLibrary,
+    found: IdentifiedField,
+    points: np.ndarray,
+    potential: np.ndarray,
+    *,
+    diffusion: np.ndarray,
+) -> Iterator[np.ndarray]:
+    """Starts for V from its values by the networks, one after the other until one serves.
+
+    The first is the fit of all values. Networks are worst where recordings are few, far out, and Gauss–Newton
+    may follow them to a false solution; the further ones are refined on lower and lower parts of V first.
+
+    Parameters
+    ----------
+    library, found, points, diffusion
+        As for `refine_globally`.
+    potential
+        V_θ at the points, shape ``(n,)``.
+    """
+    yield fit_values(library, points, potential)
+    for share in LOWER_PARTS:
+        part = potential <= np.quantile(potential, share)
+        if part.sum() > 2 * library.size:
+            start = fit_values(library, points[part], potential[part])
+            yield refine_globally(
+                start, library, found, points[part], diffusion=diffusion, sparse=False
+            ).coefficients
 
 
 def refine_globally(

@@ -24,6 +24,7 @@ GROWTH = 1.5  # of the level, from one fit to the next
 MOST_POINTS = 6000  # of one fit
 NEAREST = 600  # descents that start close to the attractor, where recordings leave directions out
 HIGHEST = 0.9  # share of the recorded starts below the level, where no saddle limits it
+AT_LEVEL = 0.05  # of a level: by so much V of the saddle that set it may change with the next fit
 CLOSE = 0.1  # of the recorded box: a saddle so close to the points of the fit has been reached
 
 
@@ -239,7 +240,7 @@ def grow_well(
     if len(tops):
         heights = basis.values(tops) @ coefficients
         nearest = int(np.argmin(np.abs(heights - level)))
-        if abs(heights[nearest] - level) < 0.05 * level:
+        if abs(heights[nearest] - level) < AT_LEVEL * level:
             saddle, level = tops[nearest], float(heights[nearest])
     return Well(attractor.position, basis, coefficients, level, saddle, residual, points)
 
@@ -255,7 +256,7 @@ def _lowest(
     believed = [
         height
         for height, top in zip(heights, tops, strict=True)
-        if height > level or np.abs((points - top) / width).max(axis=1).min() < CLOSE
+        if height > (1 - AT_LEVEL) * level or np.abs((points - top) / width).max(axis=1).min() < CLOSE
     ]
     return float(min((height for height in believed if height > 0), default=np.inf))
 

@@ -8,7 +8,8 @@ needs no network. Whether to believe either is decided by `siq.certificate`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass as plain_dataclass
 from typing import Annotated, Literal
 
@@ -19,7 +20,7 @@ from pydantic.dataclasses import dataclass
 
 from siq.bases import affordable_degree
 from siq.errors import NumericalFailure
-from siq.global_route import GlobalPotential, fit_values, refine_globally
+from siq.global_route import GlobalPotential, fit_values, network_starts, refine_globally
 from siq.identification import IdentifiedField
 from siq.library import CandidateLibrary
 from siq.local_route import Well, fit_well, grow_well
@@ -144,61 +145,89 @@ def refine(
     """
     notes: list[str] = []
     found = over_library(found, library)
-    wells: list[Well] = []
+    wells: tuple[Well, ...] = ()
     if "local" in options.routes:
-        for index in range(len(outline.attractors)):
-            try:
-                wells.append(_local_well(found, outline, index, diffusion, options, seed))
-            except NumericalFailure as error:
-                notes.append(f"local route: {error}")
-    best: GlobalPotential | None = None
-    if "network" in options.routes:
-        starts = [] if formula is None else [formula]
-        if network is not None:
-            starts.append(fit_values(library, points, network(points)))
-        for start in starts:
-            trial = refine_globally(
-                start, library, found, points, diffusion=diffusion,
-                false_terms=options.false_terms, precision=options.precision,
-            )  # fmt: skip
-            if best is None or trial.residual < best.residual:
-                best = trial
-            if best.residual < allowed_residual(found, options):
-                break
-    elif wells:
-        # Without the network route the wells themselves may turn out to be one formula.
-        start = fit_values(library, wells[0].points, wells[0].values(wells[0].points))
-        best = refine_globally(
+        wells, notes = local_wells(found, outline, diffusion=diffusion, options=options, seed=seed)
+
+    def globally(start: np.ndarray) -> GlobalPotential:
+        return refine_globally(
             start, library, found, points, diffusion=diffusion,
             false_terms=options.false_terms, precision=options.precision,
         )  # fmt: skip
-    if best is not None and best.coefficients.any() and best.residual < allowed_residual(found, options):
+
+    limit = allowed_residual(found, options)
+    best: GlobalPotential | None = None
+    network_wells: Sequence[Well] = ()
+    if "network" in options.routes:
+        starts: Iterable[np.ndarray] = [] if formula is None else [formula]
+        if network is not None:
+            further = network_starts(library, found, points, network(points), diffusion=diffusion)
+            starts = itertools.chain(starts, further)
+        best = _best_of(map(globally, starts), limit)
+        if network is not None and not _good(best, limit):
+            network_wells = _network_wells(found, outline, wells, network, diffusion, seed, notes)
+    elif wells:
+        network_wells = wells
+    if network_wells and not _good(best, limit):
+        # Refined one by one, the wells may turn out to share one formula.
+        values = (fit_values(library, well.points, well.values(well.points)) for well in network_wells)
+        best = _best_of(map(globally, values), limit, best)
+    if best is not None and _good(best, limit):
         return _with_circulation(best, found, points, diffusion, options, wells, notes)
     notes.append("no single formula in this library holds over the whole recorded region")
-    network_wells: list[Well] = []
-    if "network" in options.routes and network is not None:
-        degree = max((int(well.basis.exponents.sum(axis=1).max()) for well in wells), default=0)
-        degree = degree or affordable_degree(found.library.dimension, 8)
-        for index, attractor in enumerate(outline.attractors):
-            try:
-                network_wells.append(
-                    fit_well(
-                        found.field,
-                        attractor,
-                        outline.regions[index],
-                        outline.saddles[index],
-                        network,
-                        diffusion=diffusion,
-                        degree=degree,
-                        generator=np.random.default_rng(seed),
-                    )
-                )
-            except NumericalFailure as error:
-                notes.append(f"network route: {error}")
     return Refined(
         found, diffusion, library, None, None, None, None,
-        np.inf if best is None else best.residual, False, tuple(wells), tuple(network_wells), tuple(notes),
+        np.inf if best is None else best.residual, False, tuple(wells),
+        tuple(network_wells) if "network" in options.routes else (), tuple(notes),
     )  # fmt: skip
+
+
+def _good(trial: GlobalPotential | None, limit: float) -> bool:
+    return trial is not None and bool(trial.coefficients.any()) and trial.residual < limit
+
+
+def _best_of(
+    trials: Iterable[GlobalPotential], limit: float, best: GlobalPotential | None = None
+) -> GlobalPotential | None:
+    """The first that is good enough, otherwise that of the smallest residual."""
+    for trial in trials:
+        if best is None or trial.residual < best.residual:
+            best = trial
+        if _good(best, limit):
+            break
+    return best
+
+
+def _network_wells(
+    found: IdentifiedField,
+    outline: Outline,
+    local: Sequence[Well],
+    network: Callable[[np.ndarray], np.ndarray],
+    diffusion: np.ndarray,
+    seed: int,
+    notes: list[str],
+) -> list[Well]:
+    """V about each attractor by the network route, in the powers that the local route took."""
+    degree = max((int(well.basis.exponents.sum(axis=1).max()) for well in local), default=0)
+    degree = degree or affordable_degree(found.library.dimension, 8)
+    wells = []
+    for index, attractor in enumerate(outline.attractors):
+        try:
+            wells.append(
+                fit_well(
+                    found.field,
+                    attractor,
+                    outline.regions[index],
+                    outline.saddles[index],
+                    network,
+                    diffusion=diffusion,
+                    degree=degree,
+                    generator=np.random.default_rng(seed),
+                )
+            )
+        except NumericalFailure as error:
+            notes.append(f"network route: {error}")
+    return wells
 
 
 def allowed_residual(found: IdentifiedField, options: RefinementOptions) -> float:
@@ -222,6 +251,24 @@ def over_library(found: IdentifiedField, library: CandidateLibrary) -> Identifie
     return IdentifiedField(
         library, coefficients, support, found.covariance, found.noise_rate, found.residual_ratio, found.flow
     )
+
+
+def local_wells(
+    found: IdentifiedField,
+    outline: Outline,
+    *,
+    diffusion: np.ndarray,
+    options: RefinementOptions,
+    seed: int = 0,
+) -> tuple[tuple[Well, ...], list[str]]:
+    """The local route: V about each attractor, and where that was not possible, in words."""
+    wells, notes = [], []
+    for index in range(len(outline.attractors)):
+        try:
+            wells.append(_local_well(found, outline, index, diffusion, options, seed))
+        except NumericalFailure as error:
+            notes.append(f"local route: {error}")
+    return tuple(wells), notes
 
 
 def _local_well(
@@ -256,7 +303,7 @@ def _with_circulation(
     points: np.ndarray,
     diffusion: np.ndarray,
     options: RefinementOptions,
-    wells: list[Well],
+    wells: Sequence[Well],
     notes: list[str],
 ) -> Refined:
     """G = f + D∇V with its uncertainty, on the terms that differ from zero; jointly with V under noise."""

@@ -119,8 +119,7 @@ def euler_maruyama_step(
     numpy.ndarray
         States one step later, shape ``(d, n)``. As the noise is additive, the rule is of strong order 1.
     """
-    result = vector_field(x)
-    result *= step
+    result = step * vector_field(x)
     result += x
     result += increments
     return result

@@ -7,6 +7,8 @@ residual of V is zero as a formula and not only to rounding.
 
 from __future__ import annotations
 
+import functools
+from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import NamedTuple
 
@@ -173,8 +175,22 @@ def uniform_points(known: KnownSystem, count: int, *, seed: int = 0, share: floa
     return np.random.default_rng(seed).uniform(middle - half, middle + half, size=(count, len(middle)))
 
 
-def outline_of(known: KnownSystem, count: int = 800, *, share: float = 1.0) -> Outline:
-    """The outline that recordings from all over the domain would give."""
+def outline_of(known: KnownSystem, count: int = 400, *, share: float = 1.0) -> Outline:
+    """The outline that recordings from all over the domain would give, made once."""
+    return _outline(_Hashable(known.field, known), count, share)
+
+
+@dataclass(frozen=True)
+class _Hashable:
+    """A system told apart by its field; two with one field and different D must not meet here."""
+
+    field: VectorField
+    known: KnownSystem = field(compare=False)
+
+
+@functools.cache
+def _outline(system: _Hashable, count: int, share: float) -> Outline:
+    known = system.known
     return outline(known.field, uniform_points(known, count, share=share), diffusion=known.diffusion)
 
 

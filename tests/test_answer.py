@@ -40,7 +40,9 @@ def answer(errors: list[float | None], *, published: bool = True, certified: boo
         if error is not None
         for term, value in {"x**2": 1 + error, "x*y": 0.3 if run == 0 else 0.0, "1": 1.0}.items()
     ]
-    summary = summary_table(as_table("coefficients", rows), rrmse, PUBLISHED if published else {})
+    summary = summary_table(
+        as_table("coefficients", rows), rrmse, as_table("prediction", []), PUBLISHED if published else {}
+    )
     return " ".join(answer_sentences(rrmse, outcomes, summary, runs=len(errors), method="regression"))
 
 
@@ -88,7 +90,7 @@ def test_a_study_of_which_every_run_failed_has_an_answer() -> None:
 def test_a_study_without_any_answer_known_claims_no_error() -> None:
     rrmse = as_table("rrmse", [{"run": 0, "method": "regression", "certified": False}])
     outcomes = as_table("outcomes", [{"run": 0, "step": "train", "status": "ok", "reason": ""}])
-    summary = summary_table(as_table("coefficients", []), rrmse, {})
+    summary = summary_table(as_table("coefficients", []), rrmse, as_table("prediction", []), {})
     text = " ".join(answer_sentences(rrmse, outcomes, summary, runs=1, method="regression"))
     assert "Against the exact U" not in text
     assert isinstance(summary, pd.DataFrame)

@@ -6,12 +6,16 @@ import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
+from siq.invariant_distribution import DensityComparison, MarginalDensity
 from siq.plots import (
     ComponentFields,
+    InvariantPanel,
     plot_coefficient_distributions,
     plot_components,
     plot_error_distribution,
     plot_inclusion,
+    plot_invariant_distribution,
+    plot_prediction,
     plot_training,
     save_figure,
 )
@@ -183,6 +187,67 @@ def test_training_has_a_line_for_every_run_and_the_median() -> None:
     assert len(panel.lines) == 3 + 1
     np.testing.assert_allclose(panel.lines[-1].get_ydata(), 2 / (1 + steps[1:]))
     assert "not recorded" in words(figure)
+
+
+def invariant_panel(intensity: float, *, simulated: bool = True) -> InvariantPanel:
+    x, y = np.linspace(-2, 2, 41), np.linspace(-1.5, 1.5, 31)
+    values = np.exp(-((x[None, :] ** 2 - 1) ** 2 + y[:, None] ** 2) / intensity)
+    density = MarginalDensity(plane=(0, 2), intensity=intensity, x1=x, x2=y, values=values)
+    edges = [np.linspace(axis[0], axis[-1], 9) for axis in (x, y)]
+    comparison = DensityComparison(0.0312, 0.028, 0.0, *edges, histogram=np.ones((8, 8)))
+    return InvariantPanel(density, 0.5236, comparison if simulated else None)
+
+
+def test_the_invariant_distribution_has_a_column_for_each_intensity() -> None:
+    panels = [invariant_panel(0.05), invariant_panel(0.1), invariant_panel(0.2, simulated=False)]
+    figure = plot_invariant_distribution(panels, states="xyz", units=("mV", "1", "K"))
+    assert len(figure.axes) == 6 + 3  # two rows, and a colour bar for each column
+    text = words(figure)
+    for label in ("varepsilon = 0.05", "0.5236", "$x$ (mV)", "$z$ (K)", "(per mV per K)", "not simulated"):
+        assert label in text
+    assert "0.031 (sampling alone: 0.028)" in text
+    assert figure.axes[3].collections[1].levels == pytest.approx(np.array([0.1, 0.5, 0.9]))
+
+
+def test_without_a_simulation_there_is_one_row() -> None:
+    figure = plot_invariant_distribution(
+        [invariant_panel(0.1, simulated=False)], states="xyz", units=("m", "1", "m")
+    )
+    assert len(figure.axes) == 1 + 1
+    assert "(per m²)" in words(figure)
+    assert "no invariant distribution" in words(plot_invariant_distribution([], states="xy", units="11"))
+
+
+def test_predictions_lie_beside_the_observed_and_their_errors_on_a_logarithmic_axis() -> None:
+    paths = [
+        np.column_stack([np.linspace(-1, level, 9), np.full(9, level), np.zeros(9)]) for level in range(8)
+    ]
+    errors = pd.DataFrame(
+        {
+            "method": ["regression"] * 5 + ["refined"] * 3,
+            "error": [1e-3, 2e-3, np.nan, 1e-2, 0.0, 1e-7, 1e-7, 2e-7],
+        }
+    )
+    figure = plot_prediction(
+        paths, paths, errors, states="xyz", units=("mV", "1", "1"), published=(3.04e-4, 6.55e-4)
+    )
+    left, right = figure.axes
+    assert len(left.lines) == 6 * 2 * 2  # the curve and its start, observed and predicted
+    assert right.get_xscale() == "log"
+    assert [patch.get_data().values.sum() for patch in right.patches[:2]] == pytest.approx([3 / 5, 1])
+    text = words(figure)
+    for label in ("6 held-out trajectories", "$x$ (mV)", "regression, 5 predictions", "3.04", "6.55"):
+        assert label in text
+    assert "regression: 1 prediction without an error" in text
+    assert "regression: 1 prediction with no error at all" in text
+
+
+def test_predictions_that_are_not_there_are_told_in_words() -> None:
+    nothing = pd.DataFrame({"method": ["regression"], "error": [np.nan]})
+    text = words(plot_prediction([], [], nothing, states="xy", units="11"))
+    assert "no trajectories" in text and "no prediction has an error" in text
+    one = plot_prediction([np.ones((4, 1))], [np.ones((4, 1))], nothing, states="x", units="V")
+    assert "number of the sample" in words(one) and "1 held-out trajectory" in words(one)
 
 
 def test_the_same_figure_gives_the_same_files(tmp_path) -> None:

@@ -124,7 +124,9 @@ def summary(archetype: System, errors: list[float | None], additions: list[objec
         ],
     )
     published = {"rrmse": PublishedFigure(mean=8.87e-4, standard_deviation=3.48e-4, source="paper")}
-    return summary_table(concatenate("coefficients", tables), rrmse, published).set_index("quantity")
+    return summary_table(
+        concatenate("coefficients", tables), rrmse, as_table("prediction", []), published
+    ).set_index("quantity")
 
 
 def test_failed_runs_are_not_averaged_but_shown_by_the_count(archetype: System) -> None:
@@ -168,7 +170,7 @@ def test_a_missing_estimate_is_not_an_included_term() -> None:
         ],
     )
     rrmse = as_table("rrmse", [{"run": 0, "method": "regression", "certified": False}])
-    row = summary_table(coefficients, rrmse, {}).set_index("quantity").loc["U:x"]
+    row = summary_table(coefficients, rrmse, as_table("prediction", []), {}).set_index("quantity").loc["U:x"]
     assert row["runs"] == 2
     assert row["inclusion_frequency"] == 0.5
 
@@ -181,6 +183,8 @@ def test_a_term_that_one_run_lists_is_included_in_one_run_only(archetype: System
 
 def test_a_study_of_which_every_run_failed_has_a_summary() -> None:
     rrmse = as_table("rrmse", [{"run": run, "method": "regression", "certified": False} for run in range(2)])
-    found = summary_table(as_table("coefficients", []), rrmse, {}).set_index("quantity")
+    found = summary_table(as_table("coefficients", []), rrmse, as_table("prediction", []), {}).set_index(
+        "quantity"
+    )
     assert found["runs"].tolist() == [0, 0, 0]
     assert found["mean"].isna().all()

@@ -6,11 +6,20 @@ import numpy as np
 import pytest
 import scipy.linalg
 import sympy
+from pydantic import ValidationError
 
 from siq.errors import NumericalFailure
 from siq.randomness import generator
 from siq.recordings import snapshot_pairs
-from siq.simulate import SimulationOptions, runge_kutta_step, simulate_snapshots
+from siq.simulate import (
+    SimulationOptions,
+    euler_maruyama_step,
+    noise_factor,
+    runge_kutta_step,
+    sampling_stride,
+    simulate_snapshots,
+    simulate_stationary,
+)
 from siq.systems import System
 
 SMALL = SimulationOptions(trajectories=6, pairs=4, pair_step=0.02, interval=0.1, substeps=5)
@@ -121,3 +130,116 @@ def test_an_interval_that_does_not_fit_the_steps_is_refused(archetype: System, i
 
 def test_defaults_are_those_of_the_paper() -> None:
     assert SimulationOptions() == SimulationOptions(5000, 50, 0.01, 0.1, 5)
+
+
+COUPLED = np.array([[-1.0, 2.0], [-0.5, -1.5]])  # not symmetric: its noise circulates
+UNEQUAL = np.array([[1.0, 0.3], [0.3, 0.5]])
+
+
+def test_without_noise_the_snapshots_are_those_of_the_runge_kutta_rule_to_the_last_bit(
+    archetype: System,
+) -> None:
+    source = generator(5)
+    lower, upper = archetype.domain.T
+    x = source.uniform(lower[:, None], upper[:, None], size=(3, SMALL.trajectories))
+    expected = []
+    for pair in range(SMALL.pairs):
+        for _ in range(sampling_stride(SMALL) - (SMALL.substeps if pair else 0)):
+            x = runge_kutta_step(archetype.vector_field, x, SMALL.pair_step / SMALL.substeps)
+        expected.append(x)
+        for _ in range(SMALL.substeps):
+            x = runge_kutta_step(archetype.vector_field, x, SMALL.pair_step / SMALL.substeps)
+        expected.append(x)
+    result = simulate_snapshots(archetype, options=SMALL, generator=generator(5))
+    np.testing.assert_array_equal(
+        result.values.reshape(6, 8, 3), np.stack(expected, axis=2).transpose(1, 2, 0)
+    )
+
+
+def test_noise_starts_from_the_same_states_and_follows_the_generator(archetype: System) -> None:
+    options = dataclasses.replace(SMALL, pairs=1, pair_step=1e-6, interval=2e-6, substeps=1)
+    calm = simulate_snapshots(archetype, options=options, generator=generator(1)).values
+    noisy = dataclasses.replace(options, noise_intensity=0.02)
+    one, again, other = (
+        simulate_snapshots(archetype, options=noisy, generator=generator(seed)).values for seed in (1, 1, 2)
+    )
+    np.testing.assert_array_equal(one, again)
+    assert not np.isin(one, other).any()
+    assert (one != calm).all()
+    np.testing.assert_allclose(one, calm, atol=5 * (0.02 * 3e-6) ** 0.5)
+
+
+def test_increments_have_the_drift_of_one_step_and_the_covariance_of_the_noise() -> None:
+    system = dataclasses.replace(linear_system(COUPLED), diffusion=UNEQUAL)
+    options = SimulationOptions(
+        trajectories=20_000, pairs=1, pair_step=0.01, interval=0.02, substeps=1, noise_intensity=0.3
+    )
+    values = simulate_snapshots(system, options=options, generator=generator(0)).values.reshape(-1, 2, 2)
+    increments = values[:, 1] - values[:, 0] - 0.01 * values[:, 0] @ COUPLED.T
+    np.testing.assert_allclose(increments.mean(axis=0), 0, atol=5 * (0.3 * 0.01 / 20_000) ** 0.5)
+    np.testing.assert_allclose(np.cov(increments.T) / (0.3 * 0.01), UNEQUAL, atol=0.04)
+    factor = noise_factor(UNEQUAL, intensity=0.3, step=0.01)
+    np.testing.assert_allclose(factor @ factor.T, 0.3 * 0.01 * UNEQUAL, rtol=1e-12)
+
+
+def test_the_euler_maruyama_step_leaves_its_arguments_alone() -> None:
+    x = np.array([[1.0, 2.0]])
+    result = euler_maruyama_step(lambda x: x, x, 0.1, np.array([[0.5, -0.5]]))
+    np.testing.assert_allclose(result, [[1.6, 1.7]])
+    np.testing.assert_array_equal(x, [[1.0, 2.0]])
+
+
+def test_the_stationary_covariance_solves_the_lyapunov_equation() -> None:
+    # d<xxᵀ>/dt = J C + C Jᵀ + ε D vanishes, hence C = ε W with J W + W Jᵀ = -D, without a factor of 2.
+    intensity = 0.2
+    samples = simulate_stationary(
+        linear_system(COUPLED).vector_field,
+        diffusion=UNEQUAL,
+        intensity=intensity,
+        start=np.zeros((2, 4000)),
+        step=0.01,
+        burn_in=500,
+        steps=1500,
+        thin=50,
+        generator=generator(0),
+    )
+    assert samples.shape == (2, 30, 4000)
+    expected = intensity * scipy.linalg.solve_continuous_lyapunov(COUPLED, -UNEQUAL)
+    measured = np.cov(samples.reshape(2, -1))
+    np.testing.assert_allclose(measured, expected, atol=0.03 * expected.max())
+    # The quasipotential says the same: M = (W')⁻¹ with J W' + W' Jᵀ = -2D is the Hessian of V, U = 2V.
+    hessian = 2 * np.linalg.inv(scipy.linalg.solve_continuous_lyapunov(COUPLED, -2 * UNEQUAL))
+    np.testing.assert_allclose(expected, intensity * np.linalg.inv(hessian), rtol=1e-12)
+
+
+def test_thinning_keeps_every_so_many_steps_after_the_burn_in() -> None:
+    def samples(burn_in: int, steps: int, thin: int) -> np.ndarray:
+        return simulate_stationary(
+            np.zeros_like, diffusion=np.eye(1), intensity=1.0, start=np.zeros((1, 2)), step=0.1,
+            burn_in=burn_in, steps=steps, thin=thin, generator=generator(0),
+        )  # fmt: skip
+
+    every = samples(0, 10, 1)
+    np.testing.assert_array_equal(samples(3, 7, 2), every[:, [4, 6, 8]])
+    with pytest.raises(ValueError, match="leaves no sample"):
+        samples(0, 3, 4)
+
+
+def test_negative_noise_is_refused() -> None:
+    with pytest.raises(ValidationError, match="noise_intensity"):
+        SimulationOptions(noise_intensity=-0.01)
+    with pytest.raises(ValueError, match="must not be negative"):
+        noise_factor(np.eye(2), intensity=-0.01, step=0.1)
+
+
+def test_noisy_trajectories_and_walkers_that_run_away_are_counted_and_told() -> None:
+    system = dataclasses.replace(linear_system(np.eye(1)), equations=(sympy.Symbol("x0", real=True) ** 3,))
+    system = dataclasses.replace(system, domain=np.array([[50.0, 60.0]]))
+    options = dataclasses.replace(SMALL, noise_intensity=0.1)
+    with pytest.raises(NumericalFailure, match=r"6 of 6 trajectories of linear run to infinity"):
+        simulate_snapshots(system, options=options, generator=generator(0))
+    with pytest.raises(NumericalFailure, match="1 of 2 walkers"):
+        simulate_stationary(
+            system.vector_field, diffusion=np.eye(1), intensity=1e-6, start=np.array([[50.0, 0.0]]),
+            step=0.1, burn_in=20, steps=1, generator=generator(0),
+        )  # fmt: skip

@@ -1,7 +1,7 @@
 """The check that ends a training: whether refinement would succeed from these networks.
 
 It does, in small, what will be done in earnest afterwards: V_θ is written in powers, refined on the
-Hamilton–Jacobi equation of the identified f, and held against the curvature that f demands at the attractors.
+Hamilton–Jacobi equation of the identified f, and compared with the local route, which needs no network.
 """
 
 from __future__ import annotations
@@ -12,17 +12,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from siq.bases import affordable_degree, potential_basis
+from siq.bases import potential_basis
 from siq.decomposition.networks import Networks, evaluate_points
 from siq.decomposition.options import CheckOptions
-from siq.equilibria import hessian_at
 from siq.errors import NumericalFailure
 from siq.global_route import fit_values, refine_globally
 from siq.identification import IdentifiedField
 from siq.library import CandidateLibrary, joint_library
-from siq.local_route import fit_well
+from siq.local_route import Well, fit_well
 from siq.outline import Outline, evenly_spread, outline
-from siq.refinement import over_library
+from siq.refinement import RefinementOptions, local_wells, over_library
+
+Function = Callable[[np.ndarray], np.ndarray]
 
 logger = logging.getLogger(__name__)
 
@@ -40,6 +41,8 @@ class TrainingCheck:
         The identified f.
     outline
         Attractors and regions.
+    wells
+        V about each attractor by the local route, to be compared with.
     library
         Powers for V, with the functions of f.
     diffusion
@@ -50,13 +53,21 @@ class TrainingCheck:
 
     found: IdentifiedField
     outline: Outline
+    wells: tuple[Well, ...]
     library: CandidateLibrary
     diffusion: np.ndarray
     options: CheckOptions
 
+    def hopeless(self) -> str | None:
+        """Why no training can pass, in words; None where one can."""
+        fault = self.outline.fault()
+        if fault is None and len(self.wells) < len(self.outline.attractors):
+            fault = "the local route found no formula about some attractor"
+        return fault
+
     def passes(self, networks: Networks) -> bool:
         """Whether refinement will succeed from the networks of one run."""
-        if self.outline.fault() is not None:
+        if self.hopeless() is not None:
             return False
 
         def potential(x: np.ndarray) -> np.ndarray:
@@ -64,7 +75,7 @@ class TrainingCheck:
 
         return self._single_formula(potential) or self._by_wells(potential)
 
-    def _single_formula(self, potential: Callable[[np.ndarray], np.ndarray]) -> bool:
+    def _single_formula(self, potential: Function) -> bool:
         points = self.outline.points
         values = potential(points)
         below = values <= np.quantile(values, SHARE)
@@ -73,34 +84,34 @@ class TrainingCheck:
             start, self.library, self.found, points[below], diffusion=self.diffusion, sparse=False
         )
         basis = potential_basis(self.library)
-        worst = 0.0
-        for one in self.outline.attractors:
-            curvature = basis.hessians(one.position[None])[0] @ result.coefficients[basis.chosen]
-            worst = max(worst, self._curvature_error(one.position, curvature))
-        logger.info("check of one formula: residual %.1e, curvature %.1e", result.residual, worst)
-        return result.residual < self.options.residual / 10 and worst < self.options.branch
+        coefficients = result.coefficients[basis.chosen]
+        worst = max(self._difference(well, lambda x: basis.values(x) @ coefficients) for well in self.wells)
+        logger.info("check of one formula: residual %.1e, difference %.1e", result.residual, worst)
+        return result.residual < self.options.residual / 10 and worst < self.options.difference
 
-    def _by_wells(self, potential: Callable[[np.ndarray], np.ndarray]) -> bool:
-        for index, one in enumerate(self.outline.attractors):
+    def _by_wells(self, potential: Function) -> bool:
+        for index, (one, local) in enumerate(zip(self.outline.attractors, self.wells, strict=True)):
+            degree = int(local.basis.exponents.sum(axis=1).max())
             try:
                 well = fit_well(
                     self.found.field, one, self.outline.regions[index], self.outline.saddles[index],
-                    potential, diffusion=self.diffusion,
-                    degree=affordable_degree(len(one.position), max(self.options.degree, 6)),
+                    potential, diffusion=self.diffusion, degree=degree,
                     generator=np.random.default_rng(0), steps=WELL_STEPS,
                 )  # fmt: skip
             except NumericalFailure:
                 return False
-            worst = self._curvature_error(one.position, well.hessians(one.position[None])[0])
-            logger.info("check of a well: residual %.1e, curvature %.1e", well.residual, worst)
-            if well.residual > self.options.residual or worst > self.options.branch:
+            difference = self._difference(local, well.values)
+            logger.info("check of a well: residual %.1e, difference %.1e", well.residual, difference)
+            allowed = self.options.difference + 2 * (local.residual + well.residual)
+            if well.residual > self.options.residual or difference > allowed:
                 return False
         return True
 
-    def _curvature_error(self, attractor: np.ndarray, curvature: np.ndarray) -> float:
-        expected = hessian_at(self.found.field, attractor, diffusion=self.diffusion)
-        root = np.linalg.inv(np.linalg.cholesky(expected))
-        return float(np.abs(np.linalg.eigvalsh(root @ (curvature - expected) @ root.T)).max())
+    def _difference(self, well: Well, values: Function) -> float:
+        """Relative difference of V from that of the local route, in a well."""
+        x = well.points[well.values(well.points) < 0.9 * well.level]
+        other = values(x) - values(well.attractor[None])
+        return float(np.linalg.norm(other - well.values(x)) / np.linalg.norm(well.values(x)))
 
 
 def training_check(
@@ -108,9 +119,7 @@ def training_check(
 ) -> TrainingCheck:
     """Prepare the check of one run from its identified f and recorded states ``(n, d)``."""
     points = x[evenly_spread(x, generator=np.random.default_rng(seed))]
+    setting = outline(found.field, points, diffusion=diffusion, seed=seed)
+    wells, _ = local_wells(found, setting, diffusion=diffusion, options=RefinementOptions(), seed=seed)
     library = joint_library(found.library, degree=options.degree, potential_degree=options.degree)
-    return TrainingCheck(
-        over_library(found, library),
-        outline(found.field, points, diffusion=diffusion, seed=seed),
-        library, diffusion, options,
-    )  # fmt: skip
+    return TrainingCheck(over_library(found, library), setting, wells, library, diffusion, options)

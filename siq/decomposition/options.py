@@ -25,8 +25,9 @@ class CheckOptions:
         Highest power of V in the check.
     residual
         Largest relative Hamilton–Jacobi residual after it.
-    branch
-        Largest relative difference of the curvature of V from M at any attractor.
+    difference
+        Largest relative difference of V from the local route's in any well, beside what their residuals
+        explain.
     attempts
         Trainings from fresh networks, if a training ends without having passed.
     """
@@ -35,7 +36,7 @@ class CheckOptions:
     every: Annotated[int, Field(ge=1)] = 500
     degree: Annotated[int, Field(ge=2, le=12)] = 4
     residual: Annotated[float, Field(gt=0)] = 0.05
-    branch: Annotated[float, Field(gt=0)] = 0.05
+    difference: Annotated[float, Field(gt=0)] = 0.02
     attempts: Annotated[int, Field(ge=1)] = 2
 
 

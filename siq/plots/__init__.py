@@ -8,15 +8,20 @@ from siq.plots.accuracy import plot_error_distribution
 from siq.plots.coefficients import plot_coefficient_distributions
 from siq.plots.components import ComponentFields, plot_components
 from siq.plots.inclusion import plot_inclusion
+from siq.plots.invariant import InvariantPanel, plot_invariant_distribution
+from siq.plots.prediction import plot_prediction
 from siq.plots.saving import save_figure
 from siq.plots.training import plot_training
 
 __all__ = [
     "ComponentFields",
+    "InvariantPanel",
     "plot_coefficient_distributions",
     "plot_components",
     "plot_error_distribution",
     "plot_inclusion",
+    "plot_invariant_distribution",
+    "plot_prediction",
     "plot_training",
     "save_figure",
 ]

@@ -110,7 +110,7 @@ def trained_until_certified(known: KnownSystem, seed: int = 0):
             finished=lambda _, networks: check.passes(select_run(networks, 0)),
         )  # fmt: skip
         steps += state.step
-        if state.step < TRAINING.steps or check.outline.fault():
+        if state.step < TRAINING.steps or check.hopeless():
             break
     networks = select_run(state.networks, 0)
 

@@ -27,7 +27,9 @@ def test_every_table_of_the_contract_is_there_twice(finished, name):
 def test_every_step_of_every_run_has_an_outcome(finished):
     outcomes = table(finished, "outcomes")
     assert list(zip(outcomes["run"], outcomes["step"], strict=True)) == [
-        (run, step) for run in (0, 1) for step in ("simulate", "train", "regress", "score")
+        (run, step)
+        for run in (0, 1)
+        for step in ("simulate", "identify", "train", "regress", "refine", "score")
     ]
     assert set(outcomes["status"]) <= {"ok", "warning"}
     timings = table(finished, "timings")
@@ -35,21 +37,26 @@ def test_every_step_of_every_run_has_an_outcome(finished):
 
 
 def test_coefficients_cover_every_term_of_every_component_of_every_run(finished):
-    coefficients = table(finished, "coefficients")
+    coefficients = table(finished, "coefficients").query("method == 'regression'")
     assert set(coefficients["component"]) == {"U", "V", "f_x", "f_y", "f_z", "g_x", "g_y", "g_z"}
     sizes = coefficients.groupby(["run", "component"])["term"].nunique()
     assert set(sizes) == {35}  # monomials up to degree 4 in three states
 
 
 def test_the_runs_are_independent(finished):
-    estimates = table(finished, "coefficients").pivot_table(
-        index=["component", "term"], columns="run", values="estimate"
+    estimates = (
+        table(finished, "coefficients")
+        .query("method == 'regression'")
+        .pivot_table(index=["component", "term"], columns="run", values="estimate")
     )
     assert (estimates[0] != estimates[1]).any()
 
 
-def test_nothing_is_said_to_be_certified(finished):
-    assert not table(finished, "rrmse")["certified"].any()
+def test_the_published_method_and_the_control_are_not_certified(finished):
+    rrmse = table(finished, "rrmse")
+    assert not rrmse[rrmse["method"] != "refined"]["certified"].any()
+    control = table(finished, "certificates").query("method == 'randomised network'")
+    assert (control.groupby("run")["passed"].min() == 0).all() and set(control["run"]) == {0, 1}
     model = json.loads(finished.path("results/mini/runs/000/model.json").read_text())
     assert model["certificate"]["regression"]["certified"] is False
 
@@ -62,6 +69,18 @@ def test_the_model_alone_gives_back_the_identity_of_the_decomposition(finished):
         difference = (f - (g - gradient)).expand()
         largest = max((abs(float(c)) for c in difference.as_coefficients_dict().values()), default=0)
         assert largest < 1e-10
+
+
+def test_refined_formulas_are_exact_and_certified(finished):
+    rrmse = table(finished, "rrmse").query("method == 'refined'")
+    assert rrmse["certified"].all() and rrmse["support_correct"].all()
+    assert (rrmse["rrmse"] < 1e-6).all()
+    prediction = table(finished, "prediction").query("method == 'refined'")
+    assert len(prediction) == 2000 and prediction["error"].median() < 1e-6
+    errors = table(finished, "coefficients").query(
+        "method == 'refined' and component == 'U' and estimate != 0"
+    )
+    assert (errors["standard_error"] > 0).all()
 
 
 def test_the_report_needs_nothing_from_outside(finished):

@@ -15,9 +15,11 @@ def test_a_study_whose_every_training_fails_still_ends_in_a_report_that_says_so(
     outcomes = pd.read_parquet(project.path("results/mini/tables/outcomes.parquet")).set_index("step")
     assert outcomes["status"].to_dict() == {
         "simulate": "ok",
+        "identify": "ok",
         "train": "failed",
         "regress": "skipped",
-        "score": "skipped",
+        "refine": "ok",
+        "score": "ok",
     }
     assert "no longer finite" in outcomes.loc["train", "reason"]
     rrmse = pd.read_parquet(project.path("results/mini/tables/rrmse.parquet"))

@@ -68,10 +68,10 @@ def test_a_rule_names_every_module_that_its_script_imports(script):
     assert used <= set(code_digest(ROOT, script))
 
 
-def wait_for(path, process, seconds=120):
+def wait_for(pattern, process, *, within, seconds=120):
     deadline = time.monotonic() + seconds
-    while not path.exists():
-        assert process.poll() is None and time.monotonic() < deadline, f"{path} never appeared"
+    while not any(within.glob(pattern)):
+        assert process.poll() is None and time.monotonic() < deadline, f"{pattern} never appeared"
         time.sleep(0.02)
 
 
@@ -80,7 +80,7 @@ def test_an_interrupted_workflow_resumes_and_gives_the_same_tables(fresh_project
     project = fresh_project
     project.write_study(runs=2)
     process = project.start("results/mini/report.html")
-    wait_for(project.path("results/mini/training/000-000/checkpoint.npz"), process)
+    wait_for("results/mini/training/000-000/kept-*.npz", process, within=project.folder)
     os.killpg(process.pid, how)
     process.communicate(timeout=60)
     assert process.returncode != 0
@@ -97,7 +97,7 @@ def test_a_second_snakemake_waits_for_nobody_and_says_so(fresh_project):
     project = fresh_project
     project.write_study()
     process = project.start(NETWORKS)
-    wait_for(project.path("results/mini/logs/000/draw.log"), process)
+    wait_for("results/mini/logs/000/draw.log", process, within=project.folder)
     second = project.run(MODEL)
     assert second.returncode != 0 and "Another snakemake is at work" in second.stdout
     process.communicate(timeout=120)

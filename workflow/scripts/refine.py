@@ -35,28 +35,33 @@ from step import CONTROL, job, outcome, pair_step, position_of, read_outcomes, r
 class Run:
     """What a run has to go by: states, networks, f, and the outline that follows."""
 
-    def __init__(self, source: Any, position: int, run: int, study: dict[str, Any]) -> None:
+    def __init__(self, source: Any, position: int | None, run: int, study: dict[str, Any]) -> None:
         recordings = read_run(source.recordings)
         record = read_field(source.field)
         assert recordings is not None and record is not None  # checked by the steps before
         self.record, self.study, self.run = record, study, run
         self.diffusion = diffusion_matrix(study["metric"]["diffusion"], len(recordings.names))
         self.regression = RegressionOptions(**study["regression"])
-        self.networks = select_run(load_networks(source.networks), position)
+        self.networks = None if position is None else select_run(load_networks(source.networks), position)
         self.names = recordings.names
         mask = held_out_recordings(recordings, generator=generator(study["seed"], run, "hold out"))
         pairs = snapshot_pairs(recordings, pair_step=pair_step(study))
         held, x = mask[pairs.recording], pairs.x0
         draw = generator(study["seed"], run, "refine")
         points = x[~held][evenly_spread(x[~held], generator=draw)]
-        self.below = points[points_below(self.network(points), level=self.regression.level)]
         unseen = x[held][evenly_spread(x[held], generator=draw)]
-        lowest = self.network(points).min()
-        self.unseen = unseen[self.network(unseen) < lowest + self.regression.level]
-        self.outline: Outline = outline(record.found.field, points, diffusion=self.diffusion, seed=run)
+        everywhere = points
+        if self.networks is not None:  # the region in which the regression sought its formulas
+            potential = self.network(points)
+            below = points_below(potential, level=self.regression.level)
+            unseen = unseen[self.network(unseen) < potential.min() + self.regression.level]
+            points = points[below]
+        self.below, self.unseen = points, unseen
+        self.outline: Outline = outline(record.found.field, everywhere, diffusion=self.diffusion, seed=run)
 
     def network(self, x: np.ndarray) -> np.ndarray:
         """V_θ at points."""
+        assert self.networks is not None
         return evaluate_points(self.networks, x).potential
 
     def certify(self, formulas: SymbolicDecomposition, **details: Any) -> Certificate:
@@ -96,7 +101,8 @@ def refine_run(
         formula = np.array([named.get(name, 0.0) for name in library.names])
     options = RefinementOptions(**own.study["refinement"])
     refined = refine(
-        own.record.found, own.outline, library=library, formula=formula, network=own.network,
+        own.record.found, own.outline, library=library, formula=formula,
+        network=None if own.networks is None else own.network,
         points=own.below, diffusion=own.diffusion, options=options, seed=own.run,
     )  # fmt: skip
     formulas = refined_decomposition(refined, own.below)
@@ -115,6 +121,7 @@ def refine_run(
 
 def control(own: Run) -> Certificate:
     """Certificate of the U of a randomised network: one that must be refused, or the tests are no tests."""
+    assert own.networks is not None
     networks = shuffled(own.networks, generator=generator(own.study["seed"], own.run, "shuffle"))
     library = own.record.found.library
     coefficients = fit_values(library, own.below, evaluate_points(networks, own.below).potential)
@@ -137,14 +144,15 @@ def main(snakemake: Any) -> None:
     position, reason = position_of(run, source.outcome)
     if identified["status"] in ("failed", "skipped"):
         result = outcome(run, "refine", "skipped", f"no vector field was identified ({identified['reason']})")
-    elif position is None:
+    elif position is None and "local" not in study["refinement"]["routes"]:
         result = outcome(run, "refine", "skipped", f"the training gave no networks ({reason})")
     else:
         try:
             own = Run(source, position, run, study)
             if "regression" in models:
                 certificates["regression"] = own.certify(models["regression"]).as_data()
-            certificates[CONTROL] = control(own).as_data()
+            if own.networks is not None:
+                certificates[CONTROL] = control(own).as_data()
             models["refined"], certificate, notes = refine_run(own, models.get("regression"))
             certificates["refined"] = certificate.as_data() | {"notes": list(notes)}
             status = "ok" if certificate.certified else "warning"

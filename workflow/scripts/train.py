@@ -118,7 +118,7 @@ class Block:
 
     def needs(self, run: int, attempt: int) -> bool:
         """A first training needs every run; a further one, those whose check could yet pass."""
-        return attempt == 0 or (run in self.checks and self.checks[run].outline.fault() is None)
+        return attempt == 0 or (run in self.checks and self.checks[run].hopeless() is None)
 
     def _attempt(self, attempt: int, runs: list[int]) -> None:
         purpose = "training" if attempt == 0 else f"training {attempt}"
@@ -174,7 +174,7 @@ class Block:
             return outcome(run, "train", position=position)
         fault = "no vector field was identified, so that nothing could be checked"
         if run in self.checks:
-            fault = self.checks[run].outline.fault() or (
+            fault = self.checks[run].hopeless() or (
                 f"the check passed in none of {self.attempts} trainings of {self.options.steps} steps"
             )
         return outcome(run, "train", "warning", fault, position=position)
