@@ -17,6 +17,7 @@ include: "workflow/rules/regress.smk"
 include: "workflow/rules/refine.smk"
 include: "workflow/rules/score.smk"
 include: "workflow/rules/collect.smk"
+include: "workflow/rules/invariant.smk"
 include: "workflow/rules/report.smk"
 
 

@@ -13,9 +13,7 @@ SYMBOLS = tuple(sympy.Symbol(name, real=True) for name in "xyz")
 
 def library_basis() -> LibraryBasis:
     return potential_basis(
-        candidate_library(
-            "xyz", degree=3, potential_degree=3, further=("sqrt(1 + x**2)", "log(2 + y**2)*z")
-        )
+        candidate_library("xyz", degree=3, potential_degree=3, further=("sqrt(1 + x**2)", "log(2 + y**2)*z"))
     )
 
 

@@ -137,9 +137,7 @@ def test_the_hessian_solves_the_lyapunov_equation() -> None:
 def test_the_hessian_does_not_depend_on_the_axes_or_units() -> None:
     known = maier_stein(5)
     angle = 0.6
-    turn = np.diag([1e-2, 20.0]) @ np.array(
-        [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-    )
+    turn = np.diag([1e-2, 20.0]) @ np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     back = dict(zip((x, y), np.linalg.inv(turn) @ np.array([x, y]), strict=True))
     turned = VectorField(
         (x, y), tuple(turn @ np.array([f.subs(back, simultaneous=True) for f in known.field.equations]))

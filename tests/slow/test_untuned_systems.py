@@ -46,11 +46,12 @@ TRAINING = TrainingOptions(
     learning_rate=0.006,
     decay_steps=90,
     relative_dynamics=True,
+    orthogonality_weight=1.0,
     representative_share=1.0,
     normalise_on="representative",
     potential_gain=3.0,
     matching="symmetric",
-    matching_order=4,
+    matching_order=2,
 )
 DEGREE = 4
 

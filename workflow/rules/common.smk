@@ -30,7 +30,9 @@ FIGURES = {
     "inclusion_regression": "inclusion.rst",
     "components": "components.rst",
     "training": "training.rst",
+    "prediction": "prediction.rst",
 }
+CAPTIONS = FIGURES | {"invariant": "invariant.rst"}
 
 
 wildcard_constraints:
@@ -144,7 +146,7 @@ def all_outcomes(wildcards):
 def figure_output(name):
     return report(
         f"results/{{study}}/figures/{name}.svg",
-        caption=f"../report/{FIGURES[name]}",
+        caption=f"../report/{CAPTIONS[name]}",
         category="{study}",
         subcategory="figures",
     )

@@ -6,6 +6,7 @@ rule figures:
         coefficients="results/{study}/tables/coefficients.parquet",
         rrmse="results/{study}/tables/rrmse.parquet",
         training="results/{study}/tables/training.parquet",
+        prediction="results/{study}/tables/prediction.parquet",
         models=all_runs("results/{study}/runs/{run}/model.json"),
         recordings=all_runs("results/{study}/runs/{run}/recordings.parquet"),
         card=card_if_any,
@@ -22,7 +23,7 @@ rule figures:
     threads: 1
     params:
         code=code("figures.py"),
-        study=parameters("metric", "dynamics", "exact", "simulation"),
+        study=parameters("seed", "metric", "dynamics", "exact", "simulation"),
         folder="results/{study}/figures",
     message:
         "{wildcards.study}: drawing the figures"
@@ -39,7 +40,8 @@ rule page:
         outcomes="results/{study}/tables/outcomes.parquet",
         timings="results/{study}/tables/timings.parquet",
         models=all_runs("results/{study}/runs/{run}/model.json"),
-        figures=expand("results/{{study}}/figures/{name}.png", name=FIGURES),
+        invariant="results/{study}/tables/invariant.parquet",
+        figures=expand("results/{{study}}/figures/{name}.png", name=CAPTIONS),
         card=card_if_any,
         published=published_if_any,
     output:

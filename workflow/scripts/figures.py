@@ -4,6 +4,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
 
 from siq.model import read_model
 from siq.plots import (
@@ -12,18 +14,25 @@ from siq.plots import (
     plot_components,
     plot_error_distribution,
     plot_inclusion,
+    plot_prediction,
     plot_training,
     save_figure,
 )
+from siq.plots.style import sentence_figure
+from siq.prediction import predict
 from siq.projection import project
+from siq.randomness import generator
 from siq.recordings import Recordings
+from siq.simulate import SimulationOptions, simulate_snapshots
 from siq.study import load_published
 from siq.symbolic import SymbolicDecomposition, exact_decomposition
 from siq.systems import System, load_system
 from siq.tables import read_table
+from siq.vector_field import VectorField
 from step import METHODS, job, read_run, shown_formula
 
 TRAJECTORIES = 5
+PREDICTED = 6
 
 
 def component_fields(
@@ -40,6 +49,31 @@ def component_fields(
     lowest = recordings.values[np.argmin(identified.evaluate(recordings.values.T)[0])]
     exact = exact_decomposition(system) if system is not None else None
     return project(identified, exact=exact, domain=domain, at=lowest, trajectories=paths), domain
+
+
+def prediction_figure(
+    errors: pd.DataFrame,
+    identified: SymbolicDecomposition | None,
+    system: System | None,
+    study: dict[str, Any],
+    published: str | None,
+) -> Figure:
+    """Unseen trajectories beside those of the identified f, and the errors over all of them."""
+    if errors.empty or identified is None or system is None:
+        return sentence_figure("Nothing was predicted: no system is known to simulate unseen trajectories.")
+    options = SimulationOptions(**(study["simulation"] | {"trajectories": PREDICTED, "noise_intensity": 0.0}))
+    unseen = simulate_snapshots(system, options=options, generator=generator(study["seed"], "unseen"))
+    followed = predict(VectorField(identified.symbols, identified.vector_field), unseen)
+    paths = [unseen.recording == index for index in range(PREDICTED)]
+    figure = load_published(published).figures.get("prediction_error") if published else None
+    return plot_prediction(
+        [unseen.values[rows] for rows in paths],
+        [followed[rows] for rows in paths],
+        errors,
+        states=system.states,
+        units=system.units,
+        published=None if figure is None else (figure.mean, figure.standard_deviation or 0.0),
+    )
 
 
 def main(snakemake: Any) -> None:
@@ -70,6 +104,11 @@ def main(snakemake: Any) -> None:
     units = system.units if system is not None else tuple(unit or "1" for unit in recordings.units)
     figure = plot_components(fields, states=recordings.names, units=units, domain=domain)
     save_figure(figure, folder / "components")
+    prediction = read_table(source.prediction)
+    save_figure(
+        prediction_figure(prediction, identified, system, snakemake.params.study, source.get("published")),
+        folder / "prediction",
+    )
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """The invariant distribution of the run that is shown: Z by two ways, and against a long simulation."""
 
+import logging
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,8 @@ from siq.invariant_distribution import (
     total_variation,
 )
 from siq.model import read_model
-from siq.plots import plot_invariant_distribution, save_figure, sentence_figure
+from siq.plots import InvariantPanel, plot_invariant_distribution, save_figure
+from siq.plots.style import sentence_figure
 from siq.randomness import generator
 from siq.simulate import simulate_stationary
 from siq.study import load_published
@@ -50,17 +52,18 @@ def main(snakemake: Any) -> None:
     system = load_system(source.card)
     published = load_published(source.published).figures if source.get("published") else {}
     identified: SymbolicDecomposition = read_model(source.models[run])[0][method]
-    rows, densities, simulated = [], [], []
+    rows, panels = [], []
     for intensity in intensities:
         samples = simulate(system, intensity, seed=study["seed"])
         known = {"intensity": intensity, "box": system.domain}
-        density = marginal_density(identified.quasipotential, identified.symbols, **known)
-        compared = total_variation(density, samples)
         figure = published.get(f"Z:{intensity:g}")
         try:
+            density = marginal_density(identified.quasipotential, identified.symbols, **known)
             quadrature = normalisation_quadrature(identified.quasipotential, identified.symbols, **known)
-        except NumericalFailure:
-            quadrature = np.nan
+        except NumericalFailure as error:
+            logging.warning("intensity %g: %s", intensity, error)
+            continue
+        compared = total_variation(density, samples)
         rows.append(
             {
                 "run": run,
@@ -75,13 +78,10 @@ def main(snakemake: Any) -> None:
                 "published": figure.mean if figure else np.nan,
             }
         )
-        densities.append(density)
-        simulated.append(samples)
+        panels.append(InvariantPanel(density, quadrature, compared))
     write_table(target.table, as_table("invariant", rows))
     save_figure(
-        plot_invariant_distribution(
-            densities, simulated, intensities=intensities, states=system.states, units=system.units
-        ),
+        plot_invariant_distribution(panels, states=system.states, units=system.units),
         snakemake.params.figure,
     )
 

@@ -1,0 +1,29 @@
+# The invariant distribution of the formula that is shown.
+
+
+rule invariant:
+    input:
+        rrmse="results/{study}/tables/rrmse.parquet",
+        models=all_runs("results/{study}/runs/{run}/model.json"),
+        card=card_if_any,
+        published=published_if_any,
+    output:
+        table="results/{study}/tables/invariant.parquet",
+        csv="results/{study}/tables/invariant.csv",
+        svg=figure_output("invariant"),
+        png="results/{study}/figures/invariant.png",
+    log:
+        "results/{study}/logs/invariant.log",
+    benchmark:
+        "results/{study}/benchmarks/invariant.tsv"
+    conda:
+        "../envs/siq.yaml"
+    threads: 1
+    params:
+        code=code("invariant.py"),
+        study=parameters("seed", "invariant", "dynamics", "metric"),
+        figure="results/{study}/figures/invariant",
+    message:
+        "{wildcards.study}: computing the invariant distribution"
+    script:
+        "../scripts/invariant.py"
