@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from siq.bases import LibraryBasis
 from siq.certificate import (
     Candidate,
     CertificateOptions,
@@ -26,6 +27,7 @@ from siq.certificate import (
 from siq.expressions import compile_formulas
 from siq.fans import adapted_fan, first_caustic
 from siq.identification import IdentifiedField
+from siq.library import CandidateLibrary
 from siq.local_route import Well
 from siq.outline import Outline
 from siq.refinement import Refined
@@ -110,6 +112,51 @@ def certify_formulas(
         Draws of f, and the points on which the error is estimated.
     """
     candidate = _of_formulas(formulas, points, outline, relative_error)
+    return _certify(
+        candidate, found, outline, diffusion=diffusion, options=options, prediction=prediction,
+        wells=wells, seed=seed,
+    )  # fmt: skip
+
+
+def certify_potential(
+    potential: np.ndarray,
+    library: CandidateLibrary,
+    found: IdentifiedField,
+    outline: Outline,
+    points: np.ndarray,
+    *,
+    diffusion: np.ndarray,
+    options: CertificateOptions,
+    prediction: Verdict,
+    seed: int = 0,
+) -> Certificate:
+    """Certificate of V given by its coefficients over a library, shape ``(q,)``, with g = f + D∇V."""
+    basis = LibraryBasis(library, np.flatnonzero(potential))
+    own = potential[basis.chosen]
+    candidate = Candidate(
+        values=lambda x: basis.values(x) @ own,
+        gradients=lambda x: basis.gradients(x) @ own,
+        hessians=lambda x: basis.hessians(x) @ own,
+        circulatory=lambda x: found.field(x) + basis.gradients(x) @ own @ diffusion,
+        points=points,
+        attractors=outline.attractors,
+    )
+    return _certify(
+        candidate, found, outline, diffusion=diffusion, options=options, prediction=prediction, seed=seed
+    )
+
+
+def _certify(
+    candidate: Candidate,
+    found: IdentifiedField,
+    outline: Outline,
+    *,
+    diffusion: np.ndarray,
+    options: CertificateOptions,
+    prediction: Verdict,
+    wells: Sequence[Well] = (),
+    seed: int = 0,
+) -> Certificate:
     tests = _common(candidate, found, diffusion, options, seed)
     tests["identity"] = check_identity(candidate, found, diffusion=diffusion, limit=options.identity)
     error, worst = stated_error(candidate, found, diffusion=diffusion, seed=seed)
@@ -119,7 +166,7 @@ def certify_formulas(
         own = [_error_of(well, found, outline, diffusion, seed)[0] for well in wells]
         tests["agreement"] = check_agreement(
             candidate.values, wells, _sublevel_points(wells),
-            limit=_explained(options, error, max(own)) + 6 * relative_error,
+            limit=_explained(options, error, max(own)) + 6 * candidate.relative_error,
         )  # fmt: skip
     tests["prediction"] = prediction
     return _conclude(tests, error, worst, outline, "region")

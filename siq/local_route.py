@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import sympy
+from scipy.spatial import cKDTree
 
 from siq.bases import PowerBasis, power_basis
 from siq.equilibria import Descents, Equilibrium, follow, hessian_at
@@ -21,6 +22,7 @@ from siq.thinning import representative_subset
 from siq.vector_field import VectorField
 
 GROWTH = 1.5  # of the level, from one fit to the next
+REACH = 0.25  # of the distance at which the level lies: how far new points may be from those of the last fit
 MOST_POINTS = 6000  # of one fit
 NEAREST = 600  # descents that start close to the attractor, where recordings leave directions out
 HIGHEST = 0.9  # share of the recorded starts below the level, where no saddle limits it
@@ -214,8 +216,14 @@ def grow_well(
     reached = np.sort(np.maximum.accumulate(values[:, ::-1], axis=1)[:, ::-1][tuple(region.chosen.T)])
     level = float(reached[min(4 * basis.size, len(reached) - 1)])
     residual, points, final = np.inf, np.zeros((0, len(extent))), 0
+    places = region.points(np.arange(len(region.chosen))) @ np.linalg.cholesky(hessian)
+    fitted: np.ndarray | None = None
     for _ in range(80):
         rows = region.below(values, level)
+        ahead = np.zeros(len(rows), dtype=bool)
+        if fitted is not None:  # far from the last fit V is an extrapolation, and may be low by mistake
+            ahead = cKDTree(places[fitted]).query(places[rows])[0] > REACH * np.sqrt(2 * level)
+        fitted = rows = rows[~ahead]
         if len(rows) > MOST_POINTS:
             rows = np.sort(generator.choice(rows, MOST_POINTS, replace=False))
         points = region.points(rows)
@@ -226,7 +234,7 @@ def grow_well(
         equation = equation_at(basis, points, field(points), diffusion=diffusion)
         solution = gauss_newton(equation, coefficients, free=free, steps=8 if final == 0 else 40)
         coefficients, residual = solution.coefficients, solution.residual
-        if final >= 3:
+        if final >= 3 and not ahead.any():
             break
         values = along(coefficients)
         limit = min(_lowest(basis.values(tops) @ coefficients, tops, points, width, level),

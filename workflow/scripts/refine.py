@@ -10,6 +10,7 @@ from siq.certification import (
     Certificate,
     caustic_notes,
     certify_formulas,
+    certify_potential,
     certify_wells,
     uncertified,
 )
@@ -27,7 +28,7 @@ from siq.recordings import snapshot_pairs
 from siq.refined_formulas import refined_decomposition, relative_error_of
 from siq.refinement import RefinementOptions, refine
 from siq.regression import RegressionOptions, points_below
-from siq.symbolic import SymbolicDecomposition, decomposition_from_coefficients, term_coefficients
+from siq.symbolic import SymbolicDecomposition, term_coefficients
 from siq.systems import diffusion_matrix
 from step import CONTROL, job, outcome, pair_step, position_of, read_outcomes, read_run, write_outcomes
 
@@ -125,12 +126,10 @@ def control(own: Run) -> Certificate:
     networks = shuffled(own.networks, generator=generator(own.study["seed"], own.run, "shuffle"))
     library = own.record.found.library
     coefficients = fit_values(library, own.below, evaluate_points(networks, own.below).potential)
-    downhill = np.einsum("il,klj,j->ki", own.diffusion, library.derivatives, coefficients)
-    formulas = decomposition_from_coefficients(
-        library, potential=coefficients, circulatory=own.record.found.coefficients + downhill,
-        vector_field=own.record.found.coefficients, points=own.below,
+    return certify_potential(
+        coefficients, library, own.record.found, own.outline, own.unseen, diffusion=own.diffusion,
+        options=CertificateOptions(**own.study["certificate"]), prediction=own.prediction(), seed=own.run,
     )  # fmt: skip
-    return own.certify(formulas)
 
 
 def main(snakemake: Any) -> None:
