@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 CORES ?= 2
 
-.PHONY: statistics examples test lint format environment clean
+.PHONY: statistics examples test untuned noise lint format environment clean
 
 statistics: environment
 	$(BIN)/snakemake --cores $(CORES) statistics
@@ -14,6 +14,13 @@ examples: environment
 
 test: environment lint
 	$(BIN)/pytest
+
+# Full-size checks, minutes each and no part of `make test`.
+untuned: environment
+	$(BIN)/pytest -m slow -s tests/slow/test_untuned_systems.py
+
+noise: environment
+	$(BIN)/pytest -m slow -s tests/slow/test_noise_statistics.py
 
 lint: environment
 	$(BIN)/ruff check .

@@ -55,7 +55,9 @@ def answer_sentences(
                 f"The published figure is {value:.2e}, so ours is {errors.mean() / value:.3g} times that."
             )
     else:
-        sentences.append("No exact answer is known for these data, so the error cannot be stated.")
+        sentences.append(
+            "No exact answer is known for these data: the errors stated are those that certificates bound."
+        )
     networks = mine["network_error"].dropna()
     if len(networks):
         sentences.append(

@@ -8,6 +8,7 @@ just as exact as the true one, so that no residual of it, however small, decides
 `hamilton_jacobi` ∇V·(f + D∇V) vanishes on held-out points, and ∇V does not
 `branch`          the Hessian at every attractor is M = W⁻¹, within the error that f leaves open; J is stable
 `descent`         V falls along the recordings
+`error`           the error that V's own residual and the uncertainty of f leave open is small enough to state
 `agreement`       both routes give the same V within their errors
 `prediction`      f predicts held-out recordings, and its residuals are white
 ================  ==========================================================================================
@@ -42,7 +43,7 @@ class CertificateOptions:
     Attributes
     ----------
     identity
-        Rms of f + D∇V - g over rms of f.
+        Rms of f + D∇V - g over rms of f, both in the metric of D⁻¹.
     hamilton_jacobi
         Rms of ``∣∇V·(f + D∇V)∣ / (∣∇V∣ (∣f∣ + ∣D∇V∣))``.
     branch
@@ -114,9 +115,8 @@ def check_identity(
     flow = found.field(candidate.points)
     assert candidate.circulatory is not None
     built = candidate.circulatory(candidate.points) - candidate.gradients(candidate.points) @ diffusion
-    size = np.sqrt((flow**2).mean())
-    value = float(np.sqrt(((flow - built) ** 2).mean()) / size)
-    allowed = limit + STANDARD_ERRORS * _relative_field_error(found, candidate.points)
+    value = float(np.sqrt(_squares(flow - built, diffusion).mean() / _squares(flow, diffusion).mean()))
+    allowed = limit + STANDARD_ERRORS * _relative_field_error(found, candidate.points, diffusion)
     return Verdict(
         value, allowed, bool(value <= allowed), "" if value <= allowed else "V and g do not make up f"
     )
@@ -130,17 +130,16 @@ def check_hamilton_jacobi(
     The cosine of ∇V and g would be 0/0 for gradient systems, in which g vanishes; this measure is not.
     """
     flow, gradient = found.field(candidate.points), candidate.gradients(candidate.points)
-    precision = np.linalg.inv(diffusion)
     down = gradient @ diffusion
     slope = np.sqrt(np.maximum((gradient * down).sum(axis=1), 0))
-    speed = np.sqrt(np.einsum("ni,ij,nj->n", flow, precision, flow))
+    speed = np.sqrt(_squares(flow, diffusion))
     # Where V falls it falls by f: a V that hardly varies while states move is no potential.
     if not np.isfinite(slope).all() or np.median(slope / np.where(speed > 0, speed, np.inf)) < 1e-6:
         return Verdict(np.inf, limit, False, "∇V vanishes, or is not finite, on the held-out points")
     residual = np.abs((gradient * (flow + down)).sum(axis=1))
     size = slope * (speed + slope)
     value = float(np.sqrt(np.mean((residual / np.where(size > 0, size, 1.0)) ** 2)))
-    allowed = limit + STANDARD_ERRORS * _relative_field_error(found, candidate.points)
+    allowed = limit + STANDARD_ERRORS * _relative_field_error(found, candidate.points, diffusion)
     reason = "" if value <= allowed else "V does not solve the Hamilton–Jacobi equation of f"
     return Verdict(value, allowed, value <= allowed, reason)
 
@@ -206,7 +205,10 @@ def stated_error(
     rows = generator.choice(len(candidate.points), min(ERROR_POINTS, len(candidate.points)), replace=False)
     x = candidate.points[rows]
     slowest = min(-one.eigenvalues.real.max() for one in candidate.attractors)
-    fastest = float(np.quantile(np.linalg.norm(found.field.jacobian(x), axis=(1, 2)), 0.99))
+    width = np.ptp(x, axis=0)
+    width = np.where(width > 0, width, 1.0)
+    jacobian = found.field.jacobian(x) * width / width[:, None]
+    fastest = float(np.quantile(np.linalg.norm(jacobian, axis=(1, 2)), 0.99))
     integral = residual_integral(
         candidate.gradients, found.field, x, diffusion=diffusion, slowest=slowest, fastest=fastest
     )
@@ -294,17 +296,20 @@ def check_prediction(
     return Verdict(max(held_out_ratio - 1, 0.0), 0.1, passed, reason)
 
 
-def _relative_field_error(found: IdentifiedField, points: np.ndarray) -> float:
+def _squares(velocity: np.ndarray, diffusion: np.ndarray) -> np.ndarray:
+    """Squares of velocities ``(n, d)`` in the metric of the noise, in which no state's unit matters."""
+    return np.einsum("ni,ij,nj->n", velocity, np.linalg.inv(diffusion), velocity)
+
+
+def _relative_field_error(found: IdentifiedField, points: np.ndarray, diffusion: np.ndarray) -> float:
     """Rms over points of the standard error of f, over rms of f."""
     if found.noise_free:
         return 0.0
-    terms = found.library.evaluate(points)[:, found.support[:, 1]]
-    total = 0.0
-    for component in range(found.library.dimension):
-        mine = np.flatnonzero(found.support[:, 0] == component)
-        part = terms[:, mine]
-        total += float(np.einsum("np,pr,nr->n", part, found.covariance[np.ix_(mine, mine)], part).mean())
-    return float(np.sqrt(total / (found.field(points) ** 2).sum(axis=1).mean()))
+    components, functions = found.support.T
+    terms = found.library.evaluate(points)[:, functions]
+    weighted = np.linalg.inv(diffusion)[np.ix_(components, components)] * found.covariance
+    total = np.einsum("np,pr,nr->n", terms, weighted, terms).mean()
+    return float(np.sqrt(total / _squares(found.field(points), diffusion).mean()))
 
 
 def _hessian_error(

@@ -33,6 +33,7 @@ from siq.outline import Outline
 from siq.refinement import Refined
 from siq.symbolic import SymbolicDecomposition
 
+ALONE = "only one of the two routes that the study names led to a formula"
 NOTICEABLE = 1e-3  # a stated error above this is worth an explanation
 FAN = 512  # characteristics in search of a caustic
 HARMLESS = 1e-6  # a difference of the routes that no error needs to explain
@@ -86,6 +87,7 @@ def certify_formulas(
     prediction: Verdict,
     relative_error: float = 0.0,
     wells: Sequence[Well] = (),
+    compared: bool = False,
     seed: int = 0,
 ) -> Certificate:
     """Certificate of one formula for the whole region.
@@ -107,14 +109,16 @@ def certify_formulas(
     relative_error
         Relative standard error of V from the uncertainty of f.
     wells
-        By the local route, to be compared with; without them there is no agreement to test.
+        By the local route, to be compared with.
+    compared
+        Whether both routes were asked for: then a formula that only one of them found is refused.
     seed
         Draws of f, and the points on which the error is estimated.
     """
     candidate = _of_formulas(formulas, points, outline, relative_error)
     return _certify(
         candidate, found, outline, diffusion=diffusion, options=options, prediction=prediction,
-        wells=wells, seed=seed,
+        wells=wells, compared=compared, seed=seed,
     )  # fmt: skip
 
 
@@ -155,6 +159,7 @@ def _certify(
     options: CertificateOptions,
     prediction: Verdict,
     wells: Sequence[Well] = (),
+    compared: bool = False,
     seed: int = 0,
 ) -> Certificate:
     tests = _common(candidate, found, diffusion, options, seed)
@@ -168,6 +173,8 @@ def _certify(
             candidate.values, wells, _sublevel_points(wells),
             limit=_explained(options, error, max(own)) + 6 * candidate.relative_error,
         )  # fmt: skip
+    elif compared:
+        tests["agreement"] = Verdict(np.inf, 0.0, False, ALONE)
     tests["prediction"] = prediction
     return _conclude(tests, error, worst, outline, "region")
 
@@ -178,6 +185,7 @@ def certify_wells(
     *,
     options: CertificateOptions,
     prediction: Verdict,
+    compared: bool = True,
     seed: int = 0,
 ) -> Certificate:
     """Certificate of one formula for each attractor, the worst of them deciding.
@@ -218,6 +226,8 @@ def certify_wells(
             tests["agreement"] = Verdict(
                 np.inf, 0.0, False, "the network route found no formula for some well"
             )
+    elif compared:
+        tests["agreement"] = Verdict(np.inf, 0.0, False, ALONE)
     tests["prediction"] = prediction
     return _conclude(tests, error, worst, outline, "wells")
 

@@ -92,13 +92,14 @@ def find_equilibria(field: VectorField, points: np.ndarray) -> list[Equilibrium]
     width = np.where(high > low, high - low, 1.0)
     x = points.copy()
     for _ in range(NEWTON_STEPS):
-        value, jacobian = field(x), field.jacobian(x)
+        # In shares of the box, or states in very different units would damp each other.
+        value, jacobian = field(x) / width, field.jacobian(x) * width / width[:, None]
         size = np.linalg.norm(jacobian, axis=(1, 2))[:, None, None] + 1e-300
         # A little damping keeps singular Jacobians harmless and does not spoil convergence to rounding.
         normal = np.einsum("nji,njk->nik", jacobian, jacobian) + 1e-14 * size**2 * np.eye(x.shape[1])
         step = -np.linalg.solve(normal, np.einsum("nji,nj->ni", jacobian, value)[..., None])[..., 0]
-        longest = np.abs(step / width).max(axis=1, keepdims=True)
-        x = x + step * np.minimum(1.0, 0.2 / np.maximum(longest, 1e-300))
+        longest = np.abs(step).max(axis=1, keepdims=True)
+        x = x + width * step * np.minimum(1.0, 0.2 / np.maximum(longest, 1e-300))
         x = x[np.isfinite(x).all(axis=1) & (np.abs((x - low) / width - 0.5) < 2.0).all(axis=1)]
         if not len(x):
             return []
@@ -133,9 +134,11 @@ def hessian_at(field: VectorField, attractor: np.ndarray, *, diffusion: np.ndarr
     It follows from f near the attractor alone, and is what tells the true V from false solutions of the
     Hamilton–Jacobi equation.
     """
-    jacobian = field.jacobian(attractor[None])[0]
-    covariance = scipy.linalg.solve_continuous_lyapunov(jacobian, -2 * diffusion)
-    hessian = np.linalg.inv(covariance)
+    # In units of the noise: where the states' units differ much, rounding would swallow the smaller ones.
+    scale = np.sqrt(np.diag(diffusion))
+    jacobian = field.jacobian(attractor[None])[0] * scale / scale[:, None]
+    covariance = scipy.linalg.solve_continuous_lyapunov(jacobian, -2 * diffusion / np.outer(scale, scale))
+    hessian = np.linalg.inv(covariance) / np.outer(scale, scale)
     return (hessian + hessian.T) / 2
 
 

@@ -93,6 +93,9 @@ def read_field(path: str | Path) -> FieldRecord | None:
             library, coefficients, support, np.array(data["covariance"]), np.array(data["noise_rate"]),
             float(data["residual_ratio"]), FlowMap(**data["flow"]),
         )  # fmt: skip
+        p, d = len(support), library.dimension
+        if found.covariance.shape != (p, p) or found.noise_rate.shape != (d, d):
+            raise ValueError("covariances do not fit the terms")
         return FieldRecord(found, data["prediction"], data["noise"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(

@@ -199,8 +199,8 @@ def _eliminate(
     # Everything depends on the points through a triangular matrix only.
     triangle = np.asarray(np.linalg.qr(np.column_stack([jacobian, goal, forcing]), mode="r"))
     m = len(coefficients)
-    spread = np.sqrt(((equation.gradients**2).sum(axis=1)).mean(axis=0))
-    size = np.sqrt((gradient**2).sum(axis=1).mean())
+    spread = equation.sizes()
+    size = np.sqrt(np.einsum("ni,ij,nj->n", gradient, equation.diffusion, gradient).mean()) or 1.0
     rows = max(len(equation.points) - m, 1)
     active = np.arange(m)
     while len(active):

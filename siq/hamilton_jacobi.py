@@ -49,6 +49,11 @@ class HamiltonJacobi:
         along = self.weight[:, None] * (self.flow + 2 * gradient @ self.diffusion)
         return np.einsum("nd,ndm->nm", along, self.gradients)
 
+    def sizes(self) -> np.ndarray:
+        """Rms of each function's gradient over the points, in the metric of the noise: shape ``(m,)``."""
+        whitened = np.einsum("ij,nim->njm", np.linalg.cholesky(self.diffusion), self.gradients)
+        return np.sqrt((whitened**2).sum(axis=1).mean(axis=0))
+
     def restricted(self, rows: np.ndarray) -> HamiltonJacobi:
         """The equation with some of the functions only."""
         return replace(self, gradients=self.gradients[:, :, rows])
@@ -104,7 +109,7 @@ def gauss_newton(
     """
     coefficients = start.copy()
     free = np.ones(len(start), dtype=bool) if free is None else free
-    scale = np.sqrt((equation.gradients**2).sum(axis=1).mean(axis=0))
+    scale = equation.sizes()
     scale = np.where(scale > 0, scale, 1.0)
     residual = equation.residual(coefficients)
     converged = not free.any()

@@ -188,6 +188,16 @@ def residuals(found: IdentifiedField, pairs: SnapshotPairs) -> np.ndarray:
     return (velocity - problem.predicted(found.values)) * pairs.h[:, None]
 
 
+def copies(pairs: SnapshotPairs) -> float:
+    """Factor by which copies of resampled recordings make pairs look more than they are: 1 without any.
+
+    A pair that stands m times counts with weight m, but has only one residual: variances grow by Σm²/Σm,
+    which is about 2 for a bootstrap sample.
+    """
+    _, counts = np.unique(np.column_stack([pairs.x0, pairs.xh]), axis=0, return_counts=True)
+    return float((counts**2).sum() / counts.sum())
+
+
 def evenly(count: int, most: int) -> np.ndarray:
     """At most so many of `count` rows, evenly spread."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))
@@ -268,10 +278,13 @@ def _identify(
     q, d, n = library.size, library.dimension, len(pairs.h)
     dense = _fit_everything(library, pairs, integrator_step)
     triangle, values, noise_free = dense.triangle, dense.values, dense.ratio < NOISE_FREE
+    repeated = 1.0 if noise_free else copies(pairs)
     chosen = [
         (i, k)
         for i in range(d)
-        for k in _significant(triangle, q, i, n, options=options, noise_free=noise_free, candidates=d * q)
+        for k in _significant(
+            triangle, q, i, n / repeated, options=options, noise_free=noise_free, candidates=d * q
+        )
     ]
     if len({i for i, _ in chosen}) < d:
         missing = next(i for i in range(d) if i not in {j for j, _ in chosen})
@@ -365,7 +378,7 @@ def _significant(
     triangle: np.ndarray,
     q: int,
     component: int,
-    n: int,
+    n: float,
     *,
     options: IdentificationOptions,
     noise_free: bool,
@@ -457,6 +470,8 @@ def _fit_support(found: IdentifiedField, problem: _Problem) -> IdentifiedField:
         # alike in neighbouring pairs and do not average out, hence the number of pairs.
         relative = float(np.trace(np.linalg.solve(spread, rate))) / d
         covariance = covariance * relative * n
+    else:
+        covariance = covariance * copies(problem.pairs)
     return replace(
         found,
         coefficients=coefficients,

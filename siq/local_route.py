@@ -26,6 +26,7 @@ REACH = 0.25  # of the distance at which the level lies: how far new points may 
 MOST_POINTS = 6000  # of one fit
 NEAREST = 600  # descents that start close to the attractor, where recordings leave directions out
 HIGHEST = 0.9  # share of the recorded starts below the level, where no saddle limits it
+SETTLED = 0.01  # change of the level, and of the number of points, with which growing ends
 AT_LEVEL = 0.05  # of a level: by so much V of the saddle that set it may change with the next fit
 CLOSE = 0.1  # of the recorded box: a saddle so close to the points of the fit has been reached
 
@@ -185,6 +186,12 @@ def grow_well(
         Highest power.
     generator
         Decides which points are used where there are too many.
+
+    Raises
+    ------
+    NumericalFailure
+        When too few recorded states lead to the attractor, or the powers can follow V neither up to a
+        saddle nor to the end of the recorded region.
     """
     hessian = hessian_at(field, attractor.position, diffusion=diffusion)
     extent = np.sqrt(np.diag(np.linalg.inv(hessian)))
@@ -215,15 +222,17 @@ def grow_well(
     # The first level has points enough for all coefficients.
     reached = np.sort(np.maximum.accumulate(values[:, ::-1], axis=1)[:, ::-1][tuple(region.chosen.T)])
     level = float(reached[min(4 * basis.size, len(reached) - 1)])
-    residual, points, final = np.inf, np.zeros((0, len(extent))), 0
+    residual, points, last, recorded = np.inf, np.zeros((0, len(extent))), False, 0.0
     places = region.points(np.arange(len(region.chosen))) @ np.linalg.cholesky(hessian)
-    fitted: np.ndarray | None = None
+    spacing = cKDTree(places).query(places, k=2)[0][:, 1]
+    fitted = np.zeros(0, dtype=int)
     for _ in range(80):
         rows = region.below(values, level)
-        ahead = np.zeros(len(rows), dtype=bool)
-        if fitted is not None:  # far from the last fit V is an extrapolation, and may be low by mistake
-            ahead = cKDTree(places[fitted]).query(places[rows])[0] > REACH * np.sqrt(2 * level)
-        fitted = rows = rows[~ahead]
+        before = len(fitted)
+        if before:  # far from the last fit V is an extrapolation, and may be low by mistake
+            away = cKDTree(places[fitted]).query(places[rows])[0]
+            rows = rows[away < REACH * np.sqrt(2 * level) + 2 * spacing[rows]]
+        fitted = rows
         if len(rows) > MOST_POINTS:
             rows = np.sort(generator.choice(rows, MOST_POINTS, replace=False))
         points = region.points(rows)
@@ -232,24 +241,27 @@ def grow_well(
                 f"only {len(points)} recorded states lead to the attractor near {attractor.position.round(4)}"
             )
         equation = equation_at(basis, points, field(points), diffusion=diffusion)
-        solution = gauss_newton(equation, coefficients, free=free, steps=8 if final == 0 else 40)
+        solution = gauss_newton(equation, coefficients, free=free, steps=40 if last else 8)
         coefficients, residual = solution.coefficients, solution.residual
-        if final >= 3 and not ahead.any():
-            break
         values = along(coefficients)
-        limit = min(_lowest(basis.values(tops) @ coefficients, tops, points, width, level),
-                    float(np.quantile(values[:, 0], HIGHEST)))  # fmt: skip
-        if GROWTH * level >= limit:
-            final += 1
-            level = limit
-        else:
-            level *= GROWTH
+        recorded = float(np.quantile(values[:, 0], HIGHEST))
+        limit = min(_lowest(basis.values(tops) @ coefficients, tops, points, width, level), recorded)
+        if last and abs(limit - level) < SETTLED * level and len(fitted) <= (1 + SETTLED) * before:
+            break
+        last = GROWTH * level >= limit
+        level = limit if last else GROWTH * level
     saddle = None
     if len(tops):
         heights = basis.values(tops) @ coefficients
         nearest = int(np.argmin(np.abs(heights - level)))
-        if abs(heights[nearest] - level) < AT_LEVEL * level:
+        beside = _distances(tops[nearest : nearest + 1], points, width)[0] < CLOSE
+        if abs(heights[nearest] - level) < (4 if beside else 1) * AT_LEVEL * level:
             saddle, level = tops[nearest], float(heights[nearest])
+    if saddle is None and level < (1 - SETTLED) * recorded:
+        raise NumericalFailure(
+            f"powers of degree {degree} do not follow V from the attractor near"
+            f" {attractor.position.round(4)} up to a saddle"
+        )
     return Well(attractor.position, basis, coefficients, level, saddle, residual, points)
 
 
@@ -261,12 +273,13 @@ def _lowest(
     Far from the points of the fit it is an extrapolation: a saddle that seems to lie lower than points
     already reached does not count, unless they are close to it.
     """
-    believed = [
-        height
-        for height, top in zip(heights, tops, strict=True)
-        if height > (1 - AT_LEVEL) * level or np.abs((points - top) / width).max(axis=1).min() < CLOSE
-    ]
-    return float(min((height for height in believed if height > 0), default=np.inf))
+    believed = (heights > (1 - AT_LEVEL) * level) | (_distances(tops, points, width) < CLOSE)
+    return float(heights[believed & (heights > 0)].min(initial=np.inf))
+
+
+def _distances(tops: np.ndarray, points: np.ndarray, width: np.ndarray) -> np.ndarray:
+    """Of each saddle from the nearest point of a fit, as a share of the recorded box."""
+    return np.array([np.abs((points - top) / width).max(axis=1).min() for top in tops])
 
 
 def fit_well(

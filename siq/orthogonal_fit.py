@@ -86,28 +86,29 @@ def fit_orthogonal(
     whiten = scipy.linalg.solve_triangular(
         np.linalg.cholesky(found.covariance), np.eye(len(found.support)), lower=True
     )
-    design = whiten @ family.observed
+    # Coefficients in units of what each of them does to f, so that the units of the states do not matter.
+    design = whiten @ family.observed / family.scale
     tangent = np.zeros((len(theta), 0))
     rank = 0
     for _ in range(STEPS):
         violation, slope = family.constraints(theta)
-        left, singular, right = np.linalg.svd(slope, full_matrices=True)
+        left, singular, right = np.linalg.svd(slope / family.scale, full_matrices=True)
         rank = int((singular > RANK * singular[0]).sum()) if len(singular) else 0
         restore = -right[:rank].T @ ((left[:, :rank].T @ violation) / singular[:rank])
         tangent = right[rank:].T
-        wanted = whiten @ found.values - design @ (theta + restore)
+        wanted = whiten @ found.values - design @ (theta * family.scale + restore)
         step = restore.copy()
         if tangent.shape[1]:
             step += tangent @ np.linalg.lstsq(design @ tangent, wanted, rcond=None)[0]
-        theta = theta + step
-        if np.linalg.norm(step) <= 1e-13 * np.linalg.norm(theta):
+        theta = theta + step / family.scale
+        if np.linalg.norm(step) <= 1e-13 * np.linalg.norm(theta * family.scale):
             break
     violation, _slope = family.constraints(theta)
     if not np.isfinite(theta).all() or np.abs(violation).max() > 1e-8:
         return None
-    spread = design @ tangent
-    covariance = tangent @ np.linalg.pinv(spread.T @ spread) @ tangent.T
-    distance = whiten @ found.values - design @ theta
+    inverse = tangent @ np.linalg.pinv(design @ tangent) / family.scale[:, None]
+    covariance = inverse @ inverse.T
+    distance = whiten @ found.values - design @ (theta * family.scale)
     q, d = library.size, library.dimension
     count = int(family.of_potential.sum())
     fitted_potential, fitted = np.zeros(q), np.zeros((d, q))
@@ -147,15 +148,22 @@ class _Family:
         listed = np.zeros((d, q), dtype=bool)
         listed[found.support[:, 0], found.support[:, 1]] = True
         self.observed = whole[found.support[:, 0], found.support[:, 1]]
-        self.absent = whole[~listed]
-        self.absent = self.absent[np.abs(self.absent).any(axis=1)]
         values = library.evaluate(points)
+        flow, precision = found.field(points), np.linalg.inv(diffusion)
+        speed = np.sqrt(np.einsum("ni,ij,nj->n", flow, precision, flow))
+        usual = np.sqrt((speed**2).mean())
+        # What one unit of each term adds to f, relative to f.
+        sizes = np.sqrt(np.outer(np.diag(precision), (values**2).mean(axis=0))) / usual
+        self.absent = (sizes[:, :, None] * whole)[~listed]
+        self.absent = self.absent[np.abs(self.absent).any(axis=1)]
         self.gradients = np.einsum("nk,kij->nij", values, library.derivatives[:, :, terms])
         self.circulation = np.zeros((len(points), d, len(places)))
         for column, (i, k) in enumerate(places):
             self.circulation[:, i, column] = values[:, k]
-        speed = np.linalg.norm(found.field(points), axis=1)
-        self.weight = 1 / np.maximum(speed, 1e-3 * speed.max()) / np.sqrt(len(points))
+        slopes = np.sqrt(np.einsum("nim,ij,njm->nm", self.gradients, diffusion, self.gradients))
+        scale = np.concatenate([np.sqrt((slopes**2).mean(axis=0)) / usual, sizes[self.of_circulatory]])
+        self.scale = np.where(scale > 0, scale, 1.0)
+        self.weight = 1 / np.maximum(speed, 1e-3 * speed.max()) / usual / np.sqrt(len(points))
 
     def constraints(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Weighted ∇V·g at the points and the terms that f does not have, with their derivatives."""

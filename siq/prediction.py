@@ -29,7 +29,10 @@ def predict(field: VectorField, recordings: Recordings) -> np.ndarray:
     """
     starts = np.flatnonzero(np.diff(recordings.recording, prepend=-1))
     lengths = np.diff(np.append(starts, len(recordings.t)))
-    rate = float(np.quantile(np.linalg.norm(field.jacobian(recordings.values), axis=(1, 2)), 0.999))
+    width = np.ptp(recordings.values, axis=0)
+    width = np.where(width > 0, width, 1.0)
+    jacobian = field.jacobian(recordings.values) * width / width[:, None]
+    rate = float(np.quantile(np.linalg.norm(jacobian, axis=(1, 2)), 0.999))
     predicted = np.full_like(recordings.values, np.nan)
     predicted[starts] = recordings.values[starts]
     x = recordings.values[starts].T.copy()

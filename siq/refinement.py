@@ -282,18 +282,25 @@ def _local_well(
     dimension = found.library.dimension
     degrees = [4, 6, 8] if options.degree is None else [options.degree]
     best: Well | None = None
+    failure: NumericalFailure | None = None
     for degree in degrees:
         if best is not None and affordable_degree(dimension, degree) < degree:
             break
-        trial = grow_well(
-            found.field, outline.attractors[index], outline.regions[index], outline.saddles[index],
-            diffusion=diffusion, degree=degree, generator=np.random.default_rng(seed),
-        )  # fmt: skip
+        try:
+            trial = grow_well(
+                found.field, outline.attractors[index], outline.regions[index], outline.saddles[index],
+                diffusion=diffusion, degree=degree, generator=np.random.default_rng(seed),
+            )  # fmt: skip
+        except NumericalFailure as error:  # of one degree: another may do
+            failure = error
+            continue
         if best is None or trial.residual < best.residual:
             best = trial
         if best.residual < options.accuracy:
             break
-    assert best is not None  # there is at least one degree
+    if best is None:
+        assert failure is not None  # there is at least one degree
+        raise failure
     return best
 
 

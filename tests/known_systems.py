@@ -8,6 +8,7 @@ residual of V is zero as a formula and not only to rounding.
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import NamedTuple
@@ -23,6 +24,8 @@ from siq.library import candidate_library, monomial_exponents
 from siq.outline import Outline, outline
 from siq.systems import System
 from siq.vector_field import VectorField
+
+Function = Callable[[np.ndarray], np.ndarray]
 
 
 class KnownSystem(NamedTuple):
@@ -41,14 +44,20 @@ class KnownSystem(NamedTuple):
 def potential_values(known: KnownSystem, x: np.ndarray) -> np.ndarray:
     """V at points, ``(n, d)`` to ``(n,)``."""
     assert known.potential is not None
-    return compile_formulas([known.potential], known.field.symbols)(np.ascontiguousarray(x.T))[0]
+    return _compiled(known.potential, known.field.symbols)[0](np.ascontiguousarray(x.T))[0]
 
 
 def potential_gradient(known: KnownSystem, x: np.ndarray) -> np.ndarray:
     """∇V at points, ``(n, d)`` to ``(n, d)``."""
     assert known.potential is not None
-    gradient = [known.potential.diff(symbol) for symbol in known.field.symbols]
-    return compile_formulas(gradient, known.field.symbols)(np.ascontiguousarray(x.T)).T
+    return _compiled(known.potential, known.field.symbols)[1](np.ascontiguousarray(x.T)).T
+
+
+@functools.cache
+def _compiled(potential: sympy.Expr, symbols: tuple[sympy.Symbol, ...]) -> tuple[Function, Function]:
+    """V and ∇V, of components."""
+    gradient = [potential.diff(symbol) for symbol in symbols]
+    return compile_formulas([potential], symbols), compile_formulas(gradient, symbols)
 
 
 def linear_system(dimension: int, *, seed: int = 0, rotation: float = 6.0) -> KnownSystem:

@@ -134,10 +134,11 @@ def test_the_hessian_solves_the_lyapunov_equation() -> None:
         np.testing.assert_array_equal(hessian, hessian.T)
 
 
-def test_the_hessian_does_not_depend_on_the_axes_or_units() -> None:
+@pytest.mark.parametrize("units", [(1.0, 1.0), (1e-2, 20.0), (1e6, 1e-5)])
+def test_the_hessian_does_not_depend_on_the_axes_or_units(units: tuple[float, float]) -> None:
     known = maier_stein(5)
     angle = 0.6
-    turn = np.diag([1e-2, 20.0]) @ np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    turn = np.diag(units) @ np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     back = dict(zip((x, y), np.linalg.inv(turn) @ np.array([x, y]), strict=True))
     turned = VectorField(
         (x, y), tuple(turn @ np.array([f.subs(back, simultaneous=True) for f in known.field.equations]))
@@ -145,7 +146,29 @@ def test_the_hessian_does_not_depend_on_the_axes_or_units() -> None:
     diffusion = np.array([[1.0, 0.3], [0.3, 0.5]])
     one = hessian_at(known.field, np.array([-1.0, 0]), diffusion=diffusion)
     other = hessian_at(turned, turn @ [-1.0, 0], diffusion=turn @ diffusion @ turn.T)
-    np.testing.assert_allclose(turn.T @ other @ turn, one, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(turn.T @ other @ turn, one, rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize("units", [(1e-3, 40.0), (1e5, 1e-6)])
+def test_the_outline_does_not_depend_on_units(units: tuple[float, float]) -> None:
+    known, scale = double_well(2), np.array(units)
+    back = {s: s / sympy.Float(u) for s, u in zip(known.field.symbols, units, strict=True)}
+    scaled = VectorField(
+        known.field.symbols,
+        tuple(
+            sympy.Float(u) * f.subs(back, simultaneous=True)
+            for u, f in zip(units, known.field.equations, strict=True)
+        ),
+    )
+    points = uniform_points(known, 100)
+    one = outline(known.field, points, diffusion=known.diffusion)
+    two = outline(scaled, points * scale, diffusion=known.diffusion * np.outer(scale, scale))
+    assert [other.kind for other in two.equilibria] == [other.kind for other in one.equilibria]
+    for a, b in zip(one.equilibria, two.equilibria, strict=True):
+        np.testing.assert_allclose(b.position / scale, a.position, atol=1e-8)
+    np.testing.assert_array_equal(two.descents.ends, one.descents.ends)
+    np.testing.assert_allclose(two.descents.paths / scale, one.descents.paths, atol=1e-5)
+    assert two.fault() is None
 
 
 def test_paths_begin_at_their_starts_and_end_at_attractors() -> None:

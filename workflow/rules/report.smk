@@ -74,6 +74,7 @@ rule page:
             "regression",
             "refinement",
             "certificate",
+            "invariant",
             "metric",
             "dynamics",
             "exact",

@@ -24,8 +24,8 @@ from siq.tables import as_table, read_table, write_table
 from step import job, shown_formula
 
 WALKERS = 4000
-DURATION = 40.0  # of the simulation, after a tenth of it to settle
-STEP = 0.002
+STEPS = 20_000  # of the simulation, after a fifth of them to settle
+ACCURACY = 0.025  # step times the norm of the Jacobian where the walkers are
 
 
 def simulate(system: System, intensity: float, *, seed: int) -> np.ndarray:
@@ -33,10 +33,11 @@ def simulate(system: System, intensity: float, *, seed: int) -> np.ndarray:
     draw = generator(seed, "invariant", str(intensity))
     low, high = system.domain.T
     start = draw.uniform(low, high, (WALKERS, system.dimension)).T
-    steps = round(DURATION / STEP)
+    rate = np.linalg.norm(system.jacobian(start[:, :500]), axis=(0, 1))
     return simulate_stationary(
-        system.vector_field, diffusion=system.diffusion, intensity=intensity, start=start, step=STEP,
-        burn_in=steps // 5, steps=steps, thin=steps // 50, generator=draw,
+        system.vector_field, diffusion=system.diffusion, intensity=intensity, start=start,
+        step=ACCURACY / float(np.median(rate)), burn_in=STEPS // 5, steps=STEPS, thin=STEPS // 50,
+        generator=draw,
     )  # fmt: skip
 
 

@@ -109,12 +109,15 @@ def refine_run(
     formulas = refined_decomposition(refined, own.below)
     if formulas.potential is not None:
         certificate = own.certify(
-            formulas, wells=refined.wells, relative_error=relative_error_of(refined, own.below)
+            formulas,
+            wells=refined.wells,
+            relative_error=relative_error_of(refined, own.below),
+            compared=len(options.routes) == 2,
         )
     else:
         certificate = certify_wells(
             refined, own.outline, options=CertificateOptions(**own.study["certificate"]),
-            prediction=own.prediction(), seed=own.run,
+            prediction=own.prediction(), compared=len(options.routes) == 2, seed=own.run,
         )  # fmt: skip
     caustics = caustic_notes(refined, own.outline, certificate.error, seed=own.run)
     return formulas, certificate, (*refined.notes, *caustics)
@@ -137,8 +140,7 @@ def main(snakemake: Any) -> None:
     run, study, source = int(snakemake.wildcards.run), snakemake.params.study, snakemake.input
     torch.set_num_threads(snakemake.threads)
     models, _ = read_model(source.model)
-    unknown = "f was not identified, so that nothing could be tested"
-    certificates = {method: uncertified(unknown) for method in models}
+    certificates = {}
     identified = read_outcomes(source.identified)[0]
     position, reason = position_of(run, source.outcome)
     if identified["status"] in ("failed", "skipped"):
@@ -159,6 +161,8 @@ def main(snakemake: Any) -> None:
             result = outcome(run, "refine", status, reason)
         except (NumericalFailure, np.linalg.LinAlgError) as error:
             result = outcome(run, "refine", "failed", str(error))
+    for method in models.keys() - certificates.keys():
+        certificates[method] = uncertified(f"no test was made: {result['reason']}")
     write_model(snakemake.output.model, model_to_data(models, certificates))
     write_outcomes(snakemake.output.outcome, [result])
 

@@ -1,0 +1,121 @@
+"""The paper's system with noise (section 3.1.1), 50 runs at full size: errors against the Cramér–Rao bound.
+
+Draws, identifies and refines as the study `archetype3d-noise` does, by the local route alone, so that no
+network trains. ``make noise`` runs it; it takes minutes.
+"""
+
+import os
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from siq.identification import IdentificationOptions, identify_vector_field
+from siq.library import candidate_library, joint_library
+from siq.outline import evenly_spread, outline
+from siq.randomness import generator
+from siq.recordings import snapshot_pairs
+from siq.refined_formulas import refined_decomposition
+from siq.refinement import RefinementOptions, refine
+from siq.simulate import SimulationOptions, simulate_snapshots
+from siq.symbolic import term_coefficients
+from siq.systems import load_system
+
+RUNS = 50
+NOISE = 0.02  # ε of √ε dW: the paper's ⟨ξξ⟩ = 2ε δ with ε = 0.01
+CARD = Path(__file__).resolve().parents[2] / "config" / "systems" / "archetype3d.yaml"
+EXACT = {
+    "U": {"x**4": 1.0, "x**2": -2.0, "y**2": 1.0, "z**2": 1.0},
+    "g_x": {"y": -1.0, "z": -1.0},
+    "g_y": {"x": -2.0, "x**3": 2.0},
+    "g_z": {"x": -2.0, "x**3": 2.0},
+}
+
+
+def cramer_rao_bound(x: np.ndarray, h: float) -> dict[tuple[str, str], float]:
+    """Standard deviations that no unbiased estimate from these pairs can beat, for the true terms.
+
+    With V = ½(a x⁴ - b x² + c y² + d z²) and ∇V·g = 0 the terms leave six numbers free, (a, b, c, d, p, q)
+    with g = (p y + q z, p(bx - 2ax³)/c, q(bx - 2ax³)/d): all coefficients of f follow from them, and the
+    increments are Gaussian with variance ε h.
+    """
+    exact = np.array([1.0, 2.0, 1.0, 1.0, -1.0, -1.0])
+    names = [(part, term) for part, terms in EXACT.items() for term in terms]
+
+    def reported(p: np.ndarray) -> np.ndarray:
+        a, b, c, d, s, t = p
+        return np.array([a, -b, c, d, s, t, s * b / c, -2 * s * a / c, t * b / d, -2 * t * a / d])
+
+    def field(p: np.ndarray) -> np.ndarray:  # coefficients of (x, x³, y, z) in each equation
+        a, b, c, d, s, t = p
+        return np.array(
+            [
+                [b, -2 * a, s, t],
+                [s * b / c, -2 * s * a / c, -c, 0],
+                [t * b / d, -2 * t * a / d, 0, -d],
+            ]
+        )
+
+    def slope(function) -> np.ndarray:
+        steps = 1e-6 * np.eye(6)
+        return np.stack(
+            [(function(exact + e).ravel() - function(exact - e).ravel()) / 2e-6 for e in steps], axis=1
+        )
+
+    theta = np.stack([x[:, 0], x[:, 0] ** 3, x[:, 1], x[:, 2]], axis=1)
+    information = np.kron(np.eye(3), theta.T @ theta * h / NOISE)
+    design = slope(field)
+    covariance = np.linalg.inv(design.T @ information @ design)
+    spread = np.sqrt(np.diag(slope(reported) @ covariance @ slope(reported).T))
+    return dict(zip(names, spread, strict=True))
+
+
+def one_run(run: int):
+    """Estimates, standard errors and bounds of one run, and whether exactly the right terms were found."""
+    os.environ["OMP_NUM_THREADS"] = "1"
+    system = load_system(CARD)
+    options = SimulationOptions(noise_intensity=NOISE)
+    recordings = simulate_snapshots(system, options=options, generator=generator(20260102, run, "simulate"))
+    pairs = snapshot_pairs(recordings, pair_step=options.pair_step)
+    library = candidate_library(system.states, degree=5)
+    found = identify_vector_field(
+        library, pairs, options=IdentificationOptions(), integrator_step=options.pair_step / options.substeps
+    )
+    points = pairs.x0[evenly_spread(pairs.x0, generator=np.random.default_rng(run))]
+    refined = refine(
+        found, outline(found.field, points, diffusion=np.eye(3), seed=run),
+        library=joint_library(library, degree=5, potential_degree=5), formula=None, network=None,
+        points=points, diffusion=np.eye(3), options=RefinementOptions(routes=("local",)), seed=run,
+    )  # fmt: skip
+    formulas = refined_decomposition(refined, points)
+    components = formulas.components()
+    estimates = {part: term_coefficients(components.get(part, 0 * components["f_x"])) for part in EXACT}
+    right = all(set(found_terms) - {"1"} == set(EXACT[part]) for part, found_terms in estimates.items())
+    errors = {part: formulas.standard_errors.get(part, {}) for part in EXACT}
+    return estimates, errors, cramer_rao_bound(pairs.x0, options.pair_step), right, refined.joint
+
+
+@pytest.mark.slow
+def test_coefficients_of_u_and_g_reach_the_cramer_rao_bound_with_honest_intervals():
+    with ProcessPoolExecutor(2) as pool:
+        results = list(pool.map(one_run, range(RUNS)))
+    right = sum(result[3] for result in results)
+    print(f"\nright terms in {right} of {RUNS} runs, fitted jointly in {sum(r[4] for r in results)}")
+    assert right >= RUNS - 1
+    covered, ratios = [], []
+    for part, terms in EXACT.items():
+        for term, exact in terms.items():
+            rows = [(r[0][part][term], r[1][part][term], r[2][part, term]) for r in results if r[3]]
+            estimate, error, bound = np.array(rows).T
+            rms = np.sqrt(((estimate - exact) ** 2).mean())
+            ratios.append(rms / bound.mean())
+            covered.append(np.abs(estimate - exact) < 1.96 * error)
+            print(
+                f"{part:4} {term:5} rms error {rms / abs(exact):.2%}, bound {bound.mean() / abs(exact):.2%},"
+                f" ratio {ratios[-1]:.2f}, covered {covered[-1].mean():.0%}"
+            )
+    overall = float(np.sqrt(np.mean(np.square(ratios))))
+    print(f"rms error over bound {overall:.3f}, intervals cover {np.mean(covered):.1%}")
+    assert overall <= 1.15
+    assert 0.90 <= np.mean(covered) <= 0.98

@@ -1,0 +1,92 @@
+"""The training of a block of runs: attempts, checks, and what a killed job goes on from."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "workflow" / "scripts"))
+
+from siq.decomposition.data import prepare_data
+from siq.decomposition.options import TrainingOptions
+from siq.recordings import SnapshotPairs
+from train import Block
+
+TRAINING = {
+    "widths": [6], "steps": 60, "batch_size": 16, "thinning_distance": 0.3,
+    "check": {"first": 20, "every": 20, "attempts": 2},
+}  # fmt: skip
+STUDY = {"seed": 3, "training": TRAINING, "metric": {"diffusion": "identity"}}
+
+
+def data(run: int):
+    x0 = np.random.default_rng(run).uniform(-2, 2, size=(200, 2))
+    pairs = SnapshotPairs(x0, x0 * np.exp(-0.05), np.full(200, 0.05), np.repeat(np.arange(10), 20))
+    return prepare_data(pairs, options=TrainingOptions(**TRAINING), generator=np.random.default_rng(run))
+
+
+class Check:
+    """Passes at its n-th call, and may be told to die at another."""
+
+    def __init__(self, passes_at: int, dies_at: int = -1) -> None:
+        self.calls, self.passes_at, self.dies_at = 0, passes_at, dies_at
+        self.outline = SimpleNamespace(fault=lambda: None)
+
+    def hopeless(self) -> None:
+        return None
+
+    def passes(self, _networks: object) -> bool:
+        self.calls += 1
+        if self.calls == self.dies_at:
+            raise KeyboardInterrupt
+        return self.calls == self.passes_at
+
+
+def block(folder: Path, checks: dict[int, Check]) -> Block:
+    return Block(
+        {run: data(run) for run in (0, 1)}, checks, study=STUDY, folder=folder, mark="m" * 20,
+        device=torch.device("cpu"),
+    )  # type: ignore[arg-type]  # fmt: skip
+
+
+def weights(one: Block) -> list[torch.Tensor]:
+    return [tensor for run in (0, 1) for tensor in one.last[run].parameters()]
+
+
+def test_each_run_stops_where_its_check_passed_and_only_the_others_start_afresh(tmp_path: Path) -> None:
+    one = block(tmp_path, {0: Check(2), 1: Check(5)})  # run 1 passes in its second training
+    one.train()
+    assert set(one.passed) == {0, 1}
+    assert one.outcome(0, 0)["status"] == one.outcome(1, 1)["status"] == "ok"
+    history = one.history()
+    assert set(history["run"]) == {0, 1}
+    one.clean()
+    assert not list(tmp_path.glob("kept-*"))
+
+
+def test_a_run_whose_check_never_passes_is_shown_as_such(tmp_path: Path) -> None:
+    one = block(tmp_path, {0: Check(1), 1: Check(99)})
+    one.train()
+    said = one.outcome(1, 1)
+    assert said["status"] == "warning" and "passed in none of 2 trainings" in said["reason"]
+
+
+@pytest.mark.parametrize("dies_at", [2, 3, 4, 5])
+def test_a_killed_job_ends_with_the_same_networks(tmp_path: Path, dies_at: int) -> None:
+    whole = block(tmp_path / "whole", {0: Check(2), 1: Check(5)})
+    whole.train()
+    killed = block(tmp_path / "killed", {0: Check(2), 1: Check(5, dies_at)})
+    with pytest.raises(KeyboardInterrupt):
+        killed.train()
+    # A check is a pure function of the networks; the counter stands in for them, and goes back with them.
+    resumed = block(tmp_path / "killed", {0: Check(2), 1: Check(5)})
+    resumed.checks[1].calls = 0 if dies_at <= 3 else 3
+    resumed.checks[0].calls = 0
+    resumed.train()
+    for left, right in zip(weights(whole), weights(resumed), strict=True):
+        assert torch.equal(left, right)
