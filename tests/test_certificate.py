@@ -76,7 +76,7 @@ def certified(
     wells: tuple[Well, ...] = (),
     prediction: Verdict = PASSED,
     circulatory: tuple[sympy.Expr, ...] | None = None,
-    share: float = 0.7,
+    share: float = 0.6,
     relative_error: float = 0.0,
 ) -> Certificate:
     """Certificate of a formula of V; g is f + D∇V unless it is given."""
@@ -87,7 +87,7 @@ def certified(
     if circulatory is not None:
         formulas = replace(formulas, circulatory=circulatory)
     return certify_formulas(
-        formulas, found, outline_of(known, 300, share=share), uniform_points(known, 300, seed=5, share=share),
+        formulas, found, outline_of(known, 300, share=share), uniform_points(known, 150, seed=5, share=share),
         diffusion=known.diffusion, options=CertificateOptions(), prediction=prediction, wells=wells,
         relative_error=relative_error,
     )  # fmt: skip
@@ -97,7 +97,7 @@ def refusals(certificate: Certificate) -> set[str]:
     return {name for name, verdict in certificate.tests.items() if not verdict.passed}
 
 
-def wells_of(known: KnownSystem, *, degree: int = 4, share: float = 0.7) -> tuple[Well, ...]:
+def wells_of(known: KnownSystem, *, degree: int = 4, share: float = 0.6) -> tuple[Well, ...]:
     found = outline_of(known, 300, share=share)
     return tuple(
         grow_well(
@@ -112,11 +112,10 @@ def wells_of(known: KnownSystem, *, degree: int = 4, share: float = 0.7) -> tupl
 
 TRUE = {
     "gradient system": double_well(2),
-    "gradient system in three dimensions": double_well(3),
-    **{f"linear in {d} dimensions": linear_system(d) for d in (2, 3, 4, 5)},
+    **{f"linear in {d} dimensions": linear_system(d) for d in (2, 4)},
     **{f"archetype in {d} dimensions": archetype(d) for d in (2, 3, 4)},
     "Maier-Stein": maier_stein(1),
-    **{f"polynomial, draw {seed}": polynomial_system(2, seed=seed) for seed in range(3)},
+    **{f"polynomial, draw {seed}": polynomial_system(2, seed=seed) for seed in range(2)},
 }
 
 
@@ -204,7 +203,7 @@ def false_solutions() -> Iterator[tuple[str, FalseSolution]]:
         FalseSolution(turning, (y - z) ** 2 / 4, frozenset({"branch"}), EXACT),
     )
     for name, known in {
-        "archetype": turning, "Maier-Stein": maier_stein(1), "gradient system": double_well(2),
+        "archetype": archetype(2), "Maier-Stein": maier_stein(1), "gradient system": double_well(2),
         "linear": linear_system(2),
     }.items():  # fmt: skip
         yield f"{name}, zero", FalseSolution(known, sympy.S.Zero, frozenset({"hamilton_jacobi", "branch"}))
@@ -324,7 +323,7 @@ def test_every_other_invariant_subspace_is_refused(dimension: int, rotation: flo
     assert len(solutions) == 2**independent
     found, library = exact_field(known, 2), candidate_library([s.name for s in known.field.symbols], degree=2)
     basis = LibraryBasis(library, np.arange(1, library.size))
-    outline, points = outline_of(known, 300, share=0.7), uniform_points(known, 300, seed=5, share=0.7)
+    outline, points = outline_of(known, 300, share=0.6), uniform_points(known, 150, seed=5, share=0.6)
     accepted = 0
     for hessian in solutions:
         residual = hessian @ jacobian + jacobian.T @ hessian + 2 * hessian @ known.diffusion @ hessian
@@ -355,7 +354,7 @@ def test_every_other_invariant_subspace_is_refused(dimension: int, rotation: flo
 def test_a_network_trained_for_too_short_ends_in_an_exact_false_solution(seed: int) -> None:
     known = archetype(3)
     found, points = exact_field(known, 5), uniform_points(known, 400, share=0.7)
-    setting = outline_of(known, 300, share=0.7)
+    setting = outline_of(known, 300, share=0.6)
     direction = np.random.default_rng(seed).normal(size=3)
     # V as a short training leaves it: hardly any curvature along y - z, and everything a little wrong.
     network = 0.9 * ((points[:, 0] ** 2 - 1) ** 2 / 2 + (points[:, 1] + points[:, 2]) ** 2 / 4)
@@ -399,7 +398,7 @@ def test_a_randomised_network_is_refused(seed: int) -> None:
     start = fit_values(found.library, points, values)
     plain, refined = (
         certify_potential(
-            coefficients, found.library, found, outline_of(known, 300, share=0.7), points,
+            coefficients, found.library, found, outline_of(known, 300, share=0.6), points,
             diffusion=known.diffusion, options=CertificateOptions(), prediction=PASSED,
         )
         for coefficients in (
@@ -419,7 +418,7 @@ def test_a_randomised_network_is_refused(seed: int) -> None:
 
 def test_a_limit_cycle_is_named_and_refused_without_any_division_by_zero() -> None:
     known = limit_cycle()
-    fault = outline_of(known, 300, share=0.7).fault()
+    fault = outline_of(known, 300, share=0.6).fault()
     assert fault is not None
     assert "limit cycle" in fault
     with np.errstate(all="raise"):
@@ -541,8 +540,8 @@ def test_the_verdict_on_f(options: dict, passes: bool, reason: str) -> None:
 
 
 def test_the_uncertainty_of_f_widens_the_limits_and_no_more() -> None:
-    known, error = archetype(2), 5e-3
-    found = exact_field(known, 3, relative_error=error)
+    known, error = linear_system(2), 5e-3
+    found = exact_field(known, 1, relative_error=error)
     certificate = certified(known, known.potential, found=found, relative_error=error)
     assert certificate.certified, certificate.reason
     assert certificate.error >= 2 * error
@@ -558,7 +557,7 @@ def test_a_well_that_is_missing_is_refused() -> None:
     known = archetype(2)
     refined = of_wells(known, wells_of(known)[:1])
     certificate = certify_wells(
-        refined, outline_of(known, 300, share=0.7), options=CertificateOptions(), prediction=PASSED,
+        refined, outline_of(known, 300, share=0.6), options=CertificateOptions(), prediction=PASSED,
         compared=False,
     )  # fmt: skip
     assert "branch" in refusals(certificate)
@@ -574,7 +573,7 @@ def of_wells(known: KnownSystem, wells: tuple[Well, ...], others: tuple[Well, ..
 
 def test_wells_by_both_routes_must_agree() -> None:
     known = archetype(2)
-    wells, setting = wells_of(known), outline_of(known, 300, share=0.7)
+    wells, setting = wells_of(known), outline_of(known, 300, share=0.6)
     options, other = CertificateOptions(), wells_of(maier_stein(1))
     foreign = tuple(
         replace(two, attractor=one.attractor) for one, two in zip(wells, other, strict=True)
@@ -634,7 +633,7 @@ def test_without_an_attractor_no_error_can_be_stated() -> None:
 
 def test_an_outline_with_a_fault_refuses_whatever_else_passes() -> None:
     known = archetype(2)
-    setting = outline_of(known, 300, share=0.7)
+    setting = outline_of(known, 300, share=0.6)
     escaped = replace(setting.descents, ends=np.where(np.arange(300) < 30, -1, setting.descents.ends))
     faulty: Outline = replace(setting, descents=escaped)
     assert faulty.fault() is not None

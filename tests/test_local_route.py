@@ -77,7 +77,7 @@ def test_a_linear_system_in_six_dimensions() -> None:
 @pytest.mark.parametrize(("dimension", "seed"), [(2, 0), (2, 1), (2, 2), (3, 0)])
 def test_random_polynomials_are_found_in_every_well(dimension: int, seed: int) -> None:
     known = polynomial_system(dimension, seed=seed)
-    found = outline_of(known, 250 if dimension == 2 else 60, share=0.6)
+    found = outline_of(known, 250 if dimension == 2 else 120, share=0.6)
     assert len(found.attractors) == len(known.attractors)
     for index in range(len(found.attractors)):
         well = grown(known, found, index)
