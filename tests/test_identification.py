@@ -13,12 +13,14 @@ from siq.field_file import field_library
 from siq.identification import (
     IdentificationOptions,
     IdentifiedField,
+    copies,
     evenly,
     identify_vector_field,
     refit,
     residuals,
 )
 from siq.integration import dormand_prince_step
+from siq.library import candidate_library
 from siq.recordings import Recordings, SnapshotPairs, select_recordings, snapshot_pairs
 from siq.simulate import SimulationOptions, simulate_snapshots
 from siq.vector_field import VectorField
@@ -296,3 +298,16 @@ def test_noise_free_pairs_beyond_the_limit_are_not_used_and_noisy_ones_are() -> 
     np.testing.assert_array_equal(
         identified(TURNING, disturbed, pairs=150).values, identified(TURNING, disturbed).values
     )
+
+
+def test_copies_of_resampled_recordings_are_no_further_evidence() -> None:
+    rng = np.random.default_rng(0)
+    x0 = rng.uniform(-1, 1, (400, 1))
+    pairs = SnapshotPairs(x0, 0.9 * x0 + 0.05 * rng.normal(size=x0.shape), np.full(400, 0.1), np.arange(400))
+    parts = (pairs.x0, pairs.xh, pairs.h, pairs.recording)
+    twice = SnapshotPairs(*(np.concatenate([part, part]) for part in parts))
+    library = candidate_library(["x"], degree=2)
+    alone = identify_vector_field(library, pairs, options=IdentificationOptions())
+    doubled = identify_vector_field(library, twice, options=IdentificationOptions())
+    assert copies(pairs) == 1 and copies(twice) == 2
+    np.testing.assert_allclose(doubled.covariance, alone.covariance, rtol=0.01)
