@@ -18,10 +18,11 @@ def test_a_study_whose_every_training_fails_still_ends_in_a_report_that_says_so(
         "identify": "ok",
         "train": "failed",
         "regress": "skipped",
-        "refine": "ok",
+        "refine": "warning",
         "score": "ok",
     }
     assert "no longer finite" in outcomes.loc["train", "reason"]
+    assert "only one of the two routes" in outcomes.loc["refine", "reason"]
     rrmse = pd.read_parquet(project.path("results/mini/tables/rrmse.parquet"))
     assert rrmse["rrmse"].isna().all() and not rrmse["certified"].any()
     page = project.path("results/mini/report.html").read_text(encoding="utf-8")
