@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 CORES ?= 2
 
-.PHONY: statistics examples test untuned noise lint format environment clean
+.PHONY: statistics examples test full untuned noise lint format environment clean
 
 statistics: environment
 	$(BIN)/snakemake --cores $(CORES) statistics
@@ -16,6 +16,9 @@ test: environment lint
 	$(BIN)/pytest
 
 # Full-size checks, minutes each and no part of `make test`.
+full: environment
+	$(BIN)/pytest -m "slow or not slow" --ignore=tests/slow
+
 untuned: environment
 	$(BIN)/pytest -m slow -s tests/slow/test_untuned_systems.py
 

@@ -20,6 +20,8 @@ from siq.fans import adapted_fan, even_directions, first_caustic, lowest_sheet, 
 from siq.systems import System
 from siq.vector_field import VectorField
 
+pytestmark = pytest.mark.slow  # minutes in all: `make full` runs it
+
 WELL = np.array([[-2.0, 0.0], [-1.5, 1.5]])  # of Maier–Stein's system, up to the separatrix
 SADDLE_LEVEL = 0.25  # of V along the axis; the barrier itself is lower for β > 4
 

@@ -25,6 +25,8 @@ from siq.recordings import Recordings, SnapshotPairs, select_recordings, snapsho
 from siq.simulate import SimulationOptions, simulate_snapshots
 from siq.vector_field import VectorField
 
+pytestmark = pytest.mark.slow  # minutes in all: `make full` runs it
+
 x, y = (sympy.Symbol(name, real=True) for name in "xy")
 CORRELATED = np.array([[1.0, 0.9], [0.9, 1.0]])
 

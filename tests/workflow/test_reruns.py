@@ -75,7 +75,7 @@ def wait_for(pattern, process, *, within, seconds=120):
         time.sleep(0.02)
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+@pytest.mark.parametrize("how", [signal.SIGKILL, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
 def test_an_interrupted_workflow_resumes_and_gives_the_same_tables(fresh_project, finished, how):
     project = fresh_project
     project.write_study(runs=2)
