@@ -8,11 +8,12 @@ from siq.decomposition.data import prepare_data
 from siq.decomposition.initial import initial_networks
 from siq.decomposition.networks import (
     Networks,
+    at_rest,
     evaluate,
-    evaluate_points,
     initial_layers,
     move,
     select_run,
+    side_by_side,
 )
 from siq.decomposition.options import TrainingOptions
 from siq.errors import NumericalFailure
@@ -115,19 +116,35 @@ def test_runs_differ_and_do_not_depend_on_their_neighbours() -> None:
         assert not torch.equal(weights[0], weights[1])
 
 
-def test_points_are_evaluated_the_same_in_pieces() -> None:
-    nets = select_run(networks(), 1)
+def test_networks_at_rest_have_the_values_of_those_in_training() -> None:
+    nets = networks(diffusion=FULL)
     x = generator(2).normal(size=(25, 3))
-    whole, pieces = evaluate_points(nets, x), evaluate_points(nets, x, chunk=7)
-    components = evaluate(nets, torch.from_numpy(x)[None])
-    for name in ("potential", "circulatory", "vector_field"):
-        np.testing.assert_allclose(getattr(pieces, name), getattr(whole, name), rtol=1e-12, atol=1e-14)
-        np.testing.assert_allclose(getattr(whole, name), getattr(components, name)[0], rtol=1e-12, atol=1e-14)
+    for run in range(2):
+        one = at_rest(nets, run)
+        components = evaluate(select_run(nets, run), torch.from_numpy(x)[None])
+        whole, pieces = one.evaluate(x), one.evaluate(x, chunk=7)
+        for name in ("potential", "circulatory", "vector_field"):
+            np.testing.assert_allclose(getattr(pieces, name), getattr(whole, name), rtol=1e-12, atol=1e-14)
+            np.testing.assert_allclose(
+                getattr(whole, name), getattr(components, name)[0], rtol=1e-12, atol=1e-14
+            )
+    assert one.evaluate(x[:0]).vector_field.shape == (0, 3)
 
 
-def test_points_of_several_runs_at_once_are_refused() -> None:
-    with pytest.raises(ValueError, match="2 runs"):
-        evaluate_points(networks(), np.zeros((4, 3)))
+def test_networks_at_rest_can_be_trained_on() -> None:
+    nets = networks(diffusion=FULL)
+    again = side_by_side([at_rest(nets, run) for run in range(2)])
+    for left, right in zip(again.parameters(), nets.parameters(), strict=True):
+        assert torch.equal(left, right)
+    for name in ("mean", "scale", "potential_scale", "circulatory_scale", "diffusion"):
+        assert torch.equal(getattr(again, name), getattr(nets, name))
+
+
+def test_networks_at_rest_share_no_memory_with_the_training() -> None:
+    nets = networks()
+    one = at_rest(nets, 0)
+    one.potential[0][0][:] = 0
+    assert nets.potential[0][0].abs().sum() > 0
 
 
 def test_moved_networks_share_no_memory() -> None:

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import torch
 
+from siq.decomposition.checkpoint import load_checkpoint, save_checkpoint
 from siq.decomposition.data import Batches, TrainingData, prepare_data
 from siq.decomposition.loss import dynamics_loss, orthogonality_loss
-from siq.decomposition.networks import Components
+from siq.decomposition.networks import Components, at_rest
 from siq.decomposition.options import TrainingOptions
-from siq.decomposition.storage import load_checkpoint, load_networks, save_checkpoint, save_networks
+from siq.decomposition.trained import load_networks, pack, save_networks
 from siq.decomposition.training import HISTORY, TrainingState, failed_runs, start, train
 from siq.errors import InputError, NumericalFailure
 from siq.randomness import generator, seed_sequence
@@ -159,17 +160,18 @@ def test_a_damaged_checkpoint_is_passed_over(tmp_path: Path) -> None:
 
 def test_archives_contain_no_pickles_and_come_back_equal(tmp_path: Path) -> None:
     state = trained([0, 1], options=dataclasses.replace(OPTIONS, steps=2), diffusion=FULL)
-    save_networks(tmp_path / "n.npz", state.networks)
+    runs = [at_rest(state.networks, run) for run in range(2)]
+    save_networks(tmp_path / "n.npz", runs)
     save_checkpoint(tmp_path / "c.npz", state, fingerprint="mine")
     for name in ("n.npz", "c.npz"):
         with np.load(tmp_path / name, allow_pickle=False) as archive:
             assert all(archive[key].dtype.kind in "fiU" for key in archive.files)
-    again = load_networks(tmp_path / "n.npz")
-    assert again.runs == 2
-    for field in ("mean", "scale", "potential_scale", "circulatory_scale", "diffusion"):
-        assert torch.equal(getattr(again, field), getattr(state.networks, field))
-    for left, right in zip(again.parameters(), state.networks.parameters(), strict=True):
-        assert torch.equal(left, right)
+    for run, one in enumerate(runs):
+        again = pack([load_networks(tmp_path / "n.npz", run=run)])
+        for name, array in pack([one]).items():
+            np.testing.assert_array_equal(again[name], array)
+    with pytest.raises(InputError):
+        load_networks(tmp_path / "n.npz", run=2)
 
 
 def test_an_archive_of_pickles_is_refused(tmp_path: Path) -> None:

@@ -6,10 +6,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import sympy
-from known_systems import KnownSystem, archetype, as_system, double_well, maier_stein, uniform_points
+from known_systems import (
+    KnownSystem,
+    archetype,
+    as_system,
+    double_well,
+    exact_field,
+    maier_stein,
+    uniform_points,
+)
 
 from siq.errors import NumericalFailure
 from siq.field_file import field_library
+from siq.flow import FlowMap
 from siq.identification import (
     IdentificationOptions,
     IdentifiedField,
@@ -256,6 +265,25 @@ def test_without_the_integrators_step_f_is_that_of_the_continuous_process() -> N
     z = repeated(TURNING, 12, step=None, **sampling)
     assert 0.75 < np.sqrt((z**2).mean()) < 1.3
     assert np.abs(z.mean(axis=0)).max() < 3.5 / np.sqrt(12)
+
+
+def test_the_shift_of_the_mean_by_noise_is_accounted_for() -> None:
+    # Where f bends, noise moves the mean of Xh by h²/4 ε f'' to lowest order: here by -0.09 h x.
+    known, intensity = planar(x - x**3), 0.6
+    pairs = snapshot_pairs(
+        noisy(
+            known, seed=0, intensity=intensity, trajectories=2000, pairs=30, pair_step=0.1, substeps=20,
+            interval=0.2,
+        ),
+        pair_step=0.1,
+    )  # fmt: skip
+    found = replace(
+        exact_field(known, 3), noise_rate=np.array([[intensity]]), residual_ratio=1.0, flow=FlowMap(4)
+    )
+    rest, start = residuals(found, pairs)[:, 0], pairs.x0[:, 0]
+    assert abs(rest @ start / (start @ start) / 0.1) < 0.045
+    without = residuals(replace(found, noise_rate=np.zeros((1, 1))), pairs)[:, 0]
+    assert without @ start / (start @ start) / 0.1 < -0.06
 
 
 def test_the_integrators_step_says_which_f_is_meant() -> None:

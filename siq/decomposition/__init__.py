@@ -8,6 +8,7 @@
 `matching`     how a vector field is held against the pairs
 `loss`         the two terms of the loss
 `training`     Adam, the held-out loss, resuming
-`storage`      networks and checkpoints as files
+`checkpoint`   interrupted trainings as files
+`trained`      the networks after training, without torch; as files
 =============  ==========================================================
 """

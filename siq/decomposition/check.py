@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from siq.bases import potential_basis
-from siq.decomposition.networks import Networks, evaluate_points
 from siq.decomposition.options import CheckOptions
+from siq.decomposition.trained import TrainedNetworks
 from siq.errors import NumericalFailure
 from siq.global_route import fit_values, refine_globally
 from siq.identification import IdentifiedField
@@ -65,13 +65,13 @@ class TrainingCheck:
             fault = "the local route found no formula about some attractor"
         return fault
 
-    def passes(self, networks: Networks) -> bool:
+    def passes(self, networks: TrainedNetworks) -> bool:
         """Whether refinement will succeed from the networks of one run."""
         if self.hopeless() is not None:
             return False
 
         def potential(x: np.ndarray) -> np.ndarray:
-            return evaluate_points(networks, x).potential
+            return networks.evaluate(x).potential
 
         return self._single_formula(potential) or self._by_wells(potential)
 

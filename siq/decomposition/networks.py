@@ -11,11 +11,13 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
+
+from siq.decomposition.trained import TrainedNetworks
 
 Layer = tuple[Tensor, Tensor]
 """Weights, shape ``(runs, inputs, outputs)``, and biases, shape ``(runs, 1, outputs)``."""
@@ -75,15 +77,6 @@ class Components:
 
     def _tensors(self) -> tuple[Tensor, ...]:
         return self.potential, self.gradient, self.circulatory, self.vector_field
-
-
-@dataclass(frozen=True)
-class PointValues:
-    """The decomposition of one run at points: V ``(n,)``, g and f ``(n, d)``."""
-
-    potential: np.ndarray
-    circulatory: np.ndarray
-    vector_field: np.ndarray
 
 
 def initial_layers(
@@ -152,39 +145,46 @@ def select_run(networks: Networks, run: int) -> Networks:
     )
 
 
-def shuffled(networks: Networks, *, generator: np.random.Generator) -> Networks:
-    """The same weights in random order: a network that knows nothing, for comparison."""
+def at_rest(networks: Networks, run: int) -> TrainedNetworks:
+    """One of the runs as arrays that share no memory with the training."""
 
-    def layers(source: tuple[Layer, ...]) -> tuple[Layer, ...]:
+    def array(tensor: Tensor) -> np.ndarray:
+        return tensor[run].detach().cpu().numpy().copy()
+
+    def layers(source: tuple[Layer, ...]) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+        return tuple((array(weights), array(biases)) for weights, biases in source)
+
+    return TrainedNetworks(
+        potential=layers(networks.potential),
+        circulatory=layers(networks.circulatory),
+        mean=array(networks.mean),
+        scale=array(networks.scale),
+        potential_scale=array(networks.potential_scale),
+        circulatory_scale=array(networks.circulatory_scale),
+        diffusion=networks.diffusion.detach().cpu().numpy().copy(),
+    )
+
+
+def side_by_side(runs: Sequence[TrainedNetworks]) -> Networks:
+    """Networks of several runs to be trained together; the inverse of `at_rest`."""
+
+    def together(arrays: Sequence[np.ndarray]) -> Tensor:
+        return torch.from_numpy(np.stack(arrays))
+
+    def layers(sources: Sequence[tuple[tuple[np.ndarray, np.ndarray], ...]]) -> tuple[Layer, ...]:
         return tuple(
-            (_shuffle(weights, generator), _shuffle(biases, generator)) for weights, biases in source
-        )
-
-    return replace(networks, potential=layers(networks.potential), circulatory=layers(networks.circulatory))
-
-
-def _shuffle(tensor: Tensor, generator: np.random.Generator) -> Tensor:
-    order = torch.from_numpy(generator.permutation(tensor.numel()))
-    return tensor.flatten()[order].reshape(tensor.shape)
-
-
-def join_runs(parts: Sequence[Networks]) -> Networks:
-    """Networks of several runs side by side; the inverse of `select_run`."""
-
-    def together(layers: Sequence[tuple[Layer, ...]]) -> tuple[Layer, ...]:
-        return tuple(
-            (torch.cat([weights for weights, _ in layer]), torch.cat([biases for _, biases in layer]))
-            for layer in zip(*layers, strict=True)
+            (together([weights for weights, _ in layer]), together([biases for _, biases in layer]))
+            for layer in zip(*sources, strict=True)
         )
 
     return Networks(
-        potential=together([part.potential for part in parts]),
-        circulatory=together([part.circulatory for part in parts]),
-        mean=torch.cat([part.mean for part in parts]),
-        scale=torch.cat([part.scale for part in parts]),
-        potential_scale=torch.cat([part.potential_scale for part in parts]),
-        circulatory_scale=torch.cat([part.circulatory_scale for part in parts]),
-        diffusion=parts[0].diffusion,
+        potential=layers([one.potential for one in runs]),
+        circulatory=layers([one.circulatory for one in runs]),
+        mean=together([one.mean for one in runs]),
+        scale=together([one.scale for one in runs]),
+        potential_scale=together([one.potential_scale for one in runs]),
+        circulatory_scale=together([one.circulatory_scale for one in runs]),
+        diffusion=torch.from_numpy(runs[0].diffusion.copy()),
     )
 
 
@@ -203,33 +203,6 @@ def move(networks: Networks, device: torch.device | str) -> Networks:
         circulatory_scale=there(networks.circulatory_scale),
         diffusion=there(networks.diffusion),
     )
-
-
-def evaluate_points(networks: Networks, points: np.ndarray, *, chunk: int = 50_000) -> PointValues:
-    """Evaluate the networks of a single run at points, as numpy arrays, without gradients.
-
-    Parameters
-    ----------
-    networks
-        With one run; see `select_run`.
-    points
-        Shape ``(n, d)``.
-    chunk
-        Points evaluated together, which bounds the memory.
-    """
-    if networks.runs != 1:
-        raise ValueError(f"the networks hold {networks.runs} runs; select one with select_run")
-    d = points.shape[1]
-    potential, circulatory, vector_field = np.empty(len(points)), *np.empty((2, len(points), d))
-    with torch.no_grad():
-        for begin in range(0, len(points), chunk):
-            part = slice(begin, begin + chunk)
-            x = torch.from_numpy(np.ascontiguousarray(points[part])).to(networks.mean.dtype)[None]
-            components = evaluate(networks, x)
-            potential[part] = components.potential[0].numpy()
-            circulatory[part] = components.circulatory[0].numpy()
-            vector_field[part] = components.vector_field[0].numpy()
-    return PointValues(potential, circulatory, vector_field)
 
 
 def _forward(layers: tuple[Layer, ...], y: Tensor) -> Tensor:

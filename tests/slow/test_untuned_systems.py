@@ -24,7 +24,7 @@ from siq.certificate import CertificateOptions, check_prediction
 from siq.certification import certify_formulas, certify_wells
 from siq.decomposition.check import training_check
 from siq.decomposition.data import prepare_data
-from siq.decomposition.networks import evaluate_points, select_run
+from siq.decomposition.networks import at_rest
 from siq.decomposition.options import CheckOptions, TrainingOptions
 from siq.decomposition.training import start, train
 from siq.held_out import held_out_recordings
@@ -108,15 +108,15 @@ def trained_until_certified(known: KnownSystem, seed: int = 0):
         state = train(
             start([data], options=TRAINING, diffusion=known.diffusion, seeds=seeds), [data],
             options=TRAINING, seeds=seeds,
-            finished=lambda _, networks: check.passes(select_run(networks, 0)),
+            finished=lambda _, networks: check.passes(at_rest(networks, 0)),
         )  # fmt: skip
         steps += state.step
         if state.step < TRAINING.steps or check.hopeless():
             break
-    networks = select_run(state.networks, 0)
+    networks = at_rest(state.networks, 0)
 
     def network(x):
-        return evaluate_points(networks, x).potential
+        return networks.evaluate(x).potential
 
     points = pairs.x0[evenly_spread(pairs.x0, generator=np.random.default_rng(seed))]
     level = np.quantile(network(points), 0.75)

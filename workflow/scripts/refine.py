@@ -3,7 +3,6 @@
 from typing import Any
 
 import numpy as np
-import torch
 
 from siq.certificate import CertificateOptions, Verdict
 from siq.certification import (
@@ -14,8 +13,7 @@ from siq.certification import (
     certify_wells,
     uncertified,
 )
-from siq.decomposition.networks import evaluate_points, select_run, shuffled
-from siq.decomposition.storage import load_networks
+from siq.decomposition.trained import load_networks, shuffled
 from siq.errors import NumericalFailure
 from siq.field_file import read_field
 from siq.global_route import fit_values
@@ -43,7 +41,7 @@ class Run:
         self.record, self.study, self.run = record, study, run
         self.diffusion = diffusion_matrix(study["metric"]["diffusion"], len(recordings.names))
         self.regression = RegressionOptions(**study["regression"])
-        self.networks = None if position is None else select_run(load_networks(source.networks), position)
+        self.networks = None if position is None else load_networks(source.networks, run=position)
         self.names = recordings.names
         mask = held_out_recordings(recordings, generator=generator(study["seed"], run, "hold out"))
         pairs = snapshot_pairs(recordings, pair_step=pair_step(study))
@@ -63,7 +61,7 @@ class Run:
     def network(self, x: np.ndarray) -> np.ndarray:
         """V_θ at points."""
         assert self.networks is not None
-        return evaluate_points(self.networks, x).potential
+        return self.networks.evaluate(x).potential
 
     def certify(self, formulas: SymbolicDecomposition, **details: Any) -> Certificate:
         """Certificate of one formula for the region."""
@@ -128,7 +126,7 @@ def control(own: Run) -> Certificate:
     assert own.networks is not None
     networks = shuffled(own.networks, generator=generator(own.study["seed"], own.run, "shuffle"))
     library = own.record.found.library
-    coefficients = fit_values(library, own.below, evaluate_points(networks, own.below).potential)
+    coefficients = fit_values(library, own.below, networks.evaluate(own.below).potential)
     return certify_potential(
         coefficients, library, own.record.found, own.outline, own.unseen, diffusion=own.diffusion,
         options=CertificateOptions(**own.study["certificate"]), prediction=own.prediction(), seed=own.run,
@@ -138,7 +136,6 @@ def control(own: Run) -> Certificate:
 def main(snakemake: Any) -> None:
     """Run as a rule's script."""
     run, study, source = int(snakemake.wildcards.run), snakemake.params.study, snakemake.input
-    torch.set_num_threads(snakemake.threads)
     models, _ = read_model(source.model)
     certificates = {}
     identified = read_outcomes(source.identified)[0]

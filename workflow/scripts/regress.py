@@ -3,10 +3,8 @@
 from typing import Any
 
 import numpy as np
-import torch
 
-from siq.decomposition.networks import evaluate_points, select_run
-from siq.decomposition.storage import load_networks
+from siq.decomposition.trained import load_networks
 from siq.errors import NumericalFailure
 from siq.library import candidate_library
 from siq.model import model_to_data, write_model
@@ -31,8 +29,7 @@ def regress(
     recordings = read_run(recordings_path)
     assert recordings is not None  # a run without trajectories has no networks, and is skipped
     points = snapshot_pairs(recordings, pair_step=pair_step(study)).x0
-    networks = select_run(load_networks(networks_path), position)
-    values = evaluate_points(networks, points)
+    values = load_networks(networks_path, run=position).evaluate(points)
     below = points_below(values.potential, level=options.level)
     library = candidate_library(
         recordings.names,
@@ -75,7 +72,6 @@ def quality(result: RegressionResult) -> dict[str, Any]:
 def main(snakemake: Any) -> None:
     """Run as a rule's script."""
     run = int(snakemake.wildcards.run)
-    torch.set_num_threads(snakemake.threads)
     position, reason = position_of(run, snakemake.input.outcome)
     models: dict[str, SymbolicDecomposition] = {}
     if position is None:

@@ -4,10 +4,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import torch
 
-from siq.decomposition.networks import Networks, evaluate_points, select_run, shuffled
-from siq.decomposition.storage import load_networks
+from siq.decomposition.trained import TrainedNetworks, load_networks, shuffled
 from siq.library import candidate_library
 from siq.model import read_model
 from siq.prediction import prediction_errors
@@ -35,11 +33,11 @@ def network_errors(
     system: System, networks_path: str, position: int, run: int, seed: int
 ) -> dict[str, float]:
     """Relative L2 error on a grid over Ω of the U of the trained network, and of a randomised one."""
-    trained = select_run(load_networks(networks_path), position)
+    trained = load_networks(networks_path, run=position)
     randomised = shuffled(trained, generator=generator(seed, run, "shuffle"))
 
-    def error_of(networks: Networks, grid: np.ndarray) -> float:
-        return relative_error(2 * evaluate_points(networks, grid.T).potential, system.exact_values(grid))
+    def error_of(networks: TrainedNetworks, grid: np.ndarray) -> float:
+        return relative_error(2 * networks.evaluate(grid.T).potential, system.exact_values(grid))
 
     error = error_of(trained, domain_grid(system.domain))
     chance = error_of(randomised, domain_grid(system.domain, points=COARSE))
@@ -79,7 +77,6 @@ def certificate_table(run: int, certificates: dict[str, Any]) -> pd.DataFrame:
 def main(snakemake: Any) -> None:
     """Run as a rule's script."""
     run, study, target = int(snakemake.wildcards.run), snakemake.params.study, snakemake.output
-    torch.set_num_threads(snakemake.threads)
     system = load_system(snakemake.input.card) if snakemake.input.get("card") else None
     exact = exact_decomposition(system) if system is not None else None
     decompositions, certificates = read_model(snakemake.input.model)

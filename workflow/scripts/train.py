@@ -15,10 +15,11 @@ import pandas as pd
 import torch
 
 from siq.decomposition.check import TrainingCheck, training_check
+from siq.decomposition.checkpoint import load_checkpoint, save_checkpoint
 from siq.decomposition.data import TrainingData, prepare_data
-from siq.decomposition.networks import Networks, join_runs, select_run
+from siq.decomposition.networks import Networks, at_rest
 from siq.decomposition.options import TrainingOptions
-from siq.decomposition.storage import load_checkpoint, load_networks, save_checkpoint, save_networks
+from siq.decomposition.trained import TrainedNetworks, load_networks, save_networks
 from siq.decomposition.training import TrainingState, choose_device, failed_runs, start, train
 from siq.errors import NumericalFailure
 from siq.field_file import read_field
@@ -95,8 +96,8 @@ class Block:
         self.data, self.checks, self.study = data, checks, study
         self.options = TrainingOptions(**study["training"])
         self.folder, self.mark, self.device = folder, mark, device
-        self.passed: dict[int, Networks] = {}
-        self.last: dict[int, Networks] = {}
+        self.passed: dict[int, TrainedNetworks] = {}
+        self.last: dict[int, TrainedNetworks] = {}
         self.failures: dict[int, str] = {}
         self.histories: list[pd.DataFrame] = []
 
@@ -129,7 +130,7 @@ class Block:
         if state is None:
             diffusion = diffusion_matrix(self.study["metric"]["diffusion"], data[0].training.x0.shape[1])
             state = start(data, options=self.options, diffusion=diffusion, seeds=seeds)
-        early: dict[int, Networks] = {}
+        early: dict[int, TrainedNetworks] = {}
         for run in runs:  # what had passed before the job was killed
             if self.kept(f"attempt{attempt}-run{run}").exists():
                 early[run] = load_networks(self.kept(f"attempt{attempt}-run{run}"))
@@ -137,10 +138,10 @@ class Block:
         def finished(step: int, networks: Networks) -> bool:
             for position, run in enumerate(runs):
                 if run in self.checks and run not in early:
-                    one = select_run(networks, position)
+                    one = at_rest(networks, position)
                     if self.checks[run].passes(one):
                         early[run] = one
-                        save_networks(self.kept(f"attempt{attempt}-run{run}"), one)
+                        save_networks(self.kept(f"attempt{attempt}-run{run}"), [one])
             return len(early) == len(runs)
 
         if len(early) < len(runs):
@@ -155,11 +156,11 @@ class Block:
         save_checkpoint(checkpoint, state, fingerprint=self.mark)
         self._conclude(state, runs, early)
 
-    def _conclude(self, state: TrainingState, runs: list[int], early: dict[int, Networks]) -> None:
+    def _conclude(self, state: TrainingState, runs: list[int], early: dict[int, TrainedNetworks]) -> None:
         self.passed |= early
         lost = failed_runs(state)
         for position, run in enumerate(runs):
-            self.last[run] = early.get(run, select_run(state.networks, position))
+            self.last[run] = early.get(run, at_rest(state.networks, position))
             self.failures.pop(run, None)
             if run not in early and position in lost:
                 self.failures[run] = lost[position]
@@ -209,7 +210,7 @@ def main(snakemake: Any) -> None:
         )  # fmt: skip
         block.train()
         outcomes += [block.outcome(run, position) for position, run in enumerate(data)]
-        save_networks(snakemake.output.networks, join_runs([block.last[run] for run in data]))
+        save_networks(snakemake.output.networks, [block.last[run] for run in data])
         history = block.history()
         write_table(snakemake.output.history, as_table("training", history))
         write_outcomes(snakemake.output.outcome, outcomes)
