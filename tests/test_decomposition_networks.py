@@ -190,3 +190,18 @@ def test_a_state_that_does_not_vary_is_a_numerical_failure() -> None:
     options = TrainingOptions(widths=(3,), thinning_distance=1.0)
     with pytest.raises(NumericalFailure, match="does not vary"):
         prepare_data(pairs, options=options, generator=generator(0))
+
+
+def test_the_initial_potential_may_be_as_steep_as_the_descent_within_a_fast_rotation() -> None:
+    draw = generator(4)
+    x0 = draw.uniform(-1, 1, size=(2000, 2))
+    turning = np.array([[-0.02, 5.0], [-5.0, -0.02]])
+    pairs = SnapshotPairs(x0, x0 + 0.001 * x0 @ turning.T, np.full(2000, 0.001), np.arange(2000) // 20)
+    slopes = {}
+    for source in ("speed", "descent"):
+        options = TrainingOptions(widths=(6, 5), thinning_distance=0.1, potential_from=source)
+        data = prepare_data(pairs, options=options, generator=generator(0))
+        nets = initial_networks([data], options=options, diffusion=np.eye(2), generators=[generator(1)])
+        gradient = evaluate(nets, torch.from_numpy(x0)[None]).gradient[0].numpy()
+        slopes[source] = np.linalg.norm(gradient, axis=1).mean() / np.linalg.norm(x0, axis=1).mean()
+    assert slopes["descent"] < 0.2 < 1 < slopes["speed"]

@@ -369,3 +369,29 @@ def test_relative_dynamics_divides_by_the_mean_square_velocity() -> None:
     velocity = (part.xh - part.x0) / part.h[:, None]
     square = np.mean([row @ np.linalg.solve(FULL, row) for row in velocity])
     assert dynamics[0] / dynamics[1] == pytest.approx(square, rel=1e-9)
+
+
+def test_with_a_slow_speed_every_pair_counts_by_its_own_speed() -> None:
+    draw = generator(3)
+    predicted, observed = draw.normal(size=(2, 2, 50, 2))
+    precision, slow = np.linalg.inv(FULL), np.array([[0.3], [0.7]])
+    found = dynamics_loss(
+        *(torch.from_numpy(one) for one in (predicted, observed, precision)), slow=torch.from_numpy(slow)
+    )
+    mismatch = np.einsum("rni,ij,rnj->rn", predicted - observed, precision, predicted - observed)
+    speed = np.einsum("rni,ij,rnj->rn", observed, precision, observed)
+    np.testing.assert_allclose(found, (mismatch / (speed + slow)).mean(axis=1), rtol=1e-12)
+
+
+def test_a_slow_speed_makes_training_the_same_in_any_units() -> None:
+    options = dataclasses.replace(OPTIONS, slow_speed=0.1, potential_from="descent", steps=20)
+    losses = []
+    for size in (1.0, 1e-3):  # D stays the unit matrix, in units of its own: time takes up the rest
+        pairs = spiral_pairs(0)
+        pairs = dataclasses.replace(pairs, x0=size * pairs.x0, xh=size * pairs.xh, h=size**2 * pairs.h)
+        own = dataclasses.replace(options, thinning_distance=0.3 * size)
+        part = [prepare_data(pairs, options=own, generator=generator(0, "divide"))]
+        state = start(part, options=own, diffusion=np.eye(2), seeds=[SEEDS[0]])
+        state = train(state, part, options=own, seeds=[SEEDS[0]], log_every=20)
+        losses.append(float(state.history["held_out_loss"].iloc[-1]))
+    assert losses[1] == pytest.approx(losses[0], rel=1e-6)

@@ -47,16 +47,26 @@ def initial_networks(
         # A few thousand pairs fix a single number well; the whole data would only cost memory.
         rows = np.linspace(0, len(pairs.h) - 1, min(len(pairs.h), 20_000)).astype(int)
         components = evaluate(one, torch.from_numpy(pairs.x0[rows]).to(dtype)[None])
-        speed = np.linalg.norm((pairs.xh[rows] - pairs.x0[rows]) / pairs.h[rows, None], axis=1)
+        velocity = (pairs.xh[rows] - pairs.x0[rows]) / pairs.h[rows, None]
+        speed = np.linalg.norm(velocity, axis=1)
         # ∇ with respect to y = (x - μ)/σ, as the paper writes it. Where the σ differ this makes V several
         # times larger than ∇ with respect to x would, and V then learns as fast as g does; with the
         # smaller scale training ends in a V that is flat along x.
         downhill = torch.linalg.norm(components.gradient * one.scale, dim=-1)[0].numpy()
         circulatory = torch.linalg.norm(components.circulatory, dim=-1)[0].numpy()
-        potential_scales.append(float(downhill @ speed / (downhill @ downhill)))
+        along = float(downhill @ speed / (downhill @ downhill))
+        if options.potential_from == "descent":
+            along = _descent(components.gradient[0].double().numpy(), velocity, diffusion) or along
+        potential_scales.append(along)
         circulatory_scales.append(float(circulatory @ speed / (circulatory @ circulatory)))
     return replace(
         networks,
         potential_scale=options.potential_gain * torch.tensor(potential_scales, dtype=dtype)[:, None, None],
         circulatory_scale=torch.tensor(circulatory_scales, dtype=dtype)[:, None, None],
     )
+
+
+def _descent(gradient: np.ndarray, velocity: np.ndarray, diffusion: np.ndarray) -> float:
+    """The factor on V with which -D∇V comes closest to the velocities; 0 where these go up V on the whole."""
+    size = np.einsum("ni,ij,nj->", gradient, diffusion, gradient)
+    return max(float(-(gradient * velocity).sum() / size), 0.0)

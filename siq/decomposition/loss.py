@@ -8,7 +8,9 @@ from torch import Tensor
 from siq.decomposition.networks import Components
 
 
-def dynamics_loss(predicted: Tensor, observed: Tensor, precision: Tensor) -> Tensor:
+def dynamics_loss(
+    predicted: Tensor, observed: Tensor, precision: Tensor, *, slow: Tensor | None = None
+) -> Tensor:
     """Mean square of the mismatch of velocities, measured in the metric of the noise.
 
     Parameters
@@ -17,6 +19,9 @@ def dynamics_loss(predicted: Tensor, observed: Tensor, precision: Tensor) -> Ten
         Velocities, shape ``(runs, n, d)``.
     precision
         D⁻¹, shape ``(d, d)``; the paper has D = 1.
+    slow
+        Square of the speed, shape ``(runs, 1)``, below which a pair counts as slow. If given, every mismatch
+        is divided by the square of its observed speed plus this; the paper does not.
 
     Returns
     -------
@@ -24,7 +29,10 @@ def dynamics_loss(predicted: Tensor, observed: Tensor, precision: Tensor) -> Ten
         Shape ``(runs,)``.
     """
     mismatch = predicted - observed
-    return ((mismatch @ precision) * mismatch).sum(dim=-1).mean(dim=-1)
+    square = ((mismatch @ precision) * mismatch).sum(dim=-1)
+    if slow is not None:
+        square = square / (((observed @ precision) * observed).sum(dim=-1) + slow)
+    return square.mean(dim=-1)
 
 
 def orthogonality_loss(

@@ -69,6 +69,10 @@ class TrainingOptions:
     relative_dynamics
         Divide the first term of the loss by the mean square of the observed velocities, so that λ means
         the same for every system and in any units. The paper does not.
+    slow_speed
+        Judge the mismatch of every pair by its own speed, or by this share of the root mean square speed
+        where it is slower. Left out: by the same measure everywhere, as the paper does, and the fastest
+        region rules. For pairs without noise only, which would add to the speed.
     thinning_distance
         r, the distance between representative points, in the units of the states. Left out: a tenth of
         each state's standard deviation, whatever the units.
@@ -77,6 +81,10 @@ class TrainingOptions:
         does. ``representative``: the evenly spread ones. Trajectories crowd at attractors, where f is
         small and some states hardly vary: estimated there, the scales start V several times too small and
         too narrow, and a short training ends in a V that is flat along a direction.
+    potential_from
+        What η_v is estimated from. ``speed``: ∣∇V∣ is as large as the observed speed, as in the paper.
+        ``descent``: -D∇V is the part of the observed velocity that goes down the initial V. Where the
+        rotation is many times faster than the descent the former starts V as many times too steep.
     potential_gain
         Factor on η_v; the paper has 1. A larger one lets V learn faster beside g, which a short training
         needs: otherwise g takes over what V has not yet learned, and V stays flat along a direction.
@@ -99,8 +107,10 @@ class TrainingOptions:
     matching: Kind = "explicit"
     matching_order: Order = 2
     relative_dynamics: bool = False
+    slow_speed: Annotated[float, Field(gt=0)] | None = None
     thinning_distance: Annotated[float, Field(gt=0)] | None = None
     normalise_on: Literal["pairs", "representative"] = "pairs"
+    potential_from: Literal["speed", "descent"] = "speed"
     potential_gain: Annotated[float, Field(gt=0)] = 1.0
     training_share: Annotated[float, Field(gt=0, lt=1)] = 0.7
     precision: Literal["float32", "float64"] = "float64"

@@ -212,13 +212,15 @@ class _Objective:
         self.options = options
         self.diffusion = diffusion
         self.precision = torch.linalg.inv(diffusion)
-        squares = torch.ones(len(data), dtype=torch.float64)
-        if options.relative_dynamics:
-            precision = self.precision.double().cpu().numpy()
-            for run, pairs in enumerate(part.training for part in data):
-                velocity = (pairs.xh - pairs.x0) / pairs.h[:, None]
-                squares[run] = float(np.einsum("ni,ij,nj->n", velocity, precision, velocity).mean())
-        self.squares = squares.to(device, dtype)
+        precision = self.precision.double().cpu().numpy()
+        mean_squares = []
+        for pairs in (part.training for part in data):
+            velocity = (pairs.xh - pairs.x0) / pairs.h[:, None]
+            mean_squares.append(float(np.einsum("ni,ij,nj->n", velocity, precision, velocity).mean()))
+        squares = torch.tensor(mean_squares, device=device, dtype=dtype)
+        self.slow = None if options.slow_speed is None else options.slow_speed**2 * squares[:, None]
+        plain = options.slow_speed is not None or not options.relative_dynamics
+        self.squares = torch.ones_like(squares) if plain else squares
 
     def __call__(self, networks: Networks, pairs: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
         d = self.diffusion.shape[0]
@@ -236,7 +238,7 @@ class _Objective:
                 kind=options.matching, order=options.matching_order,
             )  # fmt: skip
             at_points = evaluate(networks, points)
-        dynamics = dynamics_loss(velocity, observed, self.precision) / self.squares
+        dynamics = dynamics_loss(velocity, observed, self.precision, slow=self.slow) / self.squares
         orthogonality = orthogonality_loss(
             at_points, self.diffusion, self.precision, asymmetry=options.asymmetry
         )
