@@ -16,9 +16,11 @@ include: "workflow/rules/train.smk"
 include: "workflow/rules/regress.smk"
 include: "workflow/rules/refine.smk"
 include: "workflow/rules/score.smk"
+include: "workflow/rules/landscape.smk"
 include: "workflow/rules/collect.smk"
 include: "workflow/rules/invariant.smk"
 include: "workflow/rules/report.smk"
+include: "workflow/rules/reproduce.smk"
 
 
 report: "workflow/report/workflow.rst"
@@ -27,6 +29,7 @@ report: "workflow/report/workflow.rst"
 localrules:
     statistics,
     examples,
+    reproduce,
 
 
 rule statistics:
@@ -38,3 +41,8 @@ rule statistics:
 rule examples:
     input:
         "results/archetype3d-recordings/report.html",
+
+
+rule reproduce:
+    input:
+        "results/reproduction.html",

@@ -32,6 +32,7 @@ from siq.local_route import Well
 Function = Callable[[np.ndarray], np.ndarray]
 
 ERROR_POINTS = 300
+FINEST_ERROR = 1e-9  # relative, of V
 DRAWS = 40  # of f from its distribution, for the error of M
 STANDARD_ERRORS = 4.0
 
@@ -195,7 +196,8 @@ def stated_error(
     Returns
     -------
     error
-        Relative L2 error on the points; infinite where ascending paths do not lead to them.
+        Relative L2 error on the points; infinite where ascending paths do not lead to them, and never below
+        what any recording can tell: its own integrator, or instrument, made f different by as much.
     worst
         Where the residual along the path contributes most, shape ``(d,)``.
     """
@@ -220,7 +222,7 @@ def stated_error(
     size = np.linalg.norm(values[reached] - lowest)
     error = SAFETY * float(np.linalg.norm(integral[reached]) / size) if size > 0 else np.inf
     worst = x[reached][int(np.argmax(integral[reached]))]
-    return error + 2 * candidate.relative_error, worst
+    return max(error + 2 * candidate.relative_error, FINEST_ERROR), worst
 
 
 def check_error(error: float, *, limit: float) -> Verdict:

@@ -18,6 +18,7 @@ from siq.vector_field import VectorField
 CLOSEST = 1e-12  # of directions: what cannot be told apart is not divided further
 CHUNK = 2048
 MOST_PARTS = 8  # into which a gap is divided at once
+BENT = 0.03  # of the level: a larger term of second order is no correction
 
 
 @dataclass(frozen=True)
@@ -174,8 +175,9 @@ def value_near(fan: Fan, x: np.ndarray, *, sheet: np.ndarray, distance: float = 
     sheet
         Which points of the fan may be used, shape ``(n,)``; see `lowest_sheet`.
     distance
-        Beyond it, in the metric in which the level is at about 1, the value is NaN. The error is of third
-        order in the distance, but where V has a kink between x and the nearest point, of first.
+        Beyond it, in the metric in which the level is at about 1, the value is NaN; so it is where the second
+        order is no small correction, close to a caustic. The error is of third order in the distance, but
+        where V has a kink between x and the nearest point, of first.
     """
     points = fan.points[sheet]
     found, nearest = cKDTree((points - fan.attractor) @ fan.metric.T).query(
@@ -183,8 +185,10 @@ def value_near(fan: Fan, x: np.ndarray, *, sheet: np.ndarray, distance: float = 
     )
     offset = x - points[nearest]
     values = fan.values[sheet][nearest] + np.sum(offset * fan.momenta[sheet][nearest], axis=1)
-    values += np.einsum("ni,nij,nj->n", offset, fan.hessians[sheet][nearest], offset) / 2
-    return np.where(found <= distance, values, np.nan)
+    bend = np.einsum("ni,nij,nj->n", offset, fan.hessians[sheet][nearest], offset) / 2
+    # Towards a caustic ∇²V grows without bound, and two terms no longer tell V.
+    known = (found <= distance) & (np.abs(bend) <= BENT * fan.level)
+    return np.where(known, values + bend, np.nan)
 
 
 def _between(fan: Fan, gap: float) -> np.ndarray:

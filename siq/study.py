@@ -19,6 +19,7 @@ from siq.documents import read_document, validate
 from siq.errors import InputError
 from siq.expressions import FormulaError
 from siq.identification import IdentificationOptions
+from siq.landscape.options import LandscapeOptions
 from siq.library import candidate_library
 from siq.refinement import RefinementOptions
 from siq.regression import RegressionOptions
@@ -87,6 +88,9 @@ class Study(BaseModel):
         The parameters of the steps.
     invariant
         Noise intensities ε for which the invariant distribution is computed, and simulated.
+    landscape
+        How the landscape is found: equilibria, a formula for each well, barriers, paths and escape times;
+        ``{}`` takes the defaults. Left out: none is found.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -105,6 +109,7 @@ class Study(BaseModel):
     refinement: RefinementOptions = RefinementOptions()
     certificate: CertificateOptions = CertificateOptions()
     invariant: tuple[Annotated[float, Field(gt=0)], ...] = ()
+    landscape: LandscapeOptions | None = None
 
     @field_validator("published")
     @classmethod

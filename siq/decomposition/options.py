@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field
@@ -29,7 +30,8 @@ class CheckOptions:
         Largest relative difference of V from the local route's in any well, beside what their residuals
         explain.
     attempts
-        Trainings from fresh networks, if a training ends without having passed.
+        Trainings from fresh networks, if a training ends without having passed; every second one in another
+        way, see `TrainingOptions.attempt`.
     """
 
     first: Annotated[int, Field(ge=1)] = 1000
@@ -114,3 +116,21 @@ class TrainingOptions:
     potential_gain: Annotated[float, Field(gt=0)] = 1.0
     training_share: Annotated[float, Field(gt=0, lt=1)] = 0.7
     precision: Literal["float32", "float64"] = "float64"
+
+    def attempt(self, number: int) -> TrainingOptions:
+        """What a training is told that comes after `number` trainings that failed.
+
+        What failed once is likelier to succeed in another way than once more: every second training has a
+        λ ten times as large, starts V as steep as f descends, and, where the pairs are free of noise, judges
+        each by its own speed. Which of the two ways a system needs is known of none beforehand: the first
+        fails where f turns much faster than it descends, the second where V is to be steep.
+        """
+        if number % 2 == 0:
+            return self
+        return replace(
+            self,
+            orthogonality_weight=10 * self.orthogonality_weight,
+            potential_from="descent",
+            potential_gain=1.0,
+            slow_speed=(self.slow_speed or 0.1) if self.matching == "symmetric" else self.slow_speed,
+        )

@@ -32,6 +32,13 @@ FIGURES = {
     "training": "training.rst",
     "prediction": "prediction.rst",
 }
+REPRODUCED = ["archetype3d", "archetype3d-noise", "archetype4d", "resonator"]
+LANDSCAPE_FIGURES = {
+    "landscape": "landscape.rst",
+    "landscape_errors": "landscape_errors.rst",
+    "degrees": "degrees.rst",
+    "escape": "escape.rst",
+}
 CAPTIONS = FIGURES | {"invariant": "invariant.rst"}
 
 
@@ -73,6 +80,16 @@ def all_runs(pattern):
     return lambda wildcards: expand(
         pattern, study=wildcards.study, run=study_of(wildcards).run_names()
     )
+
+
+def of_landscapes(pattern):
+    """Input function: a file of every run where the study asks for its landscape, otherwise none."""
+
+    def files(wildcards):
+        asked = study_of(wildcards).study.landscape is not None
+        return all_runs(pattern)(wildcards) if asked else []
+
+    return files
 
 
 def all_blocks(pattern):
@@ -123,6 +140,50 @@ def published_if_any(wildcards):
     return study_of(wildcards).published() or []
 
 
+def with_card(pattern):
+    """Input function: a file that a card alone can give, none for studies of recordings."""
+
+    def files(wildcards):
+        known = study_of(wildcards).study.recordings is None
+        return pattern.format(study=wildcards.study) if known else []
+
+    return files
+
+
+def with_landscape(*patterns):
+    """Input function: files of studies that ask for their landscape, none for others."""
+
+    def files(wildcards):
+        asked = study_of(wildcards).study.landscape is not None
+        return [one.format(study=wildcards.study) for one in patterns if asked]
+
+    return files
+
+
+def landscape_table(name):
+    """Input function: a table that a landscape with a card has."""
+
+    def files(wildcards):
+        study = study_of(wildcards).study
+        known = study.landscape is not None and study.recordings is None
+        return f"results/{wildcards.study}/tables/{name}.parquet" if known else []
+
+    return files
+
+
+def networks_of_runs(name):
+    """Input function: for every run, a file of the block in which it trained."""
+
+    def files(wildcards):
+        study = study_of(wildcards)
+        return [
+            f"results/{wildcards.study}/training/{study.block(run)}/{name}"
+            for run in range(study.study.runs)
+        ]
+
+    return files
+
+
 def of_block(name):
     """Input function: a file of the block of runs that trained this run."""
     return (
@@ -140,13 +201,15 @@ def all_outcomes(wildcards):
         "results/{study}/runs/{run}/refine.json": all_runs,
         "results/{study}/runs/{run}/score.json": all_runs,
     }
+    if study_of(wildcards).study.landscape is not None:
+        patterns["results/{study}/runs/{run}/landscape.json"] = all_runs
     return [path for pattern, of in patterns.items() for path in of(pattern)(wildcards)]
 
 
 def figure_output(name):
     return report(
         f"results/{{study}}/figures/{name}.svg",
-        caption=f"../report/{CAPTIONS[name]}",
+        caption=f"../report/{(CAPTIONS | LANDSCAPE_FIGURES)[name]}",
         category="{study}",
         subcategory="figures",
     )

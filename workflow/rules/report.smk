@@ -42,6 +42,12 @@ rule page:
         models=all_runs("results/{study}/runs/{run}/model.json"),
         invariant="results/{study}/tables/invariant.parquet",
         figures=expand("results/{{study}}/figures/{name}.png", name=CAPTIONS),
+        landscape="results/{study}/tables/landscape.parquet",
+        landscape_figures=with_landscape(
+            *(f"results/{{study}}/figures/{name}.png" for name in LANDSCAPE_FIGURES)
+        ),
+        landscape_errors=landscape_table("landscape_errors"),
+        escape=landscape_table("escape"),
         card=card_if_any,
         published=published_if_any,
     output:
@@ -75,6 +81,7 @@ rule page:
             "refinement",
             "certificate",
             "invariant",
+            "landscape",
             "metric",
             "dynamics",
             "exact",

@@ -11,7 +11,7 @@ from siq.study import load_published
 from siq.tables import as_table, concatenate, read_table, write_table
 from step import job, read_outcomes
 
-STEPS = ("simulate", "resample", "identify", "train", "regress", "refine", "score")
+STEPS = ("simulate", "resample", "identify", "train", "regress", "refine", "score", "landscape")
 
 
 def timings(folder: Path, runs: Iterable[int], *, drawing: str) -> pd.DataFrame:
@@ -48,6 +48,11 @@ def main(snakemake: Any) -> None:
     outcomes = as_table("outcomes", [{key: entry[key] for key in columns} for entry in entries])
     prediction = concatenate("prediction", [read_table(path) for path in source.prediction])
     certificates = concatenate("certificates", [read_table(path) for path in source.certificates])
+    for name, paths, path in (
+        ("landscape", source.landscapes, target.landscape),
+        ("degrees", source.degrees, target.degrees),
+    ):
+        write_table(path, concatenate(name, [read_table(one) for one in paths]))
     published = load_published(source.published).figures if source.get("published") else {}
     write_table(target.coefficients, coefficients)
     write_table(target.rrmse, rrmse)

@@ -9,6 +9,7 @@ from typing import Any
 import pandas as pd
 import yaml
 
+from landscape_page import landscape_figures, landscape_tables
 from siq.answer import answer_sentences
 from siq.files import whole_file
 from siq.formatting import formula_mathml, vector_mathml
@@ -248,14 +249,13 @@ def main(snakemake: Any) -> None:
         which = ", the median of the runs by error" if rrmse["rrmse"].notna().any() else ""
         answer.append(f"The formulas below are those of run {run}{which}.")
     coefficients = read_table(source.coefficients)
-    name = study["name"]
     tables = Path(source.summary).parent
     figures = {Path(path).stem: Path(path).read_bytes() for path in source.figures}
     troubled = outcomes[outcomes["status"].isin(["failed", "warning"])]
     failures = pd.concat([troubled, refusals(rrmse, certificates)])[["run", "step", "status", "reason"]]
     chosen = {key: study[key] for key in study if key not in ("metric", "dynamics", "exact")}
     content = ReportContent(
-        title=study["title"] or name,
+        title=study["title"] or study["name"],
         question=question(study),
         answer=answer,
         formulas=formulas,
@@ -268,12 +268,14 @@ def main(snakemake: Any) -> None:
                 rows_shown=60,
             ),
             *certificate_tables(certificates, coefficients, run, method, tables),
+            *landscape_tables(source, tables),
             *invariant_tables(read_table(source.invariant), tables),
             ReportTable("Errors by run.", rrmse, {}, f"{tables}/rrmse.csv", rows_shown=50),
             ReportTable("What became of each step of each run.", outcomes, {}, f"{tables}/outcomes.csv", 12),
         ],
         figures=[
-            ReportFigure(caption, caption, figures[figure], "png") for figure, caption in CAPTIONS.items()
+            *(ReportFigure(caption, caption, figures[name], "png") for name, caption in CAPTIONS.items()),
+            *landscape_figures(list(source.landscape_figures)),
         ],
         failures=failures.sort_values(["run", "step"]),
         commands=[

@@ -69,6 +69,12 @@ def read_outcomes(path: str | Path) -> list[dict[str, Any]]:
     return json.loads(Path(path).read_text(encoding="utf-8"))
 
 
+def read_json(path: str | Path) -> Any:
+    """A JSON file's content, None where the file is empty since there was nothing to write."""
+    text = Path(path).read_text(encoding="utf-8")
+    return json.loads(text) if text else None
+
+
 def position_of(run: int, training: str | Path) -> tuple[int | None, str]:
     """Where a run stands among the networks of its block, or None and the reason."""
     mine = next(entry for entry in read_outcomes(training) if entry["run"] == run)

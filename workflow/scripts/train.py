@@ -122,6 +122,7 @@ class Block:
         return attempt == 0 or (run in self.checks and self.checks[run].hopeless() is None)
 
     def _attempt(self, attempt: int, runs: list[int]) -> None:
+        options = self.options.attempt(attempt)
         purpose = "training" if attempt == 0 else f"training {attempt}"
         seeds = [seed_sequence(self.study["seed"], run, purpose) for run in runs]
         data = [self.data[run] for run in runs]
@@ -129,7 +130,7 @@ class Block:
         state = load_checkpoint(checkpoint, fingerprint=self.mark)
         if state is None:
             diffusion = diffusion_matrix(self.study["metric"]["diffusion"], data[0].training.x0.shape[1])
-            state = start(data, options=self.options, diffusion=diffusion, seeds=seeds)
+            state = start(data, options=options, diffusion=diffusion, seeds=seeds)
         early: dict[int, TrainedNetworks] = {}
         for run in runs:  # what had passed before the job was killed
             if self.kept(f"attempt{attempt}-run{run}").exists():
@@ -146,9 +147,9 @@ class Block:
 
         if len(early) < len(runs):
             state = train(
-                state, data, options=self.options, seeds=seeds, device=self.device,
-                log_every=max(self.options.steps // 100, 1),
-                checkpoint_every=min(1000, max(self.options.steps // 10, 1)),
+                state, data, options=options, seeds=seeds, device=self.device,
+                log_every=max(options.steps // 100, 1),
+                checkpoint_every=min(1000, max(options.steps // 10, 1)),
                 checkpoint=lambda state: save_checkpoint(checkpoint, state, fingerprint=self.mark),
                 finished=finished,
             )  # fmt: skip

@@ -1,0 +1,129 @@
+# The landscape of every run: equilibria, a formula for each well, barriers, paths; and what it is held against.
+
+
+rule landscape:
+    input:
+        recordings="results/{study}/runs/{run}/recordings.parquet",
+        field="results/{study}/runs/{run}/vector_field.json",
+    output:
+        quasipotential="results/{study}/runs/{run}/quasipotential.json",
+        table="results/{study}/runs/{run}/landscape.parquet",
+        degrees="results/{study}/runs/{run}/degrees.parquet",
+        outcome="results/{study}/runs/{run}/landscape.json",
+    log:
+        "results/{study}/logs/{run}/landscape.log",
+    benchmark:
+        "results/{study}/benchmarks/{run}/landscape.tsv"
+    conda:
+        "../envs/siq.yaml"
+    threads: 1
+    params:
+        code=code("landscape.py"),
+        study=parameters("seed", "recordings", "simulation", "landscape", "metric"),
+    message:
+        "{wildcards.study}, run {wildcards.run}: finding the landscape"
+    script:
+        "../scripts/landscape.py"
+
+
+rule reference:
+    # What methods say of the card's own vector field that share no code with ours.
+    input:
+        card=card_if_any,
+    output:
+        "results/{study}/reference.npz",
+    log:
+        "results/{study}/logs/reference.log",
+    benchmark:
+        "results/{study}/benchmarks/reference.tsv"
+    conda:
+        "../envs/siq.yaml"
+    threads: 1
+    params:
+        code=code("reference.py"),
+        study=parameters("seed", "dynamics", "metric", "landscape"),
+    message:
+        "{wildcards.study}: computing references for the landscape"
+    script:
+        "../scripts/reference.py"
+
+
+rule landscape_errors:
+    input:
+        reference="results/{study}/reference.npz",
+        fields=all_runs("results/{study}/runs/{run}/vector_field.json"),
+        landscapes=all_runs("results/{study}/runs/{run}/quasipotential.json"),
+        models=all_runs("results/{study}/runs/{run}/model.json"),
+        networks=networks_of_runs("networks.npz"),
+        training=networks_of_runs("train.json"),
+    output:
+        table="results/{study}/tables/landscape_errors.parquet",
+        csv="results/{study}/tables/landscape_errors.csv",
+    log:
+        "results/{study}/logs/landscape_errors.log",
+    benchmark:
+        "results/{study}/benchmarks/landscape_errors.tsv"
+    conda:
+        "../envs/siq.yaml"
+    threads: 1
+    params:
+        code=code("landscape_errors.py"),
+        study=parameters("landscape", "metric"),
+    message:
+        "{wildcards.study}: holding the landscapes against the references"
+    script:
+        "../scripts/landscape_errors.py"
+
+
+rule escapes:
+    input:
+        landscapes=all_runs("results/{study}/runs/{run}/quasipotential.json"),
+        card=card_if_any,
+    output:
+        table="results/{study}/tables/escape.parquet",
+        csv="results/{study}/tables/escape.csv",
+    log:
+        "results/{study}/logs/escapes.log",
+    benchmark:
+        "results/{study}/benchmarks/escapes.tsv"
+    conda:
+        "../envs/siq.yaml"
+    threads: 1
+    params:
+        code=code("escapes.py"),
+        study=parameters("seed", "dynamics", "metric", "landscape"),
+    message:
+        "{wildcards.study}: simulating escapes"
+    script:
+        "../scripts/escapes.py"
+
+
+rule landscape_figures:
+    input:
+        reference=with_card("results/{study}/reference.npz"),
+        escape=with_card("results/{study}/tables/escape.parquet"),
+        degrees="results/{study}/tables/degrees.parquet",
+        fields=all_runs("results/{study}/runs/{run}/vector_field.json"),
+        landscapes=all_runs("results/{study}/runs/{run}/quasipotential.json"),
+        models=all_runs("results/{study}/runs/{run}/model.json"),
+        recordings=all_runs("results/{study}/runs/{run}/recordings.parquet"),
+        networks=networks_of_runs("networks.npz"),
+        training=networks_of_runs("train.json"),
+    output:
+        [figure_output(name) for name in LANDSCAPE_FIGURES],
+        expand("results/{{study}}/figures/{name}.png", name=LANDSCAPE_FIGURES),
+    log:
+        "results/{study}/logs/landscape_figures.log",
+    benchmark:
+        "results/{study}/benchmarks/landscape_figures.tsv"
+    conda:
+        "../envs/siq.yaml"
+    threads: 1
+    params:
+        code=code("landscape_figures.py"),
+        study=parameters("metric", "landscape"),
+        folder="results/{study}/figures",
+    message:
+        "{wildcards.study}: drawing the landscape"
+    script:
+        "../scripts/landscape_figures.py"

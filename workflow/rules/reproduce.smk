@@ -1,0 +1,24 @@
+# Everything in the paper on one page, with ours beside it.
+
+
+rule reproduction:
+    input:
+        summaries=expand("results/{study}/tables/summary.parquet", study=REPRODUCED),
+        reports=expand("results/{study}/report.html", study=REPRODUCED),
+        contradictions="config/published/contradictions.yaml",
+    output:
+        html="results/reproduction.html",
+    log:
+        "results/logs/reproduction.log",
+    benchmark:
+        "results/benchmarks/reproduction.tsv"
+    conda:
+        "../envs/siq.yaml"
+    threads: 1
+    params:
+        code=code("reproduction.py"),
+        studies=REPRODUCED,
+    message:
+        "writing the page of the reproduction"
+    script:
+        "../scripts/reproduction.py"
