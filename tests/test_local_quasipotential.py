@@ -146,7 +146,6 @@ def test_in_the_other_well_nothing_is_known_although_the_formula_would_solve_the
     assert np.isnan(local.values(x)).all()
 
 
-@pytest.mark.xfail(reason="believed behind the ridge, down to 0.4 of V of the saddle", strict=True)
 @pytest.mark.parametrize("index", [0, 1])
 def test_right_behind_the_ridge_nothing_is_known(index: int) -> None:
     known, local = SYSTEMS["archetype"], quartic("archetype", index, 1.2)
@@ -198,7 +197,6 @@ def test_the_residual_is_the_share_of_the_equation_that_is_left() -> None:
     np.testing.assert_allclose(replace(local, well=well).residual(x), 0.01, rtol=1e-6)
 
 
-@pytest.mark.xfail(reason="so close to an attractor the residual is that of rounding", strict=True)
 @pytest.mark.parametrize("distance", [1e-16, 1e-15, 1e-14])
 def test_an_attractor_is_known_to_rounding(distance: float) -> None:
     local = quartic("double well", 1, 1.2)

@@ -28,6 +28,7 @@ from siq.vector_field import VectorField
 STEP = 1.06  # of the level, from one fit to the next
 REWEIGHTINGS = 4
 STEEP = 3.0  # of the median residual: what is larger counts less and less
+ROUNDING = 1e-16  # of what is usual: |∇V| |f| so close to the attractor says nothing
 FINEST = 1e-5  # residual below which nothing is an outlier
 NEAR = 2.5  # of the spacing of the points: further away there were no points
 HELD_OUT = 4  # every so manieth point is kept for choosing the degree
@@ -47,24 +48,36 @@ class LocalQuasipotential:
         D.
     tolerance
         Largest relative Hamilton–Jacobi residual at a point where the formula is believed.
+    elsewhere
+        Recorded states from which f leads to other attractors, shape ``(m, d)``; None for none.
     """
 
     well: Well
     field: VectorField
     diffusion: np.ndarray
     tolerance: float
+    elsewhere: np.ndarray | None = None
 
     def residual(self, x: np.ndarray) -> np.ndarray:
         """∣∇V·(f + D∇V)∣ / (∣∇V∣ ∣f∣) at points ``(n, d)``, in the metric of the noise: shape ``(n,)``.
 
         At the attractor, where both vanish, it is zero.
         """
+        numerator, size = self._terms(x)
+        # At the attractor both vanish, and what is left of them is rounding.
+        return numerator / np.maximum(size, ROUNDING * self._size)
+
+    def _terms(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         slope, flow = self.well.gradients(x), self.field(x)
-        numerator = np.abs((slope * (flow + slope @ self.diffusion)).sum(axis=1))
         steepness = np.einsum("ni,ij,nj->n", slope, self.diffusion, slope)
         speed = np.einsum("ni,ij,nj->n", flow, np.linalg.inv(self.diffusion), flow)
-        size = np.sqrt(steepness * speed)
-        return numerator / np.where(size > 0, size, np.inf)
+        numerator = np.abs((slope * (flow + slope @ self.diffusion)).sum(axis=1))
+        return numerator, np.sqrt(steepness * speed)
+
+    @cached_property
+    def _size(self) -> float:
+        size = float(np.median(self._terms(self.well.points)[1])) if len(self.well.points) else 0.0
+        return size if size > 0 else float(np.finfo(float).tiny) / ROUNDING
 
     def values(self, x: np.ndarray) -> np.ndarray:
         """V at points ``(n, d)``: shape ``(n,)``, NaN where the formula is not to be believed.
@@ -78,14 +91,18 @@ class LocalQuasipotential:
 
     def reaches(self, x: np.ndarray) -> np.ndarray:
         """Mask of the points below the level, and among recorded states that lead to the attractor."""
-        below: np.ndarray = self.well.values(x) <= self.well.level
-        return below & (self._distance(x) <= NEAR)
-
-    def _distance(self, x: np.ndarray) -> np.ndarray:
-        """Distance to the points of the fit, in units of their spacing."""
         tree, spacing = self._points
-        found, nearest = tree.query(x / self._width)
-        return found / spacing[nearest]
+        own, nearest = tree.query(x / self._width)
+        reached: np.ndarray = (self.well.values(x) <= self.well.level) & (own <= NEAR * spacing[nearest])
+        if self._others is not None:  # behind the ridge the formula would go on down to the other attractor
+            reached &= own < self._others.query(x / self._width)[0]
+        return reached
+
+    @cached_property
+    def _others(self) -> cKDTree | None:
+        if self.elsewhere is None or not len(self.elsewhere):
+            return None
+        return cKDTree(self.elsewhere / self._width)
 
     @cached_property
     def _width(self) -> np.ndarray:
@@ -112,8 +129,8 @@ class Trial:
     residual
         Median relative Hamilton–Jacobi residual on points that took no part in the fit.
     covered
-        Points among them at which the formula is believed, as a share of those that the degree which reaches
-        most of them puts below its level.
+        Points among them below the lowest level of all degrees at which the formula is believed, as a share
+        of those that the degree which reaches most of them has there.
     """
 
     degree: int
@@ -218,6 +235,8 @@ def local_quasipotential(
     attractor, region = outline.attractors[index], outline.regions[index]
     rows = np.arange(len(region.chosen))
     unseen = region.points(rows[rows % HELD_OUT == 0])
+    others = [one for number, one in enumerate(outline.regions) if number != index]
+    elsewhere = np.concatenate([one.points(np.arange(len(one.chosen))) for one in others]) if others else None
     found: list[tuple[int, LocalQuasipotential]] = []
     failure = NumericalFailure("no degree is affordable")
     for degree in options.degrees:
@@ -234,7 +253,8 @@ def local_quasipotential(
         well = extend_well(
             field, well, region, diffusion=diffusion, reach=options.reach, rows=rows[rows % HELD_OUT != 0]
         )
-        found.append((degree, LocalQuasipotential(well, field, diffusion, options.tolerance)))
+        local = LocalQuasipotential(well, field, diffusion, options.tolerance, elsewhere)
+        found.append((degree, local))
     if not found:
         raise failure
     trials = _trials(found, unseen)
@@ -243,7 +263,8 @@ def local_quasipotential(
 
 def _trials(found: Sequence[tuple[int, LocalQuasipotential]], x: np.ndarray) -> tuple[Trial, ...]:
     """What each degree is worth on points that took no part in its fit."""
-    reached = [one.reaches(x) for _, one in found]
+    level = min(one.well.level for _, one in found)  # V of the saddle differs by some per cent
+    reached = [one.reaches(x) & (one.well.values(x) <= level) for _, one in found]
     most = max(int(mask.sum()) for mask in reached)
     trials = []
     for (degree, one), mask in zip(found, reached, strict=True):

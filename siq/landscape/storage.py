@@ -91,8 +91,13 @@ def _formula(local: LocalQuasipotential) -> dict[str, Any]:
         "saddle": None if well.saddle is None else well.saddle.tolist(),
         "tolerance": local.tolerance,
         "residual": well.residual,
-        "points": [[float(f"{value:.{DIGITS}g}") for value in row] for row in well.points],
+        "points": _rounded(well.points),
+        "elsewhere": [] if local.elsewhere is None else _rounded(local.elsewhere),
     }
+
+
+def _rounded(points: np.ndarray) -> list[list[float]]:
+    return [[float(f"{value:.{DIGITS}g}") for value in row] for row in points]
 
 
 def _transition(one: Transition) -> dict[str, Any]:
@@ -156,4 +161,5 @@ def _local(data: Mapping[str, Any], field: VectorField, diffusion: np.ndarray) -
         np.array(data["attractor"]), basis, np.array(powers["coefficients"]), powers["level"], saddle,
         powers["residual"], np.array(powers["points"]),
     )  # fmt: skip
-    return LocalQuasipotential(well, field, diffusion, powers["tolerance"])
+    elsewhere = np.array(powers["elsewhere"]).reshape(-1, len(field.symbols))
+    return LocalQuasipotential(well, field, diffusion, powers["tolerance"], elsewhere)

@@ -23,6 +23,7 @@ from siq.outline import Outline
 
 logger = logging.getLogger(__name__)
 
+DIFFERENT = 0.02  # share of a barrier by which two ways to it may differ without a word
 PATH_TOLERANCE = 1e-5  # of the action; prefactors follow the end of the path and need more than barriers
 
 
@@ -33,8 +34,7 @@ class Transition:
     Attributes
     ----------
     start, end
-        Indices of the attractors. They are the same where the saddle leads back, and `end` is None where
-        it leads out of the recorded region.
+        Indices of the attractors; `end` is None where the saddle leads back, or out of the recorded region.
     saddle
         The saddle.
     path
@@ -128,6 +128,8 @@ def _transition(
     barrier, share = path.uphill.action, 0.0
     if local is not None:
         barrier, share = barrier_by_formula(path, local)
+        if abs(barrier / path.uphill.action - 1) > DIFFERENT:
+            notes.append("the formula and the path alone give different barriers")
     logger.info("barrier of U from attractor %d: %.5g (path alone %.5g)", index, barrier, path.uphill.action)
     spread = barrier_standard_error(path, found, diffusion=diffusion)
     return Transition(index, end, saddle, path, barrier, share, spread, rate, tuple(dict.fromkeys(notes)))
