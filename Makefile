@@ -13,11 +13,11 @@ examples: environment
 	$(BIN)/snakemake --cores $(CORES) examples
 
 test: environment lint
-	$(BIN)/pytest --numprocesses logical --dist loadfile
+	$(BIN)/pytest --numprocesses logical --dist loadgroup --no-loadscope-reorder
 
 # Full-size checks, minutes each and no part of `make test`.
 full: environment
-	$(BIN)/pytest --numprocesses logical --dist loadfile -m "slow or not slow" --ignore=tests/slow
+	$(BIN)/pytest --numprocesses logical --dist loadgroup --no-loadscope-reorder -m "slow or not slow" --ignore=tests/slow
 
 untuned: environment
 	$(BIN)/pytest -m slow -s tests/slow/test_untuned_systems.py

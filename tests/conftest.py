@@ -14,6 +14,14 @@ from siq.systems import System, load_system
 ROOT = Path(__file__).parents[1]
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Workflows first and all by one process: they take longest, and share a miniature. Others by file."""
+    items.sort(key=lambda item: "workflow" not in item.path.parts)
+    for item in items:
+        group = "workflow" if "workflow" in item.path.parts else item.path.name
+        item.add_marker(pytest.mark.xdist_group(group))
+
+
 @pytest.fixture
 def write(tmp_path: Path) -> Callable[..., Path]:
     """Writes a text to a file and returns its path."""

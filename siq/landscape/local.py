@@ -175,7 +175,8 @@ def extend_well(
         along = (functions @ coefficients).reshape(region.states.shape[:2])
         points = region.points(np.intersect1d(region.below(along, level), allowed))
         equation = equation_at(well.basis, points, field(points), diffusion=diffusion)
-        coefficients = _robust(equation, coefficients, free)
+        # On the way up one round keeps the formula close enough to be taken further.
+        coefficients = _robust(equation, coefficients, free, rounds=REWEIGHTINGS if level >= goal else 1)
         if level >= goal:
             break
         level = min(goal, STEP * level)
@@ -190,9 +191,11 @@ def _relative(equation: HamiltonJacobi, coefficients: np.ndarray) -> np.ndarray:
     return relative
 
 
-def _robust(equation: HamiltonJacobi, coefficients: np.ndarray, free: np.ndarray) -> np.ndarray:
+def _robust(
+    equation: HamiltonJacobi, coefficients: np.ndarray, free: np.ndarray, *, rounds: int
+) -> np.ndarray:
     """Gauss–Newton with weights that fall with the square of what is left (Cauchy's)."""
-    for _ in range(REWEIGHTINGS):
+    for _ in range(rounds):
         rest = _relative(equation, coefficients)
         scale = max(STEEP * float(np.median(rest)), FINEST)
         weight = equation.weight / np.sqrt(1 + (rest / scale) ** 2)

@@ -88,6 +88,12 @@ def fresh_project(tmp_path: Path) -> Project:
     return copy_project(tmp_path / "project")
 
 
+@pytest.fixture(scope="module")
+def fresh_module_project(tmp_path_factory: pytest.TempPathFactory) -> Project:
+    """A copy of the project that the tests of one file share."""
+    return copy_project(tmp_path_factory.mktemp("module") / "project")
+
+
 @pytest.fixture(scope="session")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Project:
     """A project whose miniature of two runs has ended; tests look at it and leave it as it is."""

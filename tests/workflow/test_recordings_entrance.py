@@ -2,6 +2,8 @@
 
 import shutil
 
+import numpy as np
+import pandas as pd
 import pytest
 
 pytestmark = pytest.mark.workflow
@@ -37,9 +39,15 @@ def test_both_entrances_give_the_same_answer_on_the_same_data(fresh_project, fin
 def test_recordings_without_a_card_are_enough(fresh_project, finished):
     project = fresh_project
     shutil.copy(finished.path("results/mini/runs/000/recordings.parquet"), project.path("measured.parquet"))
-    project.path("study.yaml").write_text(
-        STUDY.replace("system: archetype3d\n", "").replace("runs: 2", "runs: 1")
-    )
+    asked = STUDY.replace("system: archetype3d\n", "").replace("runs: 2", "runs: 1")
+    project.path("study.yaml").write_text(asked + "landscape: {degrees: [4]}\n")
     project.make("results/measured/report.html")
     page = project.path("results/measured/report.html").read_text(encoding="utf-8")
     assert "No exact answer is known" in page
+    assert "Landscape of run 0" in page
+    landscape = pd.read_parquet(project.path("results/measured/tables/landscape.parquet"))
+    assert list(landscape["kind"]) == ["attractor", "saddle", "attractor", "transition", "transition"]
+    ways = landscape[landscape["kind"] == "transition"]
+    np.testing.assert_allclose(ways["barrier"], 1.0, atol=1e-4)  # of U = x⁴ - 2x² + y² + z² + 1
+    np.testing.assert_allclose(ways["minimum_action"], 1.0, atol=1e-4)
+    assert not project.path("results/measured/tables/escape.parquet").exists()

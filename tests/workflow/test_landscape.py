@@ -1,0 +1,65 @@
+"""The landscape of a card, with everything that it is held against."""
+
+import pandas as pd
+import pytest
+
+from siq.tables import COLUMNS
+
+pytestmark = [pytest.mark.workflow, pytest.mark.slow]
+
+STUDY = """\
+name: mini
+system: resonator
+runs: 1
+seed: 7
+simulation: {trajectories: 400, pairs: 60, pair_step: 10, interval: 100}
+training:
+  widths: [12, 12]
+  steps: 60
+  batch_size: 64
+  matching: symmetric
+  slow_speed: 0.1
+  thinning_distance: 1.0e-3
+regression: {degree: 4, threshold: 0.001, threshold_on: contribution, level: 6.0e-9}
+refinement: {routes: [local], degree: 10}
+landscape: {degrees: [8, 10], noise_intensities: [2.5e-9]}
+"""
+
+
+@pytest.fixture(scope="module")
+def tables(fresh_module_project):
+    project = fresh_module_project
+    project.path("study.yaml").write_text(STUDY)
+    project.make("results/mini/report.html")
+    names = ("landscape", "degrees", "landscape_errors", "escape")
+    return {name: pd.read_parquet(project.path(f"results/mini/tables/{name}.parquet")) for name in names}
+
+
+def test_the_tables_are_those_of_the_contract(tables):
+    for name, table in tables.items():
+        assert list(table.columns) == list(COLUMNS[name]) and len(table)
+
+
+def test_equilibria_are_found_and_barriers_are_those_of_the_minimum_action(tables):
+    landscape = tables["landscape"]
+    assert sorted(landscape["kind"]) == ["attractor", "attractor", "saddle", "transition", "transition"]
+    barriers = landscape[landscape["kind"] == "transition"]["barrier"].to_numpy()
+    assert barriers == pytest.approx([1.046857e-8, 8.16145e-9], rel=0.01)
+
+
+def test_formulas_are_close_to_characteristics_and_the_mesh_too(tables):
+    errors = tables["landscape_errors"]
+    own = errors[errors["source"] == "local formulas"].set_index("region")
+    wells = own[own.index.str.startswith("A")]
+    assert (wells["error"] < 0.01).all() and (wells["covered"] > 0.97).all()
+    whole = own[own.index.str.startswith("U <")]
+    assert (whole["error"] < 0.02).all() and (whole["covered"] > 0.9).all()
+    assert (errors[errors["source"] == "mesh"]["error"] < 0.005).all()
+
+
+def test_the_escape_law_is_that_of_the_simulation(tables):
+    escape = tables["escape"]
+    assert len(escape) == 2
+    ratio = escape["simulated"] / escape["predicted"]
+    # The law is the leading order; the barriers are 3.3 and 4.2 ε.
+    assert ((ratio > 0.85) & (ratio < 1.35)).all()
