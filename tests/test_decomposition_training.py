@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from siq.decomposition.checkpoint import load_checkpoint, save_checkpoint
-from siq.decomposition.data import Batches, TrainingData, prepare_data
+from siq.decomposition.data import Batches, TrainingData, prepare_data, slowest_part
 from siq.decomposition.loss import dynamics_loss, orthogonality_loss
 from siq.decomposition.networks import Components, at_rest
 from siq.decomposition.options import TrainingOptions
@@ -395,3 +395,20 @@ def test_a_slow_speed_makes_training_the_same_in_any_units() -> None:
         state = train(state, part, options=own, seeds=[SEEDS[0]], log_every=20)
         losses.append(float(state.history["held_out_loss"].iloc[-1]))
     assert losses[1] == pytest.approx(losses[0], rel=1e-6)
+
+
+def test_the_slowest_part_leaves_out_the_fastest_points_in_any_units() -> None:
+    whole = data(0)
+    part = slowest_part(whole, 0.5)
+    speed = np.linalg.norm((whole.training.xh - whole.training.x0) / whole.training.x0.std(axis=0), axis=1)
+    kept, dropped = (
+        part.representative_rows,
+        np.setdiff1d(whole.representative_rows, part.representative_rows),
+    )
+    assert len(kept) == pytest.approx(len(whole.representative_rows) / 2, abs=1)
+    assert speed[kept].max() <= speed[dropped].min()
+    assert slowest_part(whole, 1.0) is whole
+    units = np.array([1e-3, 50.0])
+    scaled = dataclasses.replace(whole.training, x0=whole.training.x0 * units, xh=whole.training.xh * units)
+    again = slowest_part(dataclasses.replace(whole, training=scaled), 0.5)
+    np.testing.assert_array_equal(again.representative_rows, kept)

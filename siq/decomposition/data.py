@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -81,6 +81,27 @@ def prepare_data(
             " lower training.thinning_distance or leave it out"
         )
     return TrainingData(training, held_out, rows)
+
+
+def slowest_part(data: TrainingData, share: float) -> TrainingData:
+    """Representative points without the fastest ones.
+
+    Far out f is often many times faster than about the attractors, and none of what is asked there matters
+    to the wells. Speeds are measured in standard deviations of the states.
+
+    Parameters
+    ----------
+    data
+        The pairs of one run.
+    share
+        Share of the representative points that stay, the slowest; at least a few do.
+    """
+    if share >= 1:
+        return data
+    pairs = data.representative
+    speed = np.linalg.norm((pairs.xh - pairs.x0) / pairs.h[:, None] / data.training.x0.std(axis=0), axis=1)
+    count = max(int(np.ceil(share * len(speed))), min(FEWEST_REPRESENTATIVE, len(speed)))
+    return replace(data, representative_rows=np.sort(data.representative_rows[np.argsort(speed)[:count]]))
 
 
 class Batches:

@@ -23,7 +23,7 @@ from known_systems import (
 from siq.certificate import CertificateOptions, check_prediction
 from siq.certification import certify_formulas, certify_wells
 from siq.decomposition.check import training_check
-from siq.decomposition.data import prepare_data
+from siq.decomposition.data import prepare_data, slowest_part
 from siq.decomposition.networks import at_rest
 from siq.decomposition.options import CheckOptions, TrainingOptions
 from siq.decomposition.training import start, train
@@ -107,8 +107,9 @@ def trained_until_certified(known: KnownSystem, seed: int = 0):
     for attempt in range(TRAINING.check.attempts):
         seeds = [np.random.SeedSequence([seed, attempt])]
         options = TRAINING.attempt(attempt)
+        part = slowest_part(data, options.slowest_share)
         state = train(
-            start([data], options=options, diffusion=known.diffusion, seeds=seeds), [data],
+            start([part], options=options, diffusion=known.diffusion, seeds=seeds), [part],
             options=options, seeds=seeds,
             finished=lambda _, networks: check.passes(at_rest(networks, 0)),
         )  # fmt: skip

@@ -16,7 +16,7 @@ import torch
 
 from siq.decomposition.check import TrainingCheck, training_check
 from siq.decomposition.checkpoint import load_checkpoint, save_checkpoint
-from siq.decomposition.data import TrainingData, prepare_data
+from siq.decomposition.data import TrainingData, prepare_data, slowest_part
 from siq.decomposition.networks import Networks, at_rest
 from siq.decomposition.options import TrainingOptions
 from siq.decomposition.trained import TrainedNetworks, load_networks, save_networks
@@ -125,7 +125,7 @@ class Block:
         options = self.options.attempt(attempt)
         purpose = "training" if attempt == 0 else f"training {attempt}"
         seeds = [seed_sequence(self.study["seed"], run, purpose) for run in runs]
-        data = [self.data[run] for run in runs]
+        data = [slowest_part(self.data[run], options.slowest_share) for run in runs]
         checkpoint = self.kept(f"attempt{attempt}")
         state = load_checkpoint(checkpoint, fingerprint=self.mark)
         if state is None:
