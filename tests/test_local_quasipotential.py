@@ -227,7 +227,7 @@ def test_the_powers_at_the_attractor_are_kept() -> None:
     known = maier_stein(3)
     found = landscape(known, share=1.0)
     well = grown(known, found, 0, 6)
-    wider = extend_well(known.field, well, found.regions[0], diffusion=known.diffusion, reach=1.3)
+    wider = extend_well(known.field, well, found.regions[0], diffusion=known.diffusion, goal=1.3 * well.level)
     quadratic = well.basis.exponents.sum(axis=1) == 2
     np.testing.assert_array_equal(wider.coefficients[quadratic], well.coefficients[quadratic])
     assert wider.level == pytest.approx(1.3 * well.level)
@@ -251,7 +251,9 @@ def test_only_the_rows_that_are_allowed_are_fitted() -> None:
     found = landscape(known)
     region, well = found.regions[0], grown(known, found, 0, 4)
     rows = np.arange(1, len(region.chosen), 3)
-    wider = extend_well(known.field, well, region, diffusion=known.diffusion, reach=1.2, rows=rows)
+    wider = extend_well(
+        known.field, well, region, diffusion=known.diffusion, goal=1.2 * well.level, rows=rows
+    )
     allowed = {tuple(point) for point in region.points(rows)}
     assert {tuple(point) for point in wider.points} <= allowed
 
@@ -268,7 +270,7 @@ def test_points_that_contradict_the_formula_do_not_spoil_it() -> None:
 
     x = well.points
     exact = potential_values(known, x) - potential_values(known, well.attractor[None])
-    wider = extend_well(disturbed, well, found.regions[0], diffusion=known.diffusion, reach=1.2)
+    wider = extend_well(disturbed, well, found.regions[0], diffusion=known.diffusion, goal=1.2 * well.level)
     assert np.abs(wider.values(x) - exact).max() < 1e-6 * well.level
     flow = disturbed(wider.points)
     plain = gauss_newton(
@@ -284,7 +286,7 @@ def test_a_caustic_is_left_out_and_spoils_nothing() -> None:
     known, barrier = maier_stein(10), 0.3401
     found = outline_of(known)
     well = grown(known, found, 0, 8)
-    wider = extend_well(known.field, well, found.regions[0], diffusion=known.diffusion, reach=1.2)
+    wider = extend_well(known.field, well, found.regions[0], diffusion=known.diffusion, goal=1.2 * well.level)
     fan = adapted_fan(
         known.field, known.attractors[0], diffusion=known.diffusion, level=0.9 * barrier / 2,
         box=np.array([[-2.0, 0.0], [-1.5, 1.5]]), generator=np.random.default_rng(0),

@@ -22,7 +22,13 @@ from siq.identification import IdentifiedField
 from siq.landscape.local import LocalQuasipotential, local_quasipotential
 from siq.landscape.options import LandscapeOptions
 from siq.landscape.paths import TransitionPath, minimum_action_path
-from siq.landscape.transitions import Transition, barrier_by_formula, barrier_standard_error, transitions
+from siq.landscape.transitions import (
+    Transition,
+    barrier_by_formula,
+    barrier_standard_error,
+    transitions,
+    ways_out,
+)
 from siq.outline import Outline, outline
 from siq.vector_field import VectorField
 
@@ -71,12 +77,20 @@ def ways(name: str, *, with_formulas: bool) -> tuple[Transition, ...]:
     """The two ways out of the two wells of a system, its f known to a thousandth."""
     known = SYSTEMS[name]
     local = formulas(name) if with_formulas else (None, None)
-    return tuple(
-        transitions(
-            exact_field(known, 3, relative_error=1e-3), outline_of(known, 250, share=0.8), local,
-            diffusion=known.diffusion,
-        )
-    )  # fmt: skip
+    return tuple(ways_of(known, outline_of(known, 250, share=0.8), local))
+
+
+def ways_of(
+    known: KnownSystem,
+    found: Outline,
+    local: tuple[LocalQuasipotential | None, ...],
+    *,
+    relative_error: float = 1e-3,
+) -> list[Transition]:
+    field = exact_field(known, 3, relative_error=relative_error)
+    return transitions(
+        field, ways_out(field.field, found, diffusion=known.diffusion), local, diffusion=known.diffusion
+    )
 
 
 def exact_barrier(known: KnownSystem, found: Outline, way: Transition) -> float:
@@ -221,9 +235,7 @@ def test_units_change_no_barrier_and_no_error() -> None:
     )
     points = uniform_points(known, 250, share=0.8)
     found = outline(other.field, points * scale, diffusion=other.diffusion)
-    scaled = transitions(
-        exact_field(other, 3, relative_error=1e-3), found, (None, None), diffusion=other.diffusion
-    )
+    scaled = ways_of(other, found, (None, None))
     for one, two in zip(ways("double well", with_formulas=False), scaled, strict=True):
         assert (two.start, two.end) == (one.start, one.end)
         assert two.barrier == pytest.approx(one.barrier, rel=1e-6)
@@ -237,9 +249,7 @@ def test_a_saddle_that_leads_out_of_the_region_has_no_end() -> None:
     x = np.random.default_rng(0).uniform([-1.8, -1.0], [0.1, 1.0], size=(300, 2))
     found = outline(known.field, x, diffusion=known.diffusion)
     assert len(found.attractors) == 1
-    (way,) = transitions(
-        exact_field(known, 3, relative_error=1e-3), found, (None,), diffusion=known.diffusion
-    )
+    (way,) = ways_of(known, found, (None,))
     assert way.start == 0 and way.end is None
     assert way.path is None and way.rate is None
     assert np.isnan([way.barrier, way.by_formula, way.standard_error]).all()
@@ -255,7 +265,7 @@ def test_a_path_that_is_not_found_is_told_in_words(monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr("siq.landscape.transitions.transition_path", fails)
     found = outline_of(known, 250, share=0.8)
-    both = transitions(exact_field(known, 3), found, (None, None), diffusion=known.diffusion)
+    both = ways_of(known, found, (None, None))
     assert [(way.start, way.end, way.path) for way in both] == [(0, 1, None), (1, 0, None)]
     assert all(way.notes == ("no path has a finite action",) for way in both)
 
@@ -263,7 +273,7 @@ def test_a_path_that_is_not_found_is_told_in_words(monkeypatch: pytest.MonkeyPat
 def test_where_v_is_not_smooth_at_the_saddle_there_is_a_barrier_but_no_escape_time() -> None:
     known = maier_stein(10)
     found = outline_of(known)
-    for way in transitions(exact_field(known, 3), found, (None, None), diffusion=known.diffusion):
-        assert way.barrier == pytest.approx(0.3401, abs=2e-4)
+    for way in ways_of(known, found, (None, None)):
+        assert way.barrier == pytest.approx(0.34004, abs=1e-4)
         assert way.rate is None
         assert any("V is not smooth" in note for note in way.notes)

@@ -12,7 +12,7 @@ from siq.identification import IdentifiedField
 from siq.landscape.combined import GlobalQuasipotential, heights_of_attractors
 from siq.landscape.local import LocalQuasipotential, Trial, local_quasipotential
 from siq.landscape.options import LandscapeOptions
-from siq.landscape.transitions import Transition, transitions
+from siq.landscape.transitions import Transition, lowest_barrier, transitions, ways_out
 from siq.outline import Outline
 
 
@@ -82,19 +82,21 @@ def find_landscape(
         Decides which points are used where there are too many.
     """
     notes = [fault] if (fault := outline.fault()) is not None else []
+    ways_over = ways_out(found.field, outline, diffusion=diffusion)
     local: list[LocalQuasipotential | None] = []
     trials: list[tuple[Trial, ...]] = []
     for index, one in enumerate(outline.attractors):
         try:
             formula, tried = local_quasipotential(
-                found.field, outline, index, diffusion=diffusion, options=options, seed=seed
-            )
+                found.field, outline, index, diffusion=diffusion, options=options, seed=seed,
+                barrier=lowest_barrier(ways_over, index),
+            )  # fmt: skip
         except NumericalFailure as error:
             notes.append(f"no formula about {one.position.round(4).tolist()}: {error}")
             formula, tried = None, ()
         local.append(formula)
         trials.append(tried)
-    ways = transitions(found, outline, local, diffusion=diffusion)
+    ways = transitions(found, ways_over, local, diffusion=diffusion)
     ends = outline.descents.ends
     return Landscape(
         outline.equilibria,

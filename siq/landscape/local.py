@@ -145,7 +145,7 @@ def extend_well(
     region: Region,
     *,
     diffusion: np.ndarray,
-    reach: float,
+    goal: float,
     rows: np.ndarray | None = None,
 ) -> Well:
     """Take a formula on, from its well to a higher level, by robust fits of the Hamilton–Jacobi equation.
@@ -160,8 +160,8 @@ def extend_well(
         What leads to the attractor. Only such states are asked: across the ridge another well begins.
     diffusion
         D.
-    reach
-        Level to be reached, as a share of the well's.
+    goal
+        Level of V to be reached.
     rows
         Rows of ``region.chosen`` that may be used; default all.
     """
@@ -169,7 +169,7 @@ def extend_well(
     flat = region.states.reshape(-1, region.states.shape[2])
     functions = well.basis.values(flat)
     free = well.basis.exponents.sum(axis=1) > 2
-    coefficients, goal = well.coefficients, reach * well.level
+    coefficients = well.coefficients
     level = min(0.9 * well.level, goal)
     while True:
         along = (functions @ coefficients).reshape(region.states.shape[:2])
@@ -212,6 +212,7 @@ def local_quasipotential(
     diffusion: np.ndarray,
     options: LandscapeOptions,
     seed: int = 0,
+    barrier: float | None = None,
 ) -> tuple[LocalQuasipotential, tuple[Trial, ...]]:
     """V about one attractor, of the lowest degree that no other betters by much, and all that were tried.
 
@@ -229,6 +230,9 @@ def local_quasipotential(
         Degrees, reach and tolerance.
     seed
         Decides which points are used where there are too many.
+    barrier
+        The lowest barrier of U out of the well, which no formula tells as well as a path of least action
+        does; by default what each formula says of its saddle, or of where recordings end.
 
     Raises
     ------
@@ -253,9 +257,11 @@ def local_quasipotential(
         except NumericalFailure as error:  # of one degree: another may do
             failure = error
             continue
+        top = well.level if barrier is None else barrier / 2
         well = extend_well(
-            field, well, region, diffusion=diffusion, reach=options.reach, rows=rows[rows % HELD_OUT != 0]
-        )
+            field, well, region, diffusion=diffusion, goal=options.reach * top,
+            rows=rows[rows % HELD_OUT != 0],
+        )  # fmt: skip
         local = LocalQuasipotential(well, field, diffusion, options.tolerance, elsewhere)
         found.append((degree, local))
     if not found:

@@ -19,7 +19,7 @@ class LandscapeOptions:
     degrees
         Highest powers that are tried, one after the other.
     reach
-        Level up to which formulas are sought, as a share of V at the lowest saddle.
+        Level up to which formulas are sought, as a share of the lowest barrier by least action.
     tolerance
         Largest relative Hamilton–Jacobi residual at a point where a formula is believed.
     compare_below
@@ -32,6 +32,6 @@ class LandscapeOptions:
 
     degrees: Annotated[tuple[Degree, ...], Field(min_length=1)] = (4, 6, 8, 10, 12)
     reach: Annotated[float, Field(gt=0, le=3)] = 1.2
-    tolerance: Annotated[float, Field(gt=0, lt=1)] = 0.02
+    tolerance: Annotated[float, Field(gt=0, lt=1)] = 0.05
     compare_below: Annotated[float, Field(gt=0)] | None = None
     noise_intensities: tuple[Annotated[float, Field(gt=0)], ...] = ()

@@ -20,6 +20,7 @@ from siq.landscape.local import LocalQuasipotential
 from siq.landscape.paths import TransitionPath, transition_path
 from siq.landscape.rates import EscapeRate, escape_rate
 from siq.outline import Outline
+from siq.vector_field import VectorField
 
 logger = logging.getLogger(__name__)
 
@@ -62,66 +63,100 @@ class Transition:
     notes: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True)
+class WayOut:
+    """The path of least action out of one well over one saddle, before any formula.
+
+    Attributes
+    ----------
+    start, end, saddle
+        As of a `Transition`.
+    path
+        None where none was found.
+    note
+        Why not, in words.
+    """
+
+    start: int
+    end: int | None
+    saddle: Equilibrium
+    path: TransitionPath | None
+    note: str = ""
+
+
+def ways_out(field: VectorField, outline: Outline, *, diffusion: np.ndarray) -> list[WayOut]:
+    """Every way out of every well over the saddles next to it, from f alone.
+
+    Parameters
+    ----------
+    field
+        f.
+    outline
+        Attractors and saddles.
+    diffusion
+        D.
+    """
+    ways = []
+    for index, attractor in enumerate(outline.attractors):
+        for saddle in outline.saddles[index]:
+            beyond = neighbours(field, saddle, outline.attractors, box=outline.box) - {index}
+            if not beyond:
+                note = "behind the saddle lies no other attractor of the recorded region"
+                ways.append(WayOut(index, None, saddle, None, note))
+                continue
+            end = min(beyond)
+            try:
+                path = transition_path(
+                    field, attractor.position, saddle.position, outline.attractors[end].position,
+                    diffusion=diffusion, tolerance=PATH_TOLERANCE,
+                )  # fmt: skip
+                ways.append(WayOut(index, end, saddle, path))
+            except NumericalFailure as error:
+                ways.append(WayOut(index, end, saddle, None, str(error)))
+    return ways
+
+
+def lowest_barrier(ways: Sequence[WayOut], index: int) -> float | None:
+    """The least action out of one well, that is the lowest barrier of U; None where no way out is known."""
+    actions = [way.path.uphill.action for way in ways if way.start == index and way.path is not None]
+    return min(actions, default=None)
+
+
 def transitions(
     found: IdentifiedField,
-    outline: Outline,
+    ways: Sequence[WayOut],
     local: Sequence[LocalQuasipotential | None],
     *,
     diffusion: np.ndarray,
 ) -> list[Transition]:
-    """Every way out of every well over the saddles next to it.
+    """Ways out with their barriers and escape times.
 
     Parameters
     ----------
     found
         The identified f with its uncertainty.
-    outline
-        Attractors and saddles.
+    ways
+        See `ways_out`.
     local
         The formula about each attractor, None where there is none.
     diffusion
         D.
     """
-    return [
-        _transition(found, outline, index, saddle, local[index], diffusion)
-        for index in range(len(outline.attractors))
-        for saddle in outline.saddles[index]
-    ]
+    return [_transition(found, way, local[way.start], diffusion) for way in ways]
 
 
 def _transition(
-    found: IdentifiedField,
-    outline: Outline,
-    index: int,
-    saddle: Equilibrium,
-    local: LocalQuasipotential | None,
-    diffusion: np.ndarray,
+    found: IdentifiedField, way: WayOut, local: LocalQuasipotential | None, diffusion: np.ndarray
 ) -> Transition:
-    field, attractors = found.field, outline.attractors
-    beyond = neighbours(field, saddle, attractors, box=outline.box) - {index}
-    end = min(beyond) if beyond else None
+    path = way.path
+    if path is None:
+        return Transition(way.start, way.end, way.saddle, None, np.nan, np.nan, np.nan, None, (way.note,))
     notes: list[str] = []
-    if end is None:
-        return Transition(
-            index, None, saddle, None, np.nan, np.nan, np.nan, None,
-            ("behind the saddle lies no other attractor of the recorded region",),
-        )  # fmt: skip
-    try:
-        path = transition_path(
-            field,
-            attractors[index].position,
-            saddle.position,
-            attractors[end].position,
-            diffusion=diffusion,
-            tolerance=PATH_TOLERANCE,
-        )
-    except NumericalFailure as error:
-        return Transition(index, end, saddle, None, np.nan, np.nan, np.nan, None, (str(error),))
     if not path.uphill.converged:
         notes.append("the minimum action path is not converged")
     rate = None
     try:
-        rate = escape_rate(field, path.uphill, diffusion=diffusion)
+        rate = escape_rate(found.field, path.uphill, diffusion=diffusion)
         notes += rate.notes
     except (NumericalFailure, np.linalg.LinAlgError) as error:
         notes.append(f"no escape time: {error}")
@@ -130,9 +165,12 @@ def _transition(
         barrier, share = barrier_by_formula(path, local)
         if abs(barrier / path.uphill.action - 1) > DIFFERENT:
             notes.append("the formula and the path alone give different barriers")
-    logger.info("barrier of U from attractor %d: %.5g (path alone %.5g)", index, barrier, path.uphill.action)
+    logger.info("barrier of U from attractor %d: %.5g by formula, %.5g by the path", way.start, barrier,
+                path.uphill.action)  # fmt: skip
     spread = barrier_standard_error(path, found, diffusion=diffusion)
-    return Transition(index, end, saddle, path, barrier, share, spread, rate, tuple(dict.fromkeys(notes)))
+    return Transition(
+        way.start, way.end, way.saddle, path, barrier, share, spread, rate, tuple(dict.fromkeys(notes))
+    )
 
 
 def barrier_by_formula(path: TransitionPath, local: LocalQuasipotential) -> tuple[float, float]:
