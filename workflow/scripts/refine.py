@@ -53,8 +53,10 @@ class Run:
         if self.networks is not None:  # the region in which the regression sought its formulas
             potential = self.network(points)
             below = points_below(potential, level=self.regression.level)
-            unseen = unseen[self.network(unseen) < potential.min() + self.regression.level]
-            points = points[below]
+            lower = self.network(unseen) < potential.min() + self.regression.level
+            # Networks that know nothing may leave too few for any formula: then every state is asked for.
+            if below.sum() > 2 * record.found.library.size and lower.any():
+                points, unseen = points[below], unseen[lower]
         self.below, self.unseen = points, unseen
         self.outline: Outline = outline(record.found.field, everywhere, diffusion=self.diffusion, seed=run)
 
