@@ -15,11 +15,8 @@ ROOT = Path(__file__).parents[1]
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Workflows first and all by one process: they take longest, and share a miniature. Others by file."""
+    """Workflows first, for they take longest."""
     items.sort(key=lambda item: "workflow" not in item.path.parts)
-    for item in items:
-        group = "workflow" if "workflow" in item.path.parts else item.path.name
-        item.add_marker(pytest.mark.xdist_group(group))
 
 
 @pytest.fixture

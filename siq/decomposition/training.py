@@ -212,15 +212,15 @@ class _Objective:
         self.options = options
         self.diffusion = diffusion
         self.precision = torch.linalg.inv(diffusion)
-        precision = self.precision.double().cpu().numpy()
-        mean_squares = []
-        for pairs in (part.training for part in data):
-            velocity = (pairs.xh - pairs.x0) / pairs.h[:, None]
-            mean_squares.append(float(np.einsum("ni,ij,nj->n", velocity, precision, velocity).mean()))
-        squares = torch.tensor(mean_squares, device=device, dtype=dtype)
+        squares = torch.ones(len(data), dtype=torch.float64)
+        if options.relative_dynamics or options.slow_speed is not None:
+            precision = self.precision.double().cpu().numpy()
+            for run, pairs in enumerate(part.training for part in data):
+                velocity = (pairs.xh - pairs.x0) / pairs.h[:, None]
+                squares[run] = float(np.einsum("ni,ij,nj->n", velocity, precision, velocity).mean())
+        squares = squares.to(device, dtype)
         self.slow = None if options.slow_speed is None else options.slow_speed**2 * squares[:, None]
-        plain = options.slow_speed is not None or not options.relative_dynamics
-        self.squares = torch.ones_like(squares) if plain else squares
+        self.squares = squares if self.slow is None else torch.ones_like(squares)
 
     def __call__(self, networks: Networks, pairs: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
         d = self.diffusion.shape[0]

@@ -41,14 +41,25 @@ class GlobalQuasipotential:
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """U at points ``(n, d)``: shape ``(n,)``, NaN where it is not known."""
-        values = self.by_well(x)
-        known = np.isfinite(values).any(axis=0)
-        lowest = np.where(np.isfinite(values), values, np.inf).min(axis=0)
-        return np.where(known, lowest, np.nan)
+        return least_over_wells(self.by_well(x))
 
     def by_well(self, x: np.ndarray) -> np.ndarray:
         """``W_i + U_i`` at points, shape ``(k, n)``, NaN where the formula of a well is not believed."""
         return np.stack([h + 2 * one.values(x) for h, one in zip(self.heights, self.local, strict=True)])
+
+
+def least_over_wells(values: np.ndarray) -> np.ndarray:
+    """The least of ``(k, n)`` values that are known, shape ``(n,)``; NaN where none is."""
+    least = np.where(np.isfinite(values), values, np.inf).min(axis=0)
+    return np.where(np.isfinite(least), least, np.nan)
+
+
+def matched(local: Sequence[LocalQuasipotential | None], heights: np.ndarray) -> GlobalQuasipotential | None:
+    """U over all wells, None where a well has no formula or no height."""
+    known = tuple(one for one in local if one is not None)
+    if not known or len(known) < len(local) or not np.isfinite(heights).all():
+        return None
+    return GlobalQuasipotential(known, heights)
 
 
 def heights_of_attractors(barriers: np.ndarray) -> np.ndarray:

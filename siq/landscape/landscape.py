@@ -9,7 +9,7 @@ import numpy as np
 from siq.equilibria import Equilibrium
 from siq.errors import NumericalFailure
 from siq.identification import IdentifiedField
-from siq.landscape.combined import GlobalQuasipotential, heights_of_attractors
+from siq.landscape.combined import GlobalQuasipotential, heights_of_attractors, matched
 from siq.landscape.local import LocalQuasipotential, Trial, local_quasipotential
 from siq.landscape.options import LandscapeOptions
 from siq.landscape.transitions import Transition, lowest_barrier, transitions, ways_out
@@ -52,10 +52,7 @@ class Landscape:
     @property
     def quasipotential(self) -> GlobalQuasipotential | None:
         """U over all wells, None where a well has no formula or no height."""
-        known = [one for one in self.local if one is not None]
-        if not known or len(known) < len(self.local) or not np.isfinite(self.heights).all():
-            return None
-        return GlobalQuasipotential(tuple(known), self.heights)
+        return matched(self.local, self.heights)
 
 
 def find_landscape(

@@ -16,7 +16,7 @@ from siq.equilibria import hessian_at
 from siq.errors import InputError, NumericalFailure
 from siq.fans import adapted_fan, lowest_sheet, value_near
 from siq.files import whole_file
-from siq.landscape.combined import heights_of_attractors
+from siq.landscape.combined import heights_of_attractors, least_over_wells
 from siq.landscape.mesh import mesh_quasipotential
 from siq.landscape.paths import minimum_action_path
 from siq.outline import Outline
@@ -67,18 +67,12 @@ class ReferenceLandscape:
     @property
     def values(self) -> np.ndarray:
         """The global U by characteristics, shape ``(n,)``, NaN where no curve tells."""
-        return _least(self.characteristics, self.heights)
+        return least_over_wells(self.characteristics + self.heights[:, None])
 
     @property
     def mesh_values(self) -> np.ndarray:
         """The global U on the mesh, shape ``(n,)``."""
-        return _least(self.mesh, self.heights)
-
-
-def _least(by_well: np.ndarray, heights: np.ndarray) -> np.ndarray:
-    values = by_well + heights[:, None]
-    least = np.where(np.isfinite(values), values, np.inf).min(axis=0)
-    return np.where(np.isfinite(least), least, np.nan)
+        return least_over_wells(self.mesh + self.heights[:, None])
 
 
 def reference_landscape(

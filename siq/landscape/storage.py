@@ -17,7 +17,7 @@ import numpy as np
 from siq.bases import PowerBasis
 from siq.errors import InputError
 from siq.files import whole_file
-from siq.landscape.combined import GlobalQuasipotential
+from siq.landscape.combined import GlobalQuasipotential, matched
 from siq.landscape.landscape import Landscape
 from siq.landscape.local import LocalQuasipotential
 from siq.landscape.transitions import Transition
@@ -142,9 +142,7 @@ def read_landscape(path: str | Path, *, field: VectorField, diffusion: np.ndarra
         data = json.loads(text)
         local = tuple(_local(well, field, diffusion) for well in data["wells"])
         heights = np.array([well["height"] for well in data["wells"]], dtype=float)
-        known = [one for one in local if one is not None]
-        complete = bool(known) and len(known) == len(local) and bool(np.isfinite(heights).all())
-        return StoredLandscape(GlobalQuasipotential(tuple(known), heights) if complete else None, local, data)
+        return StoredLandscape(matched(local, heights), local, data)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(path, "", f"it is no landscape ({type(error).__name__})", "make it again") from None
 
