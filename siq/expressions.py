@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import ast
 import difflib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 import numpy as np
 import sympy
@@ -30,6 +30,17 @@ FUNCTIONS: Mapping[str, Callable[..., sympy.Expr]] = {
     "Min": sympy.Min,
 }
 """The functions that a formula may use, by the names that it uses for them."""
+
+class delay(sympy.Function):  # noqa: N801 (the name that formulas use)
+    """``delay(u, tau)``: the input u as it was a time tau ago.
+
+    It stands for itself; only what knows the course of the input can evaluate it, see
+    `siq.mismatch.model`.
+    """
+
+    nargs = 2
+    is_real = True
+
 
 CONSTANTS: Mapping[str, sympy.Expr] = {"pi": sympy.pi}
 
@@ -62,7 +73,9 @@ class FormulaError(ValueError):
         self.remedy = remedy
 
 
-def parse_formula(text: str | float, names: Mapping[str, sympy.Expr]) -> sympy.Expr:
+def parse_formula(
+    text: str | float, names: Mapping[str, sympy.Expr], *, inputs: Collection[str] = ()
+) -> sympy.Expr:
     """Build a sympy expression from the text of a formula.
 
     Parameters
@@ -71,6 +84,8 @@ def parse_formula(text: str | float, names: Mapping[str, sympy.Expr]) -> sympy.E
         The formula, such as ``"-2*(x**3 - x) - y"``; a plain number is a formula as well.
     names
         What every name in the formula stands for: states as symbols, parameters as numbers.
+    inputs
+        Those of the names that may be delayed, ``delay(u, tau)``.
 
     Returns
     -------
@@ -88,7 +103,7 @@ def parse_formula(text: str | float, names: Mapping[str, sympy.Expr]) -> sympy.E
         raise FormulaError(f"the formula has {len(text)} characters", f"keep it below {LONGEST_FORMULA}")
     try:
         tree = ast.parse(text.strip(), mode="eval")
-        expression = _build(tree.body, names)
+        expression = _build(tree.body, names, inputs)
     except (ArithmeticError, SyntaxError, TypeError, ValueError, MemoryError, RecursionError) as error:
         if isinstance(error, FormulaError):
             raise
@@ -98,7 +113,10 @@ def parse_formula(text: str | float, names: Mapping[str, sympy.Expr]) -> sympy.E
     return expression
 
 
-def _build(node: ast.expr, names: Mapping[str, sympy.Expr]) -> sympy.Expr:
+def _build(node: ast.expr, names: Mapping[str, sympy.Expr], inputs: Collection[str]) -> sympy.Expr:
+    def build(part: ast.expr) -> sympy.Expr:
+        return _build(part, names, inputs)
+
     match node:
         case ast.Constant(value=bool() as value):
             raise FormulaError(f"'{value}' is not a number", "write 0 or 1")
@@ -111,17 +129,19 @@ def _build(node: ast.expr, names: Mapping[str, sympy.Expr]) -> sympy.Expr:
         case ast.Name(id=name):
             return _look_up(name, names)
         case ast.UnaryOp(op=ast.USub(), operand=operand):
-            return -_build(operand, names)
+            return -build(operand)
         case ast.UnaryOp(op=ast.UAdd(), operand=operand):
-            return _build(operand, names)
+            return build(operand)
         case ast.BinOp(op=ast.Pow(), left=left, right=right):
-            return _power(_build(left, names), _build(right, names))
+            return _power(build(left), build(right))
         case ast.BinOp(op=operator) if type(operator) in _OPERATORS:
-            return _OPERATORS[type(operator)](_build(node.left, names), _build(node.right, names))
+            return _OPERATORS[type(operator)](build(node.left), build(node.right))
         case ast.BinOp(op=ast.BitXor()):
             raise FormulaError("'^' is not an operator", "write '**' for powers")
+        case ast.Call(func=ast.Name(id="delay"), args=arguments, keywords=[]) if inputs:
+            return _delay([build(argument) for argument in arguments], inputs)
         case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]):
-            return _call(name, [_build(argument, names) for argument in arguments])
+            return _call(name, [build(argument) for argument in arguments])
     raise FormulaError(
         f"'{_short(ast.unparse(node))}' is not allowed in a formula",
         f"use numbers, declared names, + - * / ** and the functions {', '.join(FUNCTIONS)}",
@@ -168,6 +188,14 @@ def _call(name: str, arguments: Sequence[sympy.Expr]) -> sympy.Expr:
     return FUNCTIONS[name](*arguments)
 
 
+def _delay(arguments: Sequence[sympy.Expr], inputs: Collection[str]) -> sympy.Expr:
+    if len(arguments) != 2 or str(arguments[0]) not in inputs:
+        raise FormulaError(
+            "'delay' needs an input and a time", f"write delay(u, tau) with one of {', '.join(inputs)} as u"
+        )
+    return delay(*arguments)
+
+
 def compile_formulas(
     expressions: Sequence[sympy.Expr], variables: Sequence[sympy.Symbol]
 ) -> Callable[[np.ndarray], np.ndarray]:
@@ -189,14 +217,7 @@ def compile_formulas(
         Maps components of shape ``(d, ...)`` to values of shape ``(m, ...)``: components first, so that
         each is contiguous in memory.
     """
-    function = sympy.lambdify(
-        list(variables),
-        list(expressions),
-        modules=[{"integer_power": _integer_power}, "numpy"],
-        printer=_ProductPrinter(),
-        cse=True,
-        dummify=True,
-    )
+    function = compile_values(expressions, variables)
 
     def evaluate(components: np.ndarray) -> np.ndarray:
         values = np.empty((len(expressions), *components.shape[1:]))
@@ -205,6 +226,29 @@ def compile_formulas(
         return values
 
     return evaluate
+
+
+def compile_values(
+    expressions: Sequence[sympy.Expr], variables: Sequence[sympy.Symbol]
+) -> Callable[..., Sequence[np.ndarray | float]]:
+    """Turn expressions into a function of as many arguments as there are variables.
+
+    Compare `compile_formulas`, whose argument is one array: here some variables may be arrays and others,
+    such as parameters, numbers.
+
+    Returns
+    -------
+    callable
+        Gives one value for each expression: an array, or a number where only numbers stand in it.
+    """
+    return sympy.lambdify(
+        list(variables),
+        list(expressions),
+        modules=[{"integer_power": _integer_power}, "numpy"],
+        printer=_ProductPrinter(),
+        cse=True,
+        dummify=True,
+    )
 
 
 def exact_number(value: float) -> sympy.Expr:

@@ -35,7 +35,7 @@ def check_name(text: str) -> str:
     """Return a name that formulas can use; raises ValueError for any other."""
     if not text.isidentifier() or keyword.iskeyword(text):
         raise ValueError(f"'{text}' cannot be a name in a formula; use letters, digits and underscores")
-    if text in FUNCTIONS or text in CONSTANTS or text in ("recording", "t"):
+    if text in FUNCTIONS or text in CONSTANTS or text in ("recording", "t", "delay"):
         raise ValueError(f"the name '{text}' is reserved; choose another")
     return text
 
@@ -72,6 +72,17 @@ class ParameterEntry(_CardPart):
     fixed: bool = False
 
 
+class InputEntry(_CardPart):
+    """An exogenous signal u(t), a column of the recordings.
+
+    `interpolation` says how it holds between samples: ``zero_order`` for what a converter puts out,
+    ``linear``, or ``band_limited`` for what was filtered before it was sampled.
+    """
+
+    unit: str = "1"
+    interpolation: Literal["zero_order", "linear", "band_limited"] = "linear"
+
+
 class ExactEntry(_CardPart):
     """Exact answers, where known. They serve scoring only; no method reads them."""
 
@@ -79,14 +90,20 @@ class ExactEntry(_CardPart):
 
 
 class SystemCard(_CardPart):
-    """The schema of a system card."""
+    """The schema of a system card.
+
+    A state that is in no output is hidden. The time is called ``t`` in formulas of a system with inputs or
+    of a mismatch study; see `siq.mismatch.model`.
+    """
 
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
     title: str = ""
     time_unit: str = "1"
     states: dict[Name, StateEntry] = Field(min_length=1)
+    inputs: dict[Name, InputEntry] = {}
     parameters: dict[Name, ParameterEntry] = {}
     equations: dict[str, Formula]
+    outputs: Annotated[dict[Name, Formula], Field(min_length=1)] | None = None
     diffusion: Diffusion = "identity"
     exact: ExactEntry = ExactEntry()
 
@@ -97,6 +114,10 @@ class SystemCard(_CardPart):
                 raise ValueError(f"the state '{name}' has no equation; add 'equations: {{{name}: ...}}'")
             if name in self.parameters:
                 raise ValueError(f"'{name}' is both a state and a parameter; rename one of them")
+        for name in self.inputs:
+            if name in self.states or name in self.parameters:
+                kind = "a state" if name in self.states else "a parameter"
+                raise ValueError(f"'{name}' is both an input and {kind}; rename one of them")
         for name in self.equations:
             if name not in self.states:
                 raise ValueError(f"the equation of '{name}' belongs to no state; declare it under states")
@@ -212,7 +233,20 @@ def load_system(path: str | Path) -> System:
 
 
 def build_system(document: Document, card: SystemCard) -> System:
-    """Build the system that a checked card describes; `document` says where its formulas stand."""
+    """Build the system that a checked card describes; `document` says where its formulas stand.
+
+    Raises
+    ------
+    InputError
+        For a formula that is refused, and for a card with inputs: it has no landscape of its own.
+    """
+    if card.inputs:
+        raise InputError(
+            document.file,
+            document.place(("inputs",)),
+            "a driven system has no quasipotential",
+            "leave the inputs out, or use the card in a study of mismatch",
+        )
     symbols = {name: sympy.Symbol(name, real=True) for name in card.states}
     names: dict[str, Any] = dict(symbols)
     names |= {name: exact_number(entry.value) for name, entry in card.parameters.items()}

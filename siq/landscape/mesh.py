@@ -31,11 +31,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, TypeVar, cast
+from typing import Literal, NamedTuple
 
-import numba
 import numpy as np
 
+from siq.compiled import compiled
 from siq.errors import NumericalFailure
 
 Stop = Literal["boundary", "level", "everywhere"]
@@ -55,7 +55,6 @@ MOST_SECANTS = 60
 UNKNOWN, CONSIDERED, FRONT, ACCEPTED = range(4)
 STOPS: tuple[Stop, ...] = ("boundary", "level", "everywhere")
 
-Function = TypeVar("Function", bound=Callable[..., object])
 
 
 @dataclass(frozen=True)
@@ -394,15 +393,7 @@ class _Heap(NamedTuple):
     size: np.ndarray
 
 
-def _compiled(function: Function) -> Function:
-    """The function as machine code, kept on disk where there is a folder to write to."""
-    try:
-        return cast(Function, numba.njit(cache=True)(function))
-    except RuntimeError:  # neither beside this module nor in the user's own folder
-        return cast(Function, numba.njit(function))
-
-
-@_compiled
+@compiled
 def _march(mesh: _Mesh, heap: _Heap, top: float, stop_at_boundary: bool) -> tuple[int, float]:
     """Work through the mesh; the index in `STOPS`, and the highest U that is known."""
     nx, ny = mesh.values.shape
@@ -436,7 +427,7 @@ def _march(mesh: _Mesh, heap: _Heap, top: float, stop_at_boundary: bool) -> tupl
     return stop, highest
 
 
-@_compiled
+@compiled
 def _consider_around(mesh: _Mesh, heap: _Heap, i: int, j: int) -> None:
     """Give the unknown neighbours of a new node of the front their first values."""
     nx, ny = mesh.values.shape
@@ -450,7 +441,7 @@ def _consider_around(mesh: _Mesh, heap: _Heap, i: int, j: int) -> None:
                 _rise(heap, mesh.values, position)
 
 
-@_compiled
+@compiled
 def _consider(mesh: _Mesh, i: int, j: int) -> None:
     """The first value of a node, from all of the front within reach."""
     nx, ny = mesh.values.shape
@@ -466,7 +457,7 @@ def _consider(mesh: _Mesh, i: int, j: int) -> None:
     mesh.values[i, j] = min(mesh.lowest[i, j], _from_pairs(mesh, a, b, i, j))
 
 
-@_compiled
+@compiled
 def _improve(mesh: _Mesh, heap: _Heap, a: int, b: int, i: int, j: int) -> None:
     """Lower the value of the node (i, j), if segments from near the new node (a, b) of the front do."""
     ny = mesh.values.shape[1]
@@ -485,7 +476,7 @@ def _improve(mesh: _Mesh, heap: _Heap, a: int, b: int, i: int, j: int) -> None:
         _rise(heap, mesh.values, heap.places[i * ny + j])
 
 
-@_compiled
+@compiled
 def _from_pairs(mesh: _Mesh, a: int, b: int, i: int, j: int) -> float:
     """The lowest value of (i, j) by segments from between (a, b) and a neighbour on the front."""
     nx, ny = mesh.values.shape
@@ -498,12 +489,12 @@ def _from_pairs(mesh: _Mesh, a: int, b: int, i: int, j: int) -> float:
     return lowest
 
 
-@_compiled
+@compiled
 def _within(mesh: _Mesh, a: int, b: int, i: int, j: int) -> bool:
     return (a - i) * (a - i) + (b - j) * (b - j) <= mesh.reach * mesh.reach
 
 
-@_compiled
+@compiled
 def _leave_front(mesh: _Mesh, i: int, j: int) -> None:
     """A node of the front falls behind it when all its neighbours are known."""
     nx, ny = mesh.values.shape
@@ -516,7 +507,7 @@ def _leave_front(mesh: _Mesh, i: int, j: int) -> None:
     mesh.status[i, j] = ACCEPTED
 
 
-@_compiled
+@compiled
 def _action(mesh: _Mesh, a: int, b: int, i: int, j: int) -> float:
     """Action of the segment from (a, b) to (i, j); its middle is a node of the mesh half as wide."""
     u = mesh.root[0, 0] * (i - a)
@@ -525,7 +516,7 @@ def _action(mesh: _Mesh, a: int, b: int, i: int, j: int) -> float:
     return math.sqrt((u * u + v * v) * (p * p + q * q)) - (u * p + v * q)
 
 
-@_compiled
+@compiled
 def _from_between(mesh: _Mesh, a: int, b: int, c: int, d: int, i: int, j: int) -> float:
     """The least value of (i, j) by segments from between (a, b) and (c, d), infinite if there is none.
 
@@ -566,7 +557,7 @@ def _from_between(mesh: _Mesh, a: int, b: int, c: int, d: int, i: int, j: int) -
     return base + math.sqrt((u * u + v * v) * (p * p + q * q)) - (u * p + v * q)
 
 
-@_compiled
+@compiled
 def _slope(
     share: float,
     u: float,
@@ -587,7 +578,7 @@ def _slope(
     return rise - bend * (0.5 - share) + product - (u * dp + v * dq + p * du + q * dv)
 
 
-@_compiled
+@compiled
 def _second_difference(mesh: _Mesh, a: int, b: int, c: int, d: int) -> float:
     """Of U along the line of two neighbours: the smaller of those at both, none where they differ in sign."""
     nx, ny = mesh.values.shape
@@ -605,7 +596,7 @@ def _second_difference(mesh: _Mesh, a: int, b: int, c: int, d: int) -> float:
     return smaller
 
 
-@_compiled
+@compiled
 def _rise(heap: _Heap, values: np.ndarray, position: int) -> None:
     """Move the node at a place up until its parent is lower."""
     ny = values.shape[1]
@@ -622,7 +613,7 @@ def _rise(heap: _Heap, values: np.ndarray, position: int) -> None:
     heap.places[node] = position
 
 
-@_compiled
+@compiled
 def _take_lowest(heap: _Heap, values: np.ndarray) -> None:
     """Remove the first node; the last takes its place and moves down."""
     ny = values.shape[1]

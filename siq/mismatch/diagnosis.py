@@ -1,0 +1,189 @@
+"""Diagnosis: compare, locate, name, model, show - the whole of it for one simulation and its recordings."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import scipy.stats
+
+from siq.errors import NumericalFailure
+from siq.mismatch.candidates import Candidate, candidates_of, generic_candidates
+from siq.mismatch.dictionary import Mechanism
+from siq.mismatch.estimation import Fit, first_noise, first_states, fit
+from siq.mismatch.measurements import Measurements
+from siq.mismatch.model import Model
+from siq.mismatch.roles import Roles, roles_of
+from siq.mismatch.search import Search, best_fit, process_noise_needed, search
+from siq.mismatch.structure import Structure, structure_of
+from siq.mismatch.study import MismatchStudy
+
+LOGGER = logging.getLogger(__name__)
+
+Verdict = Literal["no mismatch", "parameter shift", "missing physics", "unexplained"]
+
+STRUCTURED = 1e-4  # probability below which residuals are not called random
+SHIFTED = 1e-4  # probability below which parameters are not called unchanged
+ENOUGH = 0.999  # share of the excess that a mechanism explains, beyond which a remainder is only remarked
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What was found out about a simulation and recordings of the system.
+
+    Attributes
+    ----------
+    verdict
+        One of four.
+    model
+        The simulation as its author believes it.
+    roles
+        Of its states.
+    search
+        Recalibration, mechanisms found, and the final fit.
+    before
+        Structure of what the recalibrated simulation does not explain, random forces included.
+    after
+        Structure that the final fit leaves.
+    process_noise
+        Whether random forces are part of the verdict.
+    p_shift
+        Probability that the parameters of the card are the true ones.
+    share
+        Of the excess that the mechanisms explain.
+    remarks
+        Sentences about reservations.
+    candidates
+        All mechanisms that were considered.
+    """
+
+    verdict: Verdict
+    model: Model
+    roles: Roles
+    search: Search
+    before: Structure
+    after: Structure
+    process_noise: bool
+    p_shift: float
+    share: float
+    remarks: tuple[str, ...]
+    candidates: tuple[Candidate, ...]
+
+
+def diagnose(
+    model: Model, data: Measurements, dictionary: Sequence[Mechanism], study: MismatchStudy, *, file: str = ""
+) -> Diagnosis:
+    """Say whether, where and in which way a simulation differs from recordings.
+
+    Parameters
+    ----------
+    model
+        The simulation, as its card says.
+    data
+        The recordings to learn from; those held out stay out.
+    dictionary
+        The mechanisms that may be named.
+    study
+        What counts as found, and whether monomials do.
+    file
+        Where the dictionary's entries come from, for messages.
+
+    Raises
+    ------
+    NumericalFailure
+        When not even the recalibrated simulation with process noise can be fitted.
+    """
+    roles = roles_of(model)
+    generic = study.generic if study.generic is not None else not roles.physical
+    candidates = candidates_of(model, roles, dictionary, file=file)
+    monomials = [c for c in generic_candidates(model, roles, degree=study.degree) if c.coordinate != "constant"]
+    if generic:
+        candidates += monomials
+    loose, recalibrated = recalibrate(model, data)
+    found = search(model, data, recalibrated, candidates, options=study.search)
+    after = structure_of(found.fit.model, data, found.fit, roles)
+    before = structure_of(model, data, recalibrated, roles, level=0.0)
+    explained = explained_share(before.total, before.freedom, loose, found.fit, data, roles)
+    random = found.fit.has_process_noise
+    p_shift = shift_probability(model, recalibrated)
+    remarks: list[str] = []
+    knows_noise = any(form.noise for mechanism in dictionary for form in mechanism.forms)
+    structured = after.p_value < STRUCTURED
+    verdict: Verdict
+    if found.found:
+        verdict = "missing physics"
+        if structured or random:
+            if explained >= ENOUGH:
+                remarks.append(f"{1 - explained:.2g} of the excess remains, and is not noise.")
+            else:
+                verdict = "unexplained"
+        random = False
+    elif random:
+        verdict = "missing physics" if knows_noise and not structured else "unexplained"
+        random = verdict == "missing physics"
+    elif structured:
+        verdict = "unexplained"
+    else:
+        verdict = "parameter shift" if p_shift < SHIFTED else "no mismatch"
+    return Diagnosis(
+        verdict=verdict,
+        model=model,
+        roles=roles,
+        search=found,
+        before=before,
+        after=after,
+        process_noise=random,
+        p_shift=p_shift,
+        share=explained,
+        remarks=tuple(remarks),
+        candidates=tuple(candidates),
+    )
+
+
+def recalibrate(model: Model, data: Measurements) -> tuple[Fit, Fit]:
+    """Fit the simulation's own parameters: with process noise, and the simpler of this and without.
+
+    Raises
+    ------
+    NumericalFailure
+        When neither fit can be made.
+    """
+    x = first_states(model, data)
+    noise = first_noise(model, data, x)
+    loose = fit(model, data, x=x, noise=noise, estimate_process=True)
+    if not np.isfinite(loose.sum_of_squares):
+        raise NumericalFailure("the simulation has no value at the recorded states; check the card's equations")
+    best = best_fit(loose.model, data, loose)
+    return loose, best
+
+
+def explained_share(
+    total: float, freedom: int, loose: Fit, final: Fit, data: Measurements, roles: Roles
+) -> float:
+    """Share of the excess over measurement noise that the final simulation explains, without process noise."""
+    del loose
+    after = structure_of(final.model, data, final, roles, level=0.0, choose=lambda each: False)
+    # Both in units of the measurement noise of their own fit.
+    excess = max(total - freedom, 1e-300)
+    return float(np.clip(1 - max(after.total - after.freedom, 0.0) / excess, 0.0, 1.0))
+
+
+def shift_probability(model: Model, recalibrated: Fit) -> float:
+    """Probability that the card's parameters are the true ones, given the recalibrated ones."""
+    free = np.array(model.free, dtype=int)
+    if not len(free):
+        return 1.0
+    difference = recalibrated.model.values[free] - model.values[free]
+    scale = np.sqrt(np.diag(recalibrated.covariance))
+    scale = np.where(scale > 0, scale, np.inf)
+    correlation = recalibrated.covariance / np.outer(scale, scale)
+    values, vectors = np.linalg.eigh(correlation)
+    kept = values > 1e-9 * values[-1]
+    along = vectors[:, kept].T @ (difference / scale) / np.sqrt(values[kept])
+    return float(scipy.stats.chi2.sf(float(along @ along), int(kept.sum())))
+
+
+__all__ = ["Diagnosis", "diagnose", "process_noise_needed", "recalibrate", "shift_probability"]

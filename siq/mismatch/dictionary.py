@@ -1,0 +1,134 @@
+"""The dictionary of mechanisms, read from YAML: ours (`mechanisms.yaml`) and what a study adds."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from siq.documents import read_document, validate
+from siq.errors import InputError
+from siq.systems import Formula, Name
+
+Role = Literal[
+    "position", "velocity", "amplitude", "population", "level", "state", "input", "parameter", "output"
+]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Shape(_Part):
+    """Where a parameter is looked for that the mechanism does not depend on linearly; see the dictionary."""
+
+    at: tuple[float, ...] = (1.0,)
+    scale_of: str | None = None
+    inverse_scale_of: str | None = None
+    quantiles_of: str | None = None
+    samples: bool = False
+    frequencies: Annotated[int, Field(ge=2, le=2000)] | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> Shape:
+        given = (self.scale_of, self.inverse_scale_of, self.quantiles_of, self.frequencies)
+        if sum(each is not None for each in given) + self.samples != 1:
+            raise ValueError("a shape is looked for in one way; give one of scale_of, quantiles_of, ...")
+        return self
+
+
+class MechanismParameter(_Part):
+    """A parameter that a mechanism brings: an amplitude, or a shape."""
+
+    unit: str = "1"
+    sign: Literal["any", "positive"] = "any"
+    shape: Shape | None = None
+
+
+class FurtherState(_Part):
+    """A state that a mechanism brings, with its equation; `scale` is a formula of its size."""
+
+    equation: Formula
+    unit: str = "1"
+    scale: str
+
+
+class Form(_Part):
+    """How a mechanism shows in one kind of system; see the head of the dictionary."""
+
+    roles: dict[Name, Role]
+    terms: dict[Name, Formula] = {}
+    replace: dict[Name, Formula] = {}
+    outputs: dict[Name, Formula] = {}
+    states: dict[Name, FurtherState] = {}
+    noise: Name | None = None
+    parameters: dict[Name, MechanismParameter]
+    coordinate: str
+    symmetric: bool = False
+
+    @model_validator(mode="after")
+    def _about_roles(self) -> Form:
+        if not (self.terms or self.replace or self.outputs or self.noise):
+            raise ValueError("a form changes nothing; give terms, replace, outputs or noise")
+        for name in (*self.terms, *self.replace, *self.outputs, *([self.noise] if self.noise else [])):
+            if name not in self.roles:
+                raise ValueError(f"'{name}' has no role; add 'roles: {{{name}: state}}' or another role")
+        return self
+
+
+class Mechanism(_Part):
+    """An entry of the dictionary."""
+
+    name: Annotated[str, Field(min_length=1)]
+    sentence: str
+    forms: Annotated[tuple[Form, ...], Field(min_length=1)]
+    generalises: tuple[str, ...] = ()
+    look_alikes: tuple[str, ...] = ()
+    reference: str = ""
+
+
+class Dictionary(BaseModel):
+    """The schema of a file of mechanisms."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    mechanisms: tuple[Mechanism, ...]
+
+
+def standard_dictionary() -> tuple[Mechanism, ...]:
+    """The mechanisms that come with the library."""
+    with as_file(files("siq.mismatch") / "mechanisms.yaml") as path:
+        return read_dictionary(path)
+
+
+def read_dictionary(path: str | Path) -> tuple[Mechanism, ...]:
+    """Read a file ``mechanisms: [...]``.
+
+    Raises
+    ------
+    InputError
+        With the line of the first entry that cannot be used.
+    """
+    document = read_document(path)
+    return validate(document, Dictionary).mechanisms
+
+
+def dictionary_of(
+    *, without: Collection[str], further: Sequence[Mechanism], file: str
+) -> tuple[Mechanism, ...]:
+    """The standard mechanisms, less some by name, and with further ones; an equal name replaces.
+
+    Raises
+    ------
+    InputError
+        For a name to leave out that there is none of.
+    """
+    known = {each.name: each for each in standard_dictionary()}
+    for name in without:
+        if name not in known:
+            raise InputError(file, "without", f"no mechanism is called '{name}'", f"use one of {', '.join(known)}")
+        del known[name]
+    return tuple((known | {each.name: each for each in further}).values())

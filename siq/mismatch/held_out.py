@@ -1,0 +1,125 @@
+"""The fit on recordings that had no part in it: before, recalibrated, augmented, and the noise floor.
+
+Every simulation runs freely from the end of a prefix of each recording. From the prefix, which is not scored,
+it estimates its own state at the begin; the prefix is the same for all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from siq.mismatch.estimation import Noise, first_states, fit
+from siq.mismatch.linearisation import Grid, integrate_intervals
+from siq.mismatch.measurements import Measurements
+from siq.mismatch.model import Model
+
+SHORTEST_PREFIX = 8  # samples
+PREFIX = 0.2  # of a recording
+
+
+@dataclass(frozen=True)
+class FreeRun:
+    """A simulation of held-out recordings.
+
+    Attributes
+    ----------
+    outputs
+        Shape ``(n, m)``; NaN from where the simulation ran away.
+    scored
+        Rows behind the prefixes, shape ``(n,)``.
+    """
+
+    outputs: np.ndarray
+    scored: np.ndarray
+
+
+def free_run(model: Model, data: Measurements, *, noise: Noise, substeps: int, prefix: float = PREFIX) -> FreeRun:
+    """Simulate recordings from states that their prefixes tell.
+
+    Parameters
+    ----------
+    model
+        With the parameters' values to be used; nothing but initial states is fitted.
+    data
+        The recordings.
+    noise
+        The measurement noise weighs the outputs; the process noise lets the states follow the prefix first.
+    substeps
+        Runge–Kutta steps between samples.
+    prefix
+        Share of each recording.
+    """
+    lengths = np.diff(data.first)
+    rows = np.minimum(np.maximum((prefix * lengths).astype(int), SHORTEST_PREFIX), lengths - 1)
+    x = initial_states(model, data.until(np.maximum(rows, 2)), noise=noise, substeps=substeps)
+    states = run(model, data, x, substeps=substeps)
+    signals = data.signals(data.t, data.recording, delays=model.lags(model.values))
+    within = np.arange(len(data.t)) - data.first[data.recording]
+    return FreeRun(
+        outputs=model.compiled.outputs(states.T, signals, model.values).T,
+        scored=within >= rows[data.recording],
+    )
+
+
+def initial_states(model: Model, data: Measurements, *, noise: Noise, substeps: int) -> np.ndarray:
+    """The states in which recordings begin, shape ``(recordings, d)``, with all parameters as they are."""
+    still = replace(model, parameters=tuple(replace(each, fixed=True) for each in model.parameters))
+    process = np.zeros(model.dimension)
+    process[: len(noise.process)] = noise.process
+    start = first_states(still, data)
+    follow = fit(
+        still, data, x=start, noise=Noise(noise.measurement, process), estimate_process=False, substeps=substeps
+    )
+    x = follow.x if np.isfinite(follow.sum_of_squares) else start
+    strict = fit(
+        still,
+        data,
+        x=x,
+        noise=Noise(noise.measurement, np.zeros(model.dimension)),
+        estimate_process=False,
+        substeps=substeps,
+    )
+    best = strict.x if strict.converged else x
+    return best[data.first[:-1]]
+
+
+def run(model: Model, data: Measurements, begin: np.ndarray, *, substeps: int) -> np.ndarray:
+    """Integrate recordings from their initial states, shape ``(recordings, d)``, to all samples ``(n, d)``.
+
+    A simulation that runs away is NaN from there on.
+    """
+    states = np.full((len(data.t), model.dimension), np.nan)
+    lengths = np.diff(data.first)
+    current = begin.T.copy()
+    states[data.first[:-1]] = begin
+    whole = Grid(data, substeps)
+    places = np.concatenate([[0], np.cumsum(lengths - 1)])[:-1]
+    for sample in range(int(lengths.max()) - 1):
+        alive = np.flatnonzero(lengths > sample + 1)
+        one = whole.at_intervals(places[alive] + sample)
+        with np.errstate(all="ignore"):
+            after = integrate_intervals(model, one, model.values, current[:, alive])
+        current[:, alive] = after
+        states[data.first[alive] + sample + 1] = after.T
+    return states
+
+
+def normalised_rms(outputs: np.ndarray, simulated: FreeRun) -> float | None:
+    """Root mean square error over that of the outputs about their mean; None where a simulation ran away.
+
+    Parameters
+    ----------
+    outputs
+        As measured, shape ``(n, m)``.
+    simulated
+        The free run of the same recordings.
+    """
+    measured = outputs[simulated.scored]
+    error = simulated.outputs[simulated.scored] - measured
+    known = np.isfinite(measured)
+    if not np.isfinite(error[known]).all():
+        return None
+    spread = np.nanvar(measured, axis=0)
+    return float(np.sqrt(np.nanmean(error**2 / np.where(spread > 0, spread, 1.0))))

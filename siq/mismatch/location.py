@@ -1,0 +1,161 @@
+"""Location: in which equation a mismatch sits, along which coordinate, where on it, and in which recordings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from siq.mismatch.diagnosis import Diagnosis
+from siq.mismatch.estimation import Fit, solve, whiten
+from siq.mismatch.measurements import Measurements
+from siq.mismatch.structure import Curve, coordinate_values
+
+VISIBLE = 0.1  # of the largest value of a curve
+TWO_ERRORS = 2.0
+PART = 0.5  # of its fair share of the excess, from which on a recording counts as affected
+
+
+@dataclass(frozen=True)
+class Location:
+    """Where a mismatch sits.
+
+    Attributes
+    ----------
+    equations
+        Share of each equation in the excess, largest first; of the outputs for a fault of the sensor.
+    coordinate
+        Along which it acts.
+    region
+        The part of the coordinate's range where it can be seen, by coordinate.
+    time
+        First and last time of it, where it acts along time only.
+    recordings
+        Labels of those that show it.
+    sentence
+        All of it in words.
+    curve
+        What is missing against the coordinate, where that is a state, an input or an amplitude.
+    """
+
+    equations: dict[str, float]
+    coordinate: str
+    region: dict[str, tuple[float, float]]
+    time: tuple[float, float] | None
+    recordings: tuple[str, ...]
+    sentence: str
+    curve: Curve | None
+
+    def as_data(self) -> dict[str, Any]:
+        """What the verdict's file says of it."""
+        return {
+            "equations": self.equations,
+            "coordinate": self.coordinate,
+            "region": {name: list(limits) for name, limits in self.region.items()},
+            "time": None if self.time is None else list(self.time),
+            "recordings": list(self.recordings),
+            "sentence": self.sentence,
+        }
+
+
+def locate(diagnosis: Diagnosis, data: Measurements) -> Location | None:
+    """Say where a mismatch sits; None where there is none."""
+    if diagnosis.verdict in ("no mismatch", "parameter shift"):
+        return None
+    curves = diagnosis.before.curves
+    named = diagnosis.search.found[0].best.candidate if diagnosis.search.found else None
+    if diagnosis.verdict == "missing physics" and named is not None:
+        equations, coordinate = named.equations, named.coordinate
+    elif curves:
+        equations, coordinate = curves[0].direction.equations, curves[0].direction.coordinate
+    else:
+        equations, coordinate = (), "unknown"
+    curve = next(
+        (
+            each
+            for each in curves
+            if each.direction.coordinate == coordinate and set(each.direction.equations) & set(equations)
+        ),
+        None,
+    )
+    if diagnosis.process_noise:
+        driven = zip(diagnosis.model.states, diagnosis.search.fit.noise.process, strict=False)
+        equations, coordinate, curve = tuple(name for name, q in driven if q > 0), "random", None
+    region = visible_region(curve) if curve is not None else {}
+    recordings = affected(diagnosis.search.recalibrated, data)
+    everywhere = len(recordings) == len(data.labels)
+    time = (float(data.t.min()), float(data.t.max())) if coordinate == "t" else None
+    return Location(
+        equations=equation_shares(diagnosis, equations),
+        coordinate=coordinate,
+        region=region,
+        time=time,
+        recordings=recordings,
+        sentence=_sentence(equations, coordinate, region, recordings, everywhere=everywhere),
+        curve=curve,
+    )
+
+
+def equation_shares(diagnosis: Diagnosis, equations: tuple[str, ...]) -> dict[str, float]:
+    """Share of what any one equation can explain, for the equations named."""
+    gains: dict[str, float] = {}
+    for curve in diagnosis.before.curves:
+        for name in curve.direction.equations:
+            gains[name] = max(gains.get(name, 0.0), curve.gain)
+    total = max(diagnosis.before.total - diagnosis.before.freedom, 1e-300)
+    return {name: float(min(max(gains.get(name, 0.0) / total, 0.0), 1.0)) for name in equations}
+
+
+def visible_region(curve: Curve) -> dict[str, tuple[float, float]]:
+    """The range of the coordinate in which the missing part is seen beyond its error."""
+    size = np.abs(curve.values)
+    seen = (size > TWO_ERRORS * curve.standard_errors) & (size > VISIBLE * size.max())
+    knots = curve.direction.knots[seen] if seen.any() else curve.direction.knots
+    return {curve.direction.coordinate: (float(knots.min()), float(knots.max()))}
+
+
+def affected(recalibrated: Fit, data: Measurements) -> tuple[str, ...]:
+    """Recordings whose residuals, random forces not admitted, exceed noise by a fair share of the excess."""
+    white = whiten(recalibrated.linearisation, data, recalibrated.noise.without_process())
+    change, _ = solve(white.columns, white.innovations)
+    left = white.innovations - white.columns @ change
+    squares = np.bincount(white.recording, left**2, minlength=len(data.labels))
+    counts = np.bincount(white.recording, white.known, minlength=len(data.labels))
+    excess = np.maximum(squares - counts, 0.0)
+    if not excess.sum() > 0:
+        return data.labels
+    fair = counts / counts.sum()
+    return tuple(
+        label
+        for label, own, share in zip(data.labels, excess / excess.sum(), fair, strict=True)
+        if own > PART * share
+    )
+
+
+def course(diagnosis: Diagnosis, curve: Curve) -> np.ndarray:
+    """The coordinate of a curve along the fitted trajectories, shape ``(n,)``, for a rug below the plot."""
+    fit = diagnosis.search.recalibrated
+    empty = np.zeros((len(diagnosis.model.inputs), len(fit.x)))
+    return coordinate_values(diagnosis.model, curve.direction, fit.x.T, empty, np.zeros(len(fit.x)))
+
+
+def _sentence(
+    equations: tuple[str, ...],
+    coordinate: str,
+    region: dict[str, tuple[float, float]],
+    recordings: tuple[str, ...],
+    *,
+    everywhere: bool,
+) -> str:
+    where = f"In the equation{'s' if len(equations) > 1 else ''} of {' and '.join(equations)}" if equations else (
+        "In what is measured"
+    )
+    along = {
+        "t": ", along time", "constant": ", everywhere alike", "random": ", at random",
+        "measurement": "", "unknown": "",
+    }.get(coordinate, f", along {coordinate}")  # fmt: skip
+    for name, (lower, upper) in region.items():
+        along += f" from {lower:.3g} to {upper:.3g}" if name == coordinate else ""
+    who = "in every recording" if everywhere else f"mostly in {len(recordings)} recordings"
+    return f"{where}{along}, {who}."

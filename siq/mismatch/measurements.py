@@ -1,0 +1,186 @@
+"""Measurements: recordings laid out for fitting, with the inputs known at every instant that is needed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.interpolate
+import scipy.signal
+
+from siq.mismatch.model import Input, Model, Signals
+from siq.recordings import Recordings
+
+OVERSAMPLING = 16  # of band-limited inputs, between whose dense samples cubics are exact enough
+PADDING = 64  # samples by which they are continued, mirrored, so that the ends do not ring
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """Recordings, one behind the other.
+
+    Attributes
+    ----------
+    labels
+        One per recording.
+    first
+        Row at which each recording begins, and the number of rows; shape ``(recordings + 1,)``.
+    t
+        Times, shape ``(n,)``.
+    outputs
+        What was measured, shape ``(n, m)``, in the order of the model's outputs.
+    courses
+        For each recording the courses of its inputs in time, see `course_of_input`.
+    """
+
+    labels: tuple[str, ...]
+    first: np.ndarray
+    t: np.ndarray
+    outputs: np.ndarray
+    courses: tuple[tuple[scipy.interpolate.PPoly, ...], ...]
+
+    @property
+    def begins(self) -> np.ndarray:
+        """Rows at which an interval between two samples begins, shape ``(n - recordings,)``."""
+        last = self.first[1:] - 1
+        return np.setdiff1d(np.arange(len(self.t)), last, assume_unique=True)
+
+    @property
+    def recording(self) -> np.ndarray:
+        """Place of each row's recording in `labels`."""
+        return np.repeat(np.arange(len(self.labels)), np.diff(self.first))
+
+    def signals(self, t: np.ndarray, recording: np.ndarray, *, delays: Sequence[tuple[int, float]]) -> Signals:
+        """Inputs at instants, each in its recording.
+
+        Parameters
+        ----------
+        t
+            Instants, shape ``(n,)``.
+        recording
+            The place of the recording of each; it never decreases.
+        delays
+            Delayed inputs wanted: the place of the input, and by how much time it lags. What was before a
+            recording is taken to be as it began.
+        """
+        count = len(self.courses[0]) if self.courses else 0
+        inputs = np.empty((count, len(t)))
+        delayed, slopes = np.empty((len(delays), len(t))), np.empty((len(delays), len(t)))
+        bounds = np.searchsorted(recording, np.arange(len(self.labels) + 1))
+        for place, courses in enumerate(self.courses):
+            rows = slice(bounds[place], bounds[place + 1])
+            begin, end = self.t[self.first[place]], self.t[self.first[place + 1] - 1]
+            for index, course in enumerate(courses):
+                inputs[index, rows] = course(t[rows])
+            for index, (which, lag) in enumerate(delays):
+                at = np.clip(t[rows] - lag, begin, end)
+                delayed[index, rows] = courses[which](at)
+                slopes[index, rows] = courses[which](at, 1)
+        return Signals(inputs=inputs, delayed=delayed, slopes=slopes, t=t)
+
+    def select(self, chosen: Sequence[int]) -> Measurements:
+        """Some of the recordings, by their places."""
+        rows = [np.arange(self.first[place], self.first[place + 1]) for place in chosen]
+        together = np.concatenate(rows)
+        return Measurements(
+            labels=tuple(self.labels[place] for place in chosen),
+            first=np.concatenate([[0], np.cumsum([len(each) for each in rows])]),
+            t=self.t[together],
+            outputs=self.outputs[together],
+            courses=tuple(self.courses[place] for place in chosen),
+        )
+
+    def until(self, rows: np.ndarray) -> Measurements:
+        """The first so many rows of each recording, shape ``(recordings,)``; the inputs stay whole."""
+        kept = [np.arange(begin, begin + count) for begin, count in zip(self.first[:-1], rows, strict=True)]
+        together = np.concatenate(kept)
+        return replace(
+            self,
+            first=np.concatenate([[0], np.cumsum(rows)]),
+            t=self.t[together],
+            outputs=self.outputs[together],
+        )
+
+
+def course_of_input(t: np.ndarray, u: np.ndarray, interpolation: str) -> scipy.interpolate.PPoly:
+    """An input as a function of time, from its samples.
+
+    Parameters
+    ----------
+    t, u
+        Times and samples of one recording, shape ``(n,)`` each.
+    interpolation
+        ``zero_order`` holds each sample until the next; ``linear`` joins them; ``band_limited`` takes the
+        one signal without content above half the sampling rate, which needs regular sampling.
+
+    Raises
+    ------
+    ValueError
+        For a band-limited signal that is sampled irregularly.
+    """
+    if len(t) < 2:
+        return scipy.interpolate.PPoly(np.array([[u[0]]]), np.array([t[0], t[0] + 1.0]))
+    if interpolation == "zero_order":
+        return scipy.interpolate.PPoly(np.append(u[:-1], u[-1])[None, :], np.append(t, 2 * t[-1] - t[-2]))
+    if interpolation == "linear":
+        return scipy.interpolate.PPoly(np.stack([np.diff(u) / np.diff(t), u[:-1]]), t)
+    step = np.diff(t)
+    if np.ptp(step) > 1e-3 * step.mean():
+        raise ValueError("a band-limited input is sampled irregularly; resample it, or call it linear")
+    padding = min(PADDING, len(u) - 1)
+    # Mirrored through its end points the signal goes on without a jump and without a kink.
+    left = 2 * u[0] - u[padding:0:-1]
+    right = 2 * u[-1] - u[-2 : -padding - 2 : -1]
+    longer = np.concatenate([left, u, right])
+    line = np.linspace(longer[0], longer[-1], len(longer))
+    dense = scipy.signal.resample(longer - line, OVERSAMPLING * len(longer))
+    dense_t = t[0] + step.mean() * (np.arange(len(dense)) / OVERSAMPLING - padding)
+    slope = (longer[-1] - longer[0]) / (len(longer) - 1) / step.mean()
+    dense += longer[0] + slope * (dense_t - dense_t[0])
+    kept = slice((padding - 1) * OVERSAMPLING if padding else 0, (padding + len(u)) * OVERSAMPLING)
+    return scipy.interpolate.CubicSpline(dense_t[kept], dense[kept])
+
+
+def measurements(recordings: Recordings, model: Model) -> Measurements:
+    """Lay recordings out as the model needs them: its outputs, and the courses of its inputs.
+
+    Parameters
+    ----------
+    recordings
+        Read with the columns of `columns_of`, in this order.
+    model
+        Says what was measured and what drove the system.
+
+    Raises
+    ------
+    ValueError
+        When an input cannot be interpolated as the model says.
+    """
+    count = len(model.outputs)
+    first = np.searchsorted(recordings.recording, np.arange(len(recordings.labels) + 1))
+    return Measurements(
+        labels=recordings.labels,
+        first=first,
+        t=recordings.t,
+        outputs=np.ascontiguousarray(recordings.values[:, :count]),
+        courses=tuple(
+            tuple(
+                _course(recordings, slice(first[place], first[place + 1]), count + k, entry)
+                for k, entry in enumerate(model.inputs)
+            )
+            for place in range(len(recordings.labels))
+        ),
+    )
+
+
+def columns_of(model: Model) -> tuple[str, ...]:
+    """The columns of recordings that a model needs: outputs, then inputs."""
+    return (*model.output_names, *(entry.name for entry in model.inputs))
+
+
+def _course(recordings: Recordings, rows: slice, column: int, entry: Input) -> scipy.interpolate.PPoly:
+    try:
+        return course_of_input(recordings.t[rows], recordings.values[rows, column], entry.interpolation)
+    except ValueError as error:
+        raise ValueError(f"input {entry.name}: {error}") from None

@@ -1,0 +1,147 @@
+"""Studies of mismatch: which simulation, which recordings, which of them are held out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from siq.documents import read_document, validate
+from siq.errors import InputError
+from siq.mismatch.dictionary import Mechanism
+from siq.mismatch.measurements import Measurements, columns_of, measurements
+from siq.mismatch.model import Model
+from siq.mismatch.search import SearchOptions
+from siq.recordings import read_recordings
+
+FEWEST = 8  # samples of a recording that something can be learned from
+
+
+class MismatchStudy(BaseModel):
+    """The schema of ``config/mismatch/NAME.yaml``, and of ``study.yaml`` in the folder of a case.
+
+    Attributes
+    ----------
+    title
+        What the report is headed.
+    system
+        The simulation: name of a system card, or path of one. In the folder of a case it is ``system.yaml``.
+    recordings
+        Path of the long table. In the folder of a case it is ``recordings.parquet`` or ``.csv``.
+    held_out
+        Recordings that take no part in finding anything: their labels, or their share. Where there is only
+        one recording, the share is its last part.
+    noise
+        Standard deviation of the measurement noise by output, where it is known; by default it is estimated.
+    mechanisms
+        Further entries of the dictionary; one of a known name replaces it.
+    without
+        Names of entries that are not to be used.
+    generic
+        Whether a monomial without a name counts as physics; by default only in systems whose states have no
+        roles for which mechanisms have names.
+    degree
+        Highest degree of these monomials.
+    search
+        What counts as found.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    title: str = ""
+    system: str | None = None
+    recordings: str | None = None
+    held_out: tuple[str, ...] | Annotated[float, Field(gt=0, lt=1)] = 0.25
+    noise: dict[str, Annotated[float, Field(gt=0)]] = {}
+    mechanisms: tuple[Mechanism, ...] = ()
+    without: tuple[str, ...] = ()
+    generic: bool | None = None
+    degree: Annotated[int, Field(ge=1, le=5)] = 3
+    search: SearchOptions = SearchOptions()
+
+
+def load_mismatch_study(path: str | Path) -> MismatchStudy:
+    """Read a study of mismatch.
+
+    Raises
+    ------
+    InputError
+        With the line of the first entry that cannot be used.
+    """
+    return validate(read_document(path), MismatchStudy)
+
+
+def read_measurements(path: str | Path, model: Model) -> Measurements:
+    """Read the recordings that a simulation is to be compared with.
+
+    Raises
+    ------
+    InputError
+        For anything in the file that cannot be used, a recording that is too short included.
+    """
+    units = dict(zip(model.states, model.state_units, strict=True))
+    expected = {name: units[str(formula)] for name, formula in model.outputs if str(formula) in units}
+    expected |= {entry.name: entry.unit for entry in model.inputs}
+    expected["t"] = model.time_unit
+    recordings = read_recordings(path, columns=columns_of(model), units=expected)
+    try:
+        data = measurements(recordings, model)
+    except ValueError as error:
+        fault, remedy = str(error).split("; ", 1)
+        raise InputError(path, "", fault, remedy) from None
+    lengths = np.diff(data.first)
+    if (lengths < FEWEST).any():
+        label = data.labels[int((lengths < FEWEST).argmax())]
+        raise InputError(
+            path, f"recording {label}", f"it has fewer than {FEWEST} samples", "leave it out, or join recordings"
+        )
+    return data
+
+
+def split(data: Measurements, study: MismatchStudy, *, file: str) -> tuple[Measurements, Measurements]:
+    """Recordings to learn from, and those held out.
+
+    Raises
+    ------
+    InputError
+        When a label is unknown, or nothing is left on one side.
+    """
+    count = len(data.labels)
+    if isinstance(study.held_out, float):
+        if count == 1:
+            return _cut(data, study.held_out)
+        # Spread over all of them, so that a drift of the experiment is in both parts.
+        out = min(max(round(study.held_out * count), 1), count - 1)
+        chosen = set(np.linspace(0, count - 1, 2 * out + 1).round().astype(int)[1::2].tolist())
+    else:
+        for label in study.held_out:
+            if label not in data.labels:
+                raise InputError(
+                    file, "held_out", f"no recording is called '{label}'", f"use labels such as {data.labels[0]}"
+                )
+        chosen = {data.labels.index(label) for label in study.held_out}
+        if not chosen or len(chosen) == count:
+            raise InputError(file, "held_out", "one side of the split is empty", "hold out some, not all")
+    return (
+        data.select([place for place in range(count) if place not in chosen]),
+        data.select(sorted(chosen)),
+    )
+
+
+def _cut(data: Measurements, share: float) -> tuple[Measurements, Measurements]:
+    """The first part of a single recording, and its last."""
+    rows = len(data.t)
+    at = min(max(round((1 - share) * rows), FEWEST), rows - FEWEST)
+    if at < FEWEST:
+        at = rows // 2
+    first = data.until(np.array([at]))
+    last = Measurements(
+        labels=data.labels,
+        first=np.array([0, rows - at]),
+        t=data.t[at:],
+        outputs=data.outputs[at:],
+        courses=data.courses,
+    )
+    return first, last
