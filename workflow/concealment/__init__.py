@@ -1,0 +1,1 @@
+"""Concealed cases: recordings whose simulation lacks something, and keys; knows nothing of siq."""
