@@ -8,6 +8,7 @@ by node. Nothing is ever evaluated as code.
 from __future__ import annotations
 
 import ast
+import builtins
 import difflib
 from collections.abc import Callable, Collection, Mapping, Sequence
 
@@ -247,7 +248,8 @@ def compile_values(
         modules=[{"integer_power": _integer_power}, "numpy"],
         printer=_ProductPrinter(),
         cse=True,
-        dummify=True,
+        # Renaming is slow, and needed only for names that the generated code may use itself.
+        dummify=any(hasattr(np, str(each)) or hasattr(builtins, str(each)) for each in variables),
     )
 
 

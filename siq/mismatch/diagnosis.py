@@ -17,7 +17,7 @@ from siq.mismatch.estimation import Fit, first_noise, first_states, fit
 from siq.mismatch.measurements import Measurements
 from siq.mismatch.model import Model
 from siq.mismatch.roles import Roles, roles_of
-from siq.mismatch.search import Search, best_fit, process_noise_needed, search
+from siq.mismatch.search import Search, best_fit, search
 from siq.mismatch.structure import Structure, structure_of
 from siq.mismatch.study import MismatchStudy
 
@@ -102,11 +102,11 @@ def diagnose(
     monomials = [c for c in generic_candidates(model, roles, degree=study.degree) if c.coordinate != "constant"]
     if generic:
         candidates += monomials
-    loose, recalibrated = recalibrate(model, data)
+    recalibrated = recalibrate(model, data)
     found = search(model, data, recalibrated, candidates, options=study.search)
     after = structure_of(found.fit.model, data, found.fit, roles)
     before = structure_of(model, data, recalibrated, roles, level=0.0)
-    explained = explained_share(before.total, before.freedom, loose, found.fit, data, roles)
+    explained = explained_share(before, structure_of(found.fit.model, data, found.fit, roles, level=0.0))
     random = found.fit.has_process_noise
     p_shift = shift_probability(model, recalibrated)
     remarks: list[str] = []
@@ -143,8 +143,8 @@ def diagnose(
     )
 
 
-def recalibrate(model: Model, data: Measurements) -> tuple[Fit, Fit]:
-    """Fit the simulation's own parameters: with process noise, and the simpler of this and without.
+def recalibrate(model: Model, data: Measurements) -> Fit:
+    """Fit the simulation's own parameters, with process noise where the data ask for it.
 
     Raises
     ------
@@ -156,19 +156,21 @@ def recalibrate(model: Model, data: Measurements) -> tuple[Fit, Fit]:
     loose = fit(model, data, x=x, noise=noise, estimate_process=True)
     if not np.isfinite(loose.sum_of_squares):
         raise NumericalFailure("the simulation has no value at the recorded states; check the card's equations")
-    best = best_fit(loose.model, data, loose)
-    return loose, best
+    return best_fit(loose.model, data, loose)
 
 
-def explained_share(
-    total: float, freedom: int, loose: Fit, final: Fit, data: Measurements, roles: Roles
-) -> float:
-    """Share of the excess over measurement noise that the final simulation explains, without process noise."""
-    del loose
-    after = structure_of(final.model, data, final, roles, level=0.0, choose=lambda each: False)
-    # Both in units of the measurement noise of their own fit.
-    excess = max(total - freedom, 1e-300)
-    return float(np.clip(1 - max(after.total - after.freedom, 0.0) / excess, 0.0, 1.0))
+def explained_share(before: Structure, after: Structure) -> float:
+    """Share of the excess over measurement noise that the final simulation explains, without process noise.
+
+    What is left is the excess that remains, or what a function of one coordinate still finds: where a fit
+    without process noise takes a misfit for noise, only the latter shows it.
+    """
+    if not before.total > before.freedom:
+        return 1.0
+    best = after.curves[0] if after.curves else None
+    systematic = 0.0 if best is None else best.gain - 2 * len(best.direction.knots)
+    left = max(after.total - after.freedom, systematic, 0.0)
+    return float(np.clip(1 - left / (before.total - before.freedom), 0.0, 1.0))
 
 
 def shift_probability(model: Model, recalibrated: Fit) -> float:
@@ -185,5 +187,3 @@ def shift_probability(model: Model, recalibrated: Fit) -> float:
     along = vectors[:, kept].T @ (difference / scale) / np.sqrt(values[kept])
     return float(scipy.stats.chi2.sf(float(along @ along), int(kept.sum())))
 
-
-__all__ = ["Diagnosis", "diagnose", "process_noise_needed", "recalibrate", "shift_probability"]

@@ -16,7 +16,7 @@ import numpy as np
 import scipy.linalg
 import scipy.optimize
 
-from siq.mismatch.kernels import smoothed_states, whitened_innovations
+from siq.mismatch.kernels import noise_likelihood, smoothed_states, whitened_innovations
 from siq.mismatch.linearisation import Grid, Linearisation, linearise, substeps_needed
 from siq.mismatch.measurements import Measurements
 from siq.mismatch.model import Model
@@ -198,19 +198,6 @@ def process_covariance(transition: np.ndarray, step: np.ndarray, intensity: np.n
     return total * (step / 6)[:, None, None]
 
 
-def explained(columns: np.ndarray, target: np.ndarray) -> float:
-    """Sum of squares of a target that columns explain; like `solve`, and quicker."""
-    if columns.shape[1] == 0:
-        return 0.0
-    gram, overlap = columns.T @ columns, columns.T @ target
-    scale = np.sqrt(np.diag(gram))
-    scale = np.where(scale > 0, scale, np.inf)
-    values, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
-    along = vectors.T @ (overlap / scale)
-    kept = values > RANK * max(values[-1], 1e-300)
-    return float((along[kept] ** 2 / values[kept]).sum())
-
-
 def solve(columns: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Least squares with columns of any scale; what the data do not tell is left alone.
 
@@ -315,9 +302,19 @@ def estimate_noise(linearisation: Linearisation, data: Measurements, start: Nois
 
 def log_likelihood(linearisation: Linearisation, data: Measurements, noise: Noise) -> float:
     """Restricted log-likelihood along the trajectories in hand, the parameters at their best."""
-    white = whiten(linearisation, data, noise)
-    total = float(white.innovations @ white.innovations)
-    return white.log_likelihood(total - explained(white.columns, white.innovations))
+    total, log_determinant, freedom = noise_likelihood(
+        data.first,
+        linearisation.transition,
+        linearisation.response,
+        linearisation.gap,
+        linearisation.measured,
+        linearisation.measured_response,
+        linearisation.residual,
+        np.append(np.diff(data.t), 0.0),
+        noise.measurement,
+        noise.process,
+    )
+    return -0.5 * (total + log_determinant + freedom * np.log(2 * np.pi))
 
 
 def fit(

@@ -223,7 +223,7 @@ class CompiledModel:
         """Derivatives of f by states and by free parameters: ``(d, d, n)`` and ``(d, p, n)``."""
         d, _, p = self._shapes
         flat = _stacked(self._slopes, d * d + d * p, x, signals, values)
-        return flat[: d * d].reshape(d, d, -1), flat[d * d :].reshape(d, p, -1)
+        return flat[: d * d].reshape(d, d, x.shape[1]), flat[d * d :].reshape(d, p, x.shape[1])
 
     def output_slopes(
         self, x: np.ndarray, signals: Signals, values: np.ndarray
@@ -231,7 +231,7 @@ class CompiledModel:
         """Derivatives of h by states and by free parameters: ``(m, d, n)`` and ``(m, p, n)``."""
         d, m, p = self._shapes
         flat = _stacked(self._output_slopes, m * d + m * p, x, signals, values)
-        return flat[: m * d].reshape(m, d, -1), flat[m * d :].reshape(m, p, -1)
+        return flat[: m * d].reshape(m, d, x.shape[1]), flat[m * d :].reshape(m, p, x.shape[1])
 
 
 def delays_of(formulas: Sequence[sympy.Expr]) -> tuple[sympy.Expr, ...]:

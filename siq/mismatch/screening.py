@@ -8,7 +8,7 @@ noise: where physics is missing the fit had to admit such noise, and the right p
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.stats
@@ -43,12 +43,27 @@ class Screened:
     standard_errors: np.ndarray
 
 
-def probe_response(
-    model: Model, data: Measurements, fit: Fit, columns: Columns, *, substeps: int | None = None
-) -> Linearisation:
-    """Linearise along the trajectories of a fit, with the columns of probes behind those of parameters."""
-    grid = Grid(data, substeps or fit.substeps)
-    return linearise(model, grid, fit.model.values, fit.x, columns=columns)
+def probe_response(model: Model, grid: Grid, fit: Fit, columns: Columns) -> Linearisation:
+    """The linearisation of a fit, with the columns of probes behind those of its parameters.
+
+    Parameters
+    ----------
+    model, fit
+        The simulation and its fit.
+    grid
+        On which the columns are worked out; it may be coarser than that of the fit.
+    columns
+        The probes.
+    """
+    coarse = linearise(model, grid, fit.model.values, fit.x, columns=columns)
+    known, parameters = fit.linearisation, len(fit.model.free)
+    return replace(
+        known,
+        response=np.concatenate([known.response, coarse.response[:, :, parameters:]], axis=2),
+        measured_response=np.concatenate(
+            [known.measured_response, coarse.measured_response[:, :, parameters:]], axis=2
+        ),
+    )
 
 
 def projected(white: Whitened, parameters: int) -> tuple[np.ndarray, np.ndarray]:

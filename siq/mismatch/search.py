@@ -26,6 +26,7 @@ from siq.mismatch.probes import Probe, ProbeColumns, probes_of
 from siq.mismatch.screening import Screened, cluster_test, probe_response, screen
 
 LOGGER = logging.getLogger(__name__)
+PROBE_SUBSTEPS = 2  # what a little of a mechanism does need not be known to many digits
 EDGE_SUBSTEPS = 6  # between samples, for models whose f jumps
 
 
@@ -220,9 +221,9 @@ def screen_all(
         probes += probes_of(spread, data, model, current.x)
     if not probes:
         return []
-    grid = Grid(data, substeps)
+    grid = Grid(data, min(substeps, PROBE_SUBSTEPS))
     columns = ProbeColumns(model, grid, probes, current.x, current.model.values)
-    response = probe_response(model, data, current, columns)
+    response = probe_response(model, grid, current, columns)
     ends = np.cumsum([probe.width for probe in probes])
     groups = [slice(end - probe.width, end) for probe, end in zip(probes, ends, strict=True)]
     positive = [

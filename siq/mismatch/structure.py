@@ -21,6 +21,7 @@ from siq.mismatch.roles import Roles
 from siq.mismatch.screening import probe_response, projected
 
 KNOTS = 9
+SUBSTEPS = 2  # between samples, for the response to these functions
 LAGS = 12  # of autocorrelations
 
 
@@ -195,8 +196,8 @@ def structure_of(
         for each in directions_of(model, roles, data, fit.x)
         if choose is None or choose(each)
     )
-    grid = Grid(data, fit.substeps)
-    response = probe_response(model, data, fit, HatColumns(model, grid, directions))
+    grid = Grid(data, min(fit.substeps, SUBSTEPS))
+    response = probe_response(model, grid, fit, HatColumns(model, grid, directions))
     white = whiten(response, data, fit.noise.scaled(level))
     parameters = len(fit.model.free)
     left, columns = projected(white, parameters)
