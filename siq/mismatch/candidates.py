@@ -318,4 +318,5 @@ def _label(name: str, model: Model, augmented: Model) -> str:
         for (output, before), (_, after) in zip(model.outputs, augmented.outputs, strict=True)
         if before != after
     ]
-    return f"{name} in {', '.join(places or measured)}"
+    new = ", ".join(entry.name for entry in augmented.parameters[len(model.parameters) :])
+    return f"{name} in {', '.join(places)}" if places else f"{name} in {', '.join(measured)}, by {new}"

@@ -13,6 +13,7 @@ from siq.documents import Document, read_document, validate
 from siq.mismatch.cards import augmented_card
 from siq.mismatch.diagnosis import Diagnosis, diagnose
 from siq.mismatch.dictionary import Mechanism, dictionary_of
+from siq.mismatch.estimation import Fit
 from siq.mismatch.measurements import Measurements
 from siq.mismatch.model import Model, build_model
 from siq.mismatch.study import MismatchStudy, load_mismatch_study, read_measurements, split
@@ -60,12 +61,15 @@ class Outcome:
         The content of ``verdict.json``.
     card
         The augmented card, as text.
+    recalibrated
+        The card with its own parameters fitted and nothing added, as text.
     """
 
     diagnosis: Diagnosis
     shown: HeldOut
     verdict: dict[str, Any]
     card: str
+    recalibrated: str
 
 
 def read_case(card: str | Path, recordings: str | Path, study: str | Path | None) -> Case:
@@ -102,10 +106,11 @@ def solve_case(case: Case) -> Outcome:
         process=final.noise.process if diagnosis.process_noise else None,
         scale=final.x.std(axis=0),
     )
-    return Outcome(diagnosis, shown, verdict_of(diagnosis, case.learn, shown), card)
+    recalibrated = augmented_card(case.card, diagnosis.search.recalibrated.model)
+    return Outcome(diagnosis, shown, verdict_of(diagnosis, case.learn, shown), card, recalibrated)
 
 
-def final_fit(diagnosis: Diagnosis):  # noqa: ANN201
+def final_fit(diagnosis: Diagnosis) -> Fit:
     """The fit that the verdict stands on: with mechanisms only where they are physics."""
     return diagnosis.search.fit if diagnosis.verdict == "missing physics" else diagnosis.search.recalibrated
 
@@ -118,7 +123,8 @@ def tables_of(case: Case, outcome: Outcome) -> dict[str, pd.DataFrame]:
     dict
         ``curves`` (what is missing against each coordinate, in the unit of the equation), ``candidates``
         (every probe with its gain), ``held_out`` (recordings and the three simulations), ``forces`` (what
-        the recalibrated simulation lacks at each sample, as far as random forces were admitted).
+        the recalibrated simulation lacks at each sample, as far as random forces were admitted), ``noise``
+        (variance of the measurement noise by output, intensity of random forces by state).
     """
     diagnosis, shown = outcome.diagnosis, outcome.shown
     curves = [
@@ -171,7 +177,24 @@ def tables_of(case: Case, outcome: Outcome) -> dict[str, pd.DataFrame]:
         "candidates": pd.DataFrame(candidates),
         "held_out": pd.concat(rows, ignore_index=True),
         "forces": _forces(case, diagnosis),
+        "noise": _noise(case.model, diagnosis.search.recalibrated, final_fit(diagnosis)),
     }
+
+
+def _noise(model: Model, recalibrated: Fit, final: Fit) -> pd.DataFrame:
+    """Both kinds of noise, of the recalibrated simulation and of the one that the verdict stands on."""
+    return pd.DataFrame(
+        [
+            {"stage": stage, "kind": kind, "name": name, "variance": float(value)}
+            for stage, fit in (("recalibrated", recalibrated), ("final", final))
+            for kind, names, values in (
+                ("measurement", model.output_names, fit.noise.measurement),
+                ("process", fit.model.states, fit.noise.process),
+            )
+            for name, value in zip(names, values, strict=False)
+        ],
+        columns=["stage", "kind", "name", "variance"],
+    )
 
 
 def _forces(case: Case, diagnosis: Diagnosis) -> pd.DataFrame:

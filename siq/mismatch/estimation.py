@@ -4,8 +4,8 @@ The model is fitted with noise in what is measured (variance R) and, where asked
 (intensity Q per time). With Q = 0 this is the least-squares fit of whole trajectories; with Q > 0 it is the
 extended Kalman smoother, iterated to convergence, whose likelihood is that of its innovations. A model that
 lacks physics is fitted with Q > 0 too: the states then follow the data, whatever the model says, and a later
-addition is judged along the right trajectories. Initial states are unknown and enter the likelihood as
-fixed effects (restricted maximum likelihood).
+addition is judged along the right trajectories. Initial states are unknown and enter as fixed effects; the
+variances are those of highest restricted likelihood, which allows for that.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from siq.mismatch.linearisation import Grid, Linearisation, linearise, substeps_
 from siq.mismatch.measurements import Measurements
 from siq.mismatch.model import Model
 
-RANK = 1e-9  # singular values below this share of the largest say nothing
+RANK = 1e-4  # singular values below this share of the largest say nothing
 SMALLEST_STEP = 1 / 64
 NONLINEAR = 0.5  # share of a step's effect that may be unforeseen before the step is shortened
 SETTLED = 1e-4  # change of the innovations, squared and per sample, at which a fit has converged
@@ -69,7 +69,7 @@ class Whitened:
     degrees_of_freedom
         Measured values less initial states.
     log_determinant
-        Of the innovations' covariance, the projection included.
+        Of the innovations' covariance.
     """
 
     innovations: np.ndarray
@@ -80,10 +80,8 @@ class Whitened:
     log_determinant: float
 
     def log_likelihood(self, sum_of_squares: float) -> float:
-        """Restricted log-likelihood where the innovations have the given sum of squares."""
-        return -0.5 * (
-            sum_of_squares + self.log_determinant + self.degrees_of_freedom * np.log(2 * np.pi)
-        )
+        """Log-likelihood where the innovations have the given sum of squares."""
+        return -0.5 * (sum_of_squares + self.log_determinant + self.known.sum() * np.log(2 * np.pi))
 
 
 @dataclass(frozen=True)
@@ -103,7 +101,7 @@ class Fit:
     linearisation
         At `x` and the estimates.
     log_likelihood
-        Restricted; comparable between models of the same states and data.
+        Not the restricted one, which depends on the units in which a model has its states.
     sum_of_squares
         Of the whitened innovations: about `degrees_of_freedom` where the model is right.
     degrees_of_freedom
@@ -159,11 +157,10 @@ def whiten(linearisation: Linearisation, data: Measurements, noise: Noise) -> Wh
     initial = initial.reshape(len(innovations), -1)
     used = 0
     for begin, end in zip(data.first[:-1] * outputs, data.first[1:] * outputs, strict=True):
-        basis, logarithm = _orthonormal(initial[begin:end])
+        basis = _orthonormal(initial[begin:end])
         innovations[begin:end] -= basis @ (basis.T @ innovations[begin:end])
         columns[begin:end] -= basis @ (basis.T @ columns[begin:end])
         used += basis.shape[1]
-        log_determinant += logarithm
     return Whitened(
         innovations=innovations,
         columns=columns,
@@ -486,17 +483,16 @@ def _changed(values: np.ndarray, free: np.ndarray, change: np.ndarray) -> np.nda
     return result
 
 
-def _orthonormal(columns: np.ndarray) -> tuple[np.ndarray, float]:
-    """Orthonormal basis of what columns span, and the logarithm of the determinant of their product."""
+def _orthonormal(columns: np.ndarray) -> np.ndarray:
+    """Orthonormal basis of what columns span."""
     scale = np.sqrt((columns**2).sum(axis=0))
     scale[scale == 0] = 1.0
     basis, triangle = np.linalg.qr(columns / scale)
     values = np.abs(np.diag(triangle))
     if values.min(initial=1.0) <= RANK * values.max(initial=0.0):
         basis, values, _ = np.linalg.svd(columns / scale, full_matrices=False)
-        kept = values > RANK * max(values[0], 1e-300)
-        basis, values = basis[:, kept], values[kept]
-    return basis, 2 * float(np.log(values).sum() + np.log(scale).sum())
+        basis = basis[:, values > RANK * max(values[0], 1e-300)]
+    return basis
 
 
 def _failed(model: Model, x: np.ndarray, noise: Noise, current: Linearisation, substeps: int) -> Fit:

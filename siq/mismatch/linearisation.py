@@ -33,7 +33,7 @@ class Columns(Protocol):
 
 
 MOST_SUBSTEPS = 16
-EDGE = 0.5  # width of a jump, in what its argument passes in a substep
+EDGE = 0.25  # width of a jump, in what its argument passes in a substep
 INSIDE = 1e-9  # share of a substep by which its ends lie inside, where an input jumps between samples
 
 

@@ -27,7 +27,8 @@ from siq.mismatch.screening import Screened, cluster_test, probe_response, scree
 
 LOGGER = logging.getLogger(__name__)
 PROBE_SUBSTEPS = 2  # what a little of a mechanism does need not be known to many digits
-EDGE_SUBSTEPS = 6  # between samples, for models whose f jumps
+PROMISING = 0.25  # of the best gain that screening foresees, below which a candidate is not fitted
+EDGE_SUBSTEPS = 12  # between samples, for models whose f jumps
 
 
 @checked(frozen=True, config=ConfigDict(extra="forbid"))
@@ -282,7 +283,7 @@ def _fit_best(
     ranked = sorted(best.values(), key=lambda each: -each[1].gain)
     trials = []
     for probe, result in ranked[: options.fitted]:
-        if result.gain < options.same:
+        if result.gain < max(options.same, PROMISING * ranked[0][1].gain):
             break
         model = with_start(probe, result, base_model)
         further = model.dimension - base_model.dimension
@@ -296,11 +297,15 @@ def _fit_best(
 
 
 def with_start(probe: Probe, result: Screened, base: Model) -> Model:
-    """The candidate's model with parameters to begin with: those of the base, and what screening found."""
+    """The candidate's model with parameters to begin with: those of the base, and no effect yet.
+
+    What screening found of the amplitudes is a start only where shapes need one: linearised amplitudes can be
+    far off, and a fit that begins there may diverge.
+    """
     candidate = probe.candidate
     known = {parameter.name: parameter.value for parameter in base.parameters}
-    known |= dict(probe.shapes)
-    if candidate.amplitudes:
+    known |= dict.fromkeys(candidate.amplitudes, 0.0) | dict(probe.shapes)
+    if candidate.amplitudes and candidate.shapes:
         known |= dict(zip(candidate.amplitudes, map(float, result.amplitudes), strict=True))
     return candidate.model.with_values(np.array([known[each.name] for each in candidate.model.parameters]))
 
