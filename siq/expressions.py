@@ -230,12 +230,20 @@ def compile_formulas(
 
 
 def compile_values(
-    expressions: Sequence[sympy.Expr], variables: Sequence[sympy.Symbol]
+    expressions: Sequence[sympy.Expr], variables: Sequence[sympy.Symbol], *, common: bool = True
 ) -> Callable[..., Sequence[np.ndarray | float]]:
     """Turn expressions into a function of as many arguments as there are variables.
 
     Compare `compile_formulas`, whose argument is one array: here some variables may be arrays and others,
     such as parameters, numbers.
+
+    Parameters
+    ----------
+    expressions, variables
+        See `compile_formulas`.
+    common
+        Whether parts that several expressions share are worked out once. Finding them takes longer than it
+        saves for a few short ones.
 
     Returns
     -------
@@ -247,7 +255,7 @@ def compile_values(
         list(expressions),
         modules=[{"integer_power": _integer_power}, "numpy"],
         printer=_ProductPrinter(),
-        cse=True,
+        cse=common,
         # Renaming is slow, and needed only for names that the generated code may use itself.
         dummify=any(hasattr(np, str(each)) or hasattr(builtins, str(each)) for each in variables),
     )

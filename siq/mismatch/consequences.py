@@ -46,7 +46,7 @@ class Consequences:
 
 
 def obstacle(models: Sequence[Model]) -> str:
-    """Why equations have no landscape that could be compared, in a sentence; empty where nothing speaks against it."""
+    """Why there are no landscapes to compare, in a sentence; empty where nothing speaks against it."""
     for model in models:
         formulas = list(model.equations)
         if model.inputs:
@@ -61,7 +61,7 @@ def obstacle(models: Sequence[Model]) -> str:
 
 
 def identified(model: Model) -> IdentifiedField:
-    """The vector field of a model at its parameters' values, as the landscape wants it; its errors are not known."""
+    """The vector field of a model at its parameters' values; its errors are not known."""
     symbols = tuple(symbol(name) for name in model.states)
     values = {symbol(entry.name): sympy.Float(entry.value, 17) for entry in model.parameters}
     components = []

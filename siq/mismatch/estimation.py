@@ -258,7 +258,10 @@ def first_noise(model: Model, data: Measurements, x: np.ndarray) -> Noise:
 
 
 def estimate_noise(linearisation: Linearisation, data: Measurements, start: Noise) -> Noise:
-    """The noise of highest restricted likelihood along the trajectories in hand, parameters projected out.
+    """The noise of highest restricted likelihood along the trajectories in hand.
+
+    The parameters are those that are best for the noise that the search begins with: they depend little on
+    it, and a fit returns here once they have settled.
 
     Parameters
     ----------
@@ -271,6 +274,8 @@ def estimate_noise(linearisation: Linearisation, data: Measurements, start: Nois
     """
     driven = np.flatnonzero(start.process > 0)
     outputs = len(start.measurement)
+    white = whiten(linearisation, data, start)
+    linearisation = _with_parameters_changed(linearisation, solve(white.columns, white.innovations)[0])
 
     def noise_at(logarithms: np.ndarray) -> Noise:
         process = np.zeros_like(start.process)
@@ -288,13 +293,24 @@ def estimate_noise(linearisation: Linearisation, data: Measurements, start: Nois
     bounds = [(best[k] - 12.0, best[k] + 12.0) for k in range(outputs)]
     bounds += [(np.log(LOWEST), 12.0)] * len(driven)
     found = scipy.optimize.minimize(
-        cost, best, method="L-BFGS-B", bounds=bounds, options={"maxiter": 30, "ftol": 1e-7, "eps": 1e-3}
+        cost, best, method="L-BFGS-B", bounds=bounds, options={"maxiter": 12, "ftol": 1e-7, "eps": 1e-3}
     )
     logarithms = found.x if found.fun <= cost(best) else best
     noise = noise_at(logarithms)
     gone = logarithms[outputs:] <= np.log(LOWEST) + 1
     noise.process[driven[gone]] = 0.0
     return noise
+
+
+def _with_parameters_changed(linearisation: Linearisation, change: np.ndarray) -> Linearisation:
+    """The linearisation after a change of the parameters, which are then no longer free."""
+    return replace(
+        linearisation,
+        gap=linearisation.gap + linearisation.response @ change,
+        residual=linearisation.residual - linearisation.measured_response @ change,
+        response=np.zeros((*linearisation.gap.shape, 0)),
+        measured_response=np.zeros((*linearisation.residual.shape, 0)),
+    )
 
 
 def log_likelihood(linearisation: Linearisation, data: Measurements, noise: Noise) -> float:
@@ -354,7 +370,7 @@ def fit(
     before: np.ndarray | None = None
     converged, settled_noise = False, False
     for iteration in range(iterations):
-        if iteration < 3 or settled_noise:
+        if iteration in (0, 2) or settled_noise:
             noise = _noise_along(current, data, noise, estimate_process)
         white = whiten(current, data, noise)
         change, _ = solve(white.columns, white.innovations)
@@ -429,17 +445,16 @@ def state_changes(
     """Most probable changes of all states, shape ``(n, d)``, given those of the parameters, ``(p,)``."""
     step = np.append(np.diff(data.t), 0.0)
     process = process_covariance(linearisation.transition, step, noise.process)
-    gap = linearisation.gap + linearisation.response @ change
-    residual = linearisation.residual - linearisation.measured_response @ change
-    empty = np.zeros((*gap.shape, 0))
+    still = _with_parameters_changed(linearisation, change)
+    gap, residual = still.gap, still.residual
     innovations, _, initial, _ = whitened_innovations(
         data.first,
-        linearisation.transition,
-        empty,
+        still.transition,
+        still.response,
         gap,
         process,
-        linearisation.measured,
-        np.zeros((*residual.shape, 0)),
+        still.measured,
+        still.measured_response,
         residual,
         noise.measurement,
     )

@@ -234,7 +234,7 @@ def spread_edges(model: Model, data: Measurements, x: np.ndarray, *, substeps: i
     arguments = sorted((each.args[0] for each in signs), key=str)
     formulas = [evaluable(each, model) for each in arguments]
     signals = data.signals(data.t, data.recording, delays=model.lags(model.values))
-    function = compile_values(formulas, arguments_of(model))
+    function = compile_values(formulas, arguments_of(model), common=False)
     further = np.zeros((model.dimension - x.shape[1], len(x)))  # states that a mechanism brings
     along = function(*x.T, *further, *signals.inputs, *signals.delayed, *signals.slopes, signals.t, *model.values)
     rows = data.begins

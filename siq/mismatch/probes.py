@@ -177,9 +177,10 @@ class _Compiled:
         self.output_entries = [
             (i, j) for i, row in enumerate(outputs) for j, each in enumerate(row) if each != 0
         ]
-        self.rates = compile_values([rates[i][j] for i, j in self.rate_entries], arguments)
-        self.outputs = compile_values([outputs[i][j] for i, j in self.output_entries], arguments)
-        self.memory = compile_values(written[model.dimension : augmented.dimension], arguments)
+        self.rates = compile_values([rates[i][j] for i, j in self.rate_entries], arguments, common=False)
+        self.outputs = compile_values([outputs[i][j] for i, j in self.output_entries], arguments, common=False)
+        further = written[model.dimension : augmented.dimension]
+        self.memory = compile_values(further, arguments, common=False)
 
     def numbers(self, probe: Probe, values: np.ndarray) -> tuple[float, ...]:
         """All parameters: the simulation's, then the mechanism's."""
@@ -234,7 +235,7 @@ def along(text: str, data: Measurements, model: Model, x: np.ndarray) -> np.ndar
     formula = parse_formula(text, model.names)
     signals = data.signals(data.t, data.recording, delays=())
     arguments = [*(symbol(n) for n in model.states), *(symbol(e.name) for e in model.inputs), symbol("t")]
-    value = compile_values([formula], arguments)(*x.T, *signals.inputs, signals.t)[0]
+    value = compile_values([formula], arguments, common=False)(*x.T, *signals.inputs, signals.t)[0]
     return np.broadcast_to(value, data.t.shape)
 
 

@@ -36,7 +36,7 @@ def windows(data: Measurements, length: int) -> Measurements:
 def root_mean_square(
     model: Model, data: Measurements, *, variance: np.ndarray, window: int | None
 ) -> tuple[float, ...]:
-    """Root mean square error of each output of a free run, in its own unit; NaN where the simulation ran away.
+    """Root mean square error of each output of a free run, in its unit; NaN where the simulation ran away.
 
     Parameters
     ----------
@@ -45,10 +45,10 @@ def root_mean_square(
     data
         The recordings.
     variance
-        Of the measurement noise, shape ``(m,)``: how outputs are weighed when the initial state is estimated.
+        Of the measurement noise, shape ``(m,)``: how outputs weigh when the initial state is estimated.
     window
-        Length of the windows into which recordings are cut, each with a prefix of a fifth from which its initial
-        state is estimated; None for whole recordings, with a prefix of `PREFIX` samples.
+        Length of the windows into which recordings are cut, each with a prefix of a fifth from which its
+        initial state is estimated; None for whole recordings, with a prefix of `PREFIX` samples.
     """
     noise = Noise(np.asarray(variance, dtype=float), np.zeros(model.dimension))
     if window is not None:
@@ -58,7 +58,4 @@ def root_mean_square(
         run = free_run(model, data, noise=noise, substeps=SUBSTEPS, prefix=share)
     error = run.outputs[run.scored] - data.outputs[run.scored]
     measured = np.isfinite(data.outputs[run.scored])
-    return tuple(
-        float(np.sqrt(np.mean(error[known, place] ** 2)))
-        for place, known in enumerate(measured.T)
-    )
+    return tuple(float(np.sqrt(np.mean(error[known, place] ** 2))) for place, known in enumerate(measured.T))

@@ -23,10 +23,13 @@ from siq.mismatch.linearisation import Grid, spread_edges
 from siq.mismatch.measurements import Measurements
 from siq.mismatch.model import Model, symbol
 from siq.mismatch.probes import Probe, ProbeColumns, probes_of
+from siq.mismatch.roles import roles_of
 from siq.mismatch.screening import Screened, cluster_test, probe_response, screen
+from siq.mismatch.structure import structure_of
 
 LOGGER = logging.getLogger(__name__)
 PROBE_SUBSTEPS = 2  # what a little of a mechanism does need not be known to many digits
+LEFT = 0.01  # probability that residuals are random, above which no further mechanism is sought
 PROMISING = 0.25  # of the best gain that screening foresees, below which a candidate is not fitted
 EDGE_SUBSTEPS = 12  # between samples, for models whose f jumps
 
@@ -181,9 +184,9 @@ def search(
     remaining = list(candidates)
     screened: list[tuple[Probe, Screened]] = []
     while True:
-        screened = screen_all(base_model, data, current, remaining)
-        if len(found) == options.mechanisms:
+        if found and (len(found) == options.mechanisms or not _something_left(base_model, data, current)):
             break
+        screened = screen_all(base_model, data, current, remaining)
         trials = _fit_best(data, current, base_model, screened, options=options)
         for trial in trials:
             LOGGER.info(
@@ -206,6 +209,11 @@ def search(
             and (rebased := _rebased(each, model, base_model)) is not None
         ]
     return Search(recalibrated=recalibrated, found=tuple(found), fit=current, screened=tuple(screened))
+
+
+def _something_left(model: Model, data: Measurements, current: Fit) -> bool:
+    """Whether it is worth looking for another mechanism."""
+    return current.has_process_noise or structure_of(model, data, current, roles_of(model)).p_value < LEFT
 
 
 def screen_all(
