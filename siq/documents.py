@@ -148,6 +148,8 @@ def _known_keys(model: Any, keys: Keys) -> list[str]:
         # Entries of a mapping of names, such as the states of a card, share one schema.
         found += [option["additionalProperties"] for option in options if option.get("additionalProperties")]
         found += [part for option in options for part in option.get("patternProperties", {}).values()]
+        if isinstance(key, int):
+            found += [option["items"] for option in options if isinstance(option.get("items"), dict)]
         if not found:
             return []
         node = found[0]
