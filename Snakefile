@@ -21,6 +21,10 @@ include: "workflow/rules/collect.smk"
 include: "workflow/rules/invariant.smk"
 include: "workflow/rules/report.smk"
 include: "workflow/rules/reproduce.smk"
+include: "workflow/rules/cases.smk"
+include: "workflow/rules/mismatch.smk"
+include: "workflow/rules/proof_common.smk"
+include: "workflow/rules/proof.smk"
 
 
 report: "workflow/report/workflow.rst"

@@ -36,6 +36,8 @@ from siq.symbolic import SymbolicDecomposition
 ALONE = "only one of the two routes that the study names led to a formula"
 NOTICEABLE = 1e-3  # a stated error above this is worth an explanation
 FAN = 512  # characteristics in search of a caustic
+FAN_TOLERANCE = 1e-7  # of their steps: what is said of a caustic has four digits
+FAN_SPACING = 0.1  # of points along them, the level being at 1: a caustic between two of them is located
 HARMLESS = 1e-6  # a difference of the routes that no error needs to explain
 
 
@@ -245,6 +247,7 @@ def caustic_notes(refined: Refined, outline: Outline, error: float, *, seed: int
         fan = adapted_fan(
             refined.found.field, well.attractor, diffusion=refined.diffusion, level=0.98 * well.level,
             box=_widened(outline.box), generator=np.random.default_rng(seed), most=FAN,
+            tolerance=FAN_TOLERANCE, spacing=FAN_SPACING,
         )  # fmt: skip
         caustic = first_caustic(fan)
         if caustic is not None:

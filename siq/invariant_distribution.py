@@ -6,48 +6,21 @@ paper's archetypal systems, this is therefore the exact invariant density for ev
 leading order as ε → 0: the density has a prefactor that depends on the state, and Z is wrong by a factor of
 order 1 (paper, Eq. eq:invariant_dist).
 
-Integrals over a box are those of `siq.block_quadrature`.
+Integrals over a box are those of `siq.block_quadrature`. A landscape, which is known in part, has
+`siq.landscape.invariant`.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
-import scipy.interpolate
 import scipy.special
 import sympy
 
 from siq.block_quadrature import split_into_blocks
-
-GROUPS = 100  # of walkers, among which the sampling error is estimated
-
-
-@dataclass(frozen=True)
-class MarginalDensity:
-    """The invariant density on a plane of two states, the others integrated out.
-
-    Attributes
-    ----------
-    plane
-        Indices of the two states.
-    intensity
-        ε.
-    x1, x2
-        The grid, shapes ``(n,)`` and ``(m,)``, evenly spaced from edge to edge of the box.
-    values
-        Shape ``(m, n)``: density per unit of the first state and unit of the second; its integral over the
-        box is 1.
-    """
-
-    plane: tuple[int, int]
-    intensity: float
-    x1: np.ndarray
-    x2: np.ndarray
-    values: np.ndarray
+from siq.density_comparison import MarginalDensity
 
 
 def normalisation_bessel(
@@ -192,86 +165,6 @@ def marginal_density(
         elif kept:
             values = values * (density[None, :] if kept[0] == plane[0] else density[:, None])
     return MarginalDensity(plane, intensity, axes[plane[0]], axes[plane[1]], values)
-
-
-@dataclass(frozen=True)
-class DensityComparison:
-    """The histogram of a long simulation beside a marginal density.
-
-    Attributes
-    ----------
-    total_variation
-        ``½ Σ |P_b - Q_b|`` over the bins, Q the samples' shares and P the density's probabilities: from 0
-        to 1, the largest difference in the probability of any union of bins.
-    sampling_floor
-        What total variation to expect of these samples if the density were exact, from the spread among
-        the walkers; NaN with one walker.
-    outside
-        Share of the samples outside the box; it counts as a further bin, of probability 0.
-    x1_edges, x2_edges
-        Edges of the bins, shapes ``(n + 1,)`` and ``(m + 1,)``.
-    histogram
-        Shape ``(m, n)``: the samples' density, in the unit of the marginal density.
-    """
-
-    total_variation: float
-    sampling_floor: float
-    outside: float
-    x1_edges: np.ndarray
-    x2_edges: np.ndarray
-    histogram: np.ndarray
-
-
-def total_variation(density: MarginalDensity, samples: np.ndarray, *, bins: int = 40) -> DensityComparison:
-    """Compare a marginal density with samples of a long stochastic simulation.
-
-    Parameters
-    ----------
-    density
-        The marginal density on a plane.
-    samples
-        Shape ``(d, ..., walkers)``, all d states: what `siq.simulate.simulate_stationary` returns. Walkers
-        count as independent of each other, the samples of one walker do not. Where walkers never leave
-        their well, the floor includes a scatter between wells that the choice of initial states avoids.
-    bins
-        Bins along each of the two states, over the box of the density.
-    """
-    edges = [np.linspace(axis[0], axis[-1], bins + 1) for axis in (density.x1, density.x2)]
-    walkers = samples.shape[-1]
-    groups = min(GROUPS, walkers)
-    chosen = samples[list(density.plane)].reshape(2, -1, walkers)
-    places = [np.searchsorted(edge, x, side="right") - 1 for edge, x in zip(edges, chosen, strict=True)]
-    inside = np.logical_and.reduce([(place >= 0) & (place < bins) for place in places])
-    bin_of = np.where(inside, places[1] * bins + places[0], bins**2)
-    group_of = np.broadcast_to(np.arange(walkers) * groups // walkers, bin_of.shape)
-    width = bins**2 + 1
-    counts = np.bincount((group_of * width + bin_of).ravel(), minlength=groups * width)
-    shares = counts.reshape(groups, width) / np.bincount(group_of.ravel())[:, None]
-    observed = np.bincount(bin_of.ravel(), minlength=width) / bin_of.size
-    expected = np.append(_bin_probabilities(density, edges), 0.0)
-    # The mean of |x| for a normal x is sqrt(2/π) times its standard deviation.
-    errors = shares.std(axis=0, ddof=1) / math.sqrt(groups) if groups > 1 else np.full(width, np.nan)
-    area = (edges[0][1] - edges[0][0]) * (edges[1][1] - edges[1][0])
-    return DensityComparison(
-        total_variation=float(np.abs(observed - expected).sum() / 2),
-        sampling_floor=float(math.sqrt(2 / math.pi) * errors.sum() / 2),
-        outside=float(observed[-1]),
-        x1_edges=edges[0],
-        x2_edges=edges[1],
-        histogram=observed[:-1].reshape(bins, bins) / area,
-    )
-
-
-def _bin_probabilities(density: MarginalDensity, edges: Sequence[np.ndarray]) -> np.ndarray:
-    """Integrals of the density over the bins, the second state's bins by row, as one flat array."""
-    surface = scipy.interpolate.RectBivariateSpline(density.x1, density.x2, density.values.T)
-    return np.array(
-        [
-            surface.integral(left, right, low, high)
-            for low, high in itertools.pairwise(edges[1])
-            for left, right in itertools.pairwise(edges[0])
-        ]
-    )
 
 
 def _pure_powers(

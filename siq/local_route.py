@@ -27,7 +27,13 @@ MOST_POINTS = 6000  # of one fit
 NEAREST = 600  # descents that start close to the attractor, where recordings leave directions out
 HIGHEST = 0.9  # share of the recorded starts below the level, where no saddle limits it
 SETTLED = 0.01  # change of the level, and of the number of points, with which growing ends
+REPEATED = 1e-4  # of a level: one that was tried before, and from which the next would follow again
 AT_LEVEL = 0.05  # of a level: by so much V of the saddle that set it may change with the next fit
+MOST_ROUNDS = 80  # of growing
+ON_THE_WAY = 1e-6  # relative change of the coefficients with which Gauss–Newton ends before the last level
+STARTS = (0.5, 0.25, 1.0)  # of the networks' level: where the network route starts, one after the other
+NO_SOLUTION = 0.2  # relative residual from which on a start has led nowhere
+FLAT = 1e-6  # of the largest curvature at an attractor: V with a smaller one has no minimum there
 CLOSE = 0.1  # of the recorded box: a saddle so close to the points of the fit has been reached
 
 
@@ -102,8 +108,12 @@ class Region:
         level
             The level.
         """
-        highest = np.maximum.accumulate(values[:, ::-1], axis=1)[:, ::-1]
-        return np.flatnonzero(highest[self.chosen[:, 0], self.chosen[:, 1]] < level)
+        return np.flatnonzero(self.highest(values)[self.chosen[:, 0], self.chosen[:, 1]] < level)
+
+    @staticmethod
+    def highest(values: np.ndarray) -> np.ndarray:
+        """The highest of the values from each place of a descent on, ``(n, k)`` to ``(n, k)``."""
+        return np.maximum.accumulate(values[:, ::-1], axis=1)[:, ::-1]
 
     def points(self, rows: np.ndarray) -> np.ndarray:
         """The states of some rows of `chosen`."""
@@ -211,22 +221,62 @@ def grow_well(
         i, j = np.repeat(np.arange(len(extent)), basis.exponents[index])
         factor = 0.5 if i == j else 1.0
         coefficients[index] = factor * hessian[i, j] * basis.scale[i] * basis.scale[j]
+    values = basis.values(flat) @ coefficients
+    # The first level has points enough for all coefficients.
+    reached = np.sort(region.highest(values.reshape(region.states.shape[:2]))[tuple(region.chosen.T)])
+    level = float(reached[min(4 * basis.size, len(reached) - 1)])
+    return _grown(
+        field, region, saddles, basis, coefficients, diffusion=diffusion, free=free, metric=hessian,
+        level=level, fitted=np.zeros(0, dtype=int), generator=generator,
+    )  # fmt: skip
+
+
+def _grown(
+    field: VectorField,
+    region: Region,
+    saddles: Sequence[Equilibrium],
+    basis: PowerBasis,
+    coefficients: np.ndarray,
+    *,
+    diffusion: np.ndarray,
+    free: np.ndarray,
+    metric: np.ndarray,
+    level: float,
+    fitted: np.ndarray,
+    generator: np.random.Generator,
+) -> Well:
+    """V grown from a start, level by level, to its lowest saddle or to the end of the recorded region.
+
+    Parameters
+    ----------
+    basis, coefficients
+        The start.
+    free
+        Which coefficients may change, as a mask.
+    metric
+        In which distances are measured, shape ``(d, d)``: the Hessian of V at the attractor.
+    level
+        The first one.
+    fitted
+        Rows of ``region.chosen`` on which the start was fitted, as far as it was.
+    field, region, saddles, diffusion, generator
+        As for `grow_well`.
+    """
+    attractor = basis.center
+    flat = region.states.reshape(-1, len(attractor))
     functions = basis.values(flat)
 
     def along(current: np.ndarray) -> np.ndarray:
         return (functions @ current).reshape(region.states.shape[:2])
 
-    tops = np.array([one.position for one in saddles]).reshape(-1, len(extent))
+    tops = np.array([one.position for one in saddles]).reshape(-1, len(attractor))
     width = np.ptp(flat, axis=0)
     values = along(coefficients)
-    # The first level has points enough for all coefficients.
-    reached = np.sort(np.maximum.accumulate(values[:, ::-1], axis=1)[:, ::-1][tuple(region.chosen.T)])
-    level = float(reached[min(4 * basis.size, len(reached) - 1)])
-    residual, points, last, recorded = np.inf, np.zeros((0, len(extent))), False, 0.0
-    places = region.points(np.arange(len(region.chosen))) @ np.linalg.cholesky(hessian)
+    residual, points, last, recorded = np.inf, np.zeros((0, len(attractor))), False, 0.0
+    places = region.points(np.arange(len(region.chosen))) @ np.linalg.cholesky(metric)
     spacing = cKDTree(places).query(places, k=2)[0][:, 1]
-    fitted = np.zeros(0, dtype=int)
-    for _ in range(80):
+    ends: list[float] = []
+    for _ in range(MOST_ROUNDS):
         rows = region.below(values, level)
         before = len(fitted)
         if before:  # far from the last fit V is an extrapolation, and may be low by mistake
@@ -238,16 +288,21 @@ def grow_well(
         points = region.points(rows)
         if len(points) < 2 * basis.size:
             raise NumericalFailure(
-                f"only {len(points)} recorded states lead to the attractor near {attractor.position.round(4)}"
+                f"only {len(points)} recorded states lead to the attractor near {attractor.round(4)}"
             )
         equation = equation_at(basis, points, field(points), diffusion=diffusion)
-        solution = gauss_newton(equation, coefficients, free=free, steps=40 if last else 8)
+        steps, tolerance = (40, 1e-13) if last else (8, ON_THE_WAY)
+        solution = gauss_newton(equation, coefficients, free=free, steps=steps, tolerance=tolerance)
         coefficients, residual = solution.coefficients, solution.residual
         values = along(coefficients)
         recorded = float(np.quantile(values[:, 0], HIGHEST))
         limit = min(_lowest(basis.values(tops) @ coefficients, tops, points, width, level), recorded)
         if last and abs(limit - level) < SETTLED * level and len(fitted) <= (1 + SETTLED) * before:
             break
+        if any(abs(limit - one) < REPEATED * level for one in ends):  # from here on in circles
+            break
+        if last:
+            ends.append(level)
         last = GROWTH * level >= limit
         level = limit if last else GROWTH * level
     saddle = None
@@ -257,12 +312,14 @@ def grow_well(
         beside = _distances(tops[nearest : nearest + 1], points, width)[0] < CLOSE
         if abs(heights[nearest] - level) < (4 if beside else 1) * AT_LEVEL * level:
             saddle, level = tops[nearest], float(heights[nearest])
-    if saddle is None and level < (1 - SETTLED) * recorded:
+    # A V that vanishes is a solution too, and the end of what starts far from any other.
+    if not (np.isfinite(residual) and level > 0) or (saddle is None and level < (1 - SETTLED) * recorded):
+        degree = int(basis.exponents.sum(axis=1).max())
         raise NumericalFailure(
-            f"powers of degree {degree} do not follow V from the attractor near"
-            f" {attractor.position.round(4)} up to a saddle"
+            f"powers of degree {degree} do not follow V from the attractor near {attractor.round(4)} up to a"
+            " saddle"
         )
-    return Well(attractor.position, basis, coefficients, level, saddle, residual, points)
+    return Well(attractor, basis, coefficients, level, saddle, residual, points)
 
 
 def _lowest(
@@ -296,8 +353,11 @@ def fit_well(
 ) -> Well:
     """V about an attractor by the network route: from values of V, refined without M.
 
-    Where one formula cannot hold over several wells, the network route takes each for itself, within what
-    the network says is its level.
+    Where one formula cannot hold over several wells, the network route takes each for itself. It starts on
+    the states where the network says that V is low, since networks are worst far out, and which are low is
+    all that it has of them in the end: from there V grows by itself, as in the local route, but with all
+    powers free. Were it fitted on what the network takes for the well, it would have to be compared with the
+    local route at states beyond, where it says nothing.
 
     Parameters
     ----------
@@ -306,27 +366,54 @@ def fit_well(
     field, attractor, region, saddles, diffusion, degree, generator
         As for `grow_well`.
     steps
-        Most steps of Gauss–Newton.
+        Most steps of Gauss–Newton at the start.
+
+    Raises
+    ------
+    NumericalFailure
+        When the networks leave too few states for a start, or no start grows to a well.
     """
     lowest = float(potential(attractor.position[None])[0])
     flat = region.states.reshape(-1, region.states.shape[2])
     along = (potential(flat) - lowest).reshape(region.states.shape[:2])
     tops = np.array([one.position for one in saddles]).reshape(-1, flat.shape[1])
-    heights = potential(tops) - lowest if len(tops) else np.array([np.inf])
-    level = min(float(heights.min()), float(np.quantile(along[:, 0], HIGHEST)))
-    rows = region.below(along, level)
-    if len(rows) > MOST_POINTS:
-        rows = np.sort(generator.choice(rows, MOST_POINTS, replace=False))
-    points = region.points(rows)
-    scale = np.abs(points - attractor.position).max(axis=0) if len(points) else np.ones(flat.shape[1])
-    basis = power_basis(field.symbols, attractor.position, np.where(scale > 0, scale, 1.0), degree=degree)
-    if len(points) < 2 * basis.size:
-        raise NumericalFailure(
-            f"the networks leave only {len(points)} recorded states below the saddle of the attractor near"
-            f" {attractor.position.round(4)}"
-        )
-    start = np.linalg.lstsq(basis.values(points), potential(points) - lowest, rcond=1e-10)[0]
-    equation = equation_at(basis, points, field(points), diffusion=diffusion)
-    solution = gauss_newton(equation, start, steps=steps)
-    nearest = tops[int(np.argmin(heights))] if len(tops) else None
-    return Well(attractor.position, basis, solution.coefficients, level, nearest, solution.residual, points)
+    highest = float(np.quantile(along[:, 0], HIGHEST))
+    level = min(float((potential(tops) - lowest).min(initial=np.inf)), highest)
+    failure: NumericalFailure | None = None
+    for share in STARTS:
+        rows = region.below(along, share * level)
+        if len(rows) > MOST_POINTS:
+            rows = np.sort(generator.choice(rows, MOST_POINTS, replace=False))
+        points = region.points(rows)
+        scale = np.abs(points - attractor.position).max(axis=0, initial=0.0)
+        basis = power_basis(field.symbols, attractor.position, np.where(scale > 0, scale, 1.0), degree=degree)
+        if len(points) < 2 * basis.size:
+            failure = failure or NumericalFailure(
+                f"the networks leave only {len(points)} recorded states below the saddle of the attractor"
+                f" near {attractor.position.round(4)}"
+            )
+            continue
+        start = np.linalg.lstsq(basis.values(points), potential(points) - lowest, rcond=1e-10)[0]
+        equation = equation_at(basis, points, field(points), diffusion=diffusion)
+        solution = gauss_newton(equation, start, steps=steps)
+        start = solution.coefficients
+        metric = basis.hessians(attractor.position[None])[0] @ start
+        curvature = np.linalg.eigvalsh(metric * np.outer(basis.scale, basis.scale))
+        first = float(np.median(basis.values(points) @ start))
+        # V = 0 is a solution too, and what tends to it has a residual as large as itself.
+        if not solution.residual < NO_SOLUTION or curvature[0] <= FLAT * curvature[-1] or first <= 0:
+            failure = NumericalFailure(
+                f"the networks' V leads to none with a minimum at the attractor near"
+                f" {attractor.position.round(4)}"
+            )
+            continue
+        try:
+            return _grown(
+                field, region, saddles, basis, start, diffusion=diffusion,
+                free=np.ones(basis.size, dtype=bool), metric=metric, level=first, fitted=rows,
+                generator=generator,
+            )  # fmt: skip
+        except NumericalFailure as error:
+            failure = error
+    assert failure is not None  # there is at least one start
+    raise failure

@@ -1,4 +1,4 @@
-"""Projection: a decomposition on a plane of its first two states, for drawing."""
+"""Projection: a decomposition on the plane of its first two states, or a landscape of two, for drawing."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from siq.landscape.combined import GlobalQuasipotential
 from siq.plots import ComponentFields
 from siq.symbolic import SymbolicDecomposition
 
@@ -58,4 +59,45 @@ def project(
         quasipotential=2 * values[0],
         exact_quasipotential=None if exact is None else 2 * exact.evaluate(points)[0],
         trajectories=[path[:, :shown] for path in trajectories],
+    )
+
+
+def project_landscape(
+    potential: GlobalQuasipotential,
+    *,
+    domain: np.ndarray,
+    trajectories: Sequence[np.ndarray],
+    resolution: int = 161,
+) -> ComponentFields:
+    """Fields of the formulas of all wells, for two states; NaN where none is believed.
+
+    Parameters
+    ----------
+    potential
+        U over all wells. At each point the formula counts that gives U there.
+    domain
+        Shape ``(2, 2)``: the plane's limits.
+    trajectories
+        States along some trajectories, each of shape ``(k, 2)``.
+    resolution
+        Points along each axis.
+    """
+    x1, x2 = (np.linspace(low, high, resolution) for low, high in domain)
+    x = np.stack(np.meshgrid(x1, x2), axis=-1).reshape(-1, 2)
+    by_well = potential.by_well(x)
+    values = np.where(np.isfinite(by_well), by_well, np.inf)
+    least, which = values.min(axis=0), values.argmin(axis=0)
+    gradient, circulatory = np.full(x.shape, np.nan), np.full(x.shape, np.nan)
+    for index, one in enumerate(potential.local):
+        mine = np.isfinite(least) & (which == index)
+        gradient[mine] = one.well.gradients(x[mine])
+        circulatory[mine] = one.field(x[mine]) + gradient[mine] @ one.diffusion
+    shape = (resolution, resolution)
+    return ComponentFields(
+        x1=x1,
+        x2=x2,
+        minus_gradient=-gradient.T.reshape(2, *shape),
+        circulatory=circulatory.T.reshape(2, *shape),
+        quasipotential=np.where(np.isfinite(least), least, np.nan).reshape(shape),
+        trajectories=list(trajectories),
     )

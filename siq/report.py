@@ -147,6 +147,76 @@ def render_report(content: ReportContent) -> str:
     str
         The page. The same content gives the same page.
     """
+    groups = [
+        (*key, list(rows))
+        for key, rows in itertools.groupby(
+            content.formulas, key=lambda row: (row.method, row.certified, row.reason)
+        )
+    ]
+    template = _environment().get_template("report.html.j2")
+    return template.render(content=content, formula_groups=groups)
+
+
+@dataclass(frozen=True)
+class ReproductionSection:
+    """One place of a publication, with ours beside it.
+
+    Attributes
+    ----------
+    place
+        The place: ``Fig. 8 (fig2b)``.
+    text
+        What it shows, and what of it is not shown here, in paragraphs.
+    tables, figures
+        Its numbers with ours, and our figures.
+    """
+
+    place: str
+    text: Sequence[str] = ()
+    tables: Sequence[ReportTable] = ()
+    figures: Sequence[ReportFigure] = ()
+
+
+@dataclass(frozen=True)
+class ReproductionContent:
+    """All that the page of a reproduction says.
+
+    Attributes
+    ----------
+    title, introduction
+        Title, and paragraphs below it.
+    overview
+        Tables over everything.
+    contradictions
+        Sentences.
+    sections
+        The places of the publication, in its order.
+    commands
+        Command lines that make everything again.
+    language
+        Language of the page, for hyphenation and screen readers.
+    """
+
+    title: str
+    introduction: Sequence[str] = ()
+    overview: Sequence[ReportTable] = ()
+    contradictions: Sequence[str] = ()
+    sections: Sequence[ReproductionSection] = ()
+    commands: Sequence[str] = ()
+    language: str = "en"
+
+
+def render_reproduction(content: ReproductionContent) -> str:
+    """Render a reproduction as one HTML page; all text is escaped."""
+    return render_template("reproduction.html.j2", content)
+
+
+def render_template(name: str, content: object) -> str:
+    """Render a page of its own kind as HTML; all text is escaped, but for what is `markupsafe.Markup`."""
+    return _environment().get_template(name).render(content=content)
+
+
+def _environment() -> Environment:
     environment = Environment(
         loader=PackageLoader("siq"),
         autoescape=True,
@@ -162,13 +232,7 @@ def render_report(content: ReportContent) -> str:
         "unbroken": lambda text: text.replace(" × 10", "\u00a0×\u00a010"),
         "records": lambda frame: list(frame.itertuples(index=False, name=None)),
     }
-    groups = [
-        (*key, list(rows))
-        for key, rows in itertools.groupby(
-            content.formulas, key=lambda row: (row.method, row.certified, row.reason)
-        )
-    ]
-    return environment.get_template("report.html.j2").render(content=content, formula_groups=groups)
+    return environment
 
 
 def _data_address(figure: ReportFigure) -> str:

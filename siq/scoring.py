@@ -6,6 +6,8 @@ the tables with missing values.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import pandas as pd
 
@@ -103,7 +105,7 @@ def summary_table(
     coefficients: pd.DataFrame,
     rrmse: pd.DataFrame,
     prediction: pd.DataFrame,
-    published: dict[str, PublishedFigure],
+    published: Mapping[str, PublishedFigure],
 ) -> pd.DataFrame:
     """Every figure over the runs, beside the exact and the published one.
 
@@ -115,10 +117,10 @@ def summary_table(
     rows: list[dict[str, object]] = []
     for method, errors in rrmse.groupby("method", sort=False):
         for quantity in ("rrmse", "network_error", "stated_error", "support_correct", "certified"):
-            rows.append(_summary(str(method), quantity, errors[quantity].astype("float64"), published))
+            rows.append(summary_row(str(method), quantity, errors[quantity].astype("float64"), published))
         predicted = prediction[prediction["method"] == method]["error"]
         if len(predicted):
-            rows.append(_summary(str(method), "prediction_error", predicted, published))
+            rows.append(summary_row(str(method), "prediction_error", predicted, published))
         chosen = coefficients[coefficients["method"] == method].dropna(subset="estimate")
         runs = chosen["run"].unique()
         for (component, term), group in chosen.groupby(["component", "term"], sort=False):
@@ -127,16 +129,17 @@ def summary_table(
             estimates = group.set_index("run")["estimate"].reindex(runs, fill_value=0.0)
             exact = group["exact"].iloc[0]
             if (estimates != 0).any() or (pd.notna(exact) and exact != 0) or quantity in published:
-                row = _summary(str(method), quantity, estimates, published)
+                row = summary_row(str(method), quantity, estimates, published)
                 row["exact"] = exact
                 row["inclusion_frequency"] = float((estimates != 0).mean())
                 rows.append(row)
     return as_table("summary", rows)
 
 
-def _summary(
-    method: str, quantity: str, values: pd.Series, published: dict[str, PublishedFigure]
+def summary_row(
+    method: str, quantity: str, values: pd.Series, published: Mapping[str, PublishedFigure]
 ) -> dict[str, object]:
+    """A figure over the runs, in the columns of the table `summary`, beside the published one."""
     values = values.dropna()
     figure = published.get(quantity)
     return {

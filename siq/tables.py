@@ -39,6 +39,17 @@ COLUMNS: Mapping[str, Mapping[str, str]] = {
         "simulated_distance": "float64",
         "sampling_floor": "float64",
         "published": "float64",
+        "unknown_at_most": "float64",
+        "simulated_unknown": "float64",
+    },
+    "well_shares": {
+        "run": "int64",
+        "intensity": "float64",
+        "well": "str",
+        "share": "float64",
+        "by_rates": "float64",
+        "simulated": "float64",
+        "changed": "float64",
     },
     "landscape": {
         "run": "int64",

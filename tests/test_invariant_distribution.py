@@ -7,12 +7,12 @@ import pytest
 import scipy.stats
 import sympy
 
+from siq.density_comparison import total_variation
 from siq.errors import NumericalFailure
 from siq.invariant_distribution import (
     marginal_density,
     normalisation_bessel,
     normalisation_quadrature,
-    total_variation,
 )
 from siq.randomness import generator
 from siq.simulate import simulate_stationary

@@ -230,6 +230,41 @@ def test_the_network_route_needs_recorded_states_below_the_saddle() -> None:
         )  # fmt: skip
 
 
+def test_the_network_route_does_not_follow_networks_in_how_far_a_well_reaches() -> None:
+    # Steep along one state and flat along the other: where the network's V is low, V is not, and conversely.
+    known = maier_stein(3)
+    found = outline_of(known)
+    local = grown(known, found, 0, degree=10)
+
+    def distorted(x: np.ndarray) -> np.ndarray:
+        offset = x - local.attractor
+        stretch = np.array([[3.0, 0.8], [0.8, 0.5]])
+        return np.einsum("ni,ij,nj->n", offset, local.hessians(local.attractor[None])[0] * stretch, offset)
+
+    x = local.points[local.values(local.points) < 0.9 * local.level]
+    assert np.linalg.norm(distorted(x) - local.values(x)) > 0.4 * np.linalg.norm(local.values(x))
+    well = fit_well(
+        known.field, found.attractors[0], found.regions[0], found.saddles[0], distorted,
+        diffusion=known.diffusion, degree=10, generator=np.random.default_rng(0),
+    )  # fmt: skip
+    assert well.level == pytest.approx(local.level, rel=0.02)
+    assert np.linalg.norm(well.values(x) - local.values(x)) < 5e-3 * np.linalg.norm(local.values(x))
+
+
+def test_the_network_route_refuses_a_v_that_vanishes() -> None:
+    known = archetype(2)
+    found = outline_of(known)
+
+    def low(x: np.ndarray) -> np.ndarray:
+        return 0.1 * potential_values(known, x)
+
+    with pytest.raises(NumericalFailure, match="none with a minimum"):
+        fit_well(
+            known.field, found.attractors[0], found.regions[0], found.saddles[0], low,
+            diffusion=known.diffusion, degree=4, generator=np.random.default_rng(0),
+        )  # fmt: skip
+
+
 def test_the_formula_of_a_well_has_its_values() -> None:
     known = maier_stein(3)
     well = grown(known, outline_of(known), 0, degree=6)

@@ -1,4 +1,5 @@
 import itertools
+from dataclasses import replace
 
 import matplotlib
 import numpy as np
@@ -6,12 +7,14 @@ import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
-from siq.invariant_distribution import DensityComparison, MarginalDensity
+from siq.density_comparison import DensityComparison, MarginalDensity
 from siq.plots import (
     ComponentFields,
+    Dataset,
     InvariantPanel,
     plot_coefficient_distributions,
     plot_components,
+    plot_dataset,
     plot_error_distribution,
     plot_inclusion,
     plot_invariant_distribution,
@@ -203,7 +206,7 @@ def test_the_invariant_distribution_has_a_column_for_each_intensity() -> None:
     figure = plot_invariant_distribution(panels, states="xyz", units=("mV", "1", "K"))
     assert len(figure.axes) == 6 + 3  # two rows, and a colour bar for each column
     text = words(figure)
-    for label in ("varepsilon = 0.05", "0.5236", "$x$ (mV)", "$z$ (K)", "(per mV per K)", "not simulated"):
+    for label in ("varepsilon$ = $0.05$", "0.5236", "$x$ (mV)", "$z$ (K)", "(per mV per K)", "not simulated"):
         assert label in text
     assert "0.031 (sampling alone: 0.028)" in text
     assert figure.axes[3].collections[1].levels == pytest.approx(np.array([0.1, 0.5, 0.9]))
@@ -216,6 +219,47 @@ def test_without_a_simulation_there_is_one_row() -> None:
     assert len(figure.axes) == 1 + 1
     assert "(per m²)" in words(figure)
     assert "no invariant distribution" in words(plot_invariant_distribution([], states="xy", units="11"))
+
+
+def test_where_the_density_is_not_known_the_plane_is_hatched() -> None:
+    panel = invariant_panel(1e-9)
+    hidden = np.where(panel.density.x1[None, :] > 0.5, np.nan, panel.density.values)
+    partly = InvariantPanel(
+        replace(panel.density, values=hidden), panel.normalisation, panel.comparison, unknown=0.0321
+    )
+    figure = plot_invariant_distribution([partly], states="xyz", units=("1", "1", "1"))
+    assert [len(axes.patches) for axes in figure.axes[:2]] == [1, 1]
+    assert figure.axes[0].get_xlim()[1] < 1
+    text = words(figure)
+    assert "hatched: at most 3.2 %" in text and "10^{-9}" in text
+    whole = plot_invariant_distribution([panel], states="xyz", units=("1", "1", "1"))
+    assert len(whole.axes[0].patches) == 0 and "hatched" not in words(whole)
+
+
+def test_the_dataset_shows_what_the_regression_sees() -> None:
+    points = np.random.default_rng(0).uniform(-1, 1, (500, 2))
+    path = np.column_stack([np.linspace(0, 1, 9), np.zeros(9)])
+    grid = np.linspace(-1, 1, 21)
+    potential = grid[None, :] ** 2 + grid[:, None] ** 2
+    below = (points**2).sum(axis=1) < 0.25
+    data = Dataset([path, path], [path], points, below, (grid, grid), potential, 0.25)
+    figure = plot_dataset(data, states="xy", units=("mV", "1"))
+    left, middle, right = figure.axes
+    assert len(left.lines) == 2 * 2 + 1
+    assert [len(axes.lines[0].get_xdata()) for axes in (middle, right)] == [500, below.sum()]
+    assert [len(axes.collections) for axes in (left, middle, right)] == [0, 1, 1]
+    text = words(figure)
+    for label in (
+        "2 trajectories; dashed: no noise",
+        "500 pairs",
+        f"{100 * below.mean():.3g} %",
+        "(mV)",
+    ):
+        assert label in text
+    unknown = plot_dataset(Dataset([path], [], points), states="xyz", units=("1", "1", "1"))
+    assert "no networks" in words(unknown) and "dashed" not in words(unknown)
+    one_state = plot_dataset(Dataset([path[:, :1]], [], points[:, :1]), states="x", units="1")
+    assert "no plane" in words(one_state)
 
 
 def test_predictions_lie_beside_the_observed_and_their_errors_on_a_logarithmic_axis() -> None:

@@ -7,7 +7,16 @@ import pytest
 import sympy
 
 from siq.formatting import formula_mathml
-from siq.report import FormulaRow, ReportContent, ReportFigure, ReportTable, render_report
+from siq.report import (
+    FormulaRow,
+    ReportContent,
+    ReportFigure,
+    ReportTable,
+    ReproductionContent,
+    ReproductionSection,
+    render_report,
+    render_reproduction,
+)
 
 HOSTILE = "<script>alert('x')</script> & \"quoted\""
 SECTIONS = [
@@ -152,3 +161,27 @@ def test_no_failure_is_told_in_words() -> None:
 def test_the_same_content_gives_the_same_page() -> None:
     assert render_report(ReportContent("A study")) == render_report(ReportContent("A study"))
     assert '<html lang="de">' in render_report(ReportContent("Eine Studie", language="de"))
+
+
+def test_the_page_of_a_reproduction_has_every_place_and_says_nothing_of_runs_that_failed() -> None:
+    table = ReportTable(HOSTILE, pd.DataFrame({"published": [8.87e-4], "ours": [3.5e-11]}))
+    content = ReproductionContent(
+        title=HOSTILE,
+        introduction=["What was published is 2.4 × 10⁻⁷ off."],
+        overview=[table],
+        contradictions=[HOSTILE],
+        sections=[
+            ReproductionSection("Table 1", [HOSTILE], [table, table]),
+            ReproductionSection("Fig. 1", ["shown"], [], [ReportFigure("ours", HOSTILE, PNG, "png")]),
+        ],
+        commands=["snakemake reproduce"],
+    )
+    page = render_reproduction(content)
+    reader = Reader(page)
+    assert "script" not in reader.tags
+    assert all(one.startswith(("#", "data:")) for one in reader.addresses)
+    text = " ".join(reader.text)
+    for said in ("Table 1. ", "Table 3. ", "Figure 1.", "8.870 × 10⁻⁴", "snakemake reproduce"):
+        assert said in text
+    assert reader.tags.count("h2") == 5 and "failed" not in text
+    assert page == render_reproduction(content)

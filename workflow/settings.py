@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from pydantic import TypeAdapter
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, model_validator
 
 from siq.documents import Document, read_document, validate
 from siq.errors import InputError
@@ -19,10 +19,11 @@ from siq.recordings import read_pairs
 from siq.study import Study, check_states, load_published, load_study_system, system_path
 from siq.systems import System, check_name
 
-WORKFLOW_KEYS = ("statistics", "device", "runs_per_training")
+WORKFLOW_KEYS = ("statistics", "device", "runs_per_training", "mismatch", "cases", "keys", "proof")
 SYSTEMS = Path("config/systems")
 STUDIES = Path("config/studies")
 PUBLISHED = Path("config/published")
+PROOFS = Path("config/proof.yaml")
 
 
 @dataclass(frozen=True)
@@ -222,11 +223,69 @@ class Studies(Mapping[str, CheckedStudy]):
         return len(list(iter(self)))
 
 
+class ProofSet(BaseModel):
+    """The schema of an entry of ``config/proof.yaml``: a set of cases that conceal something.
+
+    Attributes
+    ----------
+    cases
+        Their number.
+    seed
+        The same seed makes the same cases.
+    shares
+        Share of each kind.
+    batch
+        Cases that one job takes.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    cases: Annotated[int, Field(ge=1)]
+    seed: Annotated[int, Field(ge=0)]
+    shares: dict[
+        Literal["null", "shift", "mechanism", "process noise", "withheld"],
+        Annotated[float, Field(ge=0, le=1)],
+    ]
+    batch: Annotated[int, Field(ge=1)] = 10
+
+    @model_validator(mode="after")
+    def _whole(self) -> ProofSet:
+        if abs(sum(self.shares.values()) - 1) > 1e-9:
+            raise ValueError(f"the shares sum to {sum(self.shares.values()):g}; make them sum to 1")
+        return self
+
+    def batch_names(self) -> list[str]:
+        """``000``, ``001``, …, one for every batch."""
+        return [f"{number:03d}" for number in range(-(-self.cases // self.batch))]
+
+
+class Proofs(BaseModel):
+    """The schema of ``config/proof.yaml``."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    proof: ProofSet
+    proof_full: ProofSet
+
+
+def load_proofs(path: str | Path = PROOFS) -> dict[str, ProofSet]:
+    """Read the sets of concealed cases.
+
+    Raises
+    ------
+    InputError
+        With the line of the first entry that cannot be used.
+    """
+    checked = validate(read_document(path), Proofs)
+    return {"proof": checked.proof, "proof_full": checked.proof_full}
+
+
 def find_resource(file: str) -> str:
-    """A file of the user's: where it says, or else in the folder that ``SIQ_RESOURCES`` names."""
-    folder = os.environ.get("SIQ_RESOURCES")
-    if folder and not Path(file).exists() and (found := Path(folder) / file).exists():
-        return str(found)
+    """A file of the user's: where it says, or else in a folder of ``SIQ_RESOURCES`` or ``SIQ_RECORDINGS``."""
+    for variable in ("SIQ_RESOURCES", "SIQ_RECORDINGS"):
+        folder = os.environ.get(variable)
+        if folder and not Path(file).exists() and (found := Path(folder) / file).exists():
+            return str(found)
     return file
 
 
@@ -236,7 +295,12 @@ def prepare_environment() -> None:
     Jobs run side by side, each on the threads that its rule names and the same whatever ``--cores`` says;
     the numerical libraries' own threads would only be in each other's way. Training takes and frees arrays
     of some 100 kB all the time, which glibc would return to the system each time: a fifth of every step.
+    Scripts import modules of the workflow by their full names, as the rules do.
     """
+    root = str(Path(__file__).resolve().parents[1])
+    paths = [path for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
+    if root not in paths:
+        os.environ["PYTHONPATH"] = os.pathsep.join([root, *paths])
     os.environ["OMP_NUM_THREADS"] = "1"
     os.environ.setdefault("MALLOC_MMAP_THRESHOLD_", str(2**30))
     os.environ.setdefault("MALLOC_TRIM_THRESHOLD_", str(2**33))

@@ -165,7 +165,7 @@ def simulate_escapes(
     with np.errstate(over="ignore", invalid="ignore"):  # told below
         for index in range(1, steps + 1):
             noise = factor @ generator.standard_normal(x.shape)
-            x = _heun_step(function, x, step, noise)
+            x = heun_step(function, x, step, noise)
             staying = np.ones(x.shape[1], dtype=bool)
             for number, target in enumerate(targets):
                 inside = np.flatnonzero(target.height(x) <= 1)
@@ -184,7 +184,8 @@ def simulate_escapes(
     return EscapeTimes(np.concatenate(times), np.concatenate(reached), x.shape[1], steps * step)
 
 
-def _heun_step(function: Field, x: np.ndarray, step: float, noise: np.ndarray) -> np.ndarray:
+def heun_step(function: Field, x: np.ndarray, step: float, noise: np.ndarray) -> np.ndarray:
+    """One step of Heun's rule; `noise` is ``sqrt(ε) D^(1/2) ΔW``, shape ``(d, walkers)``."""
     first = function(x)
     predicted = x + step * first
     predicted += noise

@@ -30,6 +30,7 @@ REWEIGHTINGS = 4
 STEEP = 3.0  # of the median residual: what is larger counts less and less
 ROUNDING = 1e-16  # of what is usual: |∇V| |f| so close to the attractor says nothing
 FINEST = 1e-5  # residual below which nothing is an outlier
+NEGATIVE = 1e-9  # of the level: V so far below zero is rounding
 NEAR = 2.5  # of the spacing of the points: further away there were no points
 HELD_OUT = 4  # every so manieth point is kept for choosing the degree
 
@@ -90,10 +91,16 @@ class LocalQuasipotential:
         return np.where(believed, self.well.values(x), np.nan)
 
     def reaches(self, x: np.ndarray) -> np.ndarray:
-        """Mask of the points below the level, and among recorded states that lead to the attractor."""
+        """Mask of the points below the level, and among recorded states that lead to the attractor.
+
+        V is zero at the attractor and nowhere lower. Where a formula is, it runs away between two of its
+        points.
+        """
         tree, spacing = self._points
         own, nearest = tree.query(x / self._width)
-        reached: np.ndarray = (self.well.values(x) <= self.well.level) & (own <= NEAR * spacing[nearest])
+        values, level = self.well.values(x), self.well.level
+        reached: np.ndarray = (values <= level) & (values >= -NEGATIVE * level)
+        reached &= own <= NEAR * spacing[nearest]
         if self._others is not None:  # behind the ridge the formula would go on down to the other attractor
             reached &= own < self._others.query(x / self._width)[0]
         return reached

@@ -249,7 +249,7 @@ def _assignments(form: Form, model: Model, roles: Roles) -> Iterator[dict[str, s
         yield {role: name for part in combination for role, name in part.items()}
 
 
-def _order(model: Model):  # noqa: ANN202 (a key function)
+def _order(model: Model):
     places = {name: place for place, name in enumerate(model.states)}
     return lambda name: places.get(name, -1)
 

@@ -98,7 +98,7 @@ def solve_case(case: Case) -> Outcome:
         When the simulation cannot be fitted at all.
     """
     diagnosis = diagnose(case.model, case.learn, case.dictionary, case.study)
-    shown = held_out(diagnosis, case.kept)
+    shown = held_out(diagnosis, case.learn, case.kept)
     final = final_fit(diagnosis)
     card = augmented_card(
         case.card,
@@ -122,7 +122,7 @@ def tables_of(case: Case, outcome: Outcome) -> dict[str, pd.DataFrame]:
     -------
     dict
         ``curves`` (what is missing against each coordinate, in the unit of the equation), ``candidates``
-        (every probe with its gain), ``held_out`` (recordings and the three simulations), ``forces`` (what
+        (what was found, what cannot be told from it, and every probe with what it would gain on top), ``held_out`` (recordings and the three simulations), ``forces`` (what
         the recalibrated simulation lacks at each sample, as far as random forces were admitted), ``noise``
         (variance of the measurement noise by output, intensity of random forces by state).
     """
@@ -145,13 +145,26 @@ def tables_of(case: Case, outcome: Outcome) -> dict[str, pd.DataFrame]:
             curve.direction.knots, curve.values, curve.standard_errors, strict=True
         )
     ]
-    candidates = [
+    candidates: list[dict[str, Any]] = [
+        {
+            "mechanism": trial.candidate.name,
+            "label": trial.candidate.label,
+            "shapes": "",
+            "gain": trial.delta_chi2,
+            "process_noise_level": 1.0,
+            "stage": stage,
+        }
+        for found in diagnosis.search.found
+        for stage, trial in (("found", found.best), *(("same", each) for each in found.indistinguishable))
+    ]
+    candidates += [
         {
             "mechanism": probe.candidate.name,
             "label": probe.candidate.label,
             "shapes": ", ".join(f"{name}={value:.4g}" for name, value in probe.shapes),
             "gain": result.gain,
             "process_noise_level": result.level,
+            "stage": "further",
         }
         for probe, result in diagnosis.search.screened
     ]

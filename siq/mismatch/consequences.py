@@ -21,6 +21,7 @@ from siq.outline import evenly_spread, outline
 ROUGH = (sympy.sign, sympy.Abs, sympy.Max, sympy.Min, sympy.Heaviside, sympy.Piecewise)
 DEGREES = (4, 6, 8)
 LEVELS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0)  # barriers over ε at which escape times are given
+TINY = 1e-100  # what remains of a zero that Newton's method found
 SAME_WELL = 0.5  # of the spread of the states: how far a well may move and keep its name
 WELLS_COLUMNS = ("simulation", "item", "kind", "position", "U", "barrier", "prefactor", "note")
 ESCAPE_COLUMNS = ("transition", "intensity", "simulation", "time")
@@ -211,4 +212,4 @@ def _escapes(barriers: dict[str, dict[str, tuple[float, float]]]) -> list[dict[s
 
 
 def _place(position: np.ndarray) -> str:
-    return "(" + ", ".join(f"{value:.4g}" for value in position) + ")"
+    return "(" + ", ".join(f"{value if abs(value) > TINY else 0:.4g}" for value in position) + ")"

@@ -13,11 +13,11 @@ import scipy.stats
 from siq.errors import NumericalFailure
 from siq.mismatch.candidates import Candidate, candidates_of, generic_candidates
 from siq.mismatch.dictionary import Mechanism
-from siq.mismatch.estimation import Fit, first_noise, first_states, fit
+from siq.mismatch.estimation import Fit, Noise, first_noise, first_states, fit
 from siq.mismatch.measurements import Measurements
 from siq.mismatch.model import Model
 from siq.mismatch.roles import Roles, roles_of
-from siq.mismatch.search import Search, best_fit, search
+from siq.mismatch.search import Search, both_fits, process_noise_needed, search
 from siq.mismatch.structure import Structure, structure_of
 from siq.mismatch.study import MismatchStudy
 
@@ -44,6 +44,8 @@ class Diagnosis:
         Of its states.
     search
         Recalibration, mechanisms found, and the final fit.
+    least_squares
+        The recalibration whose trajectories follow the equations exactly.
     before
         Structure of what the recalibrated simulation does not explain, random forces included.
     after
@@ -64,6 +66,7 @@ class Diagnosis:
     model: Model
     roles: Roles
     search: Search
+    least_squares: Fit
     before: Structure
     after: Structure
     process_noise: bool
@@ -102,11 +105,14 @@ def diagnose(
     monomials = [c for c in generic_candidates(model, roles, degree=study.degree) if c.coordinate != "constant"]
     if generic:
         candidates += monomials
-    recalibrated = recalibrate(model, data)
+    recalibrated, least_squares = recalibrate(model, data)
     found = search(model, data, recalibrated, candidates, options=study.search)
     after = structure_of(found.fit.model, data, found.fit, roles)
-    before = structure_of(model, data, recalibrated, roles, level=0.0)
-    explained = explained_share(before, structure_of(found.fit.model, data, found.fit, roles, level=0.0))
+    # Random forces that stand for missing physics take measurement noise with them; the final fit's is right.
+    still = Noise(found.fit.noise.measurement, np.zeros(model.dimension))
+    before = structure_of(model, data, recalibrated, roles, noise=still)
+    alone = structure_of(found.fit.model, data, found.fit, roles, noise=found.fit.noise.without_process())
+    explained = explained_share(before, alone)
     random = found.fit.has_process_noise
     p_shift = shift_probability(model, recalibrated)
     remarks: list[str] = []
@@ -116,7 +122,8 @@ def diagnose(
     if found.found:
         verdict = "missing physics"
         if structured or random:
-            if explained >= ENOUGH:
+            # Several terms that together fit well, and yet leave structure, are how a false explanation looks.
+            if explained >= ENOUGH and len(found.found) == 1:
                 remarks.append(f"{1 - explained:.2g} of the excess remains, and is not noise.")
             else:
                 verdict = "unexplained"
@@ -133,6 +140,7 @@ def diagnose(
         model=model,
         roles=roles,
         search=found,
+        least_squares=least_squares,
         before=before,
         after=after,
         process_noise=random,
@@ -143,8 +151,8 @@ def diagnose(
     )
 
 
-def recalibrate(model: Model, data: Measurements) -> Fit:
-    """Fit the simulation's own parameters, with process noise where the data ask for it.
+def recalibrate(model: Model, data: Measurements) -> tuple[Fit, Fit]:
+    """Fit the simulation's own parameters: with process noise where the data ask for it, and without.
 
     Raises
     ------
@@ -156,7 +164,10 @@ def recalibrate(model: Model, data: Measurements) -> Fit:
     loose = fit(model, data, x=x, noise=noise, estimate_process=True)
     if not np.isfinite(loose.sum_of_squares):
         raise NumericalFailure("the simulation has no value at the recorded states; check the card's equations")
-    return best_fit(loose.model, data, loose)
+    loose_again, strict = both_fits(loose.model, data, loose)
+    if loose_again is None or (strict.converged and not process_noise_needed(loose_again, strict)):
+        return strict, strict
+    return loose_again, strict
 
 
 def explained_share(before: Structure, after: Structure) -> float:

@@ -25,6 +25,9 @@ RANK = 1e-4  # singular values below this share of the largest say nothing
 SMALLEST_STEP = 1 / 64
 NONLINEAR = 0.5  # share of a step's effect that may be unforeseen before the step is shortened
 SETTLED = 1e-4  # change of the innovations, squared and per sample, at which a fit has converged
+STANDSTILL = 0.005  # change of the sum of squares over four steps, below which a fit moves to no avail
+PATIENCE = 6  # steps before that is asked
+SMOOTHEST = 1e-4  # least measurement noise, as a share of what third differences show
 LOWEST = np.exp(-23.0)  # of a process noise, relative to where the search began; below it there is none
 
 
@@ -236,19 +239,7 @@ def first_states(model: Model, data: Measurements) -> np.ndarray:
 
 def first_noise(model: Model, data: Measurements, x: np.ndarray) -> Noise:
     """Noise to begin with: what third differences show of the outputs, and a drive as large as the motion."""
-    measurement = np.empty(len(model.outputs))
-    for place in range(len(model.outputs)):
-        rough = [
-            np.diff(data.outputs[begin:end, place], n=3)
-            for begin, end in zip(data.first[:-1], data.first[1:], strict=True)
-        ]
-        differences = np.concatenate(rough)
-        differences = differences[np.isfinite(differences)]
-        spread = np.nanvar(data.outputs[:, place])
-        # The variance of the third difference of white noise is 20 times its own.
-        measurement[place] = max(np.mean(differences**2) / 20 if len(differences) else 0.0, 1e-12 * spread)
-        if not measurement[place] > 0:
-            measurement[place] = 1.0
+    measurement = data.roughness
     rows = data.begins
     step = (data.t[rows + 1] - data.t[rows])[:, None]
     process = 0.01 * np.mean((x[rows + 1] - x[rows]) ** 2 / step, axis=0)
@@ -290,7 +281,9 @@ def estimate_noise(linearisation: Linearisation, data: Measurements, start: Nois
     for factor in (1e-2, 1e-4, 1e-6) if len(driven) else ():
         begins.append(np.concatenate([np.zeros(outputs), np.full(len(driven), np.log(factor))]))
     best = min(begins, key=cost)
-    bounds = [(best[k] - 12.0, best[k] + 12.0) for k in range(outputs)]
+    # States that random forces drive could follow every sample; the noise of a sensor never vanishes.
+    least = np.log(SMOOTHEST * data.roughness / start.measurement)
+    bounds = [(min(least[k], 0.0), best[k] + 12.0) for k in range(outputs)]
     bounds += [(np.log(LOWEST), 12.0)] * len(driven)
     found = scipy.optimize.minimize(
         cost, best, method="L-BFGS-B", bounds=bounds, options={"maxiter": 12, "ftol": 1e-7, "eps": 1e-3}
@@ -368,11 +361,14 @@ def fit(
         return _failed(model, x, noise, current, substeps)
     scale = np.maximum(x.std(axis=0), 1e-12 * np.ptp(model.domain, axis=1))
     before: np.ndarray | None = None
+    totals: list[float] = []
     converged, settled_noise = False, False
     for iteration in range(iterations):
         if iteration in (0, 2) or settled_noise:
             noise = _noise_along(current, data, noise, estimate_process)
         white = whiten(current, data, noise)
+        if not np.isfinite(white.columns).all() or not np.isfinite(white.innovations).all():
+            return _failed(model, x, noise, current, substeps)
         change, _ = solve(white.columns, white.innovations)
         left = white.innovations - white.columns @ change
         if before is not None and ((left - before) ** 2).sum() < SETTLED * len(left) * max(
@@ -383,11 +379,19 @@ def fit(
                 break
             settled_noise = True
         before = left
+        totals.append(float((left**2).sum()))
+        if len(totals) > PATIENCE and settled_noise is False and _stands_still(totals):
+            settled_noise = True
+        elif len(totals) > 2 * PATIENCE and _stands_still(totals):
+            converged = True
+            break
         stepped = _step(model, grid, values, x, current, change, free, data, noise, scale)
         if stepped is None:
             break
         values, x, current = stepped
     white = whiten(current, data, noise)
+    if not np.isfinite(white.columns).all() or not np.isfinite(white.innovations).all():
+        return _failed(model, x, noise, current, substeps)
     change, covariance = solve(white.columns, white.innovations)
     # The last change is below the errors; it belongs to the estimate and to the innovations alike.
     left = white.innovations - white.columns @ change
@@ -490,6 +494,12 @@ def _noise_along(
         factor = np.full_like(factor, (left**2).sum() / (known.sum() * share))
         return Noise(noise.measurement * factor, noise.process * factor[0])
     return replace(noise, measurement=noise.measurement * np.maximum(factor, 1e-12))
+
+
+def _stands_still(totals: list[float]) -> bool:
+    """Whether a fit moves without becoming better: where f jumps its derivatives are never exact."""
+    recent = totals[-4:]
+    return max(recent) - min(recent) < STANDSTILL * max(recent)
 
 
 def _changed(values: np.ndarray, free: np.ndarray, change: np.ndarray) -> np.ndarray:

@@ -15,7 +15,6 @@ from typing import Protocol
 import numpy as np
 import sympy
 
-
 from siq.expressions import compile_values
 from siq.mismatch.kernels import carry_linearly
 from siq.mismatch.measurements import Measurements
@@ -33,7 +32,7 @@ class Columns(Protocol):
 
 
 MOST_SUBSTEPS = 16
-EDGE = 0.25  # width of a jump, in what its argument passes in a substep
+EDGE = 0.05  # width of a jump, in what its argument passes in a substep
 INSIDE = 1e-9  # share of a substep by which its ends lie inside, where an input jumps between samples
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from siq.mismatch.diagnosis import Diagnosis
-from siq.mismatch.estimation import Fit, solve, whiten
+from siq.mismatch.estimation import Fit, Noise, solve, whiten
 from siq.mismatch.measurements import Measurements
 from siq.mismatch.structure import Curve, coordinate_values
 
@@ -83,7 +83,7 @@ def locate(diagnosis: Diagnosis, data: Measurements) -> Location | None:
         driven = zip(diagnosis.model.states, diagnosis.search.fit.noise.process, strict=False)
         equations, coordinate, curve = tuple(name for name, q in driven if q > 0), "random", None
     region = visible_region(curve) if curve is not None else {}
-    recordings = affected(diagnosis.search.recalibrated, data)
+    recordings = affected(diagnosis.search.recalibrated, diagnosis.search.fit.noise, data)
     everywhere = len(recordings) == len(data.labels)
     time = (float(data.t.min()), float(data.t.max())) if coordinate == "t" else None
     return Location(
@@ -115,9 +115,10 @@ def visible_region(curve: Curve) -> dict[str, tuple[float, float]]:
     return {curve.direction.coordinate: (float(knots.min()), float(knots.max()))}
 
 
-def affected(recalibrated: Fit, data: Measurements) -> tuple[str, ...]:
+def affected(recalibrated: Fit, noise: Noise, data: Measurements) -> tuple[str, ...]:
     """Recordings whose residuals, random forces not admitted, exceed noise by a fair share of the excess."""
-    white = whiten(recalibrated.linearisation, data, recalibrated.noise.without_process())
+    still = Noise(noise.measurement, np.zeros(recalibrated.model.dimension))
+    white = whiten(recalibrated.linearisation, data, still)
     change, _ = solve(white.columns, white.innovations)
     left = white.innovations - white.columns @ change
     squares = np.bincount(white.recording, left**2, minlength=len(data.labels))

@@ -47,6 +47,27 @@ class Measurements:
         return np.setdiff1d(np.arange(len(self.t)), last, assume_unique=True)
 
     @property
+    def roughness(self) -> np.ndarray:
+        """Variance of each output's measurement noise, from third differences, shape ``(m,)``.
+
+        What the motion itself adds is in it: a noise is hardly larger, and can be much smaller.
+        """
+        result = np.empty(self.outputs.shape[1])
+        for place in range(len(result)):
+            differences = np.concatenate(
+                [
+                    np.diff(self.outputs[begin:end, place], n=3)
+                    for begin, end in zip(self.first[:-1], self.first[1:], strict=True)
+                ]
+            )
+            differences = differences[np.isfinite(differences)]
+            spread = np.nanvar(self.outputs[:, place])
+            # The variance of the third difference of white noise is 20 times its own.
+            rough = np.mean(differences**2) / 20 if len(differences) else 0.0
+            result[place] = max(rough, 1e-12 * spread) or 1.0
+        return result
+
+    @property
     def recording(self) -> np.ndarray:
         """Place of each row's recording in `labels`."""
         return np.repeat(np.arange(len(self.labels)), np.diff(self.first))

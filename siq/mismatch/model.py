@@ -21,6 +21,7 @@ from siq.expressions import FormulaError, compile_values, delay, parse_formula
 from siq.systems import Formula, SystemCard
 
 TIME = sympy.Symbol("t", real=True)
+SMOOTHER = 30.0  # widths of a jump over which its derivative is spread
 
 @dataclass(frozen=True)
 class Input:
@@ -193,13 +194,16 @@ class CompiledModel:
         self._arguments = arguments_of(model)
         written = [evaluable(formula, model) for formula in formulas]
         equations, outputs = written[: model.dimension], written[model.dimension :]
+        # A jump's derivative is a spike. Spread over more than a step it is seen in full by every rule of
+        # integration, and carries deviations across the jump as they are carried in the mean.
+        smooth = [evaluable(formula, model, wider=SMOOTHER) for formula in model.equations]
         states = [symbol(name) for name in model.states]
         free = [symbol(model.parameters[place].name) for place in model.free]
         self._shapes = (model.dimension, len(outputs), len(free))
         self._rates = compile_values(equations, self._arguments)
         self._outputs = compile_values(outputs, self._arguments)
         self._slopes = compile_values(
-            [each.diff(state) for each in equations for state in states]
+            [each.diff(state) for each in smooth for state in states]
             + [by_parameter(each, parameter, delays) for each in equations for parameter in free],
             self._arguments,
         )
@@ -210,11 +214,11 @@ class CompiledModel:
         )
 
     def rates(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> np.ndarray:
-        """f at states ``(d, n)``, for parameters' values ``(p,)``: shape ``(d, n)``."""
+        """F at states ``(d, n)``, for parameters' values ``(p,)``: shape ``(d, n)``."""
         return _stacked(self._rates, self._shapes[0], x, signals, values)
 
     def outputs(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> np.ndarray:
-        """h at states ``(d, n)``: shape ``(m, n)``."""
+        """H at states ``(d, n)``: shape ``(m, n)``."""
         return _stacked(self._outputs, self._shapes[1], x, signals, values)
 
     def slopes(
@@ -252,9 +256,9 @@ def arguments_of(model: Model) -> list[sympy.Symbol]:
     ]
 
 
-def evaluable(formula: sympy.Expr, model: Model) -> sympy.Expr:
-    """A formula with its jumps spread, and with symbols in the place of delayed inputs."""
-    spread = {sympy.sign(at): sympy.tanh(at / width) for at, width in model.edges}
+def evaluable(formula: sympy.Expr, model: Model, *, wider: float = 1.0) -> sympy.Expr:
+    """A formula with its jumps spread, over a multiple of their widths, and symbols for delayed inputs."""
+    spread = {sympy.sign(at): sympy.tanh(at / (wider * width)) for at, width in model.edges}
     return formula.xreplace(spread).xreplace({each: _delayed(k) for k, each in enumerate(model.delays)})
 
 

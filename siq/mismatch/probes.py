@@ -20,6 +20,7 @@ from siq.mismatch.linearisation import Grid
 from siq.mismatch.measurements import Measurements
 from siq.mismatch.model import Model, arguments_of, evaluable, symbol
 
+
 @dataclass(frozen=True)
 class Probe:
     """A candidate with its shapes set; its amplitudes are what the data are asked for.
@@ -105,6 +106,15 @@ class ProbeColumns:
         return [
             begin + (end - begin) * ((node // 3 + (node % 3) / 2) / substeps) for node in range(3 * substeps)
         ]
+
+    def further_states(self, index: int) -> np.ndarray:
+        """The states that a probe brings, at all samples, shape ``(n, k)``."""
+        nodes = self._memory(index)
+        rows = self._grid.rows
+        states = np.zeros((len(self._x), len(nodes[0])))
+        states[rows + 1] = nodes[-1].T
+        states[rows] = nodes[0].T
+        return states
 
     def _memory(self, index: int) -> list[np.ndarray]:
         """The further states of a probe at all nodes, carried along each recording from zero."""

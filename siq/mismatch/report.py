@@ -24,8 +24,8 @@ CAPTIONS = {
     " band leaves zero, something is missing there.",
     "map": "The missing part over the two states along which most of it can be seen, averaged over cells;"
     " grey where there are no recordings.",
-    "candidates": "How much each mechanism of the dictionary would explain of what is left, beside the"
-    " simulation's own parameters.",
+    "candidates": "How much what was found explains, and how much further mechanisms of the dictionary would"
+    " explain on top of it, beside the simulation's own parameters.",
     "held_out": "Held-out recordings with free runs of the three simulations, and the errors of these. A free"
     " run knows the recording's first part and its inputs only; of long recordings the end is shown.",
     "escapes": "Mean escape times from well to well by the law of Eyring and Kramers: without what was found,"
@@ -97,7 +97,7 @@ class Findings:
     dictionary
         The mechanisms that could be named.
     candidates
-        Columns ``mechanism label shapes gain``.
+        Columns ``label shapes gain stage``.
     figures
         SVG files by the names of `CAPTIONS`.
     wells, escape, notes
@@ -322,11 +322,14 @@ def _what_else(findings: Findings) -> MismatchSection:
     table = findings.candidates
     tables = []
     if len(table):
+        words = {"found": "found", "same": "not to be told from it", "further": "on top of what was found"}
         best = table.loc[table.groupby("label")["gain"].idxmax()].sort_values("gain", ascending=False)
-        shown = best[best["gain"] > 0][["label", "shapes", "gain"]].rename(columns={"gain": "gain in χ²"})
+        best = best[best["gain"] > 0].assign(as_what=best["stage"].map(words))
+        shown = best[["label", "as_what", "shapes", "gain"]]
+        shown = shown.rename(columns={"as_what": "as what", "gain": "gain in χ²"})
         tables.append(
             ReportTable(
-                "Candidates by what they would explain of what is left at the end.",
+                "Candidates by what they explain.",
                 shown.reset_index(drop=True),
                 {"shapes": "where a parameter was tried that the mechanism does not depend on linearly"},
                 f"{findings.folder}/candidates.csv",
@@ -360,7 +363,7 @@ def _recalibration(findings: Findings) -> MismatchSection | None:
         {
             "parameter": name, "on the card": entry["before"], "fitted": entry["after"],
             "standard error": entry["standard_error"], "unit": units.get(name, "1"),
-            "change in errors": (entry["after"] - entry["before"]) / entry["standard_error"]
+            "change, in standard errors": (entry["after"] - entry["before"]) / entry["standard_error"]
             if entry["standard_error"] else float("nan"),
         }
         for name, entry in findings.verdict["recalibration"].items()
@@ -394,7 +397,7 @@ def _wells(findings: Findings) -> MismatchSection:
     tables = []
     if len(findings.wells):
         text.insert(0, "U is the quasipotential for the noise of the card; equal names are the same well.")
-        shown = findings.wells.dropna(axis=1, how="all")
+        shown = findings.wells.replace("", None).dropna(axis=1, how="all")
         tables.append(
             ReportTable(
                 "Wells and ways out of them, without what was found and with it.",

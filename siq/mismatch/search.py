@@ -118,7 +118,17 @@ class Search:
 def best_fit(
     model: Model, data: Measurements, begin: Fit, *, level: float = 1.0, x: np.ndarray | None = None
 ) -> Fit:
-    """Fit with process noise estimated, and without; the simpler unless the data speak against it.
+    """Fit with process noise estimated, and without; the simpler unless the data speak against it."""
+    loose, strict = both_fits(model, data, begin, level=level, x=x)
+    if loose is None or (strict.converged and not process_noise_needed(loose, strict)):
+        return strict
+    return loose
+
+
+def both_fits(
+    model: Model, data: Measurements, begin: Fit, *, level: float = 1.0, x: np.ndarray | None = None
+) -> tuple[Fit | None, Fit]:
+    """Fit with process noise estimated, where that was begun with, and without.
 
     Parameters
     ----------
@@ -156,9 +166,7 @@ def best_fit(
         estimate_process=False,
         substeps=substeps,
     )
-    if loose is None or (strict.converged and not process_noise_needed(loose, strict)):
-        return strict
-    return loose
+    return loose, strict
 
 
 def process_noise_needed(loose: Fit, strict: Fit, *, threshold: float = 1e-4) -> bool:
@@ -294,9 +302,12 @@ def _fit_best(
         if result.gain < max(options.same, PROMISING * ranked[0][1].gain):
             break
         model = with_start(probe, result, base_model)
-        further = model.dimension - base_model.dimension
-        x = np.concatenate([current.x, np.zeros((len(current.x), further))], axis=1)
-        trial = best_fit(model, data, current, level=result.level, x=x if further else None)
+        x = current.x
+        if probe.candidate.scales:
+            grid = Grid(data, current.substeps)
+            own = ProbeColumns(base_model, grid, [probe], x, current.model.values)
+            x = np.concatenate([x, own.further_states(0)], axis=1)
+        trial = best_fit(model, data, current, level=result.level, x=x)
         if not trial.converged or not _admissible(trial, probe.candidate):
             continue
         candidate = probe.candidate

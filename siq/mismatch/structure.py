@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.stats
 
-from siq.mismatch.estimation import Fit, solve, whiten
+from siq.mismatch.estimation import Fit, Noise, solve, whiten
 from siq.mismatch.linearisation import Grid
 from siq.mismatch.measurements import Measurements
 from siq.mismatch.model import Model
@@ -174,7 +174,7 @@ def structure_of(
     fit: Fit,
     roles: Roles,
     *,
-    level: float = 1.0,
+    noise: Noise | None = None,
     choose: Callable[[Direction], bool] | None = None,
 ) -> Structure:
     """Describe what a fit leaves.
@@ -185,9 +185,9 @@ def structure_of(
         The simulation, the recordings, and the fit of the one to the other.
     roles
         Of the simulation's states.
-    level
-        Factor on the fit's process noise at which the innovations are taken; 0 shows all that the simulation
-        does not explain, 1 what is not random either.
+    noise
+        At which the innovations are taken; by default the fit's, which shows what is not random. Without
+        process noise they show all that the simulation does not explain.
     choose
         Directions to be tried; by default all.
     """
@@ -198,13 +198,14 @@ def structure_of(
     )
     grid = Grid(data, min(fit.substeps, SUBSTEPS))
     response = probe_response(model, grid, fit, HatColumns(model, grid, directions))
-    white = whiten(response, data, fit.noise.scaled(level))
+    noise = fit.noise if noise is None else noise
+    white = whiten(response, data, noise)
     parameters = len(fit.model.free)
     left, columns = projected(white, parameters)
     freedom = white.degrees_of_freedom - parameters
     total = float(left @ left)
     # Below its measurement noise a fit has no scale of its own; above it errors are as large as they are.
-    scale = max(total / freedom, 1.0) if level == 0 else 1.0
+    scale = 1.0 if noise.process.any() or not fit.has_process_noise else max(total / freedom, 1.0)
     curves, place = [], 0
     for direction in directions:
         own = columns[:, place : place + len(direction.knots)]

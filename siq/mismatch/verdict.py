@@ -14,6 +14,7 @@ from siq.mismatch.estimation import Fit
 from siq.mismatch.held_out import FreeRun, free_run, normalised_rms
 from siq.mismatch.location import Location, locate
 from siq.mismatch.measurements import Measurements
+from siq.mismatch.model import Model
 from siq.mismatch.search import Trial
 
 METRIC = "normalised rms, held-out recordings"
@@ -38,20 +39,40 @@ class HeldOut:
     scores: Mapping[str, float | None]
 
 
-def held_out(diagnosis: Diagnosis, data: Measurements) -> HeldOut:
-    """Show the fit on recordings that had no part in anything."""
+def held_out(diagnosis: Diagnosis, learned: Measurements, data: Measurements) -> HeldOut:
+    """Show the fit on recordings that had no part in anything.
+
+    Parameters
+    ----------
+    diagnosis
+        What was found.
+    learned
+        The recordings that it was found in; they decide which recalibration runs freely best.
+    data
+        The recordings held out.
+    """
     search = diagnosis.search
     noise, substeps = search.recalibrated.noise, max(search.fit.substeps, search.recalibrated.substeps)
+
+    def error_where_learned(model: Model) -> float:
+        error = normalised_rms(learned.outputs, free_run(model, learned, noise=noise, substeps=substeps))
+        return np.inf if error is None else error
+
+    # What fits best with random forces admitted need not be what runs best without.
+    recalibrated = search.recalibrated.model
+    if search.recalibrated.has_process_noise and np.isfinite(diagnosis.least_squares.sum_of_squares):
+        choices = (diagnosis.least_squares.model, recalibrated, diagnosis.model)
+        recalibrated = min(choices, key=error_where_learned)
     models = {
         "before": diagnosis.model,
-        "recalibrated": search.recalibrated.model,
+        "recalibrated": recalibrated,
         "augmented": search.fit.model,
     }
     runs = {name: free_run(model, data, noise=noise, substeps=substeps) for name, model in models.items()}
     scores = {name: normalised_rms(data.outputs, simulated) for name, simulated in runs.items()}
     scored = runs["before"].scored
     spread = np.nanvar(data.outputs[scored], axis=0)
-    floor = np.sqrt(np.mean(noise.measurement / np.where(spread > 0, spread, 1.0)))
+    floor = np.sqrt(np.mean(search.fit.noise.measurement / np.where(spread > 0, spread, 1.0)))
     return HeldOut(**runs, scores={**scores, "noise_floor": float(floor)})
 
 

@@ -7,6 +7,7 @@ column in print, and tells its groups apart for colour-blind readers too.
 from siq.plots.accuracy import plot_error_distribution
 from siq.plots.coefficients import plot_coefficient_distributions
 from siq.plots.components import ComponentFields, plot_components
+from siq.plots.dataset import Dataset, plot_dataset
 from siq.plots.inclusion import plot_inclusion
 from siq.plots.invariant import InvariantPanel, plot_invariant_distribution
 from siq.plots.prediction import plot_prediction
@@ -15,9 +16,11 @@ from siq.plots.training import plot_training
 
 __all__ = [
     "ComponentFields",
+    "Dataset",
     "InvariantPanel",
     "plot_coefficient_distributions",
     "plot_components",
+    "plot_dataset",
     "plot_error_distribution",
     "plot_inclusion",
     "plot_invariant_distribution",

@@ -12,6 +12,8 @@ name: mini
 system: resonator
 runs: 1
 seed: 7
+published: resonator
+invariant: [2.0e-9]
 simulation: {trajectories: 400, pairs: 60, pair_step: 10, interval: 100}
 training:
   widths: [12, 12]
@@ -31,7 +33,7 @@ def tables(fresh_module_project):
     project = fresh_module_project
     project.path("study.yaml").write_text(STUDY)
     project.make("results/mini/report.html")
-    names = ("landscape", "degrees", "landscape_errors", "escape")
+    names = ("landscape", "degrees", "landscape_errors", "escape", "invariant", "well_shares")
     return {name: pd.read_parquet(project.path(f"results/mini/tables/{name}.parquet")) for name in names}
 
 
@@ -63,3 +65,25 @@ def test_the_escape_law_is_that_of_the_simulation(tables):
     ratio = escape["simulated"] / escape["predicted"]
     # The law is the leading order; the barriers are 3.3 and 4.2 ε.
     assert ((ratio > 0.85) & (ratio < 1.35)).all()
+
+
+def test_the_published_formula_is_scored_beside_ours(tables):
+    errors = tables["landscape_errors"]
+    found = errors[errors["source"] == "published formula"]["error"].to_numpy()
+    assert found == pytest.approx([0.144, 0.234, 0.191], abs=2e-3)
+    others = errors[errors["source"] == "published formula, digits not printed"]
+    assert len(others) == 3 * 100 and others["error"].between(0.1, 0.35).all()
+
+
+def test_the_invariant_distribution_over_both_wells_is_that_of_the_simulation(tables):
+    ours, published = tables["invariant"].itertuples()
+    assert (ours.method, published.method) == ("local formulas", "published formula")
+    assert ours.quadrature == pytest.approx(3.25e-5, rel=0.02)
+    assert 0 < ours.simulated_unknown < ours.unknown_at_most < 0.3
+    assert ours.simulated_distance < 0.09 < published.simulated_distance
+    shares = tables["well_shares"]
+    assert shares["share"].sum() == pytest.approx(1) and shares["by_rates"].sum() == pytest.approx(1)
+    # Walkers cross at this ε, and go where the escape times say: there the prefactor counts.
+    assert (shares["changed"] > 0.05).all()
+    away = (shares["simulated"] - shares["by_rates"]).abs()
+    assert (away < (shares["share"] - shares["by_rates"]).abs()).all()

@@ -23,6 +23,7 @@ except InputError as error:
 
 
 FIGURES = {
+    "dataset": "dataset.rst",
     "error_distribution": "error.rst",
     "coefficients_refined": "coefficients.rst",
     "coefficients_regression": "coefficients.rst",
@@ -36,6 +37,7 @@ REPRODUCED = ["archetype3d", "archetype3d-noise", "archetype4d", "resonator"]
 LANDSCAPE_FIGURES = {
     "landscape": "landscape.rst",
     "landscape_errors": "landscape_errors.rst",
+    "landscape_published": "landscape_published.rst",
     "degrees": "degrees.rst",
     "escape": "escape.rst",
 }
@@ -43,7 +45,7 @@ CAPTIONS = FIGURES | {"invariant": "invariant.rst"}
 
 
 wildcard_constraints:
-    study="[A-Za-z0-9][A-Za-z0-9_.-]*",
+    study="(?!blind-test/)[A-Za-z0-9][A-Za-z0-9_.-]*",  # the blind test is no study
     run="[0-9]+",
     block="[0-9]+-[0-9]+",
 

@@ -1,4 +1,15 @@
 # The landscape of every run: equilibria, a formula for each well, barriers, paths; and what it is held against.
+from siq.study import load_published
+from workflow.settings import find_resource
+
+
+def published_mesh_if_any(wildcards):
+    """Input function: the mesh that was published beside the figures, where SIQ_RESOURCES has it."""
+    figures = study_of(wildcards).published()
+    mesh = load_published(figures).mesh if figures is not None else None
+    if mesh is None or not Path(file := find_resource(mesh.file)).is_file():
+        return []
+    return ancient(file)
 
 
 rule landscape:
@@ -56,6 +67,8 @@ rule landscape_errors:
         models=all_runs("results/{study}/runs/{run}/model.json"),
         networks=networks_of_runs("networks.npz"),
         training=networks_of_runs("train.json"),
+        published=published_if_any,
+        mesh=published_mesh_if_any,
     output:
         table="results/{study}/tables/landscape_errors.parquet",
         csv="results/{study}/tables/landscape_errors.csv",
@@ -68,7 +81,7 @@ rule landscape_errors:
     threads: 1
     params:
         code=code("landscape_errors.py"),
-        study=parameters("landscape", "metric"),
+        study=parameters("seed", "landscape", "metric"),
     message:
         "{wildcards.study}: holding the landscapes against the references"
     script:
@@ -109,6 +122,8 @@ rule landscape_figures:
         recordings=all_runs("results/{study}/runs/{run}/recordings.parquet"),
         networks=networks_of_runs("networks.npz"),
         training=networks_of_runs("train.json"),
+        published=published_if_any,
+        mesh=published_mesh_if_any,
     output:
         [figure_output(name) for name in LANDSCAPE_FIGURES],
         expand("results/{{study}}/figures/{name}.png", name=LANDSCAPE_FIGURES),

@@ -9,6 +9,10 @@ rule figures:
         prediction="results/{study}/tables/prediction.parquet",
         models=all_runs("results/{study}/runs/{run}/model.json"),
         recordings=all_runs("results/{study}/runs/{run}/recordings.parquet"),
+        networks=networks_of_runs("networks.npz"),
+        blocks=networks_of_runs("train.json"),
+        fields=of_landscapes("results/{study}/runs/{run}/vector_field.json"),
+        landscapes=of_landscapes("results/{study}/runs/{run}/quasipotential.json"),
         card=card_if_any,
         published=published_if_any,
     output:
@@ -23,7 +27,15 @@ rule figures:
     threads: 1
     params:
         code=code("figures.py"),
-        study=parameters("seed", "metric", "dynamics", "exact", "simulation"),
+        study=parameters(
+            "seed",
+            "metric",
+            "dynamics",
+            "exact",
+            "simulation",
+            "recordings",
+            "regression",
+        ),
         folder="results/{study}/figures",
     message:
         "{wildcards.study}: drawing the figures"
@@ -41,6 +53,7 @@ rule page:
         timings="results/{study}/tables/timings.parquet",
         models=all_runs("results/{study}/runs/{run}/model.json"),
         invariant="results/{study}/tables/invariant.parquet",
+        well_shares="results/{study}/tables/well_shares.parquet",
         figures=expand("results/{{study}}/figures/{name}.png", name=CAPTIONS),
         landscape="results/{study}/tables/landscape.parquet",
         landscape_figures=with_landscape(

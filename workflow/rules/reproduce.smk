@@ -1,13 +1,30 @@
 # Everything in the paper on one page, with ours beside it.
 
 
+def reproduced_studies(wildcards):
+    """Params function: the parameters of all studies that the page speaks of, those of the paper too."""
+    names = [*REPRODUCED, "archetype3d-published", "resonator-published"]
+    keys = ("runs", "simulation", "training", "regression", "dynamics", "metric")
+    return {name: STUDIES[name].parameters(*keys) for name in names}
+
+
+def of_reproduced(method):
+    """Input function: a file of every study that is reproduced."""
+    return lambda wildcards: [getattr(STUDIES[name], method)() for name in REPRODUCED]
+
+
 rule reproduction:
     input:
         summaries=expand("results/{study}/tables/summary.parquet", study=REPRODUCED),
         reports=expand("results/{study}/report.html", study=REPRODUCED),
+        published=of_reproduced("published"),
+        cards=of_reproduced("card"),
+        contents="config/published/contents.yaml",
+        parameters="config/published/parameters.yaml",
         contradictions="config/published/contradictions.yaml",
     output:
         html="results/reproduction.html",
+        csv="results/reproduction.csv",
     log:
         "results/logs/reproduction.log",
     benchmark:
@@ -17,7 +34,8 @@ rule reproduction:
     threads: 1
     params:
         code=code("reproduction.py"),
-        studies=REPRODUCED,
+        names=REPRODUCED,
+        studies=reproduced_studies,
     message:
         "writing the page of the reproduction"
     script:

@@ -1,10 +1,11 @@
-"""The landscape of every run against the references, beside the networks, the regression and the mesh."""
+"""The landscape of every run against the references, beside networks, regression and what was published."""
 
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 import pandas as pd
+import sympy
 
 from siq.decomposition.trained import TrainedNetworks, load_networks
 from siq.field_file import read_field
@@ -14,15 +15,21 @@ from siq.landscape.comparison import (
     compare_estimate,
     compare_overall,
     compare_wells,
+    overall_level,
+    relative_l2,
 )
 from siq.landscape.reference import ReferenceLandscape, read_reference
 from siq.landscape.storage import StoredLandscape, read_landscape
 from siq.model import read_model
+from siq.published import mesh_potential, published_potentials
+from siq.randomness import generator
+from siq.study import load_published
 from siq.symbolic import SymbolicDecomposition
 from siq.systems import diffusion_matrix
 from siq.tables import as_table, concatenate, write_table
 from step import job, position_of
 
+DRAWS = 100  # of the digits that a published formula does not print
 SAME = 0.02  # of the region: attractors of a run so close to the reference's are the same
 
 
@@ -70,6 +77,45 @@ def of_networks(one: TrainedNetworks) -> Potential:
     return lambda x: 2 * one.evaluate(x).potential
 
 
+def of_two(values: np.ndarray, mesh: np.ndarray, level: float) -> Comparison:
+    """An estimate of U against a mesh that is known up to a constant, below a level above its minimum."""
+    exact = mesh - np.nanmin(mesh)
+    inside = np.nan_to_num(exact, nan=np.inf) < level
+    own, exact = values[inside], exact[inside]
+    error = relative_l2(own - np.median(own - exact), exact)
+    return Comparison(f"U < {level:.4g}", int(inside.sum()), 1.0, error)
+
+
+def of_published(
+    source: Any, reference: ReferenceLandscape, study: dict[str, Any], below: float | None
+) -> list[pd.DataFrame]:
+    """The published formula, as printed and with what its rounding leaves open, and the published mesh."""
+    if not source.get("published"):
+        return []
+    published, names = load_published(source.published), study["metric"]["states"]
+    formulas = published_potentials(
+        published.figures, [sympy.Symbol(name, real=True) for name in names], draws=DRAWS,
+        generator=generator(study["seed"], "rounding"),
+    )  # fmt: skip
+    tables = []
+    for number, one in enumerate(formulas):
+        label = "published formula" + (", digits not printed" if number else "")
+        tables.append(as_rows(number - 1, label, compare_estimate(reference, one, below=below)))
+    if source.get("mesh") and published.mesh is not None:
+        mesh = mesh_potential(source.mesh, published.mesh)
+        tables.append(as_rows(-1, "published mesh", compare_estimate(reference, mesh, below=below)))
+        if formulas:  # the paper's own comparison, in its Appendix E
+            level = overall_level(reference) if below is None else below
+            tables.append(
+                as_rows(
+                    -1,
+                    "published formula, against the published mesh",
+                    [of_two(formulas[0](reference.points), mesh(reference.points), level)],
+                )
+            )
+    return tables
+
+
 def main(snakemake: Any) -> None:
     """Run as a rule's script."""
     source, study = snakemake.input, snakemake.params.study
@@ -101,6 +147,7 @@ def main(snakemake: Any) -> None:
             Comparison(f"barrier from A{index + 1}", 1, 1.0, float(one)) for index, one in enumerate(error)
         ]
         tables.append(as_rows(-1, "mesh", [whole, *barriers]))
+    tables += of_published(source, reference, study, below)
     write_table(snakemake.output.table, concatenate("landscape_errors", tables))
 
 

@@ -6,38 +6,26 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import sympy
 
+from landscapes import first_complete
 from siq.decomposition.trained import load_networks
-from siq.field_file import read_field
+from siq.expressions import compile_formulas
 from siq.landscape.comparison import overall_level
 from siq.landscape.reference import ReferenceLandscape, read_reference
-from siq.landscape.storage import StoredLandscape, read_landscape
+from siq.landscape.storage import StoredLandscape
 from siq.model import read_model
 from siq.plots.landscape import plot_error_maps, plot_landscape
 from siq.plots.landscape_curves import plot_degrees, plot_escape
 from siq.plots.saving import save_figure
 from siq.plots.style import sentence_figure
+from siq.published import mesh_potential, published_formula
 from siq.recordings import read_recordings
-from siq.systems import diffusion_matrix
+from siq.study import load_published
 from siq.tables import read_table
 from step import METHODS, job, position_of
 
 GRID = 161
-
-
-def first_complete(
-    fields: list[str], landscapes: list[str], diffusion: Any
-) -> tuple[int, StoredLandscape] | None:
-    """The first run with a U over all wells."""
-    for run, (field, landscape) in enumerate(zip(fields, landscapes, strict=True)):
-        record = read_field(field)
-        if record is None:
-            continue
-        matrix = diffusion_matrix(diffusion, record.found.library.dimension)
-        stored = read_landscape(landscape, field=record.found.field, diffusion=matrix)
-        if stored is not None and stored.quasipotential is not None:
-            return run, stored
-    return None
 
 
 def equilibria_table(data: Mapping[str, Any]) -> pd.DataFrame:
@@ -70,10 +58,41 @@ def error_maps(
         if method == METHODS[0] and one.potential is not None:
             maps[method] = 2 * one.evaluate(np.ascontiguousarray(x.T))[0]
     maps["local formulas"] = stored.quasipotential(x)
-    side = round(len(x) ** 0.5)
+    return shifted(maps, inside, of_any_constant=("networks", METHODS[0]))
+
+
+def published_maps(
+    stored: StoredLandscape, reference: ReferenceLandscape, source: Any, states: list[str], below: float
+) -> dict[str, np.ndarray]:
+    """What was published of U at the points of the reference, below a level, and ours; empty without any."""
+    x, exact = reference.points, reference.values
+    inside = np.nan_to_num(exact, nan=np.inf) < below
+    assert stored.quasipotential is not None
+    if not source.get("published"):
+        return {}
+    published = load_published(source.published)
+    symbols = [sympy.Symbol(name, real=True) for name in states]
+    formula = published_formula(published.figures, "U", symbols)
+    maps = {"characteristics": exact}
+    if source.get("mesh") and published.mesh is not None:
+        maps["published mesh"] = mesh_potential(source.mesh, published.mesh)(x)
+    if formula is not None:
+        maps["published formula"] = compile_formulas([formula], symbols)(np.ascontiguousarray(x.T))[0]
+    if len(maps) == 1:
+        return {}
+    maps["local formulas"] = stored.quasipotential(x)
+    return shifted(maps, inside, of_any_constant=("published mesh", "published formula"))
+
+
+def shifted(
+    maps: dict[str, np.ndarray], inside: np.ndarray, *, of_any_constant: tuple[str, ...]
+) -> dict[str, np.ndarray]:
+    """Maps of the points inside as squares; some shifted to the first by the median of their difference."""
+    side = round(len(inside) ** 0.5)
+    exact = next(iter(maps.values()))
     shown = {}
     for name, values in maps.items():
-        shift = np.nanmedian((values - exact)[inside]) if name in ("networks", METHODS[0]) else 0.0
+        shift = np.nanmedian((values - exact)[inside]) if name in of_any_constant else 0.0
         shown[name] = np.where(inside, values - shift, np.nan).reshape(side, side)
     return shown
 
@@ -84,6 +103,7 @@ def main(snakemake: Any) -> None:
     found = first_complete(source.fields, source.landscapes, study["metric"]["diffusion"])
     landscape = sentence_figure("No run found U over all wells.")
     maps = sentence_figure("There is nothing to compare the landscape with.")
+    published = sentence_figure("No landscape was published.")
     if found is not None and len(found[1].data["states"]) == 2:
         run, stored = found
         assert stored.quasipotential is not None
@@ -109,10 +129,15 @@ def main(snakemake: Any) -> None:
                 own, error_maps(run, stored, reference, source, below), names=recordings.names,
                 units=units, energy_unit="",
             )  # fmt: skip
+            if of_others := published_maps(stored, reference, source, list(recordings.names), below):
+                published = plot_error_maps(
+                    own, of_others, names=recordings.names, units=units, energy_unit=""
+                )
     escape = read_table(source.escape) if source.get("escape") else pd.DataFrame()
     figures = {
         "landscape": landscape,
         "landscape_errors": maps,
+        "landscape_published": published,
         "degrees": plot_degrees(read_table(source.degrees)),
         "escape": plot_escape(escape, time_unit=(study["metric"]["units"] or {}).get("t", "1"))
         if len(escape)

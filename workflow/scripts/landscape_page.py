@@ -12,7 +12,9 @@ CAPTIONS = {
     "landscape": "The quasipotential U over all wells, where its formulas are believed, with attractors,"
     " saddles and paths of least action (solid: uphill, dashed: downhill).",
     "landscape_errors": "U by every source, and its difference from characteristics of the exact vector field"
-    " (the paper: Fig. 5c-e and Appendix E).",
+    " (the paper: fig2b, c to e, and Appendix E).",
+    "landscape_published": "What was published of U, its formula as printed and, where SIQ_RESOURCES has it,"
+    " its mesh, and its difference from characteristics of the exact vector field.",
     "degrees": "Accuracy of the formula about each attractor on points that took no part in the fit, against"
     " its number of terms.",
     "escape": "Mean escape times: the law from what was identified, and direct simulations of the card.",
@@ -91,6 +93,8 @@ def errors_table(errors: pd.DataFrame, folder: Path) -> ReportTable:
         {
             "least covered": "smallest share of the region at which a source says anything",
             "worst everywhere": "of the formulas at every point of the region, believed or not",
+            "source": "networks and regression are ours, by the published method; what was published is only"
+            " scored. The digits of its formula that are not printed were drawn 100 times: one run each",
         },
         f"{folder}/landscape_errors.csv",
         40,

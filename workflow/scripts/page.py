@@ -9,6 +9,7 @@ from typing import Any
 import pandas as pd
 import yaml
 
+from invariant_page import invariant_tables
 from landscape_page import landscape_figures, landscape_tables
 from siq.answer import answer_sentences
 from siq.files import whole_file
@@ -21,6 +22,8 @@ from siq.tables import read_table
 from step import METHODS, job, shown_formula
 
 CAPTIONS = {
+    "dataset": "Trajectories, all recorded states, and those below the level of the regression, by the"
+    " networks of the run shown above (the paper: fig2a; fig1_noisy a).",
     "components": "Trajectories, downhill component −∇V, circulatory component g, exact and identified U of"
     " the run shown above, projected on the first two states (the paper: Fig. 1).",
     "coefficients_refined": "Refined: coefficients of U over the runs, one panel for each term that belongs"
@@ -31,7 +34,8 @@ CAPTIONS = {
     "inclusion_refined": "Refined: how often each term was found, by component.",
     "inclusion_regression": "The same by the published regression.",
     "prediction": "Long-term prediction of unseen trajectories, and its errors (the paper: Fig. 4a).",
-    "invariant": "Invariant distribution from the refined U, and a long simulation (the paper: Fig. 4b-d).",
+    "invariant": "Invariant distribution from the refined U, or from U over all wells where no single formula"
+    " holds, and a long simulation (the paper: fig1b and fig2c, b to d).",
     "training": "Loss on held-out recordings during training, one line a run.",
 }
 SUMMARY_COLUMNS = (
@@ -194,25 +198,6 @@ def certificate_tables(
     ]  # fmt: skip
 
 
-def invariant_tables(invariant: pd.DataFrame, folder: Path) -> list[ReportTable]:
-    """The normalisation of the invariant distribution, where one was asked for."""
-    if invariant.empty:
-        return []
-    shown = invariant.rename(columns=lambda name: name.replace("_", " "))
-    explained = {
-        "bessel": "Z by the paper's closed formula, over all space",
-        "quadrature": "Z by quadrature, over the domain",
-        "simulated distance": "total variation between density and long simulation, on the first two states",
-        "sampling floor": "what this distance is expected to be if the density is exact",
-    }
-    return [
-        ReportTable(
-            "Normalisation Z of the invariant distribution exp(−U/ε)/Z for √ε dW, for each intensity ε.",
-            shown, explained, f"{folder}/invariant.csv",
-        )
-    ]  # fmt: skip
-
-
 def provenance(timings: pd.DataFrame) -> dict[str, str]:
     """With what, and how long."""
     packages = ("siq", "torch", "numpy", "pysindy", "snakemake")
@@ -269,7 +254,7 @@ def main(snakemake: Any) -> None:
             ),
             *certificate_tables(certificates, coefficients, run, method, tables),
             *landscape_tables(source, tables),
-            *invariant_tables(read_table(source.invariant), tables),
+            *invariant_tables(read_table(source.invariant), read_table(source.well_shares), tables),
             ReportTable("Errors by run.", rrmse, {}, f"{tables}/rrmse.csv", rows_shown=50),
             ReportTable("What became of each step of each run.", outcomes, {}, f"{tables}/outcomes.csv", 12),
         ],

@@ -1,0 +1,178 @@
+"""Verdicts on recordings of a driven oscillator whose truth is known."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+from siq.errors import InputError
+from siq.mismatch.case import Outcome, read_case, solve_case
+from siq.mismatch.model import load_model
+
+CARD = {
+    "name": "oscillator",
+    "time_unit": "s",
+    "states": {"x": {"unit": "m", "domain": [-2, 2]}, "v": {"unit": "m/s", "domain": [-4, 4]}},
+    "inputs": {"u": {"unit": "N", "interpolation": "linear"}},
+    "parameters": {
+        "k": {"value": 4.0, "unit": "N/m"},
+        "d": {"value": 0.3, "unit": "N*s/m"},
+        "m": {"value": 1.0, "unit": "kg", "fixed": True},
+    },
+    "equations": {"x": "v", "v": "(-k*x - d*v + u)/m"},
+    "outputs": {"x": "x"},
+}
+STEP, SAMPLES, FINE = 0.15, 120, 20
+Force = Callable[[np.ndarray, np.ndarray, float], np.ndarray]
+
+
+def recordings_of(force: Force, *, count: int = 8, noise: float = 0.01, drive: float = 0.0, seed: int = 1) -> pd.DataFrame:
+    """Driven oscillators of different strength, by small steps of Heun's rule."""
+    generator = np.random.default_rng(seed)
+    t = np.arange(SAMPLES) * STEP
+    strength = np.geomspace(0.4, 2.0, count)[:, None]
+    phase = generator.uniform(0, 2 * np.pi, size=(count, 4, 1))
+    omega = generator.uniform(0.8, 3.0, size=(count, 4, 1))
+    u = strength * np.cos(omega * t + phase).sum(axis=1)
+    state = np.stack([generator.normal(size=count) * 0.3, np.zeros(count)])
+    seen = np.empty((count, SAMPLES))
+    h = STEP / FINE
+
+    def rate(y: np.ndarray, now: float, at: float) -> np.ndarray:
+        left = np.minimum(int(at), SAMPLES - 2)
+        push = u[:, left] + (u[:, left + 1] - u[:, left]) * (at - left)
+        return np.stack([y[1], -4.0 * y[0] - 0.3 * y[1] + push + force(y[0], y[1], now)])
+
+    for sample in range(SAMPLES):
+        seen[:, sample] = state[0]
+        for part in range(FINE if sample + 1 < SAMPLES else 0):
+            at = sample + part / FINE
+            first = rate(state, at * STEP, at)
+            second = rate(state + h * first, at * STEP + h, at + 1 / FINE)
+            state = state + h / 2 * (first + second)
+            state[1] += np.sqrt(drive * h) * generator.normal(size=count)
+    size = noise * seen.std()
+    return pd.DataFrame(
+        {
+            "recording": np.repeat([f"r{index}" for index in range(count)], SAMPLES),
+            "t": np.tile(t, count),
+            "x": (seen + size * generator.normal(size=seen.shape)).ravel(),
+            "u": u.ravel(),
+        }
+    )
+
+
+def solved(folder: Path, table: pd.DataFrame, *, card: dict = CARD, study: dict | None = None) -> Outcome:
+    (folder / "system.yaml").write_text(yaml.safe_dump(card, sort_keys=False), encoding="utf-8")
+    (folder / "study.yaml").write_text(yaml.safe_dump(study or {"held_out": ["r2", "r5"]}), encoding="utf-8")
+    table.to_parquet(folder / "recordings.parquet")
+    case = read_case(folder / "system.yaml", folder / "recordings.parquet", folder / "study.yaml")
+    return solve_case(case)
+
+
+def nothing(x: np.ndarray, v: np.ndarray, t: float) -> np.ndarray:
+    return np.zeros_like(x)
+
+
+def names(outcome: Outcome) -> list[str]:
+    return [each["name"] for each in outcome.verdict["mechanisms"]]
+
+
+def test_nothing_is_missing_and_what_could_be_is_bounded(tmp_path: Path) -> None:
+    outcome = solved(tmp_path, recordings_of(nothing))
+    assert outcome.verdict["verdict"] == "no mismatch"
+    bound = outcome.verdict["excluded"]["cubic stiffness in v"]
+    assert 0 < bound["upper_bound_95"] < 0.05 and bound["unit"] == "1/(m**2*s**2)"
+    assert outcome.verdict["fit"]["augmented"] == pytest.approx(outcome.verdict["fit"]["noise_floor"], rel=0.3)
+
+
+def test_wrong_parameters_are_no_missing_physics(tmp_path: Path) -> None:
+    card = {**CARD, "parameters": {**CARD["parameters"], "k": {"value": 3.4, "unit": "N/m"}}}
+    outcome = solved(tmp_path, recordings_of(nothing), card=card)
+    assert outcome.verdict["verdict"] == "parameter shift"
+    shift = outcome.verdict["recalibration"]["k"]
+    assert shift["before"] == 3.4
+    assert abs(shift["after"] - 4.0) < 3 * shift["standard_error"]
+
+
+def test_a_hardening_spring_is_named_measured_and_located(tmp_path: Path) -> None:
+    outcome = solved(tmp_path, recordings_of(lambda x, v, t: -0.6 * x**3))
+    verdict = outcome.verdict
+    assert verdict["verdict"] == "missing physics" and names(outcome) == ["cubic stiffness"]
+    found = verdict["mechanisms"][0]
+    assert found["terms"] == {"v": "-c_1*x**3"} and found["indistinguishable_from"] == []
+    parameter = found["parameters"]["c_1"]
+    assert abs(parameter["estimate"] - 0.6) < 3 * parameter["standard_error"] < 0.06
+    assert list(verdict["location"]["equations"]) == ["v"] and verdict["location"]["coordinate"] == "x"
+    fit = verdict["fit"]
+    assert fit["augmented"] < 1.3 * fit["noise_floor"] < fit["recalibrated"] / 5
+    path = tmp_path / "augmented.yaml"
+    path.write_text(outcome.card, encoding="utf-8")
+    assert "x**3" in str(load_model(path).equations[1])
+    json.dumps(verdict, allow_nan=False)
+
+
+def test_dry_friction_is_told_from_other_friction(tmp_path: Path) -> None:
+    outcome = solved(tmp_path, recordings_of(lambda x, v, t: -0.25 * np.tanh(v / 1e-3)))
+    assert names(outcome) == ["dry friction"]
+    assert outcome.verdict["mechanisms"][0]["parameters"]["c_1"]["estimate"] == pytest.approx(0.25, rel=0.05)
+
+
+def test_random_forces_are_no_mechanism_with_a_formula(tmp_path: Path) -> None:
+    outcome = solved(tmp_path, recordings_of(nothing, drive=0.05))
+    assert outcome.verdict["verdict"] == "missing physics" and names(outcome) == ["process noise"]
+    intensity = outcome.verdict["mechanisms"][0]["parameters"]["intensity_v"]["estimate"]
+    assert intensity == pytest.approx(0.05, rel=0.3)
+
+
+def test_what_the_dictionary_lacks_stays_unexplained(tmp_path: Path) -> None:
+    outcome = solved(tmp_path, recordings_of(lambda x, v, t: 1.5 * np.exp(-(((x - 0.5) / 0.15) ** 2))))
+    assert outcome.verdict["verdict"] == "unexplained" and outcome.verdict["mechanisms"] == []
+    assert outcome.verdict["location"]["coordinate"] == "x"
+
+
+def test_a_bias_and_an_offset_of_the_sensor_are_one_class(tmp_path: Path) -> None:
+    outcome = solved(tmp_path, recordings_of(lambda x, v, t: np.full_like(x, 0.4)))
+    first = outcome.verdict["mechanisms"][0]
+    assert {first["name"], *first["indistinguishable_from"]} == {"constant bias", "sensor gain or offset"}
+
+
+def test_units_and_order_change_nothing_but_numbers(tmp_path: Path) -> None:
+    table = recordings_of(lambda x, v, t: -0.5 * np.abs(v) * v)
+    metres = solved(tmp_path, table)
+    shuffled = pd.concat([part for _, part in list(table.groupby("recording"))[::-1]])
+    shuffled["x"] *= 1000
+    card = json.loads(json.dumps(CARD))
+    card["states"] = {"x": {"unit": "mm", "domain": [-2e3, 2e3]}, "v": {"unit": "mm/s", "domain": [-4e3, 4e3]}}
+    card["equations"]["v"] = "(-k*x - d*v + 1000*u)/m"
+    millimetres = solved(tmp_path, shuffled, card=card)
+    assert names(metres) == names(millimetres) == ["quadratic drag"]
+    ours, theirs = (each.verdict["mechanisms"][0]["parameters"]["c_1"] for each in (metres, millimetres))
+    assert theirs["estimate"] == pytest.approx(ours["estimate"] / 1000, rel=1e-3)
+    assert (ours["unit"], theirs["unit"]) == ("1/m", "1/mm")
+
+
+@pytest.mark.parametrize(
+    ("study", "message"),
+    [
+        ({"held_out": ["r9"]}, "no recording is called 'r9'"),
+        ({"held_out": [f"r{index}" for index in range(8)]}, "one side of the split is empty"),
+        ({"without": ["friction"]}, "no mechanism is called 'friction'"),
+        ({"held_oud": 0.2}, "did you mean 'held_out'"),
+    ],
+)
+def test_a_study_that_cannot_be_used_is_refused_in_a_sentence(study: dict, message: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        solved(tmp_path, recordings_of(nothing), study=study)
+    assert "study.yaml" in str(caught.value)
+
+
+def test_a_missing_column_is_told(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="u"):
+        solved(tmp_path, recordings_of(nothing).drop(columns="u"))

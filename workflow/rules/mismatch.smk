@@ -1,0 +1,196 @@
+# What physics a simulation lacks: the studies of config/mismatch/, and folders of cases (--config cases=DIR).
+
+
+localrules:
+    mismatch,
+    diagnose,
+
+
+rule mismatch:
+    input:
+        mismatch_pages,
+
+
+rule diagnose:
+    input:
+        diagnosed_pages,
+
+
+rule benchmark_recordings:
+    input:
+        file=raw_file,
+    output:
+        recordings="results/recordings/{benchmark}.parquet",
+    log:
+        "results/recordings/logs/{benchmark}.log",
+    benchmark:
+        "results/recordings/benchmarks/{benchmark}.tsv"
+    conda:
+        "../envs/siq.yaml"
+    threads: 1
+    params:
+        code=code("benchmark_recordings.py"),
+    message:
+        "{wildcards.benchmark}: reading the recordings of the benchmark"
+    script:
+        "../scripts/benchmark_recordings.py"
+
+
+rule diagnosis:
+    input:
+        card=case_file("card"),
+        recordings=case_file("recordings"),
+        study=case_file("study"),
+    output:
+        expand(
+            "results/mismatch/{{case}}/tables/{table}.csv",
+            table=MISMATCH_TABLES,
+        ),
+        verdict="results/mismatch/{case}/verdict.json",
+        system="results/mismatch/{case}/system.yaml",
+        recalibrated="results/mismatch/{case}/recalibrated.yaml",
+        curves="results/mismatch/{case}/tables/curves.parquet",
+        candidates="results/mismatch/{case}/tables/candidates.parquet",
+        held_out="results/mismatch/{case}/tables/held_out.parquet",
+        forces="results/mismatch/{case}/tables/forces.parquet",
+        noise="results/mismatch/{case}/tables/noise.parquet",
+    log:
+        "results/mismatch/{case}/logs/diagnosis.log",
+    benchmark:
+        "results/mismatch/{case}/benchmarks/diagnosis.tsv"
+    conda:
+        "../envs/siq.yaml"
+    threads: 1
+    params:
+        code=code("diagnosis.py"),
+        content=lambda wildcards: case_of(wildcards).content,
+    message:
+        "{wildcards.case}: looking for what the simulation lacks"
+    script:
+        "../scripts/diagnosis.py"
+
+
+rule mismatch_landscape:
+    input:
+        verdict="results/mismatch/{case}/verdict.json",
+        card=case_file("card"),
+        recalibrated="results/mismatch/{case}/recalibrated.yaml",
+        system="results/mismatch/{case}/system.yaml",
+        forces="results/mismatch/{case}/tables/forces.parquet",
+    output:
+        expand(
+            "results/mismatch/{{case}}/tables/{table}.csv",
+            table=["wells", "escape"],
+        ),
+        wells="results/mismatch/{case}/tables/wells.parquet",
+        escape="results/mismatch/{case}/tables/escape.parquet",
+        notes="results/mismatch/{case}/landscape.json",
+    log:
+        "results/mismatch/{case}/logs/landscape.log",
+    benchmark:
+        "results/mismatch/{case}/benchmarks/landscape.tsv"
+    conda:
+        "../envs/siq.yaml"
+    threads: 1
+    params:
+        code=code("mismatch_landscape.py"),
+    message:
+        "{wildcards.case}: working out what that does to wells and escape times"
+    script:
+        "../scripts/mismatch_landscape.py"
+
+
+rule real_recordings:
+    input:
+        card=case_file("card"),
+        recordings=case_file("recordings"),
+        study=case_file("study"),
+        recalibrated="results/mismatch/{case}/recalibrated.yaml",
+        system="results/mismatch/{case}/system.yaml",
+        noise="results/mismatch/{case}/tables/noise.parquet",
+    output:
+        table="results/mismatch/{case}/tables/real_recordings.parquet",
+        csv="results/mismatch/{case}/tables/real_recordings.csv",
+    log:
+        "results/mismatch/{case}/logs/real_recordings.log",
+    benchmark:
+        "results/mismatch/{case}/benchmarks/real_recordings.tsv"
+    conda:
+        "../envs/siq.yaml"
+    threads: 1
+    params:
+        code=code("real_recordings.py"),
+        benchmark=lambda wildcards: case_of(wildcards).benchmark,
+    message:
+        "{wildcards.case}: scoring the simulations on held-out recordings"
+    script:
+        "../scripts/real_recordings.py"
+
+
+rule mismatch_figures:
+    input:
+        verdict="results/mismatch/{case}/verdict.json",
+        card=case_file("card"),
+        system="results/mismatch/{case}/system.yaml",
+        curves="results/mismatch/{case}/tables/curves.parquet",
+        candidates="results/mismatch/{case}/tables/candidates.parquet",
+        held_out="results/mismatch/{case}/tables/held_out.parquet",
+        forces="results/mismatch/{case}/tables/forces.parquet",
+        escape="results/mismatch/{case}/tables/escape.parquet",
+    output:
+        expand(
+            "results/mismatch/{{case}}/figures/{name}.{kind}",
+            name=MISMATCH_FIGURES,
+            kind=["svg", "png"],
+        ),
+    log:
+        "results/mismatch/{case}/logs/mismatch_figures.log",
+    benchmark:
+        "results/mismatch/{case}/benchmarks/mismatch_figures.tsv"
+    conda:
+        "../envs/siq.yaml"
+    threads: 1
+    params:
+        code=code("mismatch_figures.py"),
+        folder="results/mismatch/{case}/figures",
+    message:
+        "{wildcards.case}: drawing what is missing"
+    script:
+        "../scripts/mismatch_figures.py"
+
+
+rule mismatch_page:
+    input:
+        verdict="results/mismatch/{case}/verdict.json",
+        card=case_file("card"),
+        study=case_file("study"),
+        system="results/mismatch/{case}/system.yaml",
+        candidates="results/mismatch/{case}/tables/candidates.parquet",
+        wells="results/mismatch/{case}/tables/wells.parquet",
+        escape="results/mismatch/{case}/tables/escape.parquet",
+        notes="results/mismatch/{case}/landscape.json",
+        scores=scores_if_any,
+        figures=expand(
+            "results/mismatch/{{case}}/figures/{name}.svg", name=MISMATCH_FIGURES
+        ),
+    output:
+        html=report(
+            "results/mismatch/{case}/report.html",
+            caption="../report/mismatch.rst",
+            category="mismatch",
+        ),
+    log:
+        "results/mismatch/{case}/logs/mismatch_page.log",
+    benchmark:
+        "results/mismatch/{case}/benchmarks/mismatch_page.tsv"
+    conda:
+        "../envs/siq.yaml"
+    threads: 1
+    params:
+        code=code("mismatch_page.py"),
+        title=lambda wildcards: case_of(wildcards).title,
+        command=lambda wildcards: case_of(wildcards).command,
+    message:
+        "{wildcards.case}: writing the report"
+    script:
+        "../scripts/mismatch_page.py"

@@ -1,0 +1,265 @@
+# The proof of the diagnosis: cases that conceal something, a diagnosis that cannot know what, and scores. And the
+# scores of cases that somebody else made (--config cases=DIR keys=DIR).
+
+
+wildcard_constraints:
+    proof="|".join(PROOF_SETS),
+    batch="[0-9]+",
+
+
+localrules:
+    proof,
+    proof_full,
+    blind_test,
+
+
+rule proof:
+    input:
+        "results/proof/proof/report.html",
+
+
+rule proof_full:
+    input:
+        "results/proof/proof_full/report.html",
+
+
+rule blind_test:
+    input:
+        "results/blind-test/report.html",
+
+
+rule conceal:
+    # The keys end with the job; only their digests are left.
+    output:
+        cases=directory("results/proof/{proof}/cases/{batch}"),
+        digests="results/proof/{proof}/digests/{batch}.json",
+    log:
+        "results/proof/{proof}/logs/conceal/{batch}.log",
+    benchmark:
+        "results/proof/{proof}/benchmarks/conceal/{batch}.tsv"
+    conda:
+        "../envs/siq.yaml"
+    threads: 1
+    params:
+        code=code("conceal.py"),
+        settings=proof_settings,
+    message:
+        "{wildcards.proof}, batch {wildcards.batch}: concealing effects"
+    script:
+        "../scripts/conceal.py"
+
+
+rule published_digests:
+    input:
+        digests=all_batches("results/proof/{proof}/digests/{batch}.json"),
+    output:
+        "results/proof/{proof}/digests.json",
+    log:
+        "results/proof/{proof}/logs/published_digests.log",
+    benchmark:
+        "results/proof/{proof}/benchmarks/published_digests.tsv"
+    conda:
+        "../envs/siq.yaml"
+    threads: 1
+    params:
+        code=code("published_digests.py"),
+    message:
+        "{wildcards.proof}: publishing the digests of all keys"
+    script:
+        "../scripts/published_digests.py"
+
+
+rule blind_diagnosis:
+    # Sees cases, and that digests were published; neither keys nor the seed that they follow from.
+    input:
+        cases="results/proof/{proof}/cases/{batch}",
+        digests="results/proof/{proof}/digests.json",
+        dictionary="siq/mismatch/mechanisms.yaml",
+    output:
+        "results/proof/{proof}/verdicts/{batch}.json",
+    log:
+        "results/proof/{proof}/logs/blind_diagnosis/{batch}.log",
+    benchmark:
+        "results/proof/{proof}/benchmarks/blind_diagnosis/{batch}.tsv"
+    conda:
+        "../envs/siq.yaml"
+    threads: 1
+    params:
+        code=code("blind_diagnosis.py"),
+    message:
+        "{wildcards.proof}, batch {wildcards.batch}: diagnosing"
+    script:
+        "../scripts/blind_diagnosis.py"
+
+
+rule open_keys:
+    # Keys come into being again when every diagnosis has ended, and go when the scores are known.
+    input:
+        digests="results/proof/{proof}/digests.json",
+        verdicts=all_batches("results/proof/{proof}/verdicts/{batch}.json"),
+    output:
+        temp(directory("results/proof/{proof}/keys/{batch}")),
+    log:
+        "results/proof/{proof}/logs/open_keys/{batch}.log",
+    benchmark:
+        "results/proof/{proof}/benchmarks/open_keys/{batch}.tsv"
+    conda:
+        "../envs/siq.yaml"
+    threads: 1
+    params:
+        code=code("open_keys.py"),
+        settings=proof_settings,
+    message:
+        "{wildcards.proof}, batch {wildcards.batch}: opening the keys"
+    script:
+        "../scripts/open_keys.py"
+
+
+rule score_batch:
+    input:
+        cases="results/proof/{proof}/cases/{batch}",
+        opened="results/proof/{proof}/keys/{batch}",
+        answers="results/proof/{proof}/verdicts/{batch}.json",
+    output:
+        table="results/proof/{proof}/scores/{batch}.parquet",
+        csv="results/proof/{proof}/scores/{batch}.csv",
+    log:
+        "results/proof/{proof}/logs/score/{batch}.log",
+    benchmark:
+        "results/proof/{proof}/benchmarks/score/{batch}.tsv"
+    conda:
+        "../envs/siq.yaml"
+    threads: 1
+    params:
+        code=code("score_batch.py"),
+    message:
+        "{wildcards.proof}, batch {wildcards.batch}: holding verdicts against keys"
+    script:
+        "../scripts/score_batch.py"
+
+
+rule collect_scores:
+    input:
+        all_batches("results/proof/{proof}/scores/{batch}.parquet"),
+    output:
+        table="results/proof/{proof}/tables/score.parquet",
+        csv="results/proof/{proof}/tables/score.csv",
+    log:
+        "results/proof/{proof}/logs/collect_scores.log",
+    benchmark:
+        "results/proof/{proof}/benchmarks/collect_scores.tsv"
+    conda:
+        "../envs/siq.yaml"
+    threads: 1
+    params:
+        code=code("collect_scores.py"),
+    message:
+        "{wildcards.proof}: collecting scores"
+    script:
+        "../scripts/collect_scores.py"
+
+
+rule score_proof:
+    input:
+        scores="results/proof/{proof}/tables/score.parquet",
+    output:
+        html=report(
+            "results/proof/{proof}/report.html",
+            caption="../report/proof.rst",
+            category="proof",
+        ),
+        figure="results/proof/{proof}/figures/verdicts.svg",
+        png="results/proof/{proof}/figures/verdicts.png",
+        targets="results/proof/{proof}/tables/targets.parquet",
+        csv="results/proof/{proof}/tables/targets.csv",
+    log:
+        "results/proof/{proof}/logs/page.log",
+    benchmark:
+        "results/proof/{proof}/benchmarks/page.tsv"
+    conda:
+        "../envs/siq.yaml"
+    threads: 1
+    params:
+        code=code("proof_page.py"),
+        title=lambda wildcards: PROOF_TITLES[wildcards.proof],
+        settings=proof_settings,
+        command=lambda wildcards: f"snakemake --cores 2 {wildcards.proof}",
+    message:
+        "{wildcards.proof}: writing the report"
+    script:
+        "../scripts/proof_page.py"
+
+
+rule score_case:
+    input:
+        card=case_file("card"),
+        recordings=case_file("recordings"),
+        study=case_file("study"),
+        key=key_of,
+        verdict="results/mismatch/{case}/verdict.json",
+        system="results/mismatch/{case}/system.yaml",
+    output:
+        table="results/blind-test/scores/{case}.parquet",
+        csv="results/blind-test/scores/{case}.csv",
+    log:
+        "results/blind-test/logs/score/{case}.log",
+    benchmark:
+        "results/blind-test/benchmarks/score/{case}.tsv"
+    conda:
+        "../envs/siq.yaml"
+    threads: 1
+    params:
+        code=code("score_case.py"),
+        content=lambda wildcards: case_of(wildcards).content,
+    message:
+        "{wildcards.case}: holding the verdict against the key"
+    script:
+        "../scripts/score_case.py"
+
+
+rule score_cases:
+    input:
+        all_blind_scores,
+    output:
+        table="results/blind-test/tables/score.parquet",
+        csv="results/blind-test/tables/score.csv",
+    log:
+        "results/blind-test/logs/score_cases.log",
+    benchmark:
+        "results/blind-test/benchmarks/score_cases.tsv"
+    conda:
+        "../envs/siq.yaml"
+    threads: 1
+    params:
+        code=code("collect_scores.py"),
+    message:
+        "collecting the scores of the blind test"
+    script:
+        "../scripts/collect_scores.py"
+
+
+rule blind_page:
+    input:
+        scores="results/blind-test/tables/score.parquet",
+    output:
+        html="results/blind-test/report.html",
+        figure="results/blind-test/figures/verdicts.svg",
+        png="results/blind-test/figures/verdicts.png",
+        targets="results/blind-test/tables/targets.parquet",
+        csv="results/blind-test/tables/targets.csv",
+    log:
+        "results/blind-test/logs/page.log",
+    benchmark:
+        "results/blind-test/benchmarks/page.tsv"
+    conda:
+        "../envs/siq.yaml"
+    threads: 1
+    params:
+        code=code("proof_page.py"),
+        title="Blind test of the diagnosis",
+        settings=None,
+        command="snakemake --cores 2 blind_test --config cases=DIR keys=DIR",
+    message:
+        "writing the report of the blind test"
+    script:
+        "../scripts/proof_page.py"

@@ -1,0 +1,62 @@
+"""Diagnose the cases of a batch. Nothing here knows of keys, seeds, or how cases are made."""
+
+import json
+import logging
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from siq.files import whole_file
+from siq.mismatch.case import read_case, solve_case
+from step import job
+
+LOGGER = logging.getLogger(__name__)
+
+
+def diagnosed(folder: Path) -> dict[str, Any]:
+    """What the diagnosis says of a case; a failure is told in a sentence and stops nothing else."""
+    begin = time.perf_counter()
+    verdict, card, failure = None, "", ""
+    try:
+        outcome = solve_case(
+            read_case(folder / "system.yaml", folder / "recordings.parquet", folder / "study.yaml")
+        )
+        verdict, card = plain(outcome.verdict), outcome.card
+    except Exception as error:
+        LOGGER.exception("%s failed", folder.name)
+        failure = f"{type(error).__name__}: {error}"
+    return {
+        "case": folder.name,
+        "verdict": verdict,
+        "card": card,
+        "seconds": time.perf_counter() - begin,
+        "failure": failure,
+    }
+
+
+def plain(value: Any) -> Any:
+    """The same as JSON has it; numbers that are not finite become null."""
+    if isinstance(value, dict):
+        return {str(key): plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(each) for each in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def main(snakemake: Any) -> None:
+    """Run as a rule's script."""
+    answers = [
+        diagnosed(folder) for folder in sorted(Path(snakemake.input.cases).iterdir()) if folder.is_dir()
+    ]
+    with whole_file(snakemake.output[0]) as partial:
+        partial.write_text(json.dumps(answers, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    with job(snakemake):  # type: ignore[name-defined]  # noqa: F821 (Snakemake puts it here)
+        main(snakemake)  # type: ignore[name-defined]  # noqa: F821

@@ -1,0 +1,46 @@
+"""Write the report of a diagnosis: one page that needs nothing else."""
+
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from siq.files import whole_file
+from siq.mismatch.dictionary import dictionary_of
+from siq.mismatch.model import load_model
+from siq.mismatch.report import Findings, mismatch_page
+from siq.mismatch.study import MismatchStudy, load_mismatch_study
+from siq.tables import read_table
+from step import job, read_json
+
+
+def main(snakemake: Any) -> None:
+    """Run as a rule's script."""
+    source = snakemake.input
+    study = load_mismatch_study(source.study) if source.get("study") else MismatchStudy()
+    findings = Findings(
+        verdict=read_json(source.verdict),
+        before=load_model(source.card),
+        after=load_model(source.system),
+        dictionary=dictionary_of(without=study.without, further=study.mechanisms, file="the study"),
+        candidates=read_table(source.candidates),
+        figures={Path(path).stem: Path(path).read_bytes() for path in source.figures},
+        wells=read_table(source.wells),
+        escape=read_table(source.escape),
+        notes=read_json(source.notes),
+        scores=read_table(source.scores) if source.get("scores") else pd.DataFrame(),
+        folder=str(Path(source.candidates).parent),
+    )
+    commands = [
+        snakemake.params.command,
+        f"# the simulation with what was found, a system card like any other: {source.system}",
+    ]
+    with whole_file(snakemake.output.html) as partial:
+        partial.write_text(
+            mismatch_page(findings, title=snakemake.params.title, commands=commands), encoding="utf-8"
+        )
+
+
+if __name__ == "__main__":
+    with job(snakemake):  # type: ignore[name-defined]  # noqa: F821 (Snakemake puts it here)
+        main(snakemake)  # type: ignore[name-defined]  # noqa: F821

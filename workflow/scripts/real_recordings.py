@@ -1,0 +1,38 @@
+"""How far simulations of a public benchmark are off on its held-out recordings, in its own units."""
+
+from typing import Any
+
+import pandas as pd
+
+from siq.benchmarks import BENCHMARKS
+from siq.mismatch.case import read_case
+from siq.mismatch.model import load_model
+from siq.mismatch.scores import root_mean_square
+from siq.tables import read_table, write_table
+from step import job
+
+
+def main(snakemake: Any) -> None:
+    """Run as a rule's script."""
+    source, one = snakemake.input, BENCHMARKS[snakemake.params.benchmark]
+    kept = read_case(source.card, source.recordings, source.get("study") or None).kept
+    noise = read_table(source.noise)
+    rows = []
+    for simulation, card in (("recalibrated", source.recalibrated), ("augmented", source.system)):
+        model = load_model(card)
+        own = noise[(noise["stage"] == "recalibrated") & (noise["kind"] == "measurement")]
+        for score, window in one.score.items():
+            errors = root_mean_square(model, kept, variance=own["variance"].to_numpy(float), window=window)
+            rows += [
+                {
+                    "simulation": simulation, "score": score, "output": name, "rms": one.factor * error,
+                    "unit": one.unit, "published": one.published.get(score, ""),
+                }
+                for name, error in zip(model.output_names, errors, strict=True)
+            ]  # fmt: skip
+    write_table(snakemake.output.table, pd.DataFrame(rows))
+
+
+if __name__ == "__main__":
+    with job(snakemake):  # type: ignore[name-defined]  # noqa: F821 (Snakemake puts it here)
+        main(snakemake)  # type: ignore[name-defined]  # noqa: F821

@@ -1,0 +1,31 @@
+"""Score the diagnoses of a batch."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from siq.tables import write_table
+from step import job
+from workflow.scoring import Answer, score_case, score_table
+
+
+def batch_answers(path: str | Path) -> dict[str, Answer]:
+    """The answers of a batch by name of the case."""
+    found = json.loads(Path(path).read_text(encoding="utf-8"))
+    return {
+        each["case"]: Answer(each["verdict"], each["card"], each["seconds"], each["failure"])
+        for each in found
+    }
+
+
+def main(snakemake: Any) -> None:
+    """Run as a rule's script."""
+    folder, keys = Path(snakemake.input.cases), Path(snakemake.input.opened)
+    answers = batch_answers(snakemake.input.answers)
+    rows = [score_case(name, folder / name, keys, answer) for name, answer in answers.items()]
+    write_table(snakemake.output.table, score_table(rows))
+
+
+if __name__ == "__main__":
+    with job(snakemake):  # type: ignore[name-defined]  # noqa: F821 (Snakemake puts it here)
+        main(snakemake)  # type: ignore[name-defined]  # noqa: F821
