@@ -32,6 +32,7 @@ FUNCTIONS: Mapping[str, Callable[..., sympy.Expr]] = {
 }
 """The functions that a formula may use, by the names that it uses for them."""
 
+
 class delay(sympy.Function):  # noqa: N801 (the name that formulas use)
     """``delay(u, tau)``: the input u as it was a time tau ago.
 

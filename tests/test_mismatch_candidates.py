@@ -63,7 +63,10 @@ def test_two_quadratures_in_a_rotating_frame() -> None:
     model = model_of(
         {
             "states": states("a", "b"),
-            "equations": {"a": "0.3*b - 0.1*a + 2*b*(a**2 + b**2)", "b": "-0.3*a - 0.1*b - 2*a*(a**2 + b**2) - 0.7"},
+            "equations": {
+                "a": "0.3*b - 0.1*a + 2*b*(a**2 + b**2)",
+                "b": "-0.3*a - 0.1*b - 2*a*(a**2 + b**2) - 0.7",
+            },
         }
     )
     assert roles_of(model).amplitudes == (("a", "b"),)
@@ -115,7 +118,9 @@ def test_without_its_amplitude_a_mechanism_changes_nothing(oscillator: Model) ->
 
 
 def test_units_are_worked_out(oscillator: Model) -> None:
-    found = {each.label: each for each in candidates_of(oscillator, roles_of(oscillator), standard_dictionary())}
+    found = {
+        each.label: each for each in candidates_of(oscillator, roles_of(oscillator), standard_dictionary())
+    }
     units = {label: each.model.parameters[-1].unit for label, each in found.items()}
     assert units["quadratic drag in w"] == "1/m"
     assert units["cubic stiffness in w"] == "1/(m**2*s**2)"
@@ -156,14 +161,15 @@ def test_an_augmented_card_is_a_card(oscillator: Model, tmp_path) -> None:
 def test_entries_of_a_study_are_added_and_left_out() -> None:
     names = [each.name for each in dictionary_of(without=["hysteresis"], further=(), file="study.yaml")]
     assert "hysteresis" not in names and len(names) == len(NAMES) - 1
-    with pytest.raises(InputError, match="study.yaml, without: no mechanism is called 'histeresis'"):
+    with pytest.raises(InputError, match=r"study\.yaml, without: no mechanism is called 'histeresis'"):
         dictionary_of(without=["histeresis"], further=(), file="study.yaml")
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("mechanisms: [{name: a, sentence: b, forms: [{roles: {v: velocity}, coordinate: v, parameters: {}}]}]",
+        ("mechanisms: [{name: a, sentence: b, forms: [{roles: {v: velocity}, coordinate: v,"
+         " parameters: {}}]}]",
          "changes nothing"),
         ("mechanisms: [{name: a, sentence: b, forms: [{roles: {v: speed}, terms: {v: '1'}, coordinate: v,"
          " parameters: {}}]}]", "speed"),

@@ -32,7 +32,9 @@ STEP, SAMPLES, FINE = 0.15, 120, 20
 Force = Callable[[np.ndarray, np.ndarray, float], np.ndarray]
 
 
-def recordings_of(force: Force, *, count: int = 8, noise: float = 0.01, drive: float = 0.0, seed: int = 1) -> pd.DataFrame:
+def recordings_of(
+    force: Force, *, count: int = 8, noise: float = 0.01, drive: float = 0.0, seed: int = 1
+) -> pd.DataFrame:
     """Driven oscillators of different strength, by small steps of Heun's rule."""
     generator = np.random.default_rng(seed)
     t = np.arange(SAMPLES) * STEP
@@ -89,7 +91,9 @@ def test_nothing_is_missing_and_what_could_be_is_bounded(tmp_path: Path) -> None
     assert outcome.verdict["verdict"] == "no mismatch"
     bound = outcome.verdict["excluded"]["cubic stiffness in v"]
     assert 0 < bound["upper_bound_95"] < 0.05 and bound["unit"] == "1/(m**2*s**2)"
-    assert outcome.verdict["fit"]["augmented"] == pytest.approx(outcome.verdict["fit"]["noise_floor"], rel=0.3)
+    assert outcome.verdict["fit"]["augmented"] == pytest.approx(
+        outcome.verdict["fit"]["noise_floor"], rel=0.3
+    )
 
 
 def test_wrong_parameters_are_no_missing_physics(tmp_path: Path) -> None:
@@ -149,7 +153,10 @@ def test_units_and_order_change_nothing_but_numbers(tmp_path: Path) -> None:
     shuffled = pd.concat([part for _, part in list(table.groupby("recording"))[::-1]])
     shuffled["x"] *= 1000
     card = json.loads(json.dumps(CARD))
-    card["states"] = {"x": {"unit": "mm", "domain": [-2e3, 2e3]}, "v": {"unit": "mm/s", "domain": [-4e3, 4e3]}}
+    card["states"] = {
+        "x": {"unit": "mm", "domain": [-2e3, 2e3]},
+        "v": {"unit": "mm/s", "domain": [-4e3, 4e3]},
+    }
     card["equations"]["v"] = "(-k*x - d*v + 1000*u)/m"
     millimetres = solved(tmp_path, shuffled, card=card)
     assert names(metres) == names(millimetres) == ["quadratic drag"]
@@ -167,7 +174,9 @@ def test_units_and_order_change_nothing_but_numbers(tmp_path: Path) -> None:
         ({"held_oud": 0.2}, "did you mean 'held_out'"),
     ],
 )
-def test_a_study_that_cannot_be_used_is_refused_in_a_sentence(study: dict, message: str, tmp_path: Path) -> None:
+def test_a_study_that_cannot_be_used_is_refused_in_a_sentence(
+    study: dict, message: str, tmp_path: Path
+) -> None:
     with pytest.raises(InputError, match=message) as caught:
         solved(tmp_path, recordings_of(nothing), study=study)
     assert "study.yaml" in str(caught.value)

@@ -41,7 +41,14 @@ def model_of(card: dict) -> Model:
 
 
 def oscillations(
-    *, recordings: int, samples: int, noise: float, seed: int, drive: float = 0.0, k: float = 1.0, d: float = 0.1
+    *,
+    recordings: int,
+    samples: int,
+    noise: float,
+    seed: int,
+    drive: float = 0.0,
+    k: float = 1.0,
+    d: float = 0.1,
 ) -> Measurements:
     """Free decays of a linear oscillator, sampled exactly; with random forces of the intensity `drive`."""
     generator = np.random.default_rng(seed)
@@ -83,7 +90,11 @@ def linearised() -> tuple[Measurements, object, Noise]:
     data.outputs[5, 0] = np.nan
     model = model_of(OSCILLATOR)
     x = first_states(model, data) + 0.05
-    return data, linearise(model, Grid(data, 2), model.values, x), Noise(np.array([0.01]), np.array([0.0, 0.03]))
+    return (
+        data,
+        linearise(model, Grid(data, 2), model.values, x),
+        Noise(np.array([0.01]), np.array([0.0, 0.03])),
+    )
 
 
 def dense(data: Measurements, line: object, noise: Noise) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -104,9 +115,7 @@ def dense(data: Measurements, line: object, noise: Noise) -> tuple[np.ndarray, n
             columns[k + 1, :, :parameters] += line.response[k]
             spread[k + 1] = np.einsum("ij,jkl->ikl", line.transition[k], spread[k])
             spread[:, :, k + 1] = np.einsum("kli,ji->klj", spread[:, :, k], line.transition[k])
-            spread[k + 1, :, k + 1] = (
-                line.transition[k] @ spread[k, :, k] @ line.transition[k].T + process[k]
-            )
+            spread[k + 1, :, k + 1] = line.transition[k] @ spread[k, :, k] @ line.transition[k].T + process[k]
             for before in range(begin, k + 1):
                 spread[k + 1, :, before] = line.transition[k] @ spread[k, :, before]
                 spread[before, :, k + 1] = spread[k + 1, :, before].T
@@ -220,7 +229,10 @@ def test_the_search_for_noise_ends_where_the_likelihood_is_highest() -> None:
 
 def test_the_order_of_recordings_changes_nothing() -> None:
     data = oscillations(recordings=4, samples=40, noise=0.05, seed=5)
-    there, back = fitted(data, estimate_process=False), fitted(data.select([2, 0, 3, 1]), estimate_process=False)
+    there, back = (
+        fitted(data, estimate_process=False),
+        fitted(data.select([2, 0, 3, 1]), estimate_process=False),
+    )
     np.testing.assert_allclose(there.model.values, back.model.values, rtol=1e-6)
 
 

@@ -56,7 +56,6 @@ UNKNOWN, CONSIDERED, FRONT, ACCEPTED = range(4)
 STOPS: tuple[Stop, ...] = ("boundary", "level", "everywhere")
 
 
-
 @dataclass(frozen=True)
 class MeshQuasipotential:
     """V on the nodes of a rectangular mesh.

@@ -8,7 +8,7 @@ kind, for systems whose states have no roles.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -136,7 +136,8 @@ def generic_candidates(model: Model, roles: Roles, *, degree: int) -> list[Candi
                     searches=(),
                     scales=(),
                     equations=(name,),
-                    coordinate=", ".join(s for s, p in zip(model.states, powers, strict=True) if p) or "constant",
+                    coordinate=", ".join(s for s, p in zip(model.states, powers, strict=True) if p)
+                    or "constant",
                     changes=((name, symbol(new) * monomial),),
                 )
             )
@@ -202,9 +203,7 @@ def build_candidate(
         outputs=tuple(outputs.items()),
     )
     changed = tuple(
-        name
-        for name, before in zip(model.states, model.equations, strict=True)
-        if equations[name] != before
+        name for name, before in zip(model.states, model.equations, strict=True) if equations[name] != before
     )
     searches = tuple(
         _in_names(entry.shape, names) for entry in form.parameters.values() if entry.shape is not None
@@ -215,7 +214,9 @@ def build_candidate(
         model=augmented,
         amplitudes=tuple(fresh[name] for name, entry in form.parameters.items() if entry.shape is None),
         shapes=tuple(fresh[name] for name, entry in form.parameters.items() if entry.shape is not None),
-        positive=frozenset(fresh[name] for name, entry in form.parameters.items() if entry.sign == "positive"),
+        positive=frozenset(
+            fresh[name] for name, entry in form.parameters.items() if entry.sign == "positive"
+        ),
         searches=searches,
         scales=tuple(each[3] for each in further),
         equations=changed,
@@ -249,7 +250,7 @@ def _assignments(form: Form, model: Model, roles: Roles) -> Iterator[dict[str, s
         yield {role: name for part in combination for role, name in part.items()}
 
 
-def _order(model: Model):
+def _order(model: Model) -> Callable[[str], int]:
     places = {name: place for place, name in enumerate(model.states)}
     return lambda name: places.get(name, -1)
 

@@ -49,7 +49,8 @@ def augmented_card(
             entry.name: {"unit": entry.unit, "interpolation": entry.interpolation} for entry in model.inputs
         }
     data["parameters"] = {
-        entry.name: {"value": float(entry.value), "unit": entry.unit} | ({"fixed": True} if entry.fixed else {})
+        entry.name: {"value": float(entry.value), "unit": entry.unit}
+        | ({"fixed": True} if entry.fixed else {})
         for entry in model.parameters
     }
     data["equations"] = {
@@ -65,9 +66,12 @@ def augmented_card(
 
 def _domain(model: Model, place: int, scale: np.ndarray | None) -> list[float]:
     lower, upper = (float(limit) for limit in model.domain[place])
-    if scale is not None and place < len(scale) and np.isfinite(scale[place]) and (lower, upper) == (-1.0, 1.0):
+    if (
+        scale is not None
+        and place < len(scale)
+        and np.isfinite(scale[place])
+        and (lower, upper) == (-1.0, 1.0)
+    ):
         wide = 3 * float(scale[place]) or 1.0
         return [-wide, wide]
     return [lower, upper]
-
-

@@ -121,10 +121,10 @@ def tables_of(case: Case, outcome: Outcome) -> dict[str, pd.DataFrame]:
     Returns
     -------
     dict
-        ``curves`` (what is missing against each coordinate, in the unit of the equation), ``candidates``
-        (what was found, what cannot be told from it, and every probe with what it would gain on top), ``held_out`` (recordings and the three simulations), ``forces`` (what
-        the recalibrated simulation lacks at each sample, as far as random forces were admitted), ``noise``
-        (variance of the measurement noise by output, intensity of random forces by state).
+        ``curves``: what is missing against each coordinate, in the unit of the equation. ``candidates``: every
+        probe, with what it would gain first, or on top of what was found. ``held_out``: recordings and
+        their three simulations. ``forces``: what the recalibrated simulation lacks at each sample, as far as random
+        forces were admitted. ``noise``: of the sensors by output, and of random forces by state.
     """
     diagnosis, shown = outcome.diagnosis, outcome.shown
     curves = [
@@ -141,9 +141,7 @@ def tables_of(case: Case, outcome: Outcome) -> dict[str, pd.DataFrame]:
         }
         for stage, structure in (("before", diagnosis.before), ("after", diagnosis.after))
         for curve in structure.curves
-        for at, value, error in zip(
-            curve.direction.knots, curve.values, curve.standard_errors, strict=True
-        )
+        for at, value, error in zip(curve.direction.knots, curve.values, curve.standard_errors, strict=True)
     ]
     candidates: list[dict[str, Any]] = [
         {

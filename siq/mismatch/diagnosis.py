@@ -14,6 +14,7 @@ from siq.errors import NumericalFailure
 from siq.mismatch.candidates import Candidate, candidates_of, generic_candidates
 from siq.mismatch.dictionary import Mechanism
 from siq.mismatch.estimation import Fit, Noise, first_noise, first_states, fit
+from siq.mismatch.held_out import run
 from siq.mismatch.measurements import Measurements
 from siq.mismatch.model import Model
 from siq.mismatch.roles import Roles, roles_of
@@ -27,6 +28,7 @@ Verdict = Literal["no mismatch", "parameter shift", "missing physics", "unexplai
 
 STRUCTURED = 1e-4  # probability below which residuals are not called random
 SHIFTED = 1e-4  # probability below which parameters are not called unchanged
+FAINT = 1e-4  # process noise, relative to the motion, from which a fit without any is loosened
 ENOUGH = 0.999  # share of the excess that a mechanism explains, beyond which a remainder is only remarked
 
 
@@ -102,7 +104,9 @@ def diagnose(
     roles = roles_of(model)
     generic = study.generic if study.generic is not None else not roles.physical
     candidates = candidates_of(model, roles, dictionary, file=file)
-    monomials = [c for c in generic_candidates(model, roles, degree=study.degree) if c.coordinate != "constant"]
+    monomials = [
+        c for c in generic_candidates(model, roles, degree=study.degree) if c.coordinate != "constant"
+    ]
     if generic:
         candidates += monomials
     recalibrated, least_squares = recalibrate(model, data)
@@ -122,7 +126,7 @@ def diagnose(
     if found.found:
         verdict = "missing physics"
         if structured or random:
-            # Several terms that together fit well, and yet leave structure, are how a false explanation looks.
+            # Several terms that fit well together, and yet leave structure: so a false explanation looks.
             if explained >= ENOUGH and len(found.found) == 1:
                 remarks.append(f"{1 - explained:.2g} of the excess remains, and is not noise.")
             else:
@@ -162,12 +166,27 @@ def recalibrate(model: Model, data: Measurements) -> tuple[Fit, Fit]:
     x = first_states(model, data)
     noise = first_noise(model, data, x)
     loose = fit(model, data, x=x, noise=noise, estimate_process=True)
-    if not np.isfinite(loose.sum_of_squares):
-        raise NumericalFailure("the simulation has no value at the recorded states; check the card's equations")
-    loose_again, strict = both_fits(loose.model, data, loose)
-    if loose_again is None or (strict.converged and not process_noise_needed(loose_again, strict)):
-        return strict, strict
-    return loose_again, strict
+    if loose.converged:
+        again, strict = both_fits(loose.model, data, loose)
+        if again is None or (strict.converged and not process_noise_needed(again, strict)):
+            return strict, strict
+        return again, strict
+    # Where random forces on a hidden state could explain anything, the fit has no end. The card's own
+    # simulation is then the better start.
+    followed = run(model, data, x[data.first[:-1]], substeps=max(loose.substeps, 1))
+    x = np.where(np.isfinite(followed), followed, x)
+    strict = fit(model, data, x=x, noise=noise.without_process(), estimate_process=False)
+    if not strict.converged:
+        if not np.isfinite(loose.sum_of_squares):
+            raise NumericalFailure(
+                "the simulation cannot be fitted to the recordings; check the card's equations and values"
+            )
+        return loose, strict
+    small = Noise(strict.noise.measurement, noise.process * FAINT)
+    again = fit(strict.model, data, x=strict.x, noise=small, estimate_process=True, substeps=strict.substeps)
+    if again.converged and process_noise_needed(again, strict):
+        return again, strict
+    return strict, strict
 
 
 def explained_share(before: Structure, after: Structure) -> float:
@@ -197,4 +216,3 @@ def shift_probability(model: Model, recalibrated: Fit) -> float:
     kept = values > 1e-9 * values[-1]
     along = vectors[:, kept].T @ (difference / scale) / np.sqrt(values[kept])
     return float(scipy.stats.chi2.sf(float(along @ along), int(kept.sum())))
-

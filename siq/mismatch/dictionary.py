@@ -129,6 +129,8 @@ def dictionary_of(
     known = {each.name: each for each in standard_dictionary()}
     for name in without:
         if name not in known:
-            raise InputError(file, "without", f"no mechanism is called '{name}'", f"use one of {', '.join(known)}")
+            raise InputError(
+                file, "without", f"no mechanism is called '{name}'", f"use one of {', '.join(known)}"
+            )
         del known[name]
     return tuple((known | {each.name: each for each in further}).values())

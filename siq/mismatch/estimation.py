@@ -362,7 +362,7 @@ def fit(
     scale = np.maximum(x.std(axis=0), 1e-12 * np.ptp(model.domain, axis=1))
     before: np.ndarray | None = None
     totals: list[float] = []
-    converged, settled_noise = False, False
+    converged, settled_noise, whole = False, False, False
     for iteration in range(iterations):
         if iteration in (0, 2) or settled_noise:
             noise = _noise_along(current, data, noise, estimate_process)
@@ -371,15 +371,18 @@ def fit(
             return _failed(model, x, noise, current, substeps)
         change, _ = solve(white.columns, white.innovations)
         left = white.innovations - white.columns @ change
-        if before is not None and ((left - before) ** 2).sum() < SETTLED * len(left) * max(
-            1.0, (left**2).sum() / len(left)
+        # A shortened step leaves much of what is foreseen undone, and the forecast unchanged.
+        if (
+            before is not None
+            and whole
+            and ((left - before) ** 2).sum() < SETTLED * len(left) * max(1.0, (left**2).sum() / len(left))
         ):
             if settled_noise:
                 converged = True
                 break
             settled_noise = True
         before = left
-        totals.append(float((left**2).sum()))
+        totals.append(float(white.innovations @ white.innovations))
         if len(totals) > PATIENCE and settled_noise is False and _stands_still(totals):
             settled_noise = True
         elif len(totals) > 2 * PATIENCE and _stands_still(totals):
@@ -388,14 +391,14 @@ def fit(
         stepped = _step(model, grid, values, x, current, change, free, data, noise, scale)
         if stepped is None:
             break
-        values, x, current = stepped
+        values, x, current, length = stepped
+        whole = length == 1.0
     white = whiten(current, data, noise)
     if not np.isfinite(white.columns).all() or not np.isfinite(white.innovations).all():
         return _failed(model, x, noise, current, substeps)
     change, covariance = solve(white.columns, white.innovations)
-    # The last change is below the errors; it belongs to the estimate and to the innovations alike.
-    left = white.innovations - white.columns @ change
-    total = float((left**2).sum())
+    # The last change is below the errors. The likelihood is that of the states in hand, not of a forecast.
+    total = float(white.innovations @ white.innovations)
     return Fit(
         model=model.with_values(_changed(values, free, change if converged else 0 * change)),
         covariance=covariance,
@@ -421,7 +424,7 @@ def _step(
     data: Measurements,
     noise: Noise,
     scale: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, Linearisation] | None:
+) -> tuple[np.ndarray, np.ndarray, Linearisation, float] | None:
     """The step that the linearisation suggests, shortened until it does about what was foreseen."""
     deviation = state_changes(current, data, noise, change)
     rows = grid.rows
@@ -438,7 +441,7 @@ def _step(
             expected = (1 - length) * current.gap[rows] + length * foreseen
             unforeseen = np.sqrt(np.mean(((trial.gap[rows] - expected) / scale) ** 2))
             if unforeseen <= NONLINEAR * length * effect + 1e-9:
-                return trial_values, trial_x, trial
+                return trial_values, trial_x, trial, length
         length /= 2
     return None
 

@@ -35,7 +35,9 @@ class FreeRun:
     scored: np.ndarray
 
 
-def free_run(model: Model, data: Measurements, *, noise: Noise, substeps: int, prefix: float = PREFIX) -> FreeRun:
+def free_run(
+    model: Model, data: Measurements, *, noise: Noise, substeps: int, prefix: float = PREFIX
+) -> FreeRun:
     """Simulate recordings from states that their prefixes tell.
 
     Parameters
@@ -70,7 +72,12 @@ def initial_states(model: Model, data: Measurements, *, noise: Noise, substeps: 
     process[: len(noise.process)] = noise.process
     start = first_states(still, data)
     follow = fit(
-        still, data, x=start, noise=Noise(noise.measurement, process), estimate_process=False, substeps=substeps
+        still,
+        data,
+        x=start,
+        noise=Noise(noise.measurement, process),
+        estimate_process=False,
+        substeps=substeps,
     )
     x = follow.x if np.isfinite(follow.sum_of_squares) else start
     strict = fit(

@@ -235,7 +235,9 @@ def spread_edges(model: Model, data: Measurements, x: np.ndarray, *, substeps: i
     signals = data.signals(data.t, data.recording, delays=model.lags(model.values))
     function = compile_values(formulas, arguments_of(model), common=False)
     further = np.zeros((model.dimension - x.shape[1], len(x)))  # states that a mechanism brings
-    along = function(*x.T, *further, *signals.inputs, *signals.delayed, *signals.slopes, signals.t, *model.values)
+    along = function(
+        *x.T, *further, *signals.inputs, *signals.delayed, *signals.slopes, signals.t, *model.values
+    )
     rows = data.begins
     widths = []
     for course in along:

@@ -1,4 +1,4 @@
-"""Location: in which equation a mismatch sits, along which coordinate, where on it, and in which recordings."""
+"""Location: in which equation a mismatch sits, along which coordinate and where, in which recordings."""
 
 from __future__ import annotations
 
@@ -149,8 +149,10 @@ def _sentence(
     *,
     everywhere: bool,
 ) -> str:
-    where = f"In the equation{'s' if len(equations) > 1 else ''} of {' and '.join(equations)}" if equations else (
-        "In what is measured"
+    where = (
+        f"In the equation{'s' if len(equations) > 1 else ''} of {' and '.join(equations)}"
+        if equations
+        else ("In what is measured")
     )
     along = {
         "t": ", along time", "constant": ", everywhere alike", "random": ", at random",

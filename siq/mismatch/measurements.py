@@ -72,7 +72,9 @@ class Measurements:
         """Place of each row's recording in `labels`."""
         return np.repeat(np.arange(len(self.labels)), np.diff(self.first))
 
-    def signals(self, t: np.ndarray, recording: np.ndarray, *, delays: Sequence[tuple[int, float]]) -> Signals:
+    def signals(
+        self, t: np.ndarray, recording: np.ndarray, *, delays: Sequence[tuple[int, float]]
+    ) -> Signals:
         """Inputs at instants, each in its recording.
 
         Parameters

@@ -23,6 +23,7 @@ from siq.systems import Formula, SystemCard
 TIME = sympy.Symbol("t", real=True)
 SMOOTHER = 30.0  # widths of a jump over which its derivative is spread
 
+
 @dataclass(frozen=True)
 class Input:
     """An exogenous signal: its name, unit, and how it holds between samples."""
@@ -221,9 +222,7 @@ class CompiledModel:
         """H at states ``(d, n)``: shape ``(m, n)``."""
         return _stacked(self._outputs, self._shapes[1], x, signals, values)
 
-    def slopes(
-        self, x: np.ndarray, signals: Signals, values: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def slopes(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives of f by states and by free parameters: ``(d, d, n)`` and ``(d, p, n)``."""
         d, _, p = self._shapes
         flat = _stacked(self._slopes, d * d + d * p, x, signals, values)
@@ -262,9 +261,7 @@ def evaluable(formula: sympy.Expr, model: Model, *, wider: float = 1.0) -> sympy
     return formula.xreplace(spread).xreplace({each: _delayed(k) for k, each in enumerate(model.delays)})
 
 
-def by_parameter(
-    formula: sympy.Expr, parameter: sympy.Symbol, delays: Sequence[sympy.Expr]
-) -> sympy.Expr:
+def by_parameter(formula: sympy.Expr, parameter: sympy.Symbol, delays: Sequence[sympy.Expr]) -> sympy.Expr:
     """Derivative of an evaluable formula by a parameter, which may stand in a delay as well."""
     result = formula.diff(parameter)
     for k, each in enumerate(delays):

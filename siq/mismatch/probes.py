@@ -78,7 +78,12 @@ class ProbeColumns:
                 further = self._memory(index)[node] if probe.candidate.scales else x[:0]
                 signals = self._grid.signals(node, compiled.delays_at(probe))
                 at = (*x, *further, *signals.inputs, *signals.delayed, *signals.slopes, signals.t)
-                _fill(result, place, compiled.rate_entries, compiled.rates(*at, *compiled.numbers(probe, values)))
+                _fill(
+                    result,
+                    place,
+                    compiled.rate_entries,
+                    compiled.rates(*at, *compiled.numbers(probe, values)),
+                )
             place += probe.width
         return result
 
@@ -180,15 +185,16 @@ class _Compiled:
         base = [evaluable(formula, model) for formula in model.equations]
         rates = [columns(f, b) for f, b in zip(written[: model.dimension], base, strict=True)]
         outputs = [
-            columns(f, b)
-            for f, (_, b) in zip(written[augmented.dimension :], model.outputs, strict=True)
+            columns(f, b) for f, (_, b) in zip(written[augmented.dimension :], model.outputs, strict=True)
         ]
         self.rate_entries = [(i, j) for i, row in enumerate(rates) for j, each in enumerate(row) if each != 0]
         self.output_entries = [
             (i, j) for i, row in enumerate(outputs) for j, each in enumerate(row) if each != 0
         ]
         self.rates = compile_values([rates[i][j] for i, j in self.rate_entries], arguments, common=False)
-        self.outputs = compile_values([outputs[i][j] for i, j in self.output_entries], arguments, common=False)
+        self.outputs = compile_values(
+            [outputs[i][j] for i, j in self.output_entries], arguments, common=False
+        )
         further = written[model.dimension : augmented.dimension]
         self.memory = compile_values(further, arguments, common=False)
 
@@ -229,7 +235,10 @@ def places_of(search: Shape, data: Measurements, model: Model, x: np.ndarray) ->
     if search.samples:
         return factors * np.median(steps)
     if search.frequencies is not None:
-        longest = max(data.t[end - 1] - data.t[begin] for begin, end in zip(data.first[:-1], data.first[1:]))
+        longest = max(
+            data.t[end - 1] - data.t[begin]
+            for begin, end in zip(data.first[:-1], data.first[1:], strict=True)
+        )
         # From one period in the longest recording to four samples a period.
         return np.linspace(2 * np.pi / longest, np.pi / (2 * np.median(steps)), search.frequencies)
     text = search.scale_of or search.inverse_scale_of or search.quantiles_of

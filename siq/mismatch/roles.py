@@ -124,7 +124,7 @@ def _has_root(equation: sympy.Expr, name: str) -> bool:
 
 
 def _trials(model: Model) -> tuple[np.ndarray, Signals]:
-    """States and signals at which formulas are compared; any will do, as long as they are the same each time."""
+    """States and signals at which formulas are compared; any will do that are the same each time."""
     generator = np.random.default_rng(0)
     lower, upper = model.domain.T
     x = generator.uniform(lower[:, None], upper[:, None], size=(model.dimension, TRIALS))

@@ -14,6 +14,7 @@ from typing import Annotated
 
 import numpy as np
 import scipy.stats
+import sympy
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as checked
 
@@ -30,7 +31,7 @@ from siq.mismatch.structure import structure_of
 LOGGER = logging.getLogger(__name__)
 PROBE_SUBSTEPS = 2  # what a little of a mechanism does need not be known to many digits
 LEFT = 0.01  # probability that residuals are random, above which no further mechanism is sought
-PROMISING = 0.25  # of the best gain that screening foresees, below which a candidate is not fitted
+PROMISING = 0.2  # of the best gain so far; a candidate that promises less is not fitted
 EDGE_SUBSTEPS = 12  # between samples, for models whose f jumps
 
 
@@ -150,10 +151,17 @@ def both_fits(
         model = spread_edges(model, data, states, substeps=substeps)
     noise = begin.noise
     if len(noise.process) < model.dimension:  # what a mechanism brings is driven by no noise of its own
-        noise = replace(noise, process=np.append(noise.process, np.zeros(model.dimension - len(noise.process))))
+        noise = replace(
+            noise, process=np.append(noise.process, np.zeros(model.dimension - len(noise.process)))
+        )
     if noise.process.any():
         loose = fit(
-            model, data, x=states, noise=noise.scaled(max(level, 1e-6)), estimate_process=True, substeps=substeps
+            model,
+            data,
+            x=states,
+            noise=noise.scaled(max(level, 1e-6)),
+            estimate_process=True,
+            substeps=substeps,
         )
     else:
         loose = None
@@ -187,7 +195,8 @@ def search(
     options: SearchOptions,
 ) -> Search:
     """Look for mechanisms, one after the other."""
-    current, found = recalibrated, []
+    current = recalibrated
+    found: list[Found] = []
     base_model = recalibrated.model
     remaining = list(candidates)
     screened: list[tuple[Probe, Screened]] = []
@@ -297,9 +306,11 @@ def _fit_best(
         if result.gain > 0 and (label not in best or result.gain > best[label][1].gain):
             best[label] = (probe, result)
     ranked = sorted(best.values(), key=lambda each: -each[1].gain)
-    trials = []
+    trials: list[Trial] = []
     for probe, result in ranked[: options.fitted]:
-        if result.gain < max(options.same, PROMISING * ranked[0][1].gain):
+        # Against what fits have gained, not against what screening foresaw of one that gained nothing.
+        gained = max((each.delta_chi2 for each in trials), default=0.0)
+        if result.gain < max(options.same, PROMISING * gained):
             break
         model = with_start(probe, result, base_model)
         x = current.x
@@ -311,7 +322,9 @@ def _fit_best(
         if not trial.converged or not _admissible(trial, probe.candidate):
             continue
         candidate = probe.candidate
-        trials.append(Trial(candidate, trial, *evidence(trial, current, data, candidate, blocks=options.blocks)))
+        trials.append(
+            Trial(candidate, trial, *evidence(trial, current, data, candidate, blocks=options.blocks))
+        )
     return trials
 
 
@@ -353,11 +366,13 @@ def _accepted(
 
 
 def _needless(other: Trial, best: Trial) -> bool:
-    """Whether an alternative has the best as a special case, or needs more to say the same."""
-    if best.candidate.name in other.candidate.generalises:
-        return True
+    """Whether an alternative needs more parameters than the best, and does not earn them.
+
+    One that fits better by as much as its further parameters would bring by chance twice over (Akaike) is not
+    ruled out, although the simpler is preferred (Bayes).
+    """
     more = len(other.candidate.new) - len(best.candidate.new)
-    return more > 0 and other.delta_bic > best.delta_bic + 2
+    return more > 0 and other.delta_chi2 - best.delta_chi2 < 2 * more
 
 
 def _admissible(trial: Fit, candidate: Candidate) -> bool:
@@ -385,12 +400,13 @@ def _rebased(candidate: Candidate, before: Model, now: Model) -> Candidate | Non
             renamed[name] = f"{stem}_{k}"
     change = {symbol(old): symbol(new) for old, new in renamed.items() if old != new}
 
-    def merge(theirs: object, old: object, ours: object) -> object:
-        return ours + (theirs - old).xreplace(change)  # type: ignore[operator, attr-defined]
+    def merge(theirs: sympy.Expr, old: sympy.Expr, ours: sympy.Expr) -> sympy.Expr:
+        return ours + (theirs - old).xreplace(change)
 
     count = len(before.parameters)
     equations = [
-        merge(t, o, n) for t, o, n in zip(model.equations[: before.dimension], before.equations, now.equations)
+        merge(t, o, n)
+        for t, o, n in zip(model.equations[: before.dimension], before.equations, now.equations, strict=True)
     ]
     outputs = [
         (name, merge(t, o, n))

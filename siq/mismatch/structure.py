@@ -1,8 +1,8 @@
 """Structure in residuals: what is left when a simulation has been fitted, and along which coordinate.
 
 What may be missing is described without naming it: in every equation a piecewise linear function of every
-coordinate - a state, an input, the amplitude of a rotating frame, time - is let in, and the data say how large
-it would be. The same description tells where a mismatch sits, and whether one is left.
+coordinate - a state, an input, the amplitude of a rotating frame, time - is let in, and the data say how
+large it would be. The same description tells where a mismatch sits, and whether one is left.
 """
 
 from __future__ import annotations
@@ -192,9 +192,7 @@ def structure_of(
         Directions to be tried; by default all.
     """
     directions = tuple(
-        each
-        for each in directions_of(model, roles, data, fit.x)
-        if choose is None or choose(each)
+        each for each in directions_of(model, roles, data, fit.x) if choose is None or choose(each)
     )
     grid = Grid(data, min(fit.substeps, SUBSTEPS))
     response = probe_response(model, grid, fit, HatColumns(model, grid, directions))

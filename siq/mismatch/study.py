@@ -95,7 +95,10 @@ def read_measurements(path: str | Path, model: Model) -> Measurements:
     if (lengths < FEWEST).any():
         label = data.labels[int((lengths < FEWEST).argmax())]
         raise InputError(
-            path, f"recording {label}", f"it has fewer than {FEWEST} samples", "leave it out, or join recordings"
+            path,
+            f"recording {label}",
+            f"it has fewer than {FEWEST} samples",
+            "leave it out, or join recordings",
         )
     return data
 
@@ -119,7 +122,10 @@ def split(data: Measurements, study: MismatchStudy, *, file: str) -> tuple[Measu
         for label in study.held_out:
             if label not in data.labels:
                 raise InputError(
-                    file, "held_out", f"no recording is called '{label}'", f"use labels such as {data.labels[0]}"
+                    file,
+                    "held_out",
+                    f"no recording is called '{label}'",
+                    f"use labels such as {data.labels[0]}",
                 )
         chosen = {data.labels.index(label) for label in study.held_out}
         if not chosen or len(chosen) == count:

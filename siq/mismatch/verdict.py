@@ -110,7 +110,11 @@ def mechanisms_of(diagnosis: Diagnosis) -> list[dict[str, Any]]:
         return [_process_noise(diagnosis)]
     return [
         _mechanism(each.best, diagnosis.search.fit, diagnosis.share)
-        | {"indistinguishable_from": sorted({other.candidate.name for other in each.indistinguishable} - {each.best.candidate.name})}
+        | {
+            "indistinguishable_from": sorted(
+                {other.candidate.name for other in each.indistinguishable} - {each.best.candidate.name}
+            )
+        }
         for each in diagnosis.search.found
     ]
 
@@ -150,7 +154,7 @@ def standard_errors(fit: Fit) -> dict[str, float]:
 
 
 def excluded(diagnosis: Diagnosis) -> dict[str, dict[str, Any]]:
-    """Upper bounds of mechanisms that were not found: 95 % of the largest amplitude that agrees with the data."""
+    """Upper bounds (95 %) of the amplitudes of mechanisms that were not found."""
     bounds: dict[str, dict[str, Any]] = {}
     for probe, result in diagnosis.search.screened:
         candidate = probe.candidate
@@ -171,7 +175,9 @@ def sentence(diagnosis: Diagnosis, place: Location | None) -> str:
     if diagnosis.verdict == "no mismatch":
         return "The simulation explains the recordings to within their noise, as it is."
     if diagnosis.verdict == "parameter shift":
-        return "The simulation's equations explain the recordings to within their noise, with other parameters."
+        return (
+            "The simulation's equations explain the recordings to within their noise, with other parameters."
+        )
     where = f" {place.sentence}" if place is not None else ""
     if diagnosis.verdict == "unexplained":
         return f"The recordings differ from the simulation in a way that no mechanism accounts for.{where}"
@@ -220,7 +226,9 @@ def _process_noise(diagnosis: Diagnosis) -> dict[str, Any]:
                 "standard_error": None,
                 "unit": f"({unit})**2/({fit.model.time_unit})",
             }
-            for name, unit, value in zip(fit.model.states, fit.model.state_units, fit.noise.process, strict=True)
+            for name, unit, value in zip(
+                fit.model.states, fit.model.state_units, fit.noise.process, strict=True
+            )
             if value > 0
         },
         "evidence": {"delta_chi2": None, "delta_bic": None, "p_white": None, "p_cluster": None},

@@ -5,7 +5,13 @@ from functools import cache
 from pathlib import Path
 
 from siq.errors import InputError
-from workflow.settings import Studies, code_digest, prepare_environment
+from siq.study import load_published
+from workflow.settings import (
+    Studies,
+    code_digest,
+    find_resource,
+    prepare_environment,
+)
 
 
 def say_and_stop(error):
@@ -206,6 +212,27 @@ def all_outcomes(wildcards):
     if study_of(wildcards).study.landscape is not None:
         patterns["results/{study}/runs/{run}/landscape.json"] = all_runs
     return [path for pattern, of in patterns.items() for path in of(pattern)(wildcards)]
+
+
+def published_mesh_if_any(wildcards):
+    """Input function: the mesh that was published beside the figures, where SIQ_RESOURCES has it."""
+    figures = study_of(wildcards).published()
+    mesh = load_published(figures).mesh if figures is not None else None
+    if mesh is None or not Path(file := find_resource(mesh.file)).is_file():
+        return []
+    return ancient(file)
+
+
+def reproduced_studies(wildcards):
+    """Params function: the parameters of all studies that the page speaks of, those of the paper too."""
+    names = [*REPRODUCED, "archetype3d-published", "resonator-published"]
+    keys = ("runs", "simulation", "training", "regression", "dynamics", "metric")
+    return {name: STUDIES[name].parameters(*keys) for name in names}
+
+
+def of_reproduced(method):
+    """Input function: a file of every study that is reproduced."""
+    return lambda wildcards: [getattr(STUDIES[name], method)() for name in REPRODUCED]
 
 
 def figure_output(name):

@@ -1,15 +1,4 @@
 # The landscape of every run: equilibria, a formula for each well, barriers, paths; and what it is held against.
-from siq.study import load_published
-from workflow.settings import find_resource
-
-
-def published_mesh_if_any(wildcards):
-    """Input function: the mesh that was published beside the figures, where SIQ_RESOURCES has it."""
-    figures = study_of(wildcards).published()
-    mesh = load_published(figures).mesh if figures is not None else None
-    if mesh is None or not Path(file := find_resource(mesh.file)).is_file():
-        return []
-    return ancient(file)
 
 
 rule landscape:

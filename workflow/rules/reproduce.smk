@@ -1,18 +1,6 @@
 # Everything in the paper on one page, with ours beside it.
 
 
-def reproduced_studies(wildcards):
-    """Params function: the parameters of all studies that the page speaks of, those of the paper too."""
-    names = [*REPRODUCED, "archetype3d-published", "resonator-published"]
-    keys = ("runs", "simulation", "training", "regression", "dynamics", "metric")
-    return {name: STUDIES[name].parameters(*keys) for name in names}
-
-
-def of_reproduced(method):
-    """Input function: a file of every study that is reproduced."""
-    return lambda wildcards: [getattr(STUDIES[name], method)() for name in REPRODUCED]
-
-
 rule reproduction:
     input:
         summaries=expand("results/{study}/tables/summary.parquet", study=REPRODUCED),
