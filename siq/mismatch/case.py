@@ -121,10 +121,12 @@ def tables_of(case: Case, outcome: Outcome) -> dict[str, pd.DataFrame]:
     Returns
     -------
     dict
-        ``curves``: what is missing against each coordinate, in the unit of the equation. ``candidates``: every
-        probe, with what it would gain first, or on top of what was found. ``held_out``: recordings and
-        their three simulations. ``forces``: what the recalibrated simulation lacks at each sample, as far as random
-        forces were admitted. ``noise``: of the sensors by output, and of random forces by state.
+        ``curves``: what is missing against each coordinate, in the unit of the equation.
+        ``candidates``: every probe, with what it would gain first, or on top of what was found.
+        ``held_out``: recordings and their three simulations.
+        ``forces``: what the recalibrated simulation lacks at each sample, as far as random forces were
+        admitted.
+        ``noise``: of the sensors by output, and of random forces by state.
     """
     diagnosis, shown = outcome.diagnosis, outcome.shown
     curves = [
