@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -111,12 +111,14 @@ def diagnose(
         candidates += monomials
     recalibrated, least_squares = recalibrate(model, data)
     found = search(model, data, recalibrated, candidates, options=study.search)
-    after = structure_of(found.fit.model, data, found.fit, roles)
-    # Random forces that stand for missing physics take measurement noise with them; the final fit's is right.
-    still = Noise(found.fit.noise.measurement, np.zeros(model.dimension))
-    before = structure_of(model, data, recalibrated, roles, noise=still)
-    alone = structure_of(found.fit.model, data, found.fit, roles, noise=found.fit.noise.without_process())
-    explained = explained_share(before, alone)
+    after, before, explained = what_is_left(model, data, recalibrated, found.fit, roles)
+    if len(found.found) > 1 and (after.p_value < STRUCTURED or found.fit.has_process_noise):
+        # What was added to a mechanism that explains all but a trifle only patches the trifle.
+        first = found.found[0].best.fit
+        of_first = what_is_left(model, data, recalibrated, first, roles)
+        if of_first[2] >= ENOUGH:
+            found = replace(found, found=found.found[:1], fit=first)
+            after, before, explained = of_first
     random = found.fit.has_process_noise
     p_shift = shift_probability(model, recalibrated)
     remarks: list[str] = []
@@ -187,6 +189,18 @@ def recalibrate(model: Model, data: Measurements) -> tuple[Fit, Fit]:
     if again.converged and process_noise_needed(again, strict):
         return again, strict
     return strict, strict
+
+
+def what_is_left(
+    model: Model, data: Measurements, recalibrated: Fit, final: Fit, roles: Roles
+) -> tuple[Structure, Structure, float]:
+    """Structure after and before mechanisms were added, and the share of the excess that they explain."""
+    after = structure_of(final.model, data, final, roles)
+    # Random forces that stand for missing physics take measurement noise with them; the final fit's is right.
+    still = Noise(final.noise.measurement, np.zeros(model.dimension))
+    before = structure_of(model, data, recalibrated, roles, noise=still)
+    alone = structure_of(final.model, data, final, roles, noise=final.noise.without_process())
+    return after, before, explained_share(before, alone)
 
 
 def explained_share(before: Structure, after: Structure) -> float:
