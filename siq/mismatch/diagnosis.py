@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -18,11 +17,9 @@ from siq.mismatch.held_out import run
 from siq.mismatch.measurements import Measurements
 from siq.mismatch.model import Model
 from siq.mismatch.roles import Roles, roles_of
-from siq.mismatch.search import Search, both_fits, process_noise_needed, search
+from siq.mismatch.search import Search, both_fits, search, simpler
 from siq.mismatch.structure import Structure, structure_of
 from siq.mismatch.study import MismatchStudy
-
-LOGGER = logging.getLogger(__name__)
 
 Verdict = Literal["no mismatch", "parameter shift", "missing physics", "unexplained"]
 
@@ -170,9 +167,7 @@ def recalibrate(model: Model, data: Measurements) -> tuple[Fit, Fit]:
     loose = fit(model, data, x=x, noise=noise, estimate_process=True)
     if loose.converged:
         again, strict = both_fits(loose.model, data, loose)
-        if again is None or (strict.converged and not process_noise_needed(again, strict)):
-            return strict, strict
-        return again, strict
+        return simpler(again, strict), strict
     # Where random forces on a hidden state could explain anything, the fit has no end. The card's own
     # simulation is then the better start.
     followed = run(model, data, x[data.first[:-1]], substeps=max(loose.substeps, 1))
@@ -186,9 +181,7 @@ def recalibrate(model: Model, data: Measurements) -> tuple[Fit, Fit]:
         return loose, strict
     small = Noise(strict.noise.measurement, noise.process * FAINT)
     again = fit(strict.model, data, x=strict.x, noise=small, estimate_process=True, substeps=strict.substeps)
-    if again.converged and process_noise_needed(again, strict):
-        return again, strict
-    return strict, strict
+    return simpler(again if again.converged else None, strict), strict
 
 
 def what_is_left(
@@ -199,7 +192,9 @@ def what_is_left(
     # Random forces that stand for missing physics take measurement noise with them; the final fit's is right.
     still = Noise(final.noise.measurement, np.zeros(model.dimension))
     before = structure_of(model, data, recalibrated, roles, noise=still)
-    alone = structure_of(final.model, data, final, roles, noise=final.noise.without_process())
+    alone = after
+    if final.has_process_noise:
+        alone = structure_of(final.model, data, final, roles, noise=final.noise.without_process())
     return after, before, explained_share(before, alone)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from siq.mismatch.diagnosis import Diagnosis
 from siq.mismatch.estimation import Fit, Noise, solve, whiten
 from siq.mismatch.measurements import Measurements
-from siq.mismatch.structure import Curve, coordinate_values
+from siq.mismatch.structure import Curve
 
 VISIBLE = 0.1  # of the largest value of a curve
 TWO_ERRORS = 2.0
@@ -132,13 +132,6 @@ def affected(recalibrated: Fit, noise: Noise, data: Measurements) -> tuple[str, 
         for label, own, share in zip(data.labels, excess / excess.sum(), fair, strict=True)
         if own > PART * share
     )
-
-
-def course(diagnosis: Diagnosis, curve: Curve) -> np.ndarray:
-    """The coordinate of a curve along the fitted trajectories, shape ``(n,)``, for a rug below the plot."""
-    fit = diagnosis.search.recalibrated
-    empty = np.zeros((len(diagnosis.model.inputs), len(fit.x)))
-    return coordinate_values(diagnosis.model, curve.direction, fit.x.T, empty, np.zeros(len(fit.x)))
 
 
 def _sentence(

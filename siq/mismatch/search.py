@@ -120,10 +120,12 @@ def best_fit(
     model: Model, data: Measurements, begin: Fit, *, level: float = 1.0, x: np.ndarray | None = None
 ) -> Fit:
     """Fit with process noise estimated, and without; the simpler unless the data speak against it."""
-    loose, strict = both_fits(model, data, begin, level=level, x=x)
-    if loose is None or (strict.converged and not process_noise_needed(loose, strict)):
-        return strict
-    return loose
+    return simpler(*both_fits(model, data, begin, level=level, x=x))
+
+
+def simpler(loose: Fit | None, strict: Fit) -> Fit:
+    """The fit without process noise, unless the data speak against it."""
+    return strict if loose is None or not process_noise_needed(loose, strict) else loose
 
 
 def both_fits(

@@ -7,7 +7,6 @@ large it would be. The same description tells where a mismatch sits, and whether
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -175,7 +174,6 @@ def structure_of(
     roles: Roles,
     *,
     noise: Noise | None = None,
-    choose: Callable[[Direction], bool] | None = None,
 ) -> Structure:
     """Describe what a fit leaves.
 
@@ -188,12 +186,8 @@ def structure_of(
     noise
         At which the innovations are taken; by default the fit's, which shows what is not random. Without
         process noise they show all that the simulation does not explain.
-    choose
-        Directions to be tried; by default all.
     """
-    directions = tuple(
-        each for each in directions_of(model, roles, data, fit.x) if choose is None or choose(each)
-    )
+    directions = directions_of(model, roles, data, fit.x)
     grid = Grid(data, min(fit.substeps, SUBSTEPS))
     response = probe_response(model, grid, fit, HatColumns(model, grid, directions))
     noise = fit.noise if noise is None else noise
