@@ -14,6 +14,7 @@ import scipy.linalg
 
 from siq.bases import Basis
 
+VANISHING = 1e-8  # of f: where D∇V is smaller, Gauss–Newton is on its way to V = 0, which is a solution, too
 INDEPENDENT = 1e-5  # diagonal of a triangular factor: below this share columns are not independent enough
 
 
@@ -103,7 +104,9 @@ def gauss_newton(
     steps: int = 60,
     tolerance: float = 1e-13,
 ) -> Solution:
-    """Minimise the sum of squares of the residual.
+    """Minimise the sum of squares of the residual, relative to the size of ∇V.
+
+    The residual alone would draw a bad start to V = 0, which solves the equation, too.
 
     Parameters
     ----------
@@ -120,29 +123,43 @@ def gauss_newton(
     free = np.ones(len(start), dtype=bool) if free is None else free
     scale = equation.sizes()
     scale = np.where(scale > 0, scale, 1.0)
-    residual = equation.residual(coefficients)
+    residual, slant = _relative(equation, coefficients)
     converged = not free.any()
     for _ in range(steps if free.any() else 0):
-        jacobian = equation.jacobian(coefficients)[:, free] / scale[free]
-        step = _least_squares(jacobian, -residual) / scale[free]
+        size, change_of_size = slant
+        if size == 0:
+            converged = True
+            break
+        jacobian = (equation.jacobian(coefficients) - np.outer(residual, change_of_size))[:, free]
+        step = _least_squares(jacobian / (size * scale[free]), -residual) / scale[free]
         length = 1.0
         while True:
             trial = coefficients.copy()
             trial[free] += length * step
-            attempt = equation.residual(trial)
+            attempt, slant = _relative(equation, trial)
             if np.linalg.norm(attempt) < np.linalg.norm(residual) or length < 1e-3:
                 break
             length /= 2
         improved = np.linalg.norm(attempt) < np.linalg.norm(residual)
         change = np.linalg.norm(length * step * scale[free])
-        size = np.linalg.norm(coefficients * scale)
+        reached = np.linalg.norm(coefficients * scale)
         if improved:
             gain = 1 - float(np.linalg.norm(attempt)) / max(float(np.linalg.norm(residual)), 1e-300)
             coefficients, residual = trial, attempt
-        if not improved or change <= tolerance * size or gain < 1e-7:
+        if not improved or change <= tolerance * reached or gain < 1e-7:
             converged = True
             break
     return Solution(coefficients, relative_residual(equation, coefficients), converged)
+
+
+def _relative(
+    equation: HamiltonJacobi, coefficients: np.ndarray
+) -> tuple[np.ndarray, tuple[float, np.ndarray]]:
+    """The residual over rms of ∇V, shape ``(n,)``; that rms, and its derivative by the coefficients."""
+    along = equation.slopes(coefficients) @ equation.diffusion
+    size = np.sqrt((along * np.linalg.solve(equation.diffusion, along.T).T).sum(axis=1).mean())
+    change = np.einsum("nd,ndm->m", along, equation.gradients) / (len(along) * max(size, 1e-300))
+    return equation.residual(coefficients) / max(size, 1e-300), (float(size), change)
 
 
 def _least_squares(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -163,10 +180,12 @@ def _least_squares(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 
 def relative_residual(equation: HamiltonJacobi, coefficients: np.ndarray) -> float:
-    """Rms of the weighted residual over rms of ∇V; infinite for V = 0."""
+    """Rms of the weighted residual over rms of ∇V; infinite for V = 0, or all but 0."""
     gradient = equation.slopes(coefficients)
-    size = np.sqrt(np.einsum("ni,ij,nj->n", gradient, equation.diffusion, gradient).mean())
-    return float(np.sqrt((equation.residual(coefficients) ** 2).mean()) / size) if size > 0 else np.inf
+    squared = np.einsum("ni,ij,nj->n", gradient, equation.diffusion, gradient)
+    if not np.sqrt((equation.weight**2 * squared).mean()) > VANISHING:
+        return np.inf
+    return float(np.sqrt((equation.residual(coefficients) ** 2).mean() / squared.mean()))
 
 
 def sensitivity(

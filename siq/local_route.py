@@ -32,6 +32,7 @@ AT_LEVEL = 0.05  # of a level: by so much V of the saddle that set it may change
 MOST_ROUNDS = 80  # of growing
 ON_THE_WAY = 1e-6  # relative change of the coefficients with which Gauss–Newton ends before the last level
 STARTS = (0.5, 0.25, 1.0)  # of the networks' level: where the network route starts, one after the other
+LOW = 4  # powers up to this one are fitted to a network's V, and those above begin at zero
 NO_SOLUTION = 0.2  # relative residual from which on a start has led nowhere
 FLAT = 1e-6  # of the largest curvature at an attractor: V with a smaller one has no minimum there
 CLOSE = 0.1  # of the recorded box: a saddle so close to the points of the fit has been reached
@@ -393,8 +394,12 @@ def fit_well(
                 f" near {attractor.position.round(4)}"
             )
             continue
-        start = np.linalg.lstsq(basis.values(points), potential(points) - lowest, rcond=1e-10)[0]
+        # The low powers first: what points on slow manifolds leave open of the high ones would run away.
+        low = basis.exponents.sum(axis=1) <= LOW
+        start = np.zeros(basis.size)
+        start[low] = np.linalg.lstsq(basis.values(points)[:, low], potential(points) - lowest, rcond=1e-10)[0]
         equation = equation_at(basis, points, field(points), diffusion=diffusion)
+        start = gauss_newton(equation, start, free=low, steps=steps).coefficients
         solution = gauss_newton(equation, start, steps=steps)
         start = solution.coefficients
         metric = basis.hessians(attractor.position[None])[0] @ start

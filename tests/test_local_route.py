@@ -251,16 +251,33 @@ def test_the_network_route_does_not_follow_networks_in_how_far_a_well_reaches() 
     assert np.linalg.norm(well.values(x) - local.values(x)) < 5e-3 * np.linalg.norm(local.values(x))
 
 
-def test_the_network_route_refuses_a_v_that_vanishes() -> None:
+@pytest.mark.parametrize("factor", [0.1, 10.0])
+def test_the_network_route_is_not_drawn_to_a_v_that_vanishes(factor: float) -> None:
     known = archetype(2)
     found = outline_of(known)
 
-    def low(x: np.ndarray) -> np.ndarray:
-        return 0.1 * potential_values(known, x)
+    def off(x: np.ndarray) -> np.ndarray:
+        return factor * potential_values(known, x)
 
-    with pytest.raises(NumericalFailure, match="none with a minimum"):
+    well = fit_well(
+        known.field, found.attractors[0], found.regions[0], found.saddles[0], off,
+        diffusion=known.diffusion, degree=4, generator=np.random.default_rng(0),
+    )  # fmt: skip
+    at = found.attractors[0].position[None]
+    true = potential_values(known, well.points) - potential_values(known, at)
+    np.testing.assert_allclose(well.values(well.points), true, atol=1e-6 * true.max())
+
+
+def test_the_network_route_refuses_a_v_without_a_minimum() -> None:
+    known = archetype(2)
+    found = outline_of(known)
+
+    def upside_down(x: np.ndarray) -> np.ndarray:
+        return -potential_values(known, x)
+
+    with pytest.raises(NumericalFailure, match=r"recorded states below|none with a minimum"):
         fit_well(
-            known.field, found.attractors[0], found.regions[0], found.saddles[0], low,
+            known.field, found.attractors[0], found.regions[0], found.saddles[0], upside_down,
             diffusion=known.diffusion, degree=4, generator=np.random.default_rng(0),
         )  # fmt: skip
 
