@@ -14,9 +14,13 @@ from siq.systems import System, load_system
 ROOT = Path(__file__).parents[1]
 
 
+@pytest.hookimpl(tryfirst=True)  # before the scheduler reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Workflows first, for they take longest."""
+    """Workflows first, for they take longest; those that look at the same one in the same process."""
     items.sort(key=lambda item: "workflow" not in item.path.parts)
+    for item in items:
+        if "finished" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.xdist_group("finished"))
 
 
 @pytest.fixture

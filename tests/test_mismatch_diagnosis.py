@@ -33,9 +33,15 @@ Force = Callable[[np.ndarray, np.ndarray, float], np.ndarray]
 
 
 def recordings_of(
-    force: Force, *, count: int = 8, noise: float = 0.01, drive: float = 0.0, seed: int = 1
+    force: Force,
+    *,
+    count: int = 8,
+    noise: float = 0.01,
+    drive: float = 0.0,
+    fading: bool = False,
+    seed: int = 1,
 ) -> pd.DataFrame:
-    """Driven oscillators of different strength, by small steps of Heun's rule."""
+    """Driven oscillators of different strength, by Heun's rule; random forces may follow their motion."""
     generator = np.random.default_rng(seed)
     t = np.arange(SAMPLES) * STEP
     strength = np.geomspace(0.4, 2.0, count)[:, None]
@@ -58,7 +64,8 @@ def recordings_of(
             first = rate(state, at * STEP, at)
             second = rate(state + h * first, at * STEP + h, at + 1 / FINE)
             state = state + h / 2 * (first + second)
-            state[1] += np.sqrt(drive * h) * generator.normal(size=count)
+            kick = np.sqrt(drive * h) * generator.normal(size=count)
+            state[1] += kick * np.hypot(*state) if fading else kick
     size = noise * seen.std()
     return pd.DataFrame(
         {
@@ -94,6 +101,16 @@ def test_nothing_is_missing_and_what_could_be_is_bounded(tmp_path: Path) -> None
     assert outcome.verdict["fit"]["augmented"] == pytest.approx(
         outcome.verdict["fit"]["noise_floor"], rel=0.3
     )
+
+
+def test_a_noise_that_is_known_is_not_estimated(tmp_path: Path) -> None:
+    table = recordings_of(nothing)
+    # Of half the true size: then noise itself is more than the simulation explains.
+    for factor, verdict in ((1.0, "no mismatch"), (0.5, "unexplained")):
+        size = factor * 0.01 * table["x"].std()
+        outcome = solved(tmp_path, table, study={"held_out": ["r2", "r5"], "noise": {"x": float(size)}})
+        assert outcome.diagnosis.search.fit.noise.measurement == pytest.approx([size**2])
+        assert outcome.verdict["verdict"] == verdict
 
 
 def test_wrong_parameters_are_no_missing_physics(tmp_path: Path) -> None:
@@ -135,6 +152,21 @@ def test_random_forces_are_no_mechanism_with_a_formula(tmp_path: Path) -> None:
     assert intensity == pytest.approx(0.05, rel=0.3)
 
 
+def test_random_forces_that_follow_the_motion_are_not_those_of_surroundings(tmp_path: Path) -> None:
+    outcome = solved(tmp_path, recordings_of(nothing, drive=0.03, fading=True))
+    assert outcome.verdict["verdict"] == "unexplained"
+    assert any("hidden state" in remark for remark in outcome.verdict["remarks"])
+
+
+def test_unequal_friction_is_found_though_its_first_fit_may_lead_nowhere(tmp_path: Path) -> None:
+    def force(x: np.ndarray, v: np.ndarray, t: float) -> np.ndarray:
+        return -np.where(v > 0, 0.25, 0.1) * np.tanh(v / 1e-3)
+
+    outcome = solved(tmp_path, recordings_of(force, noise=0.03))
+    assert names(outcome) == ["asymmetric friction"]
+    assert outcome.diagnosis.search.fit.substeps > 12  # the jump was made sharp enough
+
+
 def test_what_the_dictionary_lacks_stays_unexplained(tmp_path: Path) -> None:
     outcome = solved(tmp_path, recordings_of(lambda x, v, t: 1.5 * np.exp(-(((x - 0.5) / 0.15) ** 2))))
     assert outcome.verdict["verdict"] == "unexplained" and outcome.verdict["mechanisms"] == []
@@ -171,6 +203,7 @@ def test_units_and_order_change_nothing_but_numbers(tmp_path: Path) -> None:
         ({"held_out": ["r9"]}, "no recording is called 'r9'"),
         ({"held_out": [f"r{index}" for index in range(8)]}, "one side of the split is empty"),
         ({"without": ["friction"]}, "no mechanism is called 'friction'"),
+        ({"noise": {"v": 0.1}}, "'v' is no output"),
         ({"held_oud": 0.2}, "did you mean 'held_out'"),
     ],
 )

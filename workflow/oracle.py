@@ -14,6 +14,7 @@ import sympy
 
 from siq.errors import NumericalFailure
 from siq.expressions import compile_values, delay
+from siq.mismatch.best_fit import best_fit
 from siq.mismatch.candidates import Candidate, build_candidate
 from siq.mismatch.case import Case
 from siq.mismatch.diagnosis import recalibrate
@@ -21,7 +22,6 @@ from siq.mismatch.dictionary import Form, FurtherState, Mechanism, MechanismPara
 from siq.mismatch.dictionary import Role as RoleKind
 from siq.mismatch.held_out import free_run, normalised_rms
 from siq.mismatch.model import Model, symbol
-from siq.mismatch.search import best_fit
 from workflow.keys import CaseKey
 
 POINTS = 24
@@ -41,11 +41,14 @@ class Oracle:
         Its normalised error on held-out recordings, NaN where it has none.
     note
         Why something is not known.
+    model
+        The true simulation as fitted, None where there is none.
     """
 
     delta_chi2: float
     error: float
     note: str = ""
+    model: Model | None = None
 
 
 def oracle_of(case: Case, key: CaseKey) -> Oracle:
@@ -91,6 +94,7 @@ def _oracle(case: Case, key: CaseKey) -> Oracle:
         float(gained) if key.effect.changes_equations else np.nan,
         np.nan if error is None else error,
         unsettled or ("" if error is not None else "the oracle's free run ran away"),
+        best.model,
     )
 
 

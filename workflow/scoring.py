@@ -60,6 +60,7 @@ COLUMNS: Mapping[str, str] = {
     "augmented_error": "float64",
     "error_ratio": "float64",
     "functional_error": "float64",
+    "oracle_functional_error": "float64",
     "intensity_ratio": "float64",
     "mechanism_intervals": "int64",
     "mechanism_covered": "int64",
@@ -124,6 +125,8 @@ def score_case(name: str, folder: str | Path, keys: str | Path, answer: Answer) 
     oracle = oracle_of(case, key)
     notes = [answer.failure, oracle.note]
     row |= held_out_scores(answer, oracle)
+    if key.kind == "mechanism" and oracle.model is not None:
+        row["oracle_functional_error"] = functional_error(case.model, oracle.model, key, truth)[0]
     if answer.verdict is not None:
         augmented = model_of(answer.card)
         found, note = coefficient_scores(case, key, truth, answer.verdict, augmented, row)

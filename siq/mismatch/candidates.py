@@ -80,7 +80,7 @@ def candidates_of(
 ) -> list[Candidate]:
     """Every place at which a mechanism of the dictionary may be at work in a system.
 
-    Process noise is not among them: it changes no equation (`siq.mismatch.estimation` estimates it).
+    Process noise is not among them: it changes no equation (`siq.mismatch.noise` estimates it).
 
     Raises
     ------

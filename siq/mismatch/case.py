@@ -16,7 +16,13 @@ from siq.mismatch.dictionary import Mechanism, dictionary_of
 from siq.mismatch.estimation import Fit
 from siq.mismatch.measurements import Measurements
 from siq.mismatch.model import Model, build_model
-from siq.mismatch.study import MismatchStudy, load_mismatch_study, read_measurements, split
+from siq.mismatch.study import (
+    MismatchStudy,
+    load_mismatch_study,
+    read_measurements,
+    split,
+    with_known_noise,
+)
 from siq.mismatch.verdict import HeldOut, held_out, verdict_of
 from siq.systems import SystemCard
 
@@ -84,7 +90,8 @@ def read_case(card: str | Path, recordings: str | Path, study: str | Path | None
     model = build_model(document, validate(document, SystemCard))
     options = load_mismatch_study(study) if study is not None else MismatchStudy()
     file = str(study) if study is not None else "the study"
-    learn, kept = split(read_measurements(recordings, model), options, file=file)
+    data = with_known_noise(read_measurements(recordings, model), model, options, file=file)
+    learn, kept = split(data, options, file=file)
     dictionary = dictionary_of(without=options.without, further=options.mechanisms, file=file)
     return Case(document, model, learn, kept, options, dictionary)
 

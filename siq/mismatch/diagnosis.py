@@ -10,14 +10,18 @@ import numpy as np
 import scipy.stats
 
 from siq.errors import NumericalFailure
+from siq.mismatch.best_fit import both_fits, simpler
 from siq.mismatch.candidates import Candidate, candidates_of, generic_candidates
 from siq.mismatch.dictionary import Mechanism
-from siq.mismatch.estimation import Fit, Noise, first_noise, first_states, fit
+from siq.mismatch.estimation import Fit, first_states, fit
 from siq.mismatch.held_out import run
+from siq.mismatch.innovations import Noise
 from siq.mismatch.measurements import Measurements
 from siq.mismatch.model import Model
+from siq.mismatch.noise import first_noise
 from siq.mismatch.roles import Roles, roles_of
-from siq.mismatch.search import Search, both_fits, search, simpler
+from siq.mismatch.search import Search, search
+from siq.mismatch.steadiness import unsteadiness
 from siq.mismatch.structure import Structure, structure_of
 from siq.mismatch.study import MismatchStudy
 
@@ -26,7 +30,10 @@ Verdict = Literal["no mismatch", "parameter shift", "missing physics", "unexplai
 STRUCTURED = 1e-4  # probability below which residuals are not called random
 SHIFTED = 1e-4  # probability below which parameters are not called unchanged
 FAINT = 1e-4  # process noise, relative to the motion, from which a fit without any is loosened
-ENOUGH = 0.999  # share of the excess that a mechanism explains, beyond which a remainder is only remarked
+ENOUGH = 0.999  # share of the excess that mechanisms explain, beyond which a remainder is only remarked
+MOSTLY = 0.99  # share that the first of several must explain alone for that
+MANY = 3  # mechanisms that together are a description rather than an explanation
+UNSTEADY = 6.0  # twice the difference of log-likelihoods, from which random forces follow the motion
 
 
 @dataclass(frozen=True)
@@ -109,11 +116,14 @@ def diagnose(
     recalibrated, least_squares = recalibrate(model, data)
     found = search(model, data, recalibrated, candidates, options=study.search)
     after, before, explained = what_is_left(model, data, recalibrated, found.fit, roles)
-    if len(found.found) > 1 and (after.p_value < STRUCTURED or found.fit.has_process_noise):
-        # What was added to a mechanism that explains all but a trifle only patches the trifle.
+    mostly = explained
+    doubtful = after.p_value < STRUCTURED or found.fit.has_process_noise or len(found.found) >= MANY
+    if len(found.found) > 1 and doubtful:
         first = found.found[0].best.fit
         of_first = what_is_left(model, data, recalibrated, first, roles)
-        if of_first[2] >= ENOUGH:
+        mostly = of_first[2]
+        if mostly >= ENOUGH:
+            # What was added to a mechanism that explains all but a trifle only patches the trifle.
             found = replace(found, found=found.found[:1], fit=first)
             after, before, explained = of_first
     random = found.fit.has_process_noise
@@ -124,15 +134,20 @@ def diagnose(
     verdict: Verdict
     if found.found:
         verdict = "missing physics"
-        if structured or random:
+        if doubtful:
             # Several terms that fit well together, and yet leave structure: so a false explanation looks.
-            if explained >= ENOUGH and len(found.found) == 1:
+            if explained >= ENOUGH and mostly >= MOSTLY:
                 remarks.append(f"{1 - explained:.2g} of the excess remains, and is not noise.")
             else:
                 verdict = "unexplained"
         random = False
     elif random:
-        verdict = "missing physics" if knows_noise and not structured else "unexplained"
+        steady = unsteadiness(found.fit, data) < UNSTEADY
+        if not steady:
+            remarks.append(
+                "Random forces that would explain it grow with the motion: a hidden state is likelier."
+            )
+        verdict = "missing physics" if knows_noise and steady and not structured else "unexplained"
         random = verdict == "missing physics"
     elif structured:
         verdict = "unexplained"

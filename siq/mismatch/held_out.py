@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from siq.mismatch.estimation import Noise, first_states, fit
+from siq.mismatch.estimation import first_states, fit
+from siq.mismatch.innovations import Noise
 from siq.mismatch.linearisation import Grid, integrate_intervals
 from siq.mismatch.measurements import Measurements
 from siq.mismatch.model import Model

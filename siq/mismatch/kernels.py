@@ -416,7 +416,7 @@ def noise_likelihood(
                     value = 0.0
                     for m in range(dimension):
                         value += half[i, m] * transition[k, j, m]
-                        # Simpson's rule, as in siq.mismatch.estimation.process_covariance.
+                        # Simpson's rule, as in siq.mismatch.innovations.process_covariance.
                         a, b = transition[k, i, m], transition[k, j, m]
                         same_i = 1.0 if i == m else 0.0
                         same_j = 1.0 if j == m else 0.0

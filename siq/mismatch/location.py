@@ -8,12 +8,15 @@ from typing import Any
 import numpy as np
 
 from siq.mismatch.diagnosis import Diagnosis
-from siq.mismatch.estimation import Fit, Noise, solve, whiten
+from siq.mismatch.estimation import Fit
+from siq.mismatch.innovations import Noise, solve, whiten
 from siq.mismatch.measurements import Measurements
-from siq.mismatch.structure import Curve
+from siq.mismatch.roles import Roles
+from siq.mismatch.structure import Curve, Structure
 
 VISIBLE = 0.1  # of the largest value of a curve
 TWO_ERRORS = 2.0
+NEARLY = 0.9  # of what the best coordinate, or a perfect description, would explain
 PART = 0.5  # of its fair share of the excess, from which on a recording counts as affected
 
 
@@ -68,7 +71,7 @@ def locate(diagnosis: Diagnosis, data: Measurements) -> Location | None:
     if diagnosis.verdict == "missing physics" and named is not None:
         equations, coordinate = named.equations, named.coordinate
     elif curves:
-        equations, coordinate = curves[0].direction.equations, curves[0].direction.coordinate
+        equations, coordinate = most_telling(diagnosis.before, diagnosis.roles)
     else:
         equations, coordinate = (), "unknown"
     curve = next(
@@ -95,6 +98,28 @@ def locate(diagnosis: Diagnosis, data: Measurements) -> Location | None:
         sentence=_sentence(equations, coordinate, region, recordings, everywhere=everywhere),
         curve=curve,
     )
+
+
+def most_telling(structure: Structure, roles: Roles) -> tuple[tuple[str, ...], str]:
+    """The equation in which something is missing, and the coordinate along which it shows best.
+
+    Where its own motion tells nearly as much as another coordinate, it is the motion: inputs and the time
+    move a system, too. Where no coordinate tells nearly all, a force depends on the course of the motion,
+    position and velocity both.
+    """
+    best = structure.curves[0]
+    equations = best.direction.equations
+    own = next((pair for pair in roles.motions if pair[1] in equations), equations)
+    if best.direction.coordinate in (*own, "amplitude"):
+        return equations, best.direction.coordinate
+    for curve in structure.curves:
+        same = curve.direction.equations == equations
+        if same and curve.direction.coordinate in own and curve.gain >= NEARLY * best.gain:
+            return equations, curve.direction.coordinate
+    excess = structure.total - structure.freedom
+    if len(own) > len(equations) and best.gain < NEARLY * excess:
+        return equations, ", ".join(own)
+    return equations, best.direction.coordinate
 
 
 def equation_shares(diagnosis: Diagnosis, equations: tuple[str, ...]) -> dict[str, float]:

@@ -32,6 +32,9 @@ class Measurements:
         What was measured, shape ``(n, m)``, in the order of the model's outputs.
     courses
         For each recording the courses of its inputs in time, see `course_of_input`.
+    sensor_noise
+        Variance of each output's noise where it is known, NaN where it is to be estimated; shape ``(m,)``.
+        None where none is known.
     """
 
     labels: tuple[str, ...]
@@ -39,6 +42,7 @@ class Measurements:
     t: np.ndarray
     outputs: np.ndarray
     courses: tuple[tuple[scipy.interpolate.PPoly, ...], ...]
+    sensor_noise: np.ndarray | None = None
 
     @property
     def begins(self) -> np.ndarray:
@@ -66,6 +70,12 @@ class Measurements:
             rough = np.mean(differences**2) / 20 if len(differences) else 0.0
             result[place] = max(rough, 1e-12 * spread) or 1.0
         return result
+
+    def with_known_noise(self, measurement: np.ndarray) -> np.ndarray:
+        """Variances of the outputs' noise, shape ``(m,)``, with those that are known in their places."""
+        if self.sensor_noise is None:
+            return measurement
+        return np.where(np.isfinite(self.sensor_noise), self.sensor_noise, measurement)
 
     @property
     def recording(self) -> np.ndarray:
@@ -106,7 +116,8 @@ class Measurements:
         """Some of the recordings, by their places."""
         rows = [np.arange(self.first[place], self.first[place + 1]) for place in chosen]
         together = np.concatenate(rows)
-        return Measurements(
+        return replace(
+            self,
             labels=tuple(self.labels[place] for place in chosen),
             first=np.concatenate([[0], np.cumsum([len(each) for each in rows])]),
             t=self.t[together],

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from siq.mismatch.estimation import Noise
 from siq.mismatch.held_out import free_run
+from siq.mismatch.innovations import Noise
 from siq.mismatch.measurements import Measurements
 from siq.mismatch.model import Model
 

@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.stats
 
-from siq.mismatch.estimation import Fit, Whitened, solve, whiten
+from siq.mismatch.estimation import Fit
+from siq.mismatch.innovations import Whitened, whiten
 from siq.mismatch.linearisation import Columns, Grid, Linearisation, linearise
 from siq.mismatch.measurements import Measurements
 from siq.mismatch.model import Model
@@ -131,48 +131,6 @@ def screen(
     return [
         Screened(2 * (each.gain - base), each.level, each.amplitudes, each.standard_errors) for each in best
     ]
-
-
-def cluster_test(
-    white: Whitened, parameters: Sequence[int], values: np.ndarray, *, blocks: np.ndarray
-) -> float:
-    """Probability that columns explain as much by chance, whatever the errors within a block are like.
-
-    A Wald test with the covariance of the scores of whole blocks in the place of that of white errors. The
-    residuals are those with the columns included, so that a real effect does not inflate its own error.
-
-    Parameters
-    ----------
-    white
-        Innovations and the columns of all parameters, those to be tested included.
-    parameters
-        Places of the columns to be tested.
-    values
-        The fitted values of these parameters, which would be zero by chance.
-    blocks
-        The block of each innovation, numbered from 0, shape ``(n,)``.
-    """
-    tested = np.array(parameters, dtype=int)
-    others = np.setdiff1d(np.arange(white.columns.shape[1]), tested)
-    change, _ = solve(white.columns, white.innovations)
-    left = white.innovations - white.columns @ change
-    nuisance, _ = np.linalg.qr(white.columns[:, others]) if len(others) else (np.zeros((len(left), 0)), None)
-    columns = white.columns[:, tested] - nuisance @ (nuisance.T @ white.columns[:, tested])
-    scale = np.sqrt((columns**2).sum(axis=0))
-    scale = np.where(scale > 0, scale, 1.0)
-    columns = columns / scale
-    scores = np.stack([np.bincount(blocks, column * left) for column in columns.T], axis=1)
-    count, width = len(scores), len(tested)
-    if count <= width + 1:
-        return 1.0
-    gram = columns.T @ columns
-    spread = scores.T @ scores * count / (count - 1)
-    estimate = (values + change[tested]) * scale
-    # Wald: a' (G⁻¹ S G⁻¹)⁻¹ a = (G a)' S⁻¹ (G a).
-    weighted = gram @ estimate
-    statistic = float(weighted @ np.linalg.lstsq(spread, weighted, rcond=1e-10)[0])
-    factor = (count - width) / (width * (count - 1))
-    return float(scipy.stats.f.sf(statistic * factor, width, count - width))
 
 
 def _profile(total: float, freedom: int, log_determinant: float) -> float:

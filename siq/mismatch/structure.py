@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.stats
 
-from siq.mismatch.estimation import Fit, Noise, solve, whiten
+from siq.mismatch.estimation import Fit
+from siq.mismatch.innovations import Noise, solve, whiten
 from siq.mismatch.linearisation import Grid
 from siq.mismatch.measurements import Measurements
 from siq.mismatch.model import Model

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -103,6 +104,25 @@ def read_measurements(path: str | Path, model: Model) -> Measurements:
     return data
 
 
+def with_known_noise(data: Measurements, model: Model, study: MismatchStudy, *, file: str) -> Measurements:
+    """The measurements with the noise of the sensors that the study knows.
+
+    Raises
+    ------
+    InputError
+        For a noise of something that is not measured.
+    """
+    for name in study.noise:
+        if name not in model.output_names:
+            raise InputError(
+                file, "noise", f"'{name}' is no output", f"use one of {', '.join(model.output_names)}"
+            )
+    if not study.noise:
+        return data
+    known = [study.noise.get(name, np.nan) ** 2 for name in model.output_names]
+    return replace(data, sensor_noise=np.array(known))
+
+
 def split(data: Measurements, study: MismatchStudy, *, file: str) -> tuple[Measurements, Measurements]:
     """Recordings to learn from, and those held out.
 
@@ -143,11 +163,5 @@ def _cut(data: Measurements, share: float) -> tuple[Measurements, Measurements]:
     if at < FEWEST:
         at = rows // 2
     first = data.until(np.array([at]))
-    last = Measurements(
-        labels=data.labels,
-        first=np.array([0, rows - at]),
-        t=data.t[at:],
-        outputs=data.outputs[at:],
-        courses=data.courses,
-    )
+    last = replace(data, first=np.array([0, rows - at]), t=data.t[at:], outputs=data.outputs[at:])
     return first, last

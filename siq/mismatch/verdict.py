@@ -15,7 +15,7 @@ from siq.mismatch.held_out import FreeRun, free_run, normalised_rms
 from siq.mismatch.location import Location, locate
 from siq.mismatch.measurements import Measurements
 from siq.mismatch.model import Model
-from siq.mismatch.search import Trial
+from siq.mismatch.trials import Trial
 
 METRIC = "normalised rms, held-out recordings"
 BOUND = 1.96

@@ -1,0 +1,105 @@
+"""Clustered errors: whether a mechanism stands, whatever errors within a recording are like.
+
+White errors are those of a perfect simulation. Of one that lacks more than the mechanism in question, errors
+hang together over a whole recording; only recordings, or blocks that are long compared with the correlations,
+count as independent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import scipy.stats
+
+from siq.mismatch.candidates import Candidate
+from siq.mismatch.estimation import Fit
+from siq.mismatch.innovations import Whitened, solve, whiten
+from siq.mismatch.measurements import Measurements
+
+LONG = 4.0  # correlation times in a block
+
+
+def clustered_probability(fit: Fit, data: Measurements, candidate: Candidate, *, blocks: int) -> float:
+    """Probability of a mechanism by chance, whatever errors within a recording are like.
+
+    Where there are fewer recordings than half of `blocks` they are cut into at least that many, of several
+    correlation times each.
+    """
+    white = whiten(fit.linearisation, data, fit.noise)
+    names = [fit.model.parameters[place].name for place in fit.model.free]
+    tested = [names.index(name) for name in (candidate.amplitudes or candidate.shapes)]
+    values = fit.model.values[[fit.model.free[place] for place in tested]]
+    owner = white.recording
+    if len(data.labels) < blocks // 2:
+        change, _ = solve(white.columns, white.innovations)
+        left = white.innovations - white.columns @ change
+        owner = blocks_of(owner, left, least=blocks)
+    return cluster_test(white, tested, values, blocks=owner)
+
+
+def blocks_of(recording: np.ndarray, left: np.ndarray, *, least: int) -> np.ndarray:
+    """The block of each residual, numbered from 0, where recordings are cut into at least so many."""
+    recordings = np.unique(recording)
+    block = np.empty(len(recording), dtype=int)
+    begun = 0
+    for place in recordings:
+        rows = np.flatnonzero(recording == place)
+        parts = max(-(-least // len(recordings)), int(len(rows) / (LONG * correlation_time(left[rows]))))
+        block[rows] = begun + (np.arange(len(rows)) * parts) // len(rows)
+        begun += parts
+    return block
+
+
+def correlation_time(series: np.ndarray) -> float:
+    """Integral correlation time in samples: one and twice the autocorrelations up to the first negative."""
+    power = float(series @ series)
+    total = 1.0
+    for lag in range(1, len(series) // 4):
+        correlation = float(series[lag:] @ series[:-lag]) / power if power > 0 else 0.0
+        if correlation <= 0:
+            break
+        total += 2 * correlation
+    return total
+
+
+def cluster_test(
+    white: Whitened, parameters: Sequence[int], values: np.ndarray, *, blocks: np.ndarray
+) -> float:
+    """Probability that columns explain as much by chance, whatever the errors within a block are like.
+
+    A Wald test with the covariance of the scores of whole blocks in the place of that of white errors. The
+    residuals are those with the columns included, so that a real effect does not inflate its own error.
+
+    Parameters
+    ----------
+    white
+        Innovations and the columns of all parameters, those to be tested included.
+    parameters
+        Places of the columns to be tested.
+    values
+        The fitted values of these parameters, which would be zero by chance.
+    blocks
+        The block of each innovation, numbered from 0, shape ``(n,)``.
+    """
+    tested = np.array(parameters, dtype=int)
+    others = np.setdiff1d(np.arange(white.columns.shape[1]), tested)
+    change, _ = solve(white.columns, white.innovations)
+    left = white.innovations - white.columns @ change
+    nuisance, _ = np.linalg.qr(white.columns[:, others]) if len(others) else (np.zeros((len(left), 0)), None)
+    columns = white.columns[:, tested] - nuisance @ (nuisance.T @ white.columns[:, tested])
+    scale = np.sqrt((columns**2).sum(axis=0))
+    scale = np.where(scale > 0, scale, 1.0)
+    columns = columns / scale
+    scores = np.stack([np.bincount(blocks, column * left) for column in columns.T], axis=1)
+    count, width = len(scores), len(tested)
+    if count <= width + 1:
+        return 1.0
+    gram = columns.T @ columns
+    spread = scores.T @ scores * count / (count - 1)
+    estimate = (values + change[tested]) * scale
+    # Wald: a' (G⁻¹ S G⁻¹)⁻¹ a = (G a)' S⁻¹ (G a).
+    weighted = gram @ estimate
+    statistic = float(weighted @ np.linalg.lstsq(spread, weighted, rcond=1e-10)[0])
+    factor = (count - width) / (width * (count - 1))
+    return float(scipy.stats.f.sf(statistic * factor, width, count - width))

@@ -1,0 +1,199 @@
+"""Trials: the candidates that promise most, screened and then fitted, each with its evidence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.stats
+
+from siq.mismatch.best_fit import EDGE_SUBSTEPS, best_fit
+from siq.mismatch.candidates import Candidate
+from siq.mismatch.clusters import clustered_probability
+from siq.mismatch.estimation import Fit
+from siq.mismatch.linearisation import Grid, spread_edges
+from siq.mismatch.measurements import Measurements
+from siq.mismatch.model import Model
+from siq.mismatch.probes import Probe, ProbeColumns, probes_of
+from siq.mismatch.screening import Screened, probe_response, screen
+
+PROBE_SUBSTEPS = 2  # what a little of a mechanism does need not be known to many digits
+PROMISING = 0.2  # of the best gain so far; a candidate that promises less is not fitted
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A candidate, fitted.
+
+    Attributes
+    ----------
+    candidate
+        The mechanism.
+    fit
+        Of the simulation with it.
+    delta_chi2
+        Twice the increase of the log-likelihood over the simulation without it.
+    delta_bic
+        Change of the Bayesian information criterion; negative where the mechanism is worth its parameters.
+    p_white, p_cluster
+        Probabilities of as much by chance.
+    """
+
+    candidate: Candidate
+    fit: Fit
+    delta_chi2: float
+    delta_bic: float
+    p_white: float
+    p_cluster: float
+
+
+def screen_all(
+    model: Model, data: Measurements, current: Fit, candidates: Sequence[Candidate]
+) -> list[tuple[Probe, Screened]]:
+    """Screen every candidate, with its shapes at all places where they are looked for."""
+    substeps = current.substeps
+    probes = []
+    for candidate in candidates:
+        spread = replace(
+            candidate,
+            model=spread_edges(candidate.model, data, current.x, substeps=max(substeps, EDGE_SUBSTEPS)),
+        )
+        probes += probes_of(spread, data, model, current.x)
+    if not probes:
+        return []
+    grid = Grid(data, min(substeps, PROBE_SUBSTEPS))
+    columns = ProbeColumns(model, grid, probes, current.x, current.model.values)
+    response = probe_response(model, grid, current, columns)
+    ends = np.cumsum([probe.width for probe in probes])
+    groups = [slice(end - probe.width, end) for probe, end in zip(probes, ends, strict=True)]
+    positive = [
+        np.array([name in probe.candidate.positive for name in probe.candidate.amplitudes] or [True])
+        for probe in probes
+    ]
+    return list(zip(probes, screen(response, data, current, groups, positive=positive), strict=True))
+
+
+def fit_best(
+    data: Measurements,
+    current: Fit,
+    base_model: Model,
+    screened: Sequence[tuple[Probe, Screened]],
+    *,
+    most: int,
+    least_gain: float,
+    blocks: int,
+) -> list[Trial]:
+    """Fit the candidates that promise most, each from its best probe.
+
+    Parameters
+    ----------
+    data
+        The recordings.
+    current, base_model
+        The fit that is to be improved, and its model.
+    screened
+        Every probe with what it would gain.
+    most
+        So many candidates at most.
+    least_gain
+        Twice the increase of the log-likelihood that a candidate must promise.
+    blocks
+        For clustered errors; see `siq.mismatch.clusters.clustered_probability`.
+
+    Returns
+    -------
+    list
+        Those whose fit settled, with signs that their mechanism allows.
+    """
+    best: dict[str, tuple[Probe, Screened]] = {}
+    for probe, result in screened:
+        label = probe.candidate.label
+        if result.gain > 0 and (label not in best or result.gain > best[label][1].gain):
+            best[label] = (probe, result)
+    ranked = sorted(best.values(), key=lambda each: -each[1].gain)
+    trials: dict[str, Trial] = {}
+    begun: list[tuple[Probe, Screened]] = []
+
+    def attempt(probe: Probe, result: Screened, begin: Fit) -> None:
+        candidate = probe.candidate
+        x = begin.x[:, : base_model.dimension]
+        if candidate.scales:
+            own = ProbeColumns(base_model, Grid(data, current.substeps), [probe], x, current.model.values)
+            x = np.concatenate([x, own.further_states(0)], axis=1)
+        trial = best_fit(with_start(probe, result, begin.model), data, begin, level=result.level, x=x)
+        if not trial.converged or not _admissible(trial, candidate):
+            return
+        known = trials.get(candidate.label)
+        if known is None or trial.log_likelihood > known.fit.log_likelihood:
+            judged = evidence(trial, current, data, candidate, blocks=blocks)
+            trials[candidate.label] = Trial(candidate, trial, *judged)
+
+    for probe, result in ranked[:most]:
+        # Against what fits have gained, not against what screening foresaw of one that gained nothing.
+        gained = max((each.delta_chi2 for each in trials.values()), default=0.0)
+        if result.gain < max(least_gain, PROMISING * gained):
+            break
+        begun.append((probe, result))
+        attempt(probe, result, current)
+    for probe, result in begun:
+        better = _better_start(probe.candidate, trials)
+        if better is not None:
+            attempt(probe, result, better)
+    return list(trials.values())
+
+
+def _better_start(candidate: Candidate, trials: Mapping[str, Trial]) -> Fit | None:
+    """Where a candidate is begun once more: one that led nowhere, or to less than a special case of it."""
+    own = trials.get(candidate.label)
+    if own is None:
+        rivals = list(trials.values())
+    else:
+        rivals = [
+            each
+            for each in trials.values()
+            if each.candidate.name in candidate.generalises
+            and each.candidate.equations == candidate.equations
+            and each.delta_chi2 > own.delta_chi2
+        ]
+    return max(rivals, key=lambda each: each.delta_chi2).fit if rivals else None
+
+
+def with_start(probe: Probe, result: Screened, base: Model) -> Model:
+    """The candidate's model with parameters to begin with: those of the base, and no effect yet.
+
+    What screening found of the amplitudes is a start only where shapes need one: linearised amplitudes can be
+    far off, and a fit that begins there may diverge.
+    """
+    candidate = probe.candidate
+    known = {parameter.name: parameter.value for parameter in base.parameters}
+    known |= dict.fromkeys(candidate.amplitudes, 0.0) | dict(probe.shapes)
+    if candidate.amplitudes and candidate.shapes:
+        known |= dict(zip(candidate.amplitudes, map(float, result.amplitudes), strict=True))
+    return candidate.model.with_values(np.array([known[each.name] for each in candidate.model.parameters]))
+
+
+def evidence(
+    trial: Fit, before: Fit, data: Measurements, candidate: Candidate, *, blocks: int
+) -> tuple[float, float, float, float]:
+    """Δχ², ΔBIC and the two probabilities of chance, of a candidate's fit over the fit without it."""
+    extra = len(trial.model.free) - len(before.model.free)
+    gained = 2 * (trial.log_likelihood - before.log_likelihood)
+    count = trial.degrees_of_freedom + len(trial.model.free)
+    return (
+        gained,
+        -gained + extra * np.log(count),
+        float(scipy.stats.chi2.sf(max(gained, 0.0), extra)),
+        clustered_probability(trial, data, candidate, blocks=blocks),
+    )
+
+
+def _admissible(trial: Fit, candidate: Candidate) -> bool:
+    names = [trial.model.parameters[place].name for place in trial.model.free]
+    for name in candidate.positive:
+        if name in names:
+            place = names.index(name)
+            value = trial.model.values[trial.model.free[place]]
+            if value < -2 * trial.standard_errors[place]:
+                return False
+    return True
