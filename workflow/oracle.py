@@ -14,7 +14,7 @@ import sympy
 
 from siq.errors import NumericalFailure
 from siq.expressions import compile_values, delay
-from siq.mismatch.best_fit import best_fit
+from siq.mismatch.best_fit import best_fit, sharpened
 from siq.mismatch.candidates import Candidate, build_candidate
 from siq.mismatch.case import Case
 from siq.mismatch.diagnosis import recalibrate
@@ -85,6 +85,7 @@ def _oracle(case: Case, key: CaseKey) -> Oracle:
     if not best.converged and not best.log_likelihood > recalibrated.log_likelihood:
         raise NumericalFailure("the fit of the true simulation did not settle")
     unsettled = "" if best.converged else "the oracle's fit did not settle; its Δχ² is a lower bound"
+    best = sharpened(best, case.learn)
     gained = 2 * (best.log_likelihood - recalibrated.log_likelihood)
     run = free_run(
         best.model, case.kept, noise=recalibrated.noise, substeps=max(best.substeps, recalibrated.substeps)

@@ -77,12 +77,17 @@ def both_fits(
         estimate_process=False,
         substeps=substeps,
     )
-    return loose, _sharpened(strict, data)
+    return loose, strict
 
 
-def _sharpened(rough: Fit, data: Measurements) -> Fit:
-    """A fit whose jumps are spread so little that it no longer matters; motion that sticks asks for this."""
-    while rough.converged and rough.model.edges and 2 * rough.substeps <= FINEST:
+def sharpened(rough: Fit, data: Measurements) -> Fit:
+    """A fit whose jumps are spread so little that it no longer matters; motion that sticks asks for this.
+
+    Without process noise only: with it the states follow the data anyway.
+    """
+    while (
+        rough.converged and rough.model.edges and not rough.has_process_noise and 2 * rough.substeps <= FINEST
+    ):
         substeps = 2 * rough.substeps
         finer = fit(
             spread_edges(rough.model, data, rough.x, substeps=substeps),
