@@ -9,6 +9,8 @@ from siq.simulate import runge_kutta_step
 from siq.vector_field import VectorField
 
 ACCURACY = 0.05  # step times the norm of the Jacobian, per step of the integrator
+MOST_STEPS = 5000  # between two samples; what is faster than that between samples is not what was recorded
+AWAY = 1e3  # widths of the recorded states: so far off a prediction has run away
 
 
 def predict(field: VectorField, recordings: Recordings) -> np.ndarray:
@@ -25,12 +27,13 @@ def predict(field: VectorField, recordings: Recordings) -> np.ndarray:
     -------
     numpy.ndarray
         Predicted states in the order of ``recordings.values``, shape ``(n, d)``; not finite where the
-        prediction runs away.
+        prediction runs away, or f is too fast to be followed from sample to sample.
     """
     starts = np.flatnonzero(np.diff(recordings.recording, prepend=-1))
     lengths = np.diff(np.append(starts, len(recordings.t)))
     width = np.ptp(recordings.values, axis=0)
     width = np.where(width > 0, width, 1.0)
+    center = recordings.values.mean(axis=0)
     jacobian = field.jacobian(recordings.values) * width / width[:, None]
     rate = float(np.quantile(np.linalg.norm(jacobian, axis=(1, 2)), 0.999))
     predicted = np.full_like(recordings.values, np.nan)
@@ -42,10 +45,15 @@ def predict(field: VectorField, recordings: Recordings) -> np.ndarray:
 
     with np.errstate(over="ignore", invalid="ignore"):
         for place in range(1, int(lengths.max())):
-            going = lengths > place
+            near = (np.abs(x - center[:, None]) < AWAY * width[:, None]).all(axis=0)
+            going = (lengths > place) & near
+            if not going.any():
+                break
             rows = starts[going] + place
             gap = recordings.t[rows] - recordings.t[rows - 1]
             steps = max(int(np.ceil(gap.max() * rate / ACCURACY)), 1)
+            if steps > MOST_STEPS:
+                break
             part = x[:, going]
             for _ in range(steps):
                 part = runge_kutta_step(velocity, part, gap / steps)

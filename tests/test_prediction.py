@@ -128,3 +128,9 @@ def test_units_do_not_change_the_work_or_the_prediction() -> None:
     )  # fmt: skip
     counting = Counting(scaled.symbols, scaled.equations)
     np.testing.assert_allclose(predict(counting, other) / units, predict(known.field, recordings), atol=1e-5)
+
+
+def test_an_f_too_fast_for_the_samples_is_given_up() -> None:
+    recordings = simulated(linear_system(2), trajectories=3)
+    fast = VectorField((x, y), (-1e9 * x, -1e9 * y))
+    assert np.isinf(prediction_errors(fast, recordings)).all()
