@@ -59,6 +59,16 @@ class HamiltonJacobi:
         slopes: np.ndarray = (self.gradients.reshape(n * d, m) @ coefficients).reshape(n, d)
         return slopes
 
+    def size(self, coefficients: np.ndarray) -> float:
+        """Rms of ∇V over the points, in the metric of the noise."""
+        gradient = self.slopes(coefficients)
+        return float(np.sqrt((gradient * (gradient @ self.diffusion)).sum(axis=1).mean()))
+
+    def size_jacobian(self, coefficients: np.ndarray) -> np.ndarray:
+        """Derivative of the size, which must not be zero, by the coefficients, shape ``(m,)``."""
+        along = self.slopes(coefficients) @ self.diffusion
+        return np.einsum("nd,ndm->m", along, self.gradients) / (len(along) * self.size(coefficients))
+
     def sizes(self) -> np.ndarray:
         """Rms of each function's gradient over the points, in the metric of the noise: shape ``(m,)``."""
         whitened = np.einsum("ij,nim->njm", np.linalg.cholesky(self.diffusion), self.gradients)
@@ -123,20 +133,20 @@ def gauss_newton(
     free = np.ones(len(start), dtype=bool) if free is None else free
     scale = equation.sizes()
     scale = np.where(scale > 0, scale, 1.0)
-    residual, slant = _relative(equation, coefficients)
+    residual, size = _relative(equation, coefficients)
     converged = not free.any()
     for _ in range(steps if free.any() else 0):
-        size, change_of_size = slant
         if size == 0:
             converged = True
             break
-        jacobian = (equation.jacobian(coefficients) - np.outer(residual, change_of_size))[:, free]
+        slant = equation.size_jacobian(coefficients)[free]
+        jacobian = equation.jacobian(coefficients)[:, free] - np.outer(residual, slant)
         step = _least_squares(jacobian / (size * scale[free]), -residual) / scale[free]
         length = 1.0
         while True:
             trial = coefficients.copy()
             trial[free] += length * step
-            attempt, slant = _relative(equation, trial)
+            attempt, size = _relative(equation, trial)
             if np.linalg.norm(attempt) < np.linalg.norm(residual) or length < 1e-3:
                 break
             length /= 2
@@ -152,14 +162,10 @@ def gauss_newton(
     return Solution(coefficients, relative_residual(equation, coefficients), converged)
 
 
-def _relative(
-    equation: HamiltonJacobi, coefficients: np.ndarray
-) -> tuple[np.ndarray, tuple[float, np.ndarray]]:
-    """The residual over rms of ∇V, shape ``(n,)``; that rms, and its derivative by the coefficients."""
-    along = equation.slopes(coefficients) @ equation.diffusion
-    size = np.sqrt((along * np.linalg.solve(equation.diffusion, along.T).T).sum(axis=1).mean())
-    change = np.einsum("nd,ndm->m", along, equation.gradients) / (len(along) * max(size, 1e-300))
-    return equation.residual(coefficients) / max(size, 1e-300), (float(size), change)
+def _relative(equation: HamiltonJacobi, coefficients: np.ndarray) -> tuple[np.ndarray, float]:
+    """The residual over rms of ∇V, shape ``(n,)``, and that rms."""
+    size = equation.size(coefficients)
+    return equation.residual(coefficients) / max(size, 1e-300), size
 
 
 def _least_squares(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ import scipy.stats
 
 from siq.mismatch.candidates import Candidate
 from siq.mismatch.estimation import Fit
-from siq.mismatch.innovations import Whitened, solve, whiten
+from siq.mismatch.innovations import solve, whiten
 from siq.mismatch.measurements import Measurements
 
 LONG = 4.0  # correlation times in a block
@@ -30,12 +30,12 @@ def clustered_probability(fit: Fit, data: Measurements, candidate: Candidate, *,
     names = [fit.model.parameters[place].name for place in fit.model.free]
     tested = [names.index(name) for name in (candidate.amplitudes or candidate.shapes)]
     values = fit.model.values[[fit.model.free[place] for place in tested]]
+    change, _ = solve(white.columns, white.innovations)
+    left = white.innovations - white.columns @ change
     owner = white.recording
     if len(data.labels) < blocks // 2:
-        change, _ = solve(white.columns, white.innovations)
-        left = white.innovations - white.columns @ change
         owner = blocks_of(owner, left, least=blocks)
-    return cluster_test(white, tested, values, blocks=owner)
+    return cluster_test(white.columns, left, tested, values + change[tested], blocks=owner)
 
 
 def blocks_of(recording: np.ndarray, left: np.ndarray, *, least: int) -> np.ndarray:
@@ -64,7 +64,12 @@ def correlation_time(series: np.ndarray) -> float:
 
 
 def cluster_test(
-    white: Whitened, parameters: Sequence[int], values: np.ndarray, *, blocks: np.ndarray
+    columns: np.ndarray,
+    left: np.ndarray,
+    parameters: Sequence[int],
+    values: np.ndarray,
+    *,
+    blocks: np.ndarray,
 ) -> float:
     """Probability that columns explain as much by chance, whatever the errors within a block are like.
 
@@ -73,21 +78,20 @@ def cluster_test(
 
     Parameters
     ----------
-    white
-        Innovations and the columns of all parameters, those to be tested included.
+    columns, left
+        Of all parameters, those to be tested included, shape ``(n, p)``, and the residuals with them,
+        shape ``(n,)``.
     parameters
         Places of the columns to be tested.
     values
-        The fitted values of these parameters, which would be zero by chance.
+        The best values of these parameters, which would be zero by chance.
     blocks
         The block of each innovation, numbered from 0, shape ``(n,)``.
     """
     tested = np.array(parameters, dtype=int)
-    others = np.setdiff1d(np.arange(white.columns.shape[1]), tested)
-    change, _ = solve(white.columns, white.innovations)
-    left = white.innovations - white.columns @ change
-    nuisance, _ = np.linalg.qr(white.columns[:, others]) if len(others) else (np.zeros((len(left), 0)), None)
-    columns = white.columns[:, tested] - nuisance @ (nuisance.T @ white.columns[:, tested])
+    others = np.setdiff1d(np.arange(columns.shape[1]), tested)
+    nuisance, _ = np.linalg.qr(columns[:, others]) if len(others) else (np.zeros((len(left), 0)), None)
+    columns = columns[:, tested] - nuisance @ (nuisance.T @ columns[:, tested])
     scale = np.sqrt((columns**2).sum(axis=0))
     scale = np.where(scale > 0, scale, 1.0)
     columns = columns / scale
@@ -97,7 +101,7 @@ def cluster_test(
         return 1.0
     gram = columns.T @ columns
     spread = scores.T @ scores * count / (count - 1)
-    estimate = (values + change[tested]) * scale
+    estimate = values * scale
     # Wald: a' (G⁻¹ S G⁻¹)⁻¹ a = (G a)' S⁻¹ (G a).
     weighted = gram @ estimate
     statistic = float(weighted @ np.linalg.lstsq(spread, weighted, rcond=1e-10)[0])

@@ -42,6 +42,11 @@ class Noise:
         return Noise(self.measurement, self.process * factor)
 
 
+def profile_likelihood(total: float, freedom: int, log_determinant: float) -> float:
+    """Log-likelihood, up to a constant, with the common scale of both kinds of noise at its best."""
+    return -0.5 * (freedom * np.log(max(total, 1e-300) / freedom) + log_determinant)
+
+
 @dataclass(frozen=True)
 class Whitened:
     """Innovations in units of their standard deviation, initial states projected out.

@@ -86,6 +86,22 @@ def estimate_noise(linearisation: Linearisation, data: Measurements, start: Nois
 
 def log_likelihood(linearisation: Linearisation, data: Measurements, noise: Noise) -> float:
     """Restricted log-likelihood along the trajectories in hand, the parameters at their best."""
+    total, freedom, log_determinant = likelihood_sums(linearisation, data, noise)
+    return -0.5 * (total + log_determinant + freedom * np.log(2 * np.pi))
+
+
+def likelihood_sums(
+    linearisation: Linearisation, data: Measurements, noise: Noise, *, weight: np.ndarray | float = 1.0
+) -> tuple[float, int, float]:
+    """Sum of squared innovations, degrees of freedom and log-determinant, the parameters at their best.
+
+    Parameters
+    ----------
+    linearisation, data, noise
+        Along which trajectories, for which recordings, at which noise.
+    weight
+        Factor on the process noise at each sample, shape ``(n,)``.
+    """
     total, log_determinant, freedom = noise_likelihood(
         data.first,
         linearisation.transition,
@@ -94,11 +110,11 @@ def log_likelihood(linearisation: Linearisation, data: Measurements, noise: Nois
         linearisation.measured,
         linearisation.measured_response,
         linearisation.residual,
-        np.append(np.diff(data.t), 0.0),
+        weight * np.append(np.diff(data.t), 0.0),
         noise.measurement,
         noise.process,
     )
-    return -0.5 * (total + log_determinant + freedom * np.log(2 * np.pi))
+    return total, freedom, log_determinant
 
 
 def noise_along(
@@ -107,6 +123,9 @@ def noise_along(
     """The noise along the trajectories in hand, the process noise only where it is to be estimated, too."""
     if estimate_process and (noise.process > 0).any():
         return estimate_noise(linearisation, data, noise)
+    driven = bool((noise.process > 0).any())
+    if driven and data.sensor_noise is not None:
+        return noise
     white = whiten(linearisation, data, noise)
     change, _ = solve(white.columns, white.innovations)
     left = (white.innovations - white.columns @ change).reshape(len(data.t), -1)
@@ -114,9 +133,7 @@ def noise_along(
     # Each output has its share of the initial states and parameters.
     share = (white.degrees_of_freedom - len(change)) / known.sum()
     factor = (left**2).sum(axis=0) / np.maximum(known.sum(axis=0) * share, 1.0)
-    if (noise.process > 0).any() and data.sensor_noise is not None:
-        return noise
-    if (noise.process > 0).any():  # one scale for both, since only their ratio is given
+    if driven:  # one scale for both, since only their ratio is given
         factor = np.full_like(factor, (left**2).sum() / (known.sum() * share))
         return Noise(noise.measurement * factor, noise.process * factor[0])
     return replace(noise, measurement=data.with_known_noise(noise.measurement * np.maximum(factor, 1e-12)))

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from siq.mismatch.estimation import Fit
-from siq.mismatch.innovations import Whitened, whiten
+from siq.mismatch.innovations import Whitened, profile_likelihood, whiten
 from siq.mismatch.linearisation import Columns, Grid, Linearisation, linearise
 from siq.mismatch.measurements import Measurements
 from siq.mismatch.model import Model
@@ -115,7 +115,7 @@ def screen(
         freedom = white.degrees_of_freedom - parameters
         left, columns = projected(white, parameters)
         total = float(left @ left)
-        base = max(base, _profile(total, freedom, white.log_determinant))
+        base = max(base, profile_likelihood(total, freedom, white.log_determinant))
         overlap = columns.T @ left
         for place, group in enumerate(groups):
             gram = columns[:, group].T @ columns[:, group]
@@ -123,7 +123,7 @@ def screen(
             after = max(total - float(amplitudes @ overlap[group]), 1e-12 * total)
             scale = after / max(freedom - len(amplitudes), 1)
             errors = np.sqrt(np.diag(covariance) * scale)
-            value = _profile(after, freedom, white.log_determinant)
+            value = profile_likelihood(after, freedom, white.log_determinant)
             if (amplitudes[positive[place]] < -2 * errors[positive[place]]).any():
                 continue
             if value > best[place].gain:
@@ -131,11 +131,6 @@ def screen(
     return [
         Screened(2 * (each.gain - base), each.level, each.amplitudes, each.standard_errors) for each in best
     ]
-
-
-def _profile(total: float, freedom: int, log_determinant: float) -> float:
-    """Log-likelihood with the common scale of both kinds of noise at its best."""
-    return -0.5 * (freedom * np.log(max(total, 1e-300) / freedom) + log_determinant)
 
 
 def _small_solve(gram: np.ndarray, overlap: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

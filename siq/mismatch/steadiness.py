@@ -10,8 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from siq.mismatch.estimation import Fit
-from siq.mismatch.kernels import noise_likelihood
+from siq.mismatch.innovations import Noise, profile_likelihood
 from siq.mismatch.measurements import Measurements
+from siq.mismatch.noise import likelihood_sums
 
 SHARES = (0.5, 0.9, 0.99)  # of the forces that follow the motion
 RATIOS = (1 / 8, 1 / 4, 1 / 2, 1 / 1.4, 1.0, 1.4, 2.0, 4.0, 8.0)  # of process noise, to that of the fit
@@ -49,17 +50,5 @@ def unsteadiness(fit: Fit, data: Measurements) -> float:
 
 def _log_likelihood(fit: Fit, data: Measurements, ratio: float, weight: np.ndarray) -> float:
     """With both kinds of noise on the best common scale; the weight is of the forces at every sample."""
-    along = fit.linearisation
-    total, log_determinant, freedom = noise_likelihood(
-        data.first,
-        along.transition,
-        along.response,
-        along.gap,
-        along.measured,
-        along.measured_response,
-        along.residual,
-        weight * np.append(np.diff(data.t), 0.0),
-        fit.noise.measurement,
-        ratio * fit.noise.process,
-    )
-    return float(-0.5 * (freedom * np.log(max(total, 1e-300) / freedom) + log_determinant))
+    noise = Noise(fit.noise.measurement, ratio * fit.noise.process)
+    return profile_likelihood(*likelihood_sums(fit.linearisation, data, noise, weight=weight))

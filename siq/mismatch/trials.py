@@ -127,8 +127,7 @@ def fit_best(
             return
         known = trials.get(candidate.label)
         if known is None or trial.log_likelihood > known.fit.log_likelihood:
-            judged = evidence(trial, current, data, candidate, blocks=blocks)
-            trials[candidate.label] = Trial(candidate, trial, *judged)
+            trials[candidate.label] = judged(trial, current, data, candidate, blocks=blocks)
 
     for place, (probe, result) in enumerate(ranked[: 2 * most]):
         # Against what screening foresaw of those that did gain it: some promise much and gain nothing, and
@@ -148,8 +147,7 @@ def fit_best(
     for label, trial in trials.items():
         if trial.fit.model.edges and trial.delta_chi2 >= RIVALS * most_gained:
             sharp = sharpened(trial.fit, data)
-            judged = evidence(sharp, current, data, trial.candidate, blocks=blocks)
-            trials[label] = Trial(trial.candidate, sharp, *judged)
+            trials[label] = judged(sharp, current, data, trial.candidate, blocks=blocks)
     return list(trials.values())
 
 
@@ -183,18 +181,18 @@ def with_start(probe: Probe, result: Screened, base: Model) -> Model:
     return candidate.model.with_values(np.array([known[each.name] for each in candidate.model.parameters]))
 
 
-def evidence(
-    trial: Fit, before: Fit, data: Measurements, candidate: Candidate, *, blocks: int
-) -> tuple[float, float, float, float]:
-    """Δχ², ΔBIC and the two probabilities of chance, of a candidate's fit over the fit without it."""
+def judged(trial: Fit, before: Fit, data: Measurements, candidate: Candidate, *, blocks: int) -> Trial:
+    """A candidate's fit with its evidence over the fit without it."""
     extra = len(trial.model.free) - len(before.model.free)
     gained = 2 * (trial.log_likelihood - before.log_likelihood)
     count = trial.degrees_of_freedom + len(trial.model.free)
-    return (
-        gained,
-        -gained + extra * np.log(count),
-        float(scipy.stats.chi2.sf(max(gained, 0.0), extra)),
-        clustered_probability(trial, data, candidate, blocks=blocks),
+    return Trial(
+        candidate=candidate,
+        fit=trial,
+        delta_chi2=gained,
+        delta_bic=-gained + extra * np.log(count),
+        p_white=float(scipy.stats.chi2.sf(max(gained, 0.0), extra)),
+        p_cluster=clustered_probability(trial, data, candidate, blocks=blocks),
     )
 
 
