@@ -11,6 +11,7 @@ from siq.mismatch.estimation import Fit, fit
 from siq.mismatch.linearisation import spread_edges
 from siq.mismatch.measurements import Measurements
 from siq.mismatch.model import Model
+from siq.mismatch.trajectories import fit_trajectories
 
 EDGE_SUBSTEPS = 12  # between samples, for models whose f jumps
 FINEST = 96  # the same, where the likelihood still changes
@@ -77,6 +78,15 @@ def both_fits(
         estimate_process=False,
         substeps=substeps,
     )
+    if not strict.converged:
+        nearest = loose if loose is not None and np.isfinite(loose.log_likelihood) else strict
+        strict = fit_trajectories(
+            model.with_values(nearest.model.values),
+            data,
+            begin=nearest.x[data.first[:-1]],
+            noise=nearest.noise,
+            substeps=substeps,
+        )
     return loose, strict
 
 

@@ -8,6 +8,7 @@ kind, for systems whose states have no roles.
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -87,7 +88,7 @@ def candidates_of(
     InputError
         For a formula that the whitelist refuses.
     """
-    found = []
+    found: list[tuple[Candidate, str]] = []
     for mechanism in dictionary:
         for form in mechanism.forms:
             if form.noise is not None:
@@ -98,8 +99,26 @@ def candidates_of(
                 except FormulaError as error:
                     raise InputError(file, mechanism.name, error.fault, error.remedy) from None
                 if candidate is not None:
-                    found.append(candidate)
-    return found
+                    found.append((candidate, ", ".join(assignment.values())))
+    return _told_apart(found)
+
+
+def _told_apart(found: Sequence[tuple[Candidate, str]]) -> list[Candidate]:
+    """Labels that occur once, where needed with what fills the roles, and then with what is added.
+
+    Two parameters of one equation may drift, each of two species be satiated, and a coupling have two forms.
+    """
+    filled = [(f"{each.label} ({roles})", each) for each, roles in found]
+    often = Counter(each.label for each, _ in found)
+    still = Counter(label for label, _ in filled)
+    result = []
+    for label, each in filled:
+        added = "; ".join(str(formula) for _, formula in each.changes)
+        if often[each.label] == 1:
+            result.append(each)
+        else:
+            result.append(replace(each, label=label if still[label] == 1 else f"{each.label} ({added})"))
+    return result
 
 
 def generic_candidates(model: Model, roles: Roles, *, degree: int) -> list[Candidate]:
@@ -264,7 +283,7 @@ def _of_kind(kind: str, model: Model, roles: Roles) -> tuple[str, ...]:
         "level": roles.levels,
         "state": roles.states,
         "input": tuple(entry.name for entry in model.inputs),
-        "parameter": tuple(model.parameters[place].name for place in model.free),
+        "parameter": tuple(entry.name for entry in model.parameters),  # what is known at first may drift, too
         "output": model.output_names,
     }[kind]
 

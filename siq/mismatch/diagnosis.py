@@ -14,7 +14,6 @@ from siq.mismatch.best_fit import both_fits, simpler
 from siq.mismatch.candidates import Candidate, candidates_of, generic_candidates
 from siq.mismatch.dictionary import Mechanism
 from siq.mismatch.estimation import Fit, first_states, fit
-from siq.mismatch.held_out import run
 from siq.mismatch.innovations import Noise
 from siq.mismatch.measurements import Measurements
 from siq.mismatch.model import Model
@@ -24,6 +23,7 @@ from siq.mismatch.search import Search, search
 from siq.mismatch.steadiness import unsteadiness
 from siq.mismatch.structure import Structure, structure_of
 from siq.mismatch.study import MismatchStudy
+from siq.mismatch.trajectories import run
 
 Verdict = Literal["no mismatch", "parameter shift", "missing physics", "unexplained"]
 

@@ -169,18 +169,63 @@ def fit(
             break
         values, x, current, length = stepped
         whole = length == 1.0
-    white = whiten(current, data, noise)
+    return _fitted(
+        model.with_values(values),
+        data,
+        x=x,
+        noise=noise,
+        along=current,
+        substeps=substeps,
+        converged=converged,
+    )
+
+
+def fitted(
+    model: Model, data: Measurements, *, x: np.ndarray, noise: Noise, substeps: int, converged: bool
+) -> Fit:
+    """What is known of a fit that was made otherwise: without process noise, its states follow the equations.
+
+    Parameters
+    ----------
+    model
+        With the estimates.
+    data, substeps, converged
+        Of the fit.
+    x
+        The fitted states, shape ``(n, d)``.
+    noise
+        To begin with; the measurement noise is estimated.
+    """
+    along = linearise(model, Grid(data, substeps), model.values, x)
+    if not along.finite:
+        return _failed(model, x, noise, along, substeps)
+    noise = noise_along(along, data, noise, estimate_process=False)
+    return _fitted(model, data, x=x, noise=noise, along=along, substeps=substeps, converged=converged)
+
+
+def _fitted(
+    model: Model,
+    data: Measurements,
+    *,
+    x: np.ndarray,
+    noise: Noise,
+    along: Linearisation,
+    substeps: int,
+    converged: bool,
+) -> Fit:
+    white = whiten(along, data, noise)
     if not np.isfinite(white.columns).all() or not np.isfinite(white.innovations).all():
-        return _failed(model, x, noise, current, substeps)
+        return _failed(model, x, noise, along, substeps)
     change, covariance = solve(white.columns, white.innovations)
+    free = np.array(model.free, dtype=int)
     # The last change is below the errors. The likelihood is that of the states in hand, not of a forecast.
     total = float(white.innovations @ white.innovations)
     return Fit(
-        model=model.with_values(_changed(values, free, change if converged else 0 * change)),
+        model=model.with_values(_changed(model.values, free, change if converged else 0 * change)),
         covariance=covariance,
         x=x,
         noise=noise,
-        linearisation=current,
+        linearisation=along,
         log_likelihood=white.log_likelihood(total),
         sum_of_squares=total,
         degrees_of_freedom=white.degrees_of_freedom - len(free),

@@ -12,9 +12,9 @@ import numpy as np
 
 from siq.mismatch.estimation import first_states, fit
 from siq.mismatch.innovations import Noise
-from siq.mismatch.linearisation import Grid, integrate_intervals
 from siq.mismatch.measurements import Measurements
 from siq.mismatch.model import Model
+from siq.mismatch.trajectories import run
 
 SHORTEST_PREFIX = 8  # samples
 PREFIX = 0.2  # of a recording
@@ -91,27 +91,6 @@ def initial_states(model: Model, data: Measurements, *, noise: Noise, substeps: 
     )
     best = strict.x if strict.converged else x
     return best[data.first[:-1]]
-
-
-def run(model: Model, data: Measurements, begin: np.ndarray, *, substeps: int) -> np.ndarray:
-    """Integrate recordings from their initial states, shape ``(recordings, d)``, to all samples ``(n, d)``.
-
-    A simulation that runs away is NaN from there on.
-    """
-    states = np.full((len(data.t), model.dimension), np.nan)
-    lengths = np.diff(data.first)
-    current = begin.T.copy()
-    states[data.first[:-1]] = begin
-    whole = Grid(data, substeps)
-    places = np.concatenate([[0], np.cumsum(lengths - 1)])[:-1]
-    for sample in range(int(lengths.max()) - 1):
-        alive = np.flatnonzero(lengths > sample + 1)
-        one = whole.at_intervals(places[alive] + sample)
-        with np.errstate(all="ignore"):
-            after = integrate_intervals(model, one, model.values, current[:, alive])
-        current[:, alive] = after
-        states[data.first[alive] + sample + 1] = after.T
-    return states
 
 
 def normalised_rms(outputs: np.ndarray, simulated: FreeRun) -> float | None:

@@ -78,7 +78,7 @@ class Grid:
             fraction = part + (INSIDE, 0.5, 1.0 - INSIDE)[place]
             t = self.data.t[self.rows] + fraction * self.step
             recording = self.data.recording[self.rows]
-            self._known[node, delays] = self.data.signals(t, recording, delays=delays)
+            self._known[node, delays] = self.data.signals(t, recording, delays=delays, width=self.step)
         return self._known[node, delays]
 
     def at_samples(self, delays: tuple[tuple[int, float], ...]) -> Signals:

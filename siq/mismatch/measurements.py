@@ -83,7 +83,12 @@ class Measurements:
         return np.repeat(np.arange(len(self.labels)), np.diff(self.first))
 
     def signals(
-        self, t: np.ndarray, recording: np.ndarray, *, delays: Sequence[tuple[int, float]]
+        self,
+        t: np.ndarray,
+        recording: np.ndarray,
+        *,
+        delays: Sequence[tuple[int, float]],
+        width: np.ndarray | float = 0.0,
     ) -> Signals:
         """Inputs at instants, each in its recording.
 
@@ -96,7 +101,11 @@ class Measurements:
         delays
             Delayed inputs wanted: the place of the input, and by how much time it lags. What was before a
             recording is taken to be as it began.
+        width
+            Of time about each instant, over which a delayed input that is held between samples is averaged:
+            a jump within a step of an integration then acts as it should, and the lag has a derivative.
         """
+        wide = np.broadcast_to(width, t.shape)
         count = len(self.courses[0]) if self.courses else 0
         inputs = np.empty((count, len(t)))
         delayed, slopes = np.empty((len(delays), len(t))), np.empty((len(delays), len(t)))
@@ -107,9 +116,16 @@ class Measurements:
             for index, course in enumerate(courses):
                 inputs[index, rows] = course(t[rows])
             for index, (which, lag) in enumerate(delays):
-                at = np.clip(t[rows] - lag, begin, end)
-                delayed[index, rows] = courses[which](at)
-                slopes[index, rows] = courses[which](at, 1)
+                course, at, half = courses[which], t[rows] - lag, wide[rows] / 2
+                if course.c.shape[0] == 1 and (half > 0).all():
+                    before, after = (np.clip(at + side, begin, end) for side in (-half, half))
+                    outside = (2 * half - (after - before)) * course(np.clip(at, begin, end))
+                    total = course.antiderivative()
+                    delayed[index, rows] = (total(after) - total(before) + outside) / (2 * half)
+                    slopes[index, rows] = (course(after) - course(before)) / (2 * half)
+                else:
+                    at = np.clip(at, begin, end)
+                    delayed[index, rows], slopes[index, rows] = course(at), course(at, 1)
         return Signals(inputs=inputs, delayed=delayed, slopes=slopes, t=t)
 
     def select(self, chosen: Sequence[int]) -> Measurements:
