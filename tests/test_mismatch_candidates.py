@@ -127,10 +127,28 @@ def test_units_are_worked_out(oscillator: Model) -> None:
     assert unit_of("a/T", {"a": "°C", "T": "s"}) == "°C/s"
 
 
+def test_what_fills_the_roles_tells_candidates_apart() -> None:
+    populations = model_of(
+        {"states": states("n", "p"), "equations": {"n": "n - 0.5*n*p", "p": "-p + 0.2*n*p"}}
+    )
+    masses = model_of(
+        {
+            "states": states("x", "v", "y", "w"),
+            "parameters": {"k": {"value": 1.0}, "m": {"value": 1.0, "fixed": True}},
+            "equations": {"x": "v", "v": "(-k*x + y)/m", "y": "w", "w": "-y"},
+        }
+    )
+    for model in (populations, masses):
+        labels = [each.label for each in candidates_of(model, roles_of(model), standard_dictionary())]
+        assert len(set(labels)) == len(labels)
+    # What a card holds fixed may drift, too.
+    assert {"parameter drift in v (k)", "parameter drift in v (m)"} <= set(labels)
+
+
 def test_saturation_of_a_predator_acts_on_the_encounters() -> None:
     model = model_of({"states": states("n", "p"), "equations": {"n": "n - 0.5*n*p", "p": "-p + 0.2*n*p"}})
     found = candidates_of(model, roles_of(model), standard_dictionary())
-    fed = next(each for each in found if each.label == "saturation in n, p" and "h_1*n" in str(each.changes))
+    fed = next(each for each in found if each.name == "saturation" and "h_1*n" in str(each.changes))
     names = fed.model.names
     expected = names["n"] - sympy.Float("0.5") * names["n"] * names["p"] / (1 + names["h_1"] * names["n"])
     assert sympy.simplify(fed.model.equations[0] - expected) == 0

@@ -139,6 +139,15 @@ def test_a_hardening_spring_is_named_measured_and_located(tmp_path: Path) -> Non
     json.dumps(verdict, allow_nan=False)
 
 
+def test_a_faint_mechanism_is_described_but_not_named(tmp_path: Path) -> None:
+    table = recordings_of(lambda x, v, t: -0.03 * x**3)
+    study = {"held_out": ["r2", "r5"], "search": {"named": 1e6}}
+    outcome = solved(tmp_path, table, study=study)
+    assert outcome.verdict["verdict"] == "unexplained" and names(outcome) == []
+    assert outcome.verdict["description"]["by"][0]["name"] == "cubic stiffness"
+    assert "too faint to be named" in outcome.verdict["remarks"][-1]
+
+
 def test_dry_friction_is_told_from_other_friction(tmp_path: Path) -> None:
     outcome = solved(tmp_path, recordings_of(lambda x, v, t: -0.25 * np.tanh(v / 1e-3)))
     assert names(outcome) == ["dry friction"]

@@ -108,6 +108,7 @@ def targets_of(scores: pd.DataFrame) -> list[Target]:
     noisy = scores[scores["kind"] == NOISE]
     mechanisms = scores[scores["kind"] == "mechanism"]
     strong = mechanisms[mechanisms["oracle_delta_chi2"] >= STRONG]
+    faint = mechanisms[mechanisms["oracle_delta_chi2"] < STRONG]
     named = strong[strong["verdict"] == "missing physics"]
     withheld = scores[(scores["kind"] == "withheld") & scores["detected"]]
     found = [
@@ -121,6 +122,8 @@ def targets_of(scores: pd.DataFrame) -> list[Target]:
         share("truth within the reported class, Δχ² ≥ 100", strong["truth_in_class"], least=0.98),
         mean("mean size of the class, Δχ² ≥ 100", named["class_size"], most=1.5),
         share("named mechanism has the key's formula, Δχ² ≥ 100", strong["same_formula"]),
+        share("detected, Δχ² < 100", faint["detected"]),
+        share("named rightly, Δχ² < 100", faint["truth_in_class"]),
     ]
     for level, least in ((40.0, 0.85), (30.0, 0.75), (20.0, None)):
         own = strong[strong["noise_db"] == level]

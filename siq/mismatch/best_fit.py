@@ -79,12 +79,13 @@ def both_fits(
         substeps=substeps,
     )
     if not strict.converged:
-        nearest = loose if loose is not None and np.isfinite(loose.log_likelihood) else strict
+        # Where random forces led to nothing better, they led away.
+        near = loose if loose is not None and loose.log_likelihood > begin.log_likelihood else None
         strict = fit_trajectories(
-            model.with_values(nearest.model.values),
+            model if near is None else model.with_values(near.model.values),
             data,
-            begin=nearest.x[data.first[:-1]],
-            noise=nearest.noise,
+            begin=(states if near is None else near.x)[data.first[:-1]],
+            noise=noise if near is None else near.noise,
             substeps=substeps,
         )
     return loose, strict

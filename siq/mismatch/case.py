@@ -109,7 +109,7 @@ def solve_case(case: Case) -> Outcome:
     final = final_fit(diagnosis)
     card = augmented_card(
         case.card,
-        final.model,
+        shown.model if diagnosis.verdict == "missing physics" else final.model,
         process=final.noise.process if diagnosis.process_noise else None,
         scale=final.x.std(axis=0),
     )

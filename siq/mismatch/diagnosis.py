@@ -52,6 +52,8 @@ class Diagnosis:
         Recalibration, mechanisms found, and the final fit.
     least_squares
         The recalibration whose trajectories follow the equations exactly.
+    augmented_least_squares
+        The same of the final simulation, where a remainder that is no noise was admitted as random forces.
     before
         Structure of what the recalibrated simulation does not explain, random forces included.
     after
@@ -73,6 +75,7 @@ class Diagnosis:
     roles: Roles
     search: Search
     least_squares: Fit
+    augmented_least_squares: Fit | None
     before: Structure
     after: Structure
     process_noise: bool
@@ -119,13 +122,19 @@ def diagnose(
     mostly = explained
     doubtful = after.p_value < STRUCTURED or found.fit.has_process_noise or len(found.found) >= MANY
     if len(found.found) > 1 and doubtful:
-        first = found.found[0].best.fit
-        of_first = what_is_left(model, data, recalibrated, first, roles)
-        mostly = of_first[2]
+        left = [what_is_left(model, data, recalibrated, each.best.fit, roles) for each in found.found]
+        mostly = left[0][2]
         if mostly >= ENOUGH:
-            # What was added to a mechanism that explains all but a trifle only patches the trifle.
-            found = replace(found, found=found.found[:1], fit=first)
-            after, before, explained = of_first
+            # What is added to a mechanism that explains all but a trifle may only patch the trifle.
+            kept = 1
+            while (
+                kept < len(left)
+                and found.found[kept].best.delta_chi2 >= study.search.named
+                and left[kept][2] > left[kept - 1][2]
+            ):
+                kept += 1
+            found = replace(found, found=found.found[:kept], fit=found.found[kept - 1].best.fit)
+            after, before, explained = left[kept - 1]
     random = found.fit.has_process_noise
     p_shift = shift_probability(model, recalibrated)
     remarks: list[str] = []
@@ -140,6 +149,14 @@ def diagnose(
                 remarks.append(f"{1 - explained:.2g} of the excess remains, and is not noise.")
             else:
                 verdict = "unexplained"
+        gained = found.found[0].best.delta_chi2
+        if verdict == "missing physics" and gained < study.search.named:
+            verdict = "unexplained"
+            name = found.found[0].best.candidate.name
+            remarks.append(
+                f"It looks like {name}, but is too faint to be named: that gains {gained:.0f} in chi2, and "
+                f"{study.search.named:g} are asked for."
+            )
         random = False
     elif random:
         steady = unsteadiness(found.fit, data) < UNSTEADY
@@ -153,12 +170,21 @@ def diagnose(
         verdict = "unexplained"
     else:
         verdict = "parameter shift" if p_shift < SHIFTED else "no mismatch"
+    exact = None
+    if verdict == "missing physics" and not random and found.fit.has_process_noise:
+        exact = both_fits(found.fit.model, data, found.fit)[1]
+        if exact.converged:
+            remarks.append(
+                "The estimates admit random forces for what remains; the augmented card has those of least "
+                "squares where it runs better with them."
+            )
     return Diagnosis(
         verdict=verdict,
         model=model,
         roles=roles,
         search=found,
         least_squares=least_squares,
+        augmented_least_squares=exact if exact is not None and exact.converged else None,
         before=before,
         after=after,
         process_noise=random,

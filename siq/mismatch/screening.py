@@ -20,7 +20,7 @@ from siq.mismatch.model import Model
 
 LEVELS = (1.0, 0.1, 1e-2, 1e-3, 1e-4, 0.0)
 """Process noise, relative to that of the fit."""
-COLLINEAR = 1e-5  # share of a column that is left when the parameters' are projected out
+COLLINEAR = 0.02  # share of a column left beside the parameters, below which its amplitude knows no bounds
 
 
 @dataclass(frozen=True)

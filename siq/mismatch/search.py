@@ -45,6 +45,9 @@ class SearchOptions:
         Most candidates that are fitted after each screening.
     mechanisms
         Most mechanisms that are looked for.
+    named
+        χ² that the first mechanism must gain to be named. What gains less is detected, and described, but too
+        faint for its shape to be tried: much that no dictionary has looks the same.
     blocks
         Least number of blocks into which recordings are cut for clustered errors, where there are fewer than
         half as many recordings.
@@ -54,6 +57,7 @@ class SearchOptions:
     same: Annotated[float, Field(gt=0)] = 10.0
     fitted: Annotated[int, Field(ge=1)] = 6
     mechanisms: Annotated[int, Field(ge=1, le=5)] = 3
+    named: Annotated[float, Field(ge=0)] = 100.0
     blocks: Annotated[int, Field(ge=4)] = 10
 
 
@@ -216,6 +220,10 @@ def _accepted(trials: Sequence[Trial], probes: int, chance: float, *, options: S
     if not significant:
         return None
     best = min(significant, key=lambda each: each.delta_bic)
+    if best.fit.has_process_noise:
+        # What is left is no noise, and white errors mean little: of equals, what all recordings ask for.
+        equals = [each for each in significant if each.delta_bic < best.delta_bic + options.same]
+        best = min(equals, key=lambda each: each.p_cluster)
     alternatives = tuple(
         other
         for other in trials

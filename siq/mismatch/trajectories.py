@@ -17,7 +17,7 @@ from siq.mismatch.measurements import Measurements
 from siq.mismatch.model import Model
 
 ACCURACY = 1e-4  # relative change of the sum of squares at which a fit has converged
-TRIALS = 40  # most simulations of all recordings
+TRIALS = 25  # most simulations of all recordings
 
 
 def run(model: Model, data: Measurements, begin: np.ndarray, *, substeps: int) -> np.ndarray:

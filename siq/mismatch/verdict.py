@@ -29,6 +29,8 @@ class HeldOut:
     ----------
     before, recalibrated, augmented
         The card's simulation, with its parameters refitted, and with what was found.
+    model
+        The augmented simulation that was run.
     scores
         The normalised errors of the three, None where a simulation ran away, and the noise floor.
     """
@@ -36,6 +38,7 @@ class HeldOut:
     before: FreeRun
     recalibrated: FreeRun
     augmented: FreeRun
+    model: Model
     scores: Mapping[str, float | None]
 
 
@@ -47,7 +50,7 @@ def held_out(diagnosis: Diagnosis, learned: Measurements, data: Measurements) ->
     diagnosis
         What was found.
     learned
-        The recordings that it was found in; they decide which recalibration runs freely best.
+        The recordings that it was found in; they decide which estimates run freely best.
     data
         The recordings held out.
     """
@@ -63,17 +66,16 @@ def held_out(diagnosis: Diagnosis, learned: Measurements, data: Measurements) ->
     if search.recalibrated.has_process_noise and np.isfinite(diagnosis.least_squares.sum_of_squares):
         choices = (diagnosis.least_squares.model, recalibrated, diagnosis.model)
         recalibrated = min(choices, key=error_where_learned)
-    models = {
-        "before": diagnosis.model,
-        "recalibrated": recalibrated,
-        "augmented": search.fit.model,
-    }
+    augmented = search.fit.model
+    if diagnosis.augmented_least_squares is not None:
+        augmented = min((diagnosis.augmented_least_squares.model, augmented), key=error_where_learned)
+    models = {"before": diagnosis.model, "recalibrated": recalibrated, "augmented": augmented}
     runs = {name: free_run(model, data, noise=noise, substeps=substeps) for name, model in models.items()}
     scores = {name: normalised_rms(data.outputs, simulated) for name, simulated in runs.items()}
     scored = runs["before"].scored
     spread = np.nanvar(data.outputs[scored], axis=0)
     floor = np.sqrt(np.mean(search.fit.noise.measurement / np.where(spread > 0, spread, 1.0)))
-    return HeldOut(**runs, scores={**scores, "noise_floor": float(floor)})
+    return HeldOut(**runs, model=augmented, scores={**scores, "noise_floor": float(floor)})
 
 
 def verdict_of(diagnosis: Diagnosis, data: Measurements, shown: HeldOut) -> dict[str, Any]:
