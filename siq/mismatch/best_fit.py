@@ -54,10 +54,9 @@ def both_fits(
         substeps = max(substeps, EDGE_SUBSTEPS)
         model = spread_edges(model, data, states, substeps=substeps)
     noise = begin.noise
-    if len(noise.process) < model.dimension:  # what a mechanism brings is driven by no noise of its own
-        noise = replace(
-            noise, process=np.append(noise.process, np.zeros(model.dimension - len(noise.process)))
-        )
+    if len(noise.process) != model.dimension:  # what a mechanism brings is driven by no noise of its own
+        driven = noise.process[: model.dimension]
+        noise = replace(noise, process=np.append(driven, np.zeros(model.dimension - len(driven))))
     if noise.process.any():
         loose = fit(
             model,
@@ -100,14 +99,11 @@ def sharpened(rough: Fit, data: Measurements) -> Fit:
         rough.converged and rough.model.edges and not rough.has_process_noise and 2 * rough.substeps <= FINEST
     ):
         substeps = 2 * rough.substeps
-        finer = fit(
-            spread_edges(rough.model, data, rough.x, substeps=substeps),
-            data,
-            x=rough.x,
-            noise=rough.noise,
-            estimate_process=False,
-            substeps=substeps,
-        )
+        model = spread_edges(rough.model, data, rough.x, substeps=substeps)
+        finer = fit(model, data, x=rough.x, noise=rough.noise, estimate_process=False, substeps=substeps)
+        if not finer.converged:
+            begin = rough.x[data.first[:-1]]
+            finer = fit_trajectories(model, data, begin=begin, noise=rough.noise, substeps=substeps)
         if not finer.converged:
             break
         gained, rough = finer.log_likelihood - rough.log_likelihood, finer
