@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from siq.mismatch.clusters import blocks_of, correlation_time
 from siq.mismatch.location import most_telling
 from siq.mismatch.roles import Roles
+from siq.mismatch.search import SearchOptions, accepted
 from siq.mismatch.structure import Curve, Direction, Structure
+from siq.mismatch.trials import Trial
 
 
 def autoregressive(memory: float, size: int) -> np.ndarray:
@@ -73,3 +77,17 @@ def test_the_coordinate_that_tells_most(roles: Roles, found: Structure, expected
     equations, coordinate = most_telling(found, roles)
     assert equations == (found.curves[0].direction.equations)
     assert coordinate == expected
+
+
+@pytest.mark.parametrize(("random_forces", "expected"), [(False, "better"), (True, "steadier")])
+def test_of_equals_the_one_that_all_recordings_ask_for_where_white_errors_mean_little(
+    random_forces: bool, expected: str
+) -> None:
+    def trial(name: str, gain: float, p_cluster: float) -> Trial:
+        fit = SimpleNamespace(has_process_noise=random_forces)
+        return Trial(SimpleNamespace(name=name, new=("c",)), fit, gain, 7.0 - gain, 0.0, p_cluster)
+
+    trials = [trial("better", 331, 1e-9), trial("steadier", 325, 1e-49), trial("worse", 276, 1e-60)]
+    found = accepted(trials, 50, 1e-4, options=SearchOptions())
+    assert found is not None and found.best.candidate.name == expected
+    assert {each.candidate.name for each in found.indistinguishable} == {"better", "steadier"} - {expected}

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from siq.documents import Document, validate
+from siq.mismatch.best_fit import both_fits
 from siq.mismatch.estimation import first_states, fit
 from siq.mismatch.innovations import Noise
 from siq.mismatch.linearisation import Grid, integrate_intervals, linearise, spread_edges
@@ -76,13 +77,13 @@ def test_sensitivities_are_differences_of_trajectories() -> None:
 def test_friction_that_sticks_is_fitted_from_far_away() -> None:
     truth = with_values(model_of(PENDULUM), c=0.25)
     data, states = driven(truth, noise=0.01)
-    model = spread_edges(with_values(truth, k=1.2, d=0.3, c=0.0), data, states, substeps=24)
+    model = spread_edges(with_values(truth, k=1.2, d=0.3, c=0.0), data, states, substeps=12)
     found = fit_trajectories(
         model,
         data,
         begin=states[data.first[:-1]] + 0.05,
         noise=Noise(np.array([1e-4]), np.zeros(2)),
-        substeps=24,
+        substeps=12,
     )
     assert found.converged and not found.has_process_noise
     assert (np.abs(found.model.values - truth.values) < 4 * found.standard_errors).all()
@@ -100,6 +101,19 @@ def test_both_fits_agree_where_both_settle() -> None:
     assert quick.converged and slow.converged
     assert slow.model.values == pytest.approx(quick.model.values, abs=0.05 * quick.standard_errors.max())
     assert slow.log_likelihood == pytest.approx(quick.log_likelihood, abs=0.1)
+
+
+def test_a_fit_of_a_mechanism_with_its_own_states_may_be_begun_from() -> None:
+    model = model_of({**PENDULUM, "equations": {"x": "v", "v": "-k*sin(x) - d*v - c*v**3 + u"}})
+    data, states = driven(model, noise=0.02)
+    noise = Noise(np.array([4e-4]), np.array([0.0, 1e-3]))
+    begin = fit(model, data, x=states, noise=noise, estimate_process=True, substeps=2)
+    grown = replace(begin, noise=replace(begin.noise, process=np.array([0.0, 1e-3, 0.0])))
+    loose, strict = both_fits(model, data, grown, x=begin.x)
+    assert loose is not None and len(loose.noise.process) == 2
+    assert (
+        strict.converged and (np.abs(strict.model.values - model.values) < 4 * strict.standard_errors).all()
+    )
 
 
 def test_a_simulation_that_runs_away_gives_no_fit() -> None:

@@ -145,8 +145,8 @@ def _extended(
                 trial.candidate.label, trial.delta_chi2, trial.delta_bic, trial.p_white, trial.p_cluster,
             )  # fmt: skip
         chance = 5 * options.false_alarms / max(len(remaining), 1)
-        stands = _accepted(trials, len(screened), chance, options=options)
-        best = _accepted(trials, len(screened), 1.0, options=options)
+        stands = accepted(trials, len(screened), chance, options=options)
+        best = accepted(trials, len(screened), 1.0, options=options)
         if (
             on_trial
             and len(found) + 1 < options.mechanisms
@@ -209,7 +209,20 @@ def _something_left(model: Model, data: Measurements, current: Fit) -> bool:
     return current.has_process_noise or structure_of(model, data, current, roles_of(model)).p_value < LEFT
 
 
-def _accepted(trials: Sequence[Trial], probes: int, chance: float, *, options: SearchOptions) -> Found | None:
+def accepted(trials: Sequence[Trial], probes: int, chance: float, *, options: SearchOptions) -> Found | None:
+    """The best of the trials that stand every test, with what cannot be told from it.
+
+    Parameters
+    ----------
+    trials
+        Candidates, fitted.
+    probes
+        How many were screened: the white test allows for them.
+    chance
+        Probability by which an effect clustered by recording may be one of chance.
+    options
+        Of the search.
+    """
     significant = [
         trial
         for trial in trials
