@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -18,22 +18,28 @@ from siq.mismatch.innovations import Noise
 from siq.mismatch.measurements import Measurements
 from siq.mismatch.model import Model
 from siq.mismatch.noise import first_noise
+from siq.mismatch.remainder import Remainder, what_is_left, without_patches
 from siq.mismatch.roles import Roles, roles_of
 from siq.mismatch.search import Search, search
 from siq.mismatch.steadiness import unsteadiness
-from siq.mismatch.structure import Structure, structure_of
+from siq.mismatch.structure import Structure
 from siq.mismatch.study import MismatchStudy
 from siq.mismatch.trajectories import run
+from siq.mismatch.trials import Trial
 
 Verdict = Literal["no mismatch", "parameter shift", "missing physics", "unexplained"]
 
-STRUCTURED = 1e-4  # probability below which residuals are not called random
 SHIFTED = 1e-4  # probability below which parameters are not called unchanged
 FAINT = 1e-4  # process noise, relative to the motion, from which a fit without any is loosened
 ENOUGH = 0.998  # share of the excess that mechanisms explain, beyond which a remainder is only remarked
 MOSTLY = 0.99  # share that the first of several must explain alone for that
 MANY = 3  # mechanisms that together are a description rather than an explanation
 UNSTEADY = 6.0  # twice the difference of log-likelihoods, from which random forces follow the motion
+GROWING = "Random forces that would explain it grow with the motion: a hidden state is likelier."
+EXACT = (
+    "The estimates admit random forces for what remains; the augmented card has those of least squares where "
+    "it runs better with them."
+)
 
 
 @dataclass(frozen=True)
@@ -109,75 +115,35 @@ def diagnose(
         When not even the recalibrated simulation with process noise can be fitted.
     """
     roles = roles_of(model)
-    generic = study.generic if study.generic is not None else not roles.physical
-    candidates = candidates_of(model, roles, dictionary, file=file)
-    monomials = [
-        c for c in generic_candidates(model, roles, degree=study.degree) if c.coordinate != "constant"
-    ]
-    if generic:
-        candidates += monomials
+    candidates = considered(model, roles, dictionary, study, file=file)
     recalibrated, least_squares = recalibrate(model, data)
     found = search(model, data, recalibrated, candidates, options=study.search)
-    after, before, explained = what_is_left(model, data, recalibrated, found.fit, roles)
-    mostly = explained
-    doubtful = after.p_value < STRUCTURED or found.fit.has_process_noise or len(found.found) >= MANY
+    left = what_is_left(model, data, recalibrated, found.fit, roles)
+    share_of_first = left.share
+    doubtful = left.structured or found.fit.has_process_noise or len(found.found) >= MANY
     if len(found.found) > 1 and doubtful:
-        left = [what_is_left(model, data, recalibrated, each.best.fit, roles) for each in found.found]
-        mostly = left[0][2]
-        if mostly >= ENOUGH:
-            # What is added to a mechanism that explains all but a trifle may only patch the trifle.
-            kept = 1
-            while (
-                kept < len(left)
-                and found.found[kept].best.delta_chi2 >= study.search.named
-                and left[kept][2] > left[kept - 1][2]
-            ):
-                kept += 1
-            found = replace(found, found=found.found[:kept], fit=found.found[kept - 1].best.fit)
-            after, before, explained = left[kept - 1]
-    random = found.fit.has_process_noise
+        by_each = [what_is_left(model, data, recalibrated, each.best.fit, roles) for each in found.found]
+        share_of_first = by_each[0].share
+        if share_of_first >= ENOUGH:
+            found, left = without_patches(found, by_each, least=study.search.named)
     p_shift = shift_probability(model, recalibrated)
-    remarks: list[str] = []
-    knows_noise = any(form.noise for mechanism in dictionary for form in mechanism.forms)
-    structured = after.p_value < STRUCTURED
+    exact = None
     verdict: Verdict
     if found.found:
-        verdict = "missing physics"
-        if doubtful:
-            # Several terms that fit well together, and yet leave structure: so a false explanation looks.
-            if explained >= ENOUGH and mostly >= MOSTLY:
-                remarks.append(f"{1 - explained:.2g} of the excess remains, and is not noise.")
-            else:
-                verdict = "unexplained"
-        gained = found.found[0].best.delta_chi2
-        if verdict == "missing physics" and gained < study.search.named:
-            verdict = "unexplained"
-            name = found.found[0].best.candidate.name
-            remarks.append(
-                f"It looks like {name}, but is too faint to be named: that gains {gained:.0f} in chi2, and "
-                f"{study.search.named:g} are asked for."
-            )
-        random = False
-    elif random:
+        good = not doubtful or (left.share >= ENOUGH and share_of_first >= MOSTLY)
+        verdict, remarks = named_or_not(found.found[0].best, left, doubtful, good, least=study.search.named)
+        if verdict == "missing physics" and found.fit.has_process_noise:
+            exact = both_fits(found.fit.model, data, found.fit)[1]
+            remarks += (EXACT,) if exact.converged else ()
+    elif found.fit.has_process_noise:
         steady = unsteadiness(found.fit, data) < UNSTEADY
-        if not steady:
-            remarks.append(
-                "Random forces that would explain it grow with the motion: a hidden state is likelier."
-            )
-        verdict = "missing physics" if knows_noise and steady and not structured else "unexplained"
-        random = verdict == "missing physics"
-    elif structured:
-        verdict = "unexplained"
+        knows_noise = any(form.noise for mechanism in dictionary for form in mechanism.forms)
+        verdict = "missing physics" if knows_noise and steady and not left.structured else "unexplained"
+        remarks = () if steady else (GROWING,)
+    elif left.structured:
+        verdict, remarks = "unexplained", ()
     else:
-        verdict = "parameter shift" if p_shift < SHIFTED else "no mismatch"
-    exact = None
-    if verdict == "missing physics" and not random and found.fit.has_process_noise:
-        exact = both_fits(found.fit.model, data, found.fit)[1]
-        if exact.converged:
-            remarks.append(
-                "The estimates admit random forces for what remains; the augmented card has those of least "
-                "squares where it runs better with them."
-            )
+        verdict, remarks = "parameter shift" if p_shift < SHIFTED else "no mismatch", ()
     return Diagnosis(
         verdict=verdict,
         model=model,
@@ -185,14 +151,54 @@ def diagnose(
         search=found,
         least_squares=least_squares,
         augmented_least_squares=exact if exact is not None and exact.converged else None,
-        before=before,
-        after=after,
-        process_noise=random,
+        before=left.before,
+        after=left.after,
+        process_noise=verdict == "missing physics" and not found.found,
         p_shift=p_shift,
-        share=explained,
-        remarks=tuple(remarks),
+        share=left.share,
+        remarks=remarks,
         candidates=tuple(candidates),
     )
+
+
+def considered(
+    model: Model, roles: Roles, dictionary: Sequence[Mechanism], study: MismatchStudy, *, file: str
+) -> list[Candidate]:
+    """The candidates of the dictionary, and monomials where the study or the lack of roles allows them."""
+    candidates = candidates_of(model, roles, dictionary, file=file)
+    if study.generic if study.generic is not None else not roles.physical:
+        monomials = generic_candidates(model, roles, degree=study.degree)
+        candidates += [each for each in monomials if each.coordinate != "constant"]
+    return candidates
+
+
+def named_or_not(
+    first: Trial, left: Remainder, doubtful: bool, good: bool, *, least: float
+) -> tuple[Verdict, tuple[str, ...]]:
+    """Whether mechanisms that were found are named, and with which reservations.
+
+    Parameters
+    ----------
+    first
+        The first of them.
+    left
+        What they leave.
+    doubtful, good
+        Whether there is a reason for doubt, and whether they explain enough all the same: several terms that
+        fit well together, and yet leave structure, are what a false explanation looks like.
+    least
+        χ² that the first must gain.
+    """
+    if not good:
+        return "unexplained", ()
+    remarks = (f"{1 - left.share:.2g} of the excess remains, and is not noise.",) if doubtful else ()
+    if first.delta_chi2 >= least:
+        return "missing physics", remarks
+    faint = (
+        f"It looks like {first.candidate.name}, but is too faint to be named: that gains "
+        f"{first.delta_chi2:.0f} in chi2, and {least:g} are asked for."
+    )
+    return "unexplained", (*remarks, faint)
 
 
 def recalibrate(model: Model, data: Measurements) -> tuple[Fit, Fit]:
@@ -223,34 +229,6 @@ def recalibrate(model: Model, data: Measurements) -> tuple[Fit, Fit]:
     small = Noise(strict.noise.measurement, noise.process * FAINT)
     again = fit(strict.model, data, x=strict.x, noise=small, estimate_process=True, substeps=strict.substeps)
     return simpler(again if again.converged else None, strict), strict
-
-
-def what_is_left(
-    model: Model, data: Measurements, recalibrated: Fit, final: Fit, roles: Roles
-) -> tuple[Structure, Structure, float]:
-    """Structure after and before mechanisms were added, and the share of the excess that they explain."""
-    after = structure_of(final.model, data, final, roles)
-    # Random forces that stand for missing physics take measurement noise with them; the final fit's is right.
-    still = Noise(final.noise.measurement, np.zeros(model.dimension))
-    before = structure_of(model, data, recalibrated, roles, noise=still)
-    alone = after
-    if final.has_process_noise:
-        alone = structure_of(final.model, data, final, roles, noise=final.noise.without_process())
-    return after, before, explained_share(before, alone)
-
-
-def explained_share(before: Structure, after: Structure) -> float:
-    """Share of the excess over measurement noise that the final simulation explains, without process noise.
-
-    What is left is the excess that remains, or what a function of one coordinate still finds: where a fit
-    without process noise takes a misfit for noise, only the latter shows it.
-    """
-    if not before.total > before.freedom:
-        return 1.0
-    best = after.curves[0] if after.curves else None
-    systematic = 0.0 if best is None else best.gain - 2 * len(best.direction.knots)
-    left = max(after.total - after.freedom, systematic, 0.0)
-    return float(np.clip(1 - left / (before.total - before.freedom), 0.0, 1.0))
 
 
 def shift_probability(model: Model, recalibrated: Fit) -> float:

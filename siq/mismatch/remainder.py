@@ -1,0 +1,98 @@
+"""What mechanisms leave of the excess over noise, and which of them only patch a trifle."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from siq.mismatch.estimation import Fit
+from siq.mismatch.innovations import Noise
+from siq.mismatch.measurements import Measurements
+from siq.mismatch.model import Model
+from siq.mismatch.roles import Roles
+from siq.mismatch.search import Search
+from siq.mismatch.structure import Structure, structure_of
+
+STRUCTURED = 1e-4  # probability below which residuals are not called random
+
+
+@dataclass(frozen=True)
+class Remainder:
+    """What a simulation leaves.
+
+    Attributes
+    ----------
+    before, after
+        Structure of what the recalibrated simulation, and the one with mechanisms, does not explain.
+    share
+        Of the excess that the mechanisms explain.
+    """
+
+    before: Structure
+    after: Structure
+    share: float
+
+    @property
+    def structured(self) -> bool:
+        """Whether what is left is no noise."""
+        return self.after.p_value < STRUCTURED
+
+
+def what_is_left(model: Model, data: Measurements, recalibrated: Fit, final: Fit, roles: Roles) -> Remainder:
+    """Structure before and after mechanisms were added, and the share of the excess that they explain.
+
+    Parameters
+    ----------
+    model, data
+        The simulation as its author believes it, and the recordings.
+    recalibrated, final
+        Its fit, and that with mechanisms.
+    roles
+        Of the simulation's states.
+    """
+    after = structure_of(final.model, data, final, roles)
+    # Random forces that stand for missing physics take measurement noise with them; the final fit's is right.
+    still = Noise(final.noise.measurement, np.zeros(model.dimension))
+    before = structure_of(model, data, recalibrated, roles, noise=still)
+    alone = after
+    if final.has_process_noise:
+        alone = structure_of(final.model, data, final, roles, noise=final.noise.without_process())
+    return Remainder(before, after, explained_share(before, alone))
+
+
+def without_patches(search: Search, left: Sequence[Remainder], *, least: float) -> tuple[Search, Remainder]:
+    """The first mechanism, and those after it as long as each gains enough and leaves less of the excess.
+
+    Parameters
+    ----------
+    search
+        With mechanisms of which the first explains all but a trifle.
+    left
+        What is left with each.
+    least
+        Enough, in χ².
+    """
+    kept = 1
+    while (
+        kept < len(left)
+        and search.found[kept].best.delta_chi2 >= least
+        and left[kept].share > left[kept - 1].share
+    ):
+        kept += 1
+    return replace(search, found=search.found[:kept], fit=search.found[kept - 1].best.fit), left[kept - 1]
+
+
+def explained_share(before: Structure, after: Structure) -> float:
+    """Share of the excess over measurement noise that the final simulation explains, without process noise.
+
+    What is left is the excess that remains, or what a function of one coordinate still finds: where a fit
+    without process noise takes a misfit for noise, only the latter shows it.
+    """
+    if not before.total > before.freedom:
+        return 1.0
+    best = after.curves[0] if after.curves else None
+    systematic = 0.0 if best is None else best.gain - 2 * len(best.direction.knots)
+    left = max(after.total - after.freedom, systematic, 0.0)
+    return float(np.clip(1 - left / (before.total - before.freedom), 0.0, 1.0))
