@@ -47,7 +47,7 @@ def driven(model: Model, *, noise: float = 0.0, substeps: int = 48) -> tuple[Mea
         courses=tuple((course_of_input(t, push, "zero_order"),) for push in pushes),
     )
     sharp = spread_edges(model, data, np.ones((2 * SAMPLES, 2)), substeps=substeps)
-    states = run(sharp, data, np.array([[0.5, 0.0], [-1.0, 0.4]]), substeps=substeps)
+    states = run(sharp, Grid(data, substeps), np.array([[0.5, 0.0], [-1.0, 0.4]]))
     measured = states[:, :1] + noise * generator.normal(size=(2 * SAMPLES, 1))
     return replace(data, outputs=measured), states
 
@@ -70,7 +70,7 @@ def test_sensitivities_are_differences_of_trajectories() -> None:
         ends = []
         for sign in (1, -1):
             moved = model.with_values(model.values + sign * shift[:3])
-            ends.append(run(moved, data, begin + sign * shift[3:].reshape(2, 2), substeps=2)[:, 0])
+            ends.append(run(moved, Grid(data, 2), begin + sign * shift[3:].reshape(2, 2))[:, 0])
         assert columns[:, place] == pytest.approx((ends[0] - ends[1]) / 2e-5, abs=2e-4)
 
 
@@ -152,7 +152,7 @@ def test_a_held_input_that_lags_pushes_as_much_as_it_should() -> None:
     at = np.linspace(0, (SAMPLES - 1) * STEP, 40 * (SAMPLES - 1) + 1)
     middle = (at[1:] + at[:-1]) / 2
     push = one.courses[0][0](np.clip(middle - 0.07, 0, None))
-    states = run(model, one, np.zeros((1, 2)), substeps=3)
+    states = run(model, Grid(one, 3), np.zeros((1, 2)))
     exact = np.concatenate([[0], np.cumsum(push * np.diff(at))])[::40]
     # A jump within a step is spread over it: at a sample part of it may still be to come.
     assert states[:, 1] == pytest.approx(exact, abs=STEP / 3 / 2 * 1.5)

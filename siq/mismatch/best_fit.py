@@ -79,14 +79,9 @@ def both_fits(
     )
     if not strict.converged:
         # Where random forces led to nothing better, they led away.
-        near = loose if loose is not None and loose.log_likelihood > begin.log_likelihood else None
-        strict = fit_trajectories(
-            model if near is None else model.with_values(near.model.values),
-            data,
-            begin=(states if near is None else near.x)[data.first[:-1]],
-            noise=noise if near is None else near.noise,
-            substeps=substeps,
-        )
+        if loose is not None and loose.log_likelihood > begin.log_likelihood:
+            model, states, noise = loose.model, loose.x, loose.noise
+        strict = fit_trajectories(model, data, begin=states[data.first[:-1]], noise=noise, substeps=substeps)
     return loose, strict
 
 

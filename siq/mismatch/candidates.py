@@ -108,16 +108,15 @@ def _told_apart(found: Sequence[tuple[Candidate, str]]) -> list[Candidate]:
 
     Two parameters of one equation may drift, each of two species be satiated, and a coupling have two forms.
     """
-    filled = [(f"{each.label} ({roles})", each) for each, roles in found]
-    often = Counter(each.label for each, _ in found)
-    still = Counter(label for label, _ in filled)
+    by_label = Counter(each.label for each, _ in found)
+    by_roles = Counter((each.label, roles) for each, roles in found)
     result = []
-    for label, each in filled:
-        added = "; ".join(str(formula) for _, formula in each.changes)
-        if often[each.label] == 1:
-            result.append(each)
-        else:
-            result.append(replace(each, label=label if still[label] == 1 else f"{each.label} ({added})"))
+    for each, roles in found:
+        if by_label[each.label] > 1:
+            added = "; ".join(str(formula) for _, formula in each.changes)
+            known = roles if by_roles[each.label, roles] == 1 else added
+            each = replace(each, label=f"{each.label} ({known})")
+        result.append(each)
     return result
 
 

@@ -106,7 +106,7 @@ def solve_case(case: Case) -> Outcome:
     """
     diagnosis = diagnose(case.model, case.learn, case.dictionary, case.study)
     shown = held_out(diagnosis, case.learn, case.kept)
-    final = final_fit(diagnosis)
+    final = diagnosis.final
     card = augmented_card(
         case.card,
         shown.model if diagnosis.verdict == "missing physics" else final.model,
@@ -115,11 +115,6 @@ def solve_case(case: Case) -> Outcome:
     )
     recalibrated = augmented_card(case.card, diagnosis.search.recalibrated.model)
     return Outcome(diagnosis, shown, verdict_of(diagnosis, case.learn, shown), card, recalibrated)
-
-
-def final_fit(diagnosis: Diagnosis) -> Fit:
-    """The fit that the verdict stands on: with mechanisms only where they are physics."""
-    return diagnosis.search.fit if diagnosis.verdict == "missing physics" else diagnosis.search.recalibrated
 
 
 def tables_of(case: Case, outcome: Outcome) -> dict[str, pd.DataFrame]:
@@ -197,7 +192,7 @@ def tables_of(case: Case, outcome: Outcome) -> dict[str, pd.DataFrame]:
         "candidates": pd.DataFrame(candidates),
         "held_out": pd.concat(rows, ignore_index=True),
         "forces": _forces(case, diagnosis),
-        "noise": _noise(case.model, diagnosis.search.recalibrated, final_fit(diagnosis)),
+        "noise": _noise(case.model, diagnosis.search.recalibrated, diagnosis.final),
     }
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -15,6 +15,7 @@ from siq.mismatch.candidates import Candidate, candidates_of, generic_candidates
 from siq.mismatch.dictionary import Mechanism
 from siq.mismatch.estimation import Fit, first_states, fit
 from siq.mismatch.innovations import Noise
+from siq.mismatch.linearisation import Grid
 from siq.mismatch.measurements import Measurements
 from siq.mismatch.model import Model
 from siq.mismatch.noise import first_noise
@@ -90,6 +91,11 @@ class Diagnosis:
     remarks: tuple[str, ...]
     candidates: tuple[Candidate, ...]
 
+    @property
+    def final(self) -> Fit:
+        """The fit that the verdict stands on: with mechanisms only where they are physics."""
+        return self.search.fit if self.verdict == "missing physics" else self.search.recalibrated
+
 
 def diagnose(
     model: Model, data: Measurements, dictionary: Sequence[Mechanism], study: MismatchStudy, *, file: str = ""
@@ -127,14 +133,16 @@ def diagnose(
         if share_of_first >= ENOUGH:
             found, left = without_patches(found, by_each, least=study.search.named)
     p_shift = shift_probability(model, recalibrated)
-    exact = None
+    exact: Fit | None = None
     verdict: Verdict
     if found.found:
         good = not doubtful or (left.share >= ENOUGH and share_of_first >= MOSTLY)
         verdict, remarks = named_or_not(found.found[0].best, left, doubtful, good, least=study.search.named)
         if verdict == "missing physics" and found.fit.has_process_noise:
-            exact = both_fits(found.fit.model, data, found.fit)[1]
-            remarks += (EXACT,) if exact.converged else ()
+            still = replace(found.fit, noise=found.fit.noise.without_process())
+            followed = both_fits(found.fit.model, data, still)[1]
+            if followed.converged:
+                exact, remarks = followed, (*remarks, EXACT)
     elif found.fit.has_process_noise:
         steady = unsteadiness(found.fit, data) < UNSTEADY
         knows_noise = any(form.noise for mechanism in dictionary for form in mechanism.forms)
@@ -150,7 +158,7 @@ def diagnose(
         roles=roles,
         search=found,
         least_squares=least_squares,
-        augmented_least_squares=exact if exact is not None and exact.converged else None,
+        augmented_least_squares=exact,
         before=left.before,
         after=left.after,
         process_noise=verdict == "missing physics" and not found.found,
@@ -217,7 +225,7 @@ def recalibrate(model: Model, data: Measurements) -> tuple[Fit, Fit]:
         return simpler(again, strict), strict
     # Where random forces on a hidden state could explain anything, the fit has no end. The card's own
     # simulation is then the better start.
-    followed = run(model, data, x[data.first[:-1]], substeps=max(loose.substeps, 1))
+    followed = run(model, Grid(data, max(loose.substeps, 1)), x[data.first[:-1]])
     x = np.where(np.isfinite(followed), followed, x)
     strict = fit(model, data, x=x, noise=noise.without_process(), estimate_process=False)
     if not strict.converged:

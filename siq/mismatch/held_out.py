@@ -12,6 +12,7 @@ import numpy as np
 
 from siq.mismatch.estimation import first_states, fit
 from siq.mismatch.innovations import Noise
+from siq.mismatch.linearisation import Grid
 from siq.mismatch.measurements import Measurements
 from siq.mismatch.model import Model
 from siq.mismatch.trajectories import run
@@ -57,7 +58,7 @@ def free_run(
     lengths = np.diff(data.first)
     rows = np.minimum(np.maximum((prefix * lengths).astype(int), SHORTEST_PREFIX), lengths - 1)
     x = initial_states(model, data.until(np.maximum(rows, 2)), noise=noise, substeps=substeps)
-    states = run(model, data, x, substeps=substeps)
+    states = run(model, Grid(data, substeps), x)
     signals = data.signals(data.t, data.recording, delays=model.lags(model.values))
     within = np.arange(len(data.t)) - data.first[data.recording]
     return FreeRun(

@@ -20,20 +20,20 @@ ACCURACY = 1e-4  # relative change of the sum of squares at which a fit has conv
 TRIALS = 25  # most simulations of all recordings
 
 
-def run(model: Model, data: Measurements, begin: np.ndarray, *, substeps: int) -> np.ndarray:
+def run(model: Model, grid: Grid, begin: np.ndarray) -> np.ndarray:
     """Integrate recordings from their initial states, shape ``(recordings, d)``, to all samples ``(n, d)``.
 
     A simulation that runs away is NaN from there on.
     """
+    data = grid.data
     states = np.full((len(data.t), model.dimension), np.nan)
     lengths = np.diff(data.first)
     current = begin.T.copy()
     states[data.first[:-1]] = begin
-    whole = Grid(data, substeps)
     places = np.concatenate([[0], np.cumsum(lengths - 1)])[:-1]
     for sample in range(int(lengths.max()) - 1):
         alive = np.flatnonzero(lengths > sample + 1)
-        one = whole.at_intervals(places[alive] + sample)
+        one = grid.at_intervals(places[alive] + sample)
         with np.errstate(all="ignore"):
             after = integrate_intervals(model, one, model.values, current[:, alive])
         current[:, alive] = after
@@ -71,7 +71,7 @@ def fit_trajectories(
     grid = Grid(data, substeps)
     known = np.isfinite(data.outputs)
     weight = 1 / np.sqrt(noise.measurement)
-    along = _Along(model, data, grid)
+    along = _Along(model, grid)
 
     def residual(unknown: np.ndarray) -> np.ndarray:
         values, states = along.trajectory(unknown)
@@ -133,8 +133,8 @@ def sensitivities(linearisation: Linearisation, data: Measurements) -> np.ndarra
 class _Along:
     """Trajectories from parameters and initial states; the last one is kept for its derivative."""
 
-    def __init__(self, model: Model, data: Measurements, grid: Grid) -> None:
-        self._model, self._data, self._grid = model, data, grid
+    def __init__(self, model: Model, grid: Grid) -> None:
+        self._model, self._grid = model, grid
         self._free = np.array(model.free, dtype=int)
         self._last: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
@@ -144,7 +144,7 @@ class _Along:
             values = self._model.values
             values[self._free] = unknown[: len(self._free)]
             begin = unknown[len(self._free) :].reshape(-1, self._model.dimension)
-            states = run(self._model.with_values(values), self._data, begin, substeps=self._grid.substeps)
+            states = run(self._model.with_values(values), self._grid, begin)
             self._last = (unknown.copy(), values, states)
         return self._last[1], self._last[2]
 

@@ -136,7 +136,7 @@ def description_of(diagnosis: Diagnosis) -> dict[str, Any] | None:
 
 def recalibration_of(diagnosis: Diagnosis) -> dict[str, dict[str, float]]:
     """The simulation's own parameters: on the card, and in the simulation that the verdict ends with."""
-    fit = diagnosis.search.fit if diagnosis.verdict == "missing physics" else diagnosis.search.recalibrated
+    fit = diagnosis.final
     errors = standard_errors(fit)
     return {
         entry.name: {
