@@ -26,7 +26,6 @@ from siq.mismatch.steadiness import unsteadiness
 from siq.mismatch.structure import Structure
 from siq.mismatch.study import MismatchStudy
 from siq.mismatch.trajectories import run
-from siq.mismatch.trials import Trial
 
 Verdict = Literal["no mismatch", "parameter shift", "missing physics", "unexplained"]
 
@@ -126,18 +125,19 @@ def diagnose(
     found = search(model, data, recalibrated, candidates, options=study.search)
     left = what_is_left(model, data, recalibrated, found.fit, roles)
     share_of_first = left.share
-    doubtful = left.structured or found.fit.has_process_noise or len(found.found) >= MANY
-    if len(found.found) > 1 and doubtful:
+    if len(found.found) > 1:
         by_each = [what_is_left(model, data, recalibrated, each.best.fit, roles) for each in found.found]
         share_of_first = by_each[0].share
-        if share_of_first >= ENOUGH:
+        random_forces = found.found[0].best.fit.has_process_noise
+        if share_of_first >= ENOUGH or not (by_each[0].doubtful or random_forces):
             found, left = without_patches(found, by_each, least=study.search.named)
+    doubtful = left.doubtful or found.fit.has_process_noise or len(found.found) >= MANY
     p_shift = shift_probability(model, recalibrated)
     exact: Fit | None = None
     verdict: Verdict
     if found.found:
         good = not doubtful or (left.share >= ENOUGH and share_of_first >= MOSTLY)
-        verdict, remarks = named_or_not(found.found[0].best, left, doubtful, good, least=study.search.named)
+        verdict, remarks = named_or_not(found, left, doubtful, good, least=study.search.named)
         if verdict == "missing physics" and found.fit.has_process_noise:
             still = replace(found.fit, noise=found.fit.noise.without_process())
             followed = both_fits(found.fit.model, data, still)[1]
@@ -146,7 +146,7 @@ def diagnose(
     elif found.fit.has_process_noise:
         steady = unsteadiness(found.fit, data) < UNSTEADY
         knows_noise = any(form.noise for mechanism in dictionary for form in mechanism.forms)
-        verdict = "missing physics" if knows_noise and steady and not left.structured else "unexplained"
+        verdict = "missing physics" if knows_noise and steady and not left.doubtful else "unexplained"
         remarks = () if steady else (GROWING,)
     elif left.structured:
         verdict, remarks = "unexplained", ()
@@ -181,30 +181,34 @@ def considered(
 
 
 def named_or_not(
-    first: Trial, left: Remainder, doubtful: bool, good: bool, *, least: float
+    search: Search, left: Remainder, doubtful: bool, good: bool, *, least: float
 ) -> tuple[Verdict, tuple[str, ...]]:
     """Whether mechanisms that were found are named, and with which reservations.
 
     Parameters
     ----------
-    first
-        The first of them.
+    search
+        With what was found.
     left
-        What they leave.
+        What that leaves.
     doubtful, good
         Whether there is a reason for doubt, and whether they explain enough all the same: several terms that
         fit well together, and yet leave structure, are what a false explanation looks like.
     least
-        χ² that the first must gain.
+        χ² that each must gain.
     """
     if not good:
         return "unexplained", ()
     remarks = (f"{1 - left.share:.2g} of the excess remains, and is not noise.",) if doubtful else ()
-    if first.delta_chi2 >= least:
+    found = [each.best for each in search.found]
+    faintest = min(found, key=lambda each: each.delta_chi2)
+    if faintest.delta_chi2 >= least:
         return "missing physics", remarks
+    names = " and ".join(each.candidate.name for each in found)
+    which = "is" if len(found) == 1 else f"{faintest.candidate.name} is"
     faint = (
-        f"It looks like {first.candidate.name}, but is too faint to be named: that gains "
-        f"{first.delta_chi2:.0f} in chi2, and {least:g} are asked for."
+        f"It looks like {names}, but {which} too faint to be named: that gains "
+        f"{faintest.delta_chi2:.0f} in chi2, and {least:g} are asked for."
     )
     return "unexplained", (*remarks, faint)
 

@@ -17,6 +17,7 @@ from siq.mismatch.structure import Curve, Structure
 VISIBLE = 0.1  # of the largest value of a curve
 TWO_ERRORS = 2.0
 NEARLY = 0.9  # of what the best coordinate, or a perfect description, would explain
+RIVAL = 0.75  # of what the time or an input tells, from which on it is rather a state
 PART = 0.5  # of its fair share of the excess, from which on a recording counts as affected
 
 
@@ -103,23 +104,25 @@ def locate(diagnosis: Diagnosis, data: Measurements) -> Location | None:
 def most_telling(structure: Structure, roles: Roles) -> tuple[tuple[str, ...], str]:
     """The equation in which something is missing, and the coordinate along which it shows best.
 
-    Where its own motion tells nearly as much as another coordinate, it is the motion: inputs and the time
-    move a system, too. Where no coordinate tells nearly all, a force depends on the course of the motion,
-    position and velocity both.
+    Where its own motion tells nearly as much as that of others, it is its own; and where any motion tells
+    most of what the time or an input tells, it is the motion, since these move a system, too. Where no
+    coordinate tells nearly all, a force depends on the course of the motion, position and velocity both.
     """
     best = structure.curves[0]
-    equations = best.direction.equations
+    equations, coordinate = best.direction.equations, best.direction.coordinate
     own = next((pair for pair in roles.motions if pair[1] in equations), equations)
-    if best.direction.coordinate in (*own, "amplitude"):
-        return equations, best.direction.coordinate
+    if coordinate in (*own, "amplitude"):
+        return equations, coordinate
+    motion = {*roles.states, *(name for pair in roles.motions for name in pair), "amplitude"}
+    rivals, share = (own, NEARLY) if coordinate in motion else (motion, RIVAL)
     for curve in structure.curves:
-        same = curve.direction.equations == equations
-        if same and curve.direction.coordinate in own and curve.gain >= NEARLY * best.gain:
-            return equations, curve.direction.coordinate
+        there = set(equations) <= set(curve.direction.equations)
+        if there and curve.direction.coordinate in rivals and curve.gain >= share * best.gain:
+            return curve.direction.equations, curve.direction.coordinate
     excess = structure.total - structure.freedom
     if len(own) > len(equations) and best.gain < NEARLY * excess:
         return equations, ", ".join(own)
-    return equations, best.direction.coordinate
+    return equations, coordinate
 
 
 def equation_shares(diagnosis: Diagnosis, equations: tuple[str, ...]) -> dict[str, float]:

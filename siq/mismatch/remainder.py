@@ -16,6 +16,7 @@ from siq.mismatch.search import Search
 from siq.mismatch.structure import Structure, structure_of
 
 STRUCTURED = 1e-4  # probability below which residuals are not called random
+DOUBTFUL = 2e-3  # the same for what a mechanism leaves: the burden of proof is on a name
 
 
 @dataclass(frozen=True)
@@ -36,8 +37,13 @@ class Remainder:
 
     @property
     def structured(self) -> bool:
-        """Whether what is left is no noise."""
+        """Whether what is left is certainly no noise, which speaks of a mismatch by itself."""
         return self.after.p_value < STRUCTURED
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether what is left is hardly noise: a name has to leave less than that."""
+        return self.after.p_value < DOUBTFUL
 
 
 def what_is_left(model: Model, data: Measurements, recalibrated: Fit, final: Fit, roles: Roles) -> Remainder:

@@ -46,7 +46,7 @@ class SearchOptions:
     mechanisms
         Most mechanisms that are looked for.
     named
-        χ² that the first mechanism must gain to be named. What gains less is detected, and described, but too
+        χ² that a mechanism must gain to be named. What gains less is detected, and described, but too
         faint for its shape to be tried: much that no dictionary has looks the same.
     blocks
         Least number of blocks into which recordings are cut for clustered errors, where there are fewer than
