@@ -12,8 +12,10 @@ import sympy
 
 from siq.mismatch.consequences import compare_landscapes, identified, obstacle
 from siq.mismatch.dictionary import dictionary_of
+from siq.mismatch.findings import Findings
 from siq.mismatch.model import Model, load_model
-from siq.mismatch.report import CAPTIONS, Findings, mismatch_page
+from siq.mismatch.report import mismatch_page
+from siq.mismatch.report_sections import CAPTIONS
 from siq.plots.mismatch import plot_candidates, plot_curves, plot_escapes, plot_held_out, plot_missing
 
 CARD = """\

@@ -9,7 +9,8 @@ import pytest
 
 from siq.documents import Document, validate
 from siq.mismatch.best_fit import both_fits
-from siq.mismatch.estimation import first_states, fit
+from siq.mismatch.estimation import fit
+from siq.mismatch.first_states import first_states
 from siq.mismatch.innovations import Noise
 from siq.mismatch.linearisation import Grid, integrate_intervals, linearise, spread_edges
 from siq.mismatch.measurements import Measurements, course_of_input

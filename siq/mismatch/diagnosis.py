@@ -13,7 +13,8 @@ from siq.errors import NumericalFailure
 from siq.mismatch.best_fit import both_fits, simpler
 from siq.mismatch.candidates import Candidate, candidates_of, generic_candidates
 from siq.mismatch.dictionary import Mechanism
-from siq.mismatch.estimation import Fit, first_states, fit
+from siq.mismatch.estimation import Fit, fit
+from siq.mismatch.first_states import first_states
 from siq.mismatch.innovations import Noise
 from siq.mismatch.linearisation import Grid
 from siq.mismatch.measurements import Measurements

@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from siq.mismatch.estimation import first_states, fit
+from siq.mismatch.estimation import fit
+from siq.mismatch.first_states import first_states
 from siq.mismatch.innovations import Noise
 from siq.mismatch.linearisation import Grid
 from siq.mismatch.measurements import Measurements

@@ -12,10 +12,10 @@ import numpy as np
 import scipy.optimize
 
 from siq.mismatch.innovations import Noise, solve, whiten, with_parameters_changed
-from siq.mismatch.kernels import noise_likelihood
 from siq.mismatch.linearisation import Linearisation
 from siq.mismatch.measurements import Measurements
 from siq.mismatch.model import Model
+from siq.mismatch.noise_kernel import noise_likelihood
 
 SMOOTHEST = 1e-4  # least measurement noise, as a share of what third differences show
 LOWEST = np.exp(-23.0)  # of a process noise, relative to where the search began; below it there is none

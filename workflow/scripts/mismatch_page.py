@@ -7,8 +7,9 @@ import pandas as pd
 
 from siq.files import whole_file
 from siq.mismatch.dictionary import dictionary_of
+from siq.mismatch.findings import Findings
 from siq.mismatch.model import load_model
-from siq.mismatch.report import Findings, mismatch_page
+from siq.mismatch.report import mismatch_page
 from siq.mismatch.study import MismatchStudy, load_mismatch_study
 from siq.tables import read_table
 from step import job, read_json
