@@ -7,8 +7,8 @@ import pytest
 
 from siq.benchmarks import BENCHMARKS, MULTISINE, SAMPLES, read_silverbox, read_tanks
 from siq.errors import InputError
+from siq.mismatch.cards import load_model
 from siq.mismatch.measurements import measurements
-from siq.mismatch.model import load_model
 from siq.mismatch.scores import root_mean_square, windows
 from siq.recordings import Recordings
 

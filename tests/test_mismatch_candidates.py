@@ -9,9 +9,9 @@ import sympy
 from siq.documents import Document, validate
 from siq.errors import InputError
 from siq.mismatch.candidates import candidates_of, generic_candidates
-from siq.mismatch.cards import augmented_card
+from siq.mismatch.cards import augmented_card, build_model, load_model
 from siq.mismatch.dictionary import dictionary_of, read_dictionary, standard_dictionary
-from siq.mismatch.model import Model, build_model, load_model
+from siq.mismatch.model import Model
 from siq.mismatch.roles import roles_of
 from siq.mismatch.units import unit_of
 from siq.systems import SystemCard

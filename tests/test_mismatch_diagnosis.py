@@ -12,8 +12,8 @@ import pytest
 import yaml
 
 from siq.errors import InputError
+from siq.mismatch.cards import load_model
 from siq.mismatch.case import Outcome, read_case, solve_case
-from siq.mismatch.model import load_model
 
 CARD = {
     "name": "oscillator",

@@ -7,13 +7,14 @@ import pytest
 import scipy.linalg
 
 from siq.documents import Document, validate
+from siq.mismatch.cards import build_model
 from siq.mismatch.estimation import Fit, fit
 from siq.mismatch.first_states import first_states
 from siq.mismatch.innovations import Noise, process_covariance, whiten
 from siq.mismatch.kernels import smoothed_states
 from siq.mismatch.linearisation import Grid, linearise
 from siq.mismatch.measurements import Measurements, course_of_input
-from siq.mismatch.model import Model, build_model
+from siq.mismatch.model import Model
 from siq.mismatch.noise import estimate_noise, first_noise, log_likelihood
 from siq.mismatch.noise_kernel import noise_likelihood
 from siq.systems import SystemCard

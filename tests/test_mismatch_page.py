@@ -10,10 +10,11 @@ import pandas as pd
 import pytest
 import sympy
 
+from siq.mismatch.cards import load_model
 from siq.mismatch.consequences import compare_landscapes, identified, obstacle
 from siq.mismatch.dictionary import dictionary_of
 from siq.mismatch.findings import Findings
-from siq.mismatch.model import Model, load_model
+from siq.mismatch.model import Model
 from siq.mismatch.report import mismatch_page
 from siq.mismatch.report_sections import CAPTIONS
 from siq.plots.mismatch import plot_candidates, plot_curves, plot_escapes, plot_held_out, plot_missing

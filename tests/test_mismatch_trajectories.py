@@ -9,12 +9,13 @@ import pytest
 
 from siq.documents import Document, validate
 from siq.mismatch.best_fit import both_fits
+from siq.mismatch.cards import build_model
 from siq.mismatch.estimation import fit
 from siq.mismatch.first_states import first_states
 from siq.mismatch.innovations import Noise
 from siq.mismatch.linearisation import Grid, integrate_intervals, linearise, spread_edges
 from siq.mismatch.measurements import Measurements, course_of_input
-from siq.mismatch.model import Model, build_model
+from siq.mismatch.model import Model
 from siq.mismatch.trajectories import fit_trajectories, run, sensitivities
 from siq.systems import SystemCard
 

@@ -8,7 +8,7 @@ import pytest
 import sympy
 
 from siq.errors import InputError
-from siq.mismatch.model import load_model
+from siq.mismatch.cards import load_model
 from siq.systems import System, diffusion_matrix, load_system
 
 Write = Callable[..., Path]

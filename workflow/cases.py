@@ -199,9 +199,9 @@ class Cases:
 
 def _checked(name: str, card: str, recordings: str, study: str | None, command: str) -> CheckedCase:
     """Check the files of a case; recordings that a rule makes are checked by their job."""
+    from siq.mismatch.cards import build_model
     from siq.mismatch.case import read_case
     from siq.mismatch.dictionary import dictionary_of
-    from siq.mismatch.model import build_model
     from siq.mismatch.study import MismatchStudy
 
     document = read_document(card)

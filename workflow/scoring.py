@@ -14,8 +14,9 @@ import pandas as pd
 import sympy
 
 from siq.expressions import parse_formula
+from siq.mismatch.cards import load_model
 from siq.mismatch.case import Case, read_case
-from siq.mismatch.model import Model, Signals, load_model
+from siq.mismatch.model import Model, Signals
 from workflow.keys import CaseKey, Truth, read_key, read_truth
 from workflow.oracle import Oracle, oracle_of, pairing, true_model
 

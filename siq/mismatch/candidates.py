@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +17,7 @@ import sympy
 
 from siq.errors import InputError
 from siq.expressions import FormulaError, parse_formula
+from siq.mismatch.assignments import assignments
 from siq.mismatch.dictionary import Form, Mechanism, Shape
 from siq.mismatch.model import Model, Parameter, symbol
 from siq.mismatch.roles import Roles
@@ -93,7 +94,7 @@ def candidates_of(
         for form in mechanism.forms:
             if form.noise is not None:
                 continue
-            for assignment in _assignments(form, model, roles):
+            for assignment in assignments(form, model, roles):
                 try:
                     candidate = build_candidate(model, mechanism, form, assignment)
                 except FormulaError as error:
@@ -242,49 +243,6 @@ def build_candidate(
         changes=(*changes, *((each[0], each[2]) for each in further)),
         generalises=mechanism.generalises,
     )
-
-
-def _assignments(form: Form, model: Model, roles: Roles) -> Iterator[dict[str, str]]:
-    """Every way of filling a form's roles."""
-    kinds = list(form.roles.values())
-    names = list(form.roles)
-    choices: list[list[dict[str, str]]] = []
-    place = 0
-    while place < len(names):
-        kind, following = kinds[place], kinds[place + 1] if place + 1 < len(kinds) else None
-        if kind == "position" and following == "velocity":
-            choices.append([{names[place]: x, names[place + 1]: v} for x, v in roles.motions])
-            place += 2
-        elif kind == "amplitude" and following == "amplitude":
-            choices.append([{names[place]: a, names[place + 1]: b} for a, b in roles.amplitudes])
-            place += 2
-        else:
-            choices.append([{names[place]: name} for name in _of_kind(kind, model, roles)])
-            place += 1
-    for combination in itertools.product(*choices):
-        filled = [name for part in combination for name in part.values()]
-        if len(set(filled)) < len(filled) or (form.symmetric and filled != sorted(filled, key=_order(model))):
-            continue
-        yield {role: name for part in combination for role, name in part.items()}
-
-
-def _order(model: Model) -> Callable[[str], int]:
-    places = {name: place for place, name in enumerate(model.states)}
-    return lambda name: places.get(name, -1)
-
-
-def _of_kind(kind: str, model: Model, roles: Roles) -> tuple[str, ...]:
-    return {
-        "position": tuple(x for x, _ in roles.motions),
-        "velocity": tuple(v for _, v in roles.motions),
-        "amplitude": tuple(name for pair in roles.amplitudes for name in pair),
-        "population": roles.populations,
-        "level": roles.levels,
-        "state": roles.states,
-        "input": tuple(entry.name for entry in model.inputs),
-        "parameter": tuple(entry.name for entry in model.parameters),  # what is known at first may drift, too
-        "output": model.output_names,
-    }[kind]
 
 
 def _fresh(name: str, model: Model, taken: set[str] | None = None) -> str:

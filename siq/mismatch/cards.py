@@ -1,15 +1,60 @@
-"""The augmented card: the simulation with what was missing, a card like any other."""
+"""From a card to a model, and back: the simulation with what was missing is a card like any other."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import sympy
 import yaml
 
-from siq.documents import Document, validate
-from siq.mismatch.model import Model
-from siq.systems import SystemCard
+from siq.documents import Document, read_document, validate
+from siq.errors import InputError
+from siq.expressions import FormulaError, parse_formula
+from siq.mismatch.model import TIME, Input, Model, Parameter, symbol
+from siq.systems import Formula, SystemCard
+
+
+def load_model(path: str | Path) -> Model:
+    """Read a system card as a model whose parameters can be fitted.
+
+    Raises
+    ------
+    InputError
+        With the card, the line and the offending name.
+    """
+    document = read_document(path)
+    return build_model(document, validate(document, SystemCard))
+
+
+def build_model(document: Document, card: SystemCard) -> Model:
+    """Build the model that a checked card describes; `document` says where its formulas stand."""
+    declared = (*card.states, *card.inputs, *card.parameters)
+    names = {name: symbol(name) for name in declared} | {"t": TIME}
+
+    def parse(keys: tuple[str, ...], text: Formula, known: Mapping[str, sympy.Expr]) -> sympy.Expr:
+        try:
+            return parse_formula(text, known, inputs=tuple(card.inputs))
+        except FormulaError as error:
+            raise InputError(document.file, document.place(keys), error.fault, error.remedy) from None
+
+    outputs = card.outputs if card.outputs is not None else {name: name for name in card.states}
+    return Model(
+        name=card.name,
+        title=card.title or card.name,
+        time_unit=card.time_unit,
+        states=tuple(card.states),
+        state_units=tuple(entry.unit for entry in card.states.values()),
+        domain=np.array([entry.domain for entry in card.states.values()]),
+        inputs=tuple(Input(name, entry.unit, entry.interpolation) for name, entry in card.inputs.items()),
+        parameters=tuple(
+            Parameter(name, entry.value, entry.unit, entry.fixed) for name, entry in card.parameters.items()
+        ),
+        equations=tuple(parse(("equations", name), card.equations[name], names) for name in card.states),
+        outputs=tuple((name, parse(("outputs", name), text, names)) for name, text in outputs.items()),
+    )
 
 
 def augmented_card(
@@ -32,7 +77,7 @@ def augmented_card(
     Returns
     -------
     str
-        YAML that `siq.mismatch.model.load_model` reads as the same model.
+        YAML that `load_model` reads as the same model.
     """
     checked = validate(card, SystemCard)
     data: dict[str, Any] = {

@@ -10,12 +10,12 @@ import numpy as np
 import pandas as pd
 
 from siq.documents import Document, read_document, validate
-from siq.mismatch.cards import augmented_card
+from siq.mismatch.cards import augmented_card, build_model
 from siq.mismatch.diagnosis import Diagnosis, diagnose
 from siq.mismatch.dictionary import Mechanism, dictionary_of
 from siq.mismatch.estimation import Fit
 from siq.mismatch.measurements import Measurements
-from siq.mismatch.model import Model, build_model
+from siq.mismatch.model import Model
 from siq.mismatch.study import (
     MismatchStudy,
     load_mismatch_study,

@@ -7,18 +7,14 @@ by other models of the same kind, with further terms, parameters or states (`siq
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 import sympy
 
-from siq.documents import Document, read_document, validate
-from siq.errors import InputError
-from siq.expressions import FormulaError, compile_values, delay, parse_formula
-from siq.systems import Formula, SystemCard
+from siq.expressions import compile_values, delay
 
 TIME = sympy.Symbol("t", real=True)
 SMOOTHER = 30.0  # widths of a jump over which its derivative is spread
@@ -291,43 +287,3 @@ def _stacked(
         for place, value in enumerate(function(*arguments)):
             result[place] = value
     return result
-
-
-def load_model(path: str | Path) -> Model:
-    """Read a system card as a model whose parameters can be fitted.
-
-    Raises
-    ------
-    InputError
-        With the card, the line and the offending name.
-    """
-    document = read_document(path)
-    return build_model(document, validate(document, SystemCard))
-
-
-def build_model(document: Document, card: SystemCard) -> Model:
-    """Build the model that a checked card describes; `document` says where its formulas stand."""
-    declared = (*card.states, *card.inputs, *card.parameters)
-    names = {name: symbol(name) for name in declared} | {"t": TIME}
-
-    def parse(keys: tuple[str, ...], text: Formula, known: Mapping[str, sympy.Expr]) -> sympy.Expr:
-        try:
-            return parse_formula(text, known, inputs=tuple(card.inputs))
-        except FormulaError as error:
-            raise InputError(document.file, document.place(keys), error.fault, error.remedy) from None
-
-    outputs = card.outputs if card.outputs is not None else {name: name for name in card.states}
-    return Model(
-        name=card.name,
-        title=card.title or card.name,
-        time_unit=card.time_unit,
-        states=tuple(card.states),
-        state_units=tuple(entry.unit for entry in card.states.values()),
-        domain=np.array([entry.domain for entry in card.states.values()]),
-        inputs=tuple(Input(name, entry.unit, entry.interpolation) for name, entry in card.inputs.items()),
-        parameters=tuple(
-            Parameter(name, entry.value, entry.unit, entry.fixed) for name, entry in card.parameters.items()
-        ),
-        equations=tuple(parse(("equations", name), card.equations[name], names) for name in card.states),
-        outputs=tuple((name, parse(("outputs", name), text, names)) for name, text in outputs.items()),
-    )

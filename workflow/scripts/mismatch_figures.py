@@ -9,7 +9,8 @@ import sympy
 from matplotlib.figure import Figure
 
 from siq.expressions import compile_formulas
-from siq.mismatch.model import Model, load_model, symbol
+from siq.mismatch.cards import load_model
+from siq.mismatch.model import Model, symbol
 from siq.plots.mismatch import plot_candidates, plot_curves, plot_escapes, plot_held_out, plot_missing
 from siq.plots.saving import save_figure
 from siq.plots.style import sentence_figure

@@ -10,6 +10,7 @@ import pandas as pd
 from siq.documents import read_document, validate
 from siq.errors import NumericalFailure
 from siq.files import whole_file
+from siq.mismatch.cards import load_model
 from siq.mismatch.consequences import (
     ESCAPE_COLUMNS,
     WELLS_COLUMNS,
@@ -17,7 +18,6 @@ from siq.mismatch.consequences import (
     compare_landscapes,
     obstacle,
 )
-from siq.mismatch.model import load_model
 from siq.systems import SystemCard, diffusion_matrix
 from siq.tables import read_table, write_table
 from step import job, read_json

@@ -6,9 +6,9 @@ from typing import Any
 import pandas as pd
 
 from siq.files import whole_file
+from siq.mismatch.cards import load_model
 from siq.mismatch.dictionary import dictionary_of
 from siq.mismatch.findings import Findings
-from siq.mismatch.model import load_model
 from siq.mismatch.report import mismatch_page
 from siq.mismatch.study import MismatchStudy, load_mismatch_study
 from siq.tables import read_table

@@ -5,8 +5,8 @@ from typing import Any
 import pandas as pd
 
 from siq.benchmarks import BENCHMARKS
+from siq.mismatch.cards import load_model
 from siq.mismatch.case import read_case
-from siq.mismatch.model import load_model
 from siq.mismatch.scores import root_mean_square
 from siq.tables import read_table, write_table
 from step import job
