@@ -2,7 +2,8 @@
 
 From trajectories of a system with several metastable states to its energy landscape as a formula: the
 orthogonal decomposition ``f = -D∇V + g`` with ``∇V·g = 0`` by two networks, and sparse formulas of V, g and
-f by constrained regression. U = 2V is the quasipotential.
+f by constrained regression. U = 2V is the quasipotential. And from a simulation and recordings that differ
+to the physics that was left out.
 
 The names below are what users need; they are loaded when first used, since torch takes seconds to import.
 """
@@ -26,10 +27,12 @@ _WHERE = {
     "load_study": "siq.study",
     "load_system": "siq.systems",
     "parse_formula": "siq.expressions",
+    "read_case": "siq.mismatch.case",
     "read_model": "siq.model",
     "read_recordings": "siq.recordings",
     "simulate_snapshots": "siq.simulate",
     "snapshot_pairs": "siq.recordings",
+    "solve_case": "siq.mismatch.case",
     "sparse_decomposition": "siq.regression",
     "train": "siq.decomposition.training",
     "write_recordings": "siq.recordings",
