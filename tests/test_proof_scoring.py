@@ -15,9 +15,11 @@ from siq.errors import InputError
 from siq.mismatch.model import Model, Signals
 from siq.plots.proof import plot_proof
 from workflow.batches import check_digests
+from workflow.code_digest import imported_files
 from workflow.concealment.cases import CaseDesign, make_case
 from workflow.keys import CaseKey, Truth, read_key, read_truth
 from workflow.oracle import Oracle, pairing, true_model
+from workflow.proofs import load_proofs
 from workflow.scoring import (
     Answer,
     covered,
@@ -28,7 +30,6 @@ from workflow.scoring import (
     model_of,
     score_table,
 )
-from workflow.settings import imported_files, load_proofs
 from workflow.targets import clopper_pearson, counted, failures_of, quantile, target_table, targets_of
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -1,17 +1,14 @@
-"""What the rules know of the configuration: studies, their parameters, and the code of every step."""
+"""What the rules know of the configuration: studies, their parameters, and where files are."""
 
 from __future__ import annotations
 
-import ast
-import hashlib
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, model_validator
+from pydantic import TypeAdapter
 
 from siq.documents import Document, read_document, validate
 from siq.errors import InputError
@@ -23,7 +20,6 @@ WORKFLOW_KEYS = ("statistics", "device", "runs_per_training", "mismatch", "cases
 SYSTEMS = Path("config/systems")
 STUDIES = Path("config/studies")
 PUBLISHED = Path("config/published")
-PROOFS = Path("config/proof.yaml")
 
 
 @dataclass(frozen=True)
@@ -223,63 +219,6 @@ class Studies(Mapping[str, CheckedStudy]):
         return len(list(iter(self)))
 
 
-class ProofSet(BaseModel):
-    """The schema of an entry of ``config/proof.yaml``: a set of cases that conceal something.
-
-    Attributes
-    ----------
-    cases
-        Their number.
-    seed
-        The same seed makes the same cases.
-    shares
-        Share of each kind.
-    batch
-        Cases that one job takes.
-    """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    cases: Annotated[int, Field(ge=1)]
-    seed: Annotated[int, Field(ge=0)]
-    shares: dict[
-        Literal["null", "shift", "mechanism", "process noise", "withheld"],
-        Annotated[float, Field(ge=0, le=1)],
-    ]
-    batch: Annotated[int, Field(ge=1)] = 10
-
-    @model_validator(mode="after")
-    def _whole(self) -> ProofSet:
-        if abs(sum(self.shares.values()) - 1) > 1e-9:
-            raise ValueError(f"the shares sum to {sum(self.shares.values()):g}; make them sum to 1")
-        return self
-
-    def batch_names(self) -> list[str]:
-        """``000``, ``001``, …, one for every batch."""
-        return [f"{number:03d}" for number in range(-(-self.cases // self.batch))]
-
-
-class Proofs(BaseModel):
-    """The schema of ``config/proof.yaml``."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    proof: ProofSet
-    proof_full: ProofSet
-
-
-def load_proofs(path: str | Path = PROOFS) -> dict[str, ProofSet]:
-    """Read the sets of concealed cases.
-
-    Raises
-    ------
-    InputError
-        With the line of the first entry that cannot be used.
-    """
-    checked = validate(read_document(path), Proofs)
-    return {"proof": checked.proof, "proof_full": checked.proof_full}
-
-
 def find_resource(file: str) -> str:
     """A file of the user's: where it says, or else in a folder of ``SIQ_RESOURCES`` or ``SIQ_RECORDINGS``."""
     for variable in ("SIQ_RESOURCES", "SIQ_RECORDINGS"):
@@ -304,54 +243,3 @@ def prepare_environment() -> None:
     os.environ["OMP_NUM_THREADS"] = "1"
     os.environ.setdefault("MALLOC_MMAP_THRESHOLD_", str(2**30))
     os.environ.setdefault("MALLOC_TRIM_THRESHOLD_", str(2**33))
-
-
-@cache
-def code_digest(base: Path, script: str) -> dict[str, str]:
-    """The script and every module of this project that it imports, directly or not, by content.
-
-    Snakemake reruns a job when its script or a parameter changes, but does not see a module that the
-    script imports. As a parameter of the rule, this tells it.
-    """
-    digests = {}
-    for file in imported_files(base, base / "workflow" / "scripts" / script):
-        digests[str(file.relative_to(base))] = hashlib.sha256(file.read_bytes()).hexdigest()[:12]
-    return digests
-
-
-def imported_files(base: Path, script: Path) -> list[Path]:
-    """The Python files of this project that a script runs, itself included, found from its imports.
-
-    Imports within functions count as well, and so do the packages that a module lies in. Imports for
-    type checking alone count too; they are read as text, nothing is run.
-    """
-    found: dict[Path, None] = {}
-    waiting = [script]
-    while waiting:
-        file = waiting.pop()
-        if file in found:
-            continue
-        found[file] = None
-        for module in _imported_modules(file):
-            # A script finds its neighbours by their bare names.
-            waiting += [*_module_files(base, module), *_module_files(script.parent, module)]
-    return sorted(found)
-
-
-def _imported_modules(file: Path) -> list[str]:
-    modules = []
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            modules += [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            modules += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-    return modules
-
-
-def _module_files(folder: Path, module: str) -> list[Path]:
-    parts = module.split(".")
-    files = []
-    for length in range(1, len(parts) + 1):
-        place = folder.joinpath(*parts[:length])
-        files += [path for path in (place.with_suffix(".py"), place / "__init__.py") if path.is_file()]
-    return files

@@ -10,7 +10,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from workflow.settings import code_digest
+from workflow.code_digest import code_digest
 
 pytestmark = pytest.mark.workflow
 

@@ -6,12 +6,8 @@ from pathlib import Path
 
 from siq.errors import InputError
 from siq.study import load_published
-from workflow.settings import (
-    Studies,
-    code_digest,
-    find_resource,
-    prepare_environment,
-)
+from workflow.code_digest import code_digest
+from workflow.settings import Studies, find_resource, prepare_environment
 
 
 def say_and_stop(error):
