@@ -98,7 +98,12 @@ def test_a_second_snakemake_waits_for_nobody_and_says_so(fresh_project):
     project.write_study()
     process = project.start(NETWORKS)
     wait_for("results/mini/logs/000/draw.log", process, within=project.folder)
-    second = project.run(MODEL)
+    # Held where it is, or on a busy machine it may have ended before the second has begun.
+    process.send_signal(signal.SIGSTOP)
+    try:
+        second = project.run(MODEL)
+    finally:
+        process.send_signal(signal.SIGCONT)
     assert second.returncode != 0 and "Another snakemake is at work" in second.stdout
     process.communicate(timeout=120)
     assert process.returncode == 0
