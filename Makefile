@@ -1,10 +1,10 @@
-# Two commands: `make statistics` and `make test`. Both set up .venv with the pinned versions first.
+# Two commands: `make statistics` and `make test`. Each target sets up .venv with the pinned versions first.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 CORES ?= 2
 
-.PHONY: statistics examples test full untuned noise lint format environment clean
+.PHONY: statistics examples test full untuned noise wheel docs lint format environment clean
 
 statistics: environment
 	$(BIN)/snakemake --cores $(CORES) statistics
@@ -15,15 +15,25 @@ examples: environment
 test: environment lint
 	$(BIN)/pytest --numprocesses logical --dist loadgroup --no-loadscope-reorder
 
-# Full-size checks, minutes each and no part of `make test`.
-full: environment
-	$(BIN)/pytest --numprocesses logical --dist loadgroup --no-loadscope-reorder -m "slow or not slow" --ignore=tests/slow
+# Everything: the tests of `make test` and the full-size checks, minutes each.
+full: environment lint
+	$(BIN)/pytest --numprocesses logical --dist loadgroup --no-loadscope-reorder -m "slow or not slow"
 
 untuned: environment
 	$(BIN)/pytest -m slow -s tests/slow/test_untuned_systems.py
 
 noise: environment
 	$(BIN)/pytest -m slow -s tests/slow/test_noise_statistics.py
+
+# The wheel, and a small problem solved with it where neither the sources nor an extra are at hand.
+wheel: environment
+	rm -rf build dist
+	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
+	PYTHON=$(BIN)/python .ci/check-wheel
+
+# docs/_build/html/index.html: the pages and the reference. A warning is an error.
+docs: environment
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet -b html docs docs/_build/html
 
 lint: environment
 	$(BIN)/ruff check .
@@ -48,4 +58,4 @@ $(VENV)/installed: pyproject.toml requirements/pinned.txt
 	touch $@
 
 clean:
-	rm -rf $(VENV) .snakemake .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) .snakemake .mypy_cache .ruff_cache .pytest_cache build dist docs/_build docs/reference

@@ -15,7 +15,8 @@ import time
 
 import numpy as np
 
-from siq.landscape.mesh import MeshQuasipotential, mesh_quasipotential
+from siq.dynamics.diffusion import Diffusion
+from siq.reference.mesh import MeshQuasipotential, mesh_quasipotential
 
 BOX = np.array([[-2.0, 0.0], [-1.0, 1.0]])
 COUNTS = (64, 128, 256, 512)
@@ -40,7 +41,7 @@ def solve(rotation: float, count: int, *, as_published: bool) -> MeshQuasipotent
         hessian=np.diag([4.0, 1.0]),
         box=BOX,
         shape=(count + 1, count + 1),
-        diffusion=np.eye(2),
+        diffusion=Diffusion.identity(2),
         as_published=as_published,
     )
 

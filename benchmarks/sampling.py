@@ -14,9 +14,9 @@ import time
 
 import numpy as np
 
-from siq.simulate import SimulationOptions, runge_kutta_step, simulate_snapshots
-from siq.systems import load_system
-from siq.thinning import representative_subset
+from siq.dynamics.cards import load_system
+from siq.dynamics.simulation import SimulationOptions, runge_kutta_step, simulate_snapshots
+from siq.numerics.thinning import representative_subset
 
 
 def plain_field(x: np.ndarray) -> np.ndarray:
@@ -60,7 +60,7 @@ def main() -> None:
     thinning = seconds(
         lambda: representative_subset(points, distance=0.1, generator=np.random.default_rng(0))
     )
-    ratio = seconds(lambda: integrate(plain_field)) / seconds(lambda: integrate(system.vector_field))
+    ratio = seconds(lambda: integrate(plain_field)) / seconds(lambda: integrate(system.drift_of_components))
     print(f"{os.cpu_count()} cores; simulation {simulating:.2f} s, thinning {thinning:.2f} s")
     print(f"a step of the plain field takes {ratio:.1f} times as long as the compiled one")
 

@@ -17,15 +17,15 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-import siq.decomposition.networks as networks_module
-from siq.decomposition.data import prepare_data
-from siq.decomposition.networks import Layer
-from siq.decomposition.options import TrainingOptions
-from siq.decomposition.training import start, train
-from siq.recordings import snapshot_pairs
-from siq.simulate import SimulationOptions, simulate_snapshots
-from siq.study import load_study
-from siq.systems import load_system
+import siq.networks.networks as networks_module
+from siq.data.recordings import snapshot_pairs
+from siq.dynamics.cards import load_system
+from siq.dynamics.simulation import SimulationOptions, simulate_snapshots
+from siq.networks.data import prepare_data
+from siq.networks.networks import Layer
+from siq.networks.options import TrainingOptions
+from siq.networks.training import start, train
+from siq.study.study import load_study
 
 Gradient = Callable[[tuple[Layer, ...], torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
 

@@ -5,47 +5,116 @@ orthogonal decomposition ``f = -D∇V + g`` with ``∇V·g = 0`` by two networks
 f by constrained regression. U = 2V is the quasipotential. And from a simulation and recordings that differ
 to the physics that was left out.
 
-The names below are what users need; they are loaded when first used, since torch takes seconds to import.
+The names below are what users need. Each is loaded when it is first used, since torch takes seconds to
+import; ``_MODULES`` says from where. Type checkers read the same names from the block beneath it.
 """
 
 from __future__ import annotations
 
 import importlib
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-_WHERE = {
+if TYPE_CHECKING:
+    from siq.data.recordings import Recordings, read_recordings, snapshot_pairs, write_recordings
+    from siq.dynamics.cards import load_system
+    from siq.dynamics.diffusion import Diffusion
+    from siq.dynamics.dynamics import Dynamics
+    from siq.dynamics.exports import Formula
+    from siq.dynamics.formulas import parse_formula
+    from siq.dynamics.simulation import SimulationOptions, simulate_snapshots
+    from siq.errors import InputError, MissingExtra, NumericalFailure
+    from siq.identify.library import candidate_library
+    from siq.landscape.landscape import Landscape
+    from siq.mismatch.case import read_case
+    from siq.mismatch.diagnosis import Diagnosis, diagnose, solve_case
+    from siq.mismatch.study import MismatchStudy
+    from siq.networks.options import TrainingOptions
+    from siq.networks.regression import RegressionOptions, sparse_decomposition
+    from siq.networks.training import train
+    from siq.potential.storage import read_model
+    from siq.potential.symbolic import SymbolicDecomposition
+    from siq.steps.pipeline import PipelineSettings
+    from siq.study.study import Study, load_study
+
+    __version__: str
+
+__all__ = [
+    "Diagnosis",
+    "Diffusion",
+    "Dynamics",
+    "Formula",
+    "InputError",
+    "Landscape",
+    "MismatchStudy",
+    "MissingExtra",
+    "NumericalFailure",
+    "PipelineSettings",
+    "Recordings",
+    "RegressionOptions",
+    "SimulationOptions",
+    "Study",
+    "SymbolicDecomposition",
+    "TrainingOptions",
+    "candidate_library",
+    "diagnose",
+    "load_study",
+    "load_system",
+    "parse_formula",
+    "read_case",
+    "read_model",
+    "read_recordings",
+    "simulate_snapshots",
+    "snapshot_pairs",
+    "solve_case",
+    "sparse_decomposition",
+    "train",
+    "write_recordings",
+]
+
+_MODULES = {
+    "Diagnosis": "siq.mismatch.diagnosis",
+    "Diffusion": "siq.dynamics.diffusion",
+    "Dynamics": "siq.dynamics.dynamics",
+    "Formula": "siq.dynamics.exports",
     "InputError": "siq.errors",
+    "Landscape": "siq.landscape.landscape",
+    "MismatchStudy": "siq.mismatch.study",
+    "MissingExtra": "siq.errors",
     "NumericalFailure": "siq.errors",
-    "Recordings": "siq.recordings",
-    "RegressionOptions": "siq.regression",
-    "SimulationOptions": "siq.simulate",
-    "Study": "siq.study",
-    "SymbolicDecomposition": "siq.symbolic",
-    "System": "siq.systems",
-    "TrainingOptions": "siq.decomposition.options",
-    "candidate_library": "siq.library",
-    "load_study": "siq.study",
-    "load_system": "siq.systems",
-    "parse_formula": "siq.expressions",
+    "PipelineSettings": "siq.steps.pipeline",
+    "Recordings": "siq.data.recordings",
+    "RegressionOptions": "siq.networks.regression",
+    "SimulationOptions": "siq.dynamics.simulation",
+    "Study": "siq.study.study",
+    "SymbolicDecomposition": "siq.potential.symbolic",
+    "TrainingOptions": "siq.networks.options",
+    "candidate_library": "siq.identify.library",
+    "diagnose": "siq.mismatch.diagnosis",
+    "load_study": "siq.study.study",
+    "load_system": "siq.dynamics.cards",
+    "parse_formula": "siq.dynamics.formulas",
     "read_case": "siq.mismatch.case",
-    "read_model": "siq.model",
-    "read_recordings": "siq.recordings",
-    "simulate_snapshots": "siq.simulate",
-    "snapshot_pairs": "siq.recordings",
-    "solve_case": "siq.mismatch.case",
-    "sparse_decomposition": "siq.regression",
-    "train": "siq.decomposition.training",
-    "write_recordings": "siq.recordings",
+    "read_model": "siq.potential.storage",
+    "read_recordings": "siq.data.recordings",
+    "simulate_snapshots": "siq.dynamics.simulation",
+    "snapshot_pairs": "siq.data.recordings",
+    "solve_case": "siq.mismatch.diagnosis",
+    "sparse_decomposition": "siq.networks.regression",
+    "train": "siq.networks.training",
+    "write_recordings": "siq.data.recordings",
 }
-
-__all__ = list(_WHERE)
 
 
 def __getattr__(name: str) -> Any:
-    if name in _WHERE:
-        return getattr(importlib.import_module(_WHERE[name]), name)
-    raise AttributeError(f"module 'siq' has no attribute '{name}'")
+    if name == "__version__":
+        value: Any = importlib.import_module("siq.version").version()
+    elif name in _MODULES:
+        value = getattr(importlib.import_module(_MODULES[name]), name)
+    else:
+        raise AttributeError(f"module 'siq' has no attribute '{name}'")
+    globals()[name] = value  # found once
+    return value
 
 
 def __dir__() -> list[str]:
-    return sorted(_WHERE)
+    return [*__all__, "__version__"]

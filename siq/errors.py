@@ -1,8 +1,12 @@
-"""What is said when a file from outside cannot be used."""
+"""What is said when a file cannot be used, a computation has no result, or a package is not installed."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+from siq.version import DISTRIBUTION
 
 
 class InputError(ValueError):
@@ -39,3 +43,47 @@ class NumericalFailure(ArithmeticError):
     Not the user's file but the numbers are at fault; the message says what happened. A run that fails so
     is kept in every table as failed. Compare `InputError`.
     """
+
+
+class MissingExtra(ImportError):
+    """A package that only a part of `siq` needs is not installed.
+
+    The message names it, and what to install.
+
+    Parameters
+    ----------
+    extra
+        The group of optional packages, as in pyproject.toml: ``"networks"``, ``"plots"``, ``"workflow"``.
+    package
+        The one that is missing.
+    """
+
+    def __init__(self, extra: str, package: str) -> None:
+        super().__init__(
+            f"'{package}' is not installed; install it by: pip install '{DISTRIBUTION}[{extra}]'.",
+            name=package,
+        )
+        self.extra = extra
+
+
+@contextmanager
+def needs_extra(extra: str) -> Iterator[None]:
+    """Say which extra is missing when an import within the block fails.
+
+    Parameters
+    ----------
+    extra
+        The group of optional packages, as in pyproject.toml.
+
+    Raises
+    ------
+    MissingExtra
+        When a package cannot be found. One of `siq` itself is no extra: that error goes through.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package in ("", "siq"):
+            raise
+        raise MissingExtra(extra, package) from None

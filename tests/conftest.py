@@ -9,7 +9,8 @@ import pytest
 # Before torch and numpy start their threads: arrays this small take thrice as long on two as on one.
 os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
-from siq.systems import System, load_system
+from siq.dynamics.cards import load_system
+from siq.dynamics.dynamics import Dynamics
 
 ROOT = Path(__file__).parents[1]
 
@@ -36,6 +37,6 @@ def write(tmp_path: Path) -> Callable[..., Path]:
 
 
 @pytest.fixture(scope="session")
-def archetype() -> System:
+def archetype() -> Dynamics:
     """The paper's archetypal system, from its card."""
     return load_system(ROOT / "config" / "systems" / "archetype3d.yaml")

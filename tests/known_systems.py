@@ -9,48 +9,59 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import replace
 from fractions import Fraction
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import sympy
 from scipy.optimize import minimize
 
-from siq.expressions import compile_formulas
-from siq.flow import FlowMap
-from siq.identification import IdentifiedField
-from siq.library import candidate_library, monomial_exponents
-from siq.outline import Outline, outline
-from siq.systems import System
-from siq.vector_field import VectorField
+from siq.dynamics.diffusion import Diffusion
+from siq.dynamics.dynamics import Dynamics
+from siq.dynamics.formulas import compile_formulas
+from siq.dynamics.phase_portrait import PhasePortrait, phase_portrait
+from siq.identify.flow import FlowMap
+from siq.identify.identification import IdentifiedField
+from siq.identify.library import candidate_library, monomial_exponents
+from siq.potential.symbolic import SymbolicDecomposition
+from siq.study.scoring import exact_answer
 
 Function = Callable[[np.ndarray], np.ndarray]
 
 
 class KnownSystem(NamedTuple):
-    """A vector field with what is known about it.
+    """Dynamics with what is known about them.
 
     ``attractors`` has shape ``(k, d)`` and holds stable equilibria only, ``domain`` has shape ``(d, 2)``.
     """
 
-    field: VectorField
+    dynamics: Dynamics
     potential: sympy.Expr | None
-    diffusion: np.ndarray
     attractors: np.ndarray
     domain: np.ndarray
+
+    @property
+    def diffusion(self) -> np.ndarray:
+        """D, shape ``(d, d)``."""
+        return self.dynamics.diffusion.matrix
+
+    def with_diffusion(self, matrix: np.ndarray) -> KnownSystem:
+        """The same f under another noise."""
+        return self._replace(dynamics=self.dynamics.with_diffusion(Diffusion(matrix)))
 
 
 def potential_values(known: KnownSystem, x: np.ndarray) -> np.ndarray:
     """V at points, ``(n, d)`` to ``(n,)``."""
     assert known.potential is not None
-    return _compiled(known.potential, known.field.symbols)[0](np.ascontiguousarray(x.T))[0]
+    return _compiled(known.potential, known.dynamics.symbols)[0](np.ascontiguousarray(x.T))[0]
 
 
 def potential_gradient(known: KnownSystem, x: np.ndarray) -> np.ndarray:
     """∇V at points, ``(n, d)`` to ``(n, d)``."""
     assert known.potential is not None
-    return _compiled(known.potential, known.field.symbols)[1](np.ascontiguousarray(x.T)).T
+    return _compiled(known.potential, known.dynamics.symbols)[1](np.ascontiguousarray(x.T)).T
 
 
 @functools.cache
@@ -77,9 +88,8 @@ def maier_stein(beta: float) -> KnownSystem:
     equations = (x - x**3 - _rational(beta) * x * y**2, -(1 + x**2) * y)
     quasipotential = x**4 / 2 - x**2 + (1 + x**2) * y**2 + sympy.Rational(1, 2)
     return KnownSystem(
-        VectorField(symbols, equations),
+        Dynamics.of(symbols, equations),
         sympy.expand(quasipotential / 2) if beta == 1 else None,
-        np.eye(2),
         np.array([[-1.0, 0.0], [1.0, 0.0]]),
         np.array([[-2.0, 2.0], [-1.0, 1.0]]),
     )
@@ -122,9 +132,8 @@ def limit_cycle(*, rotation: float = 2.0) -> KnownSystem:
     turning = (-_rational(rotation) * y, _rational(rotation) * x)
     equations = tuple(sympy.expand(g - potential.diff(s)) for g, s in zip(turning, symbols, strict=True))
     return KnownSystem(
-        VectorField(symbols, equations),
+        Dynamics.of(symbols, equations),
         sympy.expand(potential),
-        np.eye(2),
         np.zeros((0, 2)),
         np.array([[-1.6, 1.6], [-1.6, 1.6]]),
     )
@@ -163,18 +172,18 @@ def exact_field(known: KnownSystem, degree: int, *, relative_error: float = 0.0)
 
     Without an error it counts as free of noise; with one, its coefficients are still the exact ones.
     """
-    library = candidate_library([symbol.name for symbol in known.field.symbols], degree=degree)
+    library = candidate_library([symbol.name for symbol in known.dynamics.symbols], degree=degree)
     position = {term: k for k, term in enumerate(library.terms)}
     coefficients = np.zeros((library.size, library.dimension))
-    for i, equation in enumerate(known.field.equations):
-        for powers, value in sympy.Poly(equation, *known.field.symbols).terms():
-            term = sympy.Mul(*(s**e for s, e in zip(known.field.symbols, powers, strict=True)))
+    for i, equation in enumerate(known.dynamics.formulas):
+        for powers, value in sympy.Poly(equation, *known.dynamics.symbols).terms():
+            term = sympy.Mul(*(s**e for s, e in zip(known.dynamics.symbols, powers, strict=True)))
             coefficients[position[term], i] = float(value)
     support = np.argwhere(coefficients.T)
     errors = (relative_error or 1e-12) * coefficients[support[:, 1], support[:, 0]]
     return IdentifiedField(
         library, coefficients, support, np.diag(errors**2), known.diffusion * relative_error**2,
-        relative_error or 1e-10, FlowMap(),
+        relative_error or 1e-10, FlowMap(), known.dynamics.diffusion,
     )  # fmt: skip
 
 
@@ -184,41 +193,37 @@ def uniform_points(known: KnownSystem, count: int, *, seed: int = 0, share: floa
     return np.random.default_rng(seed).uniform(middle - half, middle + half, size=(count, len(middle)))
 
 
-def outline_of(known: KnownSystem, count: int = 400, *, share: float = 1.0) -> Outline:
-    """The outline that recordings from all over the domain would give, made once."""
-    return _outline(_Hashable(known.field, known), count, share)
+def portrait_of(known: KnownSystem, count: int = 400, *, share: float = 1.0) -> PhasePortrait:
+    """The phase portrait that recordings from all over the domain would give, made once."""
+    text = (str(known.dynamics.formulas), known.diffusion.tobytes(), known.domain.tobytes(), count, share)
+    if text not in _PORTRAITS:
+        points = uniform_points(known, count, share=share)
+        _PORTRAITS[text] = phase_portrait(known.dynamics, points)
+    return _PORTRAITS[text]
 
 
-@dataclass(frozen=True)
-class _Hashable:
-    """A system told apart by its field; two with one field and different D must not meet here."""
+_PORTRAITS: dict[tuple[object, ...], PhasePortrait] = {}
 
-    field: VectorField
-    known: KnownSystem = field(compare=False)
+
+def as_system(known: KnownSystem) -> Dynamics:
+    """The same as a system to be simulated."""
+    return replace(known.dynamics, name="known", domain=known.domain)
 
 
 @functools.cache
-def _outline(system: _Hashable, count: int, share: float) -> Outline:
-    known = system.known
-    return outline(known.field, uniform_points(known, count, share=share), diffusion=known.diffusion)
-
-
-def as_system(known: KnownSystem) -> System:
-    """The same as a system to be simulated."""
-    symbols = known.field.symbols
-    return System(
-        name="known", title="", time_unit="1", states=tuple(s.name for s in symbols),
-        units=("1",) * len(symbols), domain=known.domain, symbols=symbols,
-        equations=known.field.equations, diffusion=known.diffusion,
-    )  # fmt: skip
+def exact_archetype() -> SymbolicDecomposition:
+    """The exact decomposition of the paper's archetypal system, from its card."""
+    exact = exact_answer(Path(__file__).parents[1] / "config" / "systems" / "archetype3d.yaml")
+    assert exact is not None
+    return exact
 
 
 def hamilton_jacobi_residual(known: KnownSystem) -> sympy.Expr:
     """∇V·(f + D∇V) as an expanded formula."""
     assert known.potential is not None
-    gradient = sympy.Matrix([known.potential.diff(symbol) for symbol in known.field.symbols])
+    gradient = sympy.Matrix([known.potential.diff(symbol) for symbol in known.dynamics.symbols])
     diffusion = sympy.Matrix([[_rational(entry) for entry in row] for row in known.diffusion])
-    return sympy.expand((gradient.T * (sympy.Matrix(known.field.equations) + diffusion * gradient))[0])
+    return sympy.expand((gradient.T * (sympy.Matrix(known.dynamics.formulas) + diffusion * gradient))[0])
 
 
 def _symbols(dimension: int) -> tuple[sympy.Symbol, ...]:
@@ -261,9 +266,8 @@ def _known(
     gradient = sympy.Matrix([potential.diff(symbol) for symbol in symbols])
     equations = tuple(sympy.expand(part) for part in (turning - diffusion) * gradient)
     return KnownSystem(
-        VectorField(symbols, equations),
+        Dynamics.of(symbols, equations, diffusion=np.array(diffusion.tolist(), dtype=float)),
         potential,
-        np.array(diffusion.tolist(), dtype=float),
         attractors,
         np.array(domain, dtype=float),
     )

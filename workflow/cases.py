@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from siq.benchmarks import BENCHMARKS
-from siq.documents import Document, read_document, validate
+from siq.data.public_recordings import BENCHMARKS
+from siq.dynamics.cards import SystemCard
 from siq.errors import InputError
-from siq.study import system_path
-from siq.systems import SystemCard
+from siq.files.documents import Document, read_document, validate
+from siq.study.study import system_path
 from workflow.settings import SYSTEMS, find_resource
 
 FOLDER = Path("config/mismatch")
@@ -199,13 +199,13 @@ class Cases:
 
 def _checked(name: str, card: str, recordings: str, study: str | None, command: str) -> CheckedCase:
     """Check the files of a case; recordings that a rule makes are checked by their job."""
-    from siq.mismatch.cards import build_model
+    from siq.dynamics.cards import build_system
     from siq.mismatch.case import read_case
     from siq.mismatch.dictionary import dictionary_of
     from siq.mismatch.study import MismatchStudy
 
     document = read_document(card)
-    model = build_model(document, validate(document, SystemCard))
+    model = build_system(document, validate(document, SystemCard))
     options = read_document(study) if study is not None else Document("the study", {}, {})
     checked = validate(options, MismatchStudy)
     benchmark = Path(recordings).stem if Path(recordings).parent == Path(MADE) else None

@@ -10,11 +10,13 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from siq.documents import Document, read_document, validate
+from siq.data.recordings import read_pairs
+from siq.dynamics.cards import check_name, load_exact
+from siq.dynamics.dynamics import Dynamics
 from siq.errors import InputError
-from siq.recordings import read_pairs
-from siq.study import Study, check_states, load_published, load_study_system, system_path
-from siq.systems import System, check_name
+from siq.files.documents import Document, read_document, validate
+from siq.steps.of_study import StudyParts, settings_of
+from siq.study.study import Study, check_states, completed, load_published, load_study_system, system_path
 
 WORKFLOW_KEYS = ("statistics", "device", "runs_per_training", "mismatch", "cases", "keys", "proof")
 SYSTEMS = Path("config/systems")
@@ -40,7 +42,7 @@ class CheckedStudy:
 
     study: Study
     file: str
-    system: System | None
+    system: Dynamics | None
     runs_per_training: int
 
     def command(self) -> str:
@@ -81,12 +83,9 @@ class CheckedStudy:
         recordings = self.study.recordings
         if recordings is None or recordings.file.startswith("results/"):
             return
-        metric = self._part("metric")
+        space = StudyParts(self.study, self.system).space
         found, _ = read_pairs(
-            self.source(),
-            states=metric["states"],
-            units=metric["units"],
-            pair_step=recordings.pair_step,
+            self.source(), states=space.names, units=space.units, pair_step=recordings.pair_step
         )
         for name in found.names:
             try:
@@ -106,40 +105,13 @@ class CheckedStudy:
         """The file of published figures, where the study names one."""
         return None if self.study.published is None else str(PUBLISHED / f"{self.study.published}.yaml")
 
-    def parameters(self, *keys: str) -> dict[str, Any]:
-        """Parts of the study as plain data.
+    def exact(self) -> str | None:
+        """The card's exact answer as text, on which scoring alone depends."""
+        return None if (card := self.card()) is None else str(load_exact(card))
 
-        Beside the study's own keys there are ``dynamics`` (what a simulation depends on), ``metric`` (the
-        states and D), ``prediction`` (the certificate's limit for f) and ``exact`` (what scoring depends on),
-        so that a change of a card's title, or of its exact answer, simulates nothing again.
-        """
-        return {key: self._part(key) for key in keys}
-
-    def _part(self, key: str) -> Any:
-        system = self.system
-        if key == "dynamics":
-            if system is None:
-                return None
-            formulas = [str(equation) for equation in system.equations]
-            return [list(system.states), system.domain.tolist(), formulas]
-        if key == "metric":
-            recordings = self.study.recordings
-            if system is not None:
-                diffusion: Any = system.diffusion.tolist()
-                states: Any = list(system.states)
-                units: Any = dict(zip(system.states, system.units, strict=True)) | {"t": system.time_unit}
-            else:
-                assert recordings is not None  # the schema asks for one of the two
-                diffusion, states, units = recordings.diffusion or "identity", recordings.states, None
-            return {"states": states and list(states), "diffusion": diffusion, "units": units}
-        if key == "simulation" and self.study.recordings is not None:
-            return None  # nothing is simulated, and nothing shall run again for it
-        if key == "prediction":
-            return self.study.certificate.prediction
-        if key == "exact":
-            return None if system is None else str(system.exact_quasipotential)
-        value = getattr(self.study, key)
-        return TypeAdapter(type(value)).dump_python(value, mode="json")
+    def settings(self, cls: type[Any]) -> dict[str, Any]:
+        """The settings of a step as plain data, which Snakemake can compare and a script restores."""
+        return TypeAdapter(cls).dump_python(settings_of(cls, self.study, self.system), mode="json")
 
 
 class Studies(Mapping[str, CheckedStudy]):
@@ -196,7 +168,7 @@ class Studies(Mapping[str, CheckedStudy]):
                 f"name it '{name}' as its file, or rename the file",
             )  # fmt: skip
         system = load_study_system(study, file=document.file, systems=SYSTEMS)
-        checked = CheckedStudy(study, document.file, system, self._runs_per_training)
+        checked = CheckedStudy(completed(study, system), document.file, system, self._runs_per_training)
         if (published := checked.published()) is not None:
             load_published(published)
         self._checked[study.name] = checked

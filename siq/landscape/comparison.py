@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from siq.landscape.local import LocalQuasipotential
 from siq.landscape.reference import ReferenceLandscape
+from siq.potential.well import Well
 
 WELL_SHARE = 0.9  # of its barrier: below it a well is compared
 OVERALL = 1.1  # of the highest saddle of U
@@ -47,28 +47,26 @@ def well_region(index: int) -> str:
     return f"A{index + 1}, below {WELL_SHARE:g} of its barrier"
 
 
-def compare_wells(
-    reference: ReferenceLandscape, local: Mapping[int, LocalQuasipotential]
-) -> list[Comparison]:
+def compare_wells(reference: ReferenceLandscape, wells: Mapping[int, Well]) -> list[Comparison]:
     """Formulas of wells against characteristics, each below a share of its barrier.
 
     Parameters
     ----------
     reference
         The references.
-    local
+    wells
         Formulas by the index of the reference's attractor; a well without one counts as not covered.
     """
     rows = []
     for index in range(len(reference.attractors)):
         inside = reference.below(index, WELL_SHARE)
         exact = reference.characteristics[index][inside]
-        if index not in local:
+        if index not in wells:
             rows.append(Comparison(well_region(index), len(exact), 0.0, float("nan")))
             continue
         x = reference.points[inside]
-        row = _compared(well_region(index), 2 * local[index].values(x), exact)
-        everywhere = relative_l2(2 * local[index].well.values(x), exact)
+        row = _compared(well_region(index), 2 * wells[index].known_values(x), exact)
+        everywhere = relative_l2(2 * wells[index].values(x), exact)
         rows.append(Comparison(row.region, row.points, row.covered, row.error, everywhere))
     return rows
 

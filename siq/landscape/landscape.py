@@ -2,65 +2,261 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 
-from siq.equilibria import Equilibrium
+from siq.certificate.certify import Certificate
+from siq.data.recordings import Recordings
+from siq.dynamics.dynamics import Dynamics
+from siq.dynamics.equilibria import Equilibrium
+from siq.dynamics.phase_portrait import PhasePortrait
 from siq.errors import NumericalFailure
-from siq.identification import IdentifiedField
-from siq.landscape.combined import GlobalQuasipotential, heights_of_attractors, matched
-from siq.landscape.local import LocalQuasipotential, Trial, local_quasipotential
-from siq.landscape.options import LandscapeOptions
-from siq.landscape.transitions import Transition, lowest_barrier, transitions, ways_out
-from siq.outline import Outline
+from siq.identify.identification import IdentifiedField
+from siq.landscape.global_quasipotential import GlobalQuasipotential, heights_of_attractors, matched
+from siq.landscape.transitions import Transition, transitions, ways_out
+from siq.potential.local_wells import WellOptions, local_well, surveyed
+from siq.potential.well import Well
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from siq.steps.pipeline import PipelineSettings
+
+SAME = 1e-6  # of the recorded box: one attractor, from different starts
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Landscape:
-    """What is known of a landscape.
+    """What is known of a landscape: wells, the ways out of them, and U = 2V over all of them.
 
-    Attributes
-    ----------
-    equilibria
-        All that were found in the recorded region.
+    Main attributes
+    ---------------
     attractors
         Those that recorded states lead to, in the order of everything below.
-    basins
-        Share of the evenly spread recorded states from which f leads to each attractor, shape ``(k,)``.
-    local
-        The formula about each attractor, None where none was found.
-    trials
-        The degrees that were tried about each attractor.
+    wells
+        V about each attractor, None where none was found.
     transitions
         Every way out of every well.
+    certificate
+        Whether the wells may be believed; None where no test was made.
+    dynamics
+        f and D.
+
+    Other attributes
+    ----------------
+    equilibria
+        All that were found in the recorded region.
+    basins
+        Share of the evenly spread recorded states from which f leads to each attractor, shape ``(k,)``.
     heights
         U at the attractors, shape ``(k,)``; NaN where transitions do not connect them.
-    notes
+
+    Notes
+    -----
         What could not be done, in words; limit cycles among it.
     """
 
+    dynamics: Dynamics
     equilibria: tuple[Equilibrium, ...]
     attractors: tuple[Equilibrium, ...]
     basins: np.ndarray
-    local: tuple[LocalQuasipotential | None, ...]
-    trials: tuple[tuple[Trial, ...], ...]
+    wells: tuple[Well | None, ...]
     transitions: tuple[Transition, ...]
     heights: np.ndarray
     notes: tuple[str, ...]
+    certificate: Certificate | None = None
 
-    @property
-    def quasipotential(self) -> GlobalQuasipotential | None:
+    @classmethod
+    def from_recordings(cls, recordings: Recordings, settings: PipelineSettings | None = None) -> Landscape:
+        r"""The landscape that recordings show: f identified, V refined and certified, transitions found.
+
+        Parameters
+        ----------
+        recordings
+            Trajectories; see `siq.Recordings.from_frame` and `siq.read_recordings`.
+        settings
+            Of all steps; see `siq.steps.pipeline.PipelineSettings`. By default V comes from f alone, without
+            networks.
+
+        Raises
+        ------
+        NumericalFailure
+            When f cannot be identified, or it has no landscape; the message is that of the step.
+
+        Examples
+        --------
+        >>> from siq.data.recordings import Recordings
+        >>> t, starts = np.linspace(0, 3, 61), np.random.default_rng(0).uniform(-1.5, 1.5, (2, 60, 1))
+        >>> x = starts[0] / np.sqrt(starts[0] ** 2 + (1 - starts[0] ** 2) * np.exp(-2 * t))  # dx/dt = x - x³
+        >>> y = starts[1] * np.exp(-t)  # dy/dt = -y
+        >>> recordings = Recordings.from_arrays(t, np.stack([x, y], axis=2), names=["x", "y"])
+        >>> landscape = Landscape.from_recordings(recordings)
+        >>> landscape.barriers().round(3)[["start", "end", "barrier"]]
+           start  end  barrier
+        0      0    1      0.5
+        1      1    0      0.5
+        >>> print(landscape.potential(well=1).to_latex(digits=3))
+        \begin{aligned}
+        \Delta_{x} &= x - 1.0 \\
+        V &= 0.25 \Delta_{x}^{4} + 1.0 \Delta_{x}^{3} + 1.0 \Delta_{x}^{2} + 0.5 y^{2}
+        \end{aligned}
+        """
+        from siq.steps.pipeline import PipelineSettings, analyse
+
+        settings = settings or PipelineSettings()
+        analysis = analyse(recordings, settings)
+        found = None if analysis.landscape is None else analysis.landscape.landscape
+        if found is None:
+            raise NumericalFailure("; ".join(one.reason for one in analysis.outcomes if one.reason))
+        notes = found.notes
+        if settings.space.diffusion == "identity":
+            notes = (
+                *notes,
+                "D is taken as the unit matrix, since none was given: U, barriers and times follow from it",
+            )
+        units = tuple(
+            unit or settings.space.unit(name, unknown="1")
+            for name, unit in zip(recordings.names, recordings.units, strict=True)
+        )
+        return replace(found, notes=notes).in_units(units)
+
+    def in_units(self, units: Sequence[str]) -> Landscape:
+        """The same with the units of the states said; nothing is converted."""
+        dynamics = replace(self.dynamics, units=tuple(units))
+        wells = tuple(None if well is None else replace(well, dynamics=dynamics) for well in self.wells)
+        return replace(self, dynamics=dynamics, wells=wells)
+
+    @cached_property
+    def over_wells(self) -> GlobalQuasipotential | None:
         """U over all wells, None where a well has no formula or no height."""
-        return matched(self.local, self.heights)
+        return matched(self.wells, self.heights)
+
+    def quasipotential(self, points: np.ndarray) -> np.ndarray:
+        """U at points ``(n, d)``, zero at the deepest attractor: shape ``(n,)``, NaN where not known."""
+        x = np.asarray(points, dtype=float)
+        if x.ndim != 2 or x.shape[1] != self.dynamics.dimension:
+            raise ValueError(f"the points have the shape {x.shape}; give (n, {self.dynamics.dimension})")
+        return np.full(len(x), np.nan) if self.over_wells is None else self.over_wells(x)
+
+    def potential(self, well: int = 0) -> Well:
+        """V about an attractor, zero there, as a formula with where it holds; U is 2V.
+
+        Raises
+        ------
+        NumericalFailure
+            Where no formula was found.
+        """
+        found = self.wells[well]
+        if found is None:
+            raise NumericalFailure(f"no formula was found about attractor {well}: {'; '.join(self.notes)}")
+        return found
+
+    def barriers(self) -> pd.DataFrame:
+        """ΔU on every way out of every well, one row each.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Columns ``start end barrier standard_error``: attractors by their place in `attractors`, the end
+            missing where the way leads out of the recorded region; ΔU in the unit of ε with its standard
+            error from the uncertainty of f, NaN where it is not known.
+        """
+        return pd.DataFrame(
+            {
+                "start": np.array([way.start for way in self.transitions], dtype=int),
+                "end": pd.array([way.end for way in self.transitions], dtype="Int64"),
+                "barrier": np.array([way.barrier for way in self.transitions], dtype=float),
+                "standard_error": np.array([way.standard_error for way in self.transitions], dtype=float),
+            }
+        )
+
+    def escape_times(self, *, noise: float) -> pd.DataFrame:
+        """Mean times until noise has led from each attractor to the next, one row for every way out.
+
+        Parameters
+        ----------
+        noise
+            ε of ``dx = f dt + √ε σ dW``, in the unit of U.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Columns ``start end mean_time note``: the mean time by the law of Eyring and Kramers with its
+            prefactor (`siq.landscape.rates`), NaN with a note that says why where the law does not hold.
+
+        Raises
+        ------
+        ValueError
+            When D is the unit matrix although a state is but the derivative of another: no noise drives
+            ``dx/dt = v``, and the times follow from D.
+        """
+        defined = _defined_states(self.dynamics)
+        if defined and np.array_equal(self.dynamics.diffusion.matrix, np.eye(self.dynamics.dimension)):
+            raise ValueError(
+                f"the equation of {', '.join(defined)} is of the form dx/dt = v, which no noise drives, and D"
+                " is the unit matrix: escape times follow from D, so give the D of this system"
+            )
+        rows = [(way.start, way.end, *_mean_time(way, noise)) for way in self.transitions]
+        table = pd.DataFrame(rows, columns=["start", "end", "mean_time", "note"])
+        return table.astype({"start": int, "end": "Int64", "mean_time": float})
+
+    def report(self) -> str:
+        """What was found, as text."""
+        from siq.report.landscape_text import landscape_text
+
+        return landscape_text(self)
+
+    def _repr_html_(self) -> str:
+        from siq.report.landscape_text import landscape_html
+
+        return landscape_html(self)
+
+    def plot(self, ax: Axes | None = None) -> Axes:
+        """Draw U with its equilibria and paths.
+
+        Of one state a curve; of two, contours; of more, the plane of the first two states through the lowest
+        saddle.
+
+        Parameters
+        ----------
+        ax
+            Where; by default new axes.
+        """
+        from siq.report.plots.landscape_axes import draw_landscape
+
+        return draw_landscape(self, ax)
+
+
+def _defined_states(dynamics: Dynamics) -> list[str]:
+    """States whose equation is another state, but for a factor: ``dx/dt = v``."""
+    return [
+        name
+        for name, own, formula in zip(dynamics.states, dynamics.symbols, dynamics.formulas, strict=True)
+        if formula.as_coeff_Mul()[1] in set(dynamics.symbols) - {own}
+    ]
+
+
+def _mean_time(way: Transition, noise: float) -> tuple[float, str]:
+    if way.rate is None:
+        return np.nan, "; ".join(way.notes)
+    try:
+        return way.rate.mean_time(noise), "; ".join(way.notes)
+    except NumericalFailure as error:
+        return np.nan, str(error)
 
 
 def find_landscape(
     found: IdentifiedField,
-    outline: Outline,
+    portrait: PhasePortrait,
     *,
-    diffusion: np.ndarray,
-    options: LandscapeOptions,
+    wells: Sequence[Well] | None = None,
+    certificate: Certificate | None = None,
+    options: WellOptions | None = None,
     seed: int = 0,
 ) -> Landscape:
     """Find the landscape of an identified vector field.
@@ -69,42 +265,61 @@ def find_landscape(
     ----------
     found
         The identified f with its uncertainty.
-    outline
-        Attractors, saddles and regions of f; see `siq.outline.outline`.
-    diffusion
-        D.
+    portrait
+        Attractors, saddles and basins of f; see `siq.dynamics.phase_portrait.phase_portrait`.
+    wells
+        V about the attractors as refinement found it; by default the local route finds it here.
+    certificate
+        Of these wells.
     options
-        Degrees, reach and tolerance of the formulas.
+        Of the local route.
     seed
         Decides which points are used where there are too many.
     """
-    notes = [fault] if (fault := outline.fault()) is not None else []
-    ways_over = ways_out(found.field, outline, diffusion=diffusion)
-    local: list[LocalQuasipotential | None] = []
-    trials: list[tuple[Trial, ...]] = []
-    for index, one in enumerate(outline.attractors):
+    notes = [fault] if (fault := portrait.fault()) is not None else []
+    if wells is None:
+        kept = _wells(found, portrait, options or WellOptions(), seed, notes)
+    else:
+        kept = [_given(wells, found, portrait, index, notes) for index in range(len(portrait.attractors))]
+    ways = transitions(found, ways_out(found.dynamics, portrait), kept)
+    ends = portrait.descents.ends
+    return Landscape(
+        found.dynamics,
+        portrait.equilibria,
+        portrait.attractors,
+        np.array([float((ends == index).mean()) for index in range(len(portrait.attractors))]),
+        tuple(kept),
+        tuple(ways),
+        _heights(len(portrait.attractors), ways, notes),
+        tuple(notes),
+        certificate,
+    )
+
+
+def _wells(
+    found: IdentifiedField, portrait: PhasePortrait, options: WellOptions, seed: int, notes: list[str]
+) -> list[Well | None]:
+    wells: list[Well | None] = []
+    for index, one in enumerate(portrait.attractors):
         try:
-            formula, tried = local_quasipotential(
-                found.field, outline, index, diffusion=diffusion, options=options, seed=seed,
-                barrier=lowest_barrier(ways_over, index),
-            )  # fmt: skip
+            wells.append(local_well(found.dynamics, portrait, index, options=options, seed=seed))
         except NumericalFailure as error:
             notes.append(f"no formula about {one.position.round(4).tolist()}: {error}")
-            formula, tried = None, ()
-        local.append(formula)
-        trials.append(tried)
-    ways = transitions(found, ways_over, local, diffusion=diffusion)
-    ends = outline.descents.ends
-    return Landscape(
-        outline.equilibria,
-        outline.attractors,
-        np.array([float((ends == index).mean()) for index in range(len(outline.attractors))]),
-        tuple(local),
-        tuple(trials),
-        tuple(ways),
-        _heights(len(outline.attractors), ways, notes),
-        tuple(notes),
-    )
+            wells.append(None)
+    return wells
+
+
+def _given(
+    wells: Sequence[Well], found: IdentifiedField, portrait: PhasePortrait, index: int, notes: list[str]
+) -> Well | None:
+    """The well of an attractor among those of the refinement."""
+    place = portrait.attractors[index].position
+    width = portrait.box[:, 1] - portrait.box[:, 0]
+    for well in wells:
+        if np.abs((well.attractor - place) / width).max() < SAME:
+            return surveyed(well, found.dynamics, portrait, index)
+    notes.append(f"refinement found no formula about {place.round(4).tolist()}")
+    return None
 
 
 def _heights(count: int, ways: list[Transition], notes: list[str]) -> np.ndarray:

@@ -25,9 +25,16 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from siq.dynamics.dynamics import Dynamics
 from siq.errors import NumericalFailure
-from siq.landscape.chains import MOST_NODES, NO_ACTION, Chain, ChainProblem, evenly, rivals_of
-from siq.vector_field import VectorField
+from siq.landscape.discretised_paths import (
+    MOST_NODES,
+    NO_ACTION,
+    DiscretisedPath,
+    PathProblem,
+    evenly,
+    rivals_of,
+)
 
 TURN = 0.15  # radian from one segment of the first chain to the next
 UNSTABLE_START = 1e-4  # of the distance: where the way down from a saddle starts
@@ -94,11 +101,10 @@ class TransitionPath:
 
 
 def minimum_action_path(
-    field: VectorField,
+    dynamics: Dynamics,
     start: np.ndarray,
     end: np.ndarray,
     *,
-    diffusion: np.ndarray,
     nodes: int = 100,
     tolerance: float = 1e-4,
     initial: Sequence[np.ndarray] | None = None,
@@ -107,15 +113,13 @@ def minimum_action_path(
 
     Parameters
     ----------
-    field
+    dynamics
         f, twice differentiable.
     start
         Shape ``(d,)``: mostly an attractor, to rounding.
     end
         Shape ``(d,)``: mostly a saddle, but any state will do. Where the path has to cross a saddle, it is
         found faster and better in two parts: see `transition_path`.
-    diffusion
-        D, shape ``(d, d)``, positive definite.
     nodes
         Points of the first chain. It has more where the path winds; and their number is doubled until the
         action is known.
@@ -138,11 +142,11 @@ def minimum_action_path(
     NumericalFailure
         When no first guess has a finite action.
     """
-    problem = ChainProblem(field, np.asarray(start, dtype=float), np.asarray(end, dtype=float), diffusion)
+    problem = PathProblem(dynamics, np.asarray(start, dtype=float), np.asarray(end, dtype=float))
     own, turning = problem.guesses()
     guesses = own if initial is None else [problem.scaled(np.asarray(one, dtype=float)) for one in initial]
     count = min(max(nodes, int(turning / TURN)), MOST_NODES // 4)
-    chains: list[Chain] = []
+    chains: list[DiscretisedPath] = []
     for guess in guesses:
         chain = problem.descend(guess, count, problem.action(problem.spaced(guess, count, 0.0)), first=True)
         if np.isfinite(chain.action):
@@ -175,12 +179,11 @@ def minimum_action_path(
 
 
 def transition_path(
-    field: VectorField,
+    dynamics: Dynamics,
     attractor: np.ndarray,
     saddle: np.ndarray,
     target: np.ndarray,
     *,
-    diffusion: np.ndarray,
     nodes: int = 100,
     tolerance: float = 1e-4,
     initial: Sequence[np.ndarray] | None = None,
@@ -189,7 +192,7 @@ def transition_path(
 
     Parameters
     ----------
-    field, diffusion, nodes, tolerance, initial
+    dynamics, nodes, tolerance, initial
         As for `minimum_action_path`; `nodes` is the number of points downhill, too.
     attractor, saddle, target
         Shape ``(d,)`` each; the saddle has one unstable direction.
@@ -199,19 +202,17 @@ def transition_path(
     NumericalFailure
         When f leads from the saddle to the target on neither side, or for want of an uphill path.
     """
-    descent = _descent(field, np.asarray(saddle, float), np.asarray(target, float), diffusion, nodes)
+    descent = _descent(dynamics, np.asarray(saddle, float), np.asarray(target, float), nodes)
     uphill = minimum_action_path(
-        field, attractor, saddle, diffusion=diffusion, nodes=nodes, tolerance=tolerance, initial=initial
+        dynamics, attractor, saddle, nodes=nodes, tolerance=tolerance, initial=initial
     )
     return TransitionPath(uphill, descent)
 
 
-def _descent(
-    field: VectorField, saddle: np.ndarray, target: np.ndarray, diffusion: np.ndarray, nodes: int
-) -> np.ndarray:
+def _descent(dynamics: Dynamics, saddle: np.ndarray, target: np.ndarray, nodes: int) -> np.ndarray:
     """The trajectory of f from a saddle to an attractor, in evenly spaced points."""
-    problem = ChainProblem(field, saddle, target, diffusion)
-    values, vectors = np.linalg.eig(problem.jacobian(np.zeros((1, field.dimension)))[0])
+    problem = PathProblem(dynamics, saddle, target)
+    values, vectors = np.linalg.eig(problem.jacobian(np.zeros((1, dynamics.dimension)))[0])
     if (values.real > 0).sum() != 1:
         raise NumericalFailure(f"{saddle.tolist()} is no saddle with one unstable direction")
     upwards = vectors[:, np.argmax(values.real)].real

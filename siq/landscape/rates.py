@@ -39,11 +39,11 @@ import numpy as np
 from scipy.integrate import simpson
 from scipy.interpolate import CubicSpline
 
-from siq.equilibria import classify, hessian_at
+from siq.dynamics.dynamics import Dynamics
+from siq.dynamics.equilibria import classify, hessian_at
 from siq.errors import NumericalFailure
 from siq.landscape.paths import MinimumActionPath
-from siq.power_series import quasipotential_series
-from siq.vector_field import VectorField
+from siq.reference.power_series import quasipotential_series
 
 NEAR_ATTRACTOR = 0.01  # of the distance from A to S, in the metric of M: up to there V is its power series
 NEAR_SADDLE = 0.003  # of the distance: from there at the latest the integrand is continued to S
@@ -99,23 +99,20 @@ def mean_escape_time(rates: Sequence[EscapeRate], intensity: float) -> float:
 
 
 def escape_rate(
-    field: VectorField,
+    dynamics: Dynamics,
     path: MinimumActionPath,
     *,
-    diffusion: np.ndarray,
     hessian: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> EscapeRate:
     """The law of escape along a minimum action path from an attractor to a saddle.
 
     Parameters
     ----------
-    field
+    dynamics
         f, twice differentiable.
     path
         From the attractor to the saddle: see `siq.landscape.paths.minimum_action_path`. With its tolerance
         of 1e-4 the prefactor is good to a percent, with 1e-5 to a few thousandths.
-    diffusion
-        D, shape ``(d, d)``.
     hessian
         ∇²V of a formula, points ``(n, d)`` to ``(n, d, d)``; by default it is integrated along the path.
 
@@ -134,7 +131,7 @@ def escape_rate(
         When the path does not lead from an attractor, which cannot be a cycle, to a saddle with one unstable
         direction; when it meets a caustic; or when V is not smooth at the saddle.
     """
-    frame = _Frame(field, path, np.asarray(diffusion, dtype=float))
+    frame = _Frame(dynamics, path)
     twins = any(abs(one - path.action) < SAME_ACTION * path.action for one in path.rivals)
     notes, skew = [], frame.skew()
     if not path.converged:
@@ -165,17 +162,17 @@ class _Frame:
     close to A to the neighbourhood of S; `at_attractor` and `at_saddle` are the Hessians of V.
     """
 
-    def __init__(self, field: VectorField, path: MinimumActionPath, diffusion: np.ndarray) -> None:
+    def __init__(self, dynamics: Dynamics, path: MinimumActionPath) -> None:
         start, end = path.points[0], path.points[-1]
         ends = np.stack([start, end])
-        root = np.linalg.cholesky(diffusion)
-        distance = float(np.linalg.norm(np.linalg.solve(root, end - start)))
-        jacobians = np.linalg.solve(root, field.jacobian(ends) @ root)
+        root, whitening = dynamics.diffusion.root, dynamics.diffusion.whitening
+        distance = float(np.linalg.norm(whitening @ (end - start)))
+        jacobians = whitening @ dynamics.jacobian(ends) @ root
         self.rate = float(np.linalg.norm(jacobians, axis=(1, 2)).max())
-        speeds = np.linalg.norm(np.linalg.solve(root, field(ends).T), axis=0)
+        speeds = np.linalg.norm(dynamics.drift(ends) @ whitening.T, axis=1)
         resting = speeds < AT_REST * self.rate * distance
-        saddle = classify(field, end)
-        if not resting[0] or classify(field, start).kind != "attractor":
+        saddle = classify(dynamics, end)
+        if not resting[0] or classify(dynamics, start).kind != "attractor":
             raise NumericalFailure(f"the path starts at {start.tolist()}, which is no stable equilibrium")
         if not resting[1] or saddle.kind == "degenerate" or saddle.unstable != 1:
             raise NumericalFailure(f"the path ends at {end.tolist()}, no saddle with one unstable direction")
@@ -183,13 +180,13 @@ class _Frame:
         sums = np.abs(saddle.eigenvalues[1:] / self.rate + self.unstable)
         self.resonant = bool(sums.min(initial=np.inf) < RESONANT * self.unstable)
         self.stable = float(-saddle.eigenvalues[1:].real.max(initial=-np.inf)) / self.rate
-        self.field, self.start, self.units = field, start, distance * root
-        self.series = quasipotential_series(field, start, diffusion=diffusion, degree=4)
-        self.inverse, self.unit = np.linalg.inv(self.units), distance**2 * self.rate
-        self.at_attractor = self.curvature(hessian_at(field, start, diffusion=diffusion))
+        self.dynamics, self.start, self.units = dynamics, start, distance * root
+        self.series = quasipotential_series(dynamics, start, degree=4)
+        self.inverse, self.unit = whitening / distance, distance**2 * self.rate
+        self.at_attractor = self.curvature(hessian_at(dynamics, start))
         self.at_saddle = None
         if not self.resonant:
-            self.at_saddle = self.curvature(hessian_at(field, end, diffusion=diffusion))
+            self.at_saddle = self.curvature(hessian_at(dynamics, end))
         self.end = self.inverse @ (end - start)
         points, momenta = (path.points - start) @ self.inverse.T, path.momenta @ self.units / self.unit
         level = np.einsum("ni,ij,nj->n", points, self.at_attractor, points)
@@ -225,15 +222,15 @@ class _Frame:
 
     def velocity(self, y: np.ndarray, p: np.ndarray) -> np.ndarray:
         """``ẋ = f + 2Dp``."""
-        return self.field(self.start + y @ self.units.T) @ self.inverse.T / self.rate + 2 * p
+        return self.dynamics.drift(self.start + y @ self.units.T) @ self.inverse.T / self.rate + 2 * p
 
     def jacobian(self, y: np.ndarray) -> np.ndarray:
         """J, ``(n, d, d)``."""
-        return self.inverse @ self.field.jacobian(self.start + y @ self.units.T) @ self.units / self.rate
+        return self.inverse @ self.dynamics.jacobian(self.start + y @ self.units.T) @ self.units / self.rate
 
     def bend(self, y: np.ndarray, p: np.ndarray) -> np.ndarray:
         """``Σ_k p_k ∇²f_k``, ``(n, d, d)``."""
-        second = self.field.hessian(self.start + y @ self.units.T)
+        second = self.dynamics.hessian(self.start + y @ self.units.T)
         return self.units.T @ np.einsum("nk,nkij->nij", p @ self.inverse / self.rate, second) @ self.units
 
     def skew(self) -> float:

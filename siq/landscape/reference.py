@@ -12,15 +12,15 @@ from pathlib import Path
 
 import numpy as np
 
-from siq.equilibria import hessian_at
+from siq.dynamics.dynamics import Dynamics
+from siq.dynamics.equilibria import hessian_at
+from siq.dynamics.phase_portrait import PhasePortrait
 from siq.errors import InputError, NumericalFailure
-from siq.fans import adapted_fan, lowest_sheet, value_near
-from siq.files import whole_file
-from siq.landscape.combined import heights_of_attractors, least_over_wells
-from siq.landscape.mesh import mesh_quasipotential
+from siq.files.whole import whole_file
+from siq.landscape.global_quasipotential import heights_of_attractors, least_over_wells
 from siq.landscape.paths import minimum_action_path
-from siq.outline import Outline
-from siq.vector_field import VectorField
+from siq.reference.mesh import mesh_quasipotential
+from siq.reference.sheets import adapted_fan, lowest_sheet, value_near
 
 GRID = 161  # points along each of two states
 SCATTERED = 4000  # points of a fan where there are more states
@@ -76,10 +76,9 @@ class ReferenceLandscape:
 
 
 def reference_landscape(
-    field: VectorField,
-    outline: Outline,
+    dynamics: Dynamics,
+    portrait: PhasePortrait,
     *,
-    diffusion: np.ndarray,
     box: np.ndarray,
     reach: float,
     generator: np.random.Generator,
@@ -88,12 +87,10 @@ def reference_landscape(
 
     Parameters
     ----------
-    field
+    dynamics
         The exact f.
-    outline
+    portrait
         Its attractors and saddles.
-    diffusion
-        D.
     box
         Shape ``(d, 2)``: the region of interest.
     reach
@@ -106,10 +103,10 @@ def reference_landscape(
     NumericalFailure
         When there is no attractor, or an attractor has no saddle to compare a barrier at.
     """
-    attractors = np.array([one.position for one in outline.attractors])
+    attractors = np.array([one.position for one in portrait.attractors])
     if not len(attractors):
         raise NumericalFailure("f has no attractor, so that there is no landscape to compare with")
-    actions = _actions(field, outline, diffusion)
+    actions = _actions(dynamics, portrait)
     barriers = actions.min(axis=1)
     lowest = np.where(np.isfinite(barriers), barriers, np.nan)
     if np.isnan(lowest).all():
@@ -118,15 +115,15 @@ def reference_landscape(
     wide = box + WIDER * np.ptp(box, axis=1)[:, None] * np.array([-1.0, 1.0])
     fans = [
         adapted_fan(
-            field, one, diffusion=diffusion, level=level / 2, box=wide, generator=generator,
+            dynamics, one, level=level / 2, box=wide, generator=generator,
             most=CURVES, gap=GAP,
         )
         for one, level in zip(attractors, levels, strict=True)
     ]  # fmt: skip
     sheets = [lowest_sheet(fan) for fan in fans]
-    if field.dimension <= 2:
+    if dynamics.dimension <= 2:
         axes = [np.linspace(low, high, GRID) for low, high in box]
-        points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, field.dimension)
+        points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, dynamics.dimension)
     else:
         known = np.concatenate([fan.points[sheet] for fan, sheet in zip(fans, sheets, strict=True)])
         points = known[generator.permutation(len(known))[:SCATTERED]]
@@ -137,14 +134,15 @@ def reference_landscape(
         ]
     )
     on_mesh, mesh_barriers = np.full(values.shape, np.nan), np.full(len(attractors), np.nan)
-    if field.dimension == 2:
+    if dynamics.dimension == 2:
         for index, one in enumerate(attractors):
             mesh = mesh_quasipotential(
-                field, one, hessian=hessian_at(field, one, diffusion=diffusion), box=box,
-                shape=(MESH, MESH), diffusion=diffusion, level=levels[index] / 2, stop_at_boundary=False,
+                dynamics.drift, one, hessian=hessian_at(dynamics, one), box=box,
+                shape=(MESH, MESH), diffusion=dynamics.diffusion, level=levels[index] / 2,
+                stop_at_boundary=False,
             )  # fmt: skip
             on_mesh[index] = 2 * mesh.evaluate(points)
-            tops = np.array([saddle.position for saddle in outline.saddles[index]]).reshape(-1, 2)
+            tops = np.array([saddle.position for saddle in portrait.saddles[index]]).reshape(-1, 2)
             if len(tops):
                 mesh_barriers[index] = np.nanmin(2 * mesh.evaluate(tops), initial=np.inf)
     return ReferenceLandscape(
@@ -152,15 +150,15 @@ def reference_landscape(
     )
 
 
-def _actions(field: VectorField, outline: Outline, diffusion: np.ndarray) -> np.ndarray:
+def _actions(dynamics: Dynamics, portrait: PhasePortrait) -> np.ndarray:
     """Least action from each attractor to each saddle next to it, shape ``(k, s)``, infinite elsewhere."""
-    saddles = list({tuple(one.position): one for row in outline.saddles for one in row}.values())
-    actions = np.full((len(outline.attractors), max(len(saddles), 1)), np.inf)
-    for index, one in enumerate(outline.attractors):
-        beside = {tuple(saddle.position) for saddle in outline.saddles[index]}
+    saddles = list({tuple(one.position): one for row in portrait.saddles for one in row}.values())
+    actions = np.full((len(portrait.attractors), max(len(saddles), 1)), np.inf)
+    for index, one in enumerate(portrait.attractors):
+        beside = {tuple(saddle.position) for saddle in portrait.saddles[index]}
         for column, saddle in enumerate(saddles):
             if tuple(saddle.position) in beside:
-                path = minimum_action_path(field, one.position, saddle.position, diffusion=diffusion)
+                path = minimum_action_path(dynamics, one.position, saddle.position)
                 actions[index, column] = path.action
     return actions
 

@@ -1,7 +1,8 @@
 """`quasipotential.json`: a landscape as a file that anything can evaluate without this library.
 
-Powers stand as in `siq.model`. Each well has the points of its fit, away from which nothing is claimed; the
-vector field, which tells where a formula solves the Hamilton–Jacobi equation, stands in `vector_field.json`.
+Powers stand as in `siq.potential.storage`. Each well has the points of its fit, away from which nothing is
+claimed; the vector field, which tells where a formula solves the Hamilton–Jacobi equation, stands in
+`vector_field.json`.
 """
 
 from __future__ import annotations
@@ -14,15 +15,14 @@ from typing import Any
 
 import numpy as np
 
-from siq.bases import PowerBasis
+from siq.dynamics.dynamics import Dynamics
 from siq.errors import InputError
-from siq.files import whole_file
-from siq.landscape.combined import GlobalQuasipotential, matched
+from siq.files.whole import whole_file
+from siq.landscape.global_quasipotential import GlobalQuasipotential, matched
 from siq.landscape.landscape import Landscape
-from siq.landscape.local import LocalQuasipotential
 from siq.landscape.transitions import Transition
-from siq.local_route import Well
-from siq.vector_field import VectorField
+from siq.potential.storage import basis_from_data, powers_to_data
+from siq.potential.well import Well
 
 DIGITS = 8  # of points of a fit, which only tell where a formula holds
 
@@ -35,21 +35,21 @@ class StoredLandscape:
     ----------
     quasipotential
         U over all wells, None where it is not known.
-    local
-        The formula about each attractor, None where there is none.
+    wells
+        V about each attractor, None where there is none.
     data
         Everything, as plain data: equilibria, wells, transitions with their paths, notes.
     """
 
     quasipotential: GlobalQuasipotential | None
-    local: tuple[LocalQuasipotential | None, ...]
+    wells: tuple[Well | None, ...]
     data: Mapping[str, Any]
 
 
-def write_landscape(path: str | Path, landscape: Landscape, *, field: VectorField) -> None:
+def write_landscape(path: str | Path, landscape: Landscape, *, dynamics: Dynamics) -> None:
     """Write a landscape whole or not at all."""
     data = {
-        "states": [symbol.name for symbol in field.symbols],
+        "states": [symbol.name for symbol in dynamics.symbols],
         "equilibria": [
             {
                 "position": one.position.tolist(),
@@ -63,10 +63,10 @@ def write_landscape(path: str | Path, landscape: Landscape, *, field: VectorFiel
                 "attractor": attractor.position.tolist(),
                 "basin": float(basin),
                 "height": _number(height),
-                "V": None if local is None else _formula(local),
+                "V": None if well is None else _formula(well),
             }
-            for attractor, basin, height, local in zip(
-                landscape.attractors, landscape.basins, landscape.heights, landscape.local, strict=True
+            for attractor, basin, height, well in zip(
+                landscape.attractors, landscape.basins, landscape.heights, landscape.wells, strict=True
             )
         ],
         "transitions": [_transition(one) for one in landscape.transitions],
@@ -80,19 +80,15 @@ def _number(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def _formula(local: LocalQuasipotential) -> dict[str, Any]:
-    well = local.well
-    return {
-        "center": well.basis.center.tolist(),
-        "scale": well.basis.scale.tolist(),
-        "exponents": well.basis.exponents.tolist(),
-        "coefficients": well.coefficients.tolist(),
-        "level": well.level,
+def _formula(well: Well) -> dict[str, Any]:
+    return powers_to_data(well) | {
+        "level": well.reach,
+        "depth": well.level,
         "saddle": None if well.saddle is None else well.saddle.tolist(),
-        "tolerance": local.tolerance,
+        "tolerance": well.tolerance,
         "residual": well.residual,
         "points": _rounded(well.points),
-        "elsewhere": [] if local.elsewhere is None else _rounded(local.elsewhere),
+        "elsewhere": [] if well.elsewhere is None else _rounded(well.elsewhere),
     }
 
 
@@ -118,17 +114,15 @@ def _transition(one: Transition) -> dict[str, Any]:
     }
 
 
-def read_landscape(path: str | Path, *, field: VectorField, diffusion: np.ndarray) -> StoredLandscape | None:
+def read_landscape(path: str | Path, *, dynamics: Dynamics) -> StoredLandscape | None:
     """Read what `write_landscape` wrote; None where the file is empty since there was nothing to write.
 
     Parameters
     ----------
     path
         The file.
-    field
+    dynamics
         f, as it was identified beside it.
-    diffusion
-        D.
 
     Raises
     ------
@@ -140,24 +134,22 @@ def read_landscape(path: str | Path, *, field: VectorField, diffusion: np.ndarra
         if not text:
             return None
         data = json.loads(text)
-        local = tuple(_local(well, field, diffusion) for well in data["wells"])
+        wells = tuple(_well(well, dynamics) for well in data["wells"])
         heights = np.array([well["height"] for well in data["wells"]], dtype=float)
-        return StoredLandscape(matched(local, heights), local, data)
+        return StoredLandscape(matched(wells, heights), wells, data)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(path, "", f"it is no landscape ({type(error).__name__})", "make it again") from None
 
 
-def _local(data: Mapping[str, Any], field: VectorField, diffusion: np.ndarray) -> LocalQuasipotential | None:
+def _well(data: Mapping[str, Any], dynamics: Dynamics) -> Well | None:
     powers = data["V"]
     if powers is None:
         return None
-    basis = PowerBasis(
-        field.symbols, np.array(powers["center"]), np.array(powers["scale"]), np.array(powers["exponents"])
-    )
-    saddle = None if powers["saddle"] is None else np.array(powers["saddle"])
-    well = Well(
-        np.array(data["attractor"]), basis, np.array(powers["coefficients"]), powers["level"], saddle,
-        powers["residual"], np.array(powers["points"]),
+    d = dynamics.dimension
+    return Well(
+        dynamics, np.array(data["attractor"]), basis_from_data(powers, dynamics.symbols),
+        np.array(powers["coefficients"]), powers.get("depth", powers["level"]),
+        None if powers["saddle"] is None else np.array(powers["saddle"]), powers["residual"],
+        np.array(powers["points"]).reshape(-1, d), powers["level"], powers["tolerance"],
+        np.array(powers["elsewhere"]).reshape(-1, d),
     )  # fmt: skip
-    elsewhere = np.array(powers["elsewhere"]).reshape(-1, len(field.symbols))
-    return LocalQuasipotential(well, field, diffusion, powers["tolerance"], elsewhere)

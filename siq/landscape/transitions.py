@@ -13,14 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from siq.equilibria import Equilibrium, neighbours
+from siq.dynamics.dynamics import Dynamics
+from siq.dynamics.equilibria import Equilibrium, neighbours
+from siq.dynamics.phase_portrait import PhasePortrait
 from siq.errors import NumericalFailure
-from siq.identification import IdentifiedField
-from siq.landscape.local import LocalQuasipotential
+from siq.identify.identification import IdentifiedField
 from siq.landscape.paths import TransitionPath, transition_path
 from siq.landscape.rates import EscapeRate, escape_rate
-from siq.outline import Outline
-from siq.vector_field import VectorField
+from siq.potential.well import Well
 
 logger = logging.getLogger(__name__)
 
@@ -84,22 +84,20 @@ class WayOut:
     note: str = ""
 
 
-def ways_out(field: VectorField, outline: Outline, *, diffusion: np.ndarray) -> list[WayOut]:
+def ways_out(dynamics: Dynamics, portrait: PhasePortrait) -> list[WayOut]:
     """Every way out of every well over the saddles next to it, from f alone.
 
     Parameters
     ----------
-    field
-        f.
-    outline
+    dynamics
+        f and D.
+    portrait
         Attractors and saddles.
-    diffusion
-        D.
     """
     ways = []
-    for index, attractor in enumerate(outline.attractors):
-        for saddle in outline.saddles[index]:
-            beyond = neighbours(field, saddle, outline.attractors, box=outline.box) - {index}
+    for index, attractor in enumerate(portrait.attractors):
+        for saddle in portrait.saddles[index]:
+            beyond = neighbours(dynamics, saddle, portrait.attractors, box=portrait.box) - {index}
             if not beyond:
                 note = "behind the saddle lies no other attractor of the recorded region"
                 ways.append(WayOut(index, None, saddle, None, note))
@@ -107,8 +105,8 @@ def ways_out(field: VectorField, outline: Outline, *, diffusion: np.ndarray) -> 
             end = min(beyond)
             try:
                 path = transition_path(
-                    field, attractor.position, saddle.position, outline.attractors[end].position,
-                    diffusion=diffusion, tolerance=PATH_TOLERANCE,
+                    dynamics, attractor.position, saddle.position, portrait.attractors[end].position,
+                    tolerance=PATH_TOLERANCE,
                 )  # fmt: skip
                 ways.append(WayOut(index, end, saddle, path))
             except NumericalFailure as error:
@@ -116,18 +114,10 @@ def ways_out(field: VectorField, outline: Outline, *, diffusion: np.ndarray) -> 
     return ways
 
 
-def lowest_barrier(ways: Sequence[WayOut], index: int) -> float | None:
-    """The least action out of one well, that is the lowest barrier of U; None where no way out is known."""
-    actions = [way.path.uphill.action for way in ways if way.start == index and way.path is not None]
-    return min(actions, default=None)
-
-
 def transitions(
     found: IdentifiedField,
     ways: Sequence[WayOut],
-    local: Sequence[LocalQuasipotential | None],
-    *,
-    diffusion: np.ndarray,
+    wells: Sequence[Well | None],
 ) -> list[Transition]:
     """Ways out with their barriers and escape times.
 
@@ -137,17 +127,13 @@ def transitions(
         The identified f with its uncertainty.
     ways
         See `ways_out`.
-    local
+    wells
         The formula about each attractor, None where there is none.
-    diffusion
-        D.
     """
-    return [_transition(found, way, local[way.start], diffusion) for way in ways]
+    return [_transition(found, way, wells[way.start]) for way in ways]
 
 
-def _transition(
-    found: IdentifiedField, way: WayOut, local: LocalQuasipotential | None, diffusion: np.ndarray
-) -> Transition:
+def _transition(found: IdentifiedField, way: WayOut, well: Well | None) -> Transition:
     path = way.path
     if path is None:
         return Transition(way.start, way.end, way.saddle, None, np.nan, np.nan, np.nan, None, (way.note,))
@@ -156,27 +142,27 @@ def _transition(
         notes.append("the minimum action path is not converged")
     rate = None
     try:
-        rate = escape_rate(found.field, path.uphill, diffusion=diffusion)
+        rate = escape_rate(found.dynamics, path.uphill)
         notes += rate.notes
     except (NumericalFailure, np.linalg.LinAlgError) as error:
         notes.append(f"no escape time: {error}")
     barrier, share = path.uphill.action, 0.0
-    if local is not None:
-        barrier, share = barrier_by_formula(path, local)
+    if well is not None:
+        barrier, share = barrier_by_formula(path, well)
         if abs(barrier / path.uphill.action - 1) > DIFFERENT:
             notes.append("the formula and the path alone give different barriers")
     logger.info("barrier of U from attractor %d: %.5g by formula, %.5g by the path", way.start, barrier,
                 path.uphill.action)  # fmt: skip
-    spread = barrier_standard_error(path, found, diffusion=diffusion)
+    spread = barrier_standard_error(path, found)
     return Transition(
         way.start, way.end, way.saddle, path, barrier, share, spread, rate, tuple(dict.fromkeys(notes))
     )
 
 
-def barrier_by_formula(path: TransitionPath, local: LocalQuasipotential) -> tuple[float, float]:
+def barrier_by_formula(path: TransitionPath, well: Well) -> tuple[float, float]:
     """The barrier of U by a formula and the end of the path, and the share that the formula accounts for."""
     points, action = path.uphill.points, path.uphill.values
-    formula = 2 * local.values(points)
+    formula = 2 * well.known_values(points)
     known = np.flatnonzero(np.isfinite(formula))
     if not len(known):
         return float(path.uphill.action), 0.0
@@ -185,7 +171,7 @@ def barrier_by_formula(path: TransitionPath, local: LocalQuasipotential) -> tupl
     return float(barrier), float(formula[last] / barrier)
 
 
-def barrier_standard_error(path: TransitionPath, found: IdentifiedField, *, diffusion: np.ndarray) -> float:
+def barrier_standard_error(path: TransitionPath, found: IdentifiedField) -> float:
     """Standard error of a barrier of U from that of f, to first order.
 
     The action ``½∫∣ẋ - f∣² dt`` is minimal along the path, so that a change of f changes it by
@@ -195,10 +181,9 @@ def barrier_standard_error(path: TransitionPath, found: IdentifiedField, *, diff
     points, momenta = path.uphill.points, path.uphill.momenta
     middle = (points[1:] + points[:-1]) / 2
     force = (momenta[1:] + momenta[:-1]) / 2
-    precision = np.linalg.inv(diffusion)
-    flow, move = found.field(middle), np.diff(points, axis=0)
-    speed = np.sqrt(np.einsum("ni,ij,nj->n", flow, precision, flow))
-    length = np.sqrt(np.einsum("ni,ij,nj->n", move, precision, move))
+    flow, move = found.dynamics.drift(middle), np.diff(points, axis=0)
+    noise = found.diffusion
+    speed, length = (np.sqrt(noise.squared_speed(middle, one)) for one in (flow, move))
     spent = np.where(speed > 0, length / np.where(speed > 0, speed, 1.0), 0.0)
     terms = found.library.evaluate(middle)[:, found.support[:, 1]]
     slope = -2 * (spent[:, None] * force[:, found.support[:, 0]] * terms).sum(axis=0)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator
 
+from siq.dynamics.dynamics import Dynamics
 from siq.mismatch.dictionary import Form
-from siq.mismatch.model import Model
 from siq.mismatch.roles import Roles
 
 
-def assignments(form: Form, model: Model, roles: Roles) -> Iterator[dict[str, str]]:
+def assignments(form: Form, model: Dynamics, roles: Roles) -> Iterator[dict[str, str]]:
     """Every way of filling a form's roles.
 
     Position and velocity, and the two quadratures of a rotating frame, are filled in pairs where the form
@@ -43,12 +43,12 @@ def assignments(form: Form, model: Model, roles: Roles) -> Iterator[dict[str, st
         yield {role: name for part in combination for role, name in part.items()}
 
 
-def _order(model: Model) -> Callable[[str], int]:
+def _order(model: Dynamics) -> Callable[[str], int]:
     places = {name: place for place, name in enumerate(model.states)}
     return lambda name: places.get(name, -1)
 
 
-def _of_kind(kind: str, model: Model, roles: Roles) -> tuple[str, ...]:
+def _of_kind(kind: str, model: Dynamics, roles: Roles) -> tuple[str, ...]:
     return {
         "position": tuple(x for x, _ in roles.motions),
         "velocity": tuple(v for _, v in roles.motions),

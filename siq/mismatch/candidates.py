@@ -15,11 +15,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import sympy
 
+from siq.dynamics.dynamics import Dynamics, Parameter
+from siq.dynamics.formulas import FormulaError, parse_formula
+from siq.dynamics.parametric import symbol
 from siq.errors import InputError
-from siq.expressions import FormulaError, parse_formula
 from siq.mismatch.assignments import assignments
 from siq.mismatch.dictionary import Form, Mechanism, Shape
-from siq.mismatch.model import Model, Parameter, symbol
 from siq.mismatch.roles import Roles
 from siq.mismatch.units import unit_of
 
@@ -28,7 +29,7 @@ PROCESS_NOISE = "process noise"
 
 
 @dataclass(frozen=True)
-class Candidate:
+class MechanismCandidate:
     """One way in which a mechanism may be at work in a system.
 
     Attributes
@@ -60,7 +61,7 @@ class Candidate:
 
     name: str
     label: str
-    model: Model
+    model: Dynamics
     amplitudes: tuple[str, ...]
     shapes: tuple[str, ...]
     positive: frozenset[str]
@@ -78,18 +79,18 @@ class Candidate:
 
 
 def candidates_of(
-    model: Model, roles: Roles, dictionary: Sequence[Mechanism], *, file: str = "the dictionary"
-) -> list[Candidate]:
+    model: Dynamics, roles: Roles, dictionary: Sequence[Mechanism], *, file: str = "the dictionary"
+) -> list[MechanismCandidate]:
     """Every place at which a mechanism of the dictionary may be at work in a system.
 
-    Process noise is not among them: it changes no equation (`siq.mismatch.noise` estimates it).
+    Process noise is not among them: it changes no equation (`siq.estimation.noise` estimates it).
 
     Raises
     ------
     InputError
         For a formula that the whitelist refuses.
     """
-    found: list[tuple[Candidate, str]] = []
+    found: list[tuple[MechanismCandidate, str]] = []
     for mechanism in dictionary:
         for form in mechanism.forms:
             if form.noise is not None:
@@ -104,7 +105,7 @@ def candidates_of(
     return _told_apart(found)
 
 
-def _told_apart(found: Sequence[tuple[Candidate, str]]) -> list[Candidate]:
+def _told_apart(found: Sequence[tuple[MechanismCandidate, str]]) -> list[MechanismCandidate]:
     """Labels that occur once, where needed with what fills the roles, and then with what is added.
 
     Two parameters of one equation may drift, each of two species be satiated, and a coupling have two forms.
@@ -121,7 +122,7 @@ def _told_apart(found: Sequence[tuple[Candidate, str]]) -> list[Candidate]:
     return result
 
 
-def generic_candidates(model: Model, roles: Roles, *, degree: int) -> list[Candidate]:
+def generic_candidates(model: Dynamics, roles: Roles, *, degree: int) -> list[MechanismCandidate]:
     """Monomials of the states up to a degree in every equation that says more than a definition."""
     states = [symbol(name) for name in model.states]
     found = []
@@ -133,7 +134,7 @@ def generic_candidates(model: Model, roles: Roles, *, degree: int) -> list[Candi
                 continue
             monomial = sympy.prod([s**p for s, p in zip(states, powers, strict=True)])
             new = _fresh("c", model)
-            units = {f"_{k}": unit for k, unit in enumerate(model.state_units)}
+            units = {f"_{k}": unit for k, unit in enumerate(model.units)}
             per = "*".join(f"_{k}**{power}" for k, power in enumerate(powers) if power)
             unit = unit_of(f"_{place}/_t" + (f"/({per})" if per else ""), {**units, "_t": model.time_unit})
             augmented = replace(
@@ -145,7 +146,7 @@ def generic_candidates(model: Model, roles: Roles, *, degree: int) -> list[Candi
                 ),
             )
             found.append(
-                Candidate(
+                MechanismCandidate(
                     name=GENERIC,
                     label=f"{GENERIC} {monomial} in {name}",
                     model=augmented,
@@ -164,8 +165,8 @@ def generic_candidates(model: Model, roles: Roles, *, degree: int) -> list[Candi
 
 
 def build_candidate(
-    model: Model, mechanism: Mechanism, form: Form, assignment: Mapping[str, str]
-) -> Candidate | None:
+    model: Dynamics, mechanism: Mechanism, form: Form, assignment: Mapping[str, str]
+) -> MechanismCandidate | None:
     """Build a mechanism into a model, for one assignment of names to roles; None where it changes nothing."""
     fresh: dict[str, str] = {}
     known = model
@@ -215,8 +216,9 @@ def build_candidate(
     augmented = replace(
         model,
         states=(*model.states, *(each[0] for each in further)),
-        state_units=(*model.state_units, *(each[1] for each in further)),
-        domain=np.concatenate([model.domain, np.tile([[-1.0, 1.0]], (len(further), 1))]),
+        units=(*model.units, *(each[1] for each in further)),
+        diffusion=model.diffusion.extended(len(further)),
+        domain=np.concatenate([model.limits, np.full((len(further), 2), np.nan)]),  # until a fit tells it
         parameters=(*model.parameters, *parameters),
         equations=(*equations.values(), *(each[2] for each in further)),
         outputs=tuple(outputs.items()),
@@ -227,7 +229,7 @@ def build_candidate(
     searches = tuple(
         _in_names(entry.shape, names) for entry in form.parameters.values() if entry.shape is not None
     )
-    return Candidate(
+    return MechanismCandidate(
         name=mechanism.name,
         label=_label(mechanism.name, model, augmented),
         model=augmented,
@@ -245,7 +247,7 @@ def build_candidate(
     )
 
 
-def _fresh(name: str, model: Model, taken: set[str] | None = None) -> str:
+def _fresh(name: str, model: Dynamics, taken: set[str] | None = None) -> str:
     """A name as in the dictionary, numbered so that it collides with none of the card."""
     used = set(model.names) | (taken or set())
     return next(f"{name}_{k}" for k in itertools.count(1) if f"{name}_{k}" not in used)
@@ -275,8 +277,8 @@ def _in_words(coordinate: str, assignment: Mapping[str, str]) -> str:
     return " ".join(assignment.get(word, word) for word in coordinate.split())
 
 
-def _units(model: Model, assignment: Mapping[str, str]) -> dict[str, str]:
-    known = dict(zip(model.states, model.state_units, strict=True))
+def _units(model: Dynamics, assignment: Mapping[str, str]) -> dict[str, str]:
+    known = dict(zip(model.states, model.units, strict=True))
     known |= {entry.name: entry.unit for entry in model.inputs}
     known |= {entry.name: entry.unit for entry in model.parameters}
     for name, formula in model.outputs:
@@ -284,7 +286,7 @@ def _units(model: Model, assignment: Mapping[str, str]) -> dict[str, str]:
     return {role: known.get(name, "1") for role, name in assignment.items()} | {"T": model.time_unit}
 
 
-def _label(name: str, model: Model, augmented: Model) -> str:
+def _label(name: str, model: Dynamics, augmented: Dynamics) -> str:
     places = [
         state
         for state, before, after in zip(model.states, model.equations, augmented.equations, strict=False)

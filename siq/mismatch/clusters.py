@@ -12,15 +12,17 @@ from collections.abc import Sequence
 import numpy as np
 import scipy.stats
 
-from siq.mismatch.candidates import Candidate
-from siq.mismatch.estimation import Fit
-from siq.mismatch.innovations import solve, whiten
-from siq.mismatch.measurements import Measurements
+from siq.estimation.estimation import Fit
+from siq.estimation.innovations import solve, whiten
+from siq.estimation.measurements import Measurements
+from siq.mismatch.candidates import MechanismCandidate
 
 LONG = 4.0  # correlation times in a block
 
 
-def clustered_probability(fit: Fit, data: Measurements, candidate: Candidate, *, blocks: int) -> float:
+def clustered_probability(
+    fit: Fit, data: Measurements, candidate: MechanismCandidate, *, blocks: int
+) -> float:
     """Probability of a mechanism by chance, whatever errors within a recording are like.
 
     Where there are fewer recordings than half of `blocks` they are cut into at least that many, of several

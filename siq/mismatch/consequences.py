@@ -9,14 +9,16 @@ import numpy as np
 import pandas as pd
 import sympy
 
+from siq.dynamics.diffusion import Diffusion
+from siq.dynamics.dynamics import Dynamics
+from siq.dynamics.parametric import TIME, symbol
+from siq.dynamics.phase_portrait import evenly_spread, phase_portrait
 from siq.errors import NumericalFailure
-from siq.flow import FlowMap
-from siq.identification import IdentifiedField
+from siq.identify.flow import FlowMap
+from siq.identify.identification import IdentifiedField
+from siq.identify.library import CandidateLibrary
 from siq.landscape.landscape import Landscape, find_landscape
-from siq.landscape.options import LandscapeOptions
-from siq.library import CandidateLibrary
-from siq.mismatch.model import TIME, Model, symbol
-from siq.outline import evenly_spread, outline
+from siq.potential.local_wells import WellOptions
 
 ROUGH = (sympy.sign, sympy.Abs, sympy.Max, sympy.Min, sympy.Heaviside, sympy.Piecewise)
 DEGREES = (4, 6, 8)
@@ -46,7 +48,7 @@ class Consequences:
     notes: tuple[str, ...]
 
 
-def obstacle(models: Sequence[Model]) -> str:
+def obstacle(models: Sequence[Dynamics]) -> str:
     """Why there are no landscapes to compare, in a sentence; empty where nothing speaks against it."""
     for model in models:
         formulas = list(model.equations)
@@ -56,12 +58,25 @@ def obstacle(models: Sequence[Model]) -> str:
             return "The equations change with time; such a system has no quasipotential."
         if any(formula.has(*ROUGH) for formula in formulas):
             return "The equations are not smooth; landscapes are worked out for smooth ones only."
+    noise = np.diag(models[0].diffusion.matrix)
+    pushed = [
+        name
+        for name, follows, size in zip(models[0].states, models[0].kinematic, noise, strict=True)
+        if follows and size > 0
+    ]
+    if pushed:
+        return (
+            f"The noise of the card acts on {', '.join(pushed)}, and no random force moves what only follows"
+            " from another state; 'diffusion' with a zero there would say what does drive the system."
+        )
+    if not models[0].diffusion.regular:
+        return "The noise does not reach every state; landscapes are worked out only where it does."
     if len({model.dimension for model in models}) > 1:
         return "What was left out has states of its own, so that the two landscapes lie in different spaces."
     return ""
 
 
-def identified(model: Model) -> IdentifiedField:
+def identified(model: Dynamics) -> IdentifiedField:
     """The vector field of a model at its parameters' values; its errors are not known."""
     symbols = tuple(symbol(name) for name in model.states)
     values = {symbol(entry.name): sympy.Float(entry.value, 17) for entry in model.parameters}
@@ -82,23 +97,19 @@ def identified(model: Model) -> IdentifiedField:
     )  # fmt: skip
     return IdentifiedField(
         library, coefficients, support, np.zeros((len(support), len(support))),
-        np.zeros((len(symbols), len(symbols))), 0.0, FlowMap(),
+        np.zeros((len(symbols), len(symbols))), 0.0, FlowMap(), model.diffusion,
     )  # fmt: skip
 
 
-def compare_landscapes(
-    models: dict[str, Model], states: np.ndarray, *, diffusion: np.ndarray, seed: int = 0
-) -> Consequences:
+def compare_landscapes(models: dict[str, Dynamics], states: np.ndarray, *, seed: int = 0) -> Consequences:
     """Find the landscapes of simulations of one system, and put them beside each other.
 
     Parameters
     ----------
     models
-        Two simulations of the same states by name, the one to compare with first.
+        Two simulations of the same states by name, the one to compare with first. Its D serves for both.
     states
         Recorded states, shape ``(n, d)``: where landscapes are looked for.
-    diffusion
-        D.
     seed
         Decides which points are used where there are too many.
 
@@ -107,6 +118,7 @@ def compare_landscapes(
     NumericalFailure
         When the first simulation has no wells in the recorded region.
     """
+    noise = next(iter(models.values())).diffusion
     chosen = states[evenly_spread(states, generator=np.random.default_rng(seed))]
     spread = states.std(axis=0)
     wells: list[dict[str, object]] = []
@@ -114,7 +126,7 @@ def compare_landscapes(
     known: list[np.ndarray] = []
     notes: list[str] = []
     for name, model in models.items():
-        found, note = _landscape(model, chosen, diffusion, seed)
+        found, note = _landscape(model, noise, chosen, seed)
         notes += [f"{name}: {each}" for each in note]
         if found is None:
             if not known:
@@ -138,16 +150,14 @@ def compare_landscapes(
 
 
 def _landscape(
-    model: Model, points: np.ndarray, diffusion: np.ndarray, seed: int
+    model: Dynamics, noise: Diffusion, points: np.ndarray, seed: int
 ) -> tuple[Landscape | None, list[str]]:
-    field = identified(model)
     try:
-        setting = outline(field.field, points, diffusion=diffusion, seed=seed)
+        field = identified(model.with_diffusion(noise))
+        setting = phase_portrait(field.dynamics, points, seed=seed)
         if not setting.attractors:
             return None, [setting.fault() or "no well is found"]
-        found = find_landscape(
-            field, setting, diffusion=diffusion, seed=seed, options=LandscapeOptions(degrees=DEGREES)
-        )
+        found = find_landscape(field, setting, seed=seed, options=WellOptions(degrees=DEGREES))
     except (NumericalFailure, np.linalg.LinAlgError, ValueError) as error:
         return None, [str(error)]
     return found, list(found.notes)

@@ -9,9 +9,9 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from siq.documents import read_document, validate
+from siq.dynamics.cards import Formula, Name
 from siq.errors import InputError
-from siq.systems import Formula, Name
+from siq.files.documents import read_document, validate
 
 Role = Literal[
     "position", "velocity", "amplitude", "population", "level", "state", "input", "parameter", "output"

@@ -1,114 +1,87 @@
-"""The fit on recordings that had no part in it: before, recalibrated, augmented, and the noise floor.
-
-Every simulation runs freely from the end of a prefix of each recording. From the prefix, which is not scored,
-it estimates its own state at the begin; the prefix is the same for all.
-"""
+"""The fit on recordings that had no part in it: before, recalibrated, augmented, and the noise floor."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from siq.mismatch.estimation import fit
-from siq.mismatch.first_states import first_states
-from siq.mismatch.innovations import Noise
-from siq.mismatch.linearisation import Grid
-from siq.mismatch.measurements import Measurements
-from siq.mismatch.model import Model
-from siq.mismatch.trajectories import run
-
-SHORTEST_PREFIX = 8  # samples
-PREFIX = 0.2  # of a recording
+from siq.dynamics.dynamics import Dynamics
+from siq.estimation.free_runs import FreeRun, free_run, normalised_rms
+from siq.estimation.measurements import Measurements
+from siq.mismatch.investigation import Investigation
 
 
 @dataclass(frozen=True)
-class FreeRun:
-    """A simulation of held-out recordings.
+class HeldOutErrors:
+    """Normalised errors on held-out recordings; None where a simulation ran away.
 
     Attributes
     ----------
-    outputs
-        Shape ``(n, m)``; NaN from where the simulation ran away.
-    scored
-        Rows behind the prefixes, shape ``(n,)``.
+    before, recalibrated, augmented
+        Of the simulation as it is, with its parameters refitted, and with what was found.
+    noise_floor
+        What measurement noise alone amounts to.
     """
 
-    outputs: np.ndarray
-    scored: np.ndarray
+    before: float | None
+    recalibrated: float | None
+    augmented: float | None
+    noise_floor: float | None
 
 
-def free_run(
-    model: Model, data: Measurements, *, noise: Noise, substeps: int, prefix: float = PREFIX
-) -> FreeRun:
-    """Simulate recordings from states that their prefixes tell.
+@dataclass(frozen=True)
+class HeldOutRuns:
+    """Free runs of held-out recordings by the three simulations, and how far each is off.
 
-    Parameters
+    Attributes
     ----------
+    before, recalibrated, augmented
+        The simulation as it is, with its parameters refitted, and with what was found.
     model
-        With the parameters' values to be used; nothing but initial states is fitted.
-    data
-        The recordings.
-    noise
-        The measurement noise weighs the outputs; the process noise lets the states follow the prefix first.
-    substeps
-        Runge–Kutta steps between samples.
-    prefix
-        Share of each recording.
+        The augmented simulation that was run.
+    errors
+        Of the three.
     """
-    lengths = np.diff(data.first)
-    rows = np.minimum(np.maximum((prefix * lengths).astype(int), SHORTEST_PREFIX), lengths - 1)
-    x = initial_states(model, data.until(np.maximum(rows, 2)), noise=noise, substeps=substeps)
-    states = run(model, Grid(data, substeps), x)
-    signals = data.signals(data.t, data.recording, delays=model.lags(model.values))
-    within = np.arange(len(data.t)) - data.first[data.recording]
-    return FreeRun(
-        outputs=model.compiled.outputs(states.T, signals, model.values).T,
-        scored=within >= rows[data.recording],
-    )
+
+    before: FreeRun
+    recalibrated: FreeRun
+    augmented: FreeRun
+    model: Dynamics
+    errors: HeldOutErrors
 
 
-def initial_states(model: Model, data: Measurements, *, noise: Noise, substeps: int) -> np.ndarray:
-    """The states in which recordings begin, shape ``(recordings, d)``, with all parameters as they are."""
-    still = replace(model, parameters=tuple(replace(each, fixed=True) for each in model.parameters))
-    process = np.zeros(model.dimension)
-    process[: len(noise.process)] = noise.process
-    start = first_states(still, data)
-    follow = fit(
-        still,
-        data,
-        x=start,
-        noise=Noise(noise.measurement, process),
-        estimate_process=False,
-        substeps=substeps,
-    )
-    x = follow.x if np.isfinite(follow.sum_of_squares) else start
-    strict = fit(
-        still,
-        data,
-        x=x,
-        noise=Noise(noise.measurement, np.zeros(model.dimension)),
-        estimate_process=False,
-        substeps=substeps,
-    )
-    best = strict.x if strict.converged else x
-    return best[data.first[:-1]]
-
-
-def normalised_rms(outputs: np.ndarray, simulated: FreeRun) -> float | None:
-    """Root mean square error over that of the outputs about their mean; None where a simulation ran away.
+def held_out_runs(investigation: Investigation, learned: Measurements, data: Measurements) -> HeldOutRuns:
+    """Show the fit on recordings that had no part in anything.
 
     Parameters
     ----------
-    outputs
-        As measured, shape ``(n, m)``.
-    simulated
-        The free run of the same recordings.
+    investigation
+        What was found.
+    learned
+        The recordings that it was found in; they decide which estimates run freely best.
+    data
+        The recordings held out.
     """
-    measured = outputs[simulated.scored]
-    error = simulated.outputs[simulated.scored] - measured
-    known = np.isfinite(measured)
-    if not np.isfinite(error[known]).all():
-        return None
-    spread = np.nanvar(measured, axis=0)
-    return float(np.sqrt(np.nanmean(error**2 / np.where(spread > 0, spread, 1.0))))
+    search = investigation.search
+    noise, substeps = search.recalibrated.noise, max(search.fit.substeps, search.recalibrated.substeps)
+
+    def error_where_learned(model: Dynamics) -> float:
+        error = normalised_rms(learned.outputs, free_run(model, learned, noise=noise, substeps=substeps))
+        return np.inf if error is None else error
+
+    # What fits best with random forces admitted need not be what runs best without.
+    recalibrated = search.recalibrated.model
+    if search.recalibrated.has_process_noise and np.isfinite(investigation.least_squares.sum_of_squares):
+        choices = (investigation.least_squares.model, recalibrated, investigation.model)
+        recalibrated = min(choices, key=error_where_learned)
+    augmented = search.fit.model
+    if investigation.augmented_least_squares is not None:
+        augmented = min((investigation.augmented_least_squares.model, augmented), key=error_where_learned)
+    models = {"before": investigation.model, "recalibrated": recalibrated, "augmented": augmented}
+    runs = {name: free_run(model, data, noise=noise, substeps=substeps) for name, model in models.items()}
+    scores = {name: normalised_rms(data.outputs, simulated) for name, simulated in runs.items()}
+    scored = runs["before"].scored
+    spread = np.nanvar(data.outputs[scored], axis=0)
+    floor = np.sqrt(np.mean(search.fit.noise.measurement / np.where(spread > 0, spread, 1.0)))
+    return HeldOutRuns(**runs, model=augmented, errors=HeldOutErrors(**scores, noise_floor=float(floor)))

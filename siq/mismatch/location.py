@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from siq.mismatch.diagnosis import Diagnosis
-from siq.mismatch.estimation import Fit
-from siq.mismatch.innovations import Noise, solve, whiten
-from siq.mismatch.measurements import Measurements
+from siq.estimation.estimation import Fit
+from siq.estimation.innovations import Noise, solve, whiten
+from siq.estimation.measurements import Measurements
+from siq.mismatch.investigation import Investigation, MismatchVerdict
 from siq.mismatch.roles import Roles
 from siq.mismatch.structure import Curve, Structure
 
@@ -63,16 +63,16 @@ class Location:
         }
 
 
-def locate(diagnosis: Diagnosis, data: Measurements) -> Location | None:
+def locate(investigation: Investigation, data: Measurements) -> Location | None:
     """Say where a mismatch sits; None where there is none."""
-    if diagnosis.verdict in ("no mismatch", "parameter shift"):
+    if not investigation.verdict.mismatch:
         return None
-    curves = diagnosis.before.curves
-    named = diagnosis.search.found[0].best.candidate if diagnosis.search.found else None
-    if diagnosis.verdict == "missing physics" and named is not None:
+    curves = investigation.before.curves
+    named = investigation.search.found[0].best.candidate if investigation.search.found else None
+    if investigation.verdict is MismatchVerdict.MISSING_PHYSICS and named is not None:
         equations, coordinate = named.equations, named.coordinate
     elif curves:
-        equations, coordinate = most_telling(diagnosis.before, diagnosis.roles)
+        equations, coordinate = most_telling(investigation.before, investigation.roles)
     else:
         equations, coordinate = (), "unknown"
     curve = next(
@@ -83,15 +83,15 @@ def locate(diagnosis: Diagnosis, data: Measurements) -> Location | None:
         ),
         None,
     )
-    if diagnosis.process_noise:
-        driven = zip(diagnosis.model.states, diagnosis.search.fit.noise.process, strict=False)
+    if investigation.process_noise:
+        driven = zip(investigation.model.states, investigation.search.fit.noise.process, strict=False)
         equations, coordinate, curve = tuple(name for name, q in driven if q > 0), "random", None
     region = visible_region(curve) if curve is not None else {}
-    recordings = affected(diagnosis.search.recalibrated, diagnosis.search.fit.noise, data)
+    recordings = affected(investigation.search.recalibrated, investigation.search.fit.noise, data)
     everywhere = len(recordings) == len(data.labels)
     time = (float(data.t.min()), float(data.t.max())) if coordinate == "t" else None
     return Location(
-        equations=equation_shares(diagnosis, equations),
+        equations=equation_shares(investigation, equations),
         coordinate=coordinate,
         region=region,
         time=time,
@@ -125,13 +125,13 @@ def most_telling(structure: Structure, roles: Roles) -> tuple[tuple[str, ...], s
     return equations, coordinate
 
 
-def equation_shares(diagnosis: Diagnosis, equations: tuple[str, ...]) -> dict[str, float]:
+def equation_shares(investigation: Investigation, equations: tuple[str, ...]) -> dict[str, float]:
     """Share of what any one equation can explain, for the equations named."""
     gains: dict[str, float] = {}
-    for curve in diagnosis.before.curves:
+    for curve in investigation.before.curves:
         for name in curve.direction.equations:
             gains[name] = max(gains.get(name, 0.0), curve.gain)
-    total = max(diagnosis.before.total - diagnosis.before.freedom, 1e-300)
+    total = max(investigation.before.total - investigation.before.freedom, 1e-300)
     return {name: float(min(max(gains.get(name, 0.0) / total, 0.0), 1.0)) for name in equations}
 
 

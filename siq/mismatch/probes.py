@@ -13,12 +13,13 @@ from functools import cached_property
 import numpy as np
 import sympy
 
-from siq.expressions import compile_values, parse_formula
-from siq.mismatch.candidates import Candidate
+from siq.dynamics.dynamics import Dynamics
+from siq.dynamics.formulas import compile_values, parse_formula
+from siq.dynamics.parametric import arguments_of, evaluable, symbol
+from siq.estimation.linearisation import Grid
+from siq.estimation.measurements import Measurements
+from siq.mismatch.candidates import MechanismCandidate
 from siq.mismatch.dictionary import Shape
-from siq.mismatch.linearisation import Grid
-from siq.mismatch.measurements import Measurements
-from siq.mismatch.model import Model, arguments_of, evaluable, symbol
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class Probe:
         Values of the shapes, by name.
     """
 
-    candidate: Candidate
+    candidate: MechanismCandidate
     shapes: tuple[tuple[str, float], ...]
 
     @property
@@ -43,7 +44,7 @@ class Probe:
 
 
 class ProbeColumns:
-    """The columns of many probes, as `siq.mismatch.linearisation.linearise` wants them.
+    """The columns of many probes, as `siq.estimation.linearisation.linearise` wants them.
 
     Parameters
     ----------
@@ -60,7 +61,7 @@ class ProbeColumns:
     """
 
     def __init__(
-        self, model: Model, grid: Grid, probes: Sequence[Probe], x: np.ndarray, values: np.ndarray
+        self, model: Dynamics, grid: Grid, probes: Sequence[Probe], x: np.ndarray, values: np.ndarray
     ) -> None:
         self._model, self._grid, self._probes = model, grid, probes
         self._x, self._values = x, values
@@ -69,7 +70,7 @@ class ProbeColumns:
         self.width = sum(probe.width for probe in probes)
 
     def rates(self, x: np.ndarray, values: np.ndarray, node: int) -> np.ndarray:
-        """See `siq.mismatch.linearisation.Columns`."""
+        """See `siq.estimation.linearisation.Columns`."""
         result = np.zeros((self._model.dimension, self.width, x.shape[1]))
         place = 0
         for index, probe in enumerate(self._probes):
@@ -88,7 +89,7 @@ class ProbeColumns:
         return result
 
     def outputs(self, x: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """See `siq.mismatch.linearisation.Columns`."""
+        """See `siq.estimation.linearisation.Columns`."""
         result = np.zeros((len(self._model.outputs), self.width, x.shape[1]))
         place = 0
         for probe in self._probes:
@@ -169,7 +170,7 @@ class ProbeColumns:
 class _Compiled:
     """The columns of one candidate as functions; entries without an effect are left out."""
 
-    def __init__(self, model: Model, candidate: Candidate) -> None:
+    def __init__(self, model: Dynamics, candidate: MechanismCandidate) -> None:
         augmented = candidate.model
         self._candidate, self._count = candidate, len(model.parameters)
         formulas = [*augmented.equations, *(formula for _, formula in augmented.outputs)]
@@ -211,7 +212,9 @@ class _Compiled:
         return self._candidate.model.lags(np.array(values))
 
 
-def probes_of(candidate: Candidate, data: Measurements, model: Model, x: np.ndarray) -> list[Probe]:
+def probes_of(
+    candidate: MechanismCandidate, data: Measurements, model: Dynamics, x: np.ndarray
+) -> list[Probe]:
     """A candidate with its shapes at all places where they are looked for.
 
     Parameters
@@ -228,7 +231,7 @@ def probes_of(candidate: Candidate, data: Measurements, model: Model, x: np.ndar
     return [Probe(candidate, shapes) for shapes in choices]
 
 
-def places_of(search: Shape, data: Measurements, model: Model, x: np.ndarray) -> np.ndarray:
+def places_of(search: Shape, data: Measurements, model: Dynamics, x: np.ndarray) -> np.ndarray:
     """The values of a shape that a search begins with."""
     factors = np.array(search.at)
     steps = np.diff(data.t)[np.diff(data.recording) == 0]
@@ -249,7 +252,7 @@ def places_of(search: Shape, data: Measurements, model: Model, x: np.ndarray) ->
     return factors * size if search.scale_of is not None else factors / size
 
 
-def along(text: str, data: Measurements, model: Model, x: np.ndarray) -> np.ndarray:
+def along(text: str, data: Measurements, model: Dynamics, x: np.ndarray) -> np.ndarray:
     """A formula of states and inputs at all samples, shape ``(n,)``."""
     formula = parse_formula(text, model.names)
     signals = data.signals(data.t, data.recording, delays=())

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from siq.mismatch.estimation import Fit
-from siq.mismatch.innovations import Noise
-from siq.mismatch.measurements import Measurements
-from siq.mismatch.model import Model
+from siq.dynamics.dynamics import Dynamics
+from siq.estimation.estimation import Fit
+from siq.estimation.innovations import Noise
+from siq.estimation.measurements import Measurements
 from siq.mismatch.roles import Roles
 from siq.mismatch.search import Search
 from siq.mismatch.structure import Structure, structure_of
@@ -46,7 +46,9 @@ class Remainder:
         return self.after.p_value < DOUBTFUL
 
 
-def what_is_left(model: Model, data: Measurements, recalibrated: Fit, final: Fit, roles: Roles) -> Remainder:
+def what_is_left(
+    model: Dynamics, data: Measurements, recalibrated: Fit, final: Fit, roles: Roles
+) -> Remainder:
     """Structure before and after mechanisms were added, and the share of the excess that they explain.
 
     Parameters

@@ -12,10 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 import sympy
 
-from siq.mismatch.model import Model, Signals, symbol
+from siq.dynamics.dynamics import Dynamics
+from siq.dynamics.parametric import Signals, symbol
 
 SAME = 1e-9  # relative difference of values of formulas that are the same
 TRIALS = 12
+ANYWHERE = (0.5, 1.5)  # where formulas of a state without a domain are compared, as those of inputs are
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ class Roles:
         return bool(self.motions or self.amplitudes or self.populations or self.levels)
 
 
-def roles_of(model: Model) -> Roles:
+def roles_of(model: Dynamics) -> Roles:
     """Read the roles of a model's states off its equations."""
     motions = tuple(
         (name, str(equation))
@@ -82,9 +84,9 @@ def roles_of(model: Model) -> Roles:
     )
 
 
-def _turns(model: Model, first: int, second: int) -> bool:
+def _turns(model: Dynamics, first: int, second: int) -> bool:
     """Whether f commutes with rotations of two states, but for a constant, and itself turns them."""
-    if model.state_units[first] != model.state_units[second]:
+    if model.units[first] != model.units[second]:
         return False
     x, signals = _trials(model)
     angle = np.linspace(0.3, 5.9, TRIALS)
@@ -93,7 +95,7 @@ def _turns(model: Model, first: int, second: int) -> bool:
     turned[second] = np.sin(angle) * x[first] + np.cos(angle) * x[second]
     still = x.copy()
     still[[first, second]] = 0.0
-    rates = model.compiled.rates
+    rates = model.functions.rates
     free = rates(x, signals, model.values) - rates(still, signals, model.values)
     after = rates(turned, signals, model.values) - rates(still, signals, model.values)
     expected = free.copy()
@@ -106,11 +108,11 @@ def _turns(model: Model, first: int, second: int) -> bool:
     return bool(np.abs(turning).max() > SAME * np.abs(x[[first, second]]).max() * size)
 
 
-def _stays_zero(model: Model, place: int) -> bool:
+def _stays_zero(model: Dynamics, place: int) -> bool:
     x, signals = _trials(model)
-    moving = model.compiled.rates(x, signals, model.values)[place]
+    moving = model.functions.rates(x, signals, model.values)[place]
     x[place] = 0.0
-    rate = model.compiled.rates(x, signals, model.values)[place]
+    rate = model.functions.rates(x, signals, model.values)[place]
     return bool(
         np.isfinite(rate).all() and np.abs(rate).max() <= SAME * np.abs(moving).max() and moving.any()
     )
@@ -123,10 +125,10 @@ def _has_root(equation: sympy.Expr, name: str) -> bool:
     )
 
 
-def _trials(model: Model) -> tuple[np.ndarray, Signals]:
+def _trials(model: Dynamics) -> tuple[np.ndarray, Signals]:
     """States and signals at which formulas are compared; any will do that are the same each time."""
     generator = np.random.default_rng(0)
-    lower, upper = model.domain.T
+    lower, upper = np.where(np.isfinite(model.limits), model.limits, ANYWHERE).T
     x = generator.uniform(lower[:, None], upper[:, None], size=(model.dimension, TRIALS))
     delays = len(model.delays)
     return x, Signals(

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from siq.mismatch.held_out import free_run
-from siq.mismatch.innovations import Noise
-from siq.mismatch.measurements import Measurements
-from siq.mismatch.model import Model
+from siq.dynamics.dynamics import Dynamics
+from siq.estimation.free_runs import free_run
+from siq.estimation.innovations import Noise
+from siq.estimation.measurements import Measurements
 
 PREFIX = 200  # samples of a whole recording from which a simulation may learn its initial state
 SUBSTEPS = 4  # Runge-Kutta steps between samples
@@ -34,7 +34,7 @@ def windows(data: Measurements, length: int) -> Measurements:
 
 
 def root_mean_square(
-    model: Model, data: Measurements, *, variance: np.ndarray, window: int | None
+    model: Dynamics, data: Measurements, *, variance: np.ndarray, window: int | None
 ) -> tuple[float, ...]:
     """Root mean square error of each output of a free run, in its unit; NaN where the simulation ran away.
 

@@ -12,11 +12,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from siq.mismatch.estimation import Fit
-from siq.mismatch.innovations import Whitened, profile_likelihood, whiten
-from siq.mismatch.linearisation import Columns, Grid, Linearisation, linearise
-from siq.mismatch.measurements import Measurements
-from siq.mismatch.model import Model
+from siq.dynamics.dynamics import Dynamics
+from siq.errors import NumericalFailure
+from siq.estimation.estimation import Fit
+from siq.estimation.innovations import Whitened, profile_likelihood, whiten
+from siq.estimation.linearisation import Columns, Grid, Linearisation, linearise
+from siq.estimation.measurements import Measurements
 
 LEVELS = (1.0, 0.1, 1e-2, 1e-3, 1e-4, 0.0)
 """Process noise, relative to that of the fit."""
@@ -35,15 +36,18 @@ class Screened:
         The level at which it is best.
     amplitudes, standard_errors
         There; shape ``(k,)``.
+    finite
+        Whether what the columns do to what is measured is a number at any level.
     """
 
     gain: float
     level: float
     amplitudes: np.ndarray
     standard_errors: np.ndarray
+    finite: bool = True
 
 
-def probe_response(model: Model, grid: Grid, fit: Fit, columns: Columns) -> Linearisation:
+def probe_response(model: Dynamics, grid: Grid, fit: Fit, columns: Columns) -> Linearisation:
     """The linearisation of a fit, with the columns of probes behind those of its parameters.
 
     Parameters
@@ -55,7 +59,8 @@ def probe_response(model: Model, grid: Grid, fit: Fit, columns: Columns) -> Line
     columns
         The probes.
     """
-    coarse = linearise(model, grid, fit.model.values, fit.x, columns=columns)
+    with np.errstate(all="ignore"):  # what overflows is left out of the screening
+        coarse = linearise(model, grid, fit.model.values, fit.x, columns=columns)
     known, parameters = fit.linearisation, len(fit.model.free)
     return replace(
         known,
@@ -69,9 +74,18 @@ def probe_response(model: Model, grid: Grid, fit: Fit, columns: Columns) -> Line
 def projected(white: Whitened, parameters: int) -> tuple[np.ndarray, np.ndarray]:
     """Innovations and further columns with the parameters' columns projected out.
 
-    A column of which little is left is set to zero: the parameters can do what it does.
+    A column of which little is left is set to zero, since the parameters can do what it does, and so is one
+    that is not finite.
+
+    Raises
+    ------
+    NumericalFailure
+        When a parameter's column is not finite.
     """
     own, further = white.columns[:, :parameters], white.columns[:, parameters:]
+    if not np.isfinite(own).all():
+        raise NumericalFailure("the effect of a parameter on what is measured is beyond all numbers")
+    further = np.where(np.isfinite(further).all(axis=0), further, 0.0)
     if parameters:
         scale = np.sqrt((own**2).sum(axis=0))
         basis, values, _ = np.linalg.svd(own / np.where(scale > 0, scale, 1.0), full_matrices=False)
@@ -105,19 +119,33 @@ def screen(
         The columns of each group, counted behind the parameters'.
     positive
         For each group which amplitudes must not be negative; a group that would need one gains nothing.
+
+    Raises
+    ------
+    NumericalFailure
+        When the simulation runs away at every level.
     """
     parameters = len(fit.model.free)
     levels = LEVELS if fit.has_process_noise else (1.0,)
     base = -np.inf
-    best = [Screened(-np.inf, 1.0, np.zeros(0), np.zeros(0))] * len(groups)
+    best = [Screened(-np.inf, 1.0, np.zeros(0), np.zeros(0), finite=False)] * len(groups)
+    failure: NumericalFailure | None = None
     for level in levels:
-        white = whiten(linearisation, data, fit.noise.scaled(level))
+        try:
+            white = whiten(linearisation, data, fit.noise.scaled(level))
+        except NumericalFailure as error:  # without random forces an unstable simulation does not follow
+            failure = error
+            continue
+        finite = np.isfinite(white.columns[:, parameters:]).all(axis=0)
         freedom = white.degrees_of_freedom - parameters
         left, columns = projected(white, parameters)
         total = float(left @ left)
         base = max(base, profile_likelihood(total, freedom, white.log_determinant))
         overlap = columns.T @ left
         for place, group in enumerate(groups):
+            if not finite[group].all():
+                continue
+            best[place] = replace(best[place], finite=True)
             gram = columns[:, group].T @ columns[:, group]
             amplitudes, covariance = _small_solve(gram, overlap[group])
             after = max(total - float(amplitudes @ overlap[group]), 1e-12 * total)
@@ -128,9 +156,9 @@ def screen(
                 continue
             if value > best[place].gain:
                 best[place] = Screened(value, level, amplitudes, errors)
-    return [
-        Screened(2 * (each.gain - base), each.level, each.amplitudes, each.standard_errors) for each in best
-    ]
+    if failure is not None and base == -np.inf:
+        raise failure
+    return [replace(each, gain=2 * (each.gain - base)) for each in best]
 
 
 def _small_solve(gram: np.ndarray, overlap: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -10,63 +10,39 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated
 
 import sympy
-from pydantic import ConfigDict, Field
-from pydantic.dataclasses import dataclass as checked
 
-from siq.mismatch.candidates import Candidate
+from siq.dynamics.dynamics import Dynamics
+from siq.dynamics.parametric import symbol
+from siq.errors import NumericalFailure
+from siq.estimation.estimation import Fit
+from siq.estimation.measurements import Measurements
+from siq.mismatch.candidates import MechanismCandidate
 from siq.mismatch.clusters import clustered_probability
-from siq.mismatch.estimation import Fit
-from siq.mismatch.measurements import Measurements
-from siq.mismatch.model import Model, symbol
 from siq.mismatch.probes import Probe
 from siq.mismatch.roles import roles_of
 from siq.mismatch.screening import Screened
+from siq.mismatch.search_options import SearchOptions
 from siq.mismatch.structure import structure_of
-from siq.mismatch.trials import Trial, fit_best, screen_all
+from siq.mismatch.trials import (
+    TriedMechanism,
+    UntriedMechanism,
+    fit_most_promising,
+    overflowing,
+    screen_all,
+)
 
 LOGGER = logging.getLogger(__name__)
 LEFT = 0.01  # probability that residuals are random, above which no further mechanism is sought
-
-
-@checked(frozen=True, config=ConfigDict(extra="forbid"))
-class SearchOptions:
-    """What counts as found.
-
-    Attributes
-    ----------
-    false_alarms
-        Probability of a mechanism where none is missing, over all candidates together, for each test.
-    same
-        Candidates whose χ² is within this of the best are indistinguishable from it.
-    fitted
-        Most candidates that are fitted after each screening.
-    mechanisms
-        Most mechanisms that are looked for.
-    named
-        χ² that a mechanism must gain to be named. What gains less is detected, and described, but too
-        faint for its shape to be tried: much that no dictionary has looks the same.
-    blocks
-        Least number of blocks into which recordings are cut for clustered errors, where there are fewer than
-        half as many recordings.
-    """
-
-    false_alarms: Annotated[float, Field(gt=0, lt=1)] = 0.002
-    same: Annotated[float, Field(gt=0)] = 10.0
-    fitted: Annotated[int, Field(ge=1)] = 6
-    mechanisms: Annotated[int, Field(ge=1, le=5)] = 3
-    named: Annotated[float, Field(ge=0)] = 100.0
-    blocks: Annotated[int, Field(ge=4)] = 10
 
 
 @dataclass(frozen=True)
 class Found:
     """A mechanism that stood the tests, and what cannot be told from it."""
 
-    best: Trial
-    indistinguishable: tuple[Trial, ...]
+    best: TriedMechanism
+    indistinguishable: tuple[TriedMechanism, ...]
 
 
 @dataclass(frozen=True)
@@ -83,19 +59,22 @@ class Search:
         Of the simulation with all of them.
     screened
         The last screening: every candidate with what it would gain.
+    untried
+        Candidates whose fit gave nothing that could be judged, with the reason.
     """
 
     recalibrated: Fit
     found: tuple[Found, ...]
     fit: Fit
     screened: tuple[tuple[Probe, Screened], ...]
+    untried: tuple[UntriedMechanism, ...] = ()
 
 
 def search(
-    model: Model,
+    model: Dynamics,
     data: Measurements,
     recalibrated: Fit,
-    candidates: Sequence[Candidate],
+    candidates: Sequence[MechanismCandidate],
     *,
     options: SearchOptions,
 ) -> Search:
@@ -106,9 +85,9 @@ def search(
 
 def _extended(
     progress: Search,
-    model: Model,
+    model: Dynamics,
     data: Measurements,
-    candidates: Sequence[Candidate],
+    candidates: Sequence[MechanismCandidate],
     *,
     options: SearchOptions,
     on_trial: bool,
@@ -134,11 +113,12 @@ def _extended(
             and (rebased := _rebased(each, model, base) if found else each) is not None
         ]
         screened = screen_all(base, data, current, remaining)
-        progress = replace(progress, screened=tuple(screened))
-        trials = fit_best(
+        trials, failed = fit_most_promising(
             data, current, base, screened,
             most=options.fitted, least_gain=options.same, blocks=options.blocks,
         )  # fmt: skip
+        untried = _together(progress.untried, (*overflowing(screened), *failed), trials)
+        progress = replace(progress, screened=tuple(screened), untried=untried)
         for trial in trials:
             LOGGER.info(
                 "%s: chi2 better by %.1f, BIC %.1f, p %.1e white, %.1e clustered",
@@ -165,6 +145,16 @@ def _extended(
             return progress
         LOGGER.info("found %s, chi2 better by %.1f", stands.best.candidate.label, stands.best.delta_chi2)
         progress = _with(progress, stands)
+
+
+def _together(
+    before: Sequence[UntriedMechanism], now: Sequence[UntriedMechanism], trials: Sequence[TriedMechanism]
+) -> tuple[UntriedMechanism, ...]:
+    """All that could never be judged, each once, with the last reason."""
+    reasons = {each.candidate.label: each for each in (*before, *now)}
+    for trial in trials:
+        reasons.pop(trial.candidate.label, None)
+    return tuple(reasons.values())
 
 
 def _with(progress: Search, found: Found) -> Search:
@@ -204,12 +194,19 @@ def tried_together(
     return replace(progress, found=(*progress.found[:place], stands, *progress.found[place + 1 :]))
 
 
-def _something_left(model: Model, data: Measurements, current: Fit) -> bool:
+def _something_left(model: Dynamics, data: Measurements, current: Fit) -> bool:
     """Whether it is worth looking for another mechanism."""
-    return current.has_process_noise or structure_of(model, data, current, roles_of(model)).p_value < LEFT
+    if current.has_process_noise:
+        return True
+    try:
+        return structure_of(model, data, current, roles_of(model)).p_value < LEFT
+    except NumericalFailure:  # a simulation that runs away lacks something, whatever it is
+        return True
 
 
-def accepted(trials: Sequence[Trial], probes: int, chance: float, *, options: SearchOptions) -> Found | None:
+def accepted(
+    trials: Sequence[TriedMechanism], probes: int, chance: float, *, options: SearchOptions
+) -> Found | None:
     """The best of the trials that stand every test, with what cannot be told from it.
 
     Parameters
@@ -247,7 +244,7 @@ def accepted(trials: Sequence[Trial], probes: int, chance: float, *, options: Se
     return Found(best, alternatives)
 
 
-def _needless(other: Trial, best: Trial) -> bool:
+def _needless(other: TriedMechanism, best: TriedMechanism) -> bool:
     """Whether an alternative needs more parameters than the best, and does not earn them.
 
     One that fits better by as much as its further parameters would bring by chance twice over (Akaike) is not
@@ -257,7 +254,7 @@ def _needless(other: Trial, best: Trial) -> bool:
     return more > 0 and other.delta_chi2 - best.delta_chi2 < 2 * more
 
 
-def _rebased(candidate: Candidate, before: Model, now: Model) -> Candidate | None:
+def _rebased(candidate: MechanismCandidate, before: Dynamics, now: Dynamics) -> MechanismCandidate | None:
     """A candidate on top of a model that has grown since; None where both change the same thing."""
     names = {parameter.name for parameter in now.parameters}
     model = candidate.model

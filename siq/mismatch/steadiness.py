@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from siq.mismatch.estimation import Fit
-from siq.mismatch.innovations import Noise, profile_likelihood
-from siq.mismatch.measurements import Measurements
-from siq.mismatch.noise import likelihood_sums
+from siq.estimation.estimation import Fit
+from siq.estimation.innovations import Noise, profile_likelihood
+from siq.estimation.measurements import Measurements
+from siq.estimation.noise import likelihood_sums
 
 SHARES = (0.5, 0.9, 0.99)  # of the forces that follow the motion
 RATIOS = (1 / 8, 1 / 4, 1 / 2, 1 / 1.4, 1.0, 1.4, 2.0, 4.0, 8.0)  # of process noise, to that of the fit

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.stats
 
-from siq.mismatch.estimation import Fit
-from siq.mismatch.innovations import Noise, solve, whiten
-from siq.mismatch.linearisation import Grid
-from siq.mismatch.measurements import Measurements
-from siq.mismatch.model import Model
+from siq.dynamics.dynamics import Dynamics
+from siq.estimation.estimation import Fit
+from siq.estimation.innovations import Noise, solve, whiten
+from siq.estimation.linearisation import Grid
+from siq.estimation.measurements import Measurements
 from siq.mismatch.roles import Roles
 from siq.mismatch.screening import probe_response, projected
 
@@ -97,14 +97,14 @@ class Structure:
 
 
 class HatColumns:
-    """Piecewise linear functions of coordinates, as `siq.mismatch.linearisation.linearise` wants them."""
+    """Piecewise linear functions of coordinates, as `siq.estimation.linearisation.linearise` wants them."""
 
-    def __init__(self, model: Model, grid: Grid, directions: tuple[Direction, ...]) -> None:
+    def __init__(self, model: Dynamics, grid: Grid, directions: tuple[Direction, ...]) -> None:
         self._model, self._grid, self._directions = model, grid, directions
         self.width = sum(len(each.knots) for each in directions)
 
     def rates(self, x: np.ndarray, values: np.ndarray, node: int) -> np.ndarray:
-        """See `siq.mismatch.linearisation.Columns`."""
+        """See `siq.estimation.linearisation.Columns`."""
         result = np.zeros((self._model.dimension, self.width, x.shape[1]))
         signals = self._grid.signals(node, ())
         place = 0
@@ -125,11 +125,11 @@ class HatColumns:
         return result
 
     def outputs(self, x: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """See `siq.mismatch.linearisation.Columns`."""
+        """See `siq.estimation.linearisation.Columns`."""
         return np.zeros((len(self._model.outputs), self.width, x.shape[1]))
 
 
-def directions_of(model: Model, roles: Roles, data: Measurements, x: np.ndarray) -> tuple[Direction, ...]:
+def directions_of(model: Dynamics, roles: Roles, data: Measurements, x: np.ndarray) -> tuple[Direction, ...]:
     """Every equation that may lack something, with every coordinate."""
     signals = data.signals(data.t, data.recording, delays=())
     pairs = {name for pair in roles.amplitudes for name in pair}
@@ -155,7 +155,7 @@ def directions_of(model: Model, roles: Roles, data: Measurements, x: np.ndarray)
 
 
 def coordinate_values(
-    model: Model, direction: Direction, x: np.ndarray, inputs: np.ndarray, t: np.ndarray
+    model: Dynamics, direction: Direction, x: np.ndarray, inputs: np.ndarray, t: np.ndarray
 ) -> np.ndarray:
     """The coordinate along trajectories, shape ``(n,)``."""
     if direction.coordinate == "t":
@@ -169,7 +169,7 @@ def coordinate_values(
 
 
 def structure_of(
-    model: Model,
+    model: Dynamics,
     data: Measurements,
     fit: Fit,
     roles: Roles,

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from siq.documents import read_document, validate
+from siq.data.recordings import Recordings, read_recordings
+from siq.dynamics.dynamics import Dynamics
 from siq.errors import InputError
+from siq.estimation.measurements import Measurements, columns_of, measurements
+from siq.files.documents import read_document, validate
 from siq.mismatch.dictionary import Mechanism
-from siq.mismatch.measurements import Measurements, columns_of, measurements
-from siq.mismatch.model import Model
-from siq.mismatch.search import SearchOptions
-from siq.recordings import read_recordings
+from siq.mismatch.search_options import SearchOptions
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 FEWEST = 8  # samples of a recording that something can be learned from
 
@@ -74,29 +78,40 @@ def load_mismatch_study(path: str | Path) -> MismatchStudy:
     return validate(read_document(path), MismatchStudy)
 
 
-def read_measurements(path: str | Path, model: Model) -> Measurements:
-    """Read the recordings that a simulation is to be compared with.
+def measurements_of(recordings: Recordings | pd.DataFrame | str | Path, system: Dynamics) -> Measurements:
+    """The recordings that a simulation is to be compared with, laid out for fitting.
+
+    Parameters
+    ----------
+    recordings
+        Read and checked, as a table, or the path of one; with a column for each output and input. Other
+        columns are ignored.
+    system
+        The simulation; what a recording says of units must be what it says.
 
     Raises
     ------
     InputError
-        For anything in the file that cannot be used, a recording that is too short included.
+        For anything that cannot be used, a recording that is too short included.
     """
-    units = dict(zip(model.states, model.state_units, strict=True))
-    expected = {name: units[str(formula)] for name, formula in model.outputs if str(formula) in units}
-    expected |= {entry.name: entry.unit for entry in model.inputs}
-    expected["t"] = model.time_unit
-    recordings = read_recordings(path, columns=columns_of(model), units=expected)
+    file = str(recordings) if isinstance(recordings, str | Path) else "the recordings"
+    columns, units = columns_of(system), _units_of_columns(system)
+    if isinstance(recordings, Recordings):
+        chosen = _chosen(recordings, columns, units, file=file)
+    elif isinstance(recordings, str | Path):
+        chosen = read_recordings(recordings, columns=columns, units=units)
+    else:
+        chosen = Recordings.from_frame(recordings, columns=columns, units=units)
     try:
-        data = measurements(recordings, model)
+        data = measurements(chosen, system)
     except ValueError as error:
         fault, remedy = str(error).split("; ", 1)
-        raise InputError(path, "", fault, remedy) from None
+        raise InputError(file, "", fault, remedy) from None
     lengths = np.diff(data.first)
     if (lengths < FEWEST).any():
         label = data.labels[int((lengths < FEWEST).argmax())]
         raise InputError(
-            path,
+            file,
             f"recording {label}",
             f"it has fewer than {FEWEST} samples",
             "leave it out, or join recordings",
@@ -104,7 +119,39 @@ def read_measurements(path: str | Path, model: Model) -> Measurements:
     return data
 
 
-def with_known_noise(data: Measurements, model: Model, study: MismatchStudy, *, file: str) -> Measurements:
+def _units_of_columns(system: Dynamics) -> dict[str, str]:
+    """The unit of each column, as far as it follows from those of the states and inputs."""
+    states = dict(zip(system.states, system.units, strict=True))
+    known = {name: states[str(formula)] for name, formula in system.outputs if str(formula) in states}
+    known |= {entry.name: entry.unit for entry in system.inputs}
+    return known | {"t": system.time_unit}
+
+
+def _chosen(
+    recordings: Recordings, columns: Sequence[str], units: Mapping[str, str], *, file: str
+) -> Recordings:
+    """The columns that are wanted, in their order."""
+    for name in columns:
+        if name not in recordings.names:
+            remedy = f"the simulation measures or is driven by it; there are {', '.join(recordings.names)}"
+            raise InputError(file, "", f"the column '{name}' is missing", remedy)
+    places = [recordings.names.index(name) for name in columns]
+    said = {"t": recordings.time_unit} | {
+        name: recordings.units[p] for name, p in zip(columns, places, strict=True)
+    }
+    for name, unit in said.items():
+        if unit is not None and name in units and unit != units[name]:
+            fault = f"its unit is {unit}, and in the simulation it is {units[name]}"
+            raise InputError(file, f"column {name}", fault, "convert one of the two")
+    return replace(
+        recordings,
+        names=tuple(columns),
+        units=tuple(recordings.units[place] for place in places),
+        values=np.ascontiguousarray(recordings.values[:, places]),
+    )
+
+
+def with_known_noise(data: Measurements, model: Dynamics, study: MismatchStudy, *, file: str) -> Measurements:
     """The measurements with the noise of the sensors that the study knows.
 
     Raises

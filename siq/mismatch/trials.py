@@ -2,29 +2,35 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.stats
 
-from siq.mismatch.best_fit import EDGE_SUBSTEPS, best_fit, sharpened
-from siq.mismatch.candidates import Candidate
+from siq.dynamics.dynamics import Dynamics
+from siq.errors import NumericalFailure
+from siq.estimation.estimation import Fit
+from siq.estimation.jumps import EDGE_SUBSTEPS, sharpened, spread_edges
+from siq.estimation.linearisation import Grid
+from siq.estimation.measurements import Measurements
+from siq.estimation.process_noise import fit_with_process_noise_as_needed
+from siq.mismatch.candidates import MechanismCandidate
 from siq.mismatch.clusters import clustered_probability
-from siq.mismatch.estimation import Fit
-from siq.mismatch.linearisation import Grid, spread_edges
-from siq.mismatch.measurements import Measurements
-from siq.mismatch.model import Model
 from siq.mismatch.probes import Probe, ProbeColumns, probes_of
 from siq.mismatch.screening import Screened, probe_response, screen
 
+LOGGER = logging.getLogger(__name__)
 PROBE_SUBSTEPS = 2  # what a little of a mechanism does need not be known to many digits
 PROMISING = 0.2  # of the best gain so far; a candidate that promises less is not fitted
+UNFORESEEN = (ArithmeticError, ValueError, np.linalg.LinAlgError)
+"""What ends a candidate, never the search: an overflow, a division by zero, a singular matrix."""
 RIVALS = 0.6  # of the best gain, from which on a candidate's jumps are sharpened: that gains up to a quarter
 
 
 @dataclass(frozen=True)
-class Trial:
+class TriedMechanism:
     """A candidate, fitted.
 
     Attributes
@@ -41,7 +47,7 @@ class Trial:
         Probabilities of as much by chance.
     """
 
-    candidate: Candidate
+    candidate: MechanismCandidate
     fit: Fit
     delta_chi2: float
     delta_bic: float
@@ -49,8 +55,24 @@ class Trial:
     p_cluster: float
 
 
+@dataclass(frozen=True)
+class UntriedMechanism:
+    """A candidate that promised something, and whose fit gave nothing that could be judged.
+
+    Attributes
+    ----------
+    candidate
+        The mechanism.
+    reason
+        Why, in words.
+    """
+
+    candidate: MechanismCandidate
+    reason: str
+
+
 def screen_all(
-    model: Model, data: Measurements, current: Fit, candidates: Sequence[Candidate]
+    model: Dynamics, data: Measurements, current: Fit, candidates: Sequence[MechanismCandidate]
 ) -> list[tuple[Probe, Screened]]:
     """Screen every candidate, with its shapes at all places where they are looked for."""
     substeps = current.substeps
@@ -75,16 +97,27 @@ def screen_all(
     return list(zip(probes, screen(response, data, current, groups, positive=positive), strict=True))
 
 
-def fit_best(
+def overflowing(screened: Sequence[tuple[Probe, Screened]]) -> list[UntriedMechanism]:
+    """Candidates that could not be screened at any of their shapes."""
+    finite = {probe.candidate.label for probe, result in screened if result.finite}
+    faulty = {probe.candidate.label: probe.candidate for probe, _ in screened}
+    return [
+        UntriedMechanism(candidate, "its effect along the recorded motion is beyond all numbers")
+        for label, candidate in faulty.items()
+        if label not in finite
+    ]
+
+
+def fit_most_promising(
     data: Measurements,
     current: Fit,
-    base_model: Model,
+    base_model: Dynamics,
     screened: Sequence[tuple[Probe, Screened]],
     *,
     most: int,
     least_gain: float,
     blocks: int,
-) -> list[Trial]:
+) -> tuple[list[TriedMechanism], list[UntriedMechanism]]:
     """Fit the candidates that promise most, each from its best probe.
 
     Parameters
@@ -104,8 +137,8 @@ def fit_best(
 
     Returns
     -------
-    list
-        Those whose fit settled, with signs that their mechanism allows.
+    list of TriedMechanism, list of UntriedMechanism
+        Those whose fit settled, with signs that their mechanism allows; and the others, with the reason.
     """
     best: dict[str, tuple[Probe, Screened]] = {}
     for probe, result in screened:
@@ -113,21 +146,21 @@ def fit_best(
         if result.gain > 0 and (label not in best or result.gain > best[label][1].gain):
             best[label] = (probe, result)
     ranked = sorted(best.values(), key=lambda each: -each[1].gain)
-    trials: dict[str, Trial] = {}
+    trials: dict[str, TriedMechanism] = {}
+    failed: dict[str, UntriedMechanism] = {}
     begun: list[tuple[Probe, Screened]] = []
 
     def attempt(probe: Probe, result: Screened, begin: Fit) -> None:
         candidate = probe.candidate
-        x = begin.x[:, : base_model.dimension]
-        if candidate.scales:
-            own = ProbeColumns(base_model, Grid(data, current.substeps), [probe], x, current.model.values)
-            x = np.concatenate([x, own.further_states(0)], axis=1)
-        trial = best_fit(with_start(probe, result, begin.model), data, begin, level=result.level, x=x)
-        if not trial.converged or not _admissible(trial, candidate):
+        try:
+            trial = _tried(probe, result, begin, current, base_model, data, blocks=blocks)
+        except UNFORESEEN as error:
+            LOGGER.info("%s cannot be fitted: %s", candidate.label, error)
+            failed[candidate.label] = UntriedMechanism(candidate, _in_words(error))
             return
         known = trials.get(candidate.label)
-        if known is None or trial.log_likelihood > known.fit.log_likelihood:
-            trials[candidate.label] = judged(trial, current, data, candidate, blocks=blocks)
+        if known is None or trial.fit.log_likelihood > known.fit.log_likelihood:
+            trials[candidate.label] = trial
 
     for place, (probe, result) in enumerate(ranked[: 2 * most]):
         # Against what screening foresaw of those that did gain it: some promise much and gain nothing, and
@@ -146,12 +179,50 @@ def fit_best(
     most_gained = max((each.delta_chi2 for each in trials.values()), default=0.0)
     for label, trial in trials.items():
         if trial.fit.model.edges and trial.delta_chi2 >= RIVALS * most_gained:
-            sharp = sharpened(trial.fit, data)
-            trials[label] = judged(sharp, current, data, trial.candidate, blocks=blocks)
-    return list(trials.values())
+            try:
+                sharp = sharpened(trial.fit, data)
+                trials[label] = judged(sharp, current, data, trial.candidate, blocks=blocks)
+            except UNFORESEEN as error:
+                LOGGER.info("%s stays as sharp as it is: %s", label, error)
+    return list(trials.values()), [each for label, each in failed.items() if label not in trials]
 
 
-def _better_start(candidate: Candidate, trials: Mapping[str, Trial]) -> Fit | None:
+def _tried(
+    probe: Probe,
+    result: Screened,
+    begin: Fit,
+    current: Fit,
+    base_model: Dynamics,
+    data: Measurements,
+    *,
+    blocks: int,
+) -> TriedMechanism:
+    """A probe's candidate, fitted from a fit and judged.
+
+    Raises
+    ------
+    NumericalFailure
+        When the fit has no result, does not settle, or has a sign that the mechanism does not allow.
+    """
+    candidate = probe.candidate
+    x = begin.x[:, : base_model.dimension]
+    if candidate.scales:
+        own = ProbeColumns(base_model, Grid(data, current.substeps), [probe], x, current.model.values)
+        x = np.concatenate([x, own.further_states(0)], axis=1)
+    start = with_start(probe, result, begin.model)
+    trial = fit_with_process_noise_as_needed(start, data, begin, level=result.level, x=x)
+    if not trial.converged:
+        raise NumericalFailure(trial.fault or "its fit does not settle")
+    if not _admissible(trial, candidate):
+        raise NumericalFailure("its best parameters have a sign that the mechanism cannot have")
+    return judged(trial, current, data, candidate, blocks=blocks)
+
+
+def _in_words(error: Exception) -> str:
+    return str(error) if isinstance(error, NumericalFailure) else f"{type(error).__name__}: {error}"
+
+
+def _better_start(candidate: MechanismCandidate, trials: Mapping[str, TriedMechanism]) -> Fit | None:
     """Where a candidate is begun once more: one that led nowhere, or to less than a special case of it."""
     own = trials.get(candidate.label)
     if own is None:
@@ -167,7 +238,7 @@ def _better_start(candidate: Candidate, trials: Mapping[str, Trial]) -> Fit | No
     return max(rivals, key=lambda each: each.delta_chi2).fit if rivals else None
 
 
-def with_start(probe: Probe, result: Screened, base: Model) -> Model:
+def with_start(probe: Probe, result: Screened, base: Dynamics) -> Dynamics:
     """The candidate's model with parameters to begin with: those of the base, and no effect yet.
 
     What screening found of the amplitudes is a start only where shapes need one: linearised amplitudes can be
@@ -181,12 +252,14 @@ def with_start(probe: Probe, result: Screened, base: Model) -> Model:
     return candidate.model.with_values(np.array([known[each.name] for each in candidate.model.parameters]))
 
 
-def judged(trial: Fit, before: Fit, data: Measurements, candidate: Candidate, *, blocks: int) -> Trial:
+def judged(
+    trial: Fit, before: Fit, data: Measurements, candidate: MechanismCandidate, *, blocks: int
+) -> TriedMechanism:
     """A candidate's fit with its evidence over the fit without it."""
     extra = len(trial.model.free) - len(before.model.free)
     gained = 2 * (trial.log_likelihood - before.log_likelihood)
     count = trial.degrees_of_freedom + len(trial.model.free)
-    return Trial(
+    return TriedMechanism(
         candidate=candidate,
         fit=trial,
         delta_chi2=gained,
@@ -196,7 +269,7 @@ def judged(trial: Fit, before: Fit, data: Measurements, candidate: Candidate, *,
     )
 
 
-def _admissible(trial: Fit, candidate: Candidate) -> bool:
+def _admissible(trial: Fit, candidate: MechanismCandidate) -> bool:
     names = [trial.model.parameters[place].name for place in trial.model.free]
     for name in candidate.positive:
         if name in names:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import sympy
 
-from siq.expressions import FormulaError, parse_formula
+from siq.dynamics.formulas import FormulaError, parse_formula
 
 
 def unit_of(formula: str, units: Mapping[str, str]) -> str:

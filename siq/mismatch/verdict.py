@@ -1,150 +1,280 @@
-"""The verdict as data: what `verdict.json` says, in the order of its contract."""
+"""What a diagnosis states: the verdict in a sentence, mechanisms with their evidence, place, fit and bounds.
+
+`Statement.as_data` is the content of ``verdict.json``, in the order of its contract.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from siq.estimation.estimation import Fit
+from siq.estimation.measurements import Measurements
 from siq.mismatch.candidates import PROCESS_NOISE
-from siq.mismatch.diagnosis import Diagnosis
-from siq.mismatch.estimation import Fit
-from siq.mismatch.held_out import FreeRun, free_run, normalised_rms
+from siq.mismatch.held_out import HeldOutErrors, HeldOutRuns
+from siq.mismatch.investigation import Investigation, MismatchVerdict
 from siq.mismatch.location import Location, locate
-from siq.mismatch.measurements import Measurements
-from siq.mismatch.model import Model
-from siq.mismatch.trials import Trial
+from siq.mismatch.trials import TriedMechanism
 
 METRIC = "normalised rms, held-out recordings"
-BOUND = 1.96
+UNKNOWN_ERRORS = HeldOutErrors(None, None, None, None)
+BOUND = 1.96  # standard errors on either side of an estimate within which 95 % lie
 
 
 @dataclass(frozen=True)
-class HeldOut:
-    """Free runs of held-out recordings by the three simulations, and how far each is off.
+class Estimate:
+    """A parameter's value with its standard error, None where it has none, and its unit."""
+
+    estimate: float
+    standard_error: float | None
+    unit: str
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Why a mechanism is believed; None where a test does not apply.
 
     Attributes
     ----------
-    before, recalibrated, augmented
-        The card's simulation, with its parameters refitted, and with what was found.
-    model
-        The augmented simulation that was run.
-    scores
-        The normalised errors of the three, None where a simulation ran away, and the noise floor.
+    delta_chi2, delta_bic
+        What it gains, see `siq.mismatch.trials.TriedMechanism`.
+    p_white, p_cluster
+        Probabilities of as much by chance, for independent errors and whatever those within a recording.
     """
 
-    before: FreeRun
-    recalibrated: FreeRun
-    augmented: FreeRun
-    model: Model
-    scores: Mapping[str, float | None]
+    delta_chi2: float | None
+    delta_bic: float | None
+    p_white: float | None
+    p_cluster: float | None
 
 
-def held_out(diagnosis: Diagnosis, learned: Measurements, data: Measurements) -> HeldOut:
-    """Show the fit on recordings that had no part in anything.
+@dataclass(frozen=True)
+class StatedMechanism:
+    """A mechanism that is named, or that describes what has no name.
+
+    Attributes
+    ----------
+    name, label
+        Of the dictionary, and told apart from its other forms and places.
+    terms
+        Formula that is added, by equation; see `siq.mismatch.candidates.MechanismCandidate.changes`.
+    parameters
+        Those that it brings.
+    evidence
+        Why it is believed.
+    share_of_excess
+        What all mechanisms together explain of the excess over noise.
+    indistinguishable_from
+        Names of mechanisms that explain the recordings as well; None where none was compared.
+    """
+
+    name: str
+    label: str
+    terms: Mapping[str, str]
+    parameters: Mapping[str, Estimate]
+    evidence: Evidence
+    share_of_excess: float
+    indistinguishable_from: tuple[str, ...] | None = None
+
+
+@dataclass(frozen=True)
+class Description:
+    """What is known of a mismatch that has no name.
+
+    Attributes
+    ----------
+    share_described
+        Share of the excess that the mechanisms in `by` describe.
+    by
+        Mechanisms that explain a part, and are not named.
+    p_residuals_random
+        Probability that what is left is random.
+    random_forces_admitted
+        Whether the fit needed random forces.
+    """
+
+    share_described: float
+    by: tuple[StatedMechanism, ...]
+    p_residuals_random: float
+    random_forces_admitted: bool
+
+
+@dataclass(frozen=True)
+class Recalibrated:
+    """A parameter of the simulation before and after the fit, with the standard error."""
+
+    before: float
+    after: float
+    standard_error: float
+
+
+@dataclass(frozen=True)
+class UpperBound:
+    """At most so large (95 %) is a parameter of a mechanism that was not found."""
+
+    upper_bound_95: float
+    unit: str
+    parameter: str
+    label: str
+
+
+@dataclass(frozen=True)
+class NotFitted:
+    """A mechanism of the dictionary that could not be judged, with the reason."""
+
+    mechanism: str
+    label: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Statement:
+    """All that a diagnosis states.
+
+    Attributes
+    ----------
+    verdict
+        One of four.
+    sentence
+        The same in words.
+    mechanisms
+        What is named.
+    description
+        Of a mismatch without a name.
+    location
+        Where the mismatch sits, if there is one.
+    recalibration
+        The simulation's own parameters.
+    errors
+        On held-out recordings.
+    excluded
+        Bounds of what was not found, where nothing is missing.
+    remarks
+        Reservations.
+    not_fitted
+        What could not be judged.
+    """
+
+    verdict: MismatchVerdict
+    sentence: str
+    mechanisms: tuple[StatedMechanism, ...] = ()
+    description: Description | None = None
+    location: Location | None = None
+    recalibration: Mapping[str, Recalibrated] | None = None
+    errors: HeldOutErrors = UNKNOWN_ERRORS
+    excluded: Mapping[str, UpperBound] | None = None
+    remarks: tuple[str, ...] = ()
+    not_fitted: tuple[NotFitted, ...] = ()
+
+    def as_data(self) -> dict[str, Any]:
+        """The content of ``verdict.json``; a number that is not finite is null."""
+        data = {
+            "verdict": str(self.verdict),
+            "sentence": self.sentence,
+            "mechanisms": [_mechanism_data(each) for each in self.mechanisms],
+            "description": None
+            if self.description is None
+            else asdict(self.description) | {"by": [_mechanism_data(each) for each in self.description.by]},
+            "location": None if self.location is None else self.location.as_data(),
+            "recalibration": {name: asdict(each) for name, each in (self.recalibration or {}).items()},
+            "fit": {"metric": METRIC, **asdict(self.errors)},
+            "excluded": {label: asdict(each) for label, each in (self.excluded or {}).items()},
+            "remarks": list(self.remarks),
+            "not_fitted": [asdict(each) for each in self.not_fitted],
+        }
+        plain: dict[str, Any] = _plain(data)
+        return plain
+
+
+def statement_of_failure(reason: str) -> Statement:
+    """What is stated of a simulation that cannot be fitted to the recordings at all.
 
     Parameters
     ----------
-    diagnosis
-        What was found.
-    learned
-        The recordings that it was found in; they decide which estimates run freely best.
-    data
-        The recordings held out.
+    reason
+        What happened, in lower case and without a full stop.
     """
-    search = diagnosis.search
-    noise, substeps = search.recalibrated.noise, max(search.fit.substeps, search.recalibrated.substeps)
-
-    def error_where_learned(model: Model) -> float:
-        error = normalised_rms(learned.outputs, free_run(model, learned, noise=noise, substeps=substeps))
-        return np.inf if error is None else error
-
-    # What fits best with random forces admitted need not be what runs best without.
-    recalibrated = search.recalibrated.model
-    if search.recalibrated.has_process_noise and np.isfinite(diagnosis.least_squares.sum_of_squares):
-        choices = (diagnosis.least_squares.model, recalibrated, diagnosis.model)
-        recalibrated = min(choices, key=error_where_learned)
-    augmented = search.fit.model
-    if diagnosis.augmented_least_squares is not None:
-        augmented = min((diagnosis.augmented_least_squares.model, augmented), key=error_where_learned)
-    models = {"before": diagnosis.model, "recalibrated": recalibrated, "augmented": augmented}
-    runs = {name: free_run(model, data, noise=noise, substeps=substeps) for name, model in models.items()}
-    scores = {name: normalised_rms(data.outputs, simulated) for name, simulated in runs.items()}
-    scored = runs["before"].scored
-    spread = np.nanvar(data.outputs[scored], axis=0)
-    floor = np.sqrt(np.mean(search.fit.noise.measurement / np.where(spread > 0, spread, 1.0)))
-    return HeldOut(**runs, model=augmented, scores={**scores, "noise_floor": float(floor)})
+    return Statement(
+        MismatchVerdict.UNEXPLAINED,
+        "The simulation cannot be compared with the recordings, since no fit of it has a result.",
+        remarks=(f"{reason[:1].upper()}{reason[1:]}.",),
+    )
 
 
-def verdict_of(diagnosis: Diagnosis, data: Measurements, shown: HeldOut) -> dict[str, Any]:
-    """What is written to ``verdict.json``.
+def statement_of(investigation: Investigation, data: Measurements, shown: HeldOutRuns) -> Statement:
+    """What follows from an investigation.
 
     Parameters
     ----------
-    diagnosis
+    investigation
         What was found.
     data
         The recordings that it was found in.
     shown
         The fit on those held out.
     """
-    place = locate(diagnosis, data)
-    return {
-        "verdict": diagnosis.verdict,
-        "sentence": sentence(diagnosis, place),
-        "mechanisms": mechanisms_of(diagnosis),
-        "description": description_of(diagnosis),
-        "location": place.as_data() if place is not None else None,
-        "recalibration": recalibration_of(diagnosis),
-        "fit": {"metric": METRIC, **shown.scores},
-        "excluded": excluded(diagnosis) if diagnosis.verdict in ("no mismatch", "parameter shift") else {},
-        "remarks": list(diagnosis.remarks),
-    }
+    place = locate(investigation, data)
+    mechanisms = mechanisms_of(investigation)
+    return Statement(
+        verdict=investigation.verdict,
+        sentence=sentence(investigation.verdict, mechanisms, place),
+        mechanisms=mechanisms,
+        description=description_of(investigation),
+        location=place,
+        recalibration=recalibration_of(investigation),
+        errors=shown.errors,
+        excluded={} if investigation.verdict.mismatch else excluded(investigation),
+        remarks=investigation.remarks,
+        not_fitted=tuple(
+            NotFitted(each.candidate.name, each.candidate.label, each.reason)
+            for each in investigation.search.untried
+        ),
+    )
 
 
-def mechanisms_of(diagnosis: Diagnosis) -> list[dict[str, Any]]:
+def mechanisms_of(investigation: Investigation) -> tuple[StatedMechanism, ...]:
     """What is named, each with its evidence."""
-    if diagnosis.verdict != "missing physics":
-        return []
-    if diagnosis.process_noise:
-        return [_process_noise(diagnosis)]
-    return [
-        _mechanism(each.best, diagnosis.search.fit, diagnosis.share)
-        | {
-            "indistinguishable_from": sorted(
-                {other.candidate.name for other in each.indistinguishable} - {each.best.candidate.name}
-            )
-        }
-        for each in diagnosis.search.found
-    ]
+    if investigation.verdict is not MismatchVerdict.MISSING_PHYSICS:
+        return ()
+    if investigation.process_noise:
+        return (_process_noise(investigation),)
+    return tuple(
+        replace(
+            _stated(each.best, investigation.search.fit, investigation.share),
+            indistinguishable_from=tuple(
+                sorted(
+                    {other.candidate.name for other in each.indistinguishable} - {each.best.candidate.name}
+                )
+            ),
+        )
+        for each in investigation.search.found
+    )
 
 
-def description_of(diagnosis: Diagnosis) -> dict[str, Any] | None:
+def description_of(investigation: Investigation) -> Description | None:
     """What is known of a mismatch that has no name."""
-    if diagnosis.verdict != "unexplained":
+    if investigation.verdict is not MismatchVerdict.UNEXPLAINED:
         return None
-    trials = [_mechanism(each.best, diagnosis.search.fit, diagnosis.share) for each in diagnosis.search.found]
-    return {
-        "share_described": diagnosis.share if trials else 0.0,
-        "by": trials,
-        "p_residuals_random": diagnosis.after.p_value,
-        "random_forces_admitted": diagnosis.search.fit.has_process_noise,
-    }
+    search = investigation.search
+    trials = tuple(_stated(each.best, search.fit, investigation.share) for each in search.found)
+    return Description(
+        share_described=investigation.share if trials else 0.0,
+        by=trials,
+        p_residuals_random=investigation.after.p_value,
+        random_forces_admitted=search.fit.has_process_noise,
+    )
 
 
-def recalibration_of(diagnosis: Diagnosis) -> dict[str, dict[str, float]]:
+def recalibration_of(investigation: Investigation) -> dict[str, Recalibrated]:
     """The simulation's own parameters: on the card, and in the simulation that the verdict ends with."""
-    fit = diagnosis.final
+    fit = investigation.final
     errors = standard_errors(fit)
     return {
-        entry.name: {
-            "before": entry.value,
-            "after": float(fit.model.values[place]),
-            "standard_error": errors[entry.name],
-        }
-        for place, entry in enumerate(diagnosis.model.parameters)
+        entry.name: Recalibrated(entry.value, float(fit.model.values[place]), errors[entry.name])
+        for place, entry in enumerate(investigation.model.parameters)
         if entry.name in errors
     }
 
@@ -155,85 +285,89 @@ def standard_errors(fit: Fit) -> dict[str, float]:
     return dict(zip(names, map(float, fit.standard_errors), strict=True))
 
 
-def excluded(diagnosis: Diagnosis) -> dict[str, dict[str, Any]]:
+def excluded(investigation: Investigation) -> dict[str, UpperBound]:
     """Upper bounds (95 %) of the amplitudes of mechanisms that were not found."""
-    bounds: dict[str, dict[str, Any]] = {}
-    for probe, result in diagnosis.search.screened:
+    bounds: dict[str, UpperBound] = {}
+    for probe, result in investigation.search.screened:
         candidate = probe.candidate
         for name, estimate, error in zip(
             candidate.amplitudes, result.amplitudes, result.standard_errors, strict=False
         ):
             bound = abs(float(estimate)) + BOUND * float(error)
             unit = next(p.unit for p in candidate.model.parameters if p.name == name)
-            entry = {"upper_bound_95": bound, "unit": unit, "parameter": name, "label": candidate.label}
             known = bounds.get(candidate.label)
-            if np.isfinite(bound) and error > 0 and (known is None or bound > known["upper_bound_95"]):
-                bounds[candidate.label] = entry
+            if np.isfinite(bound) and error > 0 and (known is None or bound > known.upper_bound_95):
+                bounds[candidate.label] = UpperBound(bound, unit, name, candidate.label)
     return dict(sorted(bounds.items()))
 
 
-def sentence(diagnosis: Diagnosis, place: Location | None) -> str:
+def sentence(
+    verdict: MismatchVerdict, mechanisms: tuple[StatedMechanism, ...], place: Location | None
+) -> str:
     """The verdict in one sentence."""
-    if diagnosis.verdict == "no mismatch":
+    if verdict is MismatchVerdict.NO_MISMATCH:
         return "The simulation explains the recordings to within their noise, as it is."
-    if diagnosis.verdict == "parameter shift":
+    if verdict is MismatchVerdict.PARAMETER_SHIFT:
         return (
             "The simulation's equations explain the recordings to within their noise, with other parameters."
         )
     where = f" {place.sentence}" if place is not None else ""
-    if diagnosis.verdict == "unexplained":
+    if verdict is MismatchVerdict.UNEXPLAINED:
         return f"The recordings differ from the simulation in a way that no mechanism accounts for.{where}"
-    names = [each["name"] for each in mechanisms_of(diagnosis)]
+    names = [each.name for each in mechanisms]
     if names == [PROCESS_NOISE]:
         return "Random forces drive the system that the simulation does not have."
     return f"The simulation lacks {' and '.join(names)}.{where}"
 
 
-def _mechanism(trial: Trial, final: Fit, share: float) -> dict[str, Any]:
+def _stated(trial: TriedMechanism, final: Fit, share: float) -> StatedMechanism:
     candidate = trial.candidate
     errors = standard_errors(final)
     known = {entry.name: entry for entry in final.model.parameters}
-    return {
-        "name": candidate.name,
-        "label": candidate.label,
-        "terms": {name: str(formula) for name, formula in candidate.changes},
-        "parameters": {
-            name: {
-                "estimate": known[name].value,
-                "standard_error": errors.get(name),
-                "unit": known[name].unit,
-            }
+    return StatedMechanism(
+        name=candidate.name,
+        label=candidate.label,
+        terms={name: str(formula) for name, formula in candidate.changes},
+        parameters={
+            name: Estimate(known[name].value, errors.get(name), known[name].unit)
             for name in candidate.new
             if name in known
         },
-        "evidence": {
-            "delta_chi2": trial.delta_chi2,
-            "delta_bic": trial.delta_bic,
-            "p_white": trial.p_white,
-            "p_cluster": trial.p_cluster,
-        },
-        "share_of_excess": share,
-    }
+        evidence=Evidence(trial.delta_chi2, trial.delta_bic, trial.p_white, trial.p_cluster),
+        share_of_excess=share,
+    )
 
 
-def _process_noise(diagnosis: Diagnosis) -> dict[str, Any]:
-    fit = diagnosis.search.fit
-    return {
-        "name": PROCESS_NOISE,
-        "label": PROCESS_NOISE,
-        "terms": {},
-        "parameters": {
-            f"intensity_{name}": {
-                "estimate": float(value),
-                "standard_error": None,
-                "unit": f"({unit})**2/({fit.model.time_unit})",
-            }
-            for name, unit, value in zip(
-                fit.model.states, fit.model.state_units, fit.noise.process, strict=True
-            )
+def _process_noise(investigation: Investigation) -> StatedMechanism:
+    fit = investigation.search.fit
+    return StatedMechanism(
+        name=PROCESS_NOISE,
+        label=PROCESS_NOISE,
+        terms={},
+        parameters={
+            f"intensity_{name}": Estimate(float(value), None, f"({unit})**2/({fit.model.time_unit})")
+            for name, unit, value in zip(fit.model.states, fit.model.units, fit.noise.process, strict=True)
             if value > 0
         },
-        "evidence": {"delta_chi2": None, "delta_bic": None, "p_white": None, "p_cluster": None},
-        "share_of_excess": 1.0,
-        "indistinguishable_from": [],
-    }
+        evidence=Evidence(None, None, None, None),
+        share_of_excess=1.0,
+        indistinguishable_from=(),
+    )
+
+
+def _mechanism_data(mechanism: StatedMechanism) -> dict[str, Any]:
+    data = asdict(mechanism)
+    if mechanism.indistinguishable_from is None:
+        del data["indistinguishable_from"]
+    return data
+
+
+def _plain(value: Any) -> Any:
+    """The same as JSON has it."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -5,6 +5,8 @@ Minutes in all, and therefore no part of `make test`: ``make untuned`` runs them
 
 import math
 import time
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ import torch
 from known_systems import (
     KnownSystem,
     archetype,
+    as_system,
     double_well,
     limit_cycle,
     linear_system,
@@ -20,23 +23,14 @@ from known_systems import (
     potential_values,
 )
 
-from siq.certificate import CertificateOptions, check_prediction
-from siq.certification import certify_formulas, certify_wells
-from siq.decomposition.check import training_check
-from siq.decomposition.data import prepare_data, slowest_part
-from siq.decomposition.networks import at_rest
-from siq.decomposition.options import CheckOptions, TrainingOptions
-from siq.decomposition.training import start, train
-from siq.held_out import held_out_recordings
-from siq.identification import IdentificationOptions, identify_vector_field
-from siq.library import candidate_library, joint_library
-from siq.outline import evenly_spread, outline
-from siq.prediction import prediction_errors
-from siq.recordings import select_recordings, snapshot_pairs
-from siq.refined_formulas import refined_decomposition
-from siq.refinement import RefinementOptions, refine
-from siq.simulate import SimulationOptions, simulate_snapshots
-from siq.systems import System
+from siq.data.recordings import snapshot_pairs
+from siq.dynamics.simulation import SimulationOptions, simulate_snapshots
+from siq.identify.identification import IdentificationOptions
+from siq.networks.options import CheckOptions, TrainingOptions
+from siq.networks.regression import RegressionOptions
+from siq.steps.outcomes import Method
+from siq.steps.pipeline import Analysis, PipelineSettings, analyse
+from siq.steps.settings import Sampling, StateSpace
 
 TRAINING = TrainingOptions(
     steps=8000,
@@ -54,16 +48,19 @@ TRAINING = TrainingOptions(
     matching_order=2,
 )
 DEGREE = 4
+EVERYWHERE = 1e6  # a level above every recorded state
 
 
 def simulated(known: KnownSystem, *, trajectories: int = 1000, pairs: int = 30, seed: int = 1):
     """Recordings of a known system, sampled by its own time scales."""
     rates = [
-        np.linalg.eigvals(known.field.jacobian(one[None])[0]).real.max() for one in known.attractors
+        np.linalg.eigvals(known.dynamics.jacobian(one[None])[0]).real.max() for one in known.attractors
     ] or [-1.0]
     speed = np.quantile(
         np.linalg.norm(
-            known.field.jacobian(np.random.default_rng(0).uniform(*known.domain.T, (500, len(known.domain)))),
+            known.dynamics.jacobian(
+                np.random.default_rng(0).uniform(*known.domain.T, (500, len(known.domain)))
+            ),
             axis=(1, 2),
         ),
         0.9,
@@ -72,74 +69,42 @@ def simulated(known: KnownSystem, *, trajectories: int = 1000, pairs: int = 30, 
     step = float(min(0.01, 0.1 / speed))
     # Where f is very fast somewhere, recordings that last until all is at rest would take too many steps.
     stride = min(max(math.ceil(3 * relaxation / pairs / (step / 5)), 6), 300)
-    system = System(
-        name="known", title="", time_unit="1",
-        states=tuple(s.name for s in known.field.symbols), units=("1",) * known.field.dimension,
-        domain=known.domain, symbols=known.field.symbols, equations=known.field.equations,
-        diffusion=known.diffusion,
-    )  # fmt: skip
+    system = as_system(known)
     options = SimulationOptions(
         trajectories=trajectories, pairs=pairs, pair_step=step, interval=stride * step / 5
     )
     return simulate_snapshots(system, options=options, generator=np.random.default_rng(seed)), step
 
 
-def trained_until_certified(known: KnownSystem, seed: int = 0):
-    """Refined formulas with their certificate, and how long the training was."""
+def trained_until_certified(known: KnownSystem, seed: int = 0) -> tuple[Analysis, np.ndarray]:
+    """All that the pipeline finds of a known system, and the recorded states on which it is judged."""
     recordings, step = simulated(known)
-    held = held_out_recordings(recordings, generator=np.random.default_rng(seed))
-    unseen = select_recordings(recordings, np.flatnonzero(held))
-    training = select_recordings(recordings, np.flatnonzero(~held))
-    pairs = snapshot_pairs(training, pair_step=step)
-    library = candidate_library(recordings.names, degree=5 if known.field.dimension < 5 else 3)
-    found = identify_vector_field(library, pairs, options=IdentificationOptions())
-    verdict = check_prediction(
-        noise_fault=None, errors=prediction_errors(found.field, unseen), mean_probability=None,
-        held_out_ratio=1.0, limit=0.01,
-    )  # fmt: skip
-    data = prepare_data(
-        snapshot_pairs(recordings, pair_step=step), options=TRAINING, generator=np.random.default_rng(seed)
+    x = snapshot_pairs(recordings, pair_step=step).x0
+    # The lowest three quarters of the states, where V is known; otherwise all of them.
+    level = EVERYWHERE
+    if known.potential is not None:
+        values = potential_values(known, x)
+        level = float(np.quantile(values - values.min(), 0.75))
+        x = x[values < values.min() + level]
+    settings = PipelineSettings(
+        seed=seed,
+        space=StateSpace(diffusion=known.diffusion.tolist()),
+        sampling=Sampling(pair_step=step),
+        identification=IdentificationOptions(degree=5 if known.dynamics.dimension < 5 else 3),
+        training=TRAINING,
+        published_method=False,
+        regression=RegressionOptions(degree=DEGREE, level=level),
+        landscape=None,
     )
-    check = training_check(
-        found, data.training.x0, diffusion=known.diffusion, options=TRAINING.check, seed=seed
-    )
-    steps = 0
-    for attempt in range(TRAINING.check.attempts):
-        seeds = [np.random.SeedSequence([seed, attempt])]
-        options = TRAINING.attempt(attempt)
-        part = slowest_part(data, options.slowest_share)
-        state = train(
-            start([part], options=options, diffusion=known.diffusion, seeds=seeds), [part],
-            options=options, seeds=seeds,
-            finished=lambda _, networks: check.passes(at_rest(networks, 0)),
-        )  # fmt: skip
-        steps += state.step
-        if state.step < TRAINING.steps or check.hopeless():
-            break
-    networks = at_rest(state.networks, 0)
+    began = time.perf_counter()
+    found = analyse(recordings, settings, device="cpu")
+    print(f"\n{found.trained.outcome}, {time.perf_counter() - began:.0f} s")
+    return found, x
 
-    def network(x):
-        return networks.evaluate(x).potential
 
-    points = pairs.x0[evenly_spread(pairs.x0, generator=np.random.default_rng(seed))]
-    level = np.quantile(network(points), 0.75)
-    setting = outline(found.field, points, diffusion=known.diffusion, seed=seed)
-    below = points[network(points) < level]
-    refined = refine(
-        found, setting, library=joint_library(library, degree=DEGREE, potential_degree=DEGREE),
-        formula=None, network=network, points=below, diffusion=known.diffusion,
-        options=RefinementOptions(), seed=seed,
-    )  # fmt: skip
-    x = snapshot_pairs(unseen, pair_step=step).x0
-    formulas = refined_decomposition(refined, below)
-    if formulas.potential is None:
-        certificate = certify_wells(refined, setting, options=CertificateOptions(), prediction=verdict)
-    else:
-        certificate = certify_formulas(
-            formulas, found, setting, x[network(x) < level], diffusion=known.diffusion,
-            options=CertificateOptions(), prediction=verdict, wells=refined.wells,
-        )  # fmt: skip
-    return refined, formulas, certificate, below, steps
+def certificate_of(found: Analysis) -> Mapping[str, Any]:
+    """The certificate of the refined formulas."""
+    return found.refined.certificates[Method.REFINED]
 
 
 SYSTEMS = {
@@ -160,36 +125,47 @@ SYSTEMS = {
 def test_systems_with_a_known_formula_are_certified_and_right(name):
     torch.set_num_threads(1)
     known = SYSTEMS[name]
-    began = time.perf_counter()
-    _, formulas, certificate, below, steps = trained_until_certified(known)
-    print(f"\n{name}: {steps} steps, {time.perf_counter() - began:.0f} s, stated {certificate.error:.1e}")
-    assert certificate.certified, certificate.reason
+    found, x = trained_until_certified(known)
+    certificate, formulas = certificate_of(found), found.refined.formulas[Method.REFINED]
+    assert certificate["certified"], certificate["reason"]
     assert formulas.potential is not None
-    exact = potential_values(known, below)
-    own = formulas.evaluate(np.ascontiguousarray(below.T))[0]
+    exact = potential_values(known, x)
+    own = formulas.evaluate(np.ascontiguousarray(x.T))[0]
     difference = (own - own.min()) - (exact - exact.min())
     error = np.linalg.norm(difference - difference.mean()) / np.linalg.norm(exact - exact.min())
-    print(f"relative error of V {error:.1e}")
+    print(f"{name}: relative error of V {error:.1e}, stated {certificate['stated_error']:.1e}")
     assert error < 1e-6
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("beta", [5, 10])
-def test_maier_stein_with_a_caustic_states_an_error(beta):
+def barriers_beside(beta: int, known_barrier: float) -> Mapping[str, Any]:
+    """The certificate of Maier and Stein's system; both barriers of U have to be within its stated error."""
     torch.set_num_threads(1)
-    refined, _, certificate, _, steps = trained_until_certified(maier_stein(beta))
-    levels = [2 * well.level for well in refined.wells]
-    print(f"\nβ = {beta}: {steps} steps, stated {certificate.error:.2e}, barriers of U {levels}")
-    print({name: (v.value, v.limit) for name, v in certificate.tests.items()})
-    assert certificate.certified, certificate.reason
-    assert len(refined.wells) == 2
-    for level, known_barrier in zip(levels, [{5: 0.4831, 10: 0.34004}[beta]] * 2, strict=True):
-        assert abs(level / known_barrier - 1) < max(certificate.error, 0.05)
+    found, _ = trained_until_certified(maier_stein(beta))
+    certificate, wells = certificate_of(found), found.refined.formulas[Method.REFINED].wells
+    levels = np.array([2 * well.level for well in wells])
+    print({name: (test["value"], test["limit"]) for name, test in certificate["tests"].items()})
+    print(f"β = {beta}: stated {certificate['stated_error']}, barriers of U {levels}")
+    assert len(levels) == 2
+    assert np.abs(levels / known_barrier - 1).max() < max(certificate["stated_error"] or 0, 0.05)
+    return certificate
+
+
+@pytest.mark.slow
+def test_maier_stein_with_a_weak_caustic_is_certified_with_an_error():
+    certificate = barriers_beside(5, 0.4831)
+    assert certificate["certified"], certificate["reason"]
+
+
+@pytest.mark.slow
+def test_maier_stein_with_a_strong_caustic_has_its_barriers_though_it_is_not_certified():
+    certificate = barriers_beside(10, 0.34004)
+    assert not certificate["certified"]
 
 
 @pytest.mark.slow
 def test_a_limit_cycle_is_named_and_not_certified():
     torch.set_num_threads(1)
-    *_, certificate, _, _ = trained_until_certified(limit_cycle())
-    assert not certificate.certified
-    assert "limit cycle" in certificate.reason
+    found, _ = trained_until_certified(limit_cycle())
+    certificate = certificate_of(found)
+    assert not certificate["certified"]
+    assert "limit cycle" in certificate["reason"]

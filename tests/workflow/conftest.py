@@ -19,17 +19,27 @@ system: archetype3d
 runs: {runs}
 seed: 7
 published: archetype3d
-simulation: {{trajectories: 80, pairs: 20}}
+simulation: {{trajectories: 80, pairs: 20, pair_step: 0.01, interval: 0.1}}
 training:
   widths: [12, 12]
   steps: {steps}
   batch_size: 64
+  check: null
+  decay_steps: 1000
+  orthogonality_weight: 10
+  representative_share: 0
+  relative_dynamics: false
+  normalise_on: pairs
+  potential_gain: 1
   precision: float32
   matching: symmetric
   thinning_distance: 0.2
 regression:
   degree: 4
   threshold: {threshold}
+  threshold_on: coefficient
+  level: 2.0
+landscape: false
 """
 
 
@@ -76,7 +86,8 @@ class Project:
 
 def copy_project(folder: Path) -> Project:
     folder.mkdir(parents=True)
-    shutil.copy(ROOT / "Snakefile", folder)
+    for name in ("Snakefile", "pyproject.toml"):  # the latter has the version that the page tells
+        shutil.copy(ROOT / name, folder)
     for name in ("workflow", "profiles", "siq", "config"):
         shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
     return Project(folder)

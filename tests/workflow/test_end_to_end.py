@@ -6,8 +6,8 @@ import re
 import pandas as pd
 import pytest
 
-from siq.model import read_model
-from siq.tables import COLUMNS
+from siq.potential.storage import read_model
+from siq.study.tables import COLUMNS
 
 pytestmark = pytest.mark.workflow
 

@@ -3,7 +3,7 @@
 import pandas as pd
 import pytest
 
-from siq.tables import COLUMNS
+from siq.study.tables import COLUMNS
 
 pytestmark = [pytest.mark.workflow, pytest.mark.slow]
 
@@ -19,12 +19,19 @@ training:
   widths: [12, 12]
   steps: 60
   batch_size: 64
+  check: null
+  decay_steps: 1000
+  orthogonality_weight: 10
+  representative_share: 0
+  relative_dynamics: false
+  normalise_on: pairs
+  potential_gain: 1
   matching: symmetric
   slow_speed: 0.1
   thinning_distance: 1.0e-3
 regression: {degree: 4, threshold: 0.001, threshold_on: contribution, level: 6.0e-9}
-refinement: {routes: [local], degree: 10}
-landscape: {degrees: [8, 10], noise_intensities: [2.5e-9]}
+refinement: {routes: [local], degrees: [8, 10]}
+landscape: {noise_intensities: [2.5e-9]}
 """
 
 

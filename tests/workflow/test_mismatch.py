@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from siq.tables import read_table
+from siq.study.tables import read_table
 from workflow.cases import CARD, STUDY, Cases
 
 CARD_TEXT = """\

@@ -5,8 +5,8 @@ import json
 import pandas as pd
 import pytest
 
-from workflow.concealment.cases import CaseDesign, write_case
-from workflow.scoring import COLUMNS
+from workflow.proof.concealment.cases import CaseDesign, write_case
+from workflow.proof.scoring import COLUMNS
 
 pytestmark = [pytest.mark.workflow, pytest.mark.slow]
 

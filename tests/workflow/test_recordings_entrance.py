@@ -18,10 +18,18 @@ training:
   widths: [12, 12]
   steps: 120
   batch_size: 64
+  check: null
+  decay_steps: 1000
+  orthogonality_weight: 10
+  representative_share: 0
+  relative_dynamics: false
+  normalise_on: pairs
+  potential_gain: 1
   precision: float32
   matching: symmetric
   thinning_distance: 0.2
-regression: {degree: 4, threshold: 0.1}
+regression: {degree: 4, threshold: 0.1, threshold_on: coefficient, level: 2.0}
+landscape: false
 """
 
 
@@ -39,8 +47,7 @@ def test_both_entrances_give_the_same_answer_on_the_same_data(fresh_project, fin
 def test_recordings_without_a_card_are_enough(fresh_project, finished):
     project = fresh_project
     shutil.copy(finished.path("results/mini/runs/000/recordings.parquet"), project.path("measured.parquet"))
-    asked = STUDY.replace("system: archetype3d\n", "").replace("runs: 2", "runs: 1")
-    project.path("study.yaml").write_text(asked + "landscape: {degrees: [4]}\n")
+    project.path("study.yaml").write_text("name: measured\nrecordings: {file: measured.parquet}\n")
     project.make("results/measured/report.html")
     page = project.path("results/measured/report.html").read_text(encoding="utf-8")
     assert "No exact answer is known" in page
@@ -51,3 +58,7 @@ def test_recordings_without_a_card_are_enough(fresh_project, finished):
     np.testing.assert_allclose(ways["barrier"], 1.0, atol=1e-4)  # of U = x⁴ - 2x² + y² + z² + 1
     np.testing.assert_allclose(ways["minimum_action"], 1.0, atol=1e-4)
     assert not project.path("results/measured/tables/escape.parquet").exists()
+    # Nobody asked for networks, and nothing says that they failed.
+    assert not project.path("results/measured/training").exists() and "published method" not in page
+    outcomes = pd.read_parquet(project.path("results/measured/tables/outcomes.parquet"))
+    assert not set(outcomes["step"]) & {"train", "regress"}

@@ -38,12 +38,20 @@ def test_only_what_depends_on_a_change_runs_again(fresh_project):
     project.write_study()
     project.make(MODEL)
     assert changed(project, lambda: project.write_study(threshold=0.2)) == [False, False, True]
-    assert changed(project, lambda: append(project.path("siq/regression.py"))) == [False, False, True]
-    assert changed(project, lambda: append(project.path("siq/answer.py"))) == [False, False, False]
+    assert changed(project, lambda: append(project.path("siq/networks/regression.py"))) == [
+        False,
+        False,
+        True,
+    ]
+    assert changed(project, lambda: append(project.path("siq/report/sentences.py"))) == [False, False, False]
     card = project.path("config/systems/archetype3d.yaml")
     renamed = card.read_text().replace("Archetypal model", "Renamed model")
     assert changed(project, lambda: card.write_text(renamed)) == [False, False, False]
-    assert changed(project, lambda: os.utime(project.path("siq/simulate.py"))) == [False, False, False]
+    assert changed(project, lambda: os.utime(project.path("siq/dynamics/simulation.py"))) == [
+        False,
+        False,
+        False,
+    ]
     assert changed(project, lambda: project.write_study(threshold=0.2, steps=130)) == [False, True, True]
 
 
@@ -65,7 +73,8 @@ def test_a_rule_names_every_module_that_its_script_imports(script):
         if line.startswith((f"{ROOT}/siq/", f"{ROOT}/workflow/"))
     }
     assert used, "the script imports nothing of the project"
-    assert used <= set(code_digest(ROOT, script))
+    # How the interpreter was started changes nothing of what it computes.
+    assert used - {"workflow/warm.py"} <= set(code_digest(ROOT, script))
 
 
 def wait_for(pattern, process, *, within, seconds=120):

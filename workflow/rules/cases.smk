@@ -1,5 +1,5 @@
 # Helpers of the rules for studies of mismatch: cases, and their files.
-from siq.benchmarks import BENCHMARKS
+from siq.data.public_recordings import BENCHMARKS
 from workflow.cases import Cases
 
 MISMATCH_TABLES = ["curves", "candidates", "held_out", "forces", "noise"]

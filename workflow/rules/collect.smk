@@ -7,9 +7,9 @@ rule collect:
         rrmse=all_runs("results/{study}/runs/{run}/rrmse.parquet"),
         prediction=all_runs("results/{study}/runs/{run}/prediction.parquet"),
         certificates=all_runs("results/{study}/runs/{run}/certificates.parquet"),
-        landscapes=of_landscapes("results/{study}/runs/{run}/landscape.parquet"),
+        landscape=of_landscapes("results/{study}/runs/{run}/landscape.parquet"),
         degrees=of_landscapes("results/{study}/runs/{run}/degrees.parquet"),
-        histories=all_blocks("results/{study}/training/{block}/history.parquet"),
+        training=all_blocks("results/{study}/training/{block}/history.parquet"),
         outcomes=all_outcomes,
         published=published_if_any,
     output:

@@ -5,9 +5,28 @@ from functools import cache
 from pathlib import Path
 
 from siq.errors import InputError
-from siq.study import load_published
+from siq.report.settings import (
+    FiguresSettings,
+    LandscapeFiguresSettings,
+    PageSettings,
+    ReproductionSettings,
+)
+from siq.steps.draw import DrawSettings
+from siq.steps.escapes import EscapesSettings
+from siq.steps.identify import IdentifySettings
+from siq.steps.invariant import InvariantSettings
+from siq.steps.landscape import LandscapeSettings
+from siq.steps.landscape_errors import LandscapeErrorsSettings
+from siq.steps.of_study import card_content
+from siq.steps.reference import ReferenceSettings
+from siq.steps.refine import RefineSettings
+from siq.steps.regress import RegressSettings
+from siq.steps.score import ScoreSettings
+from siq.steps.train import TrainSettings
+from siq.study.study import load_published
 from workflow.code_digest import code_digest
 from workflow.settings import Studies, find_resource, prepare_environment
+from workflow.warm import start
 
 
 def say_and_stop(error):
@@ -64,9 +83,19 @@ def statistics_studies():
     return STUDIES.default_names()
 
 
-def parameters(*keys):
-    """Params function: the named parts of the study, so that only their change reruns a rule."""
-    return lambda wildcards: study_of(wildcards).parameters(*keys)
+def settings_of(cls):
+    """Params function: the settings of a step as plain data, so that only their change reruns a rule."""
+    return lambda wildcards: study_of(wildcards).settings(cls)
+
+
+def card_says(wildcards):
+    """Params function: what a simulation takes from the card, so that another title reruns nothing."""
+    return card_content(study_of(wildcards).system)
+
+
+def exact_answer(wildcards):
+    """Params function: the card's exact answer, which scoring alone depends on."""
+    return study_of(wildcards).exact()
 
 
 def code(script):
@@ -86,6 +115,16 @@ def all_runs(pattern):
     )
 
 
+def has_networks(wildcards):
+    """Whether the study asks for networks."""
+    return study_of(wildcards).study.training is not None
+
+
+def of_networks(files):
+    """Input function: files of studies that ask for networks, none for others."""
+    return lambda wildcards: files(wildcards) if has_networks(wildcards) else []
+
+
 def of_landscapes(pattern):
     """Input function: a file of every run where the study asks for its landscape, otherwise none."""
 
@@ -97,9 +136,11 @@ def of_landscapes(pattern):
 
 
 def all_blocks(pattern):
-    """Input function: one file for every block of runs that train side by side."""
-    return lambda wildcards: expand(
-        pattern, study=wildcards.study, block=study_of(wildcards).block_names()
+    """Input function: one file for every block of runs that train side by side, where networks are asked for."""
+    return of_networks(
+        lambda wildcards: expand(
+            pattern, study=wildcards.study, block=study_of(wildcards).block_names()
+        )
     )
 
 
@@ -176,7 +217,7 @@ def landscape_table(name):
 
 
 def networks_of_runs(name):
-    """Input function: for every run, a file of the block in which it trained."""
+    """Input function: for every run, a file of the block in which it trained, where networks are asked for."""
 
     def files(wildcards):
         study = study_of(wildcards)
@@ -185,14 +226,20 @@ def networks_of_runs(name):
             for run in range(study.study.runs)
         ]
 
-    return files
+    return of_networks(files)
 
 
 def of_block(name):
-    """Input function: a file of the block of runs that trained this run."""
-    return (
+    """Input function: a file of the block of runs that trained this run, where networks are asked for."""
+    return of_networks(
         lambda wildcards: f"results/{wildcards.study}/training/{block_of(wildcards)}/{name}"
     )
+
+
+def regression_of_run(wildcards):
+    """Input function: what the published method made of the networks of a run, where there are any."""
+    model = f"results/{wildcards.study}/runs/{wildcards.run}/regression.json"
+    return model if has_networks(wildcards) else []
 
 
 def all_outcomes(wildcards):
@@ -201,10 +248,11 @@ def all_outcomes(wildcards):
         "results/{study}/runs/{run}/draw.json": all_runs,
         "results/{study}/runs/{run}/identify.json": all_runs,
         "results/{study}/training/{block}/train.json": all_blocks,
-        "results/{study}/runs/{run}/regress.json": all_runs,
         "results/{study}/runs/{run}/refine.json": all_runs,
         "results/{study}/runs/{run}/score.json": all_runs,
     }
+    if has_networks(wildcards):
+        patterns["results/{study}/runs/{run}/regress.json"] = all_runs
     if study_of(wildcards).study.landscape is not None:
         patterns["results/{study}/runs/{run}/landscape.json"] = all_runs
     return [path for pattern, of in patterns.items() for path in of(pattern)(wildcards)]
@@ -219,11 +267,10 @@ def published_mesh_if_any(wildcards):
     return ancient(file)
 
 
-def reproduced_studies(wildcards):
-    """Params function: the parameters of all studies that the page speaks of, those of the paper too."""
+def reproduced_settings(wildcards):
+    """Params function: the settings of all studies that the page speaks of, those of the paper too."""
     names = [*REPRODUCED, "archetype3d-published", "resonator-published"]
-    keys = ("runs", "simulation", "training", "regression", "dynamics", "metric")
-    return {name: STUDIES[name].parameters(*keys) for name in names}
+    return {name: STUDIES[name].settings(ReproductionSettings) for name in names}
 
 
 def of_reproduced(method):
@@ -243,6 +290,7 @@ def figure_output(name):
 # Snakemake's own lock outlives a killed process and would ask for --unlock; the profile switches it off.
 # The kernel's lock goes with the process.
 LOCK = None
+WARM = None
 
 
 onstart:
@@ -253,3 +301,6 @@ onstart:
         say_and_stop(
             "Another snakemake is at work in this folder; wait for it, or stop it."
         )
+    globals()[
+        "WARM"
+    ] = start()  # held until the end of this process, and ends with it

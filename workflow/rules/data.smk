@@ -17,7 +17,8 @@ rule draw:
     threads: 1
     params:
         code=code("draw.py"),
-        study=parameters("seed", "recordings", "simulation", "dynamics", "metric"),
+        settings=settings_of(DrawSettings),
+        card=card_says,
     message:
         "{wildcards.study}, run {wildcards.run}: drawing trajectories"
     script:

@@ -16,14 +16,7 @@ rule identify:
     threads: 1
     params:
         code=code("identify.py"),
-        study=parameters(
-            "seed",
-            "recordings",
-            "simulation",
-            "identification",
-            "prediction",
-            "metric",
-        ),
+        settings=settings_of(IdentifySettings),
     message:
         "{wildcards.study}, run {wildcards.run}: identifying the vector field"
     script:

@@ -25,7 +25,8 @@ rule invariant:
     threads: 1
     params:
         code=code("invariant.py"),
-        study=parameters("seed", "invariant", "dynamics", "metric"),
+        settings=settings_of(InvariantSettings),
+        card=card_says,
         figure="results/{study}/figures/invariant",
     message:
         "{wildcards.study}: computing the invariant distribution"

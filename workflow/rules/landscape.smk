@@ -5,6 +5,7 @@ rule landscape:
     input:
         recordings="results/{study}/runs/{run}/recordings.parquet",
         field="results/{study}/runs/{run}/vector_field.json",
+        model="results/{study}/runs/{run}/model.json",
     output:
         quasipotential="results/{study}/runs/{run}/quasipotential.json",
         table="results/{study}/runs/{run}/landscape.parquet",
@@ -19,7 +20,7 @@ rule landscape:
     threads: 1
     params:
         code=code("landscape.py"),
-        study=parameters("seed", "recordings", "simulation", "landscape", "metric"),
+        settings=settings_of(LandscapeSettings),
     message:
         "{wildcards.study}, run {wildcards.run}: finding the landscape"
     script:
@@ -41,7 +42,8 @@ rule reference:
     threads: 1
     params:
         code=code("reference.py"),
-        study=parameters("seed", "dynamics", "metric", "landscape"),
+        settings=settings_of(ReferenceSettings),
+        card=card_says,
     message:
         "{wildcards.study}: computing references for the landscape"
     script:
@@ -70,7 +72,7 @@ rule landscape_errors:
     threads: 1
     params:
         code=code("landscape_errors.py"),
-        study=parameters("seed", "landscape", "metric"),
+        settings=settings_of(LandscapeErrorsSettings),
     message:
         "{wildcards.study}: holding the landscapes against the references"
     script:
@@ -93,7 +95,8 @@ rule escapes:
     threads: 1
     params:
         code=code("escapes.py"),
-        study=parameters("seed", "dynamics", "metric", "landscape"),
+        settings=settings_of(EscapesSettings),
+        card=card_says,
     message:
         "{wildcards.study}: simulating escapes"
     script:
@@ -125,7 +128,7 @@ rule landscape_figures:
     threads: 1
     params:
         code=code("landscape_figures.py"),
-        study=parameters("metric", "landscape"),
+        settings=settings_of(LandscapeFiguresSettings),
         folder="results/{study}/figures",
     message:
         "{wildcards.study}: drawing the landscape"

@@ -1,5 +1,5 @@
 # Helpers of the rules of the proof: its sets and batches, and cases that somebody else made.
-from workflow.proofs import load_proofs
+from workflow.proof.sets import load_proofs
 
 try:
     PROOF_SETS = load_proofs()

@@ -8,7 +8,7 @@ rule refine:
         identified="results/{study}/runs/{run}/identify.json",
         networks=of_block("networks.npz"),
         outcome=of_block("train.json"),
-        model="results/{study}/runs/{run}/regression.json",
+        model=regression_of_run,
     output:
         model="results/{study}/runs/{run}/model.json",
         outcome="results/{study}/runs/{run}/refine.json",
@@ -21,15 +21,7 @@ rule refine:
     threads: 1
     params:
         code=code("refine.py"),
-        study=parameters(
-            "seed",
-            "recordings",
-            "simulation",
-            "regression",
-            "refinement",
-            "certificate",
-            "metric",
-        ),
+        settings=settings_of(RefineSettings),
     message:
         "{wildcards.study}, run {wildcards.run}: refining and certifying the formulas"
     script:

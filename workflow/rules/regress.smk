@@ -18,7 +18,7 @@ rule regress:
     threads: 1
     params:
         code=code("regress.py"),
-        study=parameters("recordings", "simulation", "regression", "metric"),
+        settings=settings_of(RegressSettings),
     message:
         "{wildcards.study}, run {wildcards.run}: regressing formulas"
     script:

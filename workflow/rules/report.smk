@@ -27,15 +27,9 @@ rule figures:
     threads: 1
     params:
         code=code("figures.py"),
-        study=parameters(
-            "seed",
-            "metric",
-            "dynamics",
-            "exact",
-            "simulation",
-            "recordings",
-            "regression",
-        ),
+        settings=settings_of(FiguresSettings),
+        card=card_says,
+        exact=exact_answer,
         folder="results/{study}/figures",
     message:
         "{wildcards.study}: drawing the figures"
@@ -79,26 +73,9 @@ rule page:
     params:
         code=code("page.py"),
         command=lambda wildcards: study_of(wildcards).command(),
-        study=parameters(
-            "name",
-            "title",
-            "system",
-            "recordings",
-            "runs",
-            "seed",
-            "published",
-            "simulation",
-            "identification",
-            "training",
-            "regression",
-            "refinement",
-            "certificate",
-            "invariant",
-            "landscape",
-            "metric",
-            "dynamics",
-            "exact",
-        ),
+        settings=settings_of(PageSettings),
+        card=card_says,
+        exact=exact_answer,
     message:
         "{wildcards.study}: writing the report"
     script:

@@ -23,7 +23,7 @@ rule reproduction:
     params:
         code=code("reproduction.py"),
         names=REPRODUCED,
-        studies=reproduced_studies,
+        settings=reproduced_settings,
     message:
         "writing the page of the reproduction"
     script:

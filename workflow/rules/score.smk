@@ -22,9 +22,9 @@ rule score:
     threads: 1
     params:
         code=code("score.py"),
-        study=parameters(
-            "seed", "dynamics", "metric", "exact", "simulation", "regression"
-        ),
+        settings=settings_of(ScoreSettings),
+        card=card_says,
+        exact=exact_answer,
     message:
         "{wildcards.study}, run {wildcards.run}: scoring"
     script:

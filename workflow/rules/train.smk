@@ -18,7 +18,7 @@ rule train:
     threads: 1
     params:
         code=code("train.py"),
-        study=parameters("seed", "recordings", "simulation", "training", "metric"),
+        settings=settings_of(TrainSettings),
     message:
         "{wildcards.study}, runs {wildcards.block}: training the networks"
     script:

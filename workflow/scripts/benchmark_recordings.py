@@ -1,9 +1,13 @@
 """The table of recordings of a public benchmark, from its file as downloaded."""
 
+from workflow.warm import run_warm
+
+run_warm()
+
 from typing import Any
 
-from siq.benchmarks import BENCHMARKS
-from siq.recordings import write_recordings
+from siq.data.public_recordings import BENCHMARKS
+from siq.data.recordings import write_recordings
 from step import job
 
 

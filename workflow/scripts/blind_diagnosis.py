@@ -1,16 +1,18 @@
 """Diagnose the cases of a batch. Nothing here knows of keys, seeds, or how cases are made."""
 
+from workflow.warm import run_warm
+
+run_warm()
+
 import json
 import logging
-import math
 import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from siq.files import whole_file
-from siq.mismatch.case import read_case, solve_case
+from siq.files.whole import whole_file
+from siq.mismatch.case import read_case
+from siq.mismatch.diagnosis import solve_case
 from step import job
 
 LOGGER = logging.getLogger(__name__)
@@ -21,10 +23,10 @@ def diagnosed(folder: Path) -> dict[str, Any]:
     begin = time.perf_counter()
     verdict, card, failure = None, "", ""
     try:
-        outcome = solve_case(
+        diagnosis = solve_case(
             read_case(folder / "system.yaml", folder / "recordings.parquet", folder / "study.yaml")
         )
-        verdict, card = plain(outcome.verdict), outcome.card
+        verdict, card = diagnosis.statement.as_data(), diagnosis.to_card()
     except Exception as error:
         LOGGER.exception("%s failed", folder.name)
         failure = f"{type(error).__name__}: {error}"
@@ -35,17 +37,6 @@ def diagnosed(folder: Path) -> dict[str, Any]:
         "seconds": time.perf_counter() - begin,
         "failure": failure,
     }
-
-
-def plain(value: Any) -> Any:
-    """The same as JSON has it; numbers that are not finite become null."""
-    if isinstance(value, dict):
-        return {str(key): plain(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(each) for each in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def main(snakemake: Any) -> None:

@@ -1,12 +1,16 @@
 """Join the scores of all batches in one table."""
 
+from workflow.warm import run_warm
+
+run_warm()
+
 from typing import Any
 
 import pandas as pd
 
-from siq.tables import read_table, write_table
+from siq.study.tables import read_table, write_table
 from step import job
-from workflow.scoring import score_table
+from workflow.proof.scoring import score_table
 
 
 def main(snakemake: Any) -> None:

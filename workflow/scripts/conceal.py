@@ -1,13 +1,17 @@
 """Conceal effects in the cases of a batch; of their keys only the digests are left."""
 
+from workflow.warm import run_warm
+
+run_warm()
+
 import json
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from siq.files import whole_file
+from siq.files.whole import whole_file
 from step import job
-from workflow.batches import write_batch
+from workflow.proof.batches import write_batch
 
 
 def main(snakemake: Any) -> None:

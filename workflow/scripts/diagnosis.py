@@ -1,13 +1,23 @@
 """Diagnose one case: where a simulation and recordings differ, and what was left out."""
 
+from workflow.warm import run_warm
+
+run_warm()
+
 import json
+import logging
 from typing import Any
 
-from siq.errors import InputError, NumericalFailure
-from siq.files import whole_file
-from siq.mismatch.case import read_case, solve_case, tables_of
-from siq.tables import write_table
+from siq.errors import NumericalFailure
+from siq.files.whole import whole_file
+from siq.mismatch.case import read_case
+from siq.mismatch.diagnosis import solve_case
+from siq.mismatch.tables import tables_of, tables_of_failure
+from siq.mismatch.verdict import statement_of_failure
+from siq.study.tables import write_table
 from step import job
+
+LOGGER = logging.getLogger(__name__)
 
 
 def main(snakemake: Any) -> None:
@@ -15,19 +25,20 @@ def main(snakemake: Any) -> None:
     study = snakemake.input.get("study")
     case = read_case(snakemake.input.card, snakemake.input.recordings, study or None)
     try:
-        outcome = solve_case(case)
-    except NumericalFailure as error:
-        raise InputError(
-            snakemake.input.card, "", f"the simulation cannot be fitted to the recordings: {error}",
-            "begin with parameters and a domain that are closer to the system",
-        ) from None  # fmt: skip
-    for name, table in tables_of(case, outcome).items():
+        diagnosis = solve_case(case)
+        statement, tables = diagnosis.statement, tables_of(diagnosis)
+        after, recalibrated = diagnosis.augmented, diagnosis.recalibrated
+    except NumericalFailure as error:  # which is a verdict, too: the page says what happened
+        LOGGER.exception("no fit has a result")
+        statement, tables = statement_of_failure(str(error)), tables_of_failure(case)
+        after = recalibrated = case.system
+    for name, table in tables.items():
         write_table(snakemake.output[name], table)
-    for name, card in (("system", outcome.card), ("recalibrated", outcome.recalibrated)):
+    for name, system in (("system", after), ("recalibrated", recalibrated)):
         with whole_file(snakemake.output[name]) as partial:
-            partial.write_text(card, encoding="utf-8")
+            partial.write_text(system.to_card(), encoding="utf-8")
     with whole_file(snakemake.output.verdict) as partial:
-        text = json.dumps(outcome.verdict, indent=1, ensure_ascii=False, allow_nan=False)
+        text = json.dumps(statement.as_data(), indent=1, ensure_ascii=False, allow_nan=False)
         partial.write_text(text + "\n", encoding="utf-8")
 
 

@@ -1,5 +1,9 @@
 """Figures of a diagnosis: the fit, what is missing and where, the candidates, and escape times."""
 
+from workflow.warm import run_warm
+
+run_warm()
+
 from pathlib import Path
 from typing import Any
 
@@ -8,19 +12,20 @@ import pandas as pd
 import sympy
 from matplotlib.figure import Figure
 
-from siq.expressions import compile_formulas
-from siq.mismatch.cards import load_model
-from siq.mismatch.model import Model, symbol
-from siq.plots.mismatch import plot_candidates, plot_curves, plot_escapes, plot_held_out, plot_missing
-from siq.plots.saving import save_figure
-from siq.plots.style import sentence_figure
-from siq.tables import read_table
+from siq.dynamics.cards import load_system
+from siq.dynamics.dynamics import Dynamics
+from siq.dynamics.formulas import compile_formulas
+from siq.dynamics.parametric import symbol
+from siq.report.plots.mismatch import plot_candidates, plot_curves, plot_escapes, plot_held_out, plot_missing
+from siq.report.plots.saving import save_figure
+from siq.report.plots.style import sentence_figure
+from siq.study.tables import read_table
 from step import job, read_json
 
 
-def units_of(model: Model) -> dict[str, str]:
+def units_of(model: Dynamics) -> dict[str, str]:
     """Units of states, inputs and outputs, as far as they are known."""
-    units = dict(zip(model.states, model.state_units, strict=True))
+    units = dict(zip(model.states, model.units, strict=True))
     units |= {entry.name: entry.unit for entry in model.inputs}
     return units | {name: units[str(formula)] for name, formula in model.outputs if str(formula) in units}
 
@@ -36,7 +41,7 @@ def plane(states: list[str], curves: pd.DataFrame, place: dict[str, Any] | None)
     return order[0], order[1]
 
 
-def added_terms(after: Model, before: Model, table: pd.DataFrame) -> dict[str, np.ndarray]:
+def added_terms(after: Dynamics, before: Dynamics, table: pd.DataFrame) -> dict[str, np.ndarray]:
     """What the final simulation has beyond the card's, at states, where that is a function of them alone."""
     values = {symbol(entry.name): sympy.Float(entry.value, 17) for entry in after.parameters}
     symbols = [symbol(name) for name in before.states]
@@ -51,7 +56,7 @@ def added_terms(after: Model, before: Model, table: pd.DataFrame) -> dict[str, n
 
 
 def missing_map(
-    before: Model, after: Model, forces: pd.DataFrame, curves: pd.DataFrame, verdict: dict[str, Any]
+    before: Dynamics, after: Dynamics, forces: pd.DataFrame, curves: pd.DataFrame, verdict: dict[str, Any]
 ) -> Figure:
     """The missing part over the plane of the two most relevant states."""
     if verdict["location"] is None:
@@ -78,7 +83,7 @@ def missing_map(
 def main(snakemake: Any) -> None:
     """Run as a rule's script."""
     source, folder = snakemake.input, Path(snakemake.params.folder)
-    verdict, before, after = read_json(source.verdict), load_model(source.card), load_model(source.system)
+    verdict, before, after = read_json(source.verdict), load_system(source.card), load_system(source.system)
     curves, place = read_table(source.curves), verdict["location"]
     named = None if place is None else (", ".join(place["equations"]), place["coordinate"])
     units, time_unit = units_of(before), before.time_unit

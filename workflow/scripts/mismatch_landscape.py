@@ -1,5 +1,9 @@
 """What left-out physics, or other parameters, do to the wells of a system."""
 
+from workflow.warm import run_warm
+
+run_warm()
+
 import json
 from pathlib import Path
 from typing import Any
@@ -7,10 +11,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from siq.documents import read_document, validate
+from siq.dynamics.cards import load_system
 from siq.errors import NumericalFailure
-from siq.files import whole_file
-from siq.mismatch.cards import load_model
+from siq.files.whole import whole_file
 from siq.mismatch.consequences import (
     ESCAPE_COLUMNS,
     WELLS_COLUMNS,
@@ -18,8 +21,7 @@ from siq.mismatch.consequences import (
     compare_landscapes,
     obstacle,
 )
-from siq.systems import SystemCard, diffusion_matrix
-from siq.tables import read_table, write_table
+from siq.study.tables import read_table, write_table
 from step import job, read_json
 
 COMPARED = {
@@ -34,15 +36,14 @@ def consequences(source: Any) -> Consequences | str:
     if verdict not in COMPARED:
         return f"The verdict is “{verdict}”: there are no two landscapes to compare."
     files = {"before": source.card, "recalibrated": source.recalibrated, "augmented": source.system}
-    models = {name: load_model(files[name]) for name in COMPARED[verdict]}
+    models = {name: load_system(files[name]) for name in COMPARED[verdict]}
     if reason := obstacle(list(models.values())):
         return reason
     names = list(next(iter(models.values())).states)
     states = read_table(source.forces)[names].to_numpy(dtype=float)
     states = states[np.isfinite(states).all(axis=1)]
-    diffusion = diffusion_matrix(validate(read_document(source.card), SystemCard).diffusion, len(names))
     try:
-        return compare_landscapes(models, states, diffusion=diffusion)
+        return compare_landscapes(models, states)
     except NumericalFailure as error:
         return f"There is no landscape to compare: {error}."
 

@@ -1,17 +1,21 @@
 """Write the report of a diagnosis: one page that needs nothing else."""
 
+from workflow.warm import run_warm
+
+run_warm()
+
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-from siq.files import whole_file
-from siq.mismatch.cards import load_model
+from siq.dynamics.cards import load_system
+from siq.files.whole import whole_file
 from siq.mismatch.dictionary import dictionary_of
-from siq.mismatch.findings import Findings
-from siq.mismatch.report import mismatch_page
 from siq.mismatch.study import MismatchStudy, load_mismatch_study
-from siq.tables import read_table
+from siq.report.mismatch_findings import Findings
+from siq.report.mismatch_page import mismatch_page
+from siq.study.tables import read_table
 from step import job, read_json
 
 
@@ -21,8 +25,8 @@ def main(snakemake: Any) -> None:
     study = load_mismatch_study(source.study) if source.get("study") else MismatchStudy()
     findings = Findings(
         verdict=read_json(source.verdict),
-        before=load_model(source.card),
-        after=load_model(source.system),
+        before=load_system(source.card),
+        after=load_system(source.system),
         dictionary=dictionary_of(without=study.without, further=study.mechanisms, file="the study"),
         candidates=read_table(source.candidates),
         figures={Path(path).stem: Path(path).read_bytes() for path in source.figures},

@@ -1,11 +1,15 @@
 """Make the keys of a batch again, after every diagnosis, and hold them against the published digests."""
 
+from workflow.warm import run_warm
+
+run_warm()
+
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 from step import job
-from workflow.batches import check_digests, read_digests, write_batch
+from workflow.proof.batches import check_digests, read_digests, write_batch
 
 
 def main(snakemake: Any) -> None:

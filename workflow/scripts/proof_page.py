@@ -1,19 +1,23 @@
 """The page of a proof: every target, what was measured, and the cases that count against it."""
 
+from workflow.warm import run_warm
+
+run_warm()
+
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 import yaml
 
-from siq.files import whole_file
-from siq.formatting import number_text
-from siq.plots.proof import plot_proof
-from siq.plots.saving import save_figure
-from siq.report import ReportContent, ReportFigure, ReportTable, render_report
-from siq.tables import read_table, write_table
+from siq.files.whole import whole_file
+from siq.numerics.number_text import number_text
+from siq.report.page import ReportContent, ReportFigure, ReportTable, render_report
+from siq.report.plots.proof import plot_proof
+from siq.report.plots.saving import save_figure
+from siq.study.tables import read_table, write_table
 from step import job
-from workflow.targets import STRONG, Target, failures_of, target_table, targets_of
+from workflow.proof.targets import STRONG, Target, failures_of, target_table, targets_of
 
 QUESTION = (
     "Does the diagnosis say rightly whether, where and in which way a simulation lacks physics? Each case is"

@@ -1,14 +1,18 @@
 """How far simulations of a public benchmark are off on its held-out recordings, in its own units."""
 
+from workflow.warm import run_warm
+
+run_warm()
+
 from typing import Any
 
 import pandas as pd
 
-from siq.benchmarks import BENCHMARKS
-from siq.mismatch.cards import load_model
+from siq.data.public_recordings import BENCHMARKS
+from siq.dynamics.cards import load_system
 from siq.mismatch.case import read_case
 from siq.mismatch.scores import root_mean_square
-from siq.tables import read_table, write_table
+from siq.study.tables import read_table, write_table
 from step import job
 
 
@@ -19,7 +23,7 @@ def main(snakemake: Any) -> None:
     noise = read_table(source.noise)
     rows = []
     for simulation, card in (("recalibrated", source.recalibrated), ("augmented", source.system)):
-        model = load_model(card)
+        model = load_system(card)
         own = noise[(noise["stage"] == "recalibrated") & (noise["kind"] == "measurement")]
         for score, window in one.score.items():
             errors = root_mean_square(model, kept, variance=own["variance"].to_numpy(float), window=window)

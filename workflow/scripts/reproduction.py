@@ -1,287 +1,46 @@
-"""One page that lists the paper's tables, figures and numbers, with ours beside them and the difference."""
+"""Write the page that has everything of the paper, with ours beside it: files in, one function, files out."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from workflow.warm import run_warm
+
+run_warm()
+
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-import pandas as pd
 import yaml
+from pydantic import TypeAdapter
 
-from invariant_page import invariant_tables, readable
-from landscape_page import errors_table
-from siq.field_file import read_field
-from siq.files import whole_file
-from siq.formatting import number_text
-from siq.model import read_model
-from siq.published import own_equations, published_decomposition
-from siq.randomness import generator
-from siq.report import (
-    ReportFigure,
-    ReportTable,
-    ReproductionContent,
-    ReproductionSection,
-    render_reproduction,
-)
-from siq.reproduction import (
-    HEADINGS,
-    OURS,
-    Place,
-    attractor_rows,
-    gradient_coefficients,
-    load_contents,
-    load_parameters,
-    numbers,
-    parameter_table,
-    shown,
-)
-from siq.scoring import summary_row, summary_table
-from siq.study import PublishedFigure, load_published
-from siq.systems import System, load_system
-from siq.tables import as_table, read_table
-from siq.vector_field import VectorField
-from step import METHODS, job, shown_formula
-
-POINTS = 20_000  # of the domain, on which published formulas are held against their own equations
-SHOWN = 60  # rows of a table
-EXPLAINED = {
-    "ours": "mean and standard deviation over the runs, of formulas that solve the Hamilton–Jacobi equation",
-    "regression": "the same by the published method, from our short training",
-}
-
-
-@dataclass(frozen=True)
-class Results:
-    """What a study left behind, with what was published of it."""
-
-    name: str
-    folder: Path
-    parameters: Mapping[str, Any]
-    figures: Mapping[str, PublishedFigure]
-    system: System
-
-    def table(self, name: str) -> pd.DataFrame:
-        """One of its tables."""
-        return read_table(self.folder / "tables" / f"{name}.parquet")
-
-    @cached_property
-    def models(self) -> list[str]:
-        """Formulas of every run."""
-        return [str(path) for path in sorted(self.folder.glob("runs/*/model.json"))]
-
-    @cached_property
-    def summary(self) -> pd.DataFrame:
-        """Every figure over the runs, those included that the study's own summary leaves out."""
-        gradient = gradient_coefficients(self.table("coefficients"), self.system.states)
-        further = summary_table(gradient, self.table("rrmse"), as_table("prediction", []), self.figures)
-        further = further[further["quantity"].str.startswith("dV_")]
-        records = map(read_field, sorted(self.folder.glob("runs/*/vector_field.json")))
-        fields = [record.found.field for record in records if record is not None]
-        exact = VectorField(self.system.symbols, self.system.equations)
-        rows = [*attractor_rows(self.figures, fields, exact), *self._counts(), *self._constants()]
-        return pd.concat([self.table("summary"), further, as_table("summary", rows)], ignore_index=True)
-
-    def _counts(self) -> list[dict[str, object]]:
-        simulation = self.parameters["simulation"]
-        states = 2.0 * simulation["trajectories"] * simulation["pairs"]
-        hours = self.table("timings")["seconds"].sum() / 3600
-        return [
-            summary_row(METHODS[1], name, pd.Series([value]), self.figures)
-            for name, value in (("data_points", states), ("processor_hours", hours))
-        ]
-
-    def _constants(self) -> list[dict[str, object]]:
-        invariant = self.table("invariant")
-        return [
-            summary_row(row["method"], f"Z:{row['intensity']:g}", pd.Series([row["bessel"]]), self.figures)
-            for _, row in invariant.iterrows()
-        ]
-
-
-def equations_table(study: Results) -> ReportTable | None:
-    """The published formulas, and ours of one run, against what they should fulfil."""
-    published = published_decomposition(study.figures, study.system.symbols, study.system.diffusion)
-    if published is None:
-        return None
-    low, high = study.system.domain.T
-    x = generator(0, "equations").uniform(low, high, (POINTS, study.system.dimension))
-    potential = published.evaluate(np.ascontiguousarray(x.T))[0]
-    x = x[potential < potential.min() + study.parameters["regression"]["level"]]
-    exact = VectorField(study.system.symbols, study.system.equations)(x)
-    found = {"published": own_equations(published, x, exact)}
-    run, _ = shown_formula(study.table("rrmse"), study.models)
-    for method, one in read_model(study.models[run or 0])[0].items():
-        if one.potential is not None:
-            found[f"{method}, run {run or 0}"] = own_equations(one, x, exact)
-    frame = pd.DataFrame([{"formulas": name} | values for name, values in found.items()])
-    return ReportTable(
-        f"The formulas against their own equations, where the published V lies below the level of the"
-        f" regression: {len(x)} points.",
-        frame.rename(columns={"vector_field": "vector field"}),
-        {
-            "orthogonality": "rms of ∇V·g over the rms of ∣∇V∣∣g∣",
-            "vector field": "rms of −D∇V + g − f over the rms of f, the exact one",
-        },
-    )
-
-
-def timing_table(studies: Mapping[str, Results]) -> ReportTable:
-    """Processor time of every study, in hours."""
-    columns: dict[str, pd.Series] = {}
-    for name, study in studies.items():
-        seconds = study.table("timings")
-        hours = seconds.groupby("step", sort=False)["seconds"].sum() / 3600
-        runs = seconds["run"].nunique()
-        columns[f"{name}, {runs} runs"] = pd.concat(
-            [pd.Series({"all": hours.sum(), "one run": hours.sum() / runs}), hours]
-        )
-    order = list(dict.fromkeys(step for column in columns.values() for step in column.index))
-    table = pd.DataFrame(columns).reindex(order).rename_axis("hours").reset_index()
-    return ReportTable("Processor time as measured, in hours, by study and step.", table)
-
-
-class Page:
-    """What stands beside each place of the paper."""
-
-    def __init__(self, studies: Mapping[str, Results], parameters: pd.DataFrame) -> None:
-        self.studies = studies
-        self.parameters = parameters
-
-    def further_table(self, name: str, study: Results | None) -> list[ReportTable]:
-        """One of the tables that a place asks for beside its numbers."""
-        if name == "parameters":
-            return [ReportTable("Parameters as stated, and those of our studies.", self.parameters)]
-        if name == "timings":
-            return [timing_table(self.studies)]
-        assert study is not None  # the schema's other tables are of a study; see the test of the contents
-        folder = study.folder / "tables"
-        if name == "own_equations":
-            return [one for one in [equations_table(study)] if one is not None]
-        if name in ("invariant", "well_shares"):
-            found = invariant_tables(study.table("invariant"), study.table("well_shares"), folder)
-            return found[:1] if name == "invariant" else found[1:]
-        if name == "landscape_errors":
-            return [errors_table(study.table("landscape_errors"), folder)]
-        if name == "escape":
-            caption = "Mean escape times: the law from what was identified, and direct simulations."
-            return [ReportTable(caption, readable(study.table("escape")), {}, f"{folder}/escape.csv")]
-        landscape = study.table("landscape")
-        wanted = (landscape["kind"] == "transition") == (name == "transitions")
-        first = landscape[wanted & (landscape["run"] == landscape["run"].min())]
-        caption = f"{name.capitalize()} of run {landscape['run'].min()}."
-        shown_here = readable(first.drop(columns=["run", "kind"] if name == "transitions" else "run"))
-        return [ReportTable(caption, shown_here, {}, f"{folder}/landscape.csv")]
-
-    def section(self, place: Place, table: pd.DataFrame) -> ReproductionSection:
-        """A place of the paper with ours beside it."""
-        study = self.studies[place.study] if place.study is not None else None
-        text = [f"In the paper: {place.says}", *([place.remark] if place.remark else [])]
-        tables = []
-        if len(table):
-            runs = study.parameters["runs"] if study is not None else 0
-            caption = (
-                f"Published ({'; '.join(table['source'].unique())}), and ours ({place.study}, {runs} runs)."
-            )
-            tables.append(ReportTable(caption, shown(table), EXPLAINED, "", SHOWN))
-        for name in place.tables:
-            tables += self.further_table(name, study)
-        figures = []
-        for picture in place.figures:
-            assert study is not None  # as for tables
-            image = (study.folder / "figures" / f"{picture}.png").read_bytes()
-            caption = f"Ours, study {place.study}: {picture.replace('_', ' ')}."
-            figures.append(ReportFigure(caption, f"{caption} {place.says}", image, "png"))
-        return ReproductionSection(place.place, text, tables, figures)
-
-
-def overview(places: Sequence[Place], tables: Sequence[pd.DataFrame]) -> ReportTable:
-    """Every place, with the largest deviation of its numbers from ours."""
-    rows = []
-    for place, table in zip(places, tables, strict=True):
-        names = dict.fromkeys(name.replace("_", " ") for name in (*place.figures, *place.tables))
-        row: dict[str, object] = {
-            "in the paper": place.place, "study": place.study or "", "shown beside": ", ".join(names),
-            "numbers": len(table),
-        }  # fmt: skip
-        for method, heading in zip(OURS, HEADINGS, strict=True):
-            row[heading] = np.nan
-            if f"{method} − published" in table:
-                away = table[f"{method} − published"].abs() / table["published"].abs().replace(0, np.nan)
-                row[heading] = away.max()
-        rows.append(row)
-    return ReportTable(
-        "Everything that the paper has, and what stands beside it below.",
-        pd.DataFrame(rows),
-        {
-            "numbers": "of the paper; all are in results/reproduction.csv",
-            "ours": "largest relative difference of these numbers from ours; exact answers tell whose it is",
-            "regression": "the same by the published method, from our short training",
-        },
-        rows_shown=SHOWN,
-    )
-
-
-def certified(study: Results) -> str:
-    """How many runs are certified, and how far from the truth they are."""
-    rrmse = study.table("rrmse")
-    mine = rrmse[rrmse["method"] == "refined"]
-    said = f"{study.name}: {int(mine['certified'].sum())} of {len(mine)} runs are certified"
-    errors = mine["rrmse"].dropna()
-    if len(errors):
-        mean, worst = (number_text(value, decimals=1) for value in (errors.mean(), errors.max()))
-        said += f"; relative error of the coefficients of U {mean} in the mean and {worst} at worst"
-    return said + "."
-
-
-def main(snakemake: Any) -> None:
-    """Run as a rule's script."""
-    source, parameters = snakemake.input, snakemake.params.studies
-    studies = {
-        name: Results(
-            name, Path(summary).parents[1], parameters[name], load_published(published).figures,
-            load_system(card),
-        )
-        for name, summary, published, card in zip(
-            snakemake.params.names, source.summaries, source.published, source.cards, strict=True
-        )
-    }  # fmt: skip
-    plain = {
-        name: dict(one) | {"domain": one["dynamics"][1]}
-        for name, one in parameters.items()
-        if one["dynamics"]
-    }
-    page = Page(studies, parameter_table(load_parameters(source.parameters), plain))
-    places = load_contents(source.contents).places
-    tables = [
-        numbers(studies[one.study].summary, one.quantities) if one.study is not None else pd.DataFrame()
-        for one in places
-    ]
-    every = [
-        table.assign(place=one.place, study=one.study)
-        for one, table in zip(places, tables, strict=True)
-        if len(table)
-    ]
-    content = ReproductionContent(
-        title="Everything in the paper, and ours beside it",
-        introduction=[
-            "Bo Lin and Pierpaolo Belardinelli, Sparse identification of quasipotentials via a combined"
-            " data-driven method: every table, figure and number, in the paper's order and numbered as in its"
-            " LaTeX source, with ours and the difference. What was published is scored; no method reads it.",
-            *(certified(study) for study in studies.values()),
-        ],
-        overview=[overview(places, tables)],
-        contradictions=yaml.safe_load(Path(source.contradictions).read_text(encoding="utf-8")),
-        sections=[page.section(one, table) for one, table in zip(places, tables, strict=True)],
-        commands=["snakemake --cores 2 reproduce"],
-    )
-    with whole_file(snakemake.output.csv) as partial:
-        pd.concat(every, ignore_index=True).to_csv(partial, index=False)
-    with whole_file(snakemake.output.html) as partial:
-        partial.write_text(render_reproduction(content), encoding="utf-8")
-
+from siq.dynamics.cards import load_system
+from siq.files.whole import whole_file
+from siq.report.page import render_reproduction
+from siq.report.reproduction_page import Paper, Results, reproduction_page
+from siq.report.settings import ReproductionSettings
+from siq.study.reproduction import load_contents, load_parameters
+from siq.study.study import load_published
+from step import job
 
 if __name__ == "__main__":
-    with job(snakemake):  # type: ignore[name-defined]  # noqa: F821 (Snakemake puts it here)
-        main(snakemake)  # type: ignore[name-defined]  # noqa: F821
+    with job() as now:
+        source = now.input
+        settings = TypeAdapter(dict[str, ReproductionSettings]).validate_python(now.params.settings)
+        studies = {
+            name: Results(
+                name,
+                Path(summary).parents[1],
+                settings[name],
+                load_published(published).figures,
+                load_system(card),
+            )
+            for name, summary, published, card in zip(
+                now.params.names, source.summaries, source.published, source.cards, strict=True
+            )
+        }
+        paper = Paper(
+            load_contents(source.contents).places,
+            load_parameters(source.parameters),
+            yaml.safe_load(Path(source.contradictions).read_text(encoding="utf-8")),
+        )
+        content, table = reproduction_page(paper, studies, settings, command="snakemake --cores 2 reproduce")
+        with whole_file(now.output.csv) as partial:
+            table.to_csv(partial, index=False)
+        with whole_file(now.output.html) as partial:
+            partial.write_text(render_reproduction(content), encoding="utf-8")

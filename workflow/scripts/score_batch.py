@@ -1,12 +1,16 @@
 """Score the diagnoses of a batch."""
 
+from workflow.warm import run_warm
+
+run_warm()
+
 import json
 from pathlib import Path
 from typing import Any
 
-from siq.tables import write_table
+from siq.study.tables import write_table
 from step import job
-from workflow.scoring import Answer, score_case, score_table
+from workflow.proof.scoring import Answer, score_case, score_table
 
 
 def batch_answers(path: str | Path) -> dict[str, Answer]:

@@ -1,11 +1,15 @@
 """Score the diagnosis of a case that somebody else made."""
 
+from workflow.warm import run_warm
+
+run_warm()
+
 from pathlib import Path
 from typing import Any
 
-from siq.tables import write_table
+from siq.study.tables import write_table
 from step import job, read_json
-from workflow.scoring import Answer, score_case, score_table
+from workflow.proof.scoring import Answer, score_case, score_table
 
 
 def answer_of(verdict: str | Path, card: str | Path) -> Answer:

@@ -1,0 +1,46 @@
+"""What an installation without extras can do, from a folder that is not the repository's."""
+
+import sys
+from dataclasses import replace
+from importlib import metadata, resources
+from pathlib import Path
+
+import numpy as np
+import sympy
+
+import siq
+from siq.data.recordings import snapshot_pairs
+from siq.identify.identification import IdentificationOptions, identify_vector_field
+from siq.identify.library import candidate_library
+
+installed = Path(siq.__file__).resolve()
+assert not installed.is_relative_to(Path(sys.argv[1]).resolve()), f"{installed} is not the installed one"
+assert siq.__version__ == metadata.version("quasipotential")
+for package, name in (
+    ("mismatch", "mechanisms.yaml"),
+    ("report", "templates/base.html.j2"),
+    (".", "py.typed"),
+):
+    assert resources.files("siq").joinpath(package, name).is_file(), f"{package}/{name} is not in the wheel"
+
+# A double well, simulated, written as CSV, read back, and identified.
+x, y = sympy.symbols("x y", real=True)
+domain = np.array([[-2.0, 2.0], [-1.0, 1.0]])
+well = replace(siq.Dynamics.of((x, y), (x - x**3, -y)), domain=domain)
+options = siq.SimulationOptions(trajectories=20, pairs=10)
+made = siq.simulate_snapshots(well, options=options, generator=np.random.default_rng(0))
+rows = np.column_stack([made.recording, made.t, made.values])
+np.savetxt("trajectories.csv", rows, delimiter=",", header="recording,t,x,y", comments="", fmt="%.17g")
+pairs = snapshot_pairs(siq.read_recordings("trajectories.csv"), pair_step=options.pair_step)
+library = candidate_library(["x", "y"], degree=3)
+found = identify_vector_field(library, pairs, options=IdentificationOptions(degree=3))
+terms = {library.names[k]: round(float(found.coefficients[k, i]), 5) for i, k in found.support if i == 0}
+assert terms == {"x": 1.0, "x**3": -1.0}, terms
+
+try:
+    siq.train  # noqa: B018
+except siq.MissingExtra as error:
+    assert "pip install 'quasipotential[networks]'" in str(error), error
+else:
+    raise AssertionError("torch is in the core")
+print(f"siq {siq.__version__} identifies dx/dt = {terms} from an installation without extras")

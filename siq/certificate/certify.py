@@ -1,0 +1,340 @@
+"""Certificates of the formulas of a run: which tests apply to each, and on which points.
+
+`siq.certificate.tests` has the tests themselves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from siq.certificate.tests import (
+    Candidate,
+    CertificateOptions,
+    Verdict,
+    check_agreement,
+    check_branch,
+    check_descent,
+    check_error,
+    check_hamilton_jacobi,
+    check_identity,
+    stated_error,
+)
+from siq.dynamics.formulas import compile_formulas
+from siq.dynamics.phase_portrait import PhasePortrait
+from siq.identify.identification import IdentifiedField
+from siq.identify.library import CandidateLibrary
+from siq.potential.bases import LibraryBasis
+from siq.potential.refinement import Refined
+from siq.potential.symbolic import SymbolicDecomposition
+from siq.potential.well import Well
+from siq.reference.sheets import adapted_fan, first_caustic
+
+ALONE = "only one of the two routes that the study names led to a formula"
+NOTICEABLE = 1e-3  # a stated error above this is worth an explanation
+FAN = 512  # characteristics in search of a caustic
+FAN_TOLERANCE = 1e-7  # of their steps: what is said of a caustic has four digits
+FAN_SPACING = 0.1  # of points along them, the level being at 1: a caustic between two of them is located
+HARMLESS = 1e-6  # a difference of the routes that no error needs to explain
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Whether a method's formulas may be believed, and why.
+
+    Attributes
+    ----------
+    tests
+        By name.
+    error
+        Relative error of V that has to be stated; infinite where unknown.
+    reason
+        What refused it, or what to know of it, in words.
+    scope
+        ``region``: one formula for the recorded region; ``wells``: one for each attractor.
+    """
+
+    tests: Mapping[str, Verdict]
+    error: float
+    reason: str
+    scope: str = "region"
+
+    @property
+    def certified(self) -> bool:
+        """Whether every test passed."""
+        return bool(self.tests) and all(verdict.passed for verdict in self.tests.values())
+
+    def as_data(self) -> dict[str, Any]:
+        """As it stands in model.json."""
+        return {
+            "certified": self.certified,
+            "scope": self.scope,
+            "stated_error": float(self.error) if np.isfinite(self.error) else None,
+            "reason": self.reason,
+            "tests": {name: verdict.as_data() for name, verdict in self.tests.items()},
+        }
+
+
+def certify_formulas(
+    formulas: SymbolicDecomposition,
+    found: IdentifiedField,
+    portrait: PhasePortrait,
+    points: np.ndarray,
+    *,
+    options: CertificateOptions,
+    prediction: Verdict,
+    relative_error: float = 0.0,
+    wells: Sequence[Well] = (),
+    compared: bool = False,
+    seed: int = 0,
+) -> Certificate:
+    """Certificate of one formula for the whole region.
+
+    Parameters
+    ----------
+    formulas
+        V and g.
+    found, portrait
+        The independently identified f, and the phase portrait that follows from it.
+    points
+        Held-out states of the region for which the formula claims to hold, shape ``(n, d)``.
+    options
+        The limits.
+    prediction
+        The verdict on f.
+    relative_error
+        Relative standard error of V from the uncertainty of f.
+    wells
+        By the local route, to be compared with.
+    compared
+        Whether both routes were asked for: then a formula that only one of them found is refused.
+    seed
+        Draws of f, and the points on which the error is estimated.
+    """
+    candidate = _of_formulas(formulas, points, portrait, relative_error)
+    return _certify(
+        candidate, found, portrait, options=options, prediction=prediction,
+        wells=wells, compared=compared, seed=seed,
+    )  # fmt: skip
+
+
+def certify_potential(
+    potential: np.ndarray,
+    library: CandidateLibrary,
+    found: IdentifiedField,
+    portrait: PhasePortrait,
+    points: np.ndarray,
+    *,
+    options: CertificateOptions,
+    prediction: Verdict,
+    seed: int = 0,
+) -> Certificate:
+    """Certificate of V given by its coefficients over a library, shape ``(q,)``, with g = f + D∇V."""
+    basis = LibraryBasis(library, np.flatnonzero(potential))
+    own = potential[basis.chosen]
+    candidate = Candidate(
+        values=lambda x: basis.values(x) @ own,
+        gradients=lambda x: basis.gradients(x) @ own,
+        hessians=lambda x: basis.hessians(x) @ own,
+        circulatory=lambda x: found.dynamics.drift(x) + found.diffusion.push(x, basis.gradients(x) @ own),
+        points=points,
+        attractors=portrait.attractors,
+    )
+    return _certify(candidate, found, portrait, options=options, prediction=prediction, seed=seed)
+
+
+def _certify(
+    candidate: Candidate,
+    found: IdentifiedField,
+    portrait: PhasePortrait,
+    *,
+    options: CertificateOptions,
+    prediction: Verdict,
+    wells: Sequence[Well] = (),
+    compared: bool = False,
+    seed: int = 0,
+) -> Certificate:
+    tests = _common(candidate, found, options, seed)
+    tests["identity"] = check_identity(candidate, found, limit=options.identity)
+    error, worst = stated_error(candidate, found, seed=seed)
+    tests["error"] = check_error(error, limit=options.error)
+    if wells:
+        # The local route shares the error of f, and has the rest of its own.
+        own = [_error_of(well, found, portrait, seed)[0] for well in wells]
+        tests["agreement"] = check_agreement(
+            candidate.values, wells, _sublevel_points(wells),
+            limit=_explained(options, error, max(own)) + 6 * candidate.relative_error,
+        )  # fmt: skip
+    elif compared:
+        tests["agreement"] = Verdict(np.inf, 0.0, False, ALONE)
+    tests["prediction"] = prediction
+    return _conclude(tests, error, worst, portrait, "region")
+
+
+def certify_wells(
+    refined: Refined,
+    portrait: PhasePortrait,
+    *,
+    options: CertificateOptions,
+    prediction: Verdict,
+    compared: bool = True,
+    seed: int = 0,
+) -> Certificate:
+    """Certificate of one formula for each attractor, the worst of them deciding.
+
+    The Hessian of the local route is M by construction, so that its branch test passes by itself; what
+    tests it is the agreement with the network route, which does not know M.
+    """
+    found = refined.found
+    wells = refined.wells or refined.network_wells
+    tests: dict[str, Verdict] = {}
+    error, worst = (0.0, None) if wells else (np.inf, None)
+    for well in wells:
+        candidate = _of_well(well, portrait)
+        for name, verdict in _common(candidate, found, options, seed).items():
+            tests[name] = _worse(tests.get(name), verdict)
+        mine, place = _error_of(well, found, portrait, seed)
+        if mine >= error:
+            error, worst = mine, place
+    missing = len(portrait.attractors) - len(wells)
+    if missing or not wells:
+        reason = f"{missing} of {len(portrait.attractors)} attractors have no formula"
+        tests["branch"] = Verdict(np.inf, options.branch, False, reason)
+    tests["error"] = check_error(error, limit=options.error)
+    if refined.wells and refined.network_wells:
+        pairs = [
+            (one, two)
+            for one in refined.network_wells
+            for two in refined.wells
+            if np.array_equal(one.attractor, two.attractor)
+        ]
+        for one, two in pairs:
+            own = _error_of(one, found, portrait, seed)[0]
+            verdict = check_agreement(
+                one.values, [two], _sublevel_points([two]), limit=_explained(options, error, own)
+            )
+            tests["agreement"] = _worse(tests.get("agreement"), verdict)
+        if len(pairs) < len(portrait.attractors):
+            tests["agreement"] = Verdict(
+                np.inf, 0.0, False, "the network route found no formula for some well"
+            )
+    elif compared:
+        tests["agreement"] = Verdict(np.inf, 0.0, False, ALONE)
+    tests["prediction"] = prediction
+    return _conclude(tests, error, worst, portrait, "wells")
+
+
+def caustic_notes(
+    refined: Refined, portrait: PhasePortrait, error: float, *, seed: int = 0
+) -> tuple[str, ...]:
+    """Where characteristics cross below the saddle of a well, in words: no smooth V exists there.
+
+    Only sought where the stated error leaves room for one. A kink of V is no fault of the method, but no
+    polynomial follows it, and the error that is stated comes from there.
+    """
+    if not error > NOTICEABLE:
+        return ()
+    notes = []
+    for well in refined.wells or refined.network_wells:
+        fan = adapted_fan(
+            refined.found.dynamics, well.attractor, level=0.98 * well.level,
+            box=_widened(portrait.box), generator=np.random.default_rng(seed), most=FAN,
+            tolerance=FAN_TOLERANCE, spacing=FAN_SPACING,
+        )  # fmt: skip
+        caustic = first_caustic(fan)
+        if caustic is not None:
+            where = np.array2string(caustic.position, precision=4, suppress_small=True, separator=", ")
+            notes.append(
+                f"characteristics from the attractor {_place(well.attractor)} cross at a caustic from {where}"
+                f" on, where U = {2 * caustic.value:.4g}: V has no smooth form there, and no formula"
+                " follows it"
+            )
+    return tuple(notes)
+
+
+def _place(position: np.ndarray) -> str:
+    return np.array2string(position, precision=4, suppress_small=True, separator=", ")
+
+
+def _widened(box: np.ndarray) -> np.ndarray:
+    width = box[:, 1] - box[:, 0]
+    return np.stack([box[:, 0] - width / 4, box[:, 1] + width / 4], axis=1)
+
+
+def uncertified(reason: str) -> dict[str, Any]:
+    """The certificate of formulas that could not be tested."""
+    return {"certified": False, "scope": "region", "stated_error": None, "reason": reason, "tests": {}}
+
+
+def _common(
+    candidate: Candidate,
+    found: IdentifiedField,
+    options: CertificateOptions,
+    seed: int,
+) -> dict[str, Verdict]:
+    noise = 0.0
+    if not found.noise_free:  # V of thermal fluctuations: half the intensity
+        noise = 0.5 * found.diffusion.intensity(found.noise_rate)
+    return {
+        "hamilton_jacobi": check_hamilton_jacobi(candidate, found, limit=options.hamilton_jacobi),
+        "branch": check_branch(candidate, found, limit=options.branch, seed=seed),
+        "descent": check_descent(candidate, found, limit=options.descent, noise=noise),
+    }
+
+
+def _of_formulas(
+    formulas: SymbolicDecomposition, points: np.ndarray, portrait: PhasePortrait, relative_error: float
+) -> Candidate:
+    symbols, d = formulas.symbols, len(formulas.symbols)
+    second = [slope.diff(symbol) for slope in formulas.gradient for symbol in symbols]
+    hessian = compile_formulas(second, symbols)
+    together, gradient = formulas.evaluate, formulas.evaluate_gradient
+    return Candidate(
+        values=lambda x: together(np.ascontiguousarray(x.T))[0],
+        gradients=lambda x: gradient(np.ascontiguousarray(x.T)).T,
+        hessians=lambda x: hessian(np.ascontiguousarray(x.T)).T.reshape(-1, d, d),
+        circulatory=lambda x: together(np.ascontiguousarray(x.T))[1 : d + 1].T,
+        points=points,
+        attractors=portrait.attractors,
+        relative_error=relative_error,
+    )
+
+
+def _of_well(well: Well, portrait: PhasePortrait) -> Candidate:
+    mine = [one for one in portrait.attractors if np.array_equal(one.position, well.attractor)]
+    return Candidate(well.values, well.gradients, well.hessians, None, _sublevel_points([well])[0], mine)
+
+
+def _sublevel_points(wells: Sequence[Well]) -> list[np.ndarray]:
+    """Points of each well below nine tenths of its level: at the saddle itself V is stationary."""
+    return [well.points[well.values(well.points) < 0.9 * well.level] for well in wells]
+
+
+def _error_of(
+    well: Well, found: IdentifiedField, portrait: PhasePortrait, seed: int
+) -> tuple[float, np.ndarray | None]:
+    return stated_error(_of_well(well, portrait), found, seed=seed)
+
+
+def _explained(options: CertificateOptions, *errors: float) -> float:
+    """Difference of two routes that their errors explain; one that cannot be stated explains nothing."""
+    return HARMLESS + sum(min(error, options.error) for error in errors)
+
+
+def _worse(one: Verdict | None, two: Verdict) -> Verdict:
+    if one is None:
+        return two
+    return max(one, two, key=lambda verdict: (not verdict.passed, verdict.value / (verdict.limit or 1.0)))
+
+
+def _conclude(
+    tests: dict[str, Verdict], error: float, worst: np.ndarray | None, portrait: PhasePortrait, scope: str
+) -> Certificate:
+    fault = portrait.fault()
+    if fault is not None:
+        tests["branch"] = Verdict(np.inf, tests["branch"].limit, False, fault)
+    refused = [verdict.reason for verdict in tests.values() if not verdict.passed]
+    return Certificate(tests, error, "; ".join(dict.fromkeys(refused)), scope)

@@ -1,0 +1,230 @@
+"""Cells of recordings: which numbers, labels and units are in them.
+
+The columns come from `siq.data.formats`, whatever the format; here their cells are parsed, and the first
+one that cannot be used is found.
+"""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections.abc import Mapping
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from siq.errors import InputError
+
+Column: TypeAlias = "pa.Array | pa.ChunkedArray"
+
+# Text that holds a number, and what may follow as its unit: "1.2mm", "5 %", but "3 1/s" only after a space.
+_NUMBER = r"(?:[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?|[+-]?(?i:nan|infinity|inf))"
+_UNIT = r"(?:\s*[^\W\d_]|\s*[%°‰]|\s+1/)[^,;]*"
+
+
+class CellFault(NamedTuple):
+    """The first cell of a column that cannot be used; rows are counted from 1."""
+
+    row: int
+    column: str
+    fault: str
+    remedy: str
+
+
+def parse_numbers(file: str, name: str, cells: Column) -> tuple[np.ndarray, str | None, CellFault | None]:
+    """Turn the cells of a column into finite numbers.
+
+    Parameters
+    ----------
+    file, name
+        The file and the column, for messages.
+    cells
+        Numbers, or text that holds a number and possibly a unit: ``1.2 mm``.
+
+    Returns
+    -------
+    values : numpy.ndarray
+        Shape ``(n,)``, float64; only to be used where there is no fault.
+    unit : str or None
+        The unit that all cells carry.
+    fault : CellFault or None
+        The first cell that is missing, not finite, no number, or in another unit than the first row.
+
+    Raises
+    ------
+    InputError
+        When the column as a whole holds something other than numbers, such as dates.
+    """
+    if pa.types.is_dictionary(cells.type):
+        cells = cells.cast(cells.type.value_type)
+    unit, fault = None, None
+    if _is_text(cells.type):
+        cells, unit, fault = _split_units(name, cells)
+    elif not any(is_kind(cells.type) for is_kind in _NUMERIC):
+        raise InputError(
+            file, f"column {name}", f"it holds {cells.type}, not numbers", "write it as numbers in one unit"
+        )
+    try:
+        values = cells.cast(pa.float64()).to_numpy(zero_copy_only=False)
+    except pa.ArrowInvalid:
+        remedy = "subtract a constant, such as the time of the first sample"
+        raise InputError(file, f"column {name}", "its integers are too large to be exact", remedy) from None
+    finite = np.isfinite(values)
+    if not finite.all():
+        row = int(np.argmin(finite))
+        if fault is None or row + 1 < fault.row:
+            what = "missing (empty or NaN)" if np.isnan(values[row]) else "infinite"
+            fault = CellFault(
+                row + 1, name, f"the value is {what}", "remove the row or write a finite number"
+            )
+    return values, unit, fault
+
+
+def parse_labels(file: str, cells: Column) -> tuple[np.ndarray, tuple[str, ...], CellFault | None]:
+    """Give every label of the column ``recording`` a number, in order of first appearance.
+
+    Parameters
+    ----------
+    file
+        The file, for messages.
+    cells
+        Text, or whole numbers.
+
+    Returns
+    -------
+    recording : numpy.ndarray
+        Shape ``(n,)``, int64: the index of every row's label.
+    labels : tuple of str
+        The labels as text without outer spaces; 3 and 3.0 both become ``"3"``.
+    fault : CellFault or None
+        The first row without a label.
+
+    Raises
+    ------
+    InputError
+        When the cells are no labels but, for example, lists.
+    """
+    if isinstance(cells, pa.ChunkedArray):
+        cells = cells.combine_chunks()
+    if pa.types.is_nested(cells.type):
+        remedy = "write one text or whole number per row"
+        raise InputError(file, "column recording", f"it holds {cells.type}, not labels", remedy)
+    if not pa.types.is_dictionary(cells.type):
+        cells = cells.dictionary_encode()
+    # All work on text is done once per label, not once per row.
+    texts = cells.dictionary
+    if not _is_text(texts.type):
+        texts = pa.array([_label(value) for value in texts.to_pylist()], type=pa.string())
+    texts = pc.fill_null(pc.utf8_trim_whitespace(texts.cast(pa.string())), "").dictionary_encode()
+    merged = np.append(texts.indices.to_numpy(), -1)
+    codes = merged[cells.indices.cast(pa.int64()).fill_null(len(merged) - 1).to_numpy()]
+    missing = (codes == -1) | (codes == texts.dictionary.index("").as_py())
+    if missing.any():
+        remedy = "write the label of the row's recording"
+        return codes, (), CellFault(int(np.argmax(missing)) + 1, "recording", "the label is missing", remedy)
+    present = pa.array(codes).dictionary_encode()  # numbers again, now in order of first appearance
+    labels = tuple(texts.dictionary.take(present.dictionary).to_pylist())
+    return present.indices.to_numpy().astype(np.int64), labels, None
+
+
+def agree_on_unit(file: str, name: str, stated: Mapping[str, str | None], expected: str | None) -> str | None:
+    """Find the unit of a column, on which every place that states one must agree.
+
+    Parameters
+    ----------
+    file, name
+        The file and the column, for messages.
+    stated
+        The unit by the place that states it (``"name"``, ``"metadata"``, ``"cells"``), None where not stated.
+    expected
+        The unit that it must be if any place states one; None accepts every unit.
+
+    Raises
+    ------
+    InputError
+        When two places, or a place and `expected`, differ.
+    """
+    places = [(place, unit) for place, unit in stated.items() if unit is not None]
+    for place, unit in places[1:]:
+        if not _same_unit(unit, places[0][1]):
+            raise InputError(
+                file,
+                f"column {name}",
+                f"mixed units, {places[0][1]} in the {places[0][0]} but {unit} in the {place}",
+                "state one unit, the one in which the numbers are",
+            )
+    if not places:
+        return None
+    unit = places[0][1]
+    if expected is not None and not _same_unit(unit, expected):
+        raise InputError(
+            file,
+            f"column {name}",
+            f"the unit is {unit} where the system card has {expected}",
+            f"convert the column to {expected}, or correct the unit in the card",
+        )
+    return unit
+
+
+def split_heading(heading: str) -> tuple[str, str | None]:
+    """Split the heading of a column, such as ``x [mm]``, into its name and its unit, if stated."""
+    match = re.fullmatch(r"\s*(.*?)\s*\[\s*(.*?)\s*\]\s*", heading)
+    return (match[1], match[2] or None) if match else (heading.strip(), None)
+
+
+def _same_unit(left: str, right: str) -> bool:
+    # The micro sign and the Greek letter look the same, as do m/s² and m/s2 to a reader.
+    plain = [unicodedata.normalize("NFKC", unit).replace(" ", "") for unit in (left, right)]
+    return plain[0] == plain[1]
+
+
+_NUMERIC = (
+    pa.types.is_floating,
+    pa.types.is_integer,
+    pa.types.is_boolean,
+    pa.types.is_decimal,
+    pa.types.is_null,
+)
+
+
+def _is_text(kind: pa.DataType) -> bool:
+    return pa.types.is_string(kind) or pa.types.is_large_string(kind) or pa.types.is_string_view(kind)
+
+
+def _split_units(name: str, cells: Column) -> tuple[Column, str | None, CellFault | None]:
+    """Split cells of text into numbers (null where there is none) and the one unit that follows them."""
+    cells = pc.utf8_trim_whitespace(cells.cast(pa.string()))
+    cells = pc.if_else(pc.equal(cells, ""), None, cells)
+    # The first cell says which unit to expect; only a cell that differs is looked at more closely.
+    unit = _unit_of(next((each for each in cells.drop_null().slice(0, 1).to_pylist()), "")) or ""
+    ending = (r"\s+" if unit[:1].isdigit() else r"\s*") + re.escape(unit) if unit else ""
+    good = pc.fill_null(pc.match_substring_regex(cells, f"^{_NUMBER}{ending}$"), False)
+    numbers = pc.replace_substring_regex(pc.if_else(good, cells, None), f"{ending}$", "")
+    bad = pc.and_not(pc.is_valid(cells), good).to_numpy(zero_copy_only=False)
+    if not bad.any():
+        return numbers, unit or None, None
+    row = int(np.argmax(bad))
+    cell = cells[row].as_py()
+    found = _unit_of(cell)
+    if found is None:
+        fault, remedy = f"'{cell}' is no number", "write a number with a decimal point, or remove the row"
+    else:
+        fault = f"mixed units, {found or 'no unit'} after rows in {unit or 'no unit'}"
+        remedy = "convert the whole column to one unit"
+    return numbers, unit or None, CellFault(row + 1, name, fault, remedy)
+
+
+def _unit_of(cell: str) -> str | None:
+    """Find the unit in a cell of text: empty where there is none, None where the cell holds no number."""
+    match = re.fullmatch(f"{_NUMBER}({_UNIT})?", cell)
+    return (match[1] or "").strip() if match else None
+
+
+def _label(value: object) -> str:
+    if value is None or value != value:  # NaN, as missing numbers are written
+        return ""
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
+    return value.decode("utf-8", errors="replace") if isinstance(value, bytes) else str(value)

@@ -1,0 +1,424 @@
+"""Recordings: trajectories as measured, in one long table.
+
+A table has the columns ``recording`` (a label), ``t`` (the time) and one column per measured quantity.
+Here such a table is read and checked, written, cut into snapshot pairs, and resampled. Whatever cannot be
+used is refused with its row and column; rows are counted from 1 without the header.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from siq.data.checks import check_times, find_columns
+from siq.data.labels import distinct_labels, sources
+from siq.errors import InputError
+from siq.files.whole import whole_file
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from siq.data.formats import ColumnFile
+
+LONGEST_STEP = 1.5  # of the median step: a missing sample makes two of it, jitter rarely a half more
+
+
+@dataclass(frozen=True)
+class Recordings:
+    """Trajectories as measured, checked: finite numbers, and times that increase within every recording.
+
+    Not to be confused with `SnapshotPairs`, which have lost the order in time.
+
+    Attributes
+    ----------
+    names
+        The d measured columns.
+    units
+        The unit of each measured column, None where the file does not say.
+    labels
+        One label per recording, in order of first appearance.
+    recording
+        Shape ``(n,)``: the index of each row's recording in `labels`; it never decreases.
+    t
+        Shape ``(n,)``: the time of each row, in `time_unit`.
+    values
+        Shape ``(n, d)``: what was measured, in `units`.
+    time_unit
+        The unit of `t`, None where the file does not say.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str | None, ...]
+    labels: tuple[str, ...]
+    recording: np.ndarray
+    t: np.ndarray
+    values: np.ndarray
+    time_unit: str | None = None
+
+    @classmethod
+    def from_frame(
+        cls,
+        frame: pd.DataFrame,
+        *,
+        columns: Sequence[str] | None = None,
+        units: Mapping[str, str] | None = None,
+    ) -> Recordings:
+        """Recordings from a table in memory, checked as a file is.
+
+        Parameters
+        ----------
+        frame
+            With the columns ``t`` and the measured ones; units may stand behind the names (``x [mm]``), in
+            the metadata ``frame.attrs["units"]``, or in the cells. A table without the column
+            ``recording`` is one recording. An index called ``recording`` or ``t`` counts as a column.
+        columns
+            The measured columns wanted, in the order of the state vector; default all others.
+        units
+            Of the columns, ``t`` included. What the table says itself must agree.
+
+        Raises
+        ------
+        InputError
+            For the first thing in the table that cannot be used, with its row and column.
+
+        Examples
+        --------
+        >>> import pandas as pd
+        >>> table = pd.DataFrame({"t": [0.0, 0.1, 0.2], "x [mm]": [1.0, 0.8, 0.7]})
+        >>> recordings = Recordings.from_frame(table)
+        >>> recordings.names, recordings.units, recordings.labels
+        (('x',), ('mm',), ('0',))
+        """
+        from siq.data.formats import frame_columns  # which imports pyarrow
+
+        levels = [name for name in frame.index.names if name in ("recording", "t")]
+        source = frame_columns(TABLE, frame.reset_index(level=levels) if levels else frame)
+        read = _checked(TABLE, source, columns, units)
+        given = units or {}
+        return replace(
+            read,
+            units=tuple(given.get(name, unit) for name, unit in zip(read.names, read.units, strict=True)),
+            time_unit=given.get("t", read.time_unit),
+        )
+
+    @classmethod
+    def from_arrays(
+        cls,
+        t: np.ndarray | Sequence[np.ndarray],
+        values: np.ndarray | Sequence[np.ndarray],
+        *,
+        names: Sequence[str],
+        units: Sequence[str | None] | None = None,
+        time_unit: str | None = None,
+    ) -> Recordings:
+        """Recordings from arrays: all of one length, or each of its own.
+
+        Parameters
+        ----------
+        t
+            Times. Shape ``(n,)`` for all recordings, or one such array for each.
+        values
+            States. Shape ``(n, d)`` for one recording, ``(r, n, d)`` for r of one length, or one array
+            ``(n_k, d)`` for each.
+        names
+            Of the d states.
+        units
+            Of each state; default not known.
+        time_unit
+            Of `t`.
+
+        Raises
+        ------
+        ValueError
+            When the shapes do not fit each other, or numbers are not finite.
+        InputError
+            When the times of a recording do not increase.
+
+        Examples
+        --------
+        >>> t = np.linspace(0, 1, 11)
+        >>> decays = np.exp(-t)[None, :, None] * np.array([1.0, -1.0, 0.5])[:, None, None]
+        >>> Recordings.from_arrays(t, decays, names=["x"]).labels
+        ('0', '1', '2')
+        """
+        one = isinstance(values, np.ndarray) and values.ndim == 2
+        parts = [np.asarray(each, dtype=float) for each in ([values] if one else values)]
+        common = np.ndim(t[0]) == 0
+        times = [np.asarray(each, dtype=float) for each in ([t] * len(parts) if common else t)]
+        if len(times) != len(parts):
+            raise ValueError(f"there are times of {len(times)} recordings and values of {len(parts)}")
+        if units is not None and len(units) != len(names):
+            raise ValueError(f"there are {len(units)} units for {len(names)} states")
+        if len({*names, "recording", "t"}) != len(names) + 2:
+            raise ValueError(f"the names {list(names)} are not distinct, or one is 'recording' or 't'")
+        for index, (time, part) in enumerate(zip(times, parts, strict=True)):
+            if time.ndim != 1 or part.shape != (len(time), len(names)):
+                raise ValueError(
+                    f"recording {index} has values of shape {part.shape} at times of shape {time.shape};"
+                    f" {len(names)} names need ({len(time)}, {len(names)})"
+                )
+            if not (np.isfinite(time).all() and np.isfinite(part).all()):
+                raise ValueError(f"recording {index} holds numbers that are not finite; remove their samples")
+        recording = np.repeat(np.arange(len(parts)), [len(time) for time in times])
+        labels = tuple(map(str, range(len(parts))))
+        together = np.concatenate([*times, np.empty(0)])
+        check_times(TABLE, together, recording, labels, np.arange(len(together)))
+        return cls(
+            tuple(names), tuple(units or (None,) * len(names)), labels, recording, together,
+            np.concatenate(parts), time_unit,
+        )  # fmt: skip
+
+
+TABLE = "the table"  # what messages call what is in no file
+
+
+@dataclass(frozen=True)
+class SnapshotPairs:
+    """States a short time apart, each pair with its own step. See `snapshot_pairs`.
+
+    Attributes
+    ----------
+    x0, xh
+        Shape ``(n, d)``: the earlier and the later state.
+    h
+        Shape ``(n,)``: the time between the two.
+    recording
+        Shape ``(n,)``: the index of the recording that the pair is from. Copies of a resampled recording
+        share one, so that none is held out while another trains.
+    """
+
+    x0: np.ndarray
+    xh: np.ndarray
+    h: np.ndarray
+    recording: np.ndarray
+
+
+def read_recordings(
+    path: str | Path, *, columns: Sequence[str] | None = None, units: Mapping[str, str] | None = None
+) -> Recordings:
+    """Read a long table of trajectories and check it.
+
+    Rows of one recording need not stand together; they are grouped, in order of first appearance.
+
+    Parameters
+    ----------
+    path
+        A file that `siq.data.formats.open_columns` can read. A unit may stand behind a name
+        (``x [mm]``), in the file's metadata, or in every cell of a column (``1.2 mm``).
+    columns
+        The measured columns wanted, in the order of the state vector; the file's others are then ignored.
+        Default: all columns but ``recording`` and ``t``, in the order of the file.
+    units
+        The units that are expected, by column, ``t`` included. Nothing is converted: another unit in the
+        file is refused. A column without a unit in the file is taken as it is.
+
+    Raises
+    ------
+    InputError
+        For the first thing in the file that cannot be used, with its row and column.
+    """
+    from siq.data.formats import open_columns  # which imports pyarrow
+
+    return _checked(str(path), open_columns(path), columns, units)
+
+
+def _checked(
+    file: str, source: ColumnFile, columns: Sequence[str] | None, units: Mapping[str, str] | None
+) -> Recordings:
+    from siq.data.cells import agree_on_unit, parse_labels, parse_numbers  # these import pyarrow
+
+    positions = find_columns(file, source.names, columns)
+    used = [source.names[position] for position in positions]
+    cells = source.load(positions)
+    if len(cells[0]) == 0:
+        raise InputError(file, "", "the table has no rows", "write at least two samples of one recording")
+
+    numbers = np.empty((len(used) - 1, len(cells[0])))
+    found_units: list[str | None] = []
+    faults = []
+    for index, name in enumerate(used[1:]):
+        numbers[index], cell_unit, fault = parse_numbers(file, name, cells[index + 1])
+        faults += [fault] if fault else []
+        stated = {**source.units[positions[index + 1]], "cells": cell_unit}
+        found_units.append(agree_on_unit(file, name, stated, (units or {}).get(name)))
+    recording, labels, fault = parse_labels(file, cells[0])
+    faults += [fault] if fault else []
+    if faults:
+        first = min(faults, key=lambda each: each.row)
+        raise InputError(file, f"row {first.row}, column {first.column}", first.fault, first.remedy)
+
+    order = np.argsort(recording, kind="stable")
+    recording, numbers = recording[order], numbers[:, order]
+    check_times(file, numbers[0], recording, labels, order)
+    return Recordings(
+        names=tuple(used[2:]),
+        units=tuple(found_units[1:]),
+        labels=labels,
+        recording=recording,
+        t=numbers[0].copy(),
+        values=np.ascontiguousarray(numbers[1:].T),
+        time_unit=found_units[0],
+    )
+
+
+def write_recordings(path: str | Path, recordings: Recordings) -> None:
+    """Write recordings as Parquet; `read_recordings` gives them back to the last bit.
+
+    The file appears complete or not at all, and the same recordings give the same bytes.
+
+    Parameters
+    ----------
+    path
+        A file named ``.parquet``; one that exists is replaced.
+    recordings
+        What to write.
+
+    Raises
+    ------
+    ValueError
+        When the path has another suffix.
+    """
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    path = Path(path)
+    if path.suffix.lower() != ".parquet":
+        raise ValueError(f"recordings are written as .parquet, not as '{path.name}'")
+
+    def field(name: str, unit: str | None) -> pa.Field:
+        return pa.field(name, pa.float64(), metadata=None if unit is None else {"unit": unit})
+
+    label = pa.DictionaryArray.from_arrays(
+        pa.array(recordings.recording.astype(np.int32)), pa.array(recordings.labels, type=pa.string())
+    )
+    names, units = ("t", *recordings.names), (recordings.time_unit, *recordings.units)
+    fields = [field(name, unit) for name, unit in zip(names, units, strict=True)]
+    table = pa.table(
+        [label, pa.array(recordings.t), *(pa.array(column) for column in recordings.values.T)],
+        schema=pa.schema([pa.field("recording", label.type), *fields]),
+    )
+    with whole_file(path) as partial:
+        parquet.write_table(table, partial, compression="zstd", use_dictionary=["recording"])
+
+
+def snapshot_pairs(recordings: Recordings, *, pair_step: float | None = None) -> SnapshotPairs:
+    """Pair every sample with the next one of the same recording.
+
+    Parameters
+    ----------
+    recordings
+        The trajectories.
+    pair_step
+        The longest gap that still makes a pair, in the unit of `t`; by default `LONGEST_STEP` median steps.
+        This is a limit, not the step h of the pairs, of which each has its own.
+
+    Raises
+    ------
+    ValueError
+        When no pair results.
+    """
+    if pair_step is not None and not pair_step > 0:
+        raise ValueError(f"pair_step is {pair_step}, but it must be positive")
+    t, recording = recordings.t, recordings.recording
+    gap = np.diff(t)
+    keep = recording[1:] == recording[:-1]
+    if pair_step is None and keep.any():
+        # Of the two middle ones the shorter: pairs with gaps between them have about as many of either.
+        pair_step = LONGEST_STEP * float(np.quantile(gap[keep], 0.5, method="lower"))
+    if pair_step is not None:
+        # Times such as 0.1·k, or seconds since 1970, carry rounding errors into their differences.
+        keep &= gap <= pair_step * (1 + 1e-6) + 2 * np.spacing(np.abs(t[1:]))
+    if not keep.any():
+        limit = "" if pair_step is None else f" that are at most pair_step = {pair_step} apart"
+        raise ValueError(f"no recording has two consecutive samples{limit}")
+    return SnapshotPairs(
+        x0=recordings.values[:-1][keep],
+        xh=recordings.values[1:][keep],
+        h=gap[keep],
+        recording=sources(recordings.labels)[recording[:-1][keep]],
+    )
+
+
+def read_pairs(
+    path: str | Path,
+    *,
+    states: Sequence[str] | None,
+    units: Mapping[str, str] | None,
+    pair_step: float | None,
+) -> tuple[Recordings, SnapshotPairs]:
+    """Read recordings that something is to be learned from, and their pairs.
+
+    Parameters
+    ----------
+    path, states, units
+        See `read_recordings`.
+    pair_step
+        See `snapshot_pairs`.
+
+    Raises
+    ------
+    InputError
+        As `read_recordings` does, and when no two samples are close enough to be a pair.
+    """
+    recordings = read_recordings(path, columns=states, units=units)
+    try:
+        return recordings, snapshot_pairs(recordings, pair_step=pair_step)
+    except ValueError as error:
+        raise InputError(path, "", str(error), "raise recordings.pair_step in the study") from None
+
+
+def select_recordings(recordings: Recordings, indices: Sequence[int] | np.ndarray) -> Recordings:
+    """Take whole recordings, in the order given.
+
+    Parameters
+    ----------
+    recordings
+        The trajectories.
+    indices
+        Indices into ``recordings.labels``, not of rows. One that stands twice gives copies, told apart by
+        their labels: ``r07``, ``r07#2``.
+
+    Raises
+    ------
+    ValueError
+        When `indices` is empty, is a mask, or points outside the recordings.
+    """
+    chosen = np.asarray(indices)
+    count = len(recordings.labels)
+    if chosen.ndim != 1 or chosen.dtype.kind not in "iu" or chosen.size == 0:
+        raise ValueError("recordings are selected by a list of at least one index")
+    if chosen.min() < 0 or chosen.max() >= count:
+        raise ValueError(f"a selected recording is not one of 0 ... {count - 1}")
+    bounds = np.searchsorted(recordings.recording, np.arange(count + 1))
+    lengths = np.diff(bounds)[chosen]
+    begins = np.cumsum(lengths) - lengths
+    rows = np.arange(lengths.sum()) + np.repeat(bounds[chosen] - begins, lengths)
+    return Recordings(
+        names=recordings.names,
+        units=recordings.units,
+        labels=distinct_labels(recordings.labels, chosen),
+        recording=np.repeat(np.arange(len(chosen)), lengths),
+        t=recordings.t[rows],
+        values=recordings.values[rows],
+        time_unit=recordings.time_unit,
+    )
+
+
+def resample_recordings(recordings: Recordings, *, generator: np.random.Generator) -> Recordings:
+    """Draw as many recordings as there are, with replacement: one bootstrap sample.
+
+    Whole recordings are drawn, not rows, since the samples of one recording are not independent.
+
+    Parameters
+    ----------
+    recordings
+        The trajectories.
+    generator
+        Where the draw comes from; the only source of chance.
+    """
+    count = len(recordings.labels)
+    return select_recordings(recordings, generator.integers(count, size=count))

@@ -1,0 +1,235 @@
+"""System cards: the equations of a simulation as a file, and the dynamics that they describe.
+
+A *system card* (``config/systems/NAME.yaml``) declares states, parameters, the vector field f, and the
+covariance D of the noise in ``dx = f dt + sqrt(ε) D^(1/2) dW``. D belongs to the system because the
+orthogonality ``∇V·g = 0`` of the decomposition ``f = -D∇V + g`` depends on it: the same equations in other
+units are another problem unless D is carried along.
+"""
+
+from __future__ import annotations
+
+import keyword
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import sympy
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from siq.dynamics.diffusion import Diffusion
+from siq.dynamics.dynamics import Dynamics, Input, Parameter
+from siq.dynamics.formulas import CONSTANTS, FUNCTIONS, FormulaError, exact_number, parse_formula
+from siq.dynamics.parametric import TIME, symbol
+from siq.errors import InputError
+from siq.files.documents import Document, read_document, validate
+
+
+def check_name(text: str) -> str:
+    """Return a name that formulas can use; raises ValueError for any other."""
+    if not text.isidentifier() or keyword.iskeyword(text):
+        raise ValueError(f"'{text}' cannot be a name in a formula; use letters, digits and underscores")
+    if text in FUNCTIONS or text in CONSTANTS or text in ("recording", "t", "delay"):
+        raise ValueError(f"the name '{text}' is reserved; choose another")
+    return text
+
+
+Name = Annotated[str, AfterValidator(check_name)]
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Formula = str | Number
+DiffusionEntry = Literal["identity"] | list[Number] | list[list[Number]]
+
+
+class _CardPart(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class StateEntry(_CardPart):
+    """One state of a card: its unit, and the interval in which initial states are drawn.
+
+    Only a simulation needs the interval. Where there are recordings to compare with, they tell it.
+    """
+
+    unit: str = "1"
+    domain: tuple[Number, Number] | None = None
+
+    @field_validator("domain")
+    @classmethod
+    def _ordered(cls, domain: tuple[float, float] | None) -> tuple[float, float] | None:
+        if domain is not None and not domain[0] < domain[1]:
+            raise ValueError("the domain is empty; write it as [lower, upper] with lower < upper")
+        return domain
+
+
+class ParameterEntry(_CardPart):
+    """One parameter of a card. ``fixed: true`` keeps it out of any recalibration."""
+
+    value: Number
+    unit: str = "1"
+    fixed: bool = False
+
+
+class InputEntry(_CardPart):
+    """An exogenous signal u(t), a column of the recordings.
+
+    `interpolation` says how it holds between samples: ``zero_order`` for what a converter puts out,
+    ``linear``, or ``band_limited`` for what was filtered before it was sampled.
+    """
+
+    unit: str = "1"
+    interpolation: Literal["zero_order", "linear", "band_limited"] = "linear"
+
+
+class ExactEntry(_CardPart):
+    """Exact answers, where known. They serve scoring only; no method reads them."""
+
+    quasipotential: Formula | None = None
+
+
+class SystemCard(_CardPart):
+    """The schema of a system card.
+
+    A state that is in no output is hidden. The time is called ``t`` in formulas of a system with inputs or
+    of a mismatch study; see `siq.dynamics.parametric`.
+    """
+
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
+    title: str = ""
+    time_unit: str = "1"
+    states: dict[Name, StateEntry] = Field(min_length=1)
+    inputs: dict[Name, InputEntry] = {}
+    parameters: dict[Name, ParameterEntry] = {}
+    equations: dict[str, Formula]
+    outputs: Annotated[dict[Name, Formula], Field(min_length=1)] | None = None
+    diffusion: DiffusionEntry = "identity"
+    exact: ExactEntry = ExactEntry()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> SystemCard:
+        for name in self.states:
+            if name not in self.equations:
+                raise ValueError(f"the state '{name}' has no equation; add 'equations: {{{name}: ...}}'")
+            if name in self.parameters:
+                raise ValueError(f"'{name}' is both a state and a parameter; rename one of them")
+        for name in self.inputs:
+            if name in self.states or name in self.parameters:
+                kind = "a state" if name in self.states else "a parameter"
+                raise ValueError(f"'{name}' is both an input and {kind}; rename one of them")
+        for name in self.equations:
+            if name not in self.states:
+                raise ValueError(f"the equation of '{name}' belongs to no state; declare it under states")
+        diffusion_matrix(self.diffusion, len(self.states))
+        return self
+
+
+def domain_of(card: SystemCard) -> np.ndarray:
+    """The domain of each state, shape ``(d, 2)``; NaN for a state of which the card does not say it."""
+    return np.array([entry.domain or (np.nan, np.nan) for entry in card.states.values()], dtype=float)
+
+
+def diffusion_matrix(diffusion: DiffusionEntry, dimension: int) -> np.ndarray:
+    """Noise covariance D as a matrix.
+
+    Parameters
+    ----------
+    diffusion
+        ``"identity"``, the diagonal, or the whole matrix, in the units of the states squared per time.
+    dimension
+        Number of states, d.
+
+    Returns
+    -------
+    numpy.ndarray
+        D, shape ``(d, d)``, symmetric and positive semi-definite: a zero says that no noise reaches a state.
+
+    Raises
+    ------
+    ValueError
+        When the shape is wrong or D is not symmetric and positive semi-definite.
+    """
+    if diffusion == "identity":
+        return np.eye(dimension)
+    lengths = {len(row) for row in diffusion if isinstance(row, list)}
+    if len(diffusion) != dimension or (lengths and lengths != {dimension}):
+        raise ValueError(f"the diffusion does not fit {dimension} states; give a diagonal or a square matrix")
+    matrix = np.array(diffusion, dtype=float)
+    if matrix.ndim == 1:
+        matrix = np.diag(matrix)
+    return Diffusion(matrix).matrix
+
+
+def load_system(path: str | Path) -> Dynamics:
+    """Read and check a system card.
+
+    Raises
+    ------
+    InputError
+        With the card, the line and the offending name, for anything that the schema or the whitelist of
+        formulas refuses.
+    """
+    document = read_document(path)
+    return build_system(document, validate(document, SystemCard))
+
+
+def build_system(document: Document, card: SystemCard) -> Dynamics:
+    """The dynamics that a checked card describes; `document` says where its formulas stand.
+
+    Parameters stay symbols, so that they can be fitted; `Dynamics.formulas` has their values inserted.
+
+    Raises
+    ------
+    InputError
+        For a formula that is refused, as it stands or with the parameters' values.
+    """
+    outputs = card.outputs if card.outputs is not None else {name: name for name in card.states}
+    parse = _parser(document, card)
+    return Dynamics(
+        name=card.name,
+        title=card.title or card.name,
+        time_unit=card.time_unit,
+        states=tuple(card.states),
+        units=tuple(entry.unit for entry in card.states.values()),
+        diffusion=Diffusion(diffusion_matrix(card.diffusion, len(card.states))),
+        domain=domain_of(card),
+        inputs=tuple(Input(name, entry.unit, entry.interpolation) for name, entry in card.inputs.items()),
+        parameters=tuple(
+            Parameter(name, entry.value, entry.unit, entry.fixed) for name, entry in card.parameters.items()
+        ),
+        equations=tuple(parse(("equations", name), card.equations[name]) for name in card.states),
+        outputs=tuple((name, parse(("outputs", name), text)) for name, text in outputs.items()),
+    )
+
+
+def load_exact(path: str | Path) -> sympy.Expr | None:
+    """The exact U that a card knows, its parameters inserted; None for none. For scoring only.
+
+    Raises
+    ------
+    InputError
+        As `load_system`.
+    """
+    document = read_document(path)
+    card = validate(document, SystemCard)
+    text = card.exact.quasipotential
+    if text is None:
+        return None
+    exact = _parser(document, card)(("exact", "quasipotential"), text)
+    return exact.xreplace(
+        {symbol(name): exact_number(entry.value) for name, entry in card.parameters.items()}
+    )
+
+
+def _parser(document: Document, card: SystemCard) -> Callable[[tuple[str, ...], Formula], sympy.Expr]:
+    """What reads the formulas of a card, and refuses them with their line."""
+    names = {name: symbol(name) for name in (*card.states, *card.inputs, *card.parameters)} | {"t": TIME}
+    numbers = names | {name: exact_number(entry.value) for name, entry in card.parameters.items()}
+
+    def parse(keys: tuple[str, ...], text: Formula) -> sympy.Expr:
+        try:
+            # A power may be too high, or a divisor zero, at the parameters' values alone.
+            parse_formula(text, numbers, inputs=tuple(card.inputs))
+            return parse_formula(text, names, inputs=tuple(card.inputs))
+        except FormulaError as error:
+            raise InputError(document.file, document.place(keys), error.fault, error.remedy) from None
+
+    return parse

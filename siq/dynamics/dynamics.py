@@ -1,0 +1,316 @@
+"""Dynamics: drift, noise, inputs and outputs of a system as one object, in formulas.
+
+``dx = f(x, u, t; θ) dt + √ε σ(x) dW`` with ``D = σσᵀ`` (Itô), of which ``y = h(x, u, t; θ)`` is measured. A
+card describes it, identification returns it with the covariance of its parameters, a diagnosis changes it;
+simulation, landscape and references take it.
+
+Two ways lead to numbers. Without inputs, `Dynamics.drift` and its derivatives take points as rows, with the
+parameters' values inserted. Where parameters are fitted and inputs drive the system, `Dynamics.functions`
+takes components, signals and the values of the parameters (`siq.dynamics.parametric`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import sympy
+
+from siq.dynamics.diffusion import Diffusion
+from siq.dynamics.formulas import compile_formulas, compile_values, exact_number
+from siq.dynamics.parametric import TIME, ParametricFunctions, delays_of, symbol
+
+
+@dataclass(frozen=True)
+class Input:
+    """An exogenous signal: its name, unit, and how it holds between samples."""
+
+    name: str
+    unit: str
+    interpolation: str
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter with its value; a fixed one is never recalibrated."""
+
+    name: str
+    value: float
+    unit: str = "1"
+    fixed: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Dynamics:
+    """A system: ``dx = f dt + √ε σ dW``, with what is known of its units, inputs and outputs.
+
+    Main attributes
+    ---------------
+    states
+        Names of the d states, in the order of the state vector.
+    equations
+        Components of f, in symbols for states, inputs, parameters and the time ``t``.
+    diffusion
+        D.
+
+    Other attributes
+    ----------------
+    name, title, time_unit
+        As a card says.
+    units
+        Of each state; ``1`` by default.
+    domain
+        Shape ``(d, 2)``: where the states are expected, in their units; NaN for a state, or None for all of
+        them, where nobody said.
+    inputs
+        The signals that drive it.
+
+    Parameters
+    ----------
+        θ, in the order of the parameter vector.
+    covariance
+        Of the free parameters' estimates, shape ``(p, p)``; None where they are not estimates.
+    outputs
+        What a recording measures, by the name of its column; by default the states.
+    edges
+        Arguments of ``sign`` in f and the widths over which the jump is spread when f is evaluated, so that
+        an integrator can follow it: ``sign(e)`` is taken as ``tanh(e/w)``. The formulas keep the sign.
+
+    Raises
+    ------
+    ValueError
+        When equations, units, domain or D do not fit the states.
+
+    Examples
+    --------
+    >>> x, y = sympy.symbols("x y", real=True)
+    >>> well = Dynamics.of((x, y), (x - x**3, -y))
+    >>> well.drift(np.array([[0.5, 1.0]]))
+    array([[ 0.375, -1.   ]])
+    >>> well.jacobian(np.array([[0.0, 0.0]]))[0]
+    array([[ 1.,  0.],
+           [ 0., -1.]])
+    """
+
+    states: tuple[str, ...]
+    equations: tuple[sympy.Expr, ...]
+    diffusion: Diffusion
+    name: str = ""
+    title: str = ""
+    time_unit: str = "1"
+    units: tuple[str, ...] = ()
+    domain: np.ndarray | None = None
+    inputs: tuple[Input, ...] = ()
+    parameters: tuple[Parameter, ...] = ()
+    covariance: np.ndarray | None = None
+    outputs: tuple[tuple[str, sympy.Expr], ...] = ()
+    edges: tuple[tuple[sympy.Expr, float], ...] = ()
+
+    def __post_init__(self) -> None:
+        d = len(self.states)
+        if not self.units:
+            object.__setattr__(self, "units", ("1",) * d)
+        if not self.outputs:
+            object.__setattr__(self, "outputs", tuple((name, symbol(name)) for name in self.states))
+        for what, count in (("equations", len(self.equations)), ("units", len(self.units)),
+                            ("rows of D", self.diffusion.dimension)):  # fmt: skip
+            if count != d:
+                raise ValueError(f"there are {count} {what} for {d} states; give one for each")
+        if self.domain is not None and np.shape(self.domain) != (d, 2):
+            raise ValueError(f"the domain has the shape {np.shape(self.domain)}; give two limits a state")
+
+    @classmethod
+    def of(
+        cls,
+        symbols: Sequence[sympy.Symbol],
+        equations: Sequence[sympy.Expr],
+        *,
+        diffusion: Diffusion | np.ndarray | None = None,
+    ) -> Dynamics:
+        """Dynamics of formulas alone, with D = 1 unless another is given.
+
+        Parameters
+        ----------
+        symbols
+            The d states, real symbols.
+        equations
+            The components of f.
+        diffusion
+            D, as `Diffusion` or as a matrix ``(d, d)``.
+        """
+        if diffusion is None:
+            diffusion = Diffusion.identity(len(symbols))
+        elif not isinstance(diffusion, Diffusion):
+            diffusion = Diffusion(np.asarray(diffusion, dtype=float))
+        return cls(tuple(each.name for each in symbols), tuple(map(sympy.sympify, equations)), diffusion)
+
+    @property
+    def dimension(self) -> int:
+        """Number of states, d."""
+        return len(self.states)
+
+    @cached_property
+    def symbols(self) -> tuple[sympy.Symbol, ...]:
+        """The states as they stand in the formulas."""
+        return tuple(symbol(name) for name in self.states)
+
+    @property
+    def box(self) -> np.ndarray:
+        """The domain, shape ``(d, 2)``, where it has to be known.
+
+        Raises
+        ------
+        ValueError
+            Where nobody said it.
+        """
+        unknown = [name for name, ends in zip(self.states, self.limits, strict=True) if np.isnan(ends).any()]
+        if unknown:
+            raise ValueError(f"no domain of {', '.join(unknown)} is known; give the limits of each state")
+        return self.limits
+
+    @property
+    def limits(self) -> np.ndarray:
+        """The domain as far as it is known, shape ``(d, 2)``: NaN for a state of which nobody said it."""
+        return np.full((self.dimension, 2), np.nan) if self.domain is None else self.domain
+
+    @property
+    def output_names(self) -> tuple[str, ...]:
+        """The measured columns."""
+        return tuple(name for name, _ in self.outputs)
+
+    @property
+    def values(self) -> np.ndarray:
+        """The parameters' values, shape ``(p,)``."""
+        return np.array([parameter.value for parameter in self.parameters], dtype=float)
+
+    @property
+    def free(self) -> tuple[int, ...]:
+        """Places of the parameters that may be recalibrated."""
+        used = set().union(*(each.free_symbols for each in (*self.equations, *dict(self.outputs).values())))
+        return tuple(
+            place
+            for place, parameter in enumerate(self.parameters)
+            if not parameter.fixed and symbol(parameter.name) in used
+        )
+
+    @property
+    def names(self) -> dict[str, sympy.Symbol]:
+        """What the names in its formulas stand for."""
+        known = [*self.states, *(each.name for each in self.inputs), *(each.name for each in self.parameters)]
+        return {name: symbol(name) for name in known} | {"t": TIME}
+
+    @property
+    def kinematic(self) -> tuple[bool, ...]:
+        """Which equations only define a state as the derivative of another, ``dx/dt = v``.
+
+        Such an equation holds by definition: no physics can be missing in it, and no noise drives it.
+        """
+        return tuple(equation in self.symbols for equation in self.equations)
+
+    def with_values(self, values: np.ndarray) -> Dynamics:
+        """The same dynamics with other parameters' values, shape ``(p,)``."""
+        changed = (
+            replace(parameter, value=float(value))
+            for parameter, value in zip(self.parameters, values, strict=True)
+        )
+        return replace(self, parameters=tuple(changed))
+
+    def with_diffusion(self, diffusion: Diffusion) -> Dynamics:
+        """The same drift under another noise."""
+        return replace(self, diffusion=diffusion)
+
+    def to_card(self) -> str:
+        """The text of a system card that is read back as the same dynamics."""
+        from siq.dynamics.card_writing import card_of
+
+        return card_of(self)
+
+    # Values and derivatives without inputs, parameters inserted: points come as rows.
+
+    @property
+    def autonomous(self) -> bool:
+        """Whether f depends on the states alone."""
+        return not self.inputs and not any(TIME in each.free_symbols for each in self.equations)
+
+    @cached_property
+    def formulas(self) -> tuple[sympy.Expr, ...]:
+        """Components of f with the parameters' values inserted."""
+        inserted = {symbol(each.name): exact_number(each.value) for each in self.parameters}
+        return tuple(equation.xreplace(inserted) if inserted else equation for equation in self.equations)
+
+    def drift(self, x: np.ndarray) -> np.ndarray:
+        """F at points: ``(n, d)`` to ``(n, d)``."""
+        return self.drift_of_components(_components(x)).T
+
+    def jacobian(self, x: np.ndarray) -> np.ndarray:
+        """∂f_i/∂x_j at points: ``(n, d)`` to ``(n, d, d)``, i before j."""
+        d = self.dimension
+        return self._first(_components(x)).T.reshape(len(x), d, d)
+
+    def hessian(self, x: np.ndarray) -> np.ndarray:
+        """∂²f_i/∂x_j∂x_k at points: ``(n, d)`` to ``(n, d, d, d)``, i first."""
+        d = self.dimension
+        return self._second(_components(x)).T.reshape(len(x), d, d, d)
+
+    @cached_property
+    def drift_of_components(self) -> Callable[[np.ndarray], np.ndarray]:
+        """F of components ``(d, ...)``, for loops over many states at once: contiguous in memory.
+
+        Raises
+        ------
+        ValueError
+            Where inputs or the time stand in f.
+        """
+        return compile_formulas(self._autonomous_formulas(), self.symbols)
+
+    @cached_property
+    def _first(self) -> Callable[[np.ndarray], np.ndarray]:
+        return compile_formulas(_derivatives(self._autonomous_formulas(), self.symbols), self.symbols)
+
+    @cached_property
+    def _second(self) -> Callable[[np.ndarray], np.ndarray]:
+        first = _derivatives(self._autonomous_formulas(), self.symbols)
+        return compile_formulas(_derivatives(first, self.symbols), self.symbols)
+
+    def _autonomous_formulas(self) -> tuple[sympy.Expr, ...]:
+        if not self.autonomous:
+            raise ValueError(f"{self.name or 'the system'} is driven: its drift is no function of x alone")
+        return self.formulas
+
+    # What inputs and fitted parameters need.
+
+    @cached_property
+    def functions(self) -> ParametricFunctions:
+        """F, h and their derivatives as functions of states, signals and parameters."""
+        return ParametricFunctions(self)
+
+    @cached_property
+    def delays(self) -> tuple[sympy.Expr, ...]:
+        """The delayed inputs in its formulas, each once, in an order that does not change."""
+        return delays_of([*self.equations, *(formula for _, formula in self.outputs)])
+
+    @cached_property
+    def _lags(self) -> Callable[..., Sequence[np.ndarray | float]]:
+        return compile_values(
+            [each.args[1] for each in self.delays], [symbol(each.name) for each in self.parameters]
+        )
+
+    def lags(self, values: np.ndarray) -> tuple[tuple[int, float], ...]:
+        """Delayed inputs at parameters' values: the place of the input, and by how much time it lags."""
+        if not self.delays:
+            return ()
+        places = {entry.name: place for place, entry in enumerate(self.inputs)}
+        times = self._lags(*values)
+        return tuple(
+            (places[str(each.args[0])], float(time)) for each, time in zip(self.delays, times, strict=True)
+        )
+
+
+def _components(x: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(x.T)
+
+
+def _derivatives(expressions: Sequence[sympy.Expr], symbols: Sequence[sympy.Symbol]) -> list[sympy.Expr]:
+    return [expression.diff(symbol) for expression in expressions for symbol in symbols]

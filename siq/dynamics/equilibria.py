@@ -1,0 +1,222 @@
+"""Equilibria of an identified f, and where its trajectories end.
+
+Equilibria are sought from the recorded points alone; nobody says how many there are, or where.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import scipy.linalg
+
+from siq.dynamics.dynamics import Dynamics
+from siq.numerics.integration import dormand_prince_step, next_step
+
+EquilibriumKind = Literal["attractor", "saddle", "repeller", "degenerate"]
+
+NEWTON_STEPS = 60
+MARGIN = 0.05  # of the recorded box, by which an equilibrium may lie outside
+SAME = 1e-6  # of the recorded box: closer equilibria are one
+MARGINAL = 1e-6  # of the largest eigenvalue: multiple roots are only found to the root of rounding
+SLOWEST_TIMES = 200.0  # trajectories are followed for so many of the slowest relaxation times, ...
+UNSETTLED_TIMES = 25.0  # ... or times to cross the box where there is no attractor
+MOST_STEPS = 3000
+SPACING = 0.04  # of the recorded box: longest step
+ACCURACY = 1e-7  # of the recorded box: local error of a step
+ARRIVED = 1e-4  # of the recorded box: trajectories so close to an attractor end there
+
+
+@dataclass(frozen=True)
+class Equilibrium:
+    """A state at which f vanishes.
+
+    Attributes
+    ----------
+    position
+        Shape ``(d,)``.
+    eigenvalues
+        Of the Jacobian, by falling real part.
+    kind
+        ``attractor``: all real parts are negative. ``repeller``: all positive. ``saddle``: some of
+        each. ``degenerate``: a real part is zero to rounding, and the linearisation decides nothing.
+    """
+
+    position: np.ndarray
+    eigenvalues: np.ndarray
+    kind: EquilibriumKind
+
+    @property
+    def unstable(self) -> int:
+        """Number of unstable directions."""
+        return int((self.eigenvalues.real > 0).sum())
+
+
+@dataclass(frozen=True)
+class Descents:
+    """Trajectories of f from recorded points to where they end.
+
+    Attributes
+    ----------
+    paths
+        Shape ``(n, k, d)``: k states along each of the n trajectories, the first being the start.
+    ends
+        Shape ``(n,)``: index of the attractor at which each ends, -1 where it ends at none.
+    escaped
+        Shape ``(n,)``: whether it left the recorded box for good.
+    """
+
+    paths: np.ndarray
+    ends: np.ndarray
+    escaped: np.ndarray
+
+
+def find_equilibria(dynamics: Dynamics, points: np.ndarray) -> list[Equilibrium]:
+    """All equilibria in the box of some points that Newton's method finds from these.
+
+    Parameters
+    ----------
+    dynamics
+        f.
+    points
+        Shape ``(n, d)``: recorded states, from all over the recorded region.
+
+    Returns
+    -------
+    list of Equilibrium
+        By their position along the first state. Only roots of f that are isolated are found.
+    """
+    low, high = points.min(axis=0), points.max(axis=0)
+    width = np.where(high > low, high - low, 1.0)
+    x = points.copy()
+    for _ in range(NEWTON_STEPS):
+        # In shares of the box, or states in very different units would damp each other.
+        value, jacobian = dynamics.drift(x) / width, dynamics.jacobian(x) * width / width[:, None]
+        size = np.linalg.norm(jacobian, axis=(1, 2))[:, None, None] + 1e-300
+        # A little damping keeps singular Jacobians harmless and does not spoil convergence to rounding.
+        normal = np.einsum("nji,njk->nik", jacobian, jacobian) + 1e-14 * size**2 * np.eye(x.shape[1])
+        step = -np.linalg.solve(normal, np.einsum("nji,nj->ni", jacobian, value)[..., None])[..., 0]
+        longest = np.abs(step).max(axis=1, keepdims=True)
+        x = x + width * step * np.minimum(1.0, 0.2 / np.maximum(longest, 1e-300))
+        x = x[np.isfinite(x).all(axis=1) & (np.abs((x - low) / width - 0.5) < 2.0).all(axis=1)]
+        if not len(x):
+            return []
+    inside = ((x > low - MARGIN * width) & (x < high + MARGIN * width)).all(axis=1)
+    speed = np.linalg.norm(dynamics.drift(points) / width, axis=1)
+    converged = np.linalg.norm(dynamics.drift(x) / width, axis=1) < 1e-9 * np.median(speed)
+    found: list[np.ndarray] = []
+    for candidate in x[inside & converged]:
+        if all(np.abs((candidate - other) / width).max() > SAME for other in found):
+            found.append(candidate)
+    found.sort(key=lambda position: tuple(np.round(position / width, 6)))
+    return [classify(dynamics, position) for position in found]
+
+
+def classify(dynamics: Dynamics, position: np.ndarray) -> Equilibrium:
+    """The equilibrium at a position, by the eigenvalues of the Jacobian there."""
+    eigenvalues = np.linalg.eigvals(dynamics.jacobian(position[None])[0])
+    eigenvalues = eigenvalues[np.argsort(-eigenvalues.real)]
+    kind: EquilibriumKind = "saddle"
+    if np.abs(eigenvalues.real).min() < MARGINAL * np.abs(eigenvalues).max():
+        kind = "degenerate"
+    elif eigenvalues.real.max() < 0:
+        kind = "attractor"
+    elif eigenvalues.real.min() > 0:
+        kind = "repeller"
+    return Equilibrium(position, eigenvalues, kind)
+
+
+def hessian_at(dynamics: Dynamics, equilibrium: np.ndarray) -> np.ndarray:
+    """M, the Hessian of V at an equilibrium: ``M = W⁻¹`` with ``J W + W Jᵀ = -2D``, shape ``(d, d)``.
+
+    It follows from f near the equilibrium alone, and at an attractor is what tells the true V from false
+    solutions of the Hamilton–Jacobi equation.
+    """
+    # In units of the noise: where the states' units differ much, rounding would swallow the smaller ones.
+    scale = dynamics.diffusion.scale
+    jacobian = dynamics.jacobian(equilibrium[None])[0] * scale / scale[:, None]
+    noise = dynamics.diffusion.at(equilibrium[None])[0] / np.outer(scale, scale)
+    covariance = scipy.linalg.solve_continuous_lyapunov(jacobian, -2 * noise)
+    hessian = np.linalg.inv(covariance) / np.outer(scale, scale)
+    return (hessian + hessian.T) / 2
+
+
+def follow(
+    dynamics: Dynamics,
+    starts: np.ndarray,
+    attractors: Sequence[Equilibrium],
+    *,
+    box: np.ndarray,
+    states: int = 48,
+) -> Descents:
+    """Follow f from some points to the attractors.
+
+    Parameters
+    ----------
+    dynamics
+        f.
+    starts
+        Shape ``(n, d)``.
+    attractors
+        Where trajectories may end.
+    box
+        Shape ``(d, 2)``: the recorded region. What leaves a box of three times this size has escaped.
+    states
+        States kept along each trajectory, about evenly spread.
+    """
+    width = box[:, 1] - box[:, 0]
+    middle = box.mean(axis=1)
+    rates = [-one.eigenvalues.real.max() for one in attractors]
+    slowest = (
+        min(rates) if rates else float(np.median(np.linalg.norm(dynamics.drift(starts) / width, axis=1)))
+    )
+    horizon = (SLOWEST_TIMES if rates else UNSETTLED_TIMES) / slowest
+    count = len(starts)
+    x, times, steps = starts.copy(), np.zeros(count), np.full(count, 0.01 / slowest)
+    ends, escaped = np.full(count, -1), np.zeros(count, dtype=bool)
+    passed, whose = [starts], [np.arange(count)]
+    running = np.arange(count)
+    for _ in range(MOST_STEPS):
+        speed = np.abs(dynamics.drift(x[running]) / width).max(axis=1)
+        step = np.minimum(steps[running], np.minimum(0.5 / slowest, SPACING / np.maximum(speed, 1e-300)))
+        with np.errstate(over="ignore", invalid="ignore"):
+            moved, error = dormand_prince_step(dynamics.drift, x[running], step)
+            relative = np.abs(error / width).max(axis=1) / ACCURACY
+        steps[running] = next_step(step, relative)
+        on, moved, step = running[relative <= 1], moved[relative <= 1], step[relative <= 1]
+        inside = (np.abs((moved - middle) / width) < 1.5).all(axis=1)
+        escaped[on[~inside]] = True
+        on, moved, step = on[inside], moved[inside], step[inside]
+        x[on] = moved
+        times[on] += step
+        passed.append(moved)
+        whose.append(on)
+        for index, one in enumerate(attractors):
+            ends[on[np.abs((moved - one.position) / width).max(axis=1) < ARRIVED]] = index
+        running = running[~escaped[running] & (ends[running] < 0) & (times[running] < horizon)]
+        if not len(running):
+            break
+    order = np.argsort(np.concatenate(whose), kind="stable")
+    last = np.cumsum(np.bincount(np.concatenate(whose), minlength=count)) - 1
+    first = np.append(0, last[:-1] + 1)
+    kept = np.round(np.linspace(first, last, states, axis=1)).astype(int)
+    return Descents(np.concatenate(passed)[order][kept], ends, escaped)
+
+
+def neighbours(
+    dynamics: Dynamics,
+    saddle: Equilibrium,
+    attractors: Sequence[Equilibrium],
+    *,
+    box: np.ndarray,
+) -> set[int]:
+    """The attractors that lie below a saddle, on either side of its unstable directions."""
+    values, vectors = np.linalg.eig(dynamics.jacobian(saddle.position[None])[0])
+    width = box[:, 1] - box[:, 0]
+    starts = []
+    for vector in vectors[:, values.real > 0].T:
+        direction = vector.real / np.abs(vector.real / width).max()
+        starts += [saddle.position + 1e-3 * direction, saddle.position - 1e-3 * direction]
+    return {int(end) for end in follow(dynamics, np.array(starts), attractors, box=box).ends if end >= 0}

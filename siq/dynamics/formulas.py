@@ -1,0 +1,296 @@
+"""Formulas of people: text, checked against a whitelist, to sympy, to vectorised numpy.
+
+A formula is data. The text is parsed by Python's own parser into a syntax tree, of which only numbers,
+declared names, ``+ - * / **`` and named functions are accepted; the sympy expression is then built node
+by node. Nothing is ever evaluated as code.
+"""
+
+from __future__ import annotations
+
+import ast
+import builtins
+import difflib
+from collections.abc import Callable, Collection, Mapping, Sequence
+
+import numpy as np
+import sympy
+from sympy.printing.numpy import NumPyPrinter
+
+FUNCTIONS: Mapping[str, Callable[..., sympy.Expr]] = {
+    "sin": sympy.sin,
+    "cos": sympy.cos,
+    "tan": sympy.tan,
+    "exp": sympy.exp,
+    "log": sympy.log,
+    "sqrt": sympy.sqrt,
+    "tanh": sympy.tanh,
+    "atan": sympy.atan,
+    "Abs": sympy.Abs,
+    "sign": sympy.sign,
+    "Max": sympy.Max,
+    "Min": sympy.Min,
+}
+"""The functions that a formula may use, by the names that it uses for them."""
+
+
+class delay(sympy.Function):  # noqa: N801 (the name that formulas use)
+    """``delay(u, tau)``: the input u as it was a time tau ago.
+
+    It stands for itself; only what knows the course of the input can evaluate it, see
+    `siq.dynamics.parametric`.
+    """
+
+    nargs = 2
+    is_real = True
+
+
+CONSTANTS: Mapping[str, sympy.Expr] = {"pi": sympy.pi}
+
+LARGEST_EXPONENT = 32
+LARGEST_BASE = 1e9
+LARGEST_VALUE = 1e300
+DIGITS = 17  # of decimal digits, that a double is read back exactly
+LONGEST_FORMULA = 20_000
+
+_OPERATORS: Mapping[type[ast.operator], Callable[[sympy.Expr, sympy.Expr], sympy.Expr]] = {
+    ast.Add: lambda left, right: left + right,
+    ast.Sub: lambda left, right: left - right,
+    ast.Mult: lambda left, right: left * right,
+    ast.Div: lambda left, right: left / right,
+}
+
+
+class FormulaError(ValueError):
+    """A formula that the whitelist refuses; the message names the offending part and the remedy.
+
+    Attributes
+    ----------
+    fault, remedy
+        The two halves of the message, for `siq.errors.InputError`.
+    """
+
+    def __init__(self, fault: str, remedy: str) -> None:
+        super().__init__(f"{fault}; {remedy}")
+        self.fault = fault
+        self.remedy = remedy
+
+
+def parse_formula(
+    text: str | float, names: Mapping[str, sympy.Expr], *, inputs: Collection[str] = ()
+) -> sympy.Expr:
+    """Build a sympy expression from the text of a formula.
+
+    Parameters
+    ----------
+    text
+        The formula, such as ``"-2*(x**3 - x) - y"``; a plain number is a formula as well.
+    names
+        What every name in the formula stands for: states as symbols, parameters as numbers.
+    inputs
+        Those of the names that may be delayed, ``delay(u, tau)``.
+
+    Returns
+    -------
+    sympy.Expr
+        The expression; numbers with a decimal point become floating-point numbers.
+
+    Raises
+    ------
+    FormulaError
+        For anything outside the whitelist: attributes, comparisons, strings, undeclared names, powers
+        above `LARGEST_EXPONENT`, a division by zero, the root of a negative number.
+    """
+    text = str(text)
+    if len(text) > LONGEST_FORMULA:
+        raise FormulaError(f"the formula has {len(text)} characters", f"keep it below {LONGEST_FORMULA}")
+    try:
+        tree = ast.parse(text.strip(), mode="eval")
+        expression = _build(tree.body, names, inputs)
+    except (ArithmeticError, SyntaxError, TypeError, ValueError, MemoryError, RecursionError) as error:
+        if isinstance(error, FormulaError):
+            raise
+        raise FormulaError(f"'{_short(text)}' is not a formula", "check brackets and operators") from None
+    if expression.has(sympy.zoo, sympy.nan, sympy.oo, -sympy.oo, sympy.I):
+        raise FormulaError(f"'{_short(text)}' is not a real number somewhere", "correct the formula")
+    return expression
+
+
+def _build(node: ast.expr, names: Mapping[str, sympy.Expr], inputs: Collection[str]) -> sympy.Expr:
+    def build(part: ast.expr) -> sympy.Expr:
+        return _build(part, names, inputs)
+
+    match node:
+        case ast.Constant(value=bool() as value):
+            raise FormulaError(f"'{value}' is not a number", "write 0 or 1")
+        case ast.Constant(value=int() as value):
+            return sympy.Integer(value) if abs(value) < LARGEST_BASE else sympy.Float(float(value), DIGITS)
+        case ast.Constant(value=float() as value):
+            if not np.isfinite(value):
+                raise FormulaError("a number is too large", "write a finite number")
+            return sympy.Float(value, DIGITS)
+        case ast.Name(id=name):
+            return _look_up(name, names)
+        case ast.UnaryOp(op=ast.USub(), operand=operand):
+            return -build(operand)
+        case ast.UnaryOp(op=ast.UAdd(), operand=operand):
+            return build(operand)
+        case ast.BinOp(op=ast.Pow(), left=left, right=right):
+            return _power(build(left), build(right))
+        case ast.BinOp(op=operator) if type(operator) in _OPERATORS:
+            return _OPERATORS[type(operator)](build(node.left), build(node.right))
+        case ast.BinOp(op=ast.BitXor()):
+            raise FormulaError("'^' is not an operator", "write '**' for powers")
+        case ast.Call(func=ast.Name(id="delay"), args=arguments, keywords=[]) if inputs:
+            return _delay([build(argument) for argument in arguments], inputs)
+        case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]):
+            return _call(name, [build(argument) for argument in arguments])
+    raise FormulaError(
+        f"'{_short(ast.unparse(node))}' is not allowed in a formula",
+        f"use numbers, declared names, + - * / ** and the functions {', '.join(FUNCTIONS)}",
+    )
+
+
+def _look_up(name: str, names: Mapping[str, sympy.Expr]) -> sympy.Expr:
+    if name in names:
+        return names[name]
+    if name in CONSTANTS:
+        return CONSTANTS[name]
+    near = difflib.get_close_matches(name, names, n=1)
+    remedy = f"did you mean '{near[0]}'" if near else "declare it, or correct the spelling"
+    raise FormulaError(f"the name '{name}' is not declared", remedy)
+
+
+def _power(base: sympy.Expr, exponent: sympy.Expr) -> sympy.Expr:
+    # An unbounded power such as 9**9**9, or (10**32)**32 repeated, would be worked out digit by digit.
+    if exponent.is_number:
+        if not exponent.is_real or abs(float(exponent)) > LARGEST_EXPONENT:
+            raise FormulaError(f"the exponent {exponent} is too large", f"keep it below {LARGEST_EXPONENT}")
+        if base.is_number and abs(complex(base)) > LARGEST_BASE:
+            raise FormulaError("a power of a very large number is taken", "write the number out as a float")
+        if base.is_number and base.is_negative and not exponent.is_integer:
+            raise FormulaError(
+                f"the power {exponent} of the negative number {base} is not real", "correct it"
+            )
+    return base**exponent
+
+
+def _call(name: str, arguments: Sequence[sympy.Expr]) -> sympy.Expr:
+    if name not in FUNCTIONS:
+        near = difflib.get_close_matches(name, FUNCTIONS, n=1)
+        remedy = f"did you mean '{near[0]}'" if near else f"use one of {', '.join(FUNCTIONS)}"
+        raise FormulaError(f"the function '{name}' is not allowed in a formula", remedy)
+    wanted = "at least two arguments" if name in ("Max", "Min") else "one argument"
+    if (len(arguments) < 2) if name in ("Max", "Min") else (len(arguments) != 1):
+        raise FormulaError(f"'{name}' has {len(arguments)} arguments", f"give it {wanted}")
+    if all(argument.is_number for argument in arguments):
+        # Worked out at once: sympy would keep a tower such as exp(exp(exp(100))) and choke on it later.
+        value = complex(FUNCTIONS[name](*(sympy.Float(float(a), DIGITS) for a in arguments)))
+        if value.imag != 0 or not np.isfinite(value.real) or abs(value.real) > LARGEST_VALUE:
+            raise FormulaError(f"'{name}' of a number is not a real number of usable size", "correct it")
+    return FUNCTIONS[name](*arguments)
+
+
+def _delay(arguments: Sequence[sympy.Expr], inputs: Collection[str]) -> sympy.Expr:
+    if len(arguments) != 2 or str(arguments[0]) not in inputs:
+        raise FormulaError(
+            "'delay' needs an input and a time", f"write delay(u, tau) with one of {', '.join(inputs)} as u"
+        )
+    return delay(*arguments)
+
+
+def compile_formulas(
+    expressions: Sequence[sympy.Expr], variables: Sequence[sympy.Symbol]
+) -> Callable[[np.ndarray], np.ndarray]:
+    """Turn expressions into one vectorised numpy function.
+
+    Integer powers become products and common parts are worked out once, which makes polynomial vector
+    fields several times faster than numpy's power function.
+
+    Parameters
+    ----------
+    expressions
+        What to evaluate, ``m`` expressions in `variables`.
+    variables
+        The ``d`` symbols, in the order of the components of a point.
+
+    Returns
+    -------
+    callable
+        Maps components of shape ``(d, ...)`` to values of shape ``(m, ...)``: components first, so that
+        each is contiguous in memory.
+    """
+    function = compile_values(expressions, variables)
+
+    def evaluate(components: np.ndarray) -> np.ndarray:
+        values = np.empty((len(expressions), *components.shape[1:]))
+        for index, value in enumerate(function(*components)):
+            values[index] = value
+        return values
+
+    return evaluate
+
+
+def compile_values(
+    expressions: Sequence[sympy.Expr], variables: Sequence[sympy.Symbol], *, common: bool = True
+) -> Callable[..., Sequence[np.ndarray | float]]:
+    """Turn expressions into a function of as many arguments as there are variables.
+
+    Compare `compile_formulas`, whose argument is one array: here some variables may be arrays and others,
+    such as parameters, numbers.
+
+    Parameters
+    ----------
+    expressions, variables
+        See `compile_formulas`.
+    common
+        Whether parts that several expressions share are worked out once. Finding them takes longer than it
+        saves for a few short ones.
+
+    Returns
+    -------
+    callable
+        Gives one value for each expression: an array, or a number where only numbers stand in it.
+    """
+    return sympy.lambdify(
+        list(variables),
+        list(expressions),
+        modules=[{"integer_power": _integer_power}, "numpy"],
+        printer=_ProductPrinter(),
+        cse=common,
+        # Renaming is slow, and needed only for names that the generated code may use itself.
+        dummify=any(hasattr(np, str(each)) or hasattr(builtins, str(each)) for each in variables),
+    )
+
+
+def exact_number(value: float) -> sympy.Expr:
+    """A float as an integer where it is one, so that exact formulas stay exact."""
+    return sympy.Integer(int(value)) if float(value).is_integer() else sympy.Float(float(value), DIGITS)
+
+
+class _ProductPrinter(NumPyPrinter):
+    """Writes integer powers as products: numpy's own power is tens of times slower."""
+
+    def __init__(self) -> None:
+        super().__init__({"fully_qualified_modules": False, "inline": True, "allow_unknown_functions": True})
+
+    def _print_Pow(self, expr: sympy.Pow, rational: bool = False) -> str:  # noqa: N802 (sympy's name)
+        base, exponent = expr.args
+        if exponent.is_Integer and 2 <= abs(exponent) <= LARGEST_EXPONENT:
+            power = f"integer_power({self._print(base)}, {abs(int(exponent))})"
+            return power if exponent > 0 else f"(1.0/{power})"
+        return super()._print_Pow(expr, rational=rational)
+
+    def _print_DiracDelta(self, expr: sympy.Expr) -> str:  # noqa: N802
+        # The derivative of sign, which a Jacobian has; it is zero but on a set of measure zero.
+        return "0.0"
+
+
+def _integer_power(base: np.ndarray, exponent: int) -> np.ndarray:
+    product = base
+    for _ in range(exponent - 1):
+        product = product * base
+    return product
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= 60 else text[:57] + "..."

@@ -1,0 +1,121 @@
+"""The phase portrait: attractors, the saddles next to each, and the recorded points that lead there.
+
+It follows from the identified f and the recorded points alone. Both routes to V start from it, and so does
+the check that ends a training.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from siq.dynamics.basins import Basin, basin_of
+from siq.dynamics.dynamics import Dynamics
+from siq.dynamics.equilibria import Descents, Equilibrium, find_equilibria, follow, neighbours
+from siq.numerics.thinning import representative_subset
+
+STARTS = 1500  # recorded points from which f is followed
+NEWTON_STARTS = 400
+
+
+@dataclass(frozen=True)
+class PhasePortrait:
+    """What f says of the recorded region.
+
+    Attributes
+    ----------
+    points
+        Evenly spread recorded states, shape ``(n, d)``.
+    box
+        Shape ``(d, 2)``: their limits.
+    equilibria
+        All that were found.
+    attractors
+        Those that are stable and that recorded points lead to.
+    saddles
+        For each attractor, the saddles next to it.
+    basins
+        For each attractor, what leads to it.
+    descents
+        From recorded points, to whatever end.
+    """
+
+    points: np.ndarray
+    box: np.ndarray
+    equilibria: tuple[Equilibrium, ...]
+    attractors: tuple[Equilibrium, ...]
+    saddles: tuple[tuple[Equilibrium, ...], ...]
+    basins: tuple[Basin, ...]
+    descents: Descents
+
+    @property
+    def unsettled(self) -> float:
+        """Share of the recorded points from which f leads to no attractor although it stays in reach."""
+        return float(((self.descents.ends < 0) & ~self.descents.escaped).mean())
+
+    def fault(self) -> str | None:
+        """Why this landscape has no wells, in words; None where it has."""
+        degenerate = [one for one in self.equilibria if one.kind == "degenerate"]
+        if degenerate:
+            place = np.array2string(degenerate[0].position, precision=4)
+            return f"the equilibrium at {place} is neither stable nor unstable to first order"
+        if not self.attractors and self.unsettled > 0.5:
+            return "no recorded state leads to a stable equilibrium: the recordings end on a limit cycle"
+        if not self.attractors:
+            return "f has no stable equilibrium in the recorded region"
+        if self.unsettled > 0.02:
+            return (
+                f"{self.unsettled:.0%} of the recorded states lead to no equilibrium: there is another"
+                " attractor, such as a limit cycle"
+            )
+        return None
+
+
+def evenly_spread(x: np.ndarray, *, generator: np.random.Generator, most: int = 4000) -> np.ndarray:
+    """Rows of states that cover the recorded region evenly, about a twentieth of each state's range apart."""
+    width = np.ptp(x, axis=0)
+    rows = representative_subset(
+        x / np.where(width > 0, width, 1.0),
+        distance=max(0.04, 0.5 * most ** (-1 / x.shape[1])),
+        generator=generator,
+    )
+    return np.sort(generator.choice(rows, most, replace=False)) if len(rows) > most else rows
+
+
+def phase_portrait(dynamics: Dynamics, points: np.ndarray, *, seed: int = 0) -> PhasePortrait:
+    """Find the attractors, their saddles, and what leads to them.
+
+    Parameters
+    ----------
+    dynamics
+        f and D.
+    points
+        Evenly spread recorded states, shape ``(n, d)``; see `evenly_spread`.
+    seed
+        Decides which points stand for the others.
+    """
+    generator = np.random.default_rng(seed)
+    box = np.stack([points.min(axis=0), points.max(axis=0)], axis=1)
+    few = generator.permutation(len(points))
+    equilibria = find_equilibria(dynamics, points[few[:NEWTON_STARTS]])
+    stable = [one for one in equilibria if one.kind == "attractor"]
+    descents = follow(dynamics, points[few[:STARTS]], stable, box=box)
+    reached = [index for index in range(len(stable)) if (descents.ends == index).any()]
+    attractors = [stable[index] for index in reached]
+    renumbered = np.full(len(stable) + 1, -1)
+    renumbered[reached] = np.arange(len(reached))
+    descents = Descents(descents.paths, renumbered[descents.ends], descents.escaped)
+    around: list[list[Equilibrium]] = [[] for _ in attractors]
+    for one in equilibria:
+        if one.kind == "saddle":
+            for index in neighbours(dynamics, one, attractors, box=box):
+                around[index].append(one)
+    basins = [
+        basin_of(dynamics, descents, index, attractors, box=box, generator=generator)
+        for index in range(len(attractors))
+    ]
+    return PhasePortrait(
+        points, box, tuple(equilibria), tuple(attractors),
+        tuple(tuple(saddles) for saddles in around), tuple(basins), descents,
+    )  # fmt: skip

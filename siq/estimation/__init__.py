@@ -1,0 +1,20 @@
+"""How likely are recordings under given dynamics, and which parameters fit best?
+
+Imports `siq.identify` and what it may import.
+
+==================  ===========================================================================
+`measurements`      what was measured, and what drove the system?
+`linearisation`     what do small changes of states and parameters do to what is measured?
+`kernels`           the same sample after sample, compiled
+`innovations`       what does a filter not foresee?
+`noise`             how strong are the sensors' noise and random forces?
+`noise_kernel`      the likelihood of both, compiled
+`first_states`      with which states does a fit begin?
+`estimation`        which parameters, states and noise fit best?
+`trajectories`      the same, where trajectories may not leave their equations
+`jumps`             how finely must a jump of f be followed?
+`process_noise`     does a model need random forces to explain recordings?
+`recalibration`     which values of its own parameters make a simulation fit best?
+`free_runs`         how far is a simulation off that runs freely?
+==================  ===========================================================================
+"""

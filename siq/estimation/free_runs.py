@@ -1,0 +1,114 @@
+"""How far is a simulation off that runs freely, told only how a recording begins?
+
+Every simulation runs from the end of a prefix of each recording. From the prefix, which is not scored, it
+estimates its own state at the begin; the prefix is the same for all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from siq.dynamics.dynamics import Dynamics
+from siq.estimation.estimation import fit_by_multiple_shooting
+from siq.estimation.first_states import first_states
+from siq.estimation.innovations import Noise
+from siq.estimation.linearisation import Grid
+from siq.estimation.measurements import Measurements
+from siq.estimation.trajectories import run
+
+SHORTEST_PREFIX = 8  # samples
+PREFIX = 0.2  # of a recording
+
+
+@dataclass(frozen=True)
+class FreeRun:
+    """A simulation of held-out recordings.
+
+    Attributes
+    ----------
+    outputs
+        Shape ``(n, m)``; NaN from where the simulation ran away.
+    scored
+        Rows behind the prefixes, shape ``(n,)``.
+    """
+
+    outputs: np.ndarray
+    scored: np.ndarray
+
+
+def free_run(
+    model: Dynamics, data: Measurements, *, noise: Noise, substeps: int, prefix: float = PREFIX
+) -> FreeRun:
+    """Simulate recordings from states that their prefixes tell.
+
+    Parameters
+    ----------
+    model
+        With the parameters' values to be used; nothing but initial states is fitted.
+    data
+        The recordings.
+    noise
+        The measurement noise weighs the outputs; the process noise lets the states follow the prefix first.
+    substeps
+        Runge–Kutta steps between samples.
+    prefix
+        Share of each recording.
+    """
+    lengths = np.diff(data.first)
+    rows = np.minimum(np.maximum((prefix * lengths).astype(int), SHORTEST_PREFIX), lengths - 1)
+    x = initial_states(model, data.until(np.maximum(rows, 2)), noise=noise, substeps=substeps)
+    states = run(model, Grid(data, substeps), x)
+    signals = data.signals(data.t, data.recording, delays=model.lags(model.values))
+    within = np.arange(len(data.t)) - data.first[data.recording]
+    return FreeRun(
+        outputs=model.functions.outputs(states.T, signals, model.values).T,
+        scored=within >= rows[data.recording],
+    )
+
+
+def initial_states(model: Dynamics, data: Measurements, *, noise: Noise, substeps: int) -> np.ndarray:
+    """The states in which recordings begin, shape ``(recordings, d)``, with all parameters as they are."""
+    still = replace(model, parameters=tuple(replace(each, fixed=True) for each in model.parameters))
+    process = np.zeros(model.dimension)
+    process[: len(noise.process)] = noise.process
+    start = first_states(still, data)
+    follow = fit_by_multiple_shooting(
+        still,
+        data,
+        x=start,
+        noise=Noise(noise.measurement, process),
+        estimate_process=False,
+        substeps=substeps,
+    )
+    x = follow.x if np.isfinite(follow.sum_of_squares) else start
+    strict = fit_by_multiple_shooting(
+        still,
+        data,
+        x=x,
+        noise=Noise(noise.measurement, np.zeros(model.dimension)),
+        estimate_process=False,
+        substeps=substeps,
+    )
+    best = strict.x if strict.converged else x
+    return best[data.first[:-1]]
+
+
+def normalised_rms(outputs: np.ndarray, simulated: FreeRun) -> float | None:
+    """Root mean square error over that of the outputs about their mean; None where a simulation ran away.
+
+    Parameters
+    ----------
+    outputs
+        As measured, shape ``(n, m)``.
+    simulated
+        The free run of the same recordings.
+    """
+    measured = outputs[simulated.scored]
+    error = simulated.outputs[simulated.scored] - measured
+    known = np.isfinite(measured)
+    if not np.isfinite(error[known]).all():
+        return None
+    spread = np.nanvar(measured, axis=0)
+    return float(np.sqrt(np.nanmean(error**2 / np.where(spread > 0, spread, 1.0))))

@@ -1,0 +1,198 @@
+"""Innovations: what a filter does not foresee, in units of its standard deviation.
+
+Along the trajectories of a fit everything is linear. The innovations, and what a unit of each parameter
+explains of them, the unknown initial states projected out, are all that estimation, screening and tests need.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.linalg
+
+from siq.errors import NumericalFailure
+from siq.estimation.kernels import whitened_innovations
+from siq.estimation.linearisation import Linearisation
+from siq.estimation.measurements import Measurements
+
+RANK = 1e-4  # singular values below this share of the largest say nothing
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Variances of the two kinds of noise.
+
+    Attributes
+    ----------
+    measurement
+        R, per sample, shape ``(m,)``.
+    process
+        Q, per time, shape ``(d,)``; zero where nothing drives the state.
+    """
+
+    measurement: np.ndarray
+    process: np.ndarray
+
+    def without_process(self) -> Noise:
+        """The same measurement noise, and states that follow their equations exactly."""
+        return Noise(self.measurement, np.zeros_like(self.process))
+
+    def scaled(self, factor: float) -> Noise:
+        """The same measurement noise, with the process noise multiplied."""
+        return Noise(self.measurement, self.process * factor)
+
+
+def profile_likelihood(total: float, freedom: int, log_determinant: float) -> float:
+    """Log-likelihood, up to a constant, with the common scale of both kinds of noise at its best."""
+    return -0.5 * (freedom * np.log(max(total, 1e-300) / freedom) + log_determinant)
+
+
+@dataclass(frozen=True)
+class Whitened:
+    """Innovations in units of their standard deviation, initial states projected out.
+
+    Attributes
+    ----------
+    innovations
+        Shape ``(n·m,)``.
+    columns
+        What a unit of each parameter explains of them, shape ``(n·m, p)``.
+    recording
+        The recording of each, shape ``(n·m,)``.
+    known
+        Which of them were measured, shape ``(n·m,)``.
+    degrees_of_freedom
+        Measured values less initial states.
+    log_determinant
+        Of the innovations' covariance.
+    """
+
+    innovations: np.ndarray
+    columns: np.ndarray
+    recording: np.ndarray
+    known: np.ndarray
+    degrees_of_freedom: int
+    log_determinant: float
+
+    def log_likelihood(self, sum_of_squares: float) -> float:
+        """Log-likelihood where the innovations have the given sum of squares."""
+        return -0.5 * (sum_of_squares + self.log_determinant + self.known.sum() * np.log(2 * np.pi))
+
+
+def whiten(linearisation: Linearisation, data: Measurements, noise: Noise) -> Whitened:
+    """Innovations of the filter in units of their standard deviation, initial states projected out.
+
+    Raises
+    ------
+    NumericalFailure
+        When the simulation, as linearised, runs away along a recording. Columns of parameters may be infinite
+        all the same.
+    """
+    transition = linearisation.transition
+    step = np.append(np.diff(data.t), 0.0)
+    process = process_covariance(transition, step, noise.process)
+    innovations, columns, initial, log_determinant = whitened_innovations(
+        data.first,
+        transition,
+        linearisation.response,
+        linearisation.gap,
+        process,
+        linearisation.measured,
+        linearisation.measured_response,
+        linearisation.residual,
+        noise.measurement,
+    )
+    outputs = innovations.shape[1]
+    known = ~np.isnan(linearisation.residual).ravel()
+    innovations = innovations.ravel()
+    columns = columns.reshape(len(innovations), -1)
+    initial = initial.reshape(len(innovations), -1)
+    if not (np.isfinite(innovations).all() and np.isfinite(initial).all() and np.isfinite(log_determinant)):
+        raise NumericalFailure("small deviations from the recorded motion grow beyond all numbers")
+    used = 0
+    for begin, end in zip(data.first[:-1] * outputs, data.first[1:] * outputs, strict=True):
+        basis = _orthonormal(initial[begin:end])
+        innovations[begin:end] -= basis @ (basis.T @ innovations[begin:end])
+        columns[begin:end] -= basis @ (basis.T @ columns[begin:end])
+        used += basis.shape[1]
+    return Whitened(
+        innovations=innovations,
+        columns=columns,
+        recording=np.repeat(data.recording, outputs),
+        known=known,
+        degrees_of_freedom=int(known.sum()) - used,
+        log_determinant=log_determinant,
+    )
+
+
+def process_covariance(transition: np.ndarray, step: np.ndarray, intensity: np.ndarray) -> np.ndarray:
+    """Covariance that noise of the given intensities adds over each interval, by Simpson's rule.
+
+    Parameters
+    ----------
+    transition
+        Φ over the intervals, shape ``(n, d, d)``.
+    step
+        Their lengths, shape ``(n,)``.
+    intensity
+        Q per time, shape ``(d,)``.
+    """
+    total = np.zeros_like(transition)
+    for place in np.flatnonzero(intensity):
+        after = transition[:, :, place]
+        unit = np.zeros(len(intensity))
+        unit[place] = 1.0
+        middle = (after + unit) / 2
+        total += intensity[place] * (after[:, :, None] * after[:, None, :])
+        total += 4 * intensity[place] * (middle[:, :, None] * middle[:, None, :])
+        total[:, place, place] += intensity[place]
+    return total * (step / 6)[:, None, None]
+
+
+def solve(columns: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Least squares with columns of any scale; what the data do not tell is left alone.
+
+    Returns
+    -------
+    estimate, covariance
+        Shapes ``(p,)`` and ``(p, p)``, for errors of unit variance.
+
+    Raises
+    ------
+    NumericalFailure
+        When a column or the target is not finite.
+    """
+    if columns.shape[1] == 0:
+        return np.zeros(0), np.zeros((0, 0))
+    if not (np.isfinite(columns).all() and np.isfinite(target).all()):
+        raise NumericalFailure("the effect of a parameter on what is measured is beyond all numbers")
+    scale = np.sqrt((columns**2).sum(axis=0))
+    scale[scale == 0] = 1.0
+    left, values, right = scipy.linalg.svd(columns / scale, full_matrices=False)
+    kept = values > RANK * values[0] if values[0] > 0 else np.zeros(len(values), dtype=bool)
+    inverse = right[kept].T / values[kept] / scale[:, None]
+    return inverse @ (left[:, kept].T @ target), inverse @ inverse.T
+
+
+def with_parameters_changed(linearisation: Linearisation, change: np.ndarray) -> Linearisation:
+    """The linearisation after a change of the parameters, which are then no longer free."""
+    return replace(
+        linearisation,
+        gap=linearisation.gap + linearisation.response @ change,
+        residual=linearisation.residual - linearisation.measured_response @ change,
+        response=np.zeros((*linearisation.gap.shape, 0)),
+        measured_response=np.zeros((*linearisation.residual.shape, 0)),
+    )
+
+
+def _orthonormal(columns: np.ndarray) -> np.ndarray:
+    """Orthonormal basis of what columns span."""
+    scale = np.sqrt((columns**2).sum(axis=0))
+    scale[scale == 0] = 1.0
+    basis, triangle = np.linalg.qr(columns / scale)
+    values = np.abs(np.diag(triangle))
+    if values.min(initial=1.0) <= RANK * values.max(initial=0.0):
+        basis, values, _ = np.linalg.svd(columns / scale, full_matrices=False)
+        basis = basis[:, values > RANK * max(values[0], 1e-300)]
+    return basis

@@ -1,0 +1,305 @@
+"""The loops over samples: linear propagation within intervals, innovations, smoothing.
+
+A recording is a chain of samples. Between two of them the model carries the state on, linearly for small
+deviations; at each of them something is measured. What is linear in a chain is worked out here, compiled,
+since every fit and every candidate passes through it many times. The statistics is in
+`siq.estimation.estimation`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from siq.numerics.machine_code import machine_code
+
+
+@machine_code
+def carry_linearly(
+    step: np.ndarray,
+    jacobians: np.ndarray,
+    forcings: np.ndarray,
+    transition: np.ndarray,
+    response: np.ndarray,
+) -> None:
+    """Carry deviations of the state over one substep, in place: ``S' = J S + F`` by the Runge–Kutta rule.
+
+    Parameters
+    ----------
+    step
+        Lengths of the substeps, shape ``(n,)``.
+    jacobians
+        J at the begin, the middle and the end of each, shape ``(3, n, d, d)``.
+    forcings
+        F at the same places, shape ``(3, n, d, p)``: the derivatives by parameters.
+    transition
+        Shape ``(n, d, d)``: derivative of the state by the state at the begin of the interval.
+    response
+        Shape ``(n, d, p)``: derivative of the state by the parameters.
+    """
+    intervals, dimension, columns = forcings.shape[1:]
+    slope = np.empty(dimension)
+    weights = (1.0, 2.0, 2.0, 1.0)
+    reach = (0.0, 0.5, 0.5, 1.0)
+    node = (0, 1, 1, 2)
+    begin = np.empty(dimension)
+    at = np.empty(dimension)
+    total = np.empty(dimension)
+    for k in range(intervals):
+        h = step[k]
+        for c in range(dimension + columns):
+            for i in range(dimension):
+                begin[i] = transition[k, i, c] if c < dimension else response[k, i, c - dimension]
+                total[i] = 0.0
+                slope[i] = 0.0
+            for stage in range(4):
+                place = node[stage]
+                for i in range(dimension):
+                    at[i] = begin[i] + reach[stage] * h * slope[i]
+                for i in range(dimension):
+                    value = forcings[place, k, i, c - dimension] if c >= dimension else 0.0
+                    for j in range(dimension):
+                        value += jacobians[place, k, i, j] * at[j]
+                    slope[i] = value
+                    total[i] += weights[stage] * value
+            for i in range(dimension):
+                value = begin[i] + h / 6.0 * total[i]
+                if c < dimension:
+                    transition[k, i, c] = value
+                else:
+                    response[k, i, c - dimension] = value
+
+
+@machine_code
+def whitened_innovations(
+    first: np.ndarray,
+    transition: np.ndarray,
+    response: np.ndarray,
+    gap: np.ndarray,
+    process: np.ndarray,
+    measured: np.ndarray,
+    measured_response: np.ndarray,
+    residual: np.ndarray,
+    variance: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Innovations of the Kalman filter and their derivatives, each divided by its standard deviation.
+
+    The initial state of every recording is unknown; it enters as d further columns, not as a covariance, so
+    that nothing is lost to rounding and the case without process noise is exact.
+
+    Parameters
+    ----------
+    first
+        Row at which each recording begins, and the number of rows at the end; shape ``(recordings + 1,)``.
+    transition, response, gap
+        Of the interval that begins at each row: shapes ``(n, d, d)``, ``(n, d, p)``, ``(n, d)``. `gap` is
+        by how much the model's next state exceeds the one in hand.
+    process
+        Covariance that process noise adds over the interval, shape ``(n, d, d)``.
+    measured, measured_response
+        Derivative of the outputs by states and parameters, ``(n, m, d)`` and ``(n, m, p)``.
+    residual
+        Measured minus modelled outputs, shape ``(n, m)``; NaN where nothing was measured.
+    variance
+        Of the measurement noise, shape ``(m,)``.
+
+    Returns
+    -------
+    innovations
+        Shape ``(n, m)``; zero where nothing was measured.
+    by_parameters
+        Shape ``(n, m, p)``: what a unit of each parameter adds to the modelled output, whitened.
+    by_initial_state
+        Shape ``(n, m, d)``: the same of the state in which the recording began.
+    log_determinant
+        Sum of the logarithms of the innovations' variances.
+    """
+    rows, dimension, columns = response.shape
+    outputs = residual.shape[1]
+    width = 1 + columns + dimension
+    innovations = np.zeros((rows, outputs))
+    by_parameters = np.zeros((rows, outputs, columns))
+    by_initial = np.zeros((rows, outputs, dimension))
+    log_determinant = 0.0
+    state = np.empty((dimension, width))
+    carried = np.empty((dimension, width))
+    covariance = np.empty((dimension, dimension))
+    half = np.empty((dimension, dimension))
+    gain = np.empty(dimension)
+    shown = np.empty(width)
+    for recording in range(len(first) - 1):
+        state[:] = 0.0
+        covariance[:] = 0.0
+        for i in range(dimension):
+            state[i, 1 + columns + i] = 1.0
+        for k in range(first[recording], first[recording + 1]):
+            for o in range(outputs):
+                if np.isnan(residual[k, o]):
+                    continue
+                for c in range(width):
+                    value = 0.0
+                    for i in range(dimension):
+                        value += measured[k, o, i] * state[i, c]
+                    shown[c] = value
+                for c in range(columns):
+                    shown[1 + c] += measured_response[k, o, c]
+                spread = variance[o]
+                for i in range(dimension):
+                    value = 0.0
+                    for j in range(dimension):
+                        value += covariance[i, j] * measured[k, o, j]
+                    gain[i] = value
+                for i in range(dimension):
+                    spread += measured[k, o, i] * gain[i]
+                scale = 1.0 / np.sqrt(spread)
+                innovation = residual[k, o] - shown[0]
+                innovations[k, o] = innovation * scale
+                for c in range(columns):
+                    by_parameters[k, o, c] = shown[1 + c] * scale
+                for i in range(dimension):
+                    by_initial[k, o, i] = shown[1 + columns + i] * scale
+                log_determinant += np.log(spread)
+                for i in range(dimension):
+                    share = gain[i] / spread
+                    state[i, 0] += share * innovation
+                    for c in range(1, width):
+                        state[i, c] -= share * shown[c]
+                    for j in range(dimension):
+                        covariance[i, j] -= share * gain[j]
+            if k + 1 == first[recording + 1]:
+                break
+            for i in range(dimension):
+                for c in range(width):
+                    value = 0.0
+                    for j in range(dimension):
+                        value += transition[k, i, j] * state[j, c]
+                    carried[i, c] = value
+                carried[i, 0] += gap[k, i]
+                for c in range(columns):
+                    carried[i, 1 + c] += response[k, i, c]
+            state[:] = carried
+            for i in range(dimension):
+                for j in range(dimension):
+                    value = 0.0
+                    for m in range(dimension):
+                        value += transition[k, i, m] * covariance[m, j]
+                    half[i, j] = value
+            for i in range(dimension):
+                for j in range(i + 1):
+                    value = process[k, i, j]
+                    for m in range(dimension):
+                        value += half[i, m] * transition[k, j, m]
+                    covariance[i, j] = value
+                    covariance[j, i] = value
+    return innovations, by_parameters, by_initial, log_determinant
+
+
+@machine_code
+def smoothed_states(
+    first: np.ndarray,
+    transition: np.ndarray,
+    gap: np.ndarray,
+    process: np.ndarray,
+    measured: np.ndarray,
+    residual: np.ndarray,
+    variance: np.ndarray,
+    begin: np.ndarray,
+) -> np.ndarray:
+    """The most probable deviation of every state, given all measurements and the initial states.
+
+    Modified Bryson–Frazier smoother: it inverts no covariance of states, which is singular where a state
+    carries no process noise.
+
+    Parameters
+    ----------
+    first, transition, gap, process, measured, residual, variance
+        As in `whitened_innovations`; the parameters' changes are already part of `gap` and `residual`.
+    begin
+        Deviation of the initial state of each recording, shape ``(recordings, d)``.
+
+    Returns
+    -------
+    numpy.ndarray
+        Shape ``(n, d)``.
+    """
+    rows, dimension = gap.shape
+    outputs = residual.shape[1]
+    smoothed = np.empty((rows, dimension))
+    covariances = np.empty((rows, dimension, dimension))
+    gains = np.zeros((rows, outputs, dimension))
+    spreads = np.ones((rows, outputs))
+    innovations = np.zeros((rows, outputs))
+    state = np.empty(dimension)
+    carried = np.empty(dimension)
+    covariance = np.empty((dimension, dimension))
+    half = np.empty((dimension, dimension))
+    adjoint = np.empty(dimension)
+    for recording in range(len(first) - 1):
+        state[:] = begin[recording]
+        covariance[:] = 0.0
+        for k in range(first[recording], first[recording + 1]):
+            smoothed[k] = state
+            covariances[k] = covariance
+            for o in range(outputs):
+                if np.isnan(residual[k, o]):
+                    continue
+                innovation = residual[k, o]
+                spread = variance[o]
+                for i in range(dimension):
+                    value = 0.0
+                    for j in range(dimension):
+                        value += covariance[i, j] * measured[k, o, j]
+                    gains[k, o, i] = value
+                for i in range(dimension):
+                    innovation -= measured[k, o, i] * state[i]
+                    spread += measured[k, o, i] * gains[k, o, i]
+                innovations[k, o] = innovation
+                spreads[k, o] = spread
+                for i in range(dimension):
+                    share = gains[k, o, i] / spread
+                    state[i] += share * innovation
+                    for j in range(dimension):
+                        covariance[i, j] -= share * gains[k, o, j]
+            if k + 1 == first[recording + 1]:
+                break
+            for i in range(dimension):
+                value = gap[k, i]
+                for j in range(dimension):
+                    value += transition[k, i, j] * state[j]
+                carried[i] = value
+            state[:] = carried
+            for i in range(dimension):
+                for j in range(dimension):
+                    value = 0.0
+                    for m in range(dimension):
+                        value += transition[k, i, m] * covariance[m, j]
+                    half[i, j] = value
+            for i in range(dimension):
+                for j in range(i + 1):
+                    value = process[k, i, j]
+                    for m in range(dimension):
+                        value += half[i, m] * transition[k, j, m]
+                    covariance[i, j] = value
+                    covariance[j, i] = value
+        adjoint[:] = 0.0
+        for k in range(first[recording + 1] - 1, first[recording] - 1, -1):
+            if k + 1 < first[recording + 1]:
+                for i in range(dimension):
+                    value = 0.0
+                    for j in range(dimension):
+                        value += transition[k, j, i] * adjoint[j]
+                    carried[i] = value
+                adjoint[:] = carried
+            for o in range(outputs - 1, -1, -1):
+                if np.isnan(residual[k, o]):
+                    continue
+                value = innovations[k, o]
+                for i in range(dimension):
+                    value += gains[k, o, i] * adjoint[i]
+                for i in range(dimension):
+                    adjoint[i] -= measured[k, o, i] * value / spreads[k, o]
+            for i in range(dimension):
+                value = 0.0
+                for j in range(dimension):
+                    value += covariances[k, i, j] * adjoint[j]
+                smoothed[k, i] -= value
+    return smoothed

@@ -1,0 +1,173 @@
+"""What the residuals of an identified f say: no noise, process noise, or noise of the measurement.
+
+Process noise is white: the residuals of neighbouring pairs know nothing of each other, and their variance
+grows with the time between samples. Measurement noise is shared by the two pairs that a sample belongs to,
+which makes their residuals anticorrelated; it enters X0 as well, and biases every regression on X0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import scipy.special
+
+from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
+from siq.identify.identification import IdentifiedField, refit, residuals
+
+NoiseKind = Literal["none", "process", "measurement", "coloured"]
+
+LONGEST_GAP = 10.0  # steps of a pair: samples farther apart say little of noise
+SIGNIFICANT = 5.0  # standard errors
+LARGE = 0.02  # a correlation, or a deviation of D, below this is harmless however significant
+PAIRS = 60_000
+
+
+@dataclass(frozen=True)
+class NoiseDiagnosis:
+    """What is in the residuals.
+
+    Attributes
+    ----------
+    kind
+        ``none``: only the integrator's error and rounding. ``process``: white. ``measurement``:
+        neighbouring residuals are anticorrelated. ``coloured``: they are positively correlated.
+    intensity
+        ε of ``√ε D^(1/2) dW``, estimated.
+    covariance
+        Shape ``(d, d)``: the residuals' covariance per time over the intensity; D, if D is right.
+    deviation
+        Largest entry of ``D^(-1/2) covariance D^(-1/2) - 1``, and ...
+    deviation_score
+        ... the same in its standard errors.
+    correlation, correlation_score
+        Of neighbouring residuals, the strongest over the states; and in standard errors.
+    measurement
+        Shape ``(d,)``: standard deviation of measurement noise; zero where none is recognised.
+    """
+
+    kind: NoiseKind
+    intensity: float
+    covariance: np.ndarray
+    deviation: float
+    deviation_score: float
+    correlation: float
+    correlation_score: float
+    measurement: np.ndarray
+
+    def fault(self, states: tuple[str, ...]) -> str | None:
+        """Why formulas from these recordings would be biased, in words; None where they are not."""
+        if self.kind == "measurement":
+            worst = int(np.argmax(self.measurement))
+            return (
+                f"the recordings carry measurement noise, of about {self.measurement[worst]:.2g} in"
+                f" {states[worst]}: residuals of neighbouring pairs are anticorrelated"
+                f" ({self.correlation:.2f}); smooth or average the recordings first"
+            )
+        if self.kind == "coloured":
+            return (
+                f"the residuals of neighbouring pairs are correlated ({self.correlation:.2f}): the noise has"
+                " a memory, or a state is missing from the recordings"
+            )
+        if self.kind == "process" and self.deviation_score > SIGNIFICANT and self.deviation > LARGE:
+            shown = np.array2string(self.covariance, precision=3, separator=", ").replace("\n", "")
+            return (
+                f"the noise in the recordings has the covariance {shown} (times {self.intensity:.3g}), which"
+                " is not the D of the study; state this D"
+            )
+        return None
+
+
+def residual_noise(
+    found: IdentifiedField, recordings: Recordings, *, pair_step: float | None
+) -> NoiseDiagnosis:
+    """Tell process noise from measurement noise.
+
+    Parameters
+    ----------
+    found
+        The identified f.
+    recordings
+        The trajectories, whose samples also serve between the pairs.
+    pair_step
+        Longest step of a pair.
+    """
+    noise, d = found.diffusion, found.library.dimension
+    pairs = snapshot_pairs(recordings, pair_step=pair_step)
+    sample = snapshot_pairs(recordings, pair_step=LONGEST_GAP * float(pairs.h.max()))
+    if len(sample.h) > PAIRS:  # whole stretches, so that neighbours stay neighbours
+        sample = SnapshotPairs(
+            sample.x0[:PAIRS], sample.xh[:PAIRS], sample.h[:PAIRS], sample.recording[:PAIRS]
+        )
+    intensity = noise.intensity(found.noise_rate)
+    covariance = found.noise_rate / intensity if intensity > 0 else noise.matrix
+    whiten = noise.whitening
+    excess = np.abs(whiten @ covariance @ whiten.T - np.eye(d))
+    deviation = float(excess.max())
+    score = float((excess / np.sqrt((1 + np.eye(d)) / len(pairs.h))).max())
+    if found.noise_free:
+        return NoiseDiagnosis("none", 0.0, noise.matrix, 0.0, 0.0, 0.0, 0.0, np.zeros(d))
+    rest = residuals(found, sample)
+    joined = _joined(sample, rest)
+    first, second = rest[:-1][joined], rest[1:][joined]
+    product = first * second
+    size = np.sqrt((first**2).mean(axis=0) * (second**2).mean(axis=0))
+    correlations = product.mean(axis=0) / size
+    scores = product.sum(axis=0) / np.sqrt((product**2).sum(axis=0))
+    worst = int(np.argmax(np.abs(scores)))
+    kind: NoiseKind = "process"
+    measurement = np.zeros(d)
+    if abs(scores[worst]) > SIGNIFICANT and abs(correlations[worst]) > LARGE:
+        kind = "measurement" if scores[worst] < 0 else "coloured"
+        if kind == "measurement":
+            measurement = _measurement_errors(found, sample)
+    return NoiseDiagnosis(
+        kind, intensity, covariance, deviation, score,
+        float(correlations[worst]), float(scores[worst]), measurement,
+    )  # fmt: skip
+
+
+def _joined(sample: SnapshotPairs, rest: np.ndarray) -> np.ndarray:
+    """Which pairs share a sample with the next: the later state of one is the earlier one of the other.
+
+    Without the few that an inaccurate f carries far away, by which everything else would be hidden.
+    """
+    usual = (np.abs(rest) < 20 * np.median(np.abs(rest), axis=0)).all(axis=1)
+    same = (sample.recording[1:] == sample.recording[:-1]) & (sample.xh[:-1] == sample.x0[1:]).all(axis=1)
+    return np.asarray(same & usual[1:] & usual[:-1])
+
+
+def _measurement_errors(found: IdentifiedField, sample: SnapshotPairs) -> np.ndarray:
+    """Standard deviations of measurement noise, from the covariance of neighbouring residuals.
+
+    Errors of X0 bias f by the inverse of the step, so that f is fitted to the long steps as well. An error
+    of the sample that two pairs share is carried on by the flow of the second.
+    """
+    found = refit(found, sample)
+    rest = residuals(found, sample)
+    joined = _joined(sample, rest)
+    covariance = (rest[:-1][joined] * rest[1:][joined]).mean(axis=0)
+    rates = np.einsum("nii->ni", found.dynamics.jacobian(sample.x0[1:][joined]))
+    carried = np.exp(np.minimum(rates * sample.h[1:][joined, None], 1.0)).mean(axis=0)
+    return np.sqrt(np.maximum(-covariance / carried, 0.0))
+
+
+def mean_residual_probability(found: IdentifiedField, pairs: SnapshotPairs) -> float:
+    """Probability of the held-out residuals having no mean left that f's library could express.
+
+    An F test of the regression of the residuals on the library, the smallest over the states, corrected
+    for their number: tiny where f misses a term.
+    """
+    # Copies of resampled recordings would count as evidence that there is not.
+    _, single = np.unique(np.column_stack([pairs.x0, pairs.xh]), axis=0, return_index=True)
+    pairs = SnapshotPairs(pairs.x0[single], pairs.xh[single], pairs.h[single], pairs.recording[single])
+    rest = residuals(found, pairs) / np.sqrt(pairs.h)[:, None]
+    design = found.library.evaluate(pairs.x0) * np.sqrt(pairs.h)[:, None]
+    design = design / np.where((size := np.linalg.norm(design, axis=0)) > 0, size, 1.0)
+    orthogonal = np.linalg.qr(design)[0]
+    explained = ((orthogonal.T @ rest) ** 2).sum(axis=0)
+    total = (rest**2).sum(axis=0)
+    n, q = design.shape
+    ratio = (explained / q) / ((total - explained) / (n - q))
+    return float(min(scipy.special.fdtrc(q, n - q, ratio).min() * rest.shape[1], 1.0))

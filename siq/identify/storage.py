@@ -1,0 +1,107 @@
+"""The identified vector field as a file, with its uncertainty and what its residuals say."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from siq.dynamics.diffusion import Diffusion
+from siq.errors import InputError
+from siq.files.whole import whole_file
+from siq.identify.flow import FlowMap
+from siq.identify.identification import IdentificationOptions, IdentifiedField
+from siq.identify.library import CandidateLibrary, candidate_library
+
+
+@dataclass(frozen=True)
+class FieldRecord:
+    """What is kept of an identification.
+
+    Attributes
+    ----------
+    found
+        The field.
+    prediction
+        The certificate's test of it, see `siq.certificate.tests.Verdict.as_data`.
+    noise
+        Kind, intensity and correlations of the residuals, see `siq.identify.residuals.NoiseDiagnosis`.
+    """
+
+    found: IdentifiedField
+    prediction: Mapping[str, Any]
+    noise: Mapping[str, Any]
+
+
+def field_library(states: Sequence[str], options: IdentificationOptions) -> CandidateLibrary:
+    """The functions in which f is sought."""
+    return candidate_library(states, degree=options.degree, further=options.functions)
+
+
+def write_field(path: str | Path, record: FieldRecord, options: IdentificationOptions) -> None:
+    """Write an identified field whole or not at all."""
+    found = record.found
+    data = {
+        "states": list(found.library.states),
+        "degree": options.degree,
+        "functions": list(options.functions),
+        "terms": [
+            {
+                "component": found.library.states[i],
+                "term": found.library.names[k],
+                "coefficient": float(found.coefficients[k, i]),
+                "standard_error": float(found.standard_errors[k, i]),
+            }
+            for i, k in found.support
+        ],
+        "covariance": found.covariance.tolist(),
+        "noise_rate": found.noise_rate.tolist(),
+        "residual_ratio": found.residual_ratio,
+        "diffusion": found.diffusion.matrix.tolist(),
+        "flow": {"steps": found.flow.steps, "euler": found.flow.euler},
+        "noise": dict(record.noise),
+        "prediction": dict(record.prediction),
+    }
+    with whole_file(path) as partial:
+        partial.write_text(json.dumps(data, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def read_field(path: str | Path) -> FieldRecord | None:
+    """Read what `write_field` wrote; None where the file is empty since nothing was identified.
+
+    Raises
+    ------
+    InputError
+        When the file is no such record.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+        if not text:
+            return None
+        data = json.loads(text)
+        options = IdentificationOptions(degree=data["degree"], functions=tuple(data["functions"]))
+        library = field_library(data["states"], options)
+        component = {name: index for index, name in enumerate(library.states)}
+        term = {name: index for index, name in enumerate(library.names)}
+        support = np.array([[component[row["component"]], term[row["term"]]] for row in data["terms"]])
+        coefficients = np.zeros((library.size, library.dimension))
+        for (i, k), row in zip(support, data["terms"], strict=True):
+            coefficients[k, i] = row["coefficient"]
+        found = IdentifiedField(
+            library, coefficients, support, np.array(data["covariance"]), np.array(data["noise_rate"]),
+            float(data["residual_ratio"]), FlowMap(**data["flow"]), Diffusion(np.array(data["diffusion"])),
+        )  # fmt: skip
+        p, d = len(support), library.dimension
+        if found.covariance.shape != (p, p) or found.noise_rate.shape != (d, d):
+            raise ValueError("covariances do not fit the terms")
+        if found.diffusion.dimension != d:
+            raise ValueError("D does not fit the states")
+        return FieldRecord(found, data["prediction"], data["noise"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            path, "", f"it is no vector field ({type(error).__name__})", "make it again"
+        ) from None

@@ -1,0 +1,319 @@
+"""The invariant density over several wells, ``p ~ exp(-U/ε)``, where U is known in part.
+
+U over all wells (`siq.landscape.global_quasipotential`) says NaN where no formula is believed. Z is then the
+integral over the cells of a box at whose middles U is known, as far as they hang together with the
+attractor, and what the other cells can add to it is bounded. If no attractor lies among them, U is nowhere
+below either of two levels in them:
+
+- the lowest U along the rim of the unknown part, since whatever leads into it from an attractor crosses the
+  rim, and U does not fall on a path of least action from its attractor;
+- U where f, followed from the state, enters the known region, since U does not rise along f.
+
+Both are told to within the width of a cell. Like the density, they are the leading order as ε → 0: the
+prefactor of exp(-U/ε), which varies with the state where div g ≠ 0, counts as 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.ndimage
+
+from siq.dynamics.dynamics import Dynamics
+from siq.dynamics.simulation import runge_kutta_step
+from siq.errors import NumericalFailure
+from siq.landscape.global_quasipotential import GlobalQuasipotential
+from siq.numerics.density_comparison import BINS, DensityComparison, MarginalDensity, compare_shares
+
+CELLS = {2: 400, 3: 80}  # along each state, by the number of states; multiples of the bins
+TOLERANCE = 0.02  # relative: by how much Z may change if cells are twice as wide
+STRIDE = 3.0  # cells: longest step along f
+LONGEST = 0.5  # of the shortest time of f: the same
+MOST_STEPS = 2000  # along f
+WIDER = 0.5  # of the box, by which f may lead out of it on the way
+
+
+@dataclass(frozen=True)
+class SampledPotential:
+    """U over all wells in the middles of the cells of a box.
+
+    Attributes
+    ----------
+    box
+        Shape ``(d, 2)``.
+    values
+        U, shape ``(n, n)`` or ``(n, n, n)``, NaN where it is not known.
+    well
+        Index of the well whose formula gives U, of the same shape; -1 where none does.
+    wells
+        Their number, k.
+    """
+
+    box: np.ndarray
+    values: np.ndarray
+    well: np.ndarray
+    wells: int
+
+    @property
+    def widths(self) -> np.ndarray:
+        """Of a cell, shape ``(d,)``."""
+        widths: np.ndarray = np.ptp(self.box, axis=1) / self.values.shape
+        return widths
+
+    @property
+    def axes(self) -> list[np.ndarray]:
+        """The middles of the cells along each state."""
+        return [
+            low + (np.arange(count) + 0.5) * width
+            for (low, _), count, width in zip(self.box, self.values.shape, self.widths, strict=True)
+        ]
+
+    @property
+    def known(self) -> np.ndarray:
+        """Where U is known, of the shape of `values`."""
+        return np.isfinite(self.values)
+
+    def middles(self, chosen: np.ndarray) -> np.ndarray:
+        """Middles of chosen cells, a mask of the shape of `values`: components ``(d, n)``."""
+        return np.stack([axis[index] for axis, index in zip(self.axes, np.nonzero(chosen), strict=True)])
+
+    def places(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The cells in which states lie, components ``(d, ...)``: indices of this shape, and what is inside.
+
+        The index of a state outside the box is that of a cell at its rim.
+        """
+        wide = (slice(None), *(None,) * (x.ndim - 1))
+        index = np.floor((x - self.box[:, 0][wide]) / self.widths[wide])
+        last = np.array(self.values.shape)[wide] - 1
+        inside = ((index >= 0) & (index <= last)).all(axis=0)
+        return np.clip(np.nan_to_num(index), 0, last).astype(int), inside
+
+
+@dataclass(frozen=True)
+class KnownDensity:
+    """``exp(-U/ε)/Z`` where U is known, and how much of all probability lies elsewhere at most.
+
+    Attributes
+    ----------
+    intensity
+        ε.
+    normalisation
+        Z over the cells in which U is known, in the product of the states' units.
+    change
+        By how much Z changes, relatively, if cells are twice as wide.
+    unknown
+        The share of all probability in the box that the other cells can hold at most.
+    lowest_unknown
+        The level that U is above in all of them; infinite where there are none.
+    probabilities
+        Of the cells, of the shape of `SampledPotential.values`, 1 in total; zero where U is not known.
+    shares
+        The wells' shares of it, shape ``(k,)``.
+    """
+
+    intensity: float
+    normalisation: float
+    change: float
+    unknown: float
+    lowest_unknown: float
+    probabilities: np.ndarray
+    shares: np.ndarray
+
+
+def sample_potential(
+    potential: GlobalQuasipotential, box: np.ndarray, *, cells: int | None = None
+) -> SampledPotential:
+    """U over all wells in the middles of the cells of a box.
+
+    Parameters
+    ----------
+    potential
+        U.
+    box
+        Shape ``(d, 2)``.
+    cells
+        Along each state; by default as many as are affordable.
+
+    Raises
+    ------
+    NumericalFailure
+        When there are neither two nor three states.
+    """
+    box = np.asarray(box, dtype=float)
+    if len(box) not in CELLS:
+        raise NumericalFailure(f"densities over wells are for two or three states, and these are {len(box)}")
+    shape = (cells or CELLS[len(box)],) * len(box)
+    empty = SampledPotential(box, np.full(shape, np.nan), np.full(shape, -1), len(potential.wells))
+    by_well = potential.by_well(empty.middles(np.ones(shape, dtype=bool)).T).reshape(-1, *shape)
+    values = np.where(np.isfinite(by_well), by_well, np.inf)
+    for own, one in zip(values, potential.wells, strict=True):
+        # An island, which places part from the attractor at which the formula is known to be wrong.
+        parts, _ = scipy.ndimage.label(np.isfinite(own))
+        own[parts != parts[tuple(empty.places(one.attractor)[0])]] = np.inf
+    least = values.min(axis=0)
+    known = np.isfinite(least)
+    return SampledPotential(
+        box,
+        np.where(known, least, np.nan),
+        np.where(known, values.argmin(axis=0), -1),
+        len(potential.wells),
+    )
+
+
+def lowest_possible(sampled: SampledPotential, dynamics: Dynamics) -> np.ndarray:
+    """What U cannot be below in the cells in which it is not known, infinite in the others.
+
+    Parameters
+    ----------
+    sampled
+        U.
+    dynamics
+        The identified f.
+
+    Returns
+    -------
+    numpy.ndarray
+        Of the shape of `SampledPotential.values`.
+    """
+    known = sampled.known
+    values = np.where(known, sampled.values, np.inf)
+    around = np.ones((3,) * values.ndim)
+    # What is outside the box is not known either, and whatever is in it may have come from there.
+    unknown = np.pad(~known, 1, constant_values=True)
+    part, parts = scipy.ndimage.label(unknown, around)
+    # Two cells wide, as U varies between the middle of a cell and the rim.
+    near = scipy.ndimage.minimum_filter(np.pad(values, 1, constant_values=np.inf), 5, mode="nearest")
+    rims = np.array([-np.inf, *np.atleast_1d(scipy.ndimage.minimum(near, part, np.arange(1, parts + 1)))])
+    inside = (slice(1, -1),) * values.ndim
+    lowest = np.where(known, np.inf, rims[part][inside])
+    lowest[~known] = np.maximum(lowest[~known], _entered(sampled, dynamics))
+    # A cell is where f leads from its middle, or from the middle of a cell beside it.
+    least: np.ndarray = scipy.ndimage.minimum_filter(lowest, footprint=around, mode="nearest")
+    return np.where(known, np.inf, least)
+
+
+def _entered(sampled: SampledPotential, dynamics: Dynamics) -> np.ndarray:
+    """U where f enters the known region from each unknown cell, -∞ where it does not."""
+    low = scipy.ndimage.minimum_filter(np.where(sampled.known, sampled.values, np.inf), 3, mode="nearest")
+    x = sampled.middles(~sampled.known)
+    levels = np.full(x.shape[1], -np.inf)
+    function = dynamics.drift_of_components
+    widths = sampled.widths[:, None]
+    fastest = np.linalg.norm(dynamics.jacobian(x.T), axis=(1, 2)).max(initial=0.0)
+    longest = LONGEST / fastest if fastest > 0 else np.inf
+    wide = sampled.box + WIDER * np.ptp(sampled.box, axis=1)[:, None] * np.array([-1.0, 1.0])
+    running = np.arange(x.shape[1])
+    for _ in range(MOST_STEPS):
+        speed = np.abs(function(x) / widths).max(axis=0)
+        with np.errstate(divide="ignore"):
+            step = np.minimum(STRIDE / speed, longest)
+        x = runge_kutta_step(function, x, np.where(np.isfinite(step), step, 0.0))
+        index, inside = sampled.places(x)
+        arrived = inside & sampled.known[tuple(index)]
+        levels[running[arrived]] = low[tuple(index)][arrived]
+        going = ~arrived & ((x > wide[:, :1]) & (x < wide[:, 1:])).all(axis=0)
+        x, running = x[:, going], running[going]
+        if not running.size:
+            break
+    return levels
+
+
+def known_density(
+    fine: SampledPotential, coarse: SampledPotential, lowest: np.ndarray, *, intensity: float
+) -> KnownDensity:
+    """The density for one ε.
+
+    Parameters
+    ----------
+    fine, coarse
+        U on cells, and on cells twice as wide, which tell how accurate the integral is.
+    lowest
+        What U cannot be below in the other of the wider cells; see `lowest_possible`.
+    intensity
+        ε, in the unit of U.
+
+    Raises
+    ------
+    ValueError
+        When ε is not positive.
+    NumericalFailure
+        When U is known nowhere, or the cells are too wide for ε.
+    """
+    if not 0 < intensity < np.inf:
+        raise ValueError(f"the noise intensity ({intensity}) must be positive")
+    if not fine.known.any():
+        raise NumericalFailure("U is known nowhere in the box")
+    bottom = float(np.nanmin(fine.values))  # taken out of the exponents, which would run out of range
+    weights, wide = (np.exp(-(np.nan_to_num(one.values, nan=np.inf) - bottom) / intensity)
+                     for one in (fine, coarse))  # fmt: skip
+    total, rough = (weights.sum() * fine.widths.prod(), wide.sum() * coarse.widths.prod())
+    change = float(abs(rough / total - 1))
+    if not change <= TOLERANCE:
+        raise NumericalFailure(
+            f"the integral of exp(-U/ε) changes by {change:.1%} if cells are twice as wide; the wells are too"
+            " narrow for the box"
+        )
+    elsewhere = float(np.exp(-(lowest - bottom) / intensity).sum() * coarse.widths.prod())
+    shares = np.bincount(fine.well[fine.known], weights[fine.known], minlength=fine.wells)
+    return KnownDensity(
+        intensity=intensity,
+        normalisation=float(total * np.exp(-bottom / intensity)),
+        change=change,
+        unknown=elsewhere / (elsewhere + float(total)),
+        lowest_unknown=float(lowest.min()),
+        probabilities=weights / weights.sum(),
+        shares=shares / shares.sum(),
+    )
+
+
+def marginal_of(
+    density: KnownDensity, sampled: SampledPotential, *, plane: tuple[int, int] = (0, 1)
+) -> MarginalDensity:
+    """The density on a plane of two states, within the known region; NaN where nothing is known."""
+    first, second = plane
+    values = _onto(density.probabilities, plane) / (sampled.widths[first] * sampled.widths[second])
+    seen = _onto(sampled.known, plane)
+    axes = sampled.axes
+    return MarginalDensity(
+        plane, density.intensity, axes[first], axes[second], np.where(seen > 0, values, np.nan)
+    )
+
+
+def compare_with_samples(
+    density: KnownDensity,
+    sampled: SampledPotential,
+    samples: np.ndarray,
+    *,
+    plane: tuple[int, int] = (0, 1),
+    bins: int = BINS,
+) -> DensityComparison:
+    """Compare the density with a simulation, both within the region where U is known.
+
+    Parameters
+    ----------
+    density, sampled
+        The density and U.
+    samples
+        Shape ``(d, times, walkers)``.
+    plane
+        Indices of the two states that are compared.
+    bins
+        Along each of them, a divisor of the number of cells.
+    """
+    index, inside = sampled.places(samples)
+    counted = inside & sampled.known[tuple(index)]
+    per_bin = [sampled.values.shape[state] // bins for state in plane]
+    column, row = (index[state] // size for state, size in zip(plane, per_bin, strict=True))
+    onto = _onto(density.probabilities, plane)
+    expected = onto.reshape(bins, per_bin[1], bins, per_bin[0]).sum(axis=(1, 3))
+    edges = [np.linspace(low, high, bins + 1) for low, high in sampled.box[list(plane)]]
+    return compare_shares(row * bins + column, np.append(expected, 0.0), edges, counted=counted)
+
+
+def _onto(values: np.ndarray, plane: Sequence[int]) -> np.ndarray:
+    """Values of cells summed onto a plane, the second state's cells by row."""
+    others = tuple(state for state in range(values.ndim) if state not in plane)
+    summed = values.sum(axis=others)
+    return np.asarray(summed.T if plane[0] < plane[1] else summed)

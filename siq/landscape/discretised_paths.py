@@ -1,0 +1,411 @@
+"""Chains of points as curves: their geometric action, and how it is made minimal.
+
+The machinery of `siq.landscape.paths`, which says what it is for. Everything is in units in which the
+distance of both ends, D and the derivatives of f are of size one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+from scipy.interpolate import Akima1DInterpolator
+from scipy.spatial import cKDTree
+
+from siq.dynamics.dynamics import Dynamics
+from siq.dynamics.equilibria import classify, hessian_at
+
+START_SHARE = 1e-6  # of the action: U on the ellipsoid where a chain begins
+CENTRAL = 0.005  # of the distance to the end: nearer to the attractor points lie no closer together
+BEND = 0.4  # of the distance: how far bent first guesses leave the straight line
+KICKS = (0.3, 0.1, 0.03, 0.01)  # of the distance: tried from a chain that is at rest and no minimum
+AT_REST = 1e-5  # |f| at a state that counts as an equilibrium, in units of the Jacobian and the distance
+SMALLEST_SHIFT, LARGEST_SHIFT = 1e-3, 1e12  # of Newton's matrix
+LEAST_GAIN, GOOD_GAIN = 0.05, 0.7  # of what a step promised: it is taken; the next one is bolder
+STEPS, RESPACINGS, MOST_KICKS = 150, 40, 3
+UNEVEN = 1.6  # longest to shortest segment at which a chain is spaced anew
+COARSE, FINE = 1e-7, 1e-12  # share of S that a step must still gain, for first guesses and for the answer
+MOST_NODES = 60_000
+NO_ACTION = 1e-7  # of ∫|f||φ'|ds: less is a path without noise
+APART = 0.03  # of the distance: minima further apart are two
+SPIRAL_STEP = 0.15  # of the shortest time of the linear dynamics
+
+
+@dataclass(frozen=True)
+class DiscretisedPath:
+    """Points ``(n, d)`` in the units of a problem, their action, and whether it is a minimum."""
+
+    points: np.ndarray
+    action: float
+    minimum: bool
+
+
+@dataclass(frozen=True)
+class Segments:
+    """f of the middles, the differences, their lengths and directions: ``(n - 1, d)`` and ``(n - 1,)``."""
+
+    middles: np.ndarray
+    force: np.ndarray
+    forward: np.ndarray
+    speed: np.ndarray
+    length: np.ndarray
+
+    @property
+    def actions(self) -> np.ndarray:
+        """``|f||Δ| - f·Δ``, written so that nothing cancels where f and Δ are parallel."""
+        turn = self.forward / self.length[:, None] - self.force / self.speed[:, None]
+        return 0.5 * self.speed * self.length * np.sum(turn**2, axis=1)
+
+
+class PathProblem:
+    """Chains between two states, in units in which D, their distance and ∂f/∂x are of size one.
+
+    ``x = start + units y``. M is the Hessian of V at the start, None where that is no attractor; then the
+    first point of a chain is as fixed as the last.
+    """
+
+    def __init__(self, dynamics: Dynamics, start: np.ndarray, end: np.ndarray) -> None:
+        noise = dynamics.diffusion
+        distance = float(np.linalg.norm(noise.whitening @ (end - start)))
+        if not distance > 0:
+            raise ValueError(f"the path is to end where it starts, at {start.tolist()}")
+        self.dynamics, self.start, self.units = dynamics, start, distance * noise.root
+        self.inverse = noise.whitening / distance
+        jacobians = self.inverse @ dynamics.jacobian(np.stack([start, end])) @ self.units
+        self.rate = float(np.linalg.norm(jacobians, axis=(1, 2)).max())
+        self.unit = distance**2 * self.rate  # of the action
+        self.end = self.inverse @ (end - start)
+        self.hessian: np.ndarray | None = None
+        resting = np.linalg.norm(self.force(np.zeros((1, len(start))))) < AT_REST
+        if resting and classify(dynamics, start).kind == "attractor":
+            hessian = hessian_at(dynamics, start)
+            self.hessian = self.units.T @ hessian @ self.units / self.unit
+
+    def scaled(self, x: np.ndarray) -> np.ndarray:
+        """Points in the units of the problem, from its start to its end."""
+        inner = (x[1:-1] - self.start) @ self.inverse.T
+        return np.vstack([np.zeros_like(self.end), inner, self.end])
+
+    def unscaled(self, y: np.ndarray) -> np.ndarray:
+        """Points in the states' units."""
+        return self.start + y @ self.units.T
+
+    def force(self, y: np.ndarray) -> np.ndarray:
+        """F, ``(n, d)``."""
+        return self.dynamics.drift(self.unscaled(y)) @ self.inverse.T / self.rate
+
+    def jacobian(self, y: np.ndarray) -> np.ndarray:
+        """∂f/∂y, ``(n, d, d)``."""
+        return self.inverse @ self.dynamics.jacobian(self.unscaled(y)) @ self.units / self.rate
+
+    def bend(self, y: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """``Σ_k weights_k ∂²f_k``, ``(n, d, d)``."""
+        second = self.dynamics.hessian(self.unscaled(y))
+        return (
+            self.units.T @ np.einsum("nk,nkij->nij", weights @ self.inverse / self.rate, second) @ self.units
+        )
+
+    def segments(self, y: np.ndarray) -> Segments:
+        """What the action of a chain is made of."""
+        middles, forward = (y[1:] + y[:-1]) / 2, np.diff(y, axis=0)
+        force = self.force(middles)
+        speed, length = (np.linalg.norm(part, axis=1) + np.finfo(float).tiny for part in (force, forward))
+        return Segments(middles, force, forward, speed, length)
+
+    def level(self, y: np.ndarray) -> np.ndarray:
+        """The action from the start to points close to it, ``y·My``; zero without M."""
+        return np.zeros(len(y)) if self.hessian is None else np.einsum("ni,ij,nj->n", y, self.hessian, y)
+
+    def action(self, y: np.ndarray) -> float:
+        """S of a chain."""
+        with np.errstate(all="ignore"):  # a trial may run away
+            return float(self.level(y[:1])[0] + self.segments(y).actions.sum())
+
+    def effort(self, y: np.ndarray) -> float:
+        """The integral ``∫ |f| |φ'| ds``, with which an action is compared that may be zero."""
+        parts = self.segments(y)
+        return float(np.sum(parts.speed * parts.length))
+
+    def guesses(self) -> tuple[list[np.ndarray], float]:
+        """First chains, and by how many radian the first of them turns, in the metric of M.
+
+        That would be the right one were f linear: ``ẋ = (J + 2DM) x``, backwards from the end.
+        """
+        share = np.linspace(0, 1, 201)[:, None]
+        line = share * self.end
+        chains = [line]
+        # The columns of the right factor span what is across the line.
+        across = np.linalg.svd(self.end[None])[2][1:]
+        chains += [line + BEND * side * np.sin(np.pi * share) * way for way in across for side in (1, -1)]
+        if self.hessian is None:
+            return chains, 0.0
+        spiral = np.vstack([self._spiral(self.end, START_SHARE), self.end])
+        forward = np.diff(spiral @ np.linalg.cholesky(self.hessian), axis=0)
+        forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+        turns = np.arccos(np.clip(np.sum(forward[1:] * forward[:-1], axis=1), -1, 1))
+        return [spiral, *chains], float(turns.sum())
+
+    def _spiral(self, last: np.ndarray, share: float) -> np.ndarray:
+        """The way that linear dynamics takes to a point from where its level is a share of the one there."""
+        assert self.hessian is not None
+        flow = self.jacobian(np.zeros((1, len(last))))[0] + 2 * self.hessian
+        back = scipy.linalg.expm(-SPIRAL_STEP * flow / np.abs(np.linalg.eigvals(flow)).max())
+        lowest = share * self.level(last[None])[0]
+        y = [back @ last]
+        while y[-1] @ self.hessian @ y[-1] > lowest and len(y) < MOST_NODES:
+            y.append(back @ y[-1])
+        return np.array(y[::-1])
+
+    def spaced(self, y: np.ndarray, count: int, level: float) -> np.ndarray:
+        """A chain along another one, which begins where the level is as given and is spaced for accuracy.
+
+        Near an attractor the segments are in proportion to the distance from it, in the metric of M, since
+        the path may wind.
+        """
+        y = y[np.append(np.linalg.norm(np.diff(y, axis=0), axis=1) > 1e-14, True)]
+        if self.hessian is not None and self.level(y[:1])[0] > level > 0:
+            y = np.vstack([self._spiral(y[0], level / self.level(y[:1])[0]), y])
+        length = np.r_[0, np.cumsum(np.linalg.norm(np.diff(y, axis=0), axis=1))]
+        curve = Akima1DInterpolator(length, y)
+        dense = np.interp(np.arange(0, len(y) - 0.95, 0.1), np.arange(len(y)), length)
+        y = curve(dense)
+        if self.hessian is not None:
+            first = max(int(np.flatnonzero(self.level(y) <= level).max(initial=0)), 0)
+            dense, y = dense[first:], y[first:]
+        measure = np.r_[0, np.cumsum(self._measure(y))]
+        return curve(np.interp(np.linspace(0, measure[-1], count), measure, dense))
+
+    def _measure(self, y: np.ndarray) -> np.ndarray:
+        """Lengths of the segments, relative to what they should be."""
+        forward, middles = np.diff(y, axis=0), (y[1:] + y[:-1]) / 2
+        if self.hessian is None:
+            return np.linalg.norm(forward, axis=1)
+        near = np.sqrt(self.level(middles)) + CENTRAL * np.sqrt(self.level(self.end[None]))
+        return np.sqrt(self.level(forward)) / near
+
+    def descend(self, y: np.ndarray, count: int, action: float, *, first: bool = False) -> DiscretisedPath:
+        """Move a chain of `count` points down to a minimum of S, by steps across the chain.
+
+        A `first` chain is spaced anew where it has become uneven, and pushed off where it rests at a saddle
+        of S.
+
+        Parameters
+        ----------
+        y
+            Points along which the chain is laid, in any number.
+        count
+            Number of points of the chain.
+        action
+            About that of the path; it decides where the chain begins.
+        first
+            Whether it starts far from a minimum.
+        """
+        level = START_SHARE * action
+        y = self.spaced(y, count, level)
+        if y.shape[1] == 1:
+            return DiscretisedPath(y, self.action(y), True)
+        action, shift, spacings, kicks = self.action(y), 1.0, 0, 0
+        for _ in range(STEPS):
+            across = _Across(self, y)
+            resting = (COARSE if first else FINE) * action + np.finfo(float).eps * across.effort
+            gained, expected = 0.0, np.inf
+            while shift < LARGEST_SHIFT:
+                step = across.step(shift)
+                if step is not None:
+                    new = across.moved(step)
+                    expected = -0.5 * float(across.slope @ step)
+                    gained = action - self.action(new)
+                    if gained > LEAST_GAIN * expected or expected < resting:
+                        break
+                shift = max(4 * shift, SMALLEST_SHIFT)
+            else:
+                break
+            if gained > 0:
+                y, action = new, action - gained
+            if expected > resting:
+                shift *= 0.2 if gained > GOOD_GAIN * expected else 1.0
+                shift = shift if shift > 1e-8 else 0.0
+                measure = self._measure(y)
+                if first and spacings < RESPACINGS and measure.max() > UNEVEN * measure.min():
+                    y = self.spaced(y, count, level)
+                    action, spacings = self.action(y), spacings + 1
+            elif across.step(0.0) is None:
+                if not first or kicks == MOST_KICKS:
+                    break
+                kicks += 1
+                lower = min((across.moved(push) for push in across.kicks()), key=self.action)
+                if self.action(lower) >= action:
+                    break
+                y, action, shift = lower, self.action(lower), 1.0
+            elif shift <= SMALLEST_SHIFT:
+                return DiscretisedPath(y, action, True)
+            else:
+                shift = 0.0
+        return DiscretisedPath(y, action, False)
+
+    def nodes(self, chain: DiscretisedPath) -> np.ndarray:
+        """Points, momenta, and actions up to there, shape ``(n, 2d + 1)``."""
+        y, parts = chain.points, self.segments(chain.points)
+        # Momenta of the middles, carried over half a segment with ṗ = -Jᵀp; both sides agree at a minimum.
+        times = (parts.length / parts.speed)[:, None]
+        middle = (parts.forward / times - parts.force) / 2
+        turn = times / 2 * np.einsum("nij,ni->nj", self.jacobian(parts.middles), middle)
+        p = np.empty_like(y)
+        p[1:-1] = (middle[1:] + turn[1:] + middle[:-1] - turn[:-1]) / 2
+        p[0] = middle[0] + turn[0] if self.hessian is None else self.hessian @ y[0]
+        p[-1] = middle[-1] - turn[-1]
+        values = self.level(y[:1]) + np.r_[0.0, np.cumsum(parts.actions)]
+        return np.column_stack([y, p, values])
+
+    def residual(self, nodes: np.ndarray) -> float:
+        """The largest Hamiltonian, in proportion to its parts."""
+        y, p = np.split(nodes[:, :-1], 2, axis=1)
+        force = self.force(y)
+        drift, push = np.sum(p * force, axis=1), np.sum(p**2, axis=1)
+        scale = max((np.abs(drift) + push).max(), NO_ACTION * np.sum(force**2, axis=1).max())
+        return float(np.abs(drift + push).max() / scale)
+
+    def extrapolated(self, coarse: DiscretisedPath, fine: DiscretisedPath) -> np.ndarray:
+        """Nodes without the error of second order, from a chain and one with half its spacing.
+
+        Where the two differ by more than their errors, by a turn about the attractor say, they do not match,
+        and the finer one stands for itself.
+        """
+        action = max((4 * fine.action - coarse.action) / 3, 0.0)
+        second = self.nodes(fine)
+        nodes = (4 * second[::2] - self.nodes(coarse)) / 3
+        if not self.residual(nodes) < self.residual(second):
+            nodes = second
+            nodes[:, -1] *= action / max(fine.action, np.finfo(float).tiny)
+        nodes[-1, -1] = action
+        return nodes if self.hessian is None else np.vstack([np.zeros_like(nodes[:1]), nodes])
+
+
+class _Across:
+    """Moves of a chain across itself: slope and second derivatives of S, in banded form.
+
+    A chain may slide along itself without any change of S but that of its error, which must not matter. The
+    matrix for frozen times is that of ``Σ |Δ - τf|²/2τ``, ``τ = |Δ|/|f|`` being held fast, without the second
+    derivatives of f: of an upper bound of S that touches it.
+    """
+
+    def __init__(self, problem: PathProblem, y: np.ndarray) -> None:
+        parts, dimension = problem.segments(y), y.shape[1]
+        self.y, self.effort = y, float(np.sum(parts.speed * parts.length))
+        self.range = slice(1 if problem.hessian is None else 0, -1)
+        speed, length = parts.speed[:, None, None], parts.length[:, None, None]
+        along, down = parts.forward / parts.length[:, None], parts.force / parts.speed[:, None]
+        by_forward = parts.speed[:, None] * along - parts.force
+        by_force = parts.length[:, None] * down - parts.forward
+        jacobian = problem.jacobian(parts.middles)
+        transposed, unit = jacobian.transpose(0, 2, 1), np.eye(dimension)
+        by_middle = np.einsum("nij,ni->nj", jacobian, by_force)
+        slope = np.zeros_like(y)
+        slope[1:] += by_middle / 2 + by_forward
+        slope[:-1] += by_middle / 2 - by_forward
+        exact = _Blocks(
+            transposed @ (length / speed * (unit - _outer(down, down))) @ jacobian
+            + problem.bend(parts.middles, by_force),
+            (_outer(along, down) - unit) @ jacobian,
+            speed / length * (unit - _outer(along, along)),
+        )
+        frozen = _Blocks(length / speed * transposed @ jacobian, -jacobian, speed / length * unit)
+        first = np.zeros((dimension, dimension))
+        if problem.hessian is not None:
+            slope[0] += 2 * problem.hessian @ y[0]
+            first = 2 * problem.hessian
+        self.normal = _normals(y)[self.range]
+        self.slope = np.einsum("nij,ni->nj", self.normal, slope[self.range]).ravel()
+        self.exact = exact.banded(self.normal, self.range.start, first)
+        self.frozen = frozen.banded(self.normal, self.range.start, first)
+
+    def step(self, shift: float) -> np.ndarray | None:
+        """Newton's step with a shift; None where the matrix is not positive definite."""
+        try:
+            with np.errstate(all="ignore"):
+                matrix = self.exact + shift * self.frozen
+            factor = scipy.linalg.cholesky_banded(matrix, lower=True)
+        except (np.linalg.LinAlgError, ValueError):  # ValueError: not finite
+            return None
+        return -scipy.linalg.cho_solve_banded((factor, True), self.slope)
+
+    def moved(self, step: np.ndarray) -> np.ndarray:
+        """The chain after a step."""
+        y = self.y.copy()
+        y[self.range] += np.einsum("nij,nj->ni", self.normal, step.reshape(len(self.normal), -1))
+        return y
+
+    def kicks(self) -> list[np.ndarray]:
+        """Steps to both sides along the direction in which S curves downwards most."""
+        _, vectors = scipy.linalg.eig_banded(self.exact, lower=True, select="i", select_range=(0, 0))
+        way = vectors[:, 0] / np.abs(vectors).max()
+        return [side * size * way for size in KICKS for side in (1, -1)]
+
+
+@dataclass(frozen=True)
+class _Blocks:
+    """Second derivatives of the segments by middles and differences, ``(n - 1, d, d)`` each."""
+
+    middle: np.ndarray
+    mixed: np.ndarray  # difference before middle
+    forward: np.ndarray
+
+    def banded(self, normal: np.ndarray, start: int, first: np.ndarray) -> np.ndarray:
+        """The matrix of the moves ``normal`` from point `start` on, in the lower form of scipy's solvers.
+
+        `first` is added to the block of the first point.
+        """
+        count, _, m = normal.shape
+        transposed = self.mixed.transpose(0, 2, 1)
+        both = (self.mixed + transposed) / 2
+        diagonal = np.zeros((len(self.middle) + 1, *first.shape))
+        diagonal[1:] += self.middle / 4 + self.forward + both
+        diagonal[:-1] += self.middle / 4 + self.forward - both
+        diagonal[0] += first
+        # Row of the next point, column of this one.
+        below = self.middle / 4 - self.forward + (self.mixed - transposed) / 2
+        turned = normal.transpose(0, 2, 1)
+        diagonal = turned @ diagonal[start : start + count] @ normal
+        below = turned[1:] @ below[start : start + count - 1] @ normal[:-1]
+        matrix = np.zeros((2 * m, count * m))
+        for column in range(m):
+            for row in range(column, m):
+                matrix[row - column, column::m] = diagonal[:, row, column]
+            for row in range(m):
+                matrix[m + row - column, column::m][: count - 1] = below[:, row, column]
+        return matrix
+
+
+def _outer(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    return left[:, :, None] * right[:, None, :]
+
+
+def _normals(y: np.ndarray) -> np.ndarray:
+    """Orthonormal directions across a chain at its points, shape ``(n, d, d - 1)``."""
+    along = np.gradient(y, axis=0)
+    return np.linalg.svd(along[:, None, :])[2][:, 1:].transpose(0, 2, 1)
+
+
+def rivals_of(chains: Sequence[DiscretisedPath], best: DiscretisedPath) -> list[DiscretisedPath]:
+    """The minima that lie apart from the first chain, from what has become of it, and from each other."""
+
+    def tree(chain: DiscretisedPath) -> cKDTree:
+        length = np.linalg.norm(np.diff(chain.points, axis=0), axis=1).sum()
+        return cKDTree(evenly(chain.points, int(5 * length / APART) + 2))
+
+    rivals: list[DiscretisedPath] = []
+    trees = [tree(chains[0]), tree(best)]
+    for chain in chains[1:]:
+        if chain.minimum and all(other.query(chain.points)[0].max() > APART for other in trees):
+            rivals.append(chain)
+            trees.append(tree(chain))
+    return rivals
+
+
+def evenly(points: np.ndarray, count: int) -> np.ndarray:
+    """Evenly spaced points on a polygon."""
+    along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
+    places = np.linspace(0, along[-1], count)
+    return np.stack([np.interp(places, along, column) for column in points.T], axis=1)

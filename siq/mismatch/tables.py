@@ -1,0 +1,148 @@
+"""The tables that figures of a diagnosis are drawn from."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from siq.dynamics.dynamics import Dynamics
+from siq.estimation.estimation import Fit
+from siq.mismatch.case import Comparison
+from siq.mismatch.diagnosis import Diagnosis
+from siq.mismatch.investigation import Investigation
+
+CURVE_COLUMNS = [
+    "equation", "coordinate", "across", "at", "missing", "standard_error", "gain", "p_value", "stage",
+]  # fmt: skip
+CANDIDATE_COLUMNS = ["mechanism", "label", "shapes", "gain", "process_noise_level", "stage"]
+HELD_OUT_COLUMNS = [
+    "recording", "t", "output", "measured", "before", "recalibrated", "augmented", "scored",
+]  # fmt: skip
+NOISE_COLUMNS = ["stage", "kind", "name", "variance"]
+
+
+def tables_of(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:
+    """The tables that figures are drawn from.
+
+    Returns
+    -------
+    dict
+        ``curves``: what is missing against each coordinate, in the unit of the equation.
+        ``candidates``: every probe, with what it would gain first, or on top of what was found.
+        ``held_out``: recordings and their three simulations.
+        ``forces``: what the recalibrated simulation lacks at each sample, as far as random forces were
+        admitted.
+        ``noise``: of the sensors by output, and of random forces by state.
+    """
+    case, found, shown = diagnosis.case, diagnosis.investigation, diagnosis.held_out
+    curves = [
+        {
+            "equation": ", ".join(curve.direction.equations),
+            "coordinate": curve.direction.coordinate,
+            "across": curve.direction.across,
+            "at": at,
+            "missing": value,
+            "standard_error": error,
+            "gain": curve.gain,
+            "p_value": curve.p_value,
+            "stage": stage,
+        }
+        for stage, structure in (("before", found.before), ("after", found.after))
+        for curve in structure.curves
+        for at, value, error in zip(curve.direction.knots, curve.values, curve.standard_errors, strict=True)
+    ]
+    candidates: list[dict[str, Any]] = [
+        {
+            "mechanism": trial.candidate.name,
+            "label": trial.candidate.label,
+            "shapes": "",
+            "gain": trial.delta_chi2,
+            "process_noise_level": 1.0,
+            "stage": stage,
+        }
+        for each in found.search.found
+        for stage, trial in (("found", each.best), *(("same", other) for other in each.indistinguishable))
+    ]
+    candidates += [
+        {
+            "mechanism": probe.candidate.name,
+            "label": probe.candidate.label,
+            "shapes": ", ".join(f"{name}={value:.4g}" for name, value in probe.shapes),
+            "gain": result.gain,
+            "process_noise_level": result.level,
+            "stage": "further",
+        }
+        for probe, result in found.search.screened
+    ]
+    data = case.kept
+    rows = []
+    for place, name in enumerate(case.system.output_names):
+        rows.append(
+            pd.DataFrame(
+                {
+                    "recording": np.array(data.labels)[data.recording],
+                    "t": data.t,
+                    "output": name,
+                    "measured": data.outputs[:, place],
+                    "before": shown.before.outputs[:, place],
+                    "recalibrated": shown.recalibrated.outputs[:, place],
+                    "augmented": shown.augmented.outputs[:, place],
+                    "scored": shown.before.scored,
+                }
+            )
+        )
+    return {
+        "curves": pd.DataFrame(curves, columns=CURVE_COLUMNS),
+        "candidates": pd.DataFrame(candidates, columns=CANDIDATE_COLUMNS),
+        "held_out": pd.concat(rows, ignore_index=True),
+        "forces": _forces(case, found),
+        "noise": _noise(case.system, found.search.recalibrated, found.final),
+    }
+
+
+def tables_of_failure(case: Comparison) -> dict[str, pd.DataFrame]:
+    """The same tables where no fit has a result: empty, but for what the recordings show of their noise."""
+    data, system = case.learn, case.system
+    noise = pd.DataFrame({"name": system.output_names, "variance": data.with_known_noise(data.roughness)})
+    return {
+        "curves": pd.DataFrame(columns=CURVE_COLUMNS),
+        "candidates": pd.DataFrame(columns=CANDIDATE_COLUMNS),
+        "held_out": pd.DataFrame(columns=HELD_OUT_COLUMNS),
+        "forces": pd.DataFrame(columns=["recording", "t", *system.states]),
+        "noise": noise.assign(stage="recalibrated", kind="measurement")[NOISE_COLUMNS],
+    }
+
+
+def _noise(model: Dynamics, recalibrated: Fit, final: Fit) -> pd.DataFrame:
+    """Both kinds of noise, of the recalibrated simulation and of the one that the verdict stands on."""
+    return pd.DataFrame(
+        [
+            {"stage": stage, "kind": kind, "name": name, "variance": float(value)}
+            for stage, fit in (("recalibrated", recalibrated), ("final", final))
+            for kind, names, values in (
+                ("measurement", model.output_names, fit.noise.measurement),
+                ("process", fit.model.states, fit.noise.process),
+            )
+            for name, value in zip(names, values, strict=False)
+        ],
+        columns=NOISE_COLUMNS,
+    )
+
+
+def _forces(case: Comparison, found: Investigation) -> pd.DataFrame:
+    """What must be added to f in each interval for the states to follow the recordings."""
+    fit, data = found.search.recalibrated, case.learn
+    rows = data.begins
+    step = data.t[rows + 1] - data.t[rows]
+    frame: dict[str, Any] = {
+        "recording": np.array(data.labels)[data.recording[rows]],
+        "t": data.t[rows],
+    }
+    for place, name in enumerate(case.system.states):
+        frame[name] = fit.x[rows, place]
+    for place, name in enumerate(case.system.states):
+        if name in found.roles.states:
+            frame[f"missing_in_{name}"] = -fit.linearisation.gap[rows, place] / step
+    return pd.DataFrame(frame)

@@ -1,0 +1,233 @@
+"""The two networks of the decomposition (paper, Eqs. NN_Vg and NN_g), with their gradient by hand.
+
+``V_θ(x) = η_v Ṽ(y)`` with ``Ṽ(y) = V^NN(y) + |y|²`` and ``g_θ(x) = η_g g^NN(y)``, where ``y = (x - μ)/σ``.
+
+Every tensor has a leading *run* axis: independent runs are trained side by side by batched products, one
+run on a CPU, many on a GPU, and never see each other. The gradient of the tanh network is written out as
+the chain of products that it is, so that training needs first-order automatic differentiation only.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from siq.errors import needs_extra
+from siq.networks.trained import TrainedNetworks
+
+with needs_extra("networks"):
+    import torch
+    from torch import Tensor
+
+Layer = tuple[Tensor, Tensor]
+"""Weights, shape ``(runs, inputs, outputs)``, and biases, shape ``(runs, 1, outputs)``."""
+
+
+@dataclass(frozen=True)
+class Networks:
+    """An orthogonal decomposition ``f = -D∇V + g`` given by two tanh networks, for one or more runs.
+
+    Attributes
+    ----------
+    potential
+        Layers of V^NN, from d inputs to one output.
+    circulatory
+        Layers of g^NN, from d inputs to d outputs.
+    mean, scale
+        μ and σ, shape ``(runs, 1, d)``, in the units of the states; constant during training.
+    potential_scale, circulatory_scale
+        η_v and η_g, shape ``(runs, 1, 1)``; constant during training.
+    diffusion
+        D, shape ``(d, d)``.
+    """
+
+    potential: tuple[Layer, ...]
+    circulatory: tuple[Layer, ...]
+    mean: Tensor
+    scale: Tensor
+    potential_scale: Tensor
+    circulatory_scale: Tensor
+    diffusion: Tensor
+
+    @property
+    def runs(self) -> int:
+        """Number of independent runs."""
+        return self.mean.shape[0]
+
+    def parameters(self) -> list[Tensor]:
+        """Everything that training changes: weights and biases of both networks."""
+        return [tensor for layer in (*self.potential, *self.circulatory) for tensor in layer]
+
+
+@dataclass(frozen=True)
+class Components:
+    """The decomposition at points, shapes ``(runs, n)`` for V and ``(runs, n, d)`` for the vectors."""
+
+    potential: Tensor
+    gradient: Tensor
+    circulatory: Tensor
+    vector_field: Tensor
+
+    def split(self, count: int) -> tuple[Components, Components]:
+        """The first `count` points, and the others."""
+        return (
+            Components(*(tensor[:, :count] for tensor in self._tensors())),
+            Components(*(tensor[:, count:] for tensor in self._tensors())),
+        )
+
+    def _tensors(self) -> tuple[Tensor, ...]:
+        return self.potential, self.gradient, self.circulatory, self.vector_field
+
+
+def initial_layers(
+    sizes: Sequence[int], *, generators: Sequence[np.random.Generator], dtype: torch.dtype
+) -> tuple[Layer, ...]:
+    """Random layers, uniform in ±1/√inputs, each run drawn from its own generator.
+
+    Parameters
+    ----------
+    sizes
+        Numbers of neurons, inputs and outputs included: ``(3, 50, 50, 50, 1)``.
+    generators
+        One per run, so that a run's networks do not depend on which runs train beside it.
+    dtype
+        Floating-point type of the tensors.
+    """
+    layers = []
+    for inputs, outputs in itertools.pairwise(sizes):
+        bound = inputs**-0.5
+        weights = np.stack([draw.uniform(-bound, bound, (inputs, outputs)) for draw in generators])
+        biases = np.stack([draw.uniform(-bound, bound, (1, outputs)) for draw in generators])
+        layers.append((torch.from_numpy(weights).to(dtype), torch.from_numpy(biases).to(dtype)))
+    return tuple(layers)
+
+
+def evaluate(networks: Networks, x: Tensor) -> Components:
+    """Evaluate V, ∇V, g and f = -D∇V + g.
+
+    Parameters
+    ----------
+    networks
+        The decomposition.
+    x
+        Points, shape ``(runs, n, d)``, in the units of the states.
+
+    Returns
+    -------
+    Components
+        ∇V is the gradient with respect to x, not to the normalised y.
+    """
+    y = (x - networks.mean) / networks.scale
+    value, gradient = _value_and_gradient(networks.potential, y)
+    potential = networks.potential_scale * (value + (y * y).sum(dim=-1, keepdim=True))
+    gradient = networks.potential_scale / networks.scale * (gradient + 2 * y)
+    circulatory = networks.circulatory_scale * _forward(networks.circulatory, y)
+    downhill = gradient @ networks.diffusion
+    return Components(
+        potential=potential.squeeze(-1),
+        gradient=gradient,
+        circulatory=circulatory,
+        vector_field=circulatory - downhill,
+    )
+
+
+def select_run(networks: Networks, run: int) -> Networks:
+    """The networks of one of the runs, as networks with a single run."""
+    pick = slice(run, run + 1)
+    return Networks(
+        potential=tuple((weights[pick], biases[pick]) for weights, biases in networks.potential),
+        circulatory=tuple((weights[pick], biases[pick]) for weights, biases in networks.circulatory),
+        mean=networks.mean[pick],
+        scale=networks.scale[pick],
+        potential_scale=networks.potential_scale[pick],
+        circulatory_scale=networks.circulatory_scale[pick],
+        diffusion=networks.diffusion,
+    )
+
+
+def at_rest(networks: Networks, run: int) -> TrainedNetworks:
+    """One of the runs as arrays that share no memory with the training."""
+
+    def array(tensor: Tensor) -> np.ndarray:
+        return tensor[run].detach().cpu().numpy().copy()
+
+    def layers(source: tuple[Layer, ...]) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+        return tuple((array(weights), array(biases)) for weights, biases in source)
+
+    return TrainedNetworks(
+        potential=layers(networks.potential),
+        circulatory=layers(networks.circulatory),
+        mean=array(networks.mean),
+        scale=array(networks.scale),
+        potential_scale=array(networks.potential_scale),
+        circulatory_scale=array(networks.circulatory_scale),
+        diffusion=networks.diffusion.detach().cpu().numpy().copy(),
+    )
+
+
+def side_by_side(runs: Sequence[TrainedNetworks]) -> Networks:
+    """Networks of several runs to be trained together; the inverse of `at_rest`."""
+
+    def together(arrays: Sequence[np.ndarray]) -> Tensor:
+        return torch.from_numpy(np.stack(arrays))
+
+    def layers(sources: Sequence[tuple[tuple[np.ndarray, np.ndarray], ...]]) -> tuple[Layer, ...]:
+        return tuple(
+            (together([weights for weights, _ in layer]), together([biases for _, biases in layer]))
+            for layer in zip(*sources, strict=True)
+        )
+
+    return Networks(
+        potential=layers([one.potential for one in runs]),
+        circulatory=layers([one.circulatory for one in runs]),
+        mean=together([one.mean for one in runs]),
+        scale=together([one.scale for one in runs]),
+        potential_scale=together([one.potential_scale for one in runs]),
+        circulatory_scale=together([one.circulatory_scale for one in runs]),
+        diffusion=torch.from_numpy(runs[0].diffusion.copy()),
+    )
+
+
+def move(networks: Networks, device: torch.device | str) -> Networks:
+    """The same networks on another device, detached from any gradient."""
+
+    def there(tensor: Tensor) -> Tensor:
+        return tensor.detach().to(device, copy=True)
+
+    return Networks(
+        potential=tuple((there(weights), there(biases)) for weights, biases in networks.potential),
+        circulatory=tuple((there(weights), there(biases)) for weights, biases in networks.circulatory),
+        mean=there(networks.mean),
+        scale=there(networks.scale),
+        potential_scale=there(networks.potential_scale),
+        circulatory_scale=there(networks.circulatory_scale),
+        diffusion=there(networks.diffusion),
+    )
+
+
+def _forward(layers: tuple[Layer, ...], y: Tensor) -> Tensor:
+    for weights, biases in layers[:-1]:
+        y = torch.tanh(torch.baddbmm(biases, y, weights))
+    weights, biases = layers[-1]
+    return torch.baddbmm(biases, y, weights)
+
+
+def _value_and_gradient(layers: tuple[Layer, ...], y: Tensor) -> tuple[Tensor, Tensor]:
+    """Value of a scalar tanh network, and its gradient with respect to its input.
+
+    With ``h_k = tanh(h_{k-1} W_k + b_k)`` the gradient runs backwards through the layers,
+    ``δ_k = (δ_{k+1} W_{k+1}ᵀ) (1 - h_k²)``, starting from the last row of weights.
+    """
+    hidden = []
+    for weights, biases in layers[:-1]:
+        y = torch.tanh(torch.baddbmm(biases, y, weights))
+        hidden.append(y)
+    weights, biases = layers[-1]
+    value = torch.baddbmm(biases, y, weights)
+    delta = weights.mT
+    for (weights, _), activation in zip(reversed(layers[:-1]), reversed(hidden), strict=True):
+        delta = (delta * (1 - activation * activation)) @ weights.mT
+    return value, delta

@@ -1,0 +1,13 @@
+"""How are things computed that every package needs?
+
+====================  ==========================================================================
+`integration`         how do many trajectories take a step of order eight at once, each its own?
+`machine_code`        how does a loop become machine code?
+`randomness`          where do the random numbers of a study come from?
+`thinning`            which points represent a region evenly?
+`density_comparison`  how far are samples from a density on a plane of two states?
+`number_text`         how is a number written for a reader?
+====================  ==========================================================================
+
+Imports `siq.errors`.
+"""

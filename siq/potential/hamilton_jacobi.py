@@ -1,0 +1,219 @@
+"""Gauss–Newton on the Hamilton–Jacobi equation ``∇V·(f + D∇V) = 0`` for V in a basis.
+
+The equation has false solutions that are just as exact as the true one: V flat along a direction, V = 0, and
+one for every invariant subspace of the linearisation. Where the iteration ends depends on where it starts;
+what it found must be tested by what does not know of this equation (`siq.certificate.tests`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.linalg
+
+from siq.dynamics.diffusion import Diffusion
+from siq.dynamics.dynamics import Dynamics
+from siq.potential.bases import Basis
+
+VANISHING = 1e-8  # of f: where D∇V is smaller, Gauss–Newton is on its way to V = 0, which is a solution, too
+INDEPENDENT = 1e-5  # diagonal of a triangular factor: below this share columns are not independent enough
+
+
+@dataclass(frozen=True)
+class HamiltonJacobi:
+    """The equation at some points.
+
+    Attributes
+    ----------
+    points
+        Shape ``(n, d)``.
+    gradients
+        ∂θ_j/∂x_i at the points, shape ``(n, d, m)``.
+    flow
+        f at the points, shape ``(n, d)``.
+    diffusion
+        D.
+    weight
+        Shape ``(n,)``: one over ∣f∣ in the metric of the noise, so that fast regions do not rule.
+    """
+
+    points: np.ndarray
+    gradients: np.ndarray
+    flow: np.ndarray
+    diffusion: Diffusion
+    weight: np.ndarray
+
+    def residual(self, coefficients: np.ndarray) -> np.ndarray:
+        """Weighted ``∇V·(f + D∇V)``, shape ``(n,)``."""
+        gradient = self.slopes(coefficients)
+        return self.weight * (gradient * (self.flow + self.diffusion.push(self.points, gradient))).sum(axis=1)
+
+    def jacobian(self, coefficients: np.ndarray) -> np.ndarray:
+        """Derivative of the residual with respect to the coefficients, shape ``(n, m)``."""
+        gradient = self.slopes(coefficients)
+        along = self.weight[:, None] * (self.flow + 2 * self.diffusion.push(self.points, gradient))
+        return np.einsum("nd,ndm->nm", along, self.gradients)
+
+    def slopes(self, coefficients: np.ndarray) -> np.ndarray:
+        """∇V at the points, shape ``(n, d)``."""
+        n, d, m = self.gradients.shape
+        slopes: np.ndarray = (self.gradients.reshape(n * d, m) @ coefficients).reshape(n, d)
+        return slopes
+
+    def size(self, coefficients: np.ndarray) -> float:
+        """Rms of ∇V over the points, in the metric of the noise."""
+        gradient = self.slopes(coefficients)
+        return float(np.sqrt(self.diffusion.steepness(self.points, gradient).mean()))
+
+    def size_jacobian(self, coefficients: np.ndarray) -> np.ndarray:
+        """Derivative of the size, which must not be zero, by the coefficients, shape ``(m,)``."""
+        along = self.diffusion.push(self.points, self.slopes(coefficients))
+        return np.einsum("nd,ndm->m", along, self.gradients) / (len(along) * self.size(coefficients))
+
+    def sizes(self) -> np.ndarray:
+        """Rms of each function's gradient over the points, in the metric of the noise: shape ``(m,)``."""
+        steepness = self.diffusion.steepness(self.points, self.gradients.transpose(0, 2, 1))
+        return np.sqrt(np.asarray(steepness.mean(axis=0)))
+
+    def restricted(self, rows: np.ndarray) -> HamiltonJacobi:
+        """The equation with some of the functions only."""
+        return replace(self, gradients=self.gradients[:, :, rows])
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Where Gauss–Newton ended.
+
+    Attributes
+    ----------
+    coefficients
+        Shape ``(m,)``.
+    residual
+        Root mean square of the weighted residual, divided by that of ∇V: the mean of
+        ``∣∇V·(f + D∇V)∣ / (∣∇V∣ ∣f∣)``.
+    converged
+        Whether the last step was too small to matter.
+    """
+
+    coefficients: np.ndarray
+    residual: float
+    converged: bool
+
+
+def equation_at(basis: Basis, x: np.ndarray, dynamics: Dynamics) -> HamiltonJacobi:
+    """The equation at those of some points, shape ``(n, d)``, where f does not vanish."""
+    flow, noise = dynamics.drift(x), dynamics.diffusion
+    speed = np.sqrt(noise.squared_speed(x, flow))
+    moving = speed > 1e-9 * speed.max()
+    return HamiltonJacobi(x[moving], basis.gradients(x[moving]), flow[moving], noise, 1 / speed[moving])
+
+
+def gauss_newton(
+    equation: HamiltonJacobi,
+    start: np.ndarray,
+    *,
+    free: np.ndarray | None = None,
+    steps: int = 60,
+    tolerance: float = 1e-13,
+) -> Solution:
+    """Minimise the sum of squares of the residual, relative to the size of ∇V.
+
+    The residual alone would draw a bad start to V = 0, which solves the equation, too.
+
+    Parameters
+    ----------
+    equation
+        At points.
+    start
+        Coefficients to start from, shape ``(m,)``.
+    free
+        Which coefficients may change, as a mask; default all.
+    steps, tolerance
+        Most steps, and the relative change of the coefficients at which to end.
+    """
+    coefficients = start.copy()
+    free = np.ones(len(start), dtype=bool) if free is None else free
+    scale = equation.sizes()
+    scale = np.where(scale > 0, scale, 1.0)
+    residual, size = _relative(equation, coefficients)
+    converged = not free.any()
+    for _ in range(steps if free.any() else 0):
+        if size == 0:
+            converged = True
+            break
+        slant = equation.size_jacobian(coefficients)[free]
+        jacobian = equation.jacobian(coefficients)[:, free] - np.outer(residual, slant)
+        step = _least_squares(jacobian / (size * scale[free]), -residual) / scale[free]
+        length = 1.0
+        while True:
+            trial = coefficients.copy()
+            trial[free] += length * step
+            attempt, size = _relative(equation, trial)
+            if np.linalg.norm(attempt) < np.linalg.norm(residual) or length < 1e-3:
+                break
+            length /= 2
+        improved = np.linalg.norm(attempt) < np.linalg.norm(residual)
+        change = np.linalg.norm(length * step * scale[free])
+        reached = np.linalg.norm(coefficients * scale)
+        if improved:
+            gain = 1 - float(np.linalg.norm(attempt)) / max(float(np.linalg.norm(residual)), 1e-300)
+            coefficients, residual = trial, attempt
+        if not improved or change <= tolerance * reached or gain < 1e-7:
+            converged = True
+            break
+    return Solution(coefficients, relative_residual(equation, coefficients), converged)
+
+
+def _relative(equation: HamiltonJacobi, coefficients: np.ndarray) -> tuple[np.ndarray, float]:
+    """The residual over rms of ∇V, shape ``(n,)``, and that rms."""
+    size = equation.size(coefficients)
+    return equation.residual(coefficients) / max(size, 1e-300), size
+
+
+def _least_squares(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """One step; directions that the points do not determine are left as they are.
+
+    By the normal equations, ten times as fast, where these are good enough: the next step corrects this one.
+    """
+    try:
+        factor, lower = scipy.linalg.cho_factor(matrix.T @ matrix, check_finite=False)
+    except scipy.linalg.LinAlgError:
+        pass
+    else:
+        diagonal = np.diag(factor)
+        if diagonal.min() > INDEPENDENT * diagonal.max():
+            found: np.ndarray = scipy.linalg.cho_solve((factor, lower), matrix.T @ right, check_finite=False)
+            return found
+    return np.linalg.lstsq(matrix, right, rcond=1e-11)[0]
+
+
+def relative_residual(equation: HamiltonJacobi, coefficients: np.ndarray) -> float:
+    """Rms of the weighted residual over rms of ∇V; infinite for V = 0, or all but 0."""
+    gradient = equation.slopes(coefficients)
+    squared = equation.diffusion.steepness(equation.points, gradient)
+    if not np.sqrt((equation.weight**2 * squared).mean()) > VANISHING:
+        return np.inf
+    return float(np.sqrt((equation.residual(coefficients) ** 2).mean() / squared.mean()))
+
+
+def sensitivity(
+    equation: HamiltonJacobi, coefficients: np.ndarray, *, field_terms: np.ndarray, components: np.ndarray
+) -> np.ndarray:
+    """How the coefficients of V follow those of f, to first order: ∂ξ/∂c, shape ``(m, p)``.
+
+    Parameters
+    ----------
+    equation, coefficients
+        A solution.
+    field_terms
+        The functions of the p coefficients of f at the points, shape ``(n, p)``.
+    components
+        Shape ``(p,)``: the component of f that each belongs to.
+    """
+    gradient = equation.slopes(coefficients)
+    forcing = equation.weight[:, None] * gradient[:, components] * field_terms
+    jacobian = equation.jacobian(coefficients)
+    scale = np.linalg.norm(jacobian, axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    return -np.linalg.lstsq(jacobian / scale, forcing, rcond=1e-11)[0] / scale[:, None]

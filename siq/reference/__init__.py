@@ -1,0 +1,13 @@
+"""What do methods say that share no code with ours?
+
+=================  ===============================================================
+`hamiltonian`      which flow has the characteristics as its trajectories?
+`characteristics`  what is V along them?
+`sheets`           where do they start, and which of their points may be believed?
+`power_series`     what is V near an attractor, order by order?
+`mesh`             what is V on a mesh of two states, found without any ansatz?
+`escapes`          how long does an escape take in a simulation?
+=================  ===============================================================
+
+Imports `siq.estimation` and what it may import; uses `siq.dynamics` only.
+"""

@@ -1,0 +1,94 @@
+"""The Hamiltonian flow whose trajectories are characteristics, in units that suit an attractor.
+
+Positions x, momenta p, the value V along the way, and the tangents (X, P) that tell how neighbouring
+trajectories lie. The equations stand in `siq.reference.characteristics`; here they are evaluated for many
+rows at once.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from siq.dynamics.dynamics import Dynamics
+from siq.dynamics.equilibria import hessian_at
+
+
+class HamiltonianFlow:
+    """The equations in units in which M is the unit matrix and the level the unit sphere.
+
+    A row of a state is ``y, q, v, X, P``, of length ``2d + 1 + 2d²``, with ``x = A + units y``, ``units =
+    (2 level)^½ L⁻¹``, ``M = LᵀL``, ``p = (2 level)^½ Lᵀ q`` and ``V = level v``; X and P are derivatives of y
+    and q. Tolerances then mean the same for states of any size.
+
+    Parameters
+    ----------
+    dynamics
+        f, twice differentiable.
+    center
+        The attractor A, shape ``(d,)``.
+    level
+        The value of V, not of U = 2V, that becomes 1.
+    """
+
+    def __init__(self, dynamics: Dynamics, center: np.ndarray, level: float) -> None:
+        self.dynamics, self.center, self.level = dynamics, center, level
+        self.dimension = dynamics.dimension
+        self.hessian = hessian_at(dynamics, center)
+        upper = np.linalg.cholesky(self.hessian).T
+        self.units = np.sqrt(2 * level) * np.linalg.inv(upper)
+        self.inverse = upper / np.sqrt(2 * level)
+        self.diffusion = upper @ dynamics.diffusion.matrix @ upper.T
+        self.jacobian = self.inverse @ dynamics.jacobian(center[None])[0] @ self.units
+
+    def parts(self, state: np.ndarray) -> tuple[np.ndarray, ...]:
+        """y, q, v, X, P of rows."""
+        d = self.dimension
+        tangents = state[:, 2 * d + 1 :].reshape(len(state), 2, d, d)
+        return state[:, :d], state[:, d : 2 * d], state[:, 2 * d], tangents[:, 0], tangents[:, 1]
+
+    def rates(self, state: np.ndarray) -> np.ndarray:
+        """Time derivative of rows."""
+        y, q, _, x_tangents, p_tangents = self.parts(state)
+        x, p = self.points(y), 2 * self.level * q @ self.inverse
+        force = self.dynamics.drift(x) @ self.inverse.T
+        jacobian = self.inverse @ self.dynamics.jacobian(x) @ self.units
+        transposed = jacobian.transpose(0, 2, 1)
+        bend = np.einsum("nk,nkij->nij", p, self.dynamics.hessian(x))
+        bend = self.units.T @ bend @ self.units / (2 * self.level)
+        push = q @ self.diffusion
+        new = np.empty_like(state)
+        y_rate, q_rate, v_rate, x_rate, p_rate = self.parts(new)
+        y_rate[...] = force + 2 * push
+        q_rate[...] = -(transposed @ q[:, :, None])[:, :, 0]
+        v_rate[...] = 2 * np.sum(q * push, axis=1)
+        x_rate[...] = jacobian @ x_tangents + 2 * self.diffusion @ p_tangents
+        p_rate[...] = -transposed @ p_tangents - bend @ x_tangents
+        return new
+
+    def points(self, y: np.ndarray) -> np.ndarray:
+        """Points in the states' units."""
+        return self.center + y @ self.units.T
+
+    def pack(self, x: np.ndarray, p: np.ndarray, values: np.ndarray, hessians: np.ndarray) -> np.ndarray:
+        """States that start at points with given V and derivatives."""
+        tangents = np.broadcast_to(np.eye(self.dimension), hessians.shape)
+        bends = self.units.T @ hessians @ self.units / (2 * self.level)
+        rows = [(x - self.center) @ self.inverse.T, p @ self.units / (2 * self.level)]
+        rows += [values[:, None] / self.level, tangents.reshape(len(x), -1), bends.reshape(len(x), -1)]
+        return self.orthonormal(np.concatenate(rows, axis=1))
+
+    def unpack(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Points, momenta, V and its Hessians, in the units of the states."""
+        y, q, v, x_tangents, p_tangents = self.parts(state)
+        # A pseudoinverse, because at a caustic itself X is singular; that Hessian is not handed on.
+        bends = 2 * self.level * self.inverse.T @ (p_tangents @ np.linalg.pinv(x_tangents)) @ self.inverse
+        bends = (bends + bends.transpose(0, 2, 1)) / 2
+        return self.points(y), 2 * self.level * q @ self.inverse, self.level * v, bends
+
+    def orthonormal(self, state: np.ndarray) -> np.ndarray:
+        """The same planes of tangents with orthonormal columns, which neither grow nor collapse."""
+        y, q, v, x_tangents, p_tangents = self.parts(state)
+        frames, upper = np.linalg.qr(np.concatenate([x_tangents, p_tangents], axis=1))
+        frames = frames * np.sign(np.diagonal(upper, axis1=1, axis2=2))[:, None, :]  # det X keeps its sign
+        flat = frames.reshape(len(state), 2 * self.dimension**2)
+        return np.concatenate([y, q, v[:, None], flat], axis=1)

@@ -1,0 +1,262 @@
+"""The power series of V at an attractor, order by order (Al'brekht's method).
+
+Around a stable equilibrium A of a smooth f the quasipotential is smooth, and the Hamilton–Jacobi equation
+``∇V·(f + D∇V) = 0`` fixes its Taylor coefficients one degree after another. With ``y = x - A``, ``J`` the
+Jacobian at A and ``M`` the Hessian of V there, the part of degree k obeys the linear system
+
+    ((J + 2 D M) y) · ∇V_k = - Σ ∇V_a · f_b - Σ ∇V_a · D ∇V_c,
+
+with ``2 ≤ a < k, a + b = k + 1`` in the first sum and ``3 ≤ a, c < k, a + c = k + 2`` in the second. The
+eigenvalues of the left side are sums of k eigenvalues of -J, never zero at an attractor: the series exists
+and is unique once M is chosen as the solution of full rank.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import sympy
+
+from siq.dynamics.dynamics import Dynamics
+from siq.dynamics.equilibria import classify, hessian_at
+from siq.dynamics.formulas import compile_formulas
+from siq.identify.library import monomial_exponents
+
+
+@dataclass(frozen=True)
+class PowerSeries:
+    """A polynomial in ``x - center``; points come as rows.
+
+    Attributes
+    ----------
+    center
+        Shape ``(d,)``, in the states' units.
+    exponents
+        Shape ``(m, d)``, integers: the powers of each term.
+    coefficients
+        Shape ``(m,)``: the value is ``Σ_k coefficients[k] Π_i (x - center)_i ** exponents[k, i]``.
+    """
+
+    center: np.ndarray
+    exponents: np.ndarray
+    coefficients: np.ndarray
+
+    @property
+    def dimension(self) -> int:
+        """Number of states, d."""
+        return len(self.center)
+
+    @property
+    def degree(self) -> int:
+        """Highest total degree of a term."""
+        return int(self.exponents.sum(axis=1).max())
+
+    def evaluate(self, x: np.ndarray) -> np.ndarray:
+        """Values at points: ``(n, d)`` to ``(n,)``."""
+        return self._derivative(self._powers(x), ())
+
+    def gradient(self, x: np.ndarray) -> np.ndarray:
+        """First derivatives at points: ``(n, d)`` to ``(n, d)``."""
+        powers = self._powers(x)
+        return np.stack([self._derivative(powers, (i,)) for i in range(self.dimension)], axis=1)
+
+    def hessian(self, x: np.ndarray) -> np.ndarray:
+        """Second derivatives at points: ``(n, d)`` to ``(n, d, d)``."""
+        powers, d = self._powers(x), self.dimension
+        values = np.empty((len(x), d, d))
+        for i in range(d):
+            for j in range(i + 1):
+                values[:, i, j] = values[:, j, i] = self._derivative(powers, (i, j))
+        return values
+
+    def _powers(self, x: np.ndarray) -> np.ndarray:
+        powers = np.ones((self.degree + 1, self.dimension, len(x)))
+        np.cumprod(np.broadcast_to((x - self.center).T, powers[1:].shape), axis=0, out=powers[1:])
+        return powers
+
+    def _derivative(self, powers: np.ndarray, along: tuple[int, ...]) -> np.ndarray:
+        exponents, coefficients = self.exponents.copy(), self.coefficients
+        for state in along:
+            coefficients = coefficients * exponents[:, state]
+            exponents[:, state] -= 1
+        used = coefficients != 0
+        exponents, coefficients = exponents[used], coefficients[used]
+        values = np.ones((len(exponents), powers.shape[2]))
+        for state in range(self.dimension):
+            values *= powers[exponents[:, state], state]
+        return coefficients @ values
+
+
+def quasipotential_series(dynamics: Dynamics, attractor: np.ndarray, *, degree: int) -> PowerSeries:
+    """Taylor polynomial of V at an attractor, V being zero there.
+
+    Parameters
+    ----------
+    dynamics
+        f, differentiable ``degree - 1`` times at the attractor.
+    attractor
+        A, shape ``(d,)``: a stable equilibrium of f to rounding.
+    degree
+        Highest total degree, at least 2; degree 2 is ``½ (x - A)ᵀ M (x - A)``.
+
+    Returns
+    -------
+    PowerSeries
+        All terms of degree 2 to `degree`. This is V, not U = 2V; and it is the Taylor polynomial, which is
+        exact at A and useless beyond its radius of convergence, not the best polynomial over a region.
+
+    Raises
+    ------
+    ValueError
+        When A is no stable equilibrium, or f has no finite derivatives there.
+    """
+    if degree < 2:
+        raise ValueError(f"a series of degree {degree} was asked for; V begins with degree 2")
+    center = np.asarray(attractor, dtype=float)
+    basis = _Homogeneous(dynamics.dimension, degree)
+    force = _taylor(dynamics, center, basis, degree - 1)
+    jacobian = dynamics.jacobian(center[None])[0]
+    if classify(dynamics, center).kind != "attractor":
+        raise ValueError(
+            f"{center.tolist()} is no attractor: its Jacobian has an eigenvalue that does not decay"
+        )
+    hessian = hessian_at(dynamics, center)
+    # States in units of their spread: without this the systems mix coefficients of very different sizes.
+    scale = np.sqrt(np.diag(np.linalg.inv(hessian)))
+    _check_equilibrium(force[0][:, 0], jacobian, center, scale)
+    force = [part * basis.scales(k, scale) / scale[:, None] for k, part in enumerate(force)]
+    noise = dynamics.diffusion.matrix / np.outer(scale, scale)
+    hessian = hessian * np.outer(scale, scale)
+    flow = jacobian * scale / scale[:, None] + 2 * noise @ hessian
+
+    parts = {2: basis.quadratic(hessian)}
+    gradients = {2: basis.gradient(parts[2], 2)}
+    for k in range(3, degree + 1):
+        known = np.zeros(len(basis.exponents[k]))
+        for a in range(2, k):
+            known += basis.dot(gradients[a], a - 1, force[k + 1 - a], k + 1 - a)
+        for a in range(3, k):
+            known += basis.dot(gradients[a], a - 1, noise @ gradients[k + 2 - a], k + 1 - a)
+        parts[k] = np.linalg.solve(basis.advection(flow, k), -known)
+        gradients[k] = basis.gradient(parts[k], k)
+    return PowerSeries(
+        center=center,
+        exponents=np.concatenate([basis.exponents[k] for k in parts]),
+        coefficients=np.concatenate([part / basis.scales(k, scale) for k, part in parts.items()]),
+    )
+
+
+def _check_equilibrium(
+    force: np.ndarray, jacobian: np.ndarray, center: np.ndarray, scale: np.ndarray
+) -> None:
+    step = np.abs(np.linalg.solve(jacobian, force))
+    if not np.all((step <= 1e-6 * np.abs(center).max()) | (step <= 1e-9 * scale)):
+        raise ValueError(f"{center.tolist()} is no equilibrium: f is {force.tolist()} there")
+
+
+class _Homogeneous:
+    """Homogeneous polynomials as coefficients along ``exponents[degree]``, and what is done with them."""
+
+    def __init__(self, dimension: int, degree: int) -> None:
+        rows = np.array(monomial_exponents(dimension, degree))
+        totals = rows.sum(axis=1)
+        self.dimension = dimension
+        self.exponents = [rows[totals == k] for k in range(degree + 1)]
+        # A monomial's number in the base degree + 1 is unique, so that a table finds its place.
+        self._weights = (degree + 1) ** np.arange(dimension)
+        keys = [block @ self._weights for block in self.exponents]
+        self._order = [np.argsort(key) for key in keys]
+        self._sorted = [key[order] for key, order in zip(keys, self._order, strict=True)]
+
+    def place(self, exponents: np.ndarray, degree: int) -> np.ndarray:
+        """Where monomials of one degree stand: ``(..., d)`` to ``(...)``."""
+        return self._order[degree][np.searchsorted(self._sorted[degree], exponents @ self._weights)]
+
+    def scales(self, degree: int, scale: np.ndarray) -> np.ndarray:
+        """What each monomial gains when the states are measured in units of `scale`."""
+        return np.prod(scale ** self.exponents[degree], axis=1)
+
+    def quadratic(self, matrix: np.ndarray) -> np.ndarray:
+        """½ yᵀ matrix y."""
+        first, second = (np.eye(self.dimension, dtype=int)[index] for index in np.indices(matrix.shape))
+        coefficients = np.zeros(len(self.exponents[2]))
+        np.add.at(coefficients, self.place(first + second, 2), matrix / 2)
+        return coefficients
+
+    def gradient(self, coefficients: np.ndarray, degree: int) -> np.ndarray:
+        """Derivatives by each state, ``(n,)`` to ``(d, m)`` of the degree below."""
+        values = np.zeros((self.dimension, len(self.exponents[degree - 1])))
+        for state, step in enumerate(np.eye(self.dimension, dtype=int)):
+            rows = np.flatnonzero(self.exponents[degree][:, state])
+            powers = self.exponents[degree][rows]
+            values[state, self.place(powers - step, degree - 1)] = powers[:, state] * coefficients[rows]
+        return values
+
+    def dot(self, left: np.ndarray, left_degree: int, right: np.ndarray, right_degree: int) -> np.ndarray:
+        """Σ_i left_i right_i of polynomials, ``(d, n)`` and ``(d, m)``."""
+        degree = left_degree + right_degree
+        sums = self.exponents[left_degree][:, None] + self.exponents[right_degree][None]
+        return np.bincount(
+            self.place(sums, degree).ravel(),
+            weights=(left.T @ right).ravel(),
+            minlength=len(self.exponents[degree]),
+        )
+
+    def advection(self, flow: np.ndarray, degree: int) -> np.ndarray:
+        """Matrix of ``P ↦ (flow y)·∇P`` on polynomials P of a degree."""
+        exponents, units = self.exponents[degree], np.eye(self.dimension, dtype=int)
+        matrix = np.zeros((len(exponents), len(exponents)))
+        for i in range(self.dimension):
+            columns = np.flatnonzero(exponents[:, i])
+            for j in range(self.dimension):
+                rows = self.place(exponents[columns] - units[i] + units[j], degree)
+                matrix[rows, columns] += exponents[columns, i] * flow[i, j]
+        return matrix
+
+
+def _taylor(dynamics: Dynamics, center: np.ndarray, basis: _Homogeneous, degree: int) -> list[np.ndarray]:
+    """Taylor coefficients of f at the center: for each degree the components, ``(d, n)``."""
+    if all(equation.is_polynomial(*dynamics.symbols) for equation in dynamics.formulas):
+        parts = _shifted(dynamics, center, basis, degree)
+    else:
+        parts = _differentiated(dynamics, center, basis, degree)
+    if not all(np.isfinite(part).all() for part in parts):
+        raise ValueError(f"f has no finite derivatives up to order {degree} at {center.tolist()}")
+    return parts
+
+
+def _shifted(dynamics: Dynamics, center: np.ndarray, basis: _Homogeneous, degree: int) -> list[np.ndarray]:
+    # x^β = Σ_α binomial(β, α) center^(β - α) y^α: nothing is differentiated, nothing truncated.
+    parts = [np.zeros((dynamics.dimension, len(basis.exponents[k]))) for k in range(degree + 1)]
+    for component, equation in enumerate(dynamics.formulas):
+        terms = sympy.Poly(equation, *dynamics.symbols).terms()
+        powers = np.array([monomial for monomial, _ in terms])
+        coefficients = np.array([float(coefficient) for _, coefficient in terms])
+        highest = max(int(powers.max()), degree)
+        binomial = np.array([[math.comb(n, k) for k in range(highest + 1)] for n in range(highest + 1)])
+        for k, part in enumerate(parts):
+            for place, lower in enumerate(basis.exponents[k]):
+                choices = np.prod(binomial[powers, lower], axis=1, dtype=float)
+                rest = np.prod(center ** np.maximum(powers - lower, 0), axis=1)
+                part[component, place] = np.sum(coefficients * choices * rest)
+    return parts
+
+
+def _differentiated(
+    dynamics: Dynamics, center: np.ndarray, basis: _Homogeneous, degree: int
+) -> list[np.ndarray]:
+    derivatives = {(0,) * dynamics.dimension: list(dynamics.formulas)}
+    for block in basis.exponents[1 : degree + 1]:
+        for row in block:
+            state = int(np.flatnonzero(row)[-1])
+            lower = tuple(int(power) - (index == state) for index, power in enumerate(row))
+            derivatives[tuple(map(int, row))] = [d.diff(dynamics.symbols[state]) for d in derivatives[lower]]
+    formulas = [expression for row in derivatives.values() for expression in row]
+    with np.errstate(all="ignore"):
+        values = compile_formulas(formulas, dynamics.symbols)(center[:, None])[:, 0]
+    table = values.reshape(len(derivatives), dynamics.dimension).T
+    factorials = np.array([math.prod(math.factorial(power) for power in row) for row in derivatives])
+    blocks = np.cumsum([len(block) for block in basis.exponents[:degree]])
+    return np.split(table / factorials, blocks, axis=1)

@@ -1,0 +1,24 @@
+"""How do people read the results? Sentences, typeset formulas, figures, pages.
+
+===================  ======================================================================
+`formatting`         how is a formula written for a reader?
+`landscape_text`     how does a landscape read, as text and in a notebook?
+`diagnosis_report`   and a diagnosis?
+`sentences`          what is the answer in words?
+`projection`         what of many states is drawn on a plane?
+`page`               how is a page made that needs nothing else?
+`settings`           what do figures and pages of a study depend on?
+`study_page`         what does the page of a study say?
+`study_figures`      and which figures has it?
+`landscape_tables`   what does it say of the landscape?
+`landscape_figures`  and which figures of it?
+`invariant_tables`   what does it say of the invariant distribution?
+`reproduction_page`  what does the page say that lists a publication's results beside ours?
+`mismatch_page`      what does the page of a diagnosis say?
+`mismatch_sections`  which sections has it?
+`mismatch_findings`  what is it made from?
+`plots`              the figures themselves
+===================  ======================================================================
+
+Imports everything below `siq.cli`.
+"""

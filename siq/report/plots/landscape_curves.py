@@ -1,0 +1,237 @@
+"""How accurate local formulas are, and how long it takes to leave a well, as curves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter
+
+from siq.report.plots.style import (
+    BLACK,
+    BLUE,
+    COLUMN_WIDTH,
+    GREEN,
+    GREY,
+    ORANGE,
+    PAGE_WIDTH,
+    PURPLE,
+    VERMILLION,
+    counted,
+    drawn_in_style,
+    say,
+    sentence_figure,
+    unit_label,
+)
+
+COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, BLACK)
+MARKERS = ("o", "s", "^", "D", "v", "P")
+LINE_STYLES = ("-", "--", "-.", ":")
+
+
+@drawn_in_style
+def plot_degrees(table: pd.DataFrame) -> Figure:
+    """Draw how formulas about the attractors improve with their number of terms.
+
+    Parameters
+    ----------
+    table
+        Columns ``run attractor degree terms residual covered chosen`` (further ones are ignored), one row per
+        run × attractor × degree: the median relative Hamilton–Jacobi residual on points that took no part in
+        the fit, the share of them at which the formula is believed, and whether this degree was chosen.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Two panels against the number of terms: the residual on a logarithmic axis, and the share covered. A
+        thin line a run, a thick one for the median, wherever at least half of the runs are; a dot marks the
+        degree that was chosen in a run, a ring the one that was chosen most often.
+    """
+    if table.empty:
+        return sentence_figure("No formula was tried about any attractor.")
+    figure = Figure(figsize=(PAGE_WIDTH, 3.3))
+    left, right = figure.subplots(1, 2, sharex=True)
+    names = list(dict.fromkeys(table["attractor"]))
+    left.set_yscale("log")
+    for place, name in enumerate(names):
+        rows = table[table["attractor"] == name]
+        _draw_runs(left, rows[rows["residual"] > 0], "residual", place)
+        _draw_runs(right, rows, "covered", place)
+    degrees = table.drop_duplicates("terms").sort_values("terms")
+    for axes in (left, right):
+        axes.set_xlabel("number of terms")
+        top = axes.secondary_xaxis("top")
+        top.set_xticks(degrees["terms"].tolist(), [str(degree) for degree in degrees["degree"]])
+        top.set_xlabel("degree")
+        axes.spines["top"].set_visible(True)
+        axes.grid(axis="y", linewidth=0.3, color="#CCCCCC")
+        axes.set_axisbelow(True)
+    left.set_ylabel("Hamilton–Jacobi residual\n(median over held-out points, relative)")
+    right.set_ylabel("share of the held-out points\nat which the formula is believed")
+    if not (table["residual"] > 0).any():
+        say(left, "no residual is known")
+    runs = table["run"].nunique()
+    handles = [
+        Line2D(
+            [], [], color=colour, linestyle=style, marker=marker, markersize=3.5, linewidth=1.6, label=name
+        )
+        for name, (colour, style, marker) in zip(names, map(_look, range(len(names))), strict=True)
+    ]
+    handles.append(_ring(GREY, label="chosen" if runs == 1 else "chosen most often"))
+    if runs > 1:
+        thin: dict[str, Any] = {"color": GREY, "linewidth": 0.5, "alpha": 0.7}
+        handles.append(
+            Line2D([], [], marker="o", markersize=2, label=f"one run ({runs} in all) and its choice", **thin)
+        )
+        handles.append(Line2D([], [], color=GREY, linewidth=1.6, label=f"median of {counted(runs, 'run')}"))
+    figure.legend(handles=handles, loc="outside upper center", ncols=min(len(handles), 5))
+    return figure
+
+
+def _look(place: int) -> tuple[str, str, str]:
+    return (
+        COLOURS[place % len(COLOURS)],
+        LINE_STYLES[place % len(LINE_STYLES)],
+        MARKERS[place % len(MARKERS)],
+    )
+
+
+def _ring(colour: str, **options: Any) -> Line2D:
+    return Line2D(
+        [], [], linestyle="none", marker="o", markersize=8, markerfacecolor="none", markeredgecolor=colour,
+        markeredgewidth=1.2, **options,
+    )  # fmt: skip
+
+
+def _draw_runs(axes: Axes, rows: pd.DataFrame, column: str, place: int) -> None:
+    rows = rows[np.isfinite(rows[column])]
+    if rows.empty:
+        return
+    colour, style, marker = _look(place)
+    courses = rows.pivot_table(index="terms", columns="run", values=column)
+    chosen = rows[rows["chosen"].astype(bool)]
+    if courses.shape[1] > 1:
+        for run in courses:
+            course = courses[run].dropna()
+            axes.plot(course.index, course, color=colour, linewidth=0.4, alpha=0.4)
+        axes.plot(
+            chosen["terms"], chosen[column], linestyle="none", marker="o", markersize=2, color=colour,
+            markeredgewidth=0, alpha=0.6,
+        )  # fmt: skip
+    median = courses[courses.notna().sum(axis=1) >= courses.shape[1] / 2].median(axis=1)
+    axes.plot(
+        median.index, median, color=colour, linestyle=style, linewidth=1.6, marker=marker, markersize=3.5
+    )
+    if len(chosen):
+        terms = chosen["terms"].mode().iloc[0]
+        if terms in median.index:
+            ring = _ring(colour)
+            ring.set_data([terms], [median[terms]])
+            axes.add_line(ring)
+
+
+@drawn_in_style
+def plot_escape(table: pd.DataFrame, *, time_unit: str = "1", energy_unit: str = "1") -> Figure:
+    """Draw mean escape times against the inverse of the noise intensity.
+
+    Parameters
+    ----------
+    table
+        Columns ``transition intensity predicted simulated simulated_error`` (further ones are ignored), one
+        row per transition × ε: the mean time by the law, and in a simulation with its standard error, both in
+        time units. What was not simulated is missing or not finite.
+    time_unit, energy_unit
+        Units of time and of ε; ``1`` and the empty text mean none.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        The law as lines, which are straight where the time is logarithmic; simulations as points with bars
+        of one standard error.
+    """
+    rows = table[table["predicted"] > 0] if len(table) else table
+    if rows.empty:
+        return sentence_figure("No escape time is known.")
+    figure = Figure(figsize=(COLUMN_WIDTH, 3.2))
+    axes = figure.add_subplot()
+    axes.set_yscale("log")
+    handles, missing = [], 0
+    for place, (name, unsorted) in enumerate(rows.groupby("transition", sort=False)):
+        ways = unsorted.sort_values("intensity", ascending=False)
+        colour, style, marker = _look(place)
+        inverse = 1 / ways["intensity"].to_numpy(float)
+        axes.plot(inverse, ways["predicted"].to_numpy(float), color=colour, linestyle=style, linewidth=1.2)
+        times, errors = (ways[column].to_numpy(float) for column in ("simulated", "simulated_error"))
+        seen = np.isfinite(times) & (times > 0)
+        missing += int((~seen).sum())
+        # An error as large as the mean has no lower end on a logarithmic axis: its bar runs out of sight.
+        errors = np.where(np.isfinite(errors), errors, 0.0)
+        bars = np.stack([np.minimum(errors, (1 - 1e-9) * times), errors])[:, seen]
+        axes.errorbar(
+            inverse[seen], times[seen], yerr=bars, linestyle="none", marker=marker,
+            markersize=4, markerfacecolor="white", color=colour, elinewidth=1.0, capsize=2,
+        )  # fmt: skip
+        handles.append(
+            Line2D([], [], color=colour, linestyle=style, marker=marker, markersize=4,
+                   markerfacecolor="white", label=name)
+        )  # fmt: skip
+    _limit(axes, rows)
+    largest = float((1 / rows["intensity"]).max())
+    inverse_unit = "" if energy_unit in ("1", "") else f"1/{energy_unit}"
+    axes.set_xlabel(scaled_label(axes.xaxis, r"$1/\varepsilon$", inverse_unit, largest))
+    axes.set_ylabel("mean escape time " + ("(time units)" if time_unit in ("1", "") else f"({time_unit})"))
+    figure.legend(
+        handles=handles, loc="outside upper center", ncols=min(len(handles), 3),
+        title="lines: law, points: simulation ± standard error", title_fontsize=7,
+    )  # fmt: skip
+    if missing:
+        figure.supxlabel(f"{missing} of {counted(len(rows), 'time')} without a simulation", fontsize=7)
+    return figure
+
+
+def _limit(axes: Axes, rows: pd.DataFrame) -> None:
+    """Limits by the times themselves: an error bar that runs to zero would leave them no room."""
+    times = rows[["predicted", "simulated"]].to_numpy(float)
+    times = times[np.isfinite(times) & (times > 0)]
+    room = max((times.max() / times.min()) ** 0.08, 1.3)
+    axes.set_ylim(times.min() / room, times.max() * room)
+
+
+def power_of_ten(largest: float) -> int:
+    """The power that is written once at an axis and not at every tick: zero for numbers that are handy."""
+    if not math.isfinite(largest) or largest == 0 or 0.1 <= abs(largest) < 1e4:
+        return 0
+    return math.floor(math.log10(abs(largest)))
+
+
+def scaled_label(axis: Axis, symbol: str, unit: str, largest: float) -> str:
+    """The label of an axis with its unit, and with the power of ten that its ticks leave out from now on.
+
+    Parameters
+    ----------
+    axis
+        The axis; its label is left to the caller.
+    symbol
+        What is shown, typeset.
+    unit
+        Its unit; ``1`` and the empty text mean a plain number.
+    largest
+        The largest number that occurs.
+    """
+    power = power_of_ten(largest)
+    if not power:
+        return f"{symbol} {unit_label(unit)}"
+    axis.set_major_formatter(FuncFormatter(_without(power)))
+    factor = rf"$10^{{{power}}}$"
+    return f"{symbol} ({factor})" if unit in ("1", "") else f"{symbol} ({factor} {unit})"
+
+
+def _without(power: int) -> Callable[[float, object], str]:
+    return lambda value, _: f"{value / 10.0**power:.6g}".replace("-", "−")

@@ -1,0 +1,151 @@
+"""How well the identified dynamics predicts trajectories (paper, Fig. fig1b, panel a, and Eq. error)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from siq.report.plots.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PAGE_WIDTH,
+    PURPLE,
+    VERMILLION,
+    counted,
+    drawn_in_style,
+    magnitude_label,
+    mean_and_spread,
+    name_label,
+    say,
+    unit_label,
+)
+
+TRAJECTORIES_SHOWN = 6
+BINS = 40
+OBSERVED: dict[str, Any] = {"color": ORANGE, "linewidth": 2.6, "alpha": 0.7}
+PREDICTED: dict[str, Any] = {"color": BLACK, "linewidth": 0.9, "linestyle": "--"}
+LINE_STYLES = ("-", "--", "-.", ":")
+
+
+@drawn_in_style
+def plot_prediction(
+    observed: Sequence[np.ndarray],
+    predicted: Sequence[np.ndarray],
+    errors: pd.DataFrame,
+    *,
+    states: Sequence[str],
+    units: Sequence[str],
+    published: tuple[float, float] | None = None,
+) -> Figure:
+    """Draw held-out trajectories beside predicted ones, and the distribution of the errors.
+
+    Parameters
+    ----------
+    observed, predicted
+        Held-out trajectories and those of the identified f from the same initial states, each of shape
+        ``(k, d)``; the first six are drawn, projected on the first two states.
+    errors
+        Columns ``method error`` (further ones are ignored), one row per trajectory and run:
+        ``E_k = ‖X̂_k(t) - X_k(t)‖ / ‖X_k(t)‖``. Missing where a prediction ran to infinity; such are counted.
+    states, units
+        Names and units of the d states.
+    published
+        Mean and standard deviation of a published result, drawn as a band.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Two panels; the errors by method on a logarithmic axis, medians as vertical lines.
+    """
+    figure = Figure(figsize=(PAGE_WIDTH, 3.8))
+    left, right = figure.subplots(1, 2)
+    _draw_trajectories(left, observed, predicted)
+    labels = [f"${name_label(name)}$ {unit_label(unit)}" for name, unit in zip(states, units, strict=True)]
+    if left.axison:
+        left.set_xlabel("number of the sample" if len(states) == 1 else labels[0])
+        left.set_ylabel(labels[0] if len(states) == 1 else labels[1])
+    shown = min(len(observed), len(predicted), TRAJECTORIES_SHOWN)
+    noun = "trajectory" if shown == 1 else "trajectories"
+    left.set_title(f"(a) {shown} held-out {noun}, • start" if shown else "(a) trajectories", loc="left")
+    notes = _draw_errors(right, errors, published)
+    right.set_title("(b) errors of the predictions, with medians", loc="left")
+    if notes:
+        figure.supxlabel("\n".join(notes), fontsize=7)
+    return figure
+
+
+def _draw_trajectories(axes: Axes, observed: Sequence[np.ndarray], predicted: Sequence[np.ndarray]) -> None:
+    pairs = list(zip(observed, predicted, strict=False))[:TRAJECTORIES_SHOWN]
+    if not pairs:
+        say(axes, "no trajectories")
+        return
+    for truth, prediction in pairs:
+        # The observed curve is wide and pale: a prediction that lies on it leaves its rims visible.
+        for path, style in ((truth, OBSERVED), (prediction, PREDICTED)):
+            points = np.asarray(path)
+            curve = (np.arange(len(points)), points[:, 0]) if points.shape[1] == 1 else points[:, :2].T
+            axes.plot(*curve, **style)
+            axes.plot(curve[0][0], curve[1][0], marker="o", markersize=3, color=BLACK)
+    axes.legend(
+        handles=[
+            Line2D([], [], label="observed", **OBSERVED),
+            Line2D([], [], label="identified $f$", **PREDICTED),
+        ],
+        loc="best",
+    )
+
+
+def _draw_errors(axes: Axes, errors: pd.DataFrame, published: tuple[float, float] | None) -> list[str]:
+    values = errors["error"].to_numpy(float)
+    positive = values[np.isfinite(values) & (values > 0)]
+    notes = []
+    if positive.size == 0:
+        say(axes, "no prediction has an error")
+        return []
+    axes.set_xscale("log")
+    lowest, highest = positive.min(), positive.max()
+    spread = max(highest / lowest, 1.1)  # errors that are all alike have no width of their own
+    edges = np.geomspace(lowest / spread**0.02, highest * spread**0.02, BINS + 1)
+    colours = (BLUE, VERMILLION, GREEN, PURPLE)
+    handles = []
+    for place, (method, rows) in enumerate(errors.groupby("method", sort=False)):
+        all_of = rows["error"].to_numpy(float)
+        found = all_of[np.isfinite(all_of)]
+        lost, zero = int((~np.isfinite(all_of)).sum()), int((found == 0).sum())
+        notes += [f"{method}: {counted(lost, 'prediction')} without an error"] if lost else []
+        notes += [f"{method}: {counted(zero, 'prediction')} with no error at all"] if zero else []
+        if not (found > 0).any():
+            continue
+        colour, style = colours[place % len(colours)], LINE_STYLES[place % len(LINE_STYLES)]
+        shares = np.histogram(found[found > 0], edges)[0] / len(all_of)
+        axes.stairs(shares, edges, color=colour, linestyle=style, linewidth=1.2)
+        axes.axvline(float(np.median(found)), color=colour, linestyle=style, linewidth=0.8)
+        text = f"{method}, {counted(len(all_of), 'prediction')}\n"
+        text += f"median {magnitude_label(float(np.median(found)))}\nmean "
+        text += mean_and_spread(found.mean(), found.std(ddof=1) if found.size > 1 else float("nan"))
+        handles.append(Line2D([], [], color=colour, linestyle=style, label=text))
+    if published is not None:
+        handles.append(_draw_published(axes, *published))
+    axes.set_xlabel("relative error of a trajectory (dimensionless)")
+    axes.set_ylabel("share of the predictions")
+    axes.set_ylim(bottom=0)
+    axes.figure.legend(handles=handles, loc="outside upper center", ncols=min(len(handles), 3))
+    return notes
+
+
+def _draw_published(axes: Axes, mean: float, spread: float) -> Line2D:
+    lowest = axes.get_xlim()[0]
+    # Where the deviation exceeds the mean, the band has no lower end on a logarithmic axis.
+    axes.axvspan(mean - spread if mean > spread else min(lowest, mean / 10), mean + spread,
+                 color=GREY, alpha=0.25, linewidth=0, zorder=0)  # fmt: skip
+    label = f"published mean:\n{mean_and_spread(mean, spread, digits=3)}"
+    return axes.axvline(mean, color=GREY, linewidth=1.0, linestyle=(0, (1, 1)), label=label, zorder=0.5)

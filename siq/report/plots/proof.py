@@ -1,0 +1,118 @@
+"""What the diagnosis said of concealed cases: verdicts by kind, and names against how much could be known."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from siq.report.plots.style import (
+    BLUE,
+    GREEN,
+    GREY,
+    PAGE_WIDTH,
+    VERMILLION,
+    counted,
+    drawn_in_style,
+    say,
+    sentence_figure,
+)
+
+KINDS = ("null", "shift", "mechanism", "process noise", "withheld")
+VERDICTS = ("no mismatch", "parameter shift", "missing physics", "unexplained", "failed")
+RIGHT = {
+    "null": "no mismatch",
+    "shift": "parameter shift",
+    "mechanism": "missing physics",
+    "process noise": "missing physics",
+    "withheld": "unexplained",
+}
+EDGES = np.array([-np.inf, 10.0, 30.0, 100.0, 300.0, 1000.0, 10_000.0, np.inf])
+MARKERS = {40.0: ("o", BLUE), 30.0: ("s", VERMILLION), 20.0: ("^", GREEN)}
+
+
+@drawn_in_style
+def plot_proof(scores: pd.DataFrame, *, strong: float = 100.0) -> Figure:
+    """Draw what was said of concealed cases.
+
+    Parameters
+    ----------
+    scores
+        Columns ``kind verdict noise_db oracle_delta_chi2 truth_in_class``, one row a case.
+    strong
+        Oracle Δχ² that is marked.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Left how many cases of each kind had each verdict, the right one framed; right the share of
+        mechanisms within the reported class, against the oracle's Δχ², by noise level.
+    """
+    if scores.empty:
+        return sentence_figure("There is no case to show.")
+    figure = Figure(figsize=(PAGE_WIDTH, 2.9))
+    left, right = figure.subplots(1, 2, width_ratios=[1.25, 1])
+    _verdicts(left, scores)
+    _named(right, scores[scores["kind"] == "mechanism"], strong)
+    return figure
+
+
+def _verdicts(axes: Axes, scores: pd.DataFrame) -> None:
+    kinds = [kind for kind in KINDS if (scores["kind"] == kind).any()]
+    verdicts = [each for each in VERDICTS if each != "failed" or (scores["verdict"] == each).any()]
+    counts = np.array(
+        [
+            [((scores["kind"] == kind) & (scores["verdict"] == each)).sum() for each in verdicts]
+            for kind in kinds
+        ]
+    )
+    shares = counts / counts.sum(axis=1, keepdims=True).clip(min=1)
+    axes.imshow(shares, cmap="Blues", vmin=0, vmax=1.6, aspect="auto")
+    for (row, column), count in np.ndenumerate(counts):
+        axes.text(column, row, str(count), ha="center", va="center", color="black" if count else GREY)
+    for row, kind in enumerate(kinds):
+        column = verdicts.index(RIGHT[kind])
+        axes.plot(
+            column + np.array([-0.46, 0.46, 0.46, -0.46, -0.46]),
+            row + np.array([-0.44, -0.44, 0.44, 0.44, -0.44]),
+            color=GREEN,
+            linewidth=1.6,
+        )
+    axes.set_xticks(range(len(verdicts)), [each.replace(" ", "\n") for each in verdicts])
+    axes.set_yticks(range(len(kinds)), kinds)
+    axes.tick_params(length=0)
+    axes.set_xlabel("verdict (the right one framed)")
+    axes.set_ylabel("what is concealed")
+    axes.set_title(counted(len(scores), "case"))
+    axes.spines[:].set_visible(False)
+
+
+def _named(axes: Axes, mechanisms: pd.DataFrame, strong: float) -> None:
+    known = mechanisms[mechanisms["oracle_delta_chi2"].notna()]
+    if known.empty:
+        say(axes, "No mechanism was concealed.")
+        return
+    labels = [
+        f"<{EDGES[1]:g}", *(f"{a:g}–{b:g}" for a, b in pairwise(EDGES[1:-1])),
+        f">{EDGES[-2]:g}",
+    ]  # fmt: skip
+    for shift, (level, (marker, colour)) in zip((-0.12, 0.0, 0.12), MARKERS.items(), strict=True):
+        own = known[known["noise_db"] == level]
+        place = np.digitize(own["oracle_delta_chi2"], EDGES[1:-1])
+        bins = np.unique(place)
+        shares = [own["truth_in_class"].to_numpy(bool)[place == each].mean() for each in bins]
+        axes.plot(
+            bins + shift, shares, marker=marker, markersize=4, color=colour, linewidth=0.8,
+            label=f"{level:g} dB ({counted(len(own), 'case')})",
+        )  # fmt: skip
+    axes.axvline(np.searchsorted(EDGES[1:], strong) + 0.5, color=GREY, linewidth=0.8, linestyle="--")
+    axes.set_xticks(range(len(labels)), labels, rotation=30, ha="right")
+    axes.set_xlim(-0.5, len(labels) - 0.5)
+    axes.set_ylim(-0.03, 1.03)
+    axes.set_xlabel(r"what the oracle gains, $\Delta\chi^2$ (dimensionless)")
+    axes.set_ylabel("share of mechanisms\nwithin the reported class")
+    axes.set_title("Mechanisms by signal-to-noise ratio")
+    axes.legend(loc="lower right")

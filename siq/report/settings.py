@@ -1,0 +1,49 @@
+"""What the figures and pages of a study depend on."""
+
+from __future__ import annotations
+
+from pydantic.dataclasses import dataclass
+
+from siq.dynamics.simulation import SimulationOptions
+from siq.landscape.options import LandscapeOptions
+from siq.networks.options import TrainingOptions
+from siq.networks.regression import RegressionOptions
+from siq.steps.settings import STRICT, Sampling, StateSpace
+from siq.study.study import Study
+
+
+@dataclass(frozen=True, config=STRICT)
+class FiguresSettings:
+    """Of the figures; `simulation` is None of recordings."""
+
+    seed: int
+    space: StateSpace
+    sampling: Sampling
+    simulation: SimulationOptions | None
+    regression: RegressionOptions
+
+
+@dataclass(frozen=True, config=STRICT)
+class LandscapeFiguresSettings:
+    """Of the figures of a landscape."""
+
+    space: StateSpace
+    landscape: LandscapeOptions
+
+
+@dataclass(frozen=True, config=STRICT)
+class PageSettings:
+    """Of the page: the whole study, which it prints."""
+
+    study: Study
+
+
+@dataclass(frozen=True, config=STRICT)
+class ReproductionSettings:
+    """Of the page that has everything of the paper: what the paper's parameters are set beside."""
+
+    runs: int
+    simulation: SimulationOptions | None
+    training: TrainingOptions | None
+    regression: RegressionOptions
+    domain: tuple[tuple[float, float], ...] | None

@@ -1,0 +1,146 @@
+"""Identify: which f do the pairs of a run show, and does it predict recordings that were held out?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass as plain_dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from pydantic.dataclasses import dataclass
+
+from siq.certificate.tests import Verdict, check_prediction
+from siq.data.held_out import held_out_recordings
+from siq.data.recordings import Recordings, SnapshotPairs, select_recordings, snapshot_pairs
+from siq.errors import NumericalFailure
+from siq.identify.identification import (
+    IdentificationOptions,
+    IdentifiedField,
+    carries_noise,
+    identify_vector_field,
+    refit,
+    residuals,
+)
+from siq.identify.prediction import prediction_errors
+from siq.identify.residuals import mean_residual_probability, residual_noise
+from siq.identify.storage import FieldRecord, field_library, read_field, write_field
+from siq.numerics.randomness import Purpose, generator
+from siq.steps.outcomes import Outcome, Status, Step, read_outcomes, write_outcomes
+from siq.steps.settings import STRICT, Sampling, StateSpace
+
+PREDICTED = 200  # held-out recordings that are predicted: enough for a median
+
+
+@dataclass(frozen=True, config=STRICT)
+class IdentifySettings:
+    """What the identification depends on; `prediction` is the certificate's limit for f."""
+
+    seed: int
+    space: StateSpace
+    sampling: Sampling
+    identification: IdentificationOptions
+    prediction: float
+
+
+@plain_dataclass(frozen=True)
+class Identified:
+    """The identified f of a run with the test of its predictions, None where none was found."""
+
+    record: FieldRecord | None
+    outcome: Outcome
+
+
+def run(settings: IdentifySettings, recordings: Recordings | None, *, number: int) -> Identified:
+    """F of run `number`, from its recordings; None where drawing them failed."""
+    if recordings is None:
+        reason = "the run has no trajectories"
+        return Identified(None, Outcome(number, Step.IDENTIFY, Status.SKIPPED, reason))
+    try:
+        record = _identified(settings, recordings, number)
+    except (NumericalFailure, np.linalg.LinAlgError) as error:
+        return Identified(None, Outcome(number, Step.IDENTIFY, Status.FAILED, str(error)))
+    if record.prediction["passed"]:
+        return Identified(record, Outcome(number, Step.IDENTIFY))
+    return Identified(record, Outcome(number, Step.IDENTIFY, Status.WARNING, record.prediction["reason"]))
+
+
+def _identified(settings: IdentifySettings, recordings: Recordings, number: int) -> FieldRecord:
+    options, sampling = settings.identification, settings.sampling
+    held = held_out_recordings(recordings, generator=generator(settings.seed, number, Purpose.HOLD_OUT))
+    held_out = select_recordings(recordings, np.flatnonzero(held))
+    training = select_recordings(recordings, np.flatnonzero(~held))
+    step, maker = sampling.pair_step, sampling.integrator_step
+    parts = snapshot_pairs(training, pair_step=step), snapshot_pairs(held_out, pair_step=step)
+    library = field_library(recordings.names, options)
+    identify_pairs = partial(
+        identify_vector_field,
+        library,
+        options=options,
+        diffusion=settings.space.noise(len(recordings.names)),
+        integrator_step=maker,
+    )
+    if carries_noise(library, parts[0], options=options, integrator_step=maker):
+        # Under noise every recording counts: all give the result, a part of them its test.
+        everything = snapshot_pairs(recordings, pair_step=step)
+        found = identify_pairs(everything)
+        fitted = refit(found, parts[0])
+    else:
+        found = fitted = identify_pairs(parts[0])
+    noise = residual_noise(found, recordings, pair_step=step)
+    verdict = _held_out_verdict(
+        found, fitted, parts, held_out, fault=noise.fault(recordings.names), limit=settings.prediction
+    )
+    kept = {
+        "kind": noise.kind,
+        "intensity": noise.intensity,
+        "covariance": noise.covariance.tolist(),
+        "correlation": noise.correlation,
+        "correlation_score": noise.correlation_score,
+        "measurement": noise.measurement.tolist(),
+    }
+    return FieldRecord(found, verdict.as_data(), kept)
+
+
+def _held_out_verdict(
+    found: IdentifiedField,
+    fitted: IdentifiedField,
+    parts: tuple[SnapshotPairs, SnapshotPairs],
+    held_out: Recordings,
+    *,
+    fault: str | None,
+    limit: float,
+) -> Verdict:
+    """Whether f holds for recordings that it was not fitted to."""
+    if found.noise_free:
+        labels = np.arange(min(len(held_out.labels), PREDICTED))
+        errors = prediction_errors(found.dynamics, select_recordings(held_out, labels))
+        return check_prediction(
+            noise_fault=fault, errors=errors, mean_probability=None, held_out_ratio=1.0, limit=limit
+        )
+    training, unseen = parts
+    squares = [
+        float((residuals(fitted, pairs) ** 2 / pairs.h[:, None]).mean()) for pairs in (unseen, training)
+    ]
+    return check_prediction(
+        noise_fault=fault,
+        errors=None,
+        mean_probability=mean_residual_probability(fitted, unseen),
+        held_out_ratio=squares[0] / squares[1],
+        limit=limit,
+    )
+
+
+def read(field: str | Path, outcome: str | Path) -> Identified:
+    """What `write` wrote."""
+    return Identified(read_field(field), read_outcomes(outcome)[0])
+
+
+def write(
+    identified: Identified, settings: IdentifySettings, *, field: str | Path, outcome: str | Path
+) -> None:
+    """Write f, an empty file where none was found, and what became of the step."""
+    if identified.record is None:
+        Path(field).touch()
+    else:
+        write_field(field, identified.record, settings.identification)
+    write_outcomes(outcome, [identified.outcome])

@@ -1,0 +1,103 @@
+"""Landscape: equilibria, one formula for each well, transitions, and U over all wells, of one run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass as plain_dataclass
+from pathlib import Path
+
+import numpy as np
+from pydantic.dataclasses import dataclass
+
+from siq.certificate.certify import Certificate
+from siq.data.recordings import Recordings, snapshot_pairs
+from siq.dynamics.phase_portrait import evenly_spread, phase_portrait
+from siq.errors import NumericalFailure
+from siq.identify.storage import FieldRecord
+from siq.landscape.landscape import Landscape, find_landscape
+from siq.landscape.storage import write_landscape
+from siq.numerics.randomness import Purpose, generator
+from siq.potential.refinement import RefinementOptions
+from siq.potential.storage import read_model
+from siq.potential.well import Well
+from siq.steps.landscape_tables import degree_rows, landscape_rows
+from siq.steps.outcomes import Method, Outcome, Status, Step, write_outcomes
+from siq.steps.settings import STRICT, Sampling
+from siq.study.tables import as_table, write_table
+
+
+@dataclass(frozen=True, config=STRICT)
+class LandscapeSettings:
+    """What a landscape depends on."""
+
+    seed: int
+    sampling: Sampling
+    refinement: RefinementOptions
+
+
+@plain_dataclass(frozen=True)
+class FoundLandscape:
+    """The landscape of a run with the f that it is of, None where it could not be found."""
+
+    landscape: Landscape | None
+    record: FieldRecord | None
+    outcome: Outcome
+
+
+def run(
+    settings: LandscapeSettings,
+    recordings: Recordings | None,
+    record: FieldRecord | None,
+    *,
+    number: int,
+    wells: Sequence[Well] = (),
+    certificate: Certificate | None = None,
+) -> FoundLandscape:
+    """The landscape of the identified f within the recorded region.
+
+    The wells are those of the refinement, with their certificate; where it found none, the local route is
+    asked once more, within the whole recorded region.
+    """
+    if recordings is None or record is None:
+        reason = "no vector field was identified"
+        return FoundLandscape(None, record, Outcome(number, Step.LANDSCAPE, Status.SKIPPED, reason))
+    x = snapshot_pairs(recordings, pair_step=settings.sampling.pair_step).x0
+    draw = generator(settings.seed, number, Purpose.LANDSCAPE)
+    points = x[evenly_spread(x, generator=draw)]
+    try:
+        portrait = phase_portrait(record.found.dynamics, points, seed=number)
+        found = find_landscape(
+            record.found, portrait, wells=wells or None, certificate=certificate,
+            options=settings.refinement, seed=number,
+        )  # fmt: skip
+    except (NumericalFailure, np.linalg.LinAlgError) as error:
+        return FoundLandscape(None, record, Outcome(number, Step.LANDSCAPE, Status.FAILED, str(error)))
+    whole = found.over_wells is not None and not found.notes
+    status = Status.OK if whole else Status.WARNING
+    return FoundLandscape(found, record, Outcome(number, Step.LANDSCAPE, status, "; ".join(found.notes)))
+
+
+def read_wells(model: str | Path) -> tuple[Well, ...]:
+    """V about the attractors as refinement wrote it to `model.json`."""
+    formulas, _ = read_model(model)
+    return formulas[Method.REFINED].wells if Method.REFINED in formulas else ()
+
+
+def write(
+    found: FoundLandscape,
+    *,
+    quasipotential: str | Path,
+    table: str | Path,
+    degrees: str | Path,
+    outcome: str | Path,
+) -> None:
+    """Write `quasipotential.json` with its tables, an empty file and none where there is no landscape."""
+    number, rows, accuracy = found.outcome.run, as_table("landscape", []), as_table("degrees", [])
+    if found.landscape is None or found.record is None:
+        Path(quasipotential).touch()
+    else:
+        write_landscape(quasipotential, found.landscape, dynamics=found.record.found.dynamics)
+        rows, accuracy = landscape_rows(number, found.landscape), degree_rows(number, found.landscape)
+    write_table(table, rows)
+    write_table(degrees, accuracy)
+    write_outcomes(outcome, [found.outcome])

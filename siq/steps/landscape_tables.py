@@ -1,0 +1,74 @@
+"""The landscape of a run as rows of the tables `landscape` and `degrees`."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+
+from siq.landscape.landscape import Landscape
+from siq.potential.local_wells import best_trial
+from siq.study.tables import as_table
+
+
+def place(position: np.ndarray) -> str:
+    """A state as text."""
+    return "(" + ", ".join(f"{value:.6g}" for value in position) + ")"
+
+
+def landscape_rows(run: int, found: Landscape) -> pd.DataFrame:
+    """One row for each equilibrium and each way out of a well."""
+    names = [f"A{index + 1}" for index in range(len(found.attractors))]
+    heights = {place(one.position): index for index, one in enumerate(found.attractors)}
+    tops: dict[str, float] = {}
+    for way in found.transitions:
+        top = found.heights[way.start] + way.barrier
+        tops[place(way.saddle.position)] = min(top, tops.get(place(way.saddle.position), np.inf))
+    rows: list[dict[str, object]] = []
+    for one in found.equilibria:
+        index = heights.get(place(one.position))
+        eigenvalues = ", ".join(
+            f"{value.real:.4g}" + (f"{value.imag:+.4g}i" if value.imag else "") for value in one.eigenvalues
+        )
+        rows.append(
+            {
+                "run": run,
+                "item": "" if index is None else names[index],
+                "kind": one.kind,
+                "position": place(one.position),
+                "eigenvalues": eigenvalues,
+                "U": tops.get(place(one.position), np.nan) if index is None else found.heights[index],
+                "basin": np.nan if index is None else found.basins[index],
+            }
+        )
+    for way in found.transitions:
+        beyond = "outside" if way.end is None else names[way.end]
+        rows.append(
+            {
+                "run": run,
+                "item": f"{names[way.start]} to {beyond}",
+                "kind": "transition",
+                "position": place(way.saddle.position),
+                "U": found.heights[way.start] + way.barrier,
+                "barrier": way.barrier,
+                "standard_error": way.standard_error,
+                "by_formula": way.by_formula,
+                "minimum_action": np.nan if way.path is None else way.path.uphill.action,
+                "prefactor": np.nan if way.rate is None else way.rate.prefactor,
+                "note": "; ".join(way.notes),
+            }
+        )
+    return as_table("landscape", rows)
+
+
+def degree_rows(run: int, found: Landscape) -> pd.DataFrame:
+    """Accuracy against number of terms, about each attractor."""
+    rows = [
+        {
+            "run": run, "attractor": f"A{index + 1}", "degree": trial.degree, "terms": trial.terms,
+            "residual": trial.residual, "covered": trial.covered, "chosen": number == best_trial(well.trials),
+        }
+        for index, well in enumerate(found.wells)
+        if well is not None
+        for number, trial in enumerate(well.trials)
+    ]  # fmt: skip
+    return as_table("degrees", rows)

@@ -1,0 +1,146 @@
+"""Pipeline: all that a run of recordings gives, in memory: f, networks, V with its certificate, landscape.
+
+The same functions as in the workflow, without its files.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass as plain_dataclass
+from dataclasses import replace
+from typing import Any, TypeVar
+
+from pydantic.dataclasses import dataclass
+
+from siq.certificate.tests import CertificateOptions
+from siq.data.recordings import Recordings
+from siq.identify.identification import IdentificationOptions
+from siq.landscape.options import LandscapeOptions
+from siq.networks.options import TrainingOptions
+from siq.networks.regression import RegressionOptions
+from siq.potential.refinement import RefinementOptions
+from siq.steps import identify, landscape, refine, regress, train
+from siq.steps.outcomes import Outcome
+from siq.steps.settings import STRICT, Sampling, StateSpace
+from siq.steps.trained import TrainedRun, not_trained
+
+Settings = TypeVar("Settings")
+
+
+@dataclass(frozen=True, config=STRICT)
+class PipelineSettings:
+    """What the analysis of recordings depends on; the defaults need no networks.
+
+    Attributes
+    ----------
+    seed
+        Of everything random.
+    space
+        The states, and D.
+    sampling
+        How samples make pairs.
+    identification, regression, refinement, certificate
+        The parameters of the steps.
+    training
+        How two networks are trained; None trains none, and V comes from the local route alone.
+    published_method
+        Whether the published regression is made of the networks, beside the refined formulas.
+    landscape
+        How the landscape is found; None finds none.
+    """
+
+    seed: int = 0
+    space: StateSpace = StateSpace()
+    sampling: Sampling = Sampling()
+    identification: IdentificationOptions = IdentificationOptions()
+    training: TrainingOptions | None = None
+    published_method: bool = True
+    regression: RegressionOptions = RegressionOptions()
+    refinement: RefinementOptions = RefinementOptions()
+    certificate: CertificateOptions = CertificateOptions()
+    landscape: LandscapeOptions | None = LandscapeOptions()
+
+    @property
+    def prediction(self) -> float:
+        """The certificate's limit for f."""
+        return self.certificate.prediction
+
+    def of(self, cls: type[Settings]) -> Settings:
+        """The settings of one step."""
+        named: dict[str, Any] = {
+            field.name: getattr(self, field.name)
+            for field in dataclasses.fields(cls)  # type: ignore[arg-type]
+        }
+        return cls(**named)
+
+
+@plain_dataclass(frozen=True)
+class Analysis:
+    """What the steps found; each has its outcome, and says why where it has no result.
+
+    Attributes
+    ----------
+    identified
+        f, and the test of its predictions.
+    trained, regressed
+        The networks, and the published method's formulas of them; `regressed` is None where not asked for.
+    refined
+        Formulas by method, with their certificates.
+    landscape
+        Wells, barriers, ways; None where not asked for.
+    """
+
+    identified: identify.Identified
+    trained: TrainedRun
+    regressed: regress.Regressed | None
+    refined: refine.RefinedRun
+    landscape: landscape.FoundLandscape | None
+
+    @property
+    def outcomes(self) -> tuple[Outcome, ...]:
+        """What became of each step."""
+        steps = (self.identified, self.trained, self.regressed, self.refined, self.landscape)
+        return tuple(one.outcome for one in steps if one is not None)
+
+
+def analyse(
+    recordings: Recordings, settings: PipelineSettings | None = None, *, number: int = 0, device: str = "auto"
+) -> Analysis:
+    """All that recordings give.
+
+    Parameters
+    ----------
+    recordings
+        Trajectories.
+    settings
+        What the steps are told.
+    number
+        Of the run: another one has other random numbers.
+    device
+        On which networks are trained: ``auto``, ``cpu``, ``cuda``.
+
+    Returns
+    -------
+    Analysis
+        Also where a step failed, which its outcome then says.
+    """
+    settings = settings or PipelineSettings()
+    identified = identify.run(settings.of(identify.IdentifySettings), recordings, number=number)
+    trained, regressed = not_trained(number), None
+    refinement = settings.refinement.with_routes(networks=settings.training is not None)
+    settings = replace(settings, refinement=refinement)
+    if settings.training is not None:
+        given = {number: train.RunToTrain(recordings, identified.record)}
+        trained = train.run(settings.of(train.TrainSettings), given, device=device).of(number)
+        if settings.published_method:
+            regressed = regress.run(settings.of(regress.RegressSettings), recordings, trained)
+    formulas = None if regressed is None else regressed.formulas
+    to_refine = refine.RunToRefine(recordings, identified, trained, formulas)
+    refined = refine.run(settings.of(refine.RefineSettings), to_refine)
+    found = None
+    if settings.landscape is not None:
+        found = landscape.run(
+            settings.of(landscape.LandscapeSettings), recordings, identified.record, number=number,
+            wells=refined.wells, certificate=refined.certificate,
+        )  # fmt: skip
+    return Analysis(identified, trained, regressed, refined, found)

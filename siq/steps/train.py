@@ -1,0 +1,213 @@
+"""Train: which V and g do two networks find? Runs of one block train side by side.
+
+A training ends as soon as its networks are good enough, or when its steps are spent. A killed one is resumed
+where it stopped: from its checkpoint, and with the networks of the runs that had already passed the check.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass as plain_dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+from pydantic import TypeAdapter
+from pydantic.dataclasses import dataclass
+
+from siq.data.recordings import Recordings, snapshot_pairs
+from siq.errors import NumericalFailure
+from siq.identify.storage import FieldRecord, read_field
+from siq.networks.options import TrainingOptions
+from siq.networks.trained import TrainedNetworks, save_networks
+from siq.numerics.randomness import Purpose, generator
+from siq.steps.files import read_run
+from siq.steps.outcomes import Outcome, Status, Step, write_outcomes
+from siq.steps.settings import STRICT, Sampling, StateSpace
+from siq.steps.trained import TrainedRun
+from siq.study.tables import as_table, write_table
+
+if TYPE_CHECKING:
+    from siq.networks.data import TrainingData
+    from siq.potential.training_check import TrainingCheck
+
+
+@dataclass(frozen=True, config=STRICT)
+class TrainSettings:
+    """What a training depends on."""
+
+    seed: int
+    space: StateSpace
+    sampling: Sampling
+    training: TrainingOptions
+
+
+@plain_dataclass(frozen=True)
+class RunToTrain:
+    """What a run brings to its training: its trajectories and its f, None where a step before failed."""
+
+    recordings: Recordings | None
+    record: FieldRecord | None
+
+
+@plain_dataclass(frozen=True)
+class Trained:
+    """The networks of a block.
+
+    Attributes
+    ----------
+    networks
+        By run, of those that have data, in the order of their positions in the file.
+    history
+        The loss, see the table `training`.
+    outcomes
+        Of every run of the block.
+    """
+
+    networks: Mapping[int, TrainedNetworks]
+    history: pd.DataFrame
+    outcomes: tuple[Outcome, ...]
+
+    def of(self, number: int) -> TrainedRun:
+        """What one run has of it."""
+        mine = next(one for one in self.outcomes if one.run == number)
+        return TrainedRun(self.networks[number] if mine.usable else None, mine)
+
+
+@plain_dataclass(frozen=True)
+class Checks:
+    """When the training of each run may end; of those that have no check, why not."""
+
+    ready: Mapping[int, TrainingCheck]
+    faults: Mapping[int, str]
+
+
+def run(
+    settings: TrainSettings,
+    runs: Mapping[int, RunToTrain],
+    *,
+    folder: Path | None = None,
+    device: str = "auto",
+) -> Trained:
+    """Train the networks of a block of runs.
+
+    Parameters
+    ----------
+    settings
+        What the networks are told.
+    runs
+        By number.
+    folder
+        Where a killed training leaves what it goes on from; None keeps nothing. See `clean`.
+    device
+        ``auto``, ``cpu``, ``cuda``.
+    """
+    data, outcomes = _training_data(settings, runs)
+    if not data:
+        return Trained({}, as_table("training", []), tuple(outcomes))
+
+    from siq.networks.training import choose_device  # torch takes seconds to import
+    from siq.steps.training_block import Block, Kept
+
+    checks = _checks(settings, runs, data)
+    dimension = next(iter(data.values())).training.x0.shape[1]
+    block = Block(
+        data,
+        checks.ready,
+        options=settings.training,
+        diffusion=settings.space.noise(dimension),
+        seed=settings.seed,
+        kept=Kept(folder, _fingerprint(settings, runs, data)),
+        device=choose_device(device),
+        faults=checks.faults,
+    )
+    block.train()
+    outcomes += [block.outcome(number) for number in data]
+    networks = {number: block.last[number] for number in data}
+    return Trained(networks, as_table("training", block.history()), tuple(outcomes))
+
+
+def _training_data(
+    settings: TrainSettings, runs: Mapping[int, RunToTrain]
+) -> tuple[dict[int, TrainingData], list[Outcome]]:
+    """The data of every run of the block that has some, and the outcomes of those that have none."""
+    from siq.networks.data import prepare_data
+
+    data, outcomes = {}, []
+    for number, one in runs.items():
+        if one.recordings is None:
+            reason = "the run has no trajectories"
+            outcomes.append(Outcome(number, Step.TRAIN, Status.SKIPPED, reason))
+            continue
+        try:
+            pairs = snapshot_pairs(one.recordings, pair_step=settings.sampling.pair_step)
+            draw = generator(settings.seed, number, Purpose.DIVIDE)
+            data[number] = prepare_data(pairs, options=settings.training, generator=draw)
+        except NumericalFailure as error:
+            outcomes.append(Outcome(number, Step.TRAIN, Status.FAILED, str(error)))
+    return data, outcomes
+
+
+def _checks(
+    settings: TrainSettings, runs: Mapping[int, RunToTrain], data: Mapping[int, TrainingData]
+) -> Checks:
+    """The check of every run whose vector field is known; the others train for all their steps."""
+    from siq.potential.training_check import training_check
+
+    ready, faults = {}, {}
+    for number, part in data.items():
+        options, record = settings.training.check, runs[number].record
+        if record is None or options is None:
+            continue
+        x = part.training.x0
+        try:
+            ready[number] = training_check(record.found, x, options=options, seed=number)
+        except (NumericalFailure, np.linalg.LinAlgError) as error:
+            faults[number] = f"the check of the training could not be prepared: {error}"
+    return Checks(ready, faults)
+
+
+def _fingerprint(
+    settings: TrainSettings, runs: Mapping[int, RunToTrain], data: Mapping[int, TrainingData]
+) -> str:
+    """What everything kept by a killed training must share with the one that goes on from it."""
+    told = TypeAdapter(TrainSettings).dump_python(settings, mode="json")
+    digest = hashlib.sha256(json.dumps([list(data), told], sort_keys=True).encode())
+    for number, part in data.items():
+        record = runs[number].record
+        arrays = [part.training.x0, part.training.xh, part.training.h]
+        if record is not None:
+            arrays += [record.found.coefficients, record.found.covariance]
+        for values in arrays:
+            digest.update(np.ascontiguousarray(values).tobytes())
+    return digest.hexdigest()
+
+
+def read(
+    recordings: Iterable[str | Path], fields: Iterable[str | Path], *, first: int
+) -> dict[int, RunToTrain]:
+    """The runs of a block, of which `first` is the first."""
+    pairs = zip(recordings, fields, strict=True)
+    return {
+        number: RunToTrain(read_run(one), read_field(field))
+        for number, (one, field) in enumerate(pairs, start=first)
+    }
+
+
+def write(trained: Trained, *, networks: str | Path, history: str | Path, outcome: str | Path) -> None:
+    """Write the networks of a block, an empty file where there are none, their loss and outcomes."""
+    if trained.networks:
+        save_networks(networks, list(trained.networks.values()))
+    else:
+        Path(networks).touch()
+    write_table(history, trained.history)
+    write_outcomes(outcome, trained.outcomes)
+
+
+def clean(folder: Path) -> None:
+    """Remove what only a killed training would need."""
+    for path in folder.glob("kept-*.npz"):
+        path.unlink()

@@ -1,0 +1,320 @@
+"""Studies: what is asked, of which data, with which parameters at every step.
+
+A study (``config/studies/NAME.yaml``) is checked against this schema before any job starts; what it leaves
+out takes the schema's defaults. The options of a step stand beside the step (`siq.dynamics.simulation`,
+`siq.networks`, `siq.networks.regression`), so that neither can drift from the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from siq.certificate.tests import CertificateOptions
+from siq.dynamics.cards import DiffusionEntry, Name, SystemCard, build_system, diffusion_matrix
+from siq.dynamics.diffusion import Diffusion
+from siq.dynamics.dynamics import Dynamics
+from siq.dynamics.formulas import FormulaError
+from siq.dynamics.sampling import SimulationEntry, complete
+from siq.errors import InputError
+from siq.files.documents import read_document, validate
+from siq.identify.identification import IdentificationOptions
+from siq.identify.library import candidate_library
+from siq.landscape.options import LandscapeOptions
+from siq.networks.options import TrainingOptions
+from siq.networks.regression import RegressionOptions
+from siq.potential.refinement import RefinementOptions
+
+NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"
+
+
+class RecordingsOptions(BaseModel):
+    """Recordings in the place of a simulation.
+
+    Attributes
+    ----------
+    file
+        Parquet, CSV, HDF5 or MATLAB file with columns ``recording``, ``t`` and the states; a relative
+        path starts from the folder in which the workflow runs, or else from ``SIQ_RESOURCES``.
+    states
+        The columns that are states, in order; by default the system's, or all of the file's.
+    pair_step
+        Consecutive samples no further apart than this are pairs; by default those no further apart than
+        one and a half of their median distance, since what is longer is a gap.
+    diffusion
+        D, in the recordings' units, where no system gives it; by default the identity.
+    integrator_step
+        Step of the Euler–Maruyama simulation that made the recordings, where one did: its increments are
+        those of a map, from which the continuous process is then found. Leave it out for measurements.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    file: str
+    states: Annotated[tuple[Name, ...], Field(min_length=1)] | None = None
+    pair_step: Annotated[float, Field(gt=0)] | None = None
+    diffusion: DiffusionEntry | None = None
+    integrator_step: Annotated[float, Field(gt=0)] | None = None
+
+    @field_validator("states")
+    @classmethod
+    def _distinct(cls, states: tuple[str, ...] | None) -> tuple[str, ...] | None:
+        if states is not None and len(set(states)) < len(states):
+            raise ValueError("a state is named twice; name each once")
+        return states
+
+
+class Study(BaseModel):
+    """The schema of a study.
+
+    Attributes
+    ----------
+    name
+        Names the folder of the results.
+    title
+        What the report is headed.
+    system
+        Name of a system card, or path of one. Simulated, unless there are recordings; then it only lends
+        its states, units, D and exact answers.
+    recordings
+        Measured trajectories in the place of a simulation.
+    runs
+        Number of independent runs: fresh initial states, or resampled recordings, and fresh networks. One
+        is an answer; what the answer varies by is seen in several.
+    seed
+        Seed of everything random.
+    published
+        Name of a file of published figures to be set beside the results.
+    simulation, identification, regression, refinement, certificate
+        The parameters of the steps.
+    training
+        How two networks are trained; ``{}`` takes the defaults. Left out, no networks take part: V comes
+        from the local route alone, and the published regression of networks is not made.
+    invariant
+        Noise intensities ε for which the invariant distribution is computed, and simulated.
+    landscape
+        How the landscape is found: equilibria, a formula for each well, barriers, paths and escape times;
+        by default with the options' own defaults. ``false`` finds none.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: str = Field(pattern=NAME)
+    title: str = ""
+    system: str | None = None
+    recordings: RecordingsOptions | None = None
+    runs: Annotated[int, Field(ge=1, le=10_000)] = 1
+    seed: Annotated[int, Field(ge=0)] = 0
+    published: str | None = None
+    simulation: SimulationEntry = SimulationEntry()
+    identification: IdentificationOptions = IdentificationOptions()
+    training: TrainingOptions | None = None
+    regression: RegressionOptions = RegressionOptions()
+    refinement: RefinementOptions = RefinementOptions()
+    certificate: CertificateOptions = CertificateOptions()
+    invariant: tuple[Annotated[float, Field(gt=0)], ...] = ()
+    landscape: LandscapeOptions | None = LandscapeOptions()
+
+    @field_validator("training", "landscape", mode="before")
+    @classmethod
+    def _switched_off(cls, value: object) -> object:
+        return None if value is False else value
+
+    @field_validator("published")
+    @classmethod
+    def _plain_name(cls, value: str | None) -> str | None:
+        if value is not None and not value.replace("-", "").replace("_", "").isalnum():
+            raise ValueError(f"'{value}' is no name of published figures; use letters, digits, '-' and '_'")
+        return value
+
+    @model_validator(mode="after")
+    def _has_data(self) -> Study:
+        if self.system is None and self.recordings is None:
+            raise ValueError("the study names no data; add 'system: NAME' or 'recordings: {file: ...}'")
+        if self.system is not None and self.recordings is not None and self.recordings.diffusion is not None:
+            raise ValueError("the diffusion is the system's; remove 'recordings.diffusion'")
+        if self.training is None and "network" in (self.refinement.routes or ()):
+            raise ValueError(
+                "'refinement.routes' names the network route, but no networks are asked for; add"
+                " 'training: {}', or leave the routes out"
+            )
+        if self.simulation.pair_step is not None and self.simulation.interval is not None:
+            self.simulation.options()
+        return self
+
+
+def completed(study: Study, system: Dynamics | None) -> Study:
+    """A study with what follows from its system where it says nothing: how this is simulated."""
+    if system is None or study.recordings is not None:
+        return study
+    return study.model_copy(update={"simulation": complete(study.simulation, system)})
+
+
+class PublishedFigure(BaseModel):
+    """A number that somebody published, to be set beside ours; it is never an input of any method.
+
+    Attributes
+    ----------
+    mean, standard_deviation
+        As published.
+    rounding
+        Half a unit of the last digit that was printed, where that matters.
+    source
+        Where it stands, and how many runs it is of.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    mean: float
+    standard_deviation: float | None = None
+    rounding: Annotated[float, Field(ge=0)] = 0.0
+    source: str
+
+
+class PublishedMesh(BaseModel):
+    """U of two states on the nodes of a rectangular mesh that somebody published.
+
+    Attributes
+    ----------
+    file
+        A MATLAB file with one matrix, the first state along its rows; sought in ``SIQ_RESOURCES``.
+    box
+        The first and the last node along each state.
+    times
+        U is so many times what the file holds, up to a constant.
+    source
+        Where it was published.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    file: str
+    box: tuple[tuple[float, float], tuple[float, float]]
+    times: float = 1.0
+    source: str
+
+
+class PublishedFigures(BaseModel):
+    """Published figures by the quantity that they are of: ``rrmse``, ``U:x**2``, ``network_error``."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    title: str
+    figures: dict[str, PublishedFigure]
+    mesh: PublishedMesh | None = None
+
+
+def load_study(path: str | Path) -> Study:
+    """Read and check a study file.
+
+    Raises
+    ------
+    InputError
+        With the file, the line and the remedy, for whatever the schema refuses.
+    """
+    return validate(read_document(path), Study)
+
+
+def load_published(path: str | Path) -> PublishedFigures:
+    """Read and check a file of published figures; raises `InputError` as `load_study` does."""
+    return validate(read_document(path), PublishedFigures)
+
+
+def load_study_system(study: Study, *, file: str, systems: Path) -> Dynamics | None:
+    """The system of a study, checked together with what the study asks of it.
+
+    Parameters
+    ----------
+    study
+        The study.
+    file
+        Its file, for messages.
+    systems
+        Folder of the cards that studies name.
+
+    Raises
+    ------
+    InputError
+        When the card is missing or refused, inputs or the time drive the system, or the study's library or D
+        does not fit the states.
+    """
+    system = None if study.system is None else _with_landscape(system_path(study.system, systems=systems))
+    states = system.states if system is not None else None
+    if study.recordings is not None and study.recordings.states is not None:
+        if system is not None and study.recordings.states != system.states:
+            raise InputError(
+                file, "recordings.states", f"the states are not those of the system '{system.name}'",
+                f"name {', '.join(system.states)}, in this order, or leave them out",
+            )  # fmt: skip
+        states = study.recordings.states
+    if states is not None:
+        check_states(study, states, file=file)
+    return system
+
+
+def _with_landscape(path: Path) -> Dynamics:
+    """The system of a card that can be simulated by itself, and has a landscape that we can work out."""
+    document = read_document(path)
+    system = build_system(document, validate(document, SystemCard))
+
+    def refuse(keys: tuple[str, ...], fault: str, remedy: str) -> None:
+        raise InputError(document.file, document.place(keys), fault, remedy)
+
+    if not system.autonomous:
+        key, what = ("inputs", "inputs") if system.inputs else ("equations", "time")
+        refuse(
+            (key,),
+            "a driven system has no quasipotential",
+            f"leave the {what} out, or use the card in a study of mismatch",
+        )
+    for name, limits in zip(system.states, system.limits, strict=True):
+        if np.isnan(limits).any():
+            refuse(
+                ("states", name),
+                f"the state '{name}' has no domain, in which a simulation could begin",
+                "add 'domain: [lower, upper]' to it",
+            )
+    if not system.diffusion.regular:
+        refuse(
+            ("diffusion",),
+            "the noise does not reach every state, and landscapes are worked out only where it does",
+            "give a positive definite matrix, or use the card in a study of mismatch",
+        )
+    return system
+
+
+def check_states(study: Study, states: Sequence[str], *, file: str) -> None:
+    """Check what a study says of its states, once these are known.
+
+    Raises
+    ------
+    InputError
+        When the library's functions or D do not fit the states.
+    """
+    try:
+        if study.recordings is not None and study.system is None:
+            noise = Diffusion(diffusion_matrix(study.recordings.diffusion or "identity", len(states)))
+            if not noise.regular:
+                raise ValueError("the noise does not reach every state; give a positive definite matrix")
+    except ValueError as error:
+        fault, remedy = str(error).split("; ", 1)
+        raise InputError(file, "recordings.diffusion", fault, remedy) from None
+    for step, functions in (
+        ("identification", study.identification.functions),
+        ("regression", study.regression.functions),
+    ):
+        try:
+            candidate_library(states, degree=1, further=functions)
+        except FormulaError as error:
+            raise InputError(file, f"{step}.functions", error.fault, error.remedy) from None
+
+
+def system_path(system: str, *, systems: Path) -> Path:
+    """The card that a study means: a path as it stands, a name within the folder of cards."""
+    if system.endswith((".yaml", ".yml")):
+        return Path(system)
+    return systems / f"{system}.yaml"

@@ -1,0 +1,173 @@
+"""Whole trajectories by damped least squares, and inputs that are held and lag."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import sympy
+
+from siq.dynamics.cards import SystemCard, build_system
+from siq.dynamics.dynamics import Dynamics
+from siq.estimation.estimation import fit_by_multiple_shooting
+from siq.estimation.first_states import first_states
+from siq.estimation.innovations import Noise
+from siq.estimation.jumps import jumps_of, spread_edges
+from siq.estimation.linearisation import Grid, integrate_intervals, linearise
+from siq.estimation.measurements import Measurements, course_of_input
+from siq.estimation.process_noise import fit_with_and_without_process_noise
+from siq.estimation.trajectories import fit_trajectories, run, sensitivities
+from siq.files.documents import Document, validate
+
+PENDULUM = {
+    "name": "pendulum",
+    "time_unit": "s",
+    "states": {"x": {"unit": "1", "domain": [-3, 3]}, "v": {"unit": "1/s", "domain": [-3, 3]}},
+    "inputs": {"u": {"unit": "1/s**2", "interpolation": "zero_order"}},
+    "parameters": {"k": {"value": 1.0}, "d": {"value": 0.1}, "c": {"value": 0.0}},
+    "equations": {"x": "v", "v": "-k*sin(x) - d*v - c*sign(v) + u"},
+    "outputs": {"x": "x"},
+}
+STEP, SAMPLES = 0.2, 80
+
+
+def model_of(card: dict) -> Dynamics:
+    document = Document("card.yaml", card, {})
+    return build_system(document, validate(document, SystemCard))
+
+
+def driven(model: Dynamics, *, noise: float = 0.0, substeps: int = 48) -> tuple[Measurements, np.ndarray]:
+    """Two recordings of a model's own motion, and the states."""
+    generator = np.random.default_rng(4)
+    t = np.arange(SAMPLES) * STEP
+    pushes = generator.normal(size=(2, SAMPLES)) * 0.6
+    data = Measurements(
+        labels=("a", "b"),
+        first=np.array([0, SAMPLES, 2 * SAMPLES]),
+        t=np.tile(t, 2),
+        outputs=np.zeros((2 * SAMPLES, 1)),
+        courses=tuple((course_of_input(t, push, "zero_order"),) for push in pushes),
+    )
+    sharp = spread_edges(model, data, np.ones((2 * SAMPLES, 2)), substeps=substeps)
+    states = run(sharp, Grid(data, substeps), np.array([[0.5, 0.0], [-1.0, 0.4]]))
+    measured = states[:, :1] + noise * generator.normal(size=(2 * SAMPLES, 1))
+    return replace(data, outputs=measured), states
+
+
+def with_values(model: Dynamics, **values: float) -> Dynamics:
+    return model.with_values(np.array([values.get(each.name, each.value) for each in model.parameters]))
+
+
+def test_sensitivities_are_differences_of_trajectories() -> None:
+    model = with_values(
+        model_of({**PENDULUM, "equations": {"x": "v", "v": "-k*sin(x) - d*v + c*x + u"}}), c=0.1
+    )
+    data, states = driven(model, substeps=2)
+    grid = Grid(data, 2)
+    columns = sensitivities(linearise(model, grid, model.values, states), data)[:, 0]
+    begin = states[data.first[:-1]]
+    for place in range(columns.shape[1]):
+        shift = np.zeros(columns.shape[1])
+        shift[place] = 1e-5
+        ends = []
+        for sign in (1, -1):
+            moved = model.with_values(model.values + sign * shift[:3])
+            ends.append(run(moved, Grid(data, 2), begin + sign * shift[3:].reshape(2, 2))[:, 0])
+        assert columns[:, place] == pytest.approx((ends[0] - ends[1]) / 2e-5, abs=2e-4)
+
+
+def test_friction_that_sticks_is_fitted_from_far_away() -> None:
+    truth = with_values(model_of(PENDULUM), c=0.25)
+    data, states = driven(truth, noise=0.01)
+    model = spread_edges(with_values(truth, k=1.2, d=0.3, c=0.0), data, states, substeps=12)
+    found = fit_trajectories(
+        model,
+        data,
+        begin=states[data.first[:-1]] + 0.05,
+        noise=Noise(np.array([1e-4]), np.zeros(2)),
+        substeps=12,
+    )
+    assert found.converged and not found.has_process_noise
+    assert (np.abs(found.model.values - truth.values) < 4 * found.standard_errors).all()
+    assert found.noise.measurement[0] == pytest.approx(1e-4, rel=0.3)
+
+
+def test_both_fits_agree_where_both_settle() -> None:
+    card = {**PENDULUM, "parameters": {**PENDULUM["parameters"], "c": {"value": 0.0, "fixed": True}}}
+    model = model_of(card)
+    data, _ = driven(model, noise=0.02)
+    x = first_states(model, data)
+    noise = Noise(np.array([4e-4]), np.zeros(2))
+    quick = fit_by_multiple_shooting(model, data, x=x, noise=noise, estimate_process=False, substeps=4)
+    slow = fit_trajectories(model, data, begin=x[data.first[:-1]], noise=noise, substeps=4)
+    assert quick.converged and slow.converged
+    assert slow.model.values == pytest.approx(quick.model.values, abs=0.05 * quick.standard_errors.max())
+    assert slow.log_likelihood == pytest.approx(quick.log_likelihood, abs=0.1)
+
+
+def test_a_fit_of_a_mechanism_with_its_own_states_may_be_begun_from() -> None:
+    model = model_of({**PENDULUM, "equations": {"x": "v", "v": "-k*sin(x) - d*v - c*v**3 + u"}})
+    data, states = driven(model, noise=0.02)
+    noise = Noise(np.array([4e-4]), np.array([0.0, 1e-3]))
+    begin = fit_by_multiple_shooting(model, data, x=states, noise=noise, estimate_process=True, substeps=2)
+    grown = replace(begin, noise=replace(begin.noise, process=np.array([0.0, 1e-3, 0.0])))
+    loose, strict = fit_with_and_without_process_noise(model, data, grown, x=begin.x)
+    assert loose is not None and len(loose.noise.process) == 2
+    assert (
+        strict.converged and (np.abs(strict.model.values - model.values) < 4 * strict.standard_errors).all()
+    )
+
+
+def test_a_simulation_that_runs_away_gives_no_fit() -> None:
+    model = model_of({**PENDULUM, "equations": {"x": "v", "v": "x**5 + k - d*v - c + u"}})
+    data, _ = driven(model_of(PENDULUM))
+    noise = Noise(np.array([1e-4]), np.zeros(2))
+    found = fit_trajectories(model, data, begin=np.full((2, 2), 3.0), noise=noise, substeps=2)
+    assert not found.converged and found.log_likelihood == -np.inf
+
+
+def delayed(tau: float) -> Dynamics:
+    equations = {"x": "v", "v": "-k*x - d*v + c*0 + delay(u, tau)"}
+    parameters = {**PENDULUM["parameters"], "tau": {"value": tau}}
+    return model_of({**PENDULUM, "parameters": parameters, "equations": equations})
+
+
+def test_a_held_input_that_lags_has_a_derivative() -> None:
+    model = delayed(0.13)
+    data, states = driven(model_of(PENDULUM))
+    grid = Grid(data, 4)
+    response = linearise(model, grid, model.values, states).response[data.begins, :, -1]
+    change = [
+        integrate_intervals(model, Grid(data, 4), model.values + np.eye(4)[3] * side, states[data.begins].T)
+        for side in (1e-4, -1e-4)
+    ]
+    assert np.abs(response).max() > 0.5
+    assert response == pytest.approx((change[0] - change[1]).T / 2e-4, abs=1e-3)
+
+
+def test_a_held_input_that_lags_pushes_as_much_as_it_should() -> None:
+    still = {**PENDULUM, "equations": {"x": "v", "v": "0*k + 0*d + 0*c + delay(u, tau)"}}
+    still["parameters"] = {**PENDULUM["parameters"], "tau": {"value": 0.07}}
+    model = model_of(still)
+    data, _ = driven(model_of(PENDULUM))
+    one = data.select([0])
+    at = np.linspace(0, (SAMPLES - 1) * STEP, 40 * (SAMPLES - 1) + 1)
+    middle = (at[1:] + at[:-1]) / 2
+    push = one.courses[0][0](np.clip(middle - 0.07, 0, None))
+    states = run(model, Grid(one, 3), np.zeros((1, 2)))
+    exact = np.concatenate([[0], np.cumsum(push * np.diff(at))])[::40]
+    # A jump within a step is spread over it: at a sample part of it may still be to come.
+    assert states[:, 1] == pytest.approx(exact, abs=STEP / 3 / 2 * 1.5)
+    assert abs(np.mean(states[:, 1] - exact)) < 2e-3
+
+
+@pytest.mark.parametrize(
+    ("formula", "arguments"),
+    [("-sign(v) - sign(x)*v", ["v", "x"]), ("-design*(x + v)", []), ("-Abs(v)", []), ("-tanh(v/sigma)", [])],
+)
+def test_jumps_are_found_in_formulas_and_not_in_their_spelling(formula: str, arguments: list[str]) -> None:
+    x, v = sympy.symbols("x v", real=True)
+    names = {"design": sympy.Symbol("design", real=True), "sigma": sympy.Symbol("sigma", positive=True)}
+    moving = Dynamics.of((x, v), (v, sympy.sympify(formula, {"x": x, "v": v, **names})))
+    assert [str(each) for each in jumps_of(moving)] == arguments

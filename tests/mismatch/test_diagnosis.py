@@ -1,0 +1,315 @@
+"""Verdicts on recordings of a driven oscillator whose truth is known."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+from siq.dynamics.cards import load_system
+from siq.dynamics.dynamics import Dynamics
+from siq.errors import InputError, NumericalFailure
+from siq.mismatch import trials
+from siq.mismatch.case import read_case
+from siq.mismatch.diagnosis import Diagnosis, solve_case
+from siq.mismatch.dictionary import standard_dictionary
+from siq.mismatch.probes import Probe
+
+CARD = {
+    "name": "oscillator",
+    "time_unit": "s",
+    "states": {"x": {"unit": "m", "domain": [-2, 2]}, "v": {"unit": "m/s", "domain": [-4, 4]}},
+    "inputs": {"u": {"unit": "N", "interpolation": "linear"}},
+    "parameters": {
+        "k": {"value": 4.0, "unit": "N/m"},
+        "d": {"value": 0.3, "unit": "N*s/m"},
+        "m": {"value": 1.0, "unit": "kg", "fixed": True},
+    },
+    "equations": {"x": "v", "v": "(-k*x - d*v + u)/m"},
+    "outputs": {"x": "x"},
+}
+STEP, SAMPLES, FINE = 0.15, 120, 20
+Force = Callable[[np.ndarray, np.ndarray, float], np.ndarray]
+
+
+def recordings_of(
+    force: Force,
+    *,
+    count: int = 8,
+    noise: float = 0.01,
+    drive: float = 0.0,
+    fading: bool = False,
+    seed: int = 1,
+) -> pd.DataFrame:
+    """Driven oscillators of different strength, by Heun's rule; random forces may follow their motion."""
+    generator = np.random.default_rng(seed)
+    t = np.arange(SAMPLES) * STEP
+    strength = np.geomspace(0.4, 2.0, count)[:, None]
+    phase = generator.uniform(0, 2 * np.pi, size=(count, 4, 1))
+    omega = generator.uniform(0.8, 3.0, size=(count, 4, 1))
+    u = strength * np.cos(omega * t + phase).sum(axis=1)
+    state = np.stack([generator.normal(size=count) * 0.3, np.zeros(count)])
+    seen = np.empty((count, SAMPLES))
+    h = STEP / FINE
+
+    def rate(y: np.ndarray, now: float, at: float) -> np.ndarray:
+        left = np.minimum(int(at), SAMPLES - 2)
+        push = u[:, left] + (u[:, left + 1] - u[:, left]) * (at - left)
+        return np.stack([y[1], -4.0 * y[0] - 0.3 * y[1] + push + force(y[0], y[1], now)])
+
+    for sample in range(SAMPLES):
+        seen[:, sample] = state[0]
+        for part in range(FINE if sample + 1 < SAMPLES else 0):
+            at = sample + part / FINE
+            first = rate(state, at * STEP, at)
+            second = rate(state + h * first, at * STEP + h, at + 1 / FINE)
+            state = state + h / 2 * (first + second)
+            kick = np.sqrt(drive * h) * generator.normal(size=count)
+            state[1] += kick * np.hypot(*state) if fading else kick
+    size = noise * seen.std()
+    return pd.DataFrame(
+        {
+            "recording": np.repeat([f"r{index}" for index in range(count)], SAMPLES),
+            "t": np.tile(t, count),
+            "x": (seen + size * generator.normal(size=seen.shape)).ravel(),
+            "u": u.ravel(),
+        }
+    )
+
+
+def solved(folder: Path, table: pd.DataFrame, *, card: dict = CARD, study: dict | None = None) -> Diagnosis:
+    (folder / "system.yaml").write_text(yaml.safe_dump(card, sort_keys=False), encoding="utf-8")
+    (folder / "study.yaml").write_text(yaml.safe_dump(study or {"held_out": ["r2", "r5"]}), encoding="utf-8")
+    table.to_parquet(folder / "recordings.parquet")
+    case = read_case(folder / "system.yaml", folder / "recordings.parquet", folder / "study.yaml")
+    return solve_case(case)
+
+
+def nothing(x: np.ndarray, v: np.ndarray, t: float) -> np.ndarray:
+    return np.zeros_like(x)
+
+
+def said(diagnosis: Diagnosis) -> dict[str, Any]:
+    return diagnosis.statement.as_data()
+
+
+def names(diagnosis: Diagnosis) -> list[str]:
+    return [each["name"] for each in said(diagnosis)["mechanisms"]]
+
+
+def test_nothing_is_missing_and_what_could_be_is_bounded(tmp_path: Path) -> None:
+    diagnosis = solved(tmp_path, recordings_of(nothing))
+    assert said(diagnosis)["verdict"] == "no mismatch"
+    bound = said(diagnosis)["excluded"]["cubic stiffness in v"]
+    assert 0 < bound["upper_bound_95"] < 0.05 and bound["unit"] == "1/(m**2*s**2)"
+    assert said(diagnosis)["fit"]["augmented"] == pytest.approx(
+        said(diagnosis)["fit"]["noise_floor"], rel=0.3
+    )
+
+
+def test_a_noise_that_is_known_is_not_estimated(tmp_path: Path) -> None:
+    table = recordings_of(nothing)
+    # Of half the true size: then noise itself is more than the simulation explains.
+    for factor, verdict in ((1.0, "no mismatch"), (0.5, "unexplained")):
+        size = factor * 0.01 * table["x"].std()
+        diagnosis = solved(tmp_path, table, study={"held_out": ["r2", "r5"], "noise": {"x": float(size)}})
+        assert diagnosis.investigation.search.fit.noise.measurement == pytest.approx([size**2])
+        assert said(diagnosis)["verdict"] == verdict
+
+
+def test_wrong_parameters_are_no_missing_physics(tmp_path: Path) -> None:
+    card = {**CARD, "parameters": {**CARD["parameters"], "k": {"value": 3.4, "unit": "N/m"}}}
+    diagnosis = solved(tmp_path, recordings_of(nothing), card=card)
+    assert said(diagnosis)["verdict"] == "parameter shift"
+    shift = said(diagnosis)["recalibration"]["k"]
+    assert shift["before"] == 3.4
+    assert abs(shift["after"] - 4.0) < 3 * shift["standard_error"]
+
+
+def test_a_hardening_spring_is_named_measured_and_located(tmp_path: Path) -> None:
+    diagnosis = solved(tmp_path, recordings_of(lambda x, v, t: -0.6 * x**3))
+    verdict = said(diagnosis)
+    assert verdict["verdict"] == "missing physics" and names(diagnosis) == ["cubic stiffness"]
+    found = verdict["mechanisms"][0]
+    assert found["terms"] == {"v": "-c_1*x**3"} and found["indistinguishable_from"] == []
+    parameter = found["parameters"]["c_1"]
+    assert abs(parameter["estimate"] - 0.6) < 3 * parameter["standard_error"] < 0.06
+    assert list(verdict["location"]["equations"]) == ["v"] and verdict["location"]["coordinate"] == "x"
+    fit = verdict["fit"]
+    assert fit["augmented"] < 1.3 * fit["noise_floor"] < fit["recalibrated"] / 5
+    path = tmp_path / "augmented.yaml"
+    path.write_text(diagnosis.to_card(), encoding="utf-8")
+    assert "x**3" in str(load_system(path).equations[1])
+    json.dumps(verdict, allow_nan=False)
+
+
+def test_a_faint_mechanism_is_described_but_not_named(tmp_path: Path) -> None:
+    table = recordings_of(lambda x, v, t: -0.03 * x**3)
+    study = {"held_out": ["r2", "r5"], "search": {"named": 1e6}}
+    diagnosis = solved(tmp_path, table, study=study)
+    assert said(diagnosis)["verdict"] == "unexplained" and names(diagnosis) == []
+    assert said(diagnosis)["description"]["by"][0]["name"] == "cubic stiffness"
+    assert "too faint to be named" in said(diagnosis)["remarks"][-1]
+
+
+def test_dry_friction_is_told_from_other_friction(tmp_path: Path) -> None:
+    diagnosis = solved(tmp_path, recordings_of(lambda x, v, t: -0.25 * np.tanh(v / 1e-3)))
+    assert names(diagnosis) == ["dry friction"]
+    assert said(diagnosis)["mechanisms"][0]["parameters"]["c_1"]["estimate"] == pytest.approx(0.25, rel=0.05)
+
+
+def test_random_forces_are_no_mechanism_with_a_formula(tmp_path: Path) -> None:
+    # They drive the velocity, and the augmented card says so, though D is singular then.
+    diagnosis = solved(tmp_path, recordings_of(nothing, drive=0.05))
+    np.testing.assert_allclose(diagnosis.augmented.diffusion.matrix, np.diag([0, 0.05]), rtol=0.3)
+    path = tmp_path / "augmented.yaml"
+    path.write_text(diagnosis.to_card(), encoding="utf-8")
+    np.testing.assert_array_equal(load_system(path).diffusion.matrix, diagnosis.augmented.diffusion.matrix)
+    assert said(diagnosis)["verdict"] == "missing physics" and names(diagnosis) == ["process noise"]
+    intensity = said(diagnosis)["mechanisms"][0]["parameters"]["intensity_v"]["estimate"]
+    assert intensity == pytest.approx(0.05, rel=0.3)
+
+
+def test_random_forces_that_follow_the_motion_are_not_those_of_surroundings(tmp_path: Path) -> None:
+    diagnosis = solved(tmp_path, recordings_of(nothing, drive=0.03, fading=True))
+    assert said(diagnosis)["verdict"] == "unexplained"
+    assert any("hidden state" in remark for remark in said(diagnosis)["remarks"])
+
+
+def test_unequal_friction_is_found_though_its_first_fit_may_lead_nowhere(tmp_path: Path) -> None:
+    def force(x: np.ndarray, v: np.ndarray, t: float) -> np.ndarray:
+        return -np.where(v > 0, 0.25, 0.1) * np.tanh(v / 1e-3)
+
+    diagnosis = solved(tmp_path, recordings_of(force, noise=0.03))
+    assert names(diagnosis) == ["asymmetric friction"]
+    assert diagnosis.investigation.search.fit.substeps > 12  # the jump was made sharp enough
+
+
+def test_what_the_dictionary_lacks_stays_unexplained(tmp_path: Path) -> None:
+    diagnosis = solved(tmp_path, recordings_of(lambda x, v, t: 1.5 * np.exp(-(((x - 0.5) / 0.15) ** 2))))
+    assert said(diagnosis)["verdict"] == "unexplained" and said(diagnosis)["mechanisms"] == []
+    assert said(diagnosis)["location"]["coordinate"] == "x"
+
+
+def test_a_bias_and_an_offset_of_the_sensor_are_one_class(tmp_path: Path) -> None:
+    diagnosis = solved(tmp_path, recordings_of(lambda x, v, t: np.full_like(x, 0.4)))
+    first = said(diagnosis)["mechanisms"][0]
+    assert {first["name"], *first["indistinguishable_from"]} == {"constant bias", "sensor gain or offset"}
+
+
+def test_units_and_order_change_nothing_but_numbers(tmp_path: Path) -> None:
+    table = recordings_of(lambda x, v, t: -0.5 * np.abs(v) * v)
+    metres = solved(tmp_path, table)
+    shuffled = pd.concat([part for _, part in list(table.groupby("recording"))[::-1]])
+    shuffled["x"] *= 1000
+    card = json.loads(json.dumps(CARD))
+    card["states"] = {
+        "x": {"unit": "mm", "domain": [-2e3, 2e3]},
+        "v": {"unit": "mm/s", "domain": [-4e3, 4e3]},
+    }
+    card["equations"]["v"] = "(-k*x - d*v + 1000*u)/m"
+    millimetres = solved(tmp_path, shuffled, card=card)
+    assert names(metres) == names(millimetres) == ["quadratic drag"]
+    ours, theirs = (said(each)["mechanisms"][0]["parameters"]["c_1"] for each in (metres, millimetres))
+    assert theirs["estimate"] == pytest.approx(ours["estimate"] / 1000, rel=1e-3)
+    assert (ours["unit"], theirs["unit"]) == ("1/m", "1/mm")
+
+
+def test_domains_that_a_card_does_not_give_are_those_of_the_recordings(tmp_path: Path) -> None:
+    table = recordings_of(nothing, count=4)
+    known = {**CARD, "states": {"x": {"unit": "m", "domain": [-1, 1]}, "v": {"unit": "m/s"}}}
+    diagnosis = solved(tmp_path, table, card=known, study={"held_out": ["r2"]})
+    assert diagnosis.verdict == "no mismatch"
+    learned = diagnosis.investigation.final.x
+    np.testing.assert_array_equal(diagnosis.augmented.domain[0], [-1, 1])  # as declared
+    np.testing.assert_array_equal(diagnosis.augmented.domain[1], [learned[:, 1].min(), learned[:, 1].max()])
+    assert np.isnan(diagnosis.case.system.limits[1]).all()
+
+
+@pytest.mark.parametrize(
+    "equation",
+    [
+        "(-k*x + u)/m + 60*v",  # unstable: exp(60 · 0.15) from sample to sample, then beyond all numbers
+        "(-k*x - d*v + u)/m + 1e-3*exp(400*x)",
+        "(-k*x - d*v + u)/m + sqrt(x)",
+    ],
+)
+def test_a_simulation_that_runs_away_is_told_as_such(equation: str, tmp_path: Path) -> None:
+    card = {**CARD, "equations": {"x": "v", "v": equation}}
+    with pytest.raises(NumericalFailure, match="cannot be fitted to the recordings: "):
+        solved(tmp_path, recordings_of(nothing, count=3), card=card, study={"held_out": ["r2"]})
+
+
+def test_a_mechanism_that_overflows_ends_itself_and_not_the_diagnosis(tmp_path: Path) -> None:
+    further = [
+        {
+            "name": name,
+            "sentence": "It grows beyond all numbers.",
+            "forms": [
+                {
+                    "roles": {"x": "position", "v": "velocity"},
+                    "terms": {"v": term},
+                    "parameters": {"c": {}},
+                    "coordinate": "x",
+                }
+            ],
+        }
+        for name, term in (("explosion", "c*exp(1000*x)"), ("chain", "c*exp(exp(30*x))"))
+    ]
+    kept = {"cubic stiffness", "dry friction"}
+    without = [each.name for each in standard_dictionary() if each.name not in kept]
+    study = {"held_out": ["r2"], "mechanisms": further, "without": without}
+    diagnosis = solved(tmp_path, recordings_of(lambda x, v, t: -0.6 * x**3, count=4), study=study)
+    assert names(diagnosis) == ["cubic stiffness"]
+    assert "explosion" in {each.mechanism for each in diagnosis.statement.not_fitted}
+    assert all(each.reason for each in diagnosis.statement.not_fitted)
+
+
+@pytest.mark.parametrize("error", [ValueError("array must not contain infs or NaNs"), ZeroDivisionError(),
+                                   FloatingPointError(), np.linalg.LinAlgError("SVD")])  # fmt: skip
+def test_a_candidate_whose_fit_fails_unforeseen_is_recorded_with_the_reason(
+    error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    right = trials.with_start
+
+    def failing(probe: Probe, *further: Any) -> Dynamics:
+        if probe.candidate.name == "cubic stiffness":
+            raise error
+        return right(probe, *further)
+
+    monkeypatch.setattr(trials, "with_start", failing)
+    kept = {"cubic stiffness", "quintic stiffness"}
+    without = [each.name for each in standard_dictionary() if each.name not in kept]
+    study = {"held_out": ["r2"], "without": without}
+    diagnosis = solved(tmp_path, recordings_of(lambda x, v, t: -0.6 * x**3, count=4), study=study)
+    (failed,) = (each for each in diagnosis.statement.not_fitted if each.mechanism == "cubic stiffness")
+    assert type(error).__name__ in failed.reason and str(error) in failed.reason
+
+
+@pytest.mark.parametrize(
+    ("study", "message"),
+    [
+        ({"held_out": ["r9"]}, "no recording is called 'r9'"),
+        ({"held_out": [f"r{index}" for index in range(8)]}, "one side of the split is empty"),
+        ({"without": ["friction"]}, "no mechanism is called 'friction'"),
+        ({"noise": {"v": 0.1}}, "'v' is no output"),
+        ({"held_oud": 0.2}, "did you mean 'held_out'"),
+    ],
+)
+def test_a_study_that_cannot_be_used_is_refused_in_a_sentence(
+    study: dict, message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        solved(tmp_path, recordings_of(nothing), study=study)
+    assert "study.yaml" in str(caught.value)
+
+
+def test_a_missing_column_is_told(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="u"):
+        solved(tmp_path, recordings_of(nothing).drop(columns="u"))

@@ -1,0 +1,99 @@
+from xml.etree import ElementTree
+
+import pytest
+import sympy
+
+from siq.report.formatting import (
+    formula_mathml,
+    formula_text,
+    polynomial_expression,
+    vector_mathml,
+)
+
+x, y, z = sympy.symbols("x y z", real=True)
+IDENTIFIED = 0.9991 * y**2 + 1.0009 - 2.0012 * x**2 + 0.9991 * z**2 + 1.0001 * x**4
+
+
+def shown(markup: str) -> str:
+    """What a reader sees of MathML, with all spaces left out."""
+    return "".join(ElementTree.fromstring(markup).itertext()).replace("\u2062", "")
+
+
+def test_the_papers_formula_reads_as_in_the_paper() -> None:
+    assert formula_text(IDENTIFIED) == "1.000 x⁴ − 2.001 x² + 0.999 y² + 0.999 z² + 1.001"
+    assert shown(formula_mathml(IDENTIFIED)) == "1.000x4−2.001x2+0.999y2+0.999z2+1.001"
+
+
+@pytest.mark.parametrize(
+    ("expression", "text"),
+    [
+        (x**4 - 2 * x**2 + 1, "x⁴ − 2 x² + 1"),
+        (-1.0 * y - 1.0 * z, "−1.000 y − 1.000 z"),
+        (y - x * y, "−x y + y"),
+        (x / 2, "(1/2) x"),
+        (2.0 * sympy.sin(3 * x) + x, "x + 2.000 sin(3 x)"),
+        ((x + 1) ** 2 * y, "y (x + 1)²"),
+        (x / y, "x y⁻¹"),
+        (x ** sympy.Float(2.0), "x²"),
+        (4.5e-4 * x - 3e9, "4.500 × 10⁻⁴ x − 3.000 × 10⁹"),
+        (sympy.Float(0), "0.000"),
+        (sympy.Integer(0), "0"),
+    ],
+)
+def test_formula_text(expression: sympy.Expr, text: str) -> None:
+    assert formula_text(expression) == text
+
+
+@pytest.mark.parametrize(
+    "expression",
+    [
+        IDENTIFIED,
+        sympy.pi * sympy.exp(-x) + sympy.sqrt(x) / (1 + y),
+        sympy.Max(x, y)
+        + sympy.Abs(x - 1.5)
+        + sympy.sign(x)
+        + sympy.tanh(x) ** 2
+        + sympy.atan(x)
+        + sympy.log(x),
+        sympy.Symbol("omega_0") ** sympy.Rational(3, 2),
+        sympy.Float("nan"),
+    ],
+)
+def test_mathml_is_wellformed_xml(expression: sympy.Expr) -> None:
+    root = ElementTree.fromstring(formula_mathml(expression))
+    assert root.tag == "math"
+    assert root.attrib["aria-label"]
+
+
+def test_powers_and_scientific_notation_are_superscripts() -> None:
+    root = ElementTree.fromstring(formula_mathml(4.5e-4 * x**3))
+    assert ["".join(power.itertext()) for power in root.iter("msup")] == ["10−4", "x3"]
+
+
+def test_a_long_sum_stands_on_several_lines() -> None:
+    sum_of_many = sympy.Add(*(1.25 * x**power for power in range(1, 13)))
+    root = ElementTree.fromstring(formula_mathml(sum_of_many))
+    assert len(list(root.iter("mtr"))) > 1
+    assert shown(formula_mathml(sum_of_many)).startswith("1.250x12+1.250x11")
+
+
+def test_a_vector_is_a_column_in_brackets() -> None:
+    root = ElementTree.fromstring(vector_mathml([2.001 * x**3 - 2.001 * x, 0.999 * y, 0.999 * z], decimals=2))
+    assert ["".join(row.itertext()).replace("\u2062", "") for row in root.iter("mtr")] == [
+        "2.00x3−2.00x",
+        "1.00y",
+        "1.00z",
+    ]
+    assert "".join(root.itertext())[0] + "".join(root.itertext())[-1] == "[]"
+
+
+def test_hostile_names_are_escaped() -> None:
+    markup = formula_mathml(sympy.Symbol("<script>alert(1)</script>") * sympy.Symbol("&lt;b&gt;"))
+    ElementTree.fromstring(markup)
+    assert "<script" not in markup
+    assert "<b>" not in markup
+
+
+def test_polynomial_of_a_table_of_coefficients() -> None:
+    expression = polynomial_expression({"1": 1.0, "x**2*y": -2.0, "x": 0.0, "omega_0": 1.0})
+    assert formula_text(expression) == "−2.000 x² y + 1.000 omega_0 + 1.000"

@@ -1,0 +1,313 @@
+"""The page and the figures of a diagnosis, from a verdict made by hand."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pandas as pd
+import pytest
+import sympy
+
+from siq.dynamics.cards import load_system
+from siq.dynamics.diffusion import Diffusion
+from siq.dynamics.dynamics import Dynamics
+from siq.mismatch.consequences import compare_landscapes, identified, obstacle
+from siq.mismatch.dictionary import dictionary_of
+from siq.mismatch.verdict import statement_of_failure
+from siq.report.mismatch_findings import Findings
+from siq.report.mismatch_page import mismatch_page
+from siq.report.mismatch_sections import CAPTIONS
+from siq.report.plots.mismatch import plot_candidates, plot_curves, plot_escapes, plot_held_out, plot_missing
+
+CARD = """\
+name: spring
+time_unit: s
+states:
+  x: {{unit: mm, domain: [-2, 2]}}
+  v: {{unit: mm/s, domain: [-2, 2]}}
+parameters:
+  k: {{value: 1.0, unit: 1/s**2}}
+  d: {{value: 0.5, unit: 1/s}}
+{further}
+equations:
+  x: v
+  v: -k*x - d*v{terms}
+outputs: {{x: x}}
+"""
+VERDICT = {
+    "verdict": "missing physics",
+    "sentence": "The simulation lacks cubic stiffness. In the equation of v, along x from -2 to 2.",
+    "mechanisms": [
+        {
+            "name": "cubic stiffness",
+            "label": "cubic stiffness in v",
+            "terms": {"v": "-c_1*x**3"},
+            "parameters": {"c_1": {"estimate": 0.25, "standard_error": 0.01, "unit": "1/(mm**2*s**2)"}},
+            "evidence": {"delta_chi2": 300.0, "delta_bic": -290.0, "p_white": 1e-60, "p_cluster": 1e-9},
+            "share_of_excess": 0.99,
+            "indistinguishable_from": ["quintic stiffness"],
+        }
+    ],
+    "description": None,
+    "location": {
+        "equations": {"v": 0.97},
+        "coordinate": "x",
+        "region": {"x": [-2.0, 2.0]},
+        "time": None,
+        "recordings": ["r01", "r02"],
+        "sentence": "In the equation of v, along x from -2 to 2, in every recording.",
+    },
+    "recalibration": {"k": {"before": 1.0, "after": 1.1, "standard_error": 0.02}},
+    "fit": {
+        "metric": "normalised rms, held-out recordings",
+        "before": None,
+        "recalibrated": 0.3,
+        "augmented": 0.05,
+        "noise_floor": 0.05,
+    },
+    "excluded": {},
+    "remarks": ["A <b>reservation</b>."],
+}
+
+
+@pytest.fixture
+def models(write) -> tuple[Dynamics, Dynamics]:
+    before = write(CARD.format(further="", terms=""), "before.yaml")
+    after = write(
+        CARD.format(further="  c_1: {value: 0.25, unit: 1/(mm**2*s**2)}", terms=" - c_1*x**3"), "after.yaml"
+    )
+    return load_system(before), load_system(after)
+
+
+def candidates() -> pd.DataFrame:
+    return pd.DataFrame(
+        {
+            "mechanism": ["cubic stiffness", "quintic stiffness", "dry friction"],
+            "label": ["cubic stiffness in v", "quintic stiffness in v", "dry friction in $v$"],
+            "shapes": ["", "", ""],
+            "gain": [300.0, 296.0, 2.0],
+            "stage": ["found", "same", "further"],
+        }
+    )
+
+
+def findings(models, **changes) -> Findings:
+    verdict = VERDICT | changes.pop("verdict", {})
+    return Findings(
+        verdict=verdict,
+        before=models[0],
+        after=models[1],
+        dictionary=dictionary_of(without=(), further=(), file=""),
+        candidates=candidates(),
+        figures=dict.fromkeys(CAPTIONS, b"<svg/>"),
+        **changes,
+    )
+
+
+class Collector(HTMLParser):
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.images: list[str] = []
+
+    def handle_starttag(self, tag, attrs):
+        if tag == "img":
+            self.images.append(dict(attrs)["src"])
+        if tag not in ("meta", "img"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def page_of(models, **changes) -> str:
+    return mismatch_page(findings(models, **changes), title="A spring", commands=["make it"])
+
+
+def test_page_says_what_where_how_sure_and_what_else(models):
+    page = page_of(models)
+    for part in (
+        "missing physics",
+        "lacks cubic stiffness",
+        "c_1 = (0.250 ± 0.010) 1/(mm**2*s**2)",
+        "Duffing",
+        "cannot tell cubic stiffness from quintic stiffness",
+        "ran away",
+        "r01, r02",
+        "make it",
+    ):
+        assert part in page
+    assert "<b>reservation</b>" not in page
+    assert page.count("<math") == 3  # the term, and both equations
+
+
+def test_page_is_self_contained_and_well_formed(models):
+    page = page_of(models)
+    parser = Collector()
+    parser.feed(page)
+    assert not parser.open
+    assert parser.images and all(source.startswith("data:image/svg+xml") for source in parser.images)
+    assert not re.search(r"(src|href)=\"https?:", page)
+    assert "<script" not in page
+
+
+@pytest.mark.parametrize("verdict", ["no mismatch", "parameter shift"])
+def test_page_without_a_mechanism_tells_what_is_excluded(models, verdict):
+    excluded = {"dry friction in v": {"upper_bound_95": 0.5, "unit": "mm/s**2", "parameter": "c_1"}}
+    page = page_of(
+        models, verdict={"verdict": verdict, "mechanisms": [], "location": None, "excluded": excluded}
+    )
+    assert "at most (95 %)" in page
+    assert "none is named" in page
+
+
+def test_page_of_an_unexplained_mismatch_describes_it(models):
+    description = {
+        "share_described": 0.7,
+        "by": VERDICT["mechanisms"],
+        "p_residuals_random": 1e-9,
+        "random_forces_admitted": True,
+    }
+    page = page_of(models, verdict={"verdict": "unexplained", "mechanisms": [], "description": description})
+    assert "a share of 0.700" in page
+    assert "1.000 × 10⁻⁹" in page.replace("\u00a0", " ")
+
+
+def test_formula_that_cannot_be_read_is_shown_as_text(models):
+    odd = VERDICT["mechanisms"][0] | {"terms": {"v": "mystery(x) <"}}
+    assert "mystery(x) &lt;" in page_of(models, verdict={"mechanisms": [odd]})
+
+
+def held_out() -> pd.DataFrame:
+    t = np.linspace(0, 5, 40)
+    runaway = np.where(t < 2, np.sin(t), np.nan)
+    return pd.DataFrame(
+        {
+            "recording": "r01", "t": t, "output": "x", "measured": np.sin(t), "before": runaway,
+            "recalibrated": np.sin(t) * 1e9, "augmented": np.sin(t) + 0.01, "scored": t > 1,
+        }
+    )  # fmt: skip
+
+
+def curves() -> pd.DataFrame:
+    at = np.linspace(-2, 2, 9)
+    parts = [
+        pd.DataFrame(
+            {
+                "stage": stage, "equation": equation, "coordinate": coordinate, "across": across, "at": at,
+                "missing": at**3, "standard_error": 0.1, "gain": gain,
+            }
+        )
+        for stage in ("before", "after")
+        for equation, coordinate, across, gain in (
+            ("v", "x", False, 100.0), ("v", "t", False, 200.0), ("x, v", "amplitude", True, 5.0),
+        )
+    ]  # fmt: skip
+    return pd.concat(parts, ignore_index=True)
+
+
+def test_held_out_figure_keeps_a_runaway_out_of_its_limits():
+    figure = plot_held_out(held_out(), units={"x": "mm"}, time_unit="s")
+    left, right = figure.axes
+    assert left.get_ylabel() == "$x$ (mm)" and left.get_xlabel() == "$t$ (s)"
+    assert max(np.abs(left.get_ylim())) < 5 and max(np.abs(right.get_ylim())) < 10
+
+
+def test_curve_of_the_named_mechanism_comes_first():
+    figure = plot_curves(curves(), named=("v", "x"), units={"x": "mm", "v": "mm/s"}, time_unit="s")
+    labels = [axes.get_xlabel() for axes in figure.axes]
+    assert labels == ["$x$ (mm)", "$t$ (s)", "amplitude (mm)"]
+    assert figure.axes[0].get_ylabel() == "missing in $v'$ (mm/s/s)"
+
+
+def test_map_has_a_panel_for_each_of_two_equations():
+    points = np.random.default_rng(0).normal(size=(500, 2))
+    missing = {"x": 0.1 * points[:, 0], "v": points[:, 0] ** 3, "w": np.full(500, np.nan)}
+    figure = plot_missing(points, missing, names=("x", "v"), units={"v": "mm/s"}, time_unit="s")
+    bars = [axes.get_ylabel() for axes in figure.axes if "missing" in axes.get_ylabel()]
+    assert bars == ["missing in $v'$ (mm/s/s)", "missing in $x'$ (1/s)"]
+
+
+def test_candidates_are_told_apart_by_what_they_are():
+    figure = plot_candidates(candidates())
+    colours = {patch.get_facecolor() for patch in figure.axes[0].patches}
+    assert len(colours) == 3
+
+
+@pytest.mark.parametrize(
+    "figure",
+    [
+        lambda: plot_held_out(held_out().assign(scored=False)),
+        lambda: plot_curves(pd.DataFrame()),
+        lambda: plot_missing(np.zeros((3, 2)), {"x": np.zeros(3)}, names=("x", "v")),
+        lambda: plot_candidates(pd.DataFrame()),
+        lambda: plot_escapes(pd.DataFrame()),
+    ],
+)
+def test_figures_without_data_say_so(figure):
+    (axes,) = figure().axes
+    assert axes.texts
+
+
+def test_a_simulation_that_cannot_be_fitted_has_a_page(models):
+    said = findings(models, verdict=statement_of_failure("the simulation runs away").as_data())
+    page = mismatch_page(replace(said, candidates=candidates()[:0]), title="t", commands=())
+    assert "no fit of it has a result" in page and "The simulation runs away." in page
+
+
+def test_what_could_not_be_judged_is_on_the_page(models):
+    further = {"not_fitted": [{"mechanism": "m", "label": "drag in v", "reason": "it overflows"}]}
+    page = mismatch_page(findings(models, verdict=further), title="t", commands=())
+    assert "Drag in v could not be judged: it overflows." in page
+
+
+def two_wells(write, tilt: float) -> Dynamics:
+    text = f"""\
+name: wells
+states: {{x: {{domain: [-2, 2]}}, y: {{domain: [-2, 2]}}}}
+parameters: {{a: {{value: {tilt}}}}}
+equations: {{x: x - x**3 + a, y: -y}}
+"""
+    return load_system(write(text, f"wells{tilt}.yaml"))
+
+
+def test_a_force_tilts_the_wells_of_a_gradient_system(write):
+    states = np.random.default_rng(0).uniform(-1.6, 1.6, size=(1500, 2))
+    models = {"recalibrated": two_wells(write, 0.0), "augmented": two_wells(write, 0.1)}
+    assert obstacle(list(models.values())) == ""
+    found = compare_landscapes(models, states)
+    ways = found.wells[found.wells["kind"] == "way out"].set_index(["simulation", "item"])["barrier"]
+    x = np.sort(np.roots([-1, 0, 1, 0.1]).real)
+    energy = x**4 / 4 - x**2 / 2 - 0.1 * x
+    left, right = (2 * (energy[1] - energy[end]) for end in (0, 2))
+    assert ways["recalibrated"].to_numpy() == pytest.approx([0.5, 0.5], rel=0.01)
+    assert sorted(ways["augmented"]) == pytest.approx(sorted([left, right]), rel=0.01)
+    assert set(found.escape["simulation"]) == {"recalibrated", "augmented"}
+
+
+def test_identified_field_is_the_model_at_its_values(models):
+    x = np.random.default_rng(1).normal(size=(20, 2))
+    expected = np.stack([x[:, 1], -x[:, 0] - 0.5 * x[:, 1] - 0.25 * x[:, 0] ** 3], axis=1)
+    assert identified(models[1]).dynamics.drift(x) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("change", "part"),
+    [
+        ({"equations": "sign"}, "not smooth"),
+        ({"equations": "t"}, "change with time"),
+    ],
+)
+def test_systems_without_a_landscape_are_told(models, change, part):
+    v = sympy.Symbol("v", real=True)
+    formula = sympy.sign(v) if change["equations"] == "sign" else sympy.Symbol("t", real=True) * v
+    rough = replace(models[0], equations=(v, formula))
+    assert part in obstacle([models[0], rough])
+
+
+@pytest.mark.parametrize(("noise", "part"), [([1.0, 1.0], "acts on x"), ([0.0, 1.0], "does not reach every")])
+def test_noise_without_a_landscape_is_told(models, noise, part):
+    assert part in obstacle([each.with_diffusion(Diffusion(np.diag(noise))) for each in models])

@@ -1,0 +1,156 @@
+"""All steps of a run in memory, on systems whose answer is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from known_settings import PAPER
+from known_systems import as_system, double_well, potential_gradient, potential_values
+
+from siq.data.recordings import Recordings
+from siq.dynamics.simulation import SimulationOptions
+from siq.errors import NumericalFailure
+from siq.networks.options import CheckOptions
+from siq.potential.symbolic import exact_decomposition
+from siq.steps import draw, identify, score, train
+from siq.steps.outcomes import Method, Outcome, Status, Step
+from siq.steps.pipeline import Analysis, PipelineSettings, analyse
+from siq.steps.settings import Sampling, StateSpace
+from siq.steps.trained import TrainedRun, not_trained
+from siq.study.tables import COLUMNS
+
+KNOWN = double_well(2)
+SYSTEM = as_system(KNOWN)
+SIMULATION = SimulationOptions(trajectories=60, pairs=20, pair_step=0.01, interval=0.05)
+SETTINGS = PipelineSettings(
+    seed=3,
+    space=StateSpace(diffusion=KNOWN.diffusion.tolist()),
+    sampling=Sampling(pair_step=0.01),
+)
+BRIEF = replace(
+    PAPER,
+    widths=(6,),
+    steps=20,
+    batch_size=32,
+    matching="symmetric",
+    thinning_distance=0.3,
+    precision="float32",
+)
+
+
+def drawn(*, number: int = 0) -> draw.Drawn:
+    settings = draw.DrawSettings(3, StateSpace(), SETTINGS.sampling, SIMULATION)
+    return draw.run(settings, SYSTEM, number=number)
+
+
+@pytest.fixture(scope="module")
+def recordings() -> Recordings:
+    found = drawn().recordings
+    assert found is not None
+    return found
+
+
+@pytest.fixture(scope="module")
+def analysis(recordings: Recordings) -> Analysis:
+    return analyse(recordings, SETTINGS)
+
+
+def test_every_step_that_was_asked_for_has_an_outcome(analysis: Analysis) -> None:
+    said = {one.step: one.status for one in analysis.outcomes}
+    assert said == {
+        Step.IDENTIFY: Status.OK, Step.TRAIN: Status.SKIPPED, Step.REFINE: said[Step.REFINE],
+        Step.LANDSCAPE: Status.OK,
+    }  # fmt: skip
+    assert said[Step.REFINE] in (Status.OK, Status.WARNING) and analysis.regressed is None
+
+
+def test_v_and_its_barriers_are_right(analysis: Analysis) -> None:
+    refined = analysis.refined.formulas[Method.REFINED]
+    assert refined.potential is not None
+    x = np.random.default_rng(0).uniform(-1, 1, size=(50, 2))
+    ours = refined.evaluate_gradient(np.ascontiguousarray(x.T)).T
+    assert np.abs(ours - potential_gradient(KNOWN, x)).max() < 1e-5
+    assert analysis.landscape is not None and analysis.landscape.landscape is not None
+    found = analysis.landscape.landscape
+    for way in found.transitions:
+        saddle, bottom = way.saddle.position, found.attractors[way.start].position
+        top, low = potential_values(KNOWN, np.stack([saddle, bottom]))
+        assert way.barrier == pytest.approx(2 * (top - low), rel=1e-4)
+
+
+def test_the_same_seed_gives_the_same_and_another_run_another_answer(recordings: Recordings) -> None:
+    settings = replace(SETTINGS, landscape=None)
+    one, same = analyse(recordings, settings), analyse(recordings, settings)
+    assert one.landscape is None
+    assert one.refined.certificates == same.refined.certificates
+    first, second = drawn(number=0).recordings, drawn(number=1).recordings
+    assert first is not None and second is not None and not np.array_equal(first.values, second.values)
+
+
+def test_networks_take_part_where_settings_ask_for_them(recordings: Recordings) -> None:
+    settings = replace(SETTINGS, training=BRIEF, published_method=False, landscape=None)
+    found = analyse(recordings, settings, device="cpu")
+    assert found.trained.networks is not None and found.trained.outcome.status == Status.OK
+    # The control is certified by nobody, and the report counts that.
+    assert found.refined.certificates[Method.CONTROL]["certified"] is False
+
+
+def test_a_run_without_trajectories_is_skipped_by_every_step_after() -> None:
+    settings = SETTINGS.of(identify.IdentifySettings)
+    nothing = identify.run(settings, None, number=5)
+    assert (nothing.outcome.run, nothing.outcome.status) == (5, Status.SKIPPED)
+    told = replace(SETTINGS, training=BRIEF).of(train.TrainSettings)
+    trained = train.run(told, {5: train.RunToTrain(None, None)})
+    assert not trained.networks and trained.of(5).networks is None
+    assert trained.outcomes[0].reason == "the run has no trajectories"
+
+
+def test_a_simulation_that_runs_to_infinity_fails_and_says_so() -> None:
+    away = replace(SYSTEM, equations=tuple(symbol**3 for symbol in SYSTEM.symbols))
+    settings = draw.DrawSettings(0, StateSpace(), Sampling(), replace(SIMULATION, interval=2.0))
+    found = draw.run(settings, away, number=2)
+    assert found.recordings is None
+    assert (found.outcome.step, found.outcome.status) == (Step.SIMULATE, Status.FAILED)
+
+
+def test_recordings_are_taken_whole_by_the_first_run_and_resampled_by_others(
+    recordings: Recordings,
+) -> None:
+    settings = draw.DrawSettings(0, StateSpace(), Sampling(), None)
+    first, second = (draw.run(settings, recordings, number=number) for number in (0, 1))
+    assert first.recordings is recordings and second.recordings is not recordings
+    assert first.outcome.step == second.outcome.step == Step.RESAMPLE
+
+
+def test_why_a_check_could_not_be_prepared_is_the_reason(
+    recordings: Recordings, analysis: Analysis, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*arguments: object, **named: object) -> None:
+        raise NumericalFailure("the attractors cannot be told apart")
+
+    monkeypatch.setattr("siq.potential.training_check.training_check", refuse)
+    options = replace(BRIEF, check=CheckOptions(first=10, every=10, attempts=2))
+    settings = replace(SETTINGS, training=options).of(train.TrainSettings)
+    runs = {0: train.RunToTrain(recordings, analysis.identified.record)}
+    said = train.run(settings, runs, device="cpu").outcomes[0]
+    assert said.status == Status.WARNING
+    assert said.reason.endswith("could not be prepared: the attractors cannot be told apart")
+
+
+def test_scores_are_in_the_columns_of_the_contract(analysis: Analysis) -> None:
+    settings = score.ScoreSettings(3, SETTINGS.regression, None)
+    certificates = {str(name): one for name, one in analysis.refined.certificates.items()}
+    formulas = {str(name): one for name, one in analysis.refined.formulas.items()}
+    assert KNOWN.potential is not None
+    exact = exact_decomposition(SYSTEM, 2 * KNOWN.potential)
+    given = score.RunToScore(formulas, certificates, not_trained(0), SYSTEM, exact)
+    found = score.run(settings, given)
+    assert found.outcome == Outcome(0, Step.SCORE)
+    for name in ("coefficients", "rrmse", "prediction", "certificates"):
+        assert list(getattr(found, name).columns) == list(COLUMNS[name])
+    errors = found.rrmse.set_index("method")["rrmse"]
+    assert errors["refined"] < 1e-5 and np.isnan(errors["regression"])
+    skipped = score.run(settings, score.RunToScore({}, {}, TrainedRun(None, Outcome(0, Step.TRAIN))))
+    assert skipped.outcome.reason == "there is no formula to score"

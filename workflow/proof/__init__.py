@@ -1,0 +1,15 @@
+"""Does the diagnosis say rightly what a simulation lacks? Cases that conceal something, and their scores.
+
+Nothing here imports what it tests, the search and the verdict of `siq.mismatch`; and what makes the cases,
+`concealment`, imports nothing of `siq` at all.
+
+=================  ===========================================================
+`sets`             which sets of cases are there, from which seeds?
+`concealment`      what does each case conceal, and what was recorded of it?
+`batches`          which cases and keys does one job make?
+`keys`             what does a key say?
+`oracle`           how well could a diagnosis do?
+`scoring`          what did a diagnosis say rightly of one case?
+`targets`          and of all of them: which targets are met?
+=================  ===========================================================
+"""

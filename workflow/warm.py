@@ -1,0 +1,198 @@
+"""A warm interpreter: every job of a workflow starts where its imports are done already.
+
+A step of a run takes seconds, and the imports of numpy, sympy, torch and pysindy as long again. So one
+process imports them, once for each script that asks; every job is a fork of it. `serve` is that process,
+which the Snakefile starts; `run_warm` is what a script calls first. Files, rules and jobs stay one a run.
+Where there is no such process, as on systems that cannot fork, a script runs as it would by itself.
+"""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import importlib
+import json
+import os
+import runpy
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import traceback
+from pathlib import Path
+from typing import TypedDict
+
+ADDRESS = "SIQ_WARM_INTERPRETER"
+"""Environment variable with the path of the socket; absent where there is no warm interpreter."""
+
+STREAMS = 3  # standard input, output and error of the job
+LONGEST_REQUEST = 1 << 20
+
+
+class Request(TypedDict):
+    """What a job asks for."""
+
+    script: str
+    folder: str
+    path: list[str]
+    environment: dict[str, str]
+
+
+def start() -> subprocess.Popen[bytes] | None:
+    """Start the warm interpreter of this workflow and tell every job where it is.
+
+    It ends with the process that calls this, however that ends: its standard input is a pipe that only this
+    process holds open.
+
+    Returns
+    -------
+    subprocess.Popen or None
+        To be kept for as long as jobs run. None on a system that cannot fork.
+    """
+    if not hasattr(os, "fork"):
+        return None
+    folder = tempfile.mkdtemp(prefix="siq-")
+    address = str(Path(folder) / "warm")
+    server = socket.socket(socket.AF_UNIX)
+    server.bind(address)
+    server.listen(64)  # jobs that ask before its first imports are done wait here
+    process = subprocess.Popen(
+        [sys.executable, "-m", "workflow.warm", str(server.fileno()), folder],
+        stdin=subprocess.PIPE,
+        pass_fds=[server.fileno()],
+        cwd=Path(__file__).resolve().parents[1],
+    )
+    server.close()
+    os.environ[ADDRESS] = address
+    return process
+
+
+def run_warm() -> None:
+    """Run the script that calls this in a fork of the warm interpreter, and end with its exit code.
+
+    Returns at once where there is none, or where this is that fork. To be called before the imports that take
+    their time.
+    """
+    address = os.environ.pop(ADDRESS, None)
+    if address is None:
+        return
+    connection = socket.socket(socket.AF_UNIX)
+    try:
+        connection.connect(address)
+    except OSError:
+        return
+    request: Request = {
+        "script": str(Path(sys.argv[0]).resolve()),  # Snakemake runs a copy, which says what the job is
+        "folder": str(Path.cwd()),
+        "path": sys.path,
+        "environment": dict(os.environ),
+    }
+    payload = json.dumps(request).encode()
+    socket.send_fds(connection, [len(payload).to_bytes(8, "big")], [0, 1, 2])
+    connection.sendall(payload)
+    signal.signal(signal.SIGTERM, lambda *_: os._exit(128 + signal.SIGTERM))  # the fork sees us gone
+    code = connection.recv(1)
+    os._exit(code[0] if code else 1)
+
+
+def serve(listening: socket.socket, folder: Path) -> None:
+    """Fork a job for every script that connects, until standard input ends; then remove the folder."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is for the workflow, which then ends
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # finished jobs are reaped by the system
+    threading.Thread(target=_end_with_workflow, args=(folder,), daemon=True).start()
+    while True:
+        connection, _ = listening.accept()
+        try:
+            header, descriptors, _, _ = socket.recv_fds(connection, 8, STREAMS)
+            request: Request = json.loads(_received(connection, int.from_bytes(header, "big")))
+        except (OSError, ValueError):  # a job that was killed while it asked
+            connection.close()
+            continue
+        sys.path[:] = request["path"]
+        for module in _imported(Path(request["script"])):
+            with contextlib.suppress(Exception):  # the script says itself what is wrong with it
+                importlib.import_module(module)
+        if os.fork() == 0:
+            listening.close()
+            _become(request, descriptors, connection)
+        for descriptor in descriptors:
+            os.close(descriptor)
+        connection.close()
+
+
+def _imported(script: Path) -> list[str]:
+    """The modules that a script imports from this library or from others, found from its text."""
+    try:
+        statements = ast.parse(script.read_text(encoding="utf-8")).body
+    except (OSError, SyntaxError):
+        return []
+    modules = []
+    for statement in statements:
+        if isinstance(statement, ast.Import):
+            modules += [alias.name for alias in statement.names]
+        elif isinstance(statement, ast.ImportFrom) and statement.module:
+            modules += [statement.module, *(f"{statement.module}.{alias.name}" for alias in statement.names)]
+    # What stands beside the script, such as its own helpers, is the job's.
+    return [module for module in modules if module.partition(".")[0] not in {script.stem, "step"}]
+
+
+def _end_with_workflow(folder: Path) -> None:
+    while os.read(0, 1):
+        pass
+    shutil.rmtree(folder, ignore_errors=True)
+    os._exit(0)
+
+
+def _received(connection: socket.socket, size: int) -> bytes:
+    if size > LONGEST_REQUEST:
+        raise ValueError("the request is too long")
+    payload = b""
+    while len(payload) < size:
+        part = connection.recv(size - len(payload))
+        if not part:
+            raise OSError("the job is gone")
+        payload += part
+    return payload
+
+
+def _become(request: Request, streams: list[int], connection: socket.socket) -> None:
+    """Be the job: its folder, environment and streams, its script, its exit code."""
+    code = 1
+    try:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+        for place, descriptor in enumerate(streams):
+            os.dup2(descriptor, place)
+            os.close(descriptor)
+        os.chdir(request["folder"])
+        os.environ.clear()
+        os.environ.update(request["environment"])
+        sys.argv = [request["script"]]
+        threading.Thread(target=_end_with_job, args=(connection,), daemon=True).start()
+        runpy.run_path(request["script"], run_name="__main__")
+        code = 0
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else int(end.code is not None)
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        with contextlib.suppress(Exception):
+            sys.stdout.flush()
+            sys.stderr.flush()
+        with contextlib.suppress(OSError):
+            connection.sendall(bytes([code % 256]))
+        os._exit(code % 256)
+
+
+def _end_with_job(connection: socket.socket) -> None:
+    """A job that is killed takes its fork along."""
+    with contextlib.suppress(OSError):
+        connection.recv(1)
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    serve(socket.socket(fileno=int(sys.argv[1])), Path(sys.argv[2]))
