@@ -23,7 +23,7 @@ from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.formulas import compile_formulas
 from siq.dynamics.phase_portrait import PhasePortrait, phase_portrait
 from siq.identify.flow import FlowMap
-from siq.identify.identification import IdentifiedField
+from siq.identify.identified_field import IdentifiedField
 from siq.identify.library import candidate_library, monomial_exponents
 from siq.potential.symbolic import SymbolicDecomposition
 from siq.study.scoring import exact_answer

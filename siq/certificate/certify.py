@@ -25,7 +25,7 @@ from siq.certificate.tests import (
 )
 from siq.dynamics.formulas import compile_formulas
 from siq.dynamics.phase_portrait import PhasePortrait
-from siq.identify.identification import IdentifiedField
+from siq.identify.identified_field import IdentifiedField
 from siq.identify.library import CandidateLibrary
 from siq.potential.bases import LibraryBasis
 from siq.potential.refinement import Refined

@@ -26,7 +26,7 @@ from pydantic.dataclasses import dataclass
 
 from siq.certificate.error_bound import SAFETY, residual_integral
 from siq.dynamics.equilibria import Equilibrium, hessian_at
-from siq.identify.identification import IdentifiedField
+from siq.identify.identified_field import IdentifiedField
 from siq.potential.well import Well
 
 Function = Callable[[np.ndarray], np.ndarray]

@@ -1,13 +1,15 @@
 """Which drift and which noise do recordings show?
 
-================  =============================================================================
-`identification`  which terms has f, with which errors?
-`library`         which candidate functions are there, with which derivatives and constraints?
-`flow`            where does f lead within the step of a pair?
-`residuals`       what do its residuals say: no noise, process noise, noise of the measurement?
-`prediction`      where does f lead in the long run?
+==================  ===========================================================================
+`identification`    which terms has f?
+`flow_regression`   which coefficients of given terms make f lead from X0 to Xh?
+`identified_field`  what is known of the f that was found, errors included?
+`library`           which candidate functions are there, with which derivatives and constraints?
+`flow`              where does f lead within the step of a pair?
+`residuals`         what do its residuals say: no noise, process noise, noise of the measurement?
+`prediction`        where does f lead in the long run?
 `storage`         how is it kept in a file?
-================  =============================================================================
+==================  ===========================================================================
 
 Imports `siq.dynamics` and what it may import.
 """

@@ -14,7 +14,8 @@ import numpy as np
 import scipy.special
 
 from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
-from siq.identify.identification import IdentifiedField, refit, residuals
+from siq.identify.flow_regression import refit, residuals
+from siq.identify.identified_field import IdentifiedField
 
 NoiseKind = Literal["none", "process", "measurement", "coloured"]
 

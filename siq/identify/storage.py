@@ -14,7 +14,8 @@ from siq.dynamics.diffusion import Diffusion
 from siq.errors import InputError
 from siq.files.whole import whole_file
 from siq.identify.flow import FlowMap
-from siq.identify.identification import IdentificationOptions, IdentifiedField
+from siq.identify.identification import IdentificationOptions
+from siq.identify.identified_field import IdentifiedField
 from siq.identify.library import CandidateLibrary, candidate_library
 
 

@@ -16,7 +16,7 @@ from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.equilibria import Equilibrium
 from siq.dynamics.phase_portrait import PhasePortrait
 from siq.errors import NumericalFailure
-from siq.identify.identification import IdentifiedField
+from siq.identify.identified_field import IdentifiedField
 from siq.landscape.global_quasipotential import GlobalQuasipotential, heights_of_attractors, matched
 from siq.landscape.transitions import Transition, transitions, ways_out
 from siq.potential.local_wells import WellOptions, local_well, surveyed

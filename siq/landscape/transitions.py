@@ -17,7 +17,7 @@ from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.equilibria import Equilibrium, neighbours
 from siq.dynamics.phase_portrait import PhasePortrait
 from siq.errors import NumericalFailure
-from siq.identify.identification import IdentifiedField
+from siq.identify.identified_field import IdentifiedField
 from siq.landscape.paths import TransitionPath, transition_path
 from siq.landscape.rates import EscapeRate, escape_rate
 from siq.potential.well import Well

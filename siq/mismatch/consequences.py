@@ -15,7 +15,7 @@ from siq.dynamics.parametric import TIME, symbol
 from siq.dynamics.phase_portrait import evenly_spread, phase_portrait
 from siq.errors import NumericalFailure
 from siq.identify.flow import FlowMap
-from siq.identify.identification import IdentifiedField
+from siq.identify.identified_field import IdentifiedField
 from siq.identify.library import CandidateLibrary
 from siq.landscape.landscape import Landscape, find_landscape
 from siq.potential.local_wells import WellOptions

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.linalg
 import scipy.special
 
-from siq.identify.identification import IdentifiedField
+from siq.identify.identified_field import IdentifiedField
 from siq.identify.library import CandidateLibrary
 
 STEPS = 50

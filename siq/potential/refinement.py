@@ -21,7 +21,7 @@ from pydantic.dataclasses import dataclass
 
 from siq.dynamics.phase_portrait import PhasePortrait
 from siq.errors import NumericalFailure
-from siq.identify.identification import IdentifiedField
+from siq.identify.identified_field import IdentifiedField
 from siq.identify.library import CandidateLibrary, joint_library, total_degree
 from siq.potential.bases import affordable_degree
 from siq.potential.global_route import GlobalPotential, fit_values, network_starts, refine_globally

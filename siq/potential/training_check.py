@@ -14,7 +14,7 @@ import numpy as np
 
 from siq.dynamics.phase_portrait import PhasePortrait, evenly_spread, phase_portrait
 from siq.errors import NumericalFailure
-from siq.identify.identification import IdentifiedField
+from siq.identify.identified_field import IdentifiedField
 from siq.identify.library import CandidateLibrary, joint_library
 from siq.networks.options import CheckOptions
 from siq.networks.trained import TrainedNetworks

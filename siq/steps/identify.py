@@ -13,14 +13,13 @@ from siq.certificate.tests import Verdict, check_prediction
 from siq.data.held_out import held_out_recordings
 from siq.data.recordings import Recordings, SnapshotPairs, select_recordings, snapshot_pairs
 from siq.errors import NumericalFailure
+from siq.identify.flow_regression import refit, residuals
 from siq.identify.identification import (
     IdentificationOptions,
-    IdentifiedField,
     carries_noise,
     identify_vector_field,
-    refit,
-    residuals,
 )
+from siq.identify.identified_field import IdentifiedField
 from siq.identify.prediction import prediction_errors
 from siq.identify.residuals import mean_residual_probability, residual_noise
 from siq.identify.storage import FieldRecord, field_library, read_field, write_field

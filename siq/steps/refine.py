@@ -27,7 +27,7 @@ from siq.data.held_out import held_out_recordings
 from siq.data.recordings import Recordings, snapshot_pairs
 from siq.dynamics.phase_portrait import PhasePortrait, evenly_spread, phase_portrait
 from siq.errors import NumericalFailure
-from siq.identify.identification import IdentifiedField
+from siq.identify.identified_field import IdentifiedField
 from siq.identify.storage import FieldRecord
 from siq.networks.trained import TrainedNetworks, shuffled
 from siq.numerics.randomness import Purpose, generator

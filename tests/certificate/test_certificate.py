@@ -45,7 +45,7 @@ from siq.data.recordings import Recordings
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.phase_portrait import PhasePortrait
 from siq.dynamics.simulation import SimulationOptions, simulate_snapshots
-from siq.identify.identification import IdentifiedField
+from siq.identify.identified_field import IdentifiedField
 from siq.identify.library import candidate_library, monomial_exponents
 from siq.identify.prediction import prediction_errors
 from siq.networks.networks import Networks, at_rest, initial_layers

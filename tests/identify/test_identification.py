@@ -21,15 +21,13 @@ from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.simulation import SimulationOptions, simulate_snapshots
 from siq.errors import NumericalFailure
 from siq.identify.flow import FlowMap
+from siq.identify.flow_regression import copies, refit, residuals
 from siq.identify.identification import (
     IdentificationOptions,
-    IdentifiedField,
-    copies,
     evenly,
     identify_vector_field,
-    refit,
-    residuals,
 )
+from siq.identify.identified_field import IdentifiedField
 from siq.identify.library import candidate_library
 from siq.identify.storage import field_library
 from siq.numerics.integration import dormand_prince_step

@@ -12,7 +12,8 @@ from siq.data.recordings import Recordings, select_recordings, snapshot_pairs
 from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.simulation import SimulationOptions, simulate_snapshots
-from siq.identify.identification import IdentificationOptions, IdentifiedField, identify_vector_field
+from siq.identify.identification import IdentificationOptions, identify_vector_field
+from siq.identify.identified_field import IdentifiedField
 from siq.identify.residuals import NoiseDiagnosis, mean_residual_probability, residual_noise
 from siq.identify.storage import field_library
 

@@ -20,7 +20,7 @@ from known_systems import (
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.phase_portrait import PhasePortrait, phase_portrait
 from siq.errors import NumericalFailure
-from siq.identify.identification import IdentifiedField
+from siq.identify.identified_field import IdentifiedField
 from siq.landscape.paths import TransitionPath, minimum_action_path
 from siq.landscape.transitions import (
     Transition,

@@ -18,7 +18,7 @@ from known_systems import (
 )
 
 from siq.dynamics.dynamics import Dynamics
-from siq.identify.identification import IdentifiedField
+from siq.identify.identified_field import IdentifiedField
 from siq.identify.library import CandidateLibrary
 from siq.potential.global_route import GlobalPotential, fit_values, refine_globally
 

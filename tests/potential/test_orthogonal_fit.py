@@ -17,7 +17,7 @@ from known_systems import (
 )
 
 from siq.dynamics.diffusion import Diffusion
-from siq.identify.identification import IdentifiedField
+from siq.identify.identified_field import IdentifiedField
 from siq.potential.global_route import refine_globally
 from siq.potential.orthogonal_fit import OrthogonalFit, fit_orthogonal
 

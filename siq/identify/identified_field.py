@@ -1,0 +1,88 @@
+"""The identified f: coefficients over a library, with their covariance, and what the residuals leave."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import sympy
+
+from siq.dynamics.diffusion import Diffusion
+from siq.dynamics.dynamics import Dynamics, Parameter
+from siq.dynamics.parametric import symbol
+from siq.identify.flow import FlowMap
+from siq.identify.library import CandidateLibrary
+
+NOISE_FREE = 1e-6  # residuals below this share of the increments are the integrator's and the rounding's
+
+
+@dataclass(frozen=True)
+class IdentifiedField:
+    """A vector field ``f = Θ Ξ`` with its uncertainty.
+
+    Attributes
+    ----------
+    library
+        The q functions.
+    coefficients
+        Ξ, shape ``(q, d)``: column i holds the coefficients of f_i.
+    support
+        Shape ``(p, 2)``: the pair (component i, term k) of each of the p coefficients that are not zero.
+    covariance
+        Shape ``(p, p)``: their covariance.
+    noise_rate
+        Shape ``(d, d)``: covariance of the residual per unit of time. For process noise it is ε D.
+    residual_ratio
+        Rms of the residuals over rms of the increments.
+    flow
+        The map over a pair's step that was fitted.
+    diffusion
+        D, which recordings do not tell apart from ε: of these only the product, `noise_rate`, is identified.
+    """
+
+    library: CandidateLibrary
+    coefficients: np.ndarray
+    support: np.ndarray
+    covariance: np.ndarray
+    noise_rate: np.ndarray
+    residual_ratio: float
+    flow: FlowMap
+    diffusion: Diffusion
+
+    @property
+    def noise_free(self) -> bool:
+        """Whether the residuals are those of the integrator and of rounding."""
+        return self.residual_ratio < NOISE_FREE
+
+    @cached_property
+    def dynamics(self) -> Dynamics:
+        """F and D, with the p coefficients that are not zero as parameters, and their covariance."""
+        prefix = "c"
+        while any(f"{prefix}{place}" in self.library.states for place in range(len(self.support))):
+            prefix += "_"
+        names = [f"{prefix}{place}" for place in range(len(self.support))]
+        equations = [sympy.S.Zero] * self.library.dimension
+        for (component, term), name in zip(self.support, names, strict=True):
+            equations[component] += symbol(name) * self.library.terms[term]
+        return Dynamics(
+            states=self.library.states,
+            equations=tuple(equations),
+            diffusion=self.diffusion,
+            parameters=tuple(
+                Parameter(name, float(value)) for name, value in zip(names, self.values, strict=True)
+            ),
+            covariance=self.covariance,
+        )
+
+    @property
+    def values(self) -> np.ndarray:
+        """The p coefficients that are not zero."""
+        return self.coefficients[self.support[:, 1], self.support[:, 0]]
+
+    @property
+    def standard_errors(self) -> np.ndarray:
+        """Shape ``(q, d)``: standard error of each coefficient, zero where there is no term."""
+        errors = np.zeros_like(self.coefficients)
+        errors[self.support[:, 1], self.support[:, 0]] = np.sqrt(np.diag(self.covariance))
+        return errors
