@@ -7,6 +7,7 @@ run_warm()
 from pathlib import Path
 
 import torch
+import torch._dynamo  # the first optimiser loads it: once for all runs
 
 from siq.steps import train
 from step import job
