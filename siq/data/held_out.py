@@ -8,7 +8,7 @@ from siq.data.labels import sources
 from siq.data.recordings import Recordings
 from siq.errors import NumericalFailure
 
-SHARE = 0.2
+SHARE = 0.2  # a convention: the usual fifth
 
 
 def held_out_recordings(

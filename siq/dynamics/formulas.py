@@ -46,11 +46,11 @@ class delay(sympy.Function):  # noqa: N801 (the name that formulas use)
 
 CONSTANTS: Mapping[str, sympy.Expr] = {"pi": sympy.pi}
 
-LARGEST_EXPONENT = 32
-LARGEST_BASE = 1e9
-LARGEST_VALUE = 1e300
+LARGEST_EXPONENT = 32  # numerical: several such powers of states of the order of 10 stay doubles
+LARGEST_BASE = 1e9  # numerical: the same for numbers in formulas; (1e9)^32 = 1e288 is still a double
+LARGEST_VALUE = 1e300  # numerical: below the largest double, 1.8e308
 DIGITS = 17  # of decimal digits, that a double is read back exactly
-LONGEST_FORMULA = 20_000
+LONGEST_FORMULA = 20_000  # characters, a guard against files that are no formulas
 
 _OPERATORS: Mapping[type[ast.operator], Callable[[sympy.Expr, sympy.Expr], sympy.Expr]] = {
     ast.Add: lambda left, right: left + right,

@@ -49,11 +49,11 @@ NEAR_ATTRACTOR = 0.01  # of the distance from A to S, in the metric of M: up to 
 NEAR_SADDLE = 0.003  # of the distance: from there at the latest the integrand is continued to S
 AT_REST = 1e-5  # f at an equilibrium, in units of the rate and the distance
 LONGEST_STEP = 0.2  # of Riccati's equation, in units of the largest rate
-MOST_STEPS = 1e6
+MOST_STEPS = 1e6  # numerical, a guard
 LARGEST = 1e5  # of ∇²V to its size at the attractor: beyond lies a caustic
 RESONANT = 0.1  # of λ: as close to it, with the other sign, other eigenvalues leave M_S undecided
 SKEW, SLIGHT_SKEW = 0.1, 0.01  # |p - M_S (x - S)| to its parts at the saddle
-SAME_ACTION = 1e-3
+SAME_ACTION = 1e-3  # of the action: closer paths are rivals for which the law has no single prefactor
 
 
 @dataclass(frozen=True)

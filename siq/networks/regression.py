@@ -25,7 +25,7 @@ from siq.errors import NumericalFailure, needs_extra
 from siq.identify.library import CandidateLibrary, constraint_matrix
 
 LOWER_SHARE = 0.75
-"""Of the points by V_θ, where no level is given: the highest are the fewest, and the networks worst there."""
+"""Of the points by V_θ, where no level is given, a choice: the highest are few, and networks worst there."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))

@@ -14,9 +14,10 @@ from scipy.integrate import DOP853
 Rates = Callable[[np.ndarray], np.ndarray]
 """Time derivative of states: ``(n, s)`` to ``(n, s)``, row by row."""
 
+# Of step control, the usual values: Hairer, Nørsett, Wanner, Solving Ordinary Differential Equations I, II.4.
 SAFETY = 0.9
 SMALLEST_FACTOR, LARGEST_FACTOR = 0.2, 5.0
-ORDER = 8
+ORDER = 8  # of the rule
 
 
 def dormand_prince_step(rates: Rates, state: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

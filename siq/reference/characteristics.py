@@ -30,7 +30,7 @@ from siq.numerics.integration import dormand_prince_step, next_step
 from siq.reference.hamiltonian import HamiltonianFlow
 from siq.reference.power_series import quasipotential_series
 
-MOST_STEPS = 20_000
+MOST_STEPS = 20_000  # numerical, a guard: a curve that takes more is stiff, or circles
 HALVINGS = 26  # of the last step, to find where a curve ends
 LONGEST_TIME = 60.0  # in units of the slowest relaxation time of the attractor
 RESTING = 1e-3  # p to x - A, in units in which both are equal near A

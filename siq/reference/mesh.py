@@ -47,10 +47,10 @@ STRAIGHT_REACH = 3.0  # mesh widths that suffice where f does not turn
 FARTHEST = 60  # mesh widths, beyond which the reach is not set unasked
 SLACK = 0.05  # by which f at the attractor, and M, may be off
 SMALL = 1e-3  # of the starting ellipse: where f counts as linear
-DIRECTIONS = 360
+DIRECTIONS = 360  # numerical: of the starting ellipse, a degree apart
 AT_ONCE = 1 << 18  # points at which f is evaluated in one call
 PRECISION = 1e-6  # of λ: U is flat at its minimum, and off by the square of this
-MOST_SECANTS = 60
+MOST_SECANTS = 60  # numerical, a guard: bisection alone reaches PRECISION in 20
 
 # A node has no value yet; a guess; its value, on the front; its value, behind the front.
 UNKNOWN, CONSIDERED, FRONT, ACCEPTED = range(4)

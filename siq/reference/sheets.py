@@ -16,7 +16,7 @@ from siq.dynamics.dynamics import Dynamics
 from siq.reference.characteristics import Fan, characteristics, join
 
 CLOSEST = 1e-12  # of directions: what cannot be told apart is not divided further
-CHUNK = 2048
+CHUNK = 2048  # numerical: curves followed together, as fit into the cache
 MOST_PARTS = 8  # into which a gap is divided at once
 BENT = 0.03  # of the level: a larger term of second order is no correction
 
