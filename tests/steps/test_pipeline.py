@@ -97,6 +97,22 @@ def test_networks_take_part_where_settings_ask_for_them(recordings: Recordings) 
     assert found.refined.certificates[Method.CONTROL]["certified"] is False
 
 
+def test_networks_are_trained_with_the_d_that_the_noise_shows() -> None:
+    noisy = replace(SIMULATION, pairs=40, noise_intensity=0.02)
+    found = draw.run(draw.DrawSettings(3, StateSpace(), Sampling(), noisy), SYSTEM, number=0).recordings
+    assert found is not None
+    settings = PipelineSettings(
+        sampling=Sampling(0.01, 0.002), training=replace(BRIEF, matching="explicit", steps=2)
+    )
+    record = identify.run(settings.of(identify.IdentifySettings), found, number=0).record
+    runs = {0: train.RunToTrain(found, record)}
+    networks = train.run(settings.of(train.TrainSettings), runs, device="cpu").of(0).networks
+    assert record is not None and networks is not None
+    np.testing.assert_allclose(networks.diffusion, record.found.diffusion.matrix, rtol=1e-6)
+    shape = KNOWN.diffusion / np.sqrt(np.linalg.det(KNOWN.diffusion))
+    np.testing.assert_allclose(networks.diffusion, shape, atol=0.2)
+
+
 def test_a_run_without_trajectories_is_skipped_by_every_step_after() -> None:
     settings = SETTINGS.of(identify.IdentifySettings)
     nothing = identify.run(settings, None, number=5)
