@@ -30,8 +30,8 @@ class DiffusionSource(StrEnum):
         """What a reader of U has to know; nothing where D was given."""
         return {
             DiffusionSource.GIVEN: None,
-            DiffusionSource.ESTIMATED: "D is estimated from the noise of the recordings, since none was given,"
-            " and scaled to the determinant 1: ε has the size of the noise, and U is in the unit of ε",
+            DiffusionSource.ESTIMATED: "D is estimated from the noise of the recordings, since none was"
+            " given, and scaled to the determinant 1: ε has the size of the noise, and U is in the unit of ε",
             DiffusionSource.UNIT: "D is taken as the unit matrix, since none was given and the recordings do"
             " not show it: U, barriers and times follow from it",
         }[self]
