@@ -6,9 +6,10 @@
 `identified_field`  what is known of the f that was found, errors included?
 `library`           which candidate functions are there, with which derivatives and constraints?
 `flow`              where does f lead within the step of a pair?
+`diffusion`         which D, where nobody gave it?
 `residuals`         what do its residuals say: no noise, process noise, noise of the measurement?
 `prediction`        where does f lead in the long run?
-`storage`         how is it kept in a file?
+`storage`           how is it kept in a file?
 ==================  ===========================================================================
 
 Imports `siq.dynamics` and what it may import.

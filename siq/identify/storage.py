@@ -13,6 +13,7 @@ import numpy as np
 from siq.dynamics.diffusion import Diffusion
 from siq.errors import InputError
 from siq.files.whole import whole_file
+from siq.identify.diffusion import DiffusionSource
 from siq.identify.flow import FlowMap
 from siq.identify.identification import IdentificationOptions
 from siq.identify.identified_field import IdentifiedField
@@ -30,12 +31,18 @@ class FieldRecord:
     prediction
         The certificate's test of it, see `siq.certificate.tests.Verdict.as_data`.
     noise
-        Kind, intensity and correlations of the residuals, see `siq.identify.residuals.NoiseDiagnosis`.
+        Kind, intensity and correlations of the residuals, see `siq.identify.residuals.NoiseDiagnosis`; and
+        where D is from.
     """
 
     found: IdentifiedField
     prediction: Mapping[str, Any]
     noise: Mapping[str, Any]
+
+    @property
+    def diffusion_source(self) -> DiffusionSource:
+        """Where D is from."""
+        return DiffusionSource(self.noise.get("diffusion", DiffusionSource.GIVEN))
 
 
 def field_library(states: Sequence[str], options: IdentificationOptions) -> CandidateLibrary:

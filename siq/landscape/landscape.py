@@ -16,6 +16,7 @@ from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.equilibria import Equilibrium
 from siq.dynamics.phase_portrait import PhasePortrait
 from siq.errors import NumericalFailure
+from siq.identify.diffusion import defined_states
 from siq.identify.identified_field import IdentifiedField
 from siq.landscape.global_quasipotential import GlobalQuasipotential, heights_of_attractors, matched
 from siq.landscape.transitions import Transition, transitions, ways_out
@@ -112,18 +113,14 @@ class Landscape:
         analysis = analyse(recordings, settings)
         found = None if analysis.landscape is None else analysis.landscape.landscape
         if found is None:
-            raise NumericalFailure("; ".join(one.reason for one in analysis.outcomes if one.reason))
-        notes = found.notes
-        if settings.space.diffusion == "identity":
-            notes = (
-                *notes,
-                "D is taken as the unit matrix, since none was given: U, barriers and times follow from it",
+            raise NumericalFailure(
+                "; ".join(one.reason for one in analysis.outcomes if one.status != "ok" and one.reason)
             )
         units = tuple(
             unit or settings.space.unit(name, unknown="1")
             for name, unit in zip(recordings.names, recordings.units, strict=True)
         )
-        return replace(found, notes=notes).in_units(units)
+        return found.in_units(units)
 
     def in_units(self, units: Sequence[str]) -> Landscape:
         """The same with the units of the states said; nothing is converted."""
@@ -195,7 +192,7 @@ class Landscape:
             When D is the unit matrix although a state is but the derivative of another: no noise drives
             ``dx/dt = v``, and the times follow from D.
         """
-        defined = _defined_states(self.dynamics)
+        defined = defined_states(self.dynamics)
         if defined and np.array_equal(self.dynamics.diffusion.matrix, np.eye(self.dynamics.dimension)):
             raise ValueError(
                 f"the equation of {', '.join(defined)} is of the form dx/dt = v, which no noise drives, and D"
@@ -230,15 +227,6 @@ class Landscape:
         from siq.report.plots.landscape_axes import draw_landscape
 
         return draw_landscape(self, ax)
-
-
-def _defined_states(dynamics: Dynamics) -> list[str]:
-    """States whose equation is another state, but for a factor: ``dx/dt = v``."""
-    return [
-        name
-        for name, own, formula in zip(dynamics.states, dynamics.symbols, dynamics.formulas, strict=True)
-        if formula.as_coeff_Mul()[1] in set(dynamics.symbols) - {own}
-    ]
 
 
 def _mean_time(way: Transition, noise: float) -> tuple[float, str]:

@@ -158,7 +158,13 @@ def _answer(study: Study, results: StudyResults) -> list[str]:
     if shown.run is not None:
         which = ", the median of the runs by error" if rrmse["rrmse"].notna().any() else ""
         said.append(f"The formulas below are those of run {shown.run}{which}.")
-    return said
+    return said + _remarks(results.tables["outcomes"])
+
+
+def _remarks(outcomes: pd.DataFrame) -> list[str]:
+    """What steps that went well have to say, each once: where D is from, if nobody gave it."""
+    texts = outcomes[outcomes["status"] == Status.OK]["reason"].dropna()
+    return [f"{text[0].upper()}{text[1:]}." for text in dict.fromkeys(texts) if text]
 
 
 def _formulas(results: StudyResults) -> list[FormulaRow]:

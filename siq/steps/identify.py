@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass as plain_dataclass
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from siq.certificate.tests import Verdict, check_prediction
 from siq.data.held_out import held_out_recordings
 from siq.data.recordings import Recordings, SnapshotPairs, select_recordings, snapshot_pairs
 from siq.errors import NumericalFailure
+from siq.identify.diffusion import DiffusionSource, check_units, estimated_diffusion
 from siq.identify.flow_regression import refit, residuals
 from siq.identify.identification import (
     IdentificationOptions,
@@ -21,7 +23,7 @@ from siq.identify.identification import (
 )
 from siq.identify.identified_field import IdentifiedField
 from siq.identify.prediction import prediction_errors
-from siq.identify.residuals import mean_residual_probability, residual_noise
+from siq.identify.residuals import NoiseDiagnosis, mean_residual_probability, residual_noise
 from siq.identify.storage import FieldRecord, field_library, read_field, write_field
 from siq.numerics.randomness import Purpose, generator
 from siq.steps.outcomes import Outcome, Status, Step, read_outcomes, write_outcomes
@@ -59,7 +61,8 @@ def run(settings: IdentifySettings, recordings: Recordings | None, *, number: in
     except (NumericalFailure, np.linalg.LinAlgError) as error:
         return Identified(None, Outcome(number, Step.IDENTIFY, Status.FAILED, str(error)))
     if record.prediction["passed"]:
-        return Identified(record, Outcome(number, Step.IDENTIFY))
+        note = record.diffusion_source.note or ""
+        return Identified(record, Outcome(number, Step.IDENTIFY, reason=note))
     return Identified(record, Outcome(number, Step.IDENTIFY, Status.WARNING, record.prediction["reason"]))
 
 
@@ -75,7 +78,6 @@ def _identified(settings: IdentifySettings, recordings: Recordings, number: int)
         identify_vector_field,
         library,
         options=options,
-        diffusion=settings.space.noise(len(recordings.names)),
         integrator_step=maker,
     )
     if carries_noise(library, parts[0], options=options, integrator_step=maker):
@@ -85,7 +87,7 @@ def _identified(settings: IdentifySettings, recordings: Recordings, number: int)
         fitted = refit(found, parts[0])
     else:
         found = fitted = identify_pairs(parts[0])
-    noise = residual_noise(found, recordings, pair_step=step)
+    found, noise, source = _with_diffusion(found, recordings, settings)
     verdict = _held_out_verdict(
         found, fitted, parts, held_out, fault=noise.fault(recordings.names), limit=settings.prediction
     )
@@ -96,8 +98,35 @@ def _identified(settings: IdentifySettings, recordings: Recordings, number: int)
         "correlation": noise.correlation,
         "correlation_score": noise.correlation_score,
         "measurement": noise.measurement.tolist(),
+        "diffusion": str(source),
     }
     return FieldRecord(found, verdict.as_data(), kept)
+
+
+def _with_diffusion(
+    found: IdentifiedField, recordings: Recordings, settings: IdentifySettings
+) -> tuple[IdentifiedField, NoiseDiagnosis, DiffusionSource]:
+    """The field with its D, what its residuals say, and where D is from.
+
+    f does not depend on D, and whether noise is white does not either: so D can come last.
+    """
+    step, space = settings.sampling.pair_step, settings.space
+    given = space.noise(len(recordings.names))
+    if given is not None:
+        found = replace(found, diffusion=given)
+        return found, residual_noise(found, recordings, pair_step=step), DiffusionSource.GIVEN
+    estimated = estimated_diffusion(found)
+    if estimated is not None:
+        with_own = replace(found, diffusion=estimated)
+        noise = residual_noise(with_own, recordings, pair_step=step)
+        if noise.kind == "process":
+            return with_own, noise, DiffusionSource.ESTIMATED
+    units = [
+        unit or space.unit(name) or None
+        for name, unit in zip(recordings.names, recordings.units, strict=True)
+    ]
+    check_units(recordings.names, units)
+    return found, residual_noise(found, recordings, pair_step=step), DiffusionSource.UNIT
 
 
 def _held_out_verdict(

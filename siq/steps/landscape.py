@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass as plain_dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -74,7 +75,11 @@ def run(
         return FoundLandscape(None, record, Outcome(number, Step.LANDSCAPE, Status.FAILED, str(error)))
     whole = found.over_wells is not None and not found.notes
     status = Status.OK if whole else Status.WARNING
-    return FoundLandscape(found, record, Outcome(number, Step.LANDSCAPE, status, "; ".join(found.notes)))
+    outcome = Outcome(number, Step.LANDSCAPE, status, "; ".join(found.notes))
+    note = record.diffusion_source.note
+    if note is not None:
+        found = replace(found, notes=(*found.notes, note))
+    return FoundLandscape(found, record, outcome)
 
 
 def read_wells(model: str | Path) -> tuple[Well, ...]:
@@ -97,7 +102,10 @@ def write(
         Path(quasipotential).touch()
     else:
         write_landscape(quasipotential, found.landscape, dynamics=found.record.found.dynamics)
-        rows, accuracy = landscape_rows(number, found.landscape), degree_rows(number, found.landscape)
+        rows, accuracy = (
+            landscape_rows(number, found.landscape, found.record.diffusion_source.note),
+            degree_rows(number, found.landscape),
+        )
     write_table(table, rows)
     write_table(degrees, accuracy)
     write_outcomes(outcome, [found.outcome])

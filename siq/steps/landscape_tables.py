@@ -15,8 +15,8 @@ def place(position: np.ndarray) -> str:
     return "(" + ", ".join(f"{value:.6g}" for value in position) + ")"
 
 
-def landscape_rows(run: int, found: Landscape) -> pd.DataFrame:
-    """One row for each equilibrium and each way out of a well."""
+def landscape_rows(run: int, found: Landscape, remark: str | None = None) -> pd.DataFrame:
+    """One row for each equilibrium and each way out of a well; `remark` is of what all barriers hang on."""
     names = [f"A{index + 1}" for index in range(len(found.attractors))]
     heights = {place(one.position): index for index, one in enumerate(found.attractors)}
     tops: dict[str, float] = {}
@@ -54,7 +54,7 @@ def landscape_rows(run: int, found: Landscape) -> pd.DataFrame:
                 "by_formula": way.by_formula,
                 "minimum_action": np.nan if way.path is None else way.path.uphill.action,
                 "prefactor": np.nan if way.rate is None else way.rate.prefactor,
-                "note": "; ".join(way.notes),
+                "note": "; ".join([*way.notes, *([] if remark is None else [remark])]),
             }
         )
     return as_table("landscape", rows)

@@ -60,7 +60,7 @@ class StudyParts:
             return StateSpace(self.system.states, units, self.system.diffusion.matrix.tolist())
         recordings = self.study.recordings
         assert recordings is not None  # the schema asks for one of the two
-        return StateSpace(recordings.states, None, recordings.diffusion or "identity")
+        return StateSpace(recordings.states, None, recordings.diffusion)
 
     @property
     def refinement(self) -> RefinementOptions:

@@ -64,7 +64,7 @@ class Outcome:
     step, status
         Which step, and how it ended.
     reason
-        Why it is not ``ok``, in words.
+        Why it is not ``ok``, in words; of one that is, what has to be known of it.
     details
         What else the step says of itself, as plain data.
     """

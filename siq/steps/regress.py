@@ -10,6 +10,7 @@ import numpy as np
 from pydantic.dataclasses import dataclass
 
 from siq.data.recordings import Recordings, snapshot_pairs
+from siq.dynamics.diffusion import Diffusion
 from siq.errors import NumericalFailure
 from siq.identify.library import candidate_library
 from siq.networks.regression import RegressionOptions, RegressionResult, points_below, sparse_decomposition
@@ -78,7 +79,8 @@ def _regressed(
         values.potential[below],
         values.circulatory[below],
         values.vector_field[below],
-        diffusion=settings.space.noise(points.shape[1]),
+        # D that nobody gave is that of the networks, in their precision.
+        diffusion=settings.space.noise(points.shape[1]) or Diffusion(networks.diffusion),
         options=options,
     )
     formulas = decomposition_from_coefficients(

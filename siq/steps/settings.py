@@ -41,16 +41,17 @@ class StateSpace:
     units
         Unit of each state by name, and of the time as ``t``; None where nobody said.
     diffusion
-        D: ``identity``, its diagonal, or the matrix, in the states' units squared per unit of time.
+        D: ``identity``, its diagonal, or the matrix, in the states' units squared per unit of time; None
+        where nobody said, see `siq.identify.diffusion`.
     """
 
     names: tuple[str, ...] | None = None
     units: dict[str, str] | None = None
-    diffusion: DiffusionEntry = "identity"
+    diffusion: DiffusionEntry | None = None
 
-    def noise(self, dimension: int) -> Diffusion:
-        """D of so many states."""
-        return Diffusion(diffusion_matrix(self.diffusion, dimension))
+    def noise(self, dimension: int) -> Diffusion | None:
+        """D of so many states, None where nobody said."""
+        return None if self.diffusion is None else Diffusion(diffusion_matrix(self.diffusion, dimension))
 
     def unit(self, name: str, *, unknown: str = "") -> str:
         """Unit of a state, or of the time ``t``."""

@@ -19,6 +19,7 @@ from pydantic import TypeAdapter
 from pydantic.dataclasses import dataclass
 
 from siq.data.recordings import Recordings, snapshot_pairs
+from siq.dynamics.diffusion import Diffusion
 from siq.errors import NumericalFailure
 from siq.identify.storage import FieldRecord, read_field
 from siq.networks.options import TrainingOptions
@@ -113,12 +114,11 @@ def run(
     from siq.steps.training_block import Block, Kept
 
     checks = _checks(settings, runs, data)
-    dimension = next(iter(data.values())).training.x0.shape[1]
     block = Block(
         data,
         checks.ready,
         options=settings.training,
-        diffusion=settings.space.noise(dimension),
+        diffusion=_diffusion(settings, runs, data),
         seed=settings.seed,
         kept=Kept(folder, _fingerprint(settings, runs, data)),
         device=choose_device(device),
@@ -128,6 +128,23 @@ def run(
     outcomes += [block.outcome(number) for number in data]
     networks = {number: block.last[number] for number in data}
     return Trained(networks, as_table("training", block.history()), tuple(outcomes))
+
+
+def _diffusion(
+    settings: TrainSettings, runs: Mapping[int, RunToTrain], data: Mapping[int, TrainingData]
+) -> Diffusion:
+    """D of all networks of a block: as given, or else the mean of what its runs show.
+
+    Networks only lead to the right solution, which is then found with the D of its own run.
+    """
+    dimension = next(iter(data.values())).training.x0.shape[1]
+    given = settings.space.noise(dimension)
+    if given is not None:
+        return given
+    records = [record for number in data if (record := runs[number].record) is not None]
+    if not records:
+        return Diffusion.identity(dimension)
+    return Diffusion(np.mean([record.found.diffusion.matrix for record in records], axis=0))
 
 
 def _training_data(
@@ -180,7 +197,7 @@ def _fingerprint(
         record = runs[number].record
         arrays = [part.training.x0, part.training.xh, part.training.h]
         if record is not None:
-            arrays += [record.found.coefficients, record.found.covariance]
+            arrays += [record.found.coefficients, record.found.covariance, record.found.diffusion.matrix]
         for values in arrays:
             digest.update(np.ascontiguousarray(values).tobytes())
     return digest.hexdigest()

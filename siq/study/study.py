@@ -46,7 +46,8 @@ class RecordingsOptions(BaseModel):
         Consecutive samples no further apart than this are pairs; by default those no further apart than
         one and a half of their median distance, since what is longer is a gap.
     diffusion
-        D, in the recordings' units, where no system gives it; by default the identity.
+        D, in the recordings' units, where no system gives it; by default as the noise of the recordings shows
+        it, or else the identity, which states of different units refuse. See `siq.identify.diffusion`.
     integrator_step
         Step of the Euler–Maruyama simulation that made the recordings, where one did: its increments are
         those of a map, from which the continuous process is then found. Leave it out for measurements.
@@ -296,8 +297,8 @@ def check_states(study: Study, states: Sequence[str], *, file: str) -> None:
         When the library's functions or D do not fit the states.
     """
     try:
-        if study.recordings is not None and study.system is None:
-            noise = Diffusion(diffusion_matrix(study.recordings.diffusion or "identity", len(states)))
+        if study.recordings is not None and study.recordings.diffusion is not None:
+            noise = Diffusion(diffusion_matrix(study.recordings.diffusion, len(states)))
             if not noise.regular:
                 raise ValueError("the noise does not reach every state; give a positive definite matrix")
     except ValueError as error:

@@ -9,7 +9,8 @@ import pytest
 from siq.dynamics.diffusion import Diffusion
 from siq.errors import InputError
 from siq.identify.flow import FlowMap
-from siq.identify.identification import IdentificationOptions, IdentifiedField
+from siq.identify.identification import IdentificationOptions
+from siq.identify.identified_field import IdentifiedField
 from siq.identify.storage import FieldRecord, field_library, read_field, write_field
 
 OPTIONS = IdentificationOptions(degree=2, functions=("x/(1+y**2)", "sqrt(1+x**2)"))

@@ -3,7 +3,6 @@
 Minutes in all, and therefore no part of `make test`: ``make untuned`` runs them.
 """
 
-import math
 import time
 from collections.abc import Mapping
 from typing import Any
@@ -11,20 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from known_systems import (
-    KnownSystem,
-    archetype,
-    as_system,
-    double_well,
-    limit_cycle,
-    linear_system,
-    maier_stein,
-    polynomial_system,
-    potential_values,
-)
+from known_systems import KnownSystem, limit_cycle, maier_stein, potential_values
+from untuned_systems import SYSTEMS, simulated
 
 from siq.data.recordings import snapshot_pairs
-from siq.dynamics.simulation import SimulationOptions, simulate_snapshots
 from siq.identify.identification import IdentificationOptions
 from siq.networks.options import CheckOptions, TrainingOptions
 from siq.networks.regression import RegressionOptions
@@ -49,31 +38,6 @@ TRAINING = TrainingOptions(
 )
 DEGREE = 4
 EVERYWHERE = 1e6  # a level above every recorded state
-
-
-def simulated(known: KnownSystem, *, trajectories: int = 1000, pairs: int = 30, seed: int = 1):
-    """Recordings of a known system, sampled by its own time scales."""
-    rates = [
-        np.linalg.eigvals(known.dynamics.jacobian(one[None])[0]).real.max() for one in known.attractors
-    ] or [-1.0]
-    speed = np.quantile(
-        np.linalg.norm(
-            known.dynamics.jacobian(
-                np.random.default_rng(0).uniform(*known.domain.T, (500, len(known.domain)))
-            ),
-            axis=(1, 2),
-        ),
-        0.9,
-    )
-    relaxation = 1 / -max(rates)
-    step = float(min(0.01, 0.1 / speed))
-    # Where f is very fast somewhere, recordings that last until all is at rest would take too many steps.
-    stride = min(max(math.ceil(3 * relaxation / pairs / (step / 5)), 6), 300)
-    system = as_system(known)
-    options = SimulationOptions(
-        trajectories=trajectories, pairs=pairs, pair_step=step, interval=stride * step / 5
-    )
-    return simulate_snapshots(system, options=options, generator=np.random.default_rng(seed)), step
 
 
 def trained_until_certified(known: KnownSystem, seed: int = 0) -> tuple[Analysis, np.ndarray]:
@@ -105,19 +69,6 @@ def trained_until_certified(known: KnownSystem, seed: int = 0) -> tuple[Analysis
 def certificate_of(found: Analysis) -> Mapping[str, Any]:
     """The certificate of the refined formulas."""
     return found.refined.certificates[Method.REFINED]
-
-
-SYSTEMS = {
-    **{f"linear in {d} dimensions": linear_system(d) for d in range(2, 7)},
-    "Maier–Stein, β = 1": maier_stein(1),
-    **{
-        f"polynomial in {d} dimensions, draw {s}": polynomial_system(d, seed=s)
-        for d in (2, 3)
-        for s in (0, 1, 2)
-    },
-    "archetype in 3 dimensions": archetype(3),
-    "gradient system": double_well(2),
-}
 
 
 @pytest.mark.slow

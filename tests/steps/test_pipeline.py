@@ -12,7 +12,9 @@ from known_systems import as_system, double_well, potential_gradient, potential_
 from siq.data.recordings import Recordings
 from siq.dynamics.simulation import SimulationOptions
 from siq.errors import NumericalFailure
-from siq.networks.options import CheckOptions
+from siq.networks.options import CheckOptions, TrainingOptions
+from siq.networks.regression import RegressionOptions
+from siq.potential.storage import model_to_data
 from siq.potential.symbolic import exact_decomposition
 from siq.steps import draw, identify, score, train
 from siq.steps.outcomes import Method, Outcome, Status, Step
@@ -95,6 +97,51 @@ def test_networks_take_part_where_settings_ask_for_them(recordings: Recordings) 
     assert found.trained.networks is not None and found.trained.outcome.status == Status.OK
     # The control is certified by nobody, and the report counts that.
     assert found.refined.certificates[Method.CONTROL]["certified"] is False
+
+
+@pytest.mark.parametrize(
+    "training",
+    [
+        pytest.param(None, id="without networks"),
+        pytest.param(BRIEF, id="with networks", marks=pytest.mark.slow),
+    ],
+)
+def test_the_regression_does_not_steer_the_refined_formulas(
+    recordings: Recordings, training: TrainingOptions | None
+) -> None:
+    # Of a degree too low for V, of one that is high enough, and where hardly a point is below the level.
+    told = (RegressionOptions(degree=2, level=1e6), RegressionOptions(degree=5, level=0.5))
+    settings = replace(SETTINGS, training=training, landscape=None)
+    one, other = (
+        analyse(recordings, replace(settings, regression=each), device="cpu").refined for each in told
+    )
+    first, second = (
+        model_to_data({"refined": each.formulas[Method.REFINED]}, {"refined": {}})["methods"]["refined"]
+        for each in (one, other)
+    )
+    assert first["V"]["exponents"] == second["V"]["exponents"]
+    # With networks the regression is where the search begins; it ends at the same V, to its own rounding.
+    np.testing.assert_allclose(first["V"]["coefficients"], second["V"]["coefficients"], rtol=1e-8)
+    assert [each["exponents"] for each in first["g"]] == [each["exponents"] for each in second["g"]]
+    reports = [each.certificates[Method.REFINED] for each in (one, other)]
+    assert reports[0]["certified"] == reports[1]["certified"]
+    assert (training is not None) or first == second
+
+
+def test_networks_are_trained_with_the_d_that_the_noise_shows() -> None:
+    noisy = replace(SIMULATION, pairs=40, noise_intensity=0.02)
+    found = draw.run(draw.DrawSettings(3, StateSpace(), Sampling(), noisy), SYSTEM, number=0).recordings
+    assert found is not None
+    settings = PipelineSettings(
+        sampling=Sampling(0.01, 0.002), training=replace(BRIEF, matching="explicit", steps=2)
+    )
+    record = identify.run(settings.of(identify.IdentifySettings), found, number=0).record
+    runs = {0: train.RunToTrain(found, record)}
+    networks = train.run(settings.of(train.TrainSettings), runs, device="cpu").of(0).networks
+    assert record is not None and networks is not None
+    np.testing.assert_allclose(networks.diffusion, record.found.diffusion.matrix, rtol=1e-6)
+    shape = KNOWN.diffusion / np.sqrt(np.linalg.det(KNOWN.diffusion))
+    np.testing.assert_allclose(networks.diffusion, shape, atol=0.2)
 
 
 def test_a_run_without_trajectories_is_skipped_by_every_step_after() -> None:

@@ -1,0 +1,101 @@
+"""What networks add to the local route: time, certificate and error of V, without and with them.
+
+    .venv/bin/python benchmarks/networks.py
+
+All other settings are defaults. Systems with a card are simulated as a study of two lines would; the others
+are those of ``tests/untuned_systems.py``. The error of V is relative, after subtracting the minima,
+over the lowest three quarters of the recorded states; of the resonator, whose V nobody knows, that of the
+barriers of U against those by minimum action.
+"""
+
+import os
+
+os.environ["OMP_NUM_THREADS"] = "1"
+
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import sympy
+
+sys.path.append(str(Path(__file__).parents[1] / "tests"))
+
+from untuned_systems import SYSTEMS, simulated
+
+from siq.data.recordings import Recordings, snapshot_pairs
+from siq.dynamics.cards import load_exact, load_system
+from siq.dynamics.formulas import compile_formulas
+from siq.dynamics.sampling import complete
+from siq.dynamics.simulation import simulate_snapshots
+from siq.networks.options import TrainingOptions
+from siq.steps.outcomes import Method
+from siq.steps.pipeline import Analysis, PipelineSettings, analyse
+from siq.steps.settings import Sampling, StateSpace
+from siq.study.study import SimulationEntry
+
+ROOT = Path(__file__).parents[1]
+CARDS = ("archetype3d", "resonator", "maier-stein")
+UNTUNED = ("linear in 3 dimensions", "polynomial in 2 dimensions, draw 0", "gradient system")
+LOWEST = 0.75  # quantile of V: beyond, hardly anything is recorded
+RESONATOR_BARRIERS = (1.047e-8, 8.16e-9)  # of U from either well, by minimum action
+
+
+def of_card(name: str) -> tuple[Recordings, PipelineSettings, sympy.Expr | None]:
+    """Recordings of a card, what a study of two lines says of them, and the exact V where it is known."""
+    path = ROOT / "config" / "systems" / f"{name}.yaml"
+    system, exact = load_system(path), load_exact(path)
+    options = complete(SimulationEntry(), system).options()
+    recordings = simulate_snapshots(system, options=options, generator=np.random.default_rng(0))
+    space = StateSpace(system.states, None, system.diffusion.matrix.tolist())
+    settings = PipelineSettings(space=space, sampling=Sampling(options.pair_step))
+    return recordings, settings, None if exact is None else exact / 2
+
+
+def of_known(name: str) -> tuple[Recordings, PipelineSettings, sympy.Expr | None]:
+    """The same of a system that was never tuned for."""
+    known = SYSTEMS[name]
+    space = StateSpace(diffusion=known.diffusion.tolist())
+    return simulated(known)[0], PipelineSettings(space=space), known.potential
+
+
+def error_of(found: Analysis, recordings: Recordings, exact: sympy.Expr | None) -> float:
+    """Relative error of V, or of barriers."""
+    if exact is None:
+        assert found.landscape is not None and found.landscape.landscape is not None
+        barriers = found.landscape.landscape.barriers()["barrier"].to_numpy()
+        return float(np.abs(barriers / RESONATOR_BARRIERS - 1).max())
+    formulas = found.refined.formulas[Method.REFINED]
+    if formulas.potential is None:
+        return np.nan
+    symbols = [sympy.Symbol(name, real=True) for name in recordings.names]
+    x = np.ascontiguousarray(snapshot_pairs(recordings).x0.T)
+    values = compile_formulas([exact], symbols)(x)[0]
+    low = values < np.quantile(values, LOWEST)
+    own, values = formulas.evaluate(x)[0][low], values[low]
+    difference = (own - own.min()) - (values - values.min())
+    return float(np.linalg.norm(difference - difference.mean()) / np.linalg.norm(values - values.min()))
+
+
+def main() -> None:
+    """Print one row for each system and way."""
+    print(f"{'system':36s} {'networks':8s} {'seconds':>7s} certified  error   stated", flush=True)
+    for name in (*CARDS, *UNTUNED):
+        recordings, settings, exact = of_card(name) if name in CARDS else of_known(name)
+        for training in (None, TrainingOptions()):
+            began = time.perf_counter()
+            found = analyse(recordings, replace(settings, training=training), device="cpu")
+            seconds = time.perf_counter() - began
+            certificate = found.refined.certificates[Method.REFINED]
+            error, stated = error_of(found, recordings, exact), certificate["stated_error"]
+            print(
+                f"{name:36s} {'no' if training is None else 'yes':8s} {seconds:7.0f}"
+                f" {certificate['certified']!s:9s} {error:8.1e} {stated or np.nan:8.1e}"
+                f" {certificate['reason']} {found.trained.outcome.reason}",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,58 @@
+"""Systems for which nothing was ever tuned, and their recordings."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from known_systems import (
+    KnownSystem,
+    archetype,
+    as_system,
+    double_well,
+    linear_system,
+    maier_stein,
+    polynomial_system,
+)
+
+from siq.data.recordings import Recordings
+from siq.dynamics.simulation import SimulationOptions, simulate_snapshots
+
+SYSTEMS = {
+    **{f"linear in {d} dimensions": linear_system(d) for d in range(2, 7)},
+    "Maier–Stein, β = 1": maier_stein(1),
+    **{
+        f"polynomial in {d} dimensions, draw {s}": polynomial_system(d, seed=s)
+        for d in (2, 3)
+        for s in (0, 1, 2)
+    },
+    "archetype in 3 dimensions": archetype(3),
+    "gradient system": double_well(2),
+}
+
+
+def simulated(
+    known: KnownSystem, *, trajectories: int = 1000, pairs: int = 30, seed: int = 1
+) -> tuple[Recordings, float]:
+    """Recordings of a known system, sampled by its own time scales."""
+    rates = [
+        np.linalg.eigvals(known.dynamics.jacobian(one[None])[0]).real.max() for one in known.attractors
+    ] or [-1.0]
+    speed = np.quantile(
+        np.linalg.norm(
+            known.dynamics.jacobian(
+                np.random.default_rng(0).uniform(*known.domain.T, (500, len(known.domain)))
+            ),
+            axis=(1, 2),
+        ),
+        0.9,
+    )
+    relaxation = 1 / -max(rates)
+    step = float(min(0.01, 0.1 / speed))
+    # Where f is very fast somewhere, recordings that last until all is at rest would take too many steps.
+    stride = min(max(math.ceil(3 * relaxation / pairs / (step / 5)), 6), 300)
+    system = as_system(known)
+    options = SimulationOptions(
+        trajectories=trajectories, pairs=pairs, pair_step=step, interval=stride * step / 5
+    )
+    return simulate_snapshots(system, options=options, generator=np.random.default_rng(seed)), step
