@@ -24,6 +24,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from known_systems import (
     KnownSystem,
+    archetype,
     as_system,
     double_well,
     exact_field,
@@ -51,9 +52,10 @@ SYSTEMS = {
     "linear": (linear_system(2, rotation=1.0), 1),
     "linear, turning": (linear_system(2), 1),
     "double well": (double_well(2), 3),
+    "archetype, 3 states": (archetype(3), 3),
 }
-TRAININGS = 25  # of each system and length
-STEPS = (50, 400)
+TRAININGS = 20  # of each system and length
+STEPS = (3, 50, 400)
 WRONG = 0.05  # relative L2 difference from the exact V in a well, above which V is wrong
 LIMITS = CertificateOptions()
 SIMULATION = SimulationOptions(trajectories=60, pairs=20, pair_step=0.01, interval=0.1)

@@ -41,6 +41,7 @@ NOTICEABLE = 1e-3  # a stated error above this is worth an explanation
 FAN = 512  # characteristics in search of a caustic
 FAN_TOLERANCE = 1e-7  # of their steps: what is said of a caustic has four digits
 FAN_SPACING = 0.1  # of points along them, the level being at 1: a caustic between two of them is located
+LEAST_CLAIMED = 0.5  # of the states in a well: a formula that holds at fewer is none of the well (a choice)
 HARMLESS = 1e-6  # a difference of the routes that no error needs to explain
 
 
@@ -182,7 +183,8 @@ def certify_wells(
     """Certificate of one formula for each attractor, the worst of them deciding.
 
     The Hessian of the local route is M by construction, so that its branch test passes by itself; what tests
-    it are the characteristics. Each formula is tested on held-out states of its own well.
+    it are the characteristics. Each formula is tested on held-out states of its own well where it claims to
+    hold, and it has to claim more than half of them.
     """
     found = refined.found
     wells = refined.wells or refined.network_wells
@@ -194,8 +196,11 @@ def certify_wells(
         mine = [one for one in references if _same(one.attractor, well.attractor)]
         part = part_of(held_out, well, basin_region(portrait, own[0]), mine[0] if mine else None)
         tested.append(part.described)
-        if not len(part.points):
-            reason = f"no held-out state lies in the well about {_place(well.attractor)}: record more there"
+        if part.claimed < LEAST_CLAIMED:
+            reason = (
+                f"V claims to hold at {part.claimed:.0%} of the held-out states in the well about"
+                f" {_place(well.attractor)}: record more there, or raise refinement.degrees"
+            )
             tests["hamilton_jacobi"] = Verdict(np.inf, options.hamilton_jacobi, False, reason)
             error = np.inf
             continue

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -255,22 +256,12 @@ def _heights(fan: Fan, tops: np.ndarray) -> np.ndarray:
 
 
 def _fan(
-    dynamics: Dynamics,
-    portrait: PhasePortrait,
-    attractor: np.ndarray,
-    level: float,
-    seed: int,
-    *,
-    count: int,
-    most: int,
-    rounds: int,
-    tolerance: float = TOLERANCE,
+    dynamics: Dynamics, portrait: PhasePortrait, attractor: np.ndarray, level: float, seed: int, **told: Any
 ) -> Fan:
     return adapted_fan(
         dynamics, attractor, level=level, box=portrait.box, generator=np.random.default_rng(seed),
-        count=count, most=most, rounds=rounds, gap=GAP, tolerance=tolerance,
-        spacing=_spacing(len(attractor)), most_steps=MOST_STEPS,
-        start=START, start_degree=START_DEGREE if len(attractor) <= 4 else 4,
+        gap=GAP, spacing=_spacing(len(attractor)), most_steps=MOST_STEPS, start=START,
+        start_degree=START_DEGREE if len(attractor) <= 4 else 4, **{"tolerance": TOLERANCE} | told,
     )  # fmt: skip
 
 

@@ -24,11 +24,14 @@ class HeldOut:
         Consecutive samples.
     described
         What the points are, in words.
+    claimed
+        Share of the states of the region at which the formula claims to hold.
     """
 
     points: np.ndarray
     pairs: SnapshotPairs
     described: str = ""
+    claimed: float = 1.0
 
     def __post_init__(self) -> None:
         if not self.described:
@@ -53,7 +56,9 @@ def part_of(held_out: HeldOut, well: Well, region: BasinRegion, reference: Refer
     Returns
     -------
     HeldOut
-        Pairs count by their first sample: to ask where the second one lies would be to choose the noise.
+        States where the formula claims to hold: it makes no claim where its own residual is large, as at a
+        caustic. `claimed` has their share. Pairs count by their first sample: to ask where the second one
+        lies would be to choose the noise.
     """
 
     def inside(x: np.ndarray) -> np.ndarray:
@@ -62,14 +67,18 @@ def part_of(held_out: HeldOut, well: Well, region: BasinRegion, reference: Refer
         return np.asarray(mask)
 
     points, pairs = held_out.points[inside(held_out.points)], held_out.pairs
-    described = f"{len(points)} held-out states"
+    further = ""
     if len(points) < FEWEST and reference is not None:
-        further = reference.below(well.level)[0]
-        further = further[well.reaches(further)]
-        described += f" and, as these are few, {len(further)} points that characteristics reach"
-        points = np.concatenate([points, further])
+        own = len(points)
+        points = np.concatenate([points, reference.below(well.level)[0]])
+        further = f", {own} of them held out and, as these are few, the others reached by characteristics"
+    believed = well.believed(points)
+    described = f"{believed.sum()} of {len(points)} states of a well, where V claims to hold"
+    described += further or ", all held out"
+    share = float(believed.mean()) if len(points) else 0.0
     rows = inside(pairs.x0)
+    rows[rows] = well.believed(pairs.x0[rows])
     kept = replace(
         pairs, x0=pairs.x0[rows], xh=pairs.xh[rows], h=pairs.h[rows], recording=pairs.recording[rows]
     )
-    return HeldOut(points, kept, described)
+    return HeldOut(points[believed], kept, described, share)

@@ -44,7 +44,7 @@ from siq.certificate.tests import (
     check_prediction,
     stated_error,
 )
-from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
+from siq.data.recordings import Recordings, SnapshotPairs
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.phase_portrait import PhasePortrait
 from siq.dynamics.simulation import SimulationOptions, simulate_snapshots
@@ -629,8 +629,9 @@ def test_the_error_that_is_stated_lies_above_the_true_one(beta: float, barrier: 
         degree=8, generator=np.random.default_rng(0),
     )  # fmt: skip
     certificate = certify_wells(
-        of_wells(known, (well,)), setting, held_out_of(known, share=1.0, count=600), options=CertificateOptions(),
-        prediction=PASSED, references=references_of(known, share=1.0, count=400), compared=False,
+        of_wells(known, (well,)), setting, held_out_of(known, share=1.0, count=600),
+        options=CertificateOptions(), prediction=PASSED,
+        references=references_of(known, share=1.0, count=400), compared=False,
     )  # fmt: skip
     fan = fan_of(beta, barrier / 2)
     kept = lowest_sheet(fan)
