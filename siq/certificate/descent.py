@@ -109,6 +109,7 @@ def _in_the_mean(
         worst = max(worst, beyond / spread if spread > 0 else np.inf)
     if not claimed.max() > 0:
         return Verdict(np.inf, limit, False, FLAT)
-    passed = worst <= limit
+    worst = float(worst)
+    passed = bool(worst <= limit)
     reason = "" if passed else "in the mean over its noise V does not fall along the recordings as it has to"
     return Verdict(worst, limit, passed, reason)
