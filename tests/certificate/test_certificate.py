@@ -31,7 +31,7 @@ from known_systems import (
 )
 
 from siq.certificate.certify import Certificate, certify_formulas, certify_wells
-from siq.certificate.characteristics import Reference, references_about
+from siq.certificate.characteristics import Reference, check_characteristics, references_about
 from siq.certificate.held_out import HeldOut
 from siq.certificate.tests import (
     Candidate,
@@ -286,7 +286,7 @@ def test_false_solutions_are_refused_by_the_test_that_is_meant_for_them(name: st
     case = FALSE[name]
     certificate = certified(case.known, case.potential)
     assert not certificate.certified
-    assert case.refused_by <= refusals(certificate), certificate.tests
+    assert case.refused_by | {"characteristics"} <= refusals(certificate), certificate.tests
     assert not case.blind & refusals(certificate), certificate.tests
     assert certificate.reason
     assert certificate.as_data()["certified"] is False
@@ -372,14 +372,19 @@ def test_every_other_invariant_subspace_is_refused(dimension: int, rotation: flo
         candidate = in_basis(basis, own, points, portrait)
         equation = check_hamilton_jacobi(candidate, found, limit=0.05)
         branch = check_branch(candidate, found, limit=0.01)
+        followed, _, _ = check_characteristics(
+            candidate, found, references_of(known), error=1e-6, options=CertificateOptions()
+        )
         if np.allclose(hessian, true, rtol=1e-6, atol=1e-8):
             accepted += 1
             assert equation.passed
             assert branch.passed
+            assert followed.passed
         else:
             zero = np.abs(hessian).max() < 1e-9 * np.abs(true).max()
             assert equation.passed is not zero
             assert not branch.passed
+            assert not followed.passed
     assert accepted == 1
 
 
