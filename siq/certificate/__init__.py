@@ -1,10 +1,14 @@
 """May a formula of V be believed, and to within which error?
 
-=============  =================================================================
-`tests`        which tests are there, and which false solution does each refuse?
-`error_bound`  how far may V be from the true one, from its own residual?
-`certify`      which tests apply to the formulas of a run, on which points?
-=============  =================================================================
+=================  =======================================================================
+`tests`            which tests are there, and which false solution does each refuse?
+`characteristics`  is V that which characteristics carry, with nothing else of its fit?
+`descent`          does V fall along recordings that no fit saw, as fast as it has to?
+`error_bound`      how far may V be from the true one, from its own residual?
+`regions`          which points lie among the recorded states that lead to an attractor?
+`held_out`         which held-out states and pairs does a formula have to answer?
+`certify`          which tests apply to the formulas of a run, on which points?
+=================  =======================================================================
 
 Imports `siq.potential` and what it may import.
 """

@@ -1,6 +1,7 @@
 """Certificates of the formulas of a run: which tests apply to each, and on which points.
 
-`siq.certificate.tests` has the tests themselves.
+`siq.certificate.tests` has the tests themselves. No formula is certified without one that shares nothing with
+its fit but f: `INDEPENDENT` names those.
 """
 
 from __future__ import annotations
@@ -11,13 +12,16 @@ from typing import Any
 
 import numpy as np
 
+from siq.certificate.characteristics import SHARE, Reference, check_characteristics
+from siq.certificate.descent import check_descent
+from siq.certificate.held_out import HeldOut, part_of
+from siq.certificate.regions import basin_region
 from siq.certificate.tests import (
     Candidate,
     CertificateOptions,
     Verdict,
     check_agreement,
     check_branch,
-    check_descent,
     check_error,
     check_hamilton_jacobi,
     check_identity,
@@ -26,18 +30,18 @@ from siq.certificate.tests import (
 from siq.dynamics.formulas import compile_formulas
 from siq.dynamics.phase_portrait import PhasePortrait
 from siq.identify.identified_field import IdentifiedField
-from siq.identify.library import CandidateLibrary
-from siq.potential.bases import LibraryBasis
 from siq.potential.refinement import Refined
 from siq.potential.symbolic import SymbolicDecomposition
 from siq.potential.well import Well
 from siq.reference.sheets import adapted_fan, first_caustic
 
+INDEPENDENT = ("characteristics",)  # tests of V that share nothing with a fit of V but f and D
 ALONE = "only one of the two routes that the study names led to a formula"
 NOTICEABLE = 1e-3  # a stated error above this is worth an explanation
 FAN = 512  # characteristics in search of a caustic
 FAN_TOLERANCE = 1e-7  # of their steps: what is said of a caustic has four digits
 FAN_SPACING = 0.1  # of points along them, the level being at 1: a caustic between two of them is located
+LEAST_CLAIMED = 0.5  # of the states in a well: a formula that holds at fewer is none of the well (a choice)
 HARMLESS = 1e-6  # a difference of the routes that no error needs to explain
 
 
@@ -55,17 +59,25 @@ class Certificate:
         What refused it, or what to know of it, in words.
     scope
         ``region``: one formula for the recorded region; ``wells``: one for each attractor.
+    tested_on
+        The points, in words.
     """
 
     tests: Mapping[str, Verdict]
     error: float
     reason: str
     scope: str = "region"
+    tested_on: str = ""
+
+    @property
+    def independent(self) -> tuple[str, ...]:
+        """The tests made that share nothing with the fit of V but f and D."""
+        return tuple(name for name in INDEPENDENT if name in self.tests)
 
     @property
     def certified(self) -> bool:
-        """Whether every test passed."""
-        return bool(self.tests) and all(verdict.passed for verdict in self.tests.values())
+        """Whether every test passed, one of them an independent one."""
+        return bool(self.independent) and all(verdict.passed for verdict in self.tests.values())
 
     def as_data(self) -> dict[str, Any]:
         """As it stands in model.json."""
@@ -74,6 +86,8 @@ class Certificate:
             "scope": self.scope,
             "stated_error": float(self.error) if np.isfinite(self.error) else None,
             "reason": self.reason,
+            "tested_on": self.tested_on,
+            "independent": list(self.independent),
             "tests": {name: verdict.as_data() for name, verdict in self.tests.items()},
         }
 
@@ -82,10 +96,11 @@ def certify_formulas(
     formulas: SymbolicDecomposition,
     found: IdentifiedField,
     portrait: PhasePortrait,
-    points: np.ndarray,
+    held_out: HeldOut,
     *,
     options: CertificateOptions,
     prediction: Verdict,
+    references: Sequence[Reference],
     relative_error: float = 0.0,
     wells: Sequence[Well] = (),
     compared: bool = False,
@@ -98,13 +113,15 @@ def certify_formulas(
     formulas
         V and g.
     found, portrait
-        The independently identified f, and the phase portrait that follows from it.
-    points
-        Held-out states of the region for which the formula claims to hold, shape ``(n, d)``.
+        F, identified without V, and the phase portrait that follows from it.
+    held_out
+        States and pairs of the region for which the formula claims to hold.
     options
         The limits.
     prediction
         The verdict on f.
+    references
+        V by characteristics about every attractor.
     relative_error
         Relative standard error of V from the uncertainty of f.
     wells
@@ -114,52 +131,30 @@ def certify_formulas(
     seed
         Draws of f, and the points on which the error is estimated.
     """
-    candidate = _of_formulas(formulas, points, portrait, relative_error)
+    candidate = _of_formulas(formulas, held_out.points, portrait, relative_error)
     return _certify(
-        candidate, found, portrait, options=options, prediction=prediction,
-        wells=wells, compared=compared, seed=seed,
+        candidate, found, portrait, held_out, options=options, prediction=prediction,
+        references=references, wells=wells, compared=compared, seed=seed,
     )  # fmt: skip
-
-
-def certify_potential(
-    potential: np.ndarray,
-    library: CandidateLibrary,
-    found: IdentifiedField,
-    portrait: PhasePortrait,
-    points: np.ndarray,
-    *,
-    options: CertificateOptions,
-    prediction: Verdict,
-    seed: int = 0,
-) -> Certificate:
-    """Certificate of V given by its coefficients over a library, shape ``(q,)``, with g = f + D∇V."""
-    basis = LibraryBasis(library, np.flatnonzero(potential))
-    own = potential[basis.chosen]
-    candidate = Candidate(
-        values=lambda x: basis.values(x) @ own,
-        gradients=lambda x: basis.gradients(x) @ own,
-        hessians=lambda x: basis.hessians(x) @ own,
-        circulatory=lambda x: found.dynamics.drift(x) + found.diffusion.push(x, basis.gradients(x) @ own),
-        points=points,
-        attractors=portrait.attractors,
-    )
-    return _certify(candidate, found, portrait, options=options, prediction=prediction, seed=seed)
 
 
 def _certify(
     candidate: Candidate,
     found: IdentifiedField,
     portrait: PhasePortrait,
+    held_out: HeldOut,
     *,
     options: CertificateOptions,
     prediction: Verdict,
-    wells: Sequence[Well] = (),
-    compared: bool = False,
-    seed: int = 0,
+    references: Sequence[Reference],
+    wells: Sequence[Well],
+    compared: bool,
+    seed: int,
 ) -> Certificate:
-    tests = _common(candidate, found, options, seed)
-    tests["identity"] = check_identity(candidate, found, limit=options.identity)
     error, worst = stated_error(candidate, found, seed=seed)
+    tests, error, place = _common(candidate, found, held_out, references, options, error, np.inf, seed)
+    worst = worst if place is None else place
+    tests["identity"] = check_identity(candidate, found, limit=options.identity)
     tests["error"] = check_error(error, limit=options.error)
     if wells:
         # The local route shares the error of f, and has the rest of its own.
@@ -171,34 +166,51 @@ def _certify(
     elif compared:
         tests["agreement"] = Verdict(np.inf, 0.0, False, ALONE)
     tests["prediction"] = prediction
-    return _conclude(tests, error, worst, portrait, "region")
+    return _conclude(tests, error, worst, portrait, "region", held_out.described)
 
 
 def certify_wells(
     refined: Refined,
     portrait: PhasePortrait,
+    held_out: HeldOut,
     *,
     options: CertificateOptions,
     prediction: Verdict,
+    references: Sequence[Reference],
     compared: bool = True,
     seed: int = 0,
 ) -> Certificate:
     """Certificate of one formula for each attractor, the worst of them deciding.
 
-    The Hessian of the local route is M by construction, so that its branch test passes by itself; what
-    tests it is the agreement with the network route, which does not know M.
+    The Hessian of the local route is M by construction, so that its branch test passes by itself; what tests
+    it are the characteristics. Each formula is tested on held-out states of its own well where it claims to
+    hold, and it has to claim more than half of them.
     """
     found = refined.found
     wells = refined.wells or refined.network_wells
     tests: dict[str, Verdict] = {}
     error, worst = (0.0, None) if wells else (np.inf, None)
+    tested = []
     for well in wells:
-        candidate = _of_well(well, portrait)
-        for name, verdict in _common(candidate, found, options, seed).items():
+        own = [place for place, one in enumerate(portrait.attractors) if _same(one.position, well.attractor)]
+        mine = [one for one in references if _same(one.attractor, well.attractor)]
+        part = part_of(held_out, well, basin_region(portrait, own[0]), mine[0] if mine else None)
+        tested.append(part.described)
+        if part.claimed < LEAST_CLAIMED:
+            reason = (
+                f"V claims to hold at {part.claimed:.0%} of the held-out states in the well about"
+                f" {_place(well.attractor)}: record more there, or raise refinement.degrees"
+            )
+            tests["hamilton_jacobi"] = Verdict(np.inf, options.hamilton_jacobi, False, reason)
+            error = np.inf
+            continue
+        candidate = _of_well(well, portrait, part.points)
+        its, place = stated_error(candidate, found, seed=seed)
+        made, its, there = _common(candidate, found, part, mine, options, its, well.level, seed)
+        for name, verdict in made.items():
             tests[name] = _worse(tests.get(name), verdict)
-        mine, place = _error_of(well, found, portrait, seed)
-        if mine >= error:
-            error, worst = mine, place
+        if its >= error:
+            error, worst = its, place if there is None else there
     missing = len(portrait.attractors) - len(wells)
     if missing or not wells:
         reason = f"{missing} of {len(portrait.attractors)} attractors have no formula"
@@ -209,12 +221,12 @@ def certify_wells(
             (one, two)
             for one in refined.network_wells
             for two in refined.wells
-            if np.array_equal(one.attractor, two.attractor)
+            if _same(one.attractor, two.attractor)
         ]
         for one, two in pairs:
-            own = _error_of(one, found, portrait, seed)[0]
+            its = _error_of(one, found, portrait, seed)[0]
             verdict = check_agreement(
-                one.values, [two], _sublevel_points([two]), limit=_explained(options, error, own)
+                one.values, [two], _sublevel_points([two]), limit=_explained(options, error, its)
             )
             tests["agreement"] = _worse(tests.get("agreement"), verdict)
         if len(pairs) < len(portrait.attractors):
@@ -224,7 +236,7 @@ def certify_wells(
     elif compared:
         tests["agreement"] = Verdict(np.inf, 0.0, False, ALONE)
     tests["prediction"] = prediction
-    return _conclude(tests, error, worst, portrait, "wells")
+    return _conclude(tests, error, worst, portrait, "wells", "; ".join(dict.fromkeys(tested)))
 
 
 def caustic_notes(
@@ -272,17 +284,24 @@ def uncertified(reason: str) -> dict[str, Any]:
 def _common(
     candidate: Candidate,
     found: IdentifiedField,
+    held_out: HeldOut,
+    references: Sequence[Reference],
     options: CertificateOptions,
+    error: float,
+    level: float,
     seed: int,
-) -> dict[str, Verdict]:
-    noise = 0.0
-    if not found.noise_free:  # V of thermal fluctuations: half the intensity
-        noise = 0.5 * found.diffusion.intensity(found.noise_rate)
-    return {
+) -> tuple[dict[str, Verdict], float, np.ndarray | None]:
+    """The tests of either scope, the error to be stated after them, and where V is worst if they tell."""
+    followed, error, place = check_characteristics(
+        candidate, found, references, error=error, options=options, level=level, seed=seed
+    )
+    tests = {
         "hamilton_jacobi": check_hamilton_jacobi(candidate, found, limit=options.hamilton_jacobi),
         "branch": check_branch(candidate, found, limit=options.branch, seed=seed),
-        "descent": check_descent(candidate, found, limit=options.descent, noise=noise),
+        "descent": check_descent(candidate, found, held_out.pairs, options=options, error=error),
+        "characteristics": followed,
     }
+    return tests, error, None if followed.passed else place
 
 
 def _of_formulas(
@@ -303,20 +322,24 @@ def _of_formulas(
     )
 
 
-def _of_well(well: Well, portrait: PhasePortrait) -> Candidate:
-    mine = [one for one in portrait.attractors if np.array_equal(one.position, well.attractor)]
-    return Candidate(well.values, well.gradients, well.hessians, None, _sublevel_points([well])[0], mine)
+def _same(one: np.ndarray, two: np.ndarray) -> bool:
+    return np.array_equal(one, two)
+
+
+def _of_well(well: Well, portrait: PhasePortrait, points: np.ndarray) -> Candidate:
+    mine = [one for one in portrait.attractors if _same(one.position, well.attractor)]
+    return Candidate(well.values, well.gradients, well.hessians, None, points, mine)
 
 
 def _sublevel_points(wells: Sequence[Well]) -> list[np.ndarray]:
-    """Points of each well below nine tenths of its level: at the saddle itself V is stationary."""
-    return [well.points[well.values(well.points) < 0.9 * well.level] for well in wells]
+    """Points of the fit of each well, below a share of its level: where two routes are compared."""
+    return [well.points[well.values(well.points) < SHARE * well.level] for well in wells]
 
 
 def _error_of(
     well: Well, found: IdentifiedField, portrait: PhasePortrait, seed: int
 ) -> tuple[float, np.ndarray | None]:
-    return stated_error(_of_well(well, portrait), found, seed=seed)
+    return stated_error(_of_well(well, portrait, _sublevel_points([well])[0]), found, seed=seed)
 
 
 def _explained(options: CertificateOptions, *errors: float) -> float:
@@ -331,10 +354,16 @@ def _worse(one: Verdict | None, two: Verdict) -> Verdict:
 
 
 def _conclude(
-    tests: dict[str, Verdict], error: float, worst: np.ndarray | None, portrait: PhasePortrait, scope: str
+    tests: dict[str, Verdict],
+    error: float,
+    worst: np.ndarray | None,
+    portrait: PhasePortrait,
+    scope: str,
+    tested_on: str,
 ) -> Certificate:
     fault = portrait.fault()
     if fault is not None:
-        tests["branch"] = Verdict(np.inf, tests["branch"].limit, False, fault)
+        limit = tests["branch"].limit if "branch" in tests else 0.0
+        tests["branch"] = Verdict(np.inf, limit, False, fault)
     refused = [verdict.reason for verdict in tests.values() if not verdict.passed]
-    return Certificate(tests, error, "; ".join(dict.fromkeys(refused)), scope)
+    return Certificate(tests, error, "; ".join(dict.fromkeys(refused)), scope, tested_on)

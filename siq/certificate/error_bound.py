@@ -20,6 +20,7 @@ from siq.dynamics.dynamics import Dynamics
 SAFETY = 2.0
 STEPS = 400
 RELAXATIONS = 12.0
+RUNAWAY = 3.0  # of the box's width from its middle: a path so far out does not come back to its attractor
 
 
 def residual_integral(
@@ -27,6 +28,7 @@ def residual_integral(
     dynamics: Dynamics,
     x: np.ndarray,
     *,
+    box: np.ndarray,
     slowest: float,
     fastest: float,
 ) -> np.ndarray:
@@ -40,6 +42,9 @@ def residual_integral(
         f and D.
     x
         Where the paths end, shape ``(n, d)``.
+    box
+        Shape ``(d, 2)``: of the states where V is asked for, and of its attractors. A path that leaves it by
+        `RUNAWAY` times its width in any state has run away, whatever the units.
     slowest, fastest
         Rates that set how long, and how finely, the paths are followed back.
 
@@ -51,7 +56,8 @@ def residual_integral(
     steps = int(np.clip(RELAXATIONS / slowest * fastest / 0.3, STEPS, 4000))
     step = RELAXATIONS / slowest / steps
     total = np.zeros(len(x))
-    size = np.abs(x).max() * 4
+    width = box[:, 1] - box[:, 0]
+    middle, far = box.mean(axis=1), RUNAWAY * np.where(width > 0, width, 1.0)
 
     def rate(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         slope, flow = gradient(points), dynamics.drift(points)
@@ -63,7 +69,7 @@ def residual_integral(
         for _ in range(steps):  # Heun's rule: the integrand is a bound, not a result
             ahead, _later = rate(x + step * velocity)
             moved = x + step / 2 * (velocity + ahead)
-            lost = ~(np.abs(moved) < size).all(axis=1)
+            lost = ~(np.abs(moved - middle) < far).all(axis=1)
             x = np.where(lost[:, None], x, moved)
             velocity, following = rate(x)
             total += step / 2 * (residual + following)

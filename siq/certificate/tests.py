@@ -1,17 +1,23 @@
 """The certificate: the tests that decide whether a formula of V may be believed.
 
 Each test can refuse what the others cannot see. The Hamilton–Jacobi equation has false solutions that are
-just as exact as the true one, so that no residual of it, however small, decides alone.
+just as exact as the true one, so that no residual of it, however small, decides alone. All tests share f, to
+which `prediction` belongs. `characteristics` shares nothing else with a fit of V, and no formula is
+certified without it.
 
 =================  ===========================================================================================
-`identity`         f, V, g as stored satisfy f = -D∇V + g, with f identified independently of V and g
+`identity`         f, V, g as stored satisfy f = -D∇V + g, with f identified apart from V and g
 `hamilton_jacobi`  ∇V·(f + D∇V) vanishes on held-out points, and ∇V does not
 `branch`           the Hessian at every attractor is M = W⁻¹, within the error that f leaves open; J is stable
-`descent`          V falls along the recordings
+`descent`          V falls along held-out recordings, from sample to sample or in the mean over their noise
 `error`            the error that V's own residual and the uncertainty of f leave is small enough to be stated
-`agreement`        both routes give the same V within their errors
+`characteristics`  V is that which characteristics carry, within that error
+`agreement`        both routes give the same V within their errors. Networks that do not agree with the local
+                   route are trained again: a test of consistency, and no evidence from elsewhere
 `prediction`       f predicts held-out recordings, and its residuals are white
 =================  ===========================================================================================
+
+`siq.certificate.characteristics` and `siq.certificate.descent` have those two tests, this module all others.
 """
 
 from __future__ import annotations
@@ -34,12 +40,39 @@ Function = Callable[[np.ndarray], np.ndarray]
 ERROR_POINTS = 300
 FINEST_ERROR = 1e-9  # relative, of V
 DRAWS = 40  # of f from its distribution, for the error of M
-STANDARD_ERRORS = 4.0
+STANDARD_ERRORS = 4.0  # exceeded by chance once in 16 000 times
+UNPREDICTED = "f does not predict held-out recordings"
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class CertificateOptions:
-    """Limits of the tests; each is widened by what the uncertainty of f explains.
+class PredictionLimits:
+    """Limits of the test of f.
+
+    Attributes
+    ----------
+    prediction
+        Median error of long-term prediction, for recordings without noise.
+    held_out_ratio
+        Mean square of the residuals of f on held-out recordings over that on its own, for recordings with
+        noise. The default, a tenth more, is what a systematic error of √0.1 of the noise adds.
+    false_alarms
+        Probability with which the noise alone refuses what is right; `descent` has it too. The default is
+        one in ten thousand runs.
+    """
+
+    prediction: Annotated[float, Field(gt=0)] = 0.01
+    held_out_ratio: Annotated[float, Field(gt=1)] = 1.1
+    false_alarms: Annotated[float, Field(gt=0, lt=0.5)] = 1e-4
+
+    @property
+    def of_f(self) -> PredictionLimits:
+        """These alone."""
+        return PredictionLimits(self.prediction, self.held_out_ratio, self.false_alarms)
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class CertificateOptions(PredictionLimits):
+    """Limits of the tests; those of the first three are widened by what the uncertainty of f explains.
 
     Attributes
     ----------
@@ -50,18 +83,17 @@ class CertificateOptions:
     branch
         Largest relative difference of the Hessian from M, in the metric of M.
     descent
-        Share of the held-out points at which V does not fall.
-    prediction
-        Median error of long-term prediction, for recordings without noise.
+        Share of the held-out pairs of samples along which V rises, for recordings without noise.
     error
         Largest relative error of V that a certificate may state.
+    prediction, held_out_ratio, false_alarms
+        See `PredictionLimits`.
     """
 
     identity: Annotated[float, Field(gt=0)] = 1e-3
     hamilton_jacobi: Annotated[float, Field(gt=0)] = 0.05
     branch: Annotated[float, Field(gt=0)] = 0.01
     descent: Annotated[float, Field(ge=0, lt=1)] = 0.01
-    prediction: Annotated[float, Field(gt=0)] = 0.01
     error: Annotated[float, Field(gt=0)] = 0.15
 
 
@@ -110,7 +142,7 @@ class Candidate:
 
 
 def check_identity(candidate: Candidate, found: IdentifiedField, *, limit: float) -> Verdict:
-    """Whether the stored V and g make up the independently identified f."""
+    """Whether the stored V and g make up the f that was identified without them."""
     flow = found.dynamics.drift(candidate.points)
     assert candidate.circulatory is not None
     x, noise = candidate.points, found.diffusion
@@ -164,26 +196,6 @@ def check_branch(candidate: Candidate, found: IdentifiedField, *, limit: float, 
     return Verdict(worst, allowed, passed, "" if passed else reason)
 
 
-def check_descent(candidate: Candidate, found: IdentifiedField, *, limit: float, noise: float) -> Verdict:
-    """Whether V falls along the flow at held-out points, other than where it is as low as the noise."""
-    gradient, flow = candidate.gradients(candidate.points), found.dynamics.drift(candidate.points)
-    fall = -(gradient * flow).sum(axis=1)
-    size = np.linalg.norm(gradient, axis=1) * np.linalg.norm(flow, axis=1)
-    values = candidate.values(candidate.points)
-    lowest = min(
-        (float(candidate.values(a.position[None])[0]) for a in candidate.attractors), default=values.min()
-    )
-    counts = values - lowest > max(1e-3 * np.ptp(values), 3 * noise)
-    if not counts.any():
-        return Verdict(1.0, limit, False, "V does not vary on the held-out points")
-    value = float((fall[counts] <= 1e-9 * size[counts]).mean())
-    below = float((values < lowest - 0.02 * np.ptp(values)).mean()) if candidate.attractors else 0.0
-    value = max(value, below)
-    return Verdict(
-        value, limit, value <= limit, "" if value <= limit else "V does not fall along the recordings"
-    )
-
-
 def stated_error(
     candidate: Candidate, found: IdentifiedField, *, seed: int = 0
 ) -> tuple[float, np.ndarray | None]:
@@ -207,7 +219,11 @@ def stated_error(
     width = np.where(width > 0, width, 1.0)
     jacobian = found.dynamics.jacobian(x) * width / width[:, None]
     fastest = float(np.quantile(np.linalg.norm(jacobian, axis=(1, 2)), 0.99))
-    integral = residual_integral(candidate.gradients, found.dynamics, x, slowest=slowest, fastest=fastest)
+    places = np.concatenate([candidate.points, [one.position for one in candidate.attractors]])
+    box = np.stack([places.min(axis=0), places.max(axis=0)], axis=1)
+    integral = residual_integral(
+        candidate.gradients, found.dynamics, x, box=box, slowest=slowest, fastest=fastest
+    )
     values = candidate.values(x)
     lowest = min(float(candidate.values(one.position[None])[0]) for one in candidate.attractors)
     reached = np.isfinite(integral)
@@ -261,9 +277,9 @@ def check_prediction(
     errors: np.ndarray | None,
     mean_probability: float | None,
     held_out_ratio: float,
-    limit: float,
+    limits: PredictionLimits,
 ) -> Verdict:
-    """Whether f, which both routes share, holds for recordings that it was not fitted to.
+    """Whether f, which every V here is made from, holds for recordings that it was not fitted to.
 
     Parameters
     ----------
@@ -275,21 +291,32 @@ def check_prediction(
         Probability of the mean of the held-out residuals, where they carry noise.
     held_out_ratio
         Mean square of the held-out residuals over that of the others.
-    limit
-        For the median of `errors`.
+    limits
+        Of the three.
+
+    Returns
+    -------
+    Verdict
+        Its figure is the median error; or how much larger the mean square is, as a share; or, where the mean
+        of the residuals refuses, how many powers of ten its probability lies below 1.
     """
     if noise_fault is not None:
-        return Verdict(np.inf, limit, False, noise_fault)
+        return Verdict(np.inf, limits.prediction, False, noise_fault)
     if errors is not None:
-        value = float(np.median(errors))
-        reason = "" if value <= limit else "f does not predict held-out recordings"
-        return Verdict(value, limit, value <= limit, reason)
+        value, limit = float(np.median(errors)), limits.prediction
+        return Verdict(value, limit, value <= limit, "" if value <= limit else UNPREDICTED)
     assert mean_probability is not None
-    if held_out_ratio > 1.1:
-        return Verdict(held_out_ratio - 1, 0.1, False, "f fits held-out recordings worse than its own")
-    passed = mean_probability > 1e-4
-    reason = "" if passed else "the residuals of f on held-out recordings have a mean: f misses a term"
-    return Verdict(max(held_out_ratio - 1, 0.0), 0.1, passed, reason)
+    value, limit = max(held_out_ratio - 1, 0.0), limits.held_out_ratio - 1
+    if not value <= limit:
+        return Verdict(value, limit, False, "f fits held-out recordings worse than its own")
+    rarity, rare = -float(np.log10(max(mean_probability, 1e-300))), -float(np.log10(limits.false_alarms))
+    if not rarity <= rare:
+        reason = (
+            "the residuals of f on held-out recordings have a mean, of a probability of"
+            f" {mean_probability:.1g}: f misses a term"
+        )
+        return Verdict(rarity, rare, False, reason)
+    return Verdict(value, limit, True)
 
 
 def _relative_error_of_drift(found: IdentifiedField, points: np.ndarray) -> float:

@@ -112,6 +112,7 @@ def characteristics(
     spacing: float = 0.05,
     time_limit: float | None = None,
     tolerance: float = 1e-10,
+    most_steps: int = MOST_STEPS,
 ) -> Fan:
     """Follow characteristics until V reaches a level, a caustic is met, or a box or a time limit is left.
 
@@ -139,6 +140,8 @@ def characteristics(
         In time units; by default 60 of the slowest relaxation times.
     tolerance
         Local error, relative to the distance from A, to V and to the tangents.
+    most_steps
+        Of any curve: what takes more, in a stiff system, ends as `End.STALLED`.
 
     Notes
     -----
@@ -155,7 +158,7 @@ def characteristics(
     if time_limit is None:
         time_limit = LONGEST_TIME / np.abs(np.linalg.eigvals(flow.jacobian).real).min()
 
-    run = _Run(flow, np.asarray(box, dtype=float), spacing, time_limit, tolerance)
+    run = _Run(flow, np.asarray(box, dtype=float), spacing, time_limit, tolerance, most_steps)
     states, curve, ends = run.follow(initial)
     met = ends[curve] == End.CAUSTIC
     met &= np.append(curve[1:] != curve[:-1], True)
@@ -203,10 +206,16 @@ class _Run:
     """Many curves at once, each with a step of its own, until each has ended."""
 
     def __init__(
-        self, flow: HamiltonianFlow, box: np.ndarray, spacing: float, time_limit: float, tolerance: float
+        self,
+        flow: HamiltonianFlow,
+        box: np.ndarray,
+        spacing: float,
+        time_limit: float,
+        tolerance: float,
+        most_steps: int,
     ) -> None:
         self.flow, self.box, self.spacing = flow, box, spacing
-        self.time_limit, self.tolerance = time_limit, tolerance
+        self.time_limit, self.tolerance, self.most_steps = time_limit, tolerance, most_steps
 
     def follow(self, initial: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """States of all points, the curve of each, and why each curve ends."""
@@ -216,7 +225,7 @@ class _Run:
         last_steps = np.zeros(count)
         running = np.arange(count)
         kept, kept_curves = [initial], [running]
-        for _ in range(MOST_STEPS):
+        for _ in range(self.most_steps):
             if not len(running):
                 break
             step = np.minimum(steps[running], self._longest(states[running]))

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import pandas as pd
 
-from siq.steps.outcomes import Status
+from siq.steps.outcomes import Method, Status
+
+SAME = "same_as_refined"  # the row of a control that compares it with the refined V
 
 
 def answer_sentences(
@@ -95,3 +97,30 @@ def _mean_text(row: pd.Series) -> str:
 
 def _with_spread(values: pd.Series) -> str:
     return f"{values.mean():.2e}" + (f" ± {values.std():.1e}" if len(values) > 1 else "")
+
+
+def control_sentences(certificates: pd.DataFrame) -> list[str]:
+    """What became of the control, a network with its weights in random order; none where there is none.
+
+    Parameters
+    ----------
+    certificates
+        The table of that name. `same_as_refined` is no test of the control but a comparison.
+    """
+    mine = certificates[certificates["method"] == Method.CONTROL]
+    if not len(mine):
+        return []
+    compared = mine["test"] == SAME
+    certified = mine[~compared].groupby("run")["passed"].all()
+    same = mine[compared].set_index("run")["passed"].reindex(certified.index, fill_value=False).astype(bool)
+    runs = len(certified)
+    sentence = (
+        "The control, a network with its weights in random order that was refined and tested as the real one,"
+        f" was refused in {int((~certified).sum())} of {runs} runs"
+    )
+    if (certified & same).any():
+        sentence += f"; in {int((certified & same).sum())} refinement led from it to the same V all the same"
+    false = int((certified & ~same).sum())
+    if false:
+        sentence += f"; in {false} ANOTHER V than the refined one was certified: believe neither"
+    return [sentence + "."]

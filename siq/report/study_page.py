@@ -17,7 +17,7 @@ from siq.report.formatting import formula_mathml, vector_mathml
 from siq.report.invariant_tables import invariant_tables
 from siq.report.landscape_tables import landscape_figures, landscape_tables
 from siq.report.page import FormulaRow, ReportContent, ReportFigure, ReportTable
-from siq.report.sentences import answer_sentences
+from siq.report.sentences import answer_sentences, control_sentences
 from siq.steps.outcomes import METHODS, Method, Status
 from siq.steps.shown import ModelFiles, Shown
 from siq.study.study import Study
@@ -314,8 +314,9 @@ def _certificate_tables(
     )
     return [
         ReportTable(
-            "The certificate: how many runs passed each test. The U of a randomised network is the control,"
-            " and has to be refused.",
+            " ".join([
+                "The certificate: how many runs passed each test.", *control_sentences(certificates)
+            ]),
             counted.reset_index(), {}, f"{folder}/certificates.csv", rows_shown=40,
         ),
         ReportTable(

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from pydantic.dataclasses import dataclass
 
-from siq.certificate.tests import Verdict, check_prediction
+from siq.certificate.tests import PredictionLimits, Verdict, check_prediction
 from siq.data.held_out import held_out_recordings
 from siq.data.recordings import Recordings, SnapshotPairs, select_recordings, snapshot_pairs
 from siq.errors import NumericalFailure
@@ -34,13 +34,13 @@ PREDICTED = 200  # held-out recordings that are predicted: enough for a median
 
 @dataclass(frozen=True, config=STRICT)
 class IdentifySettings:
-    """What the identification depends on; `prediction` is the certificate's limit for f."""
+    """What the identification depends on; `prediction` has the certificate's limits for f."""
 
     seed: int
     space: StateSpace
     sampling: Sampling
     identification: IdentificationOptions
-    prediction: float
+    prediction: PredictionLimits
 
 
 @plain_dataclass(frozen=True)
@@ -89,7 +89,7 @@ def _identified(settings: IdentifySettings, recordings: Recordings, number: int)
         found = fitted = identify_pairs(parts[0])
     found, noise, source = _with_diffusion(found, recordings, settings)
     verdict = _held_out_verdict(
-        found, fitted, parts, held_out, fault=noise.fault(recordings.names), limit=settings.prediction
+        found, fitted, parts, held_out, fault=noise.fault(recordings.names), limits=settings.prediction
     )
     kept = {
         "kind": noise.kind,
@@ -136,14 +136,14 @@ def _held_out_verdict(
     held_out: Recordings,
     *,
     fault: str | None,
-    limit: float,
+    limits: PredictionLimits,
 ) -> Verdict:
     """Whether f holds for recordings that it was not fitted to."""
     if found.noise_free:
         labels = np.arange(min(len(held_out.labels), PREDICTED))
         errors = prediction_errors(found.dynamics, select_recordings(held_out, labels))
         return check_prediction(
-            noise_fault=fault, errors=errors, mean_probability=None, held_out_ratio=1.0, limit=limit
+            noise_fault=fault, errors=errors, mean_probability=None, held_out_ratio=1.0, limits=limits
         )
     training, unseen = parts
     squares = [
@@ -154,7 +154,7 @@ def _held_out_verdict(
         errors=None,
         mean_probability=mean_residual_probability(fitted, unseen),
         held_out_ratio=squares[0] / squares[1],
-        limit=limit,
+        limits=limits,
     )
 
 

@@ -6,6 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from siq.certificate.tests import PredictionLimits
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.sampling import complete
 from siq.dynamics.simulation import SimulationOptions
@@ -73,9 +74,9 @@ class StudyParts:
         return METHODS if self.study.training is not None else (Method.REFINED,)
 
     @property
-    def prediction(self) -> float:
-        """The certificate's limit for f."""
-        return self.study.certificate.prediction
+    def prediction(self) -> PredictionLimits:
+        """The certificate's limits for f."""
+        return self.study.certificate.of_f
 
     @property
     def domain(self) -> tuple[tuple[float, float], ...] | None:

@@ -41,7 +41,8 @@ class Method(StrEnum):
     """Whose formulas they are.
 
     ``regression`` is the published method, ``refined`` ours. ``randomised network`` is no method but the
-    control, the U of a network with its weights in random order: it must never be certified.
+    control, a network with its weights in random order, refined as the real one is: no other V than the
+    refined one may come of it with a certificate.
     """
 
     REGRESSION = "regression"

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from pydantic.dataclasses import dataclass
 
-from siq.certificate.tests import CertificateOptions
+from siq.certificate.tests import CertificateOptions, PredictionLimits
 from siq.data.recordings import Recordings
 from siq.identify.identification import IdentificationOptions
 from siq.landscape.options import LandscapeOptions
@@ -61,9 +61,9 @@ class PipelineSettings:
     landscape: LandscapeOptions | None = LandscapeOptions()
 
     @property
-    def prediction(self) -> float:
-        """The certificate's limit for f."""
-        return self.certificate.prediction
+    def prediction(self) -> PredictionLimits:
+        """The certificate's limits for f."""
+        return self.certificate.of_f
 
     def of(self, cls: type[Settings]) -> Settings:
         """The settings of one step."""

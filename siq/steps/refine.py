@@ -1,13 +1,15 @@
 """Refine: which V solves the Hamilton–Jacobi equation of the identified f, and may it be believed?
 
 How the method works, steps 6 to 8. The formulas of the regression are certified beside the refined ones, and
-so is a control that has to be refused.
+so is a control: what the same refinement makes of a network with its weights in random order.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass as plain_dataclass
+from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -15,25 +17,26 @@ import numpy as np
 from pydantic.dataclasses import dataclass
 
 from siq.certificate.certify import (
+    HARMLESS,
     Certificate,
     caustic_notes,
     certify_formulas,
-    certify_potential,
     certify_wells,
     uncertified,
 )
-from siq.certificate.tests import CertificateOptions, Verdict
+from siq.certificate.characteristics import Reference, references_about
+from siq.certificate.held_out import HeldOut
+from siq.certificate.tests import CertificateOptions, Function, Verdict
 from siq.data.held_out import held_out_recordings
-from siq.data.recordings import Recordings, snapshot_pairs
+from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
 from siq.dynamics.phase_portrait import PhasePortrait, evenly_spread, phase_portrait
 from siq.errors import NumericalFailure
 from siq.identify.identified_field import IdentifiedField
 from siq.identify.storage import FieldRecord
 from siq.networks.trained import TrainedNetworks, shuffled
 from siq.numerics.randomness import Purpose, generator
-from siq.potential.global_route import fit_values
 from siq.potential.refined_formulas import refined_decomposition, relative_error_of
-from siq.potential.refinement import RefinementOptions, formula_library, refine
+from siq.potential.refinement import Refined, RefinementOptions, formula_library, refine
 from siq.potential.storage import model_to_data, write_model
 from siq.potential.symbolic import SymbolicDecomposition, term_coefficients
 from siq.potential.well import Well
@@ -99,6 +102,7 @@ def run(settings: RefineSettings, given: RunToRefine) -> RefinedRun:
     formulas = {} if given.regressed is None else {Method.REGRESSION: given.regressed}
     certificates: dict[Method, Mapping[str, Any]] = {}
     certificate: Certificate | None = None
+    ground: Ground | None = None
     if (missing := _missing(settings, given)) is not None:
         outcome = Outcome(number, Step.REFINE, Status.SKIPPED, missing)
     else:
@@ -106,8 +110,6 @@ def run(settings: RefineSettings, given: RunToRefine) -> RefinedRun:
             ground = Ground(settings, given)
             if given.regressed is not None:
                 certificates[Method.REGRESSION] = ground.certify(given.regressed).as_data()
-            if ground.networks is not None:
-                certificates[Method.CONTROL] = control(ground, ground.networks).as_data()
             refined, certificate, notes = refine_and_certify(ground, given.regressed)
             formulas[Method.REFINED] = refined
             certificates[Method.REFINED] = certificate.as_data() | {"notes": list(notes)}
@@ -116,6 +118,9 @@ def run(settings: RefineSettings, given: RunToRefine) -> RefinedRun:
             outcome = Outcome(number, Step.REFINE, status, reason)
         except (NumericalFailure, np.linalg.LinAlgError) as error:
             outcome = Outcome(number, Step.REFINE, Status.FAILED, str(error))
+    if ground is not None and ground.networks is not None:
+        theirs = (formulas.get(Method.REFINED), certificate)
+        certificates[Method.CONTROL] = control(ground, ground.networks, *theirs)
     for method in formulas.keys() - certificates.keys():
         certificates[method] = uncertified(f"no test was made: {outcome.reason}")
     return RefinedRun(formulas, certificates, outcome, certificate)
@@ -135,8 +140,9 @@ class Ground:
 
     Attributes
     ----------
-    points, unseen
-        States on which formulas are sought and tested, of recordings that take part and that are held out.
+    points, held_out
+        States on which formulas are sought, of recordings that take part; and of those that are held out the
+        states, and pairs of samples, on which they are tested.
     options
         How V is refined, with the routes that there are.
     portrait
@@ -157,8 +163,14 @@ class Ground:
         held, x = mask[pairs.recording], pairs.x0
         draw = generator(settings.seed, self.number, Purpose.REFINE)
         self.points = x[~held][evenly_spread(x[~held], generator=draw)]
-        self.unseen = x[held][evenly_spread(x[held], generator=draw)]
+        unseen = x[held][evenly_spread(x[held], generator=draw)]
+        self.held_out = HeldOut(unseen, _rows(pairs, held))
         self.portrait: PhasePortrait = phase_portrait(self.found.dynamics, self.points, seed=self.number)
+
+    @cached_property
+    def references(self) -> tuple[Reference, ...]:
+        """V by characteristics about every attractor: the same for all formulas of the run."""
+        return references_about(self.found.dynamics, self.portrait, seed=self.number)
 
     def network(self, x: np.ndarray) -> np.ndarray:
         """V_θ at points."""
@@ -171,11 +183,25 @@ class Ground:
             formulas,
             self.found,
             self.portrait,
-            self.unseen,
+            self.held_out,
             options=self.settings.certificate,
             prediction=self.prediction(),
+            references=self.references,
             seed=self.number,
             **details,
+        )
+
+    def certify_wells(self, refined: Refined, *, compared: bool) -> Certificate:
+        """Certificate of one formula for each attractor."""
+        return certify_wells(
+            refined,
+            self.portrait,
+            self.held_out,
+            options=self.settings.certificate,
+            prediction=self.prediction(),
+            references=self.references,
+            compared=compared,
+            seed=self.number,
         )
 
     def prediction(self) -> Verdict:
@@ -189,45 +215,109 @@ def refine_and_certify(
     ground: Ground, regressed: SymbolicDecomposition | None
 ) -> tuple[SymbolicDecomposition, Certificate, tuple[str, ...]]:
     """Refined formulas of a run with their certificate, and what could not be done."""
-    options = ground.options
-    library = formula_library(ground.found, options)
-    compared = options.routes is not None and len(options.routes) == 2
+    library = formula_library(ground.found, ground.options)
     formula = None
     if regressed is not None and regressed.potential is not None:
         named = term_coefficients(regressed.potential)
         formula = np.array([named.get(name, 0.0) for name in library.names])
-    refined = refine(
-        ground.found, ground.portrait, library=library, formula=formula,
-        network=None if ground.networks is None else ground.network,
-        points=ground.points, options=options, seed=ground.number,
-    )  # fmt: skip
-    formulas = refined_decomposition(refined, ground.points)
-    if formulas.potential is not None:
-        certificate = ground.certify(
-            formulas,
-            wells=refined.wells,
-            relative_error=relative_error_of(refined, ground.points),
-            compared=compared,
-        )
-    else:
-        certificate = certify_wells(
-            refined, ground.portrait, options=ground.settings.certificate, prediction=ground.prediction(),
-            compared=compared, seed=ground.number,
-        )  # fmt: skip
+    network = None if ground.networks is None else ground.network
+    refined, formulas, certificate = _refined(ground, ground.options, network, formula)
     caustics = caustic_notes(refined, ground.portrait, certificate.error, seed=ground.number)
     return formulas, certificate, (*refined.notes, *caustics)
 
 
-def control(ground: Ground, networks: TrainedNetworks) -> Certificate:
-    """Certificate of the U of a randomised network: one that must be refused, or the tests are no tests."""
+def _refined(
+    ground: Ground, options: RefinementOptions, network: Function | None, formula: np.ndarray | None
+) -> tuple[Refined, SymbolicDecomposition, Certificate]:
+    """What the routes make of their starts, with its certificate."""
+    compared = options.routes is not None and len(options.routes) == 2
+    refined = refine(
+        ground.found, ground.portrait, library=formula_library(ground.found, options), formula=formula,
+        network=network, points=ground.points, options=options, seed=ground.number,
+    )  # fmt: skip
+    formulas = refined_decomposition(refined, ground.points)
+    if formulas.potential is None:
+        return refined, formulas, ground.certify_wells(refined, compared=compared)
+    error = relative_error_of(refined, ground.points)
+    certificate = ground.certify(
+        formulas, wells=refined.wells, relative_error=error, compared=compared
+    )  # fmt: skip
+    return refined, formulas, certificate
+
+
+def control(
+    ground: Ground,
+    networks: TrainedNetworks,
+    refined: SymbolicDecomposition | None,
+    certificate: Certificate | None,
+) -> dict[str, Any]:
+    """What becomes of a network with its weights in random order, refined and tested as the real one is.
+
+    Gauss–Newton from a random start ends nowhere, at a false solution that is as exact as the true one, or at
+    the true one. The tests have to refuse the first two; `same_as_refined` tells the third.
+
+    Parameters
+    ----------
+    ground, networks
+        What the real refinement had.
+    refined, certificate
+        What came of it, None where nothing did.
+
+    Returns
+    -------
+    dict
+        A certificate as it stands in `model.json`. `same_as_refined` among its tests has the largest
+        relative difference from the refined V in any well; it takes no part in whether it is certified.
+    """
     draw = generator(ground.settings.seed, ground.number, Purpose.SHUFFLE)
     randomised = shuffled(networks, generator=draw)
-    library = ground.found.library
-    coefficients = fit_values(library, ground.points, randomised.evaluate(ground.points).potential)
-    return certify_potential(
-        coefficients, library, ground.found, ground.portrait, ground.unseen,
-        options=ground.settings.certificate, prediction=ground.prediction(), seed=ground.number,
-    )  # fmt: skip
+    options = replace(ground.options, routes=("network",))
+    limit = ground.settings.certificate.hamilton_jacobi
+    try:
+        _, formulas, made = _refined(ground, options, lambda x: randomised.evaluate(x).potential, None)
+    except (NumericalFailure, np.linalg.LinAlgError) as error:
+        nothing = Verdict(np.inf, limit, False, f"refinement from random weights led to no V: {error}")
+        return uncertified(nothing.reason) | {"tests": {"hamilton_jacobi": nothing.as_data()}}
+    data = made.as_data()
+    if refined is None or certificate is None:
+        return data
+    difference = _difference(formulas, refined, ground.references)
+    explained = HARMLESS + sum(one.error for one in (made, certificate) if np.isfinite(one.error))
+    same = bool(difference <= explained)
+    if made.certified:
+        data["reason"] = (
+            "refinement from random weights led to the same V" if same else
+            "a V from random weights was certified that is not the refined one: one of the two is false"
+        )  # fmt: skip
+    verdict = Verdict(difference, explained, same, "" if same else "it is another V than the refined one")
+    data["tests"]["same_as_refined"] = verdict.as_data()
+    return data
+
+
+def _difference(
+    one: SymbolicDecomposition, two: SymbolicDecomposition, references: Sequence[Reference]
+) -> float:
+    """Largest relative L2 difference of two V about any attractor; infinite where one has none there."""
+    worst = 0.0 if references else np.inf
+    for reference in references:
+        x, attractor = reference.points, reference.attractor
+        first, second = (_about(formulas, attractor) for formulas in (one, two))
+        if first is None or second is None or not len(x):
+            return np.inf
+        mine, theirs = (values(x) - values(attractor[None]) for values in (first, second))
+        worst = max(worst, float(np.linalg.norm(mine - theirs) / np.linalg.norm(theirs)))
+    return worst
+
+
+def _about(formulas: SymbolicDecomposition, attractor: np.ndarray) -> Function | None:
+    """V about an attractor: of the region, or of that well."""
+    if formulas.potential is not None:
+        return lambda x: np.asarray(formulas.evaluate(np.ascontiguousarray(x.T))[0])
+    return next((one.values for one in formulas.wells if np.array_equal(one.attractor, attractor)), None)
+
+
+def _rows(pairs: SnapshotPairs, rows: np.ndarray) -> SnapshotPairs:
+    return SnapshotPairs(pairs.x0[rows], pairs.xh[rows], pairs.h[rows], pairs.recording[rows])
 
 
 def write(refined: RefinedRun, *, model: str | Path, outcome: str | Path) -> None:

@@ -30,10 +30,13 @@ from known_systems import (
     uniform_points,
 )
 
-from siq.certificate.certify import Certificate, certify_formulas, certify_potential, certify_wells
+from siq.certificate.certify import Certificate, certify_formulas, certify_wells
+from siq.certificate.characteristics import Reference, check_characteristics, references_about
+from siq.certificate.held_out import HeldOut
 from siq.certificate.tests import (
     Candidate,
     CertificateOptions,
+    PredictionLimits,
     Verdict,
     check_agreement,
     check_branch,
@@ -41,7 +44,7 @@ from siq.certificate.tests import (
     check_prediction,
     stated_error,
 )
-from siq.data.recordings import Recordings
+from siq.data.recordings import Recordings, SnapshotPairs
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.phase_portrait import PhasePortrait
 from siq.dynamics.simulation import SimulationOptions, simulate_snapshots
@@ -86,11 +89,44 @@ def certified(
     if circulatory is not None:
         formulas = replace(formulas, circulatory=circulatory)
     return certify_formulas(
-        formulas, found, portrait_of(known, 300, share=share),
-        uniform_points(known, 150, seed=5, share=share),
+        formulas, found, portrait_of(known, 300, share=share), held_out_of(known, share=share),
         options=CertificateOptions(), prediction=prediction, wells=wells,
-        relative_error=relative_error,
+        references=references_of(known, share=share), relative_error=relative_error,
     )  # fmt: skip
+
+
+def held_out_of(known: KnownSystem, *, share: float = 0.6, count: int = 150) -> HeldOut:
+    """States from all over the domain, and where each comes to in a hundredth of a time unit."""
+    x0 = uniform_points(known, count, seed=5, share=share)
+    return HeldOut(x0, pairs_from(known, x0, 0.01))
+
+
+def pairs_from(known: KnownSystem, x0: np.ndarray, h: float) -> SnapshotPairs:
+    """Pairs without noise, by the classical Runge–Kutta rule."""
+    drift = known.dynamics.drift
+    first = drift(x0)
+    second = drift(x0 + h / 2 * first)
+    third = drift(x0 + h / 2 * second)
+    fourth = drift(x0 + h * third)
+    xh = x0 + h / 6 * (first + 2 * second + 2 * third + fourth)
+    return SnapshotPairs(x0, xh, np.full(len(x0), h), np.arange(len(x0)))
+
+
+def references_of(known: KnownSystem, *, share: float = 0.6, count: int = 300) -> tuple[Reference, ...]:
+    """V by characteristics, made once for a system."""
+    text = (str(known.dynamics.formulas), known.diffusion.tobytes(), known.domain.tobytes(), count, share)
+    if text not in _REFERENCES:
+        _REFERENCES[text] = references_about(known.dynamics, portrait_of(known, count, share=share))
+    return _REFERENCES[text]
+
+
+_REFERENCES: dict[tuple[object, ...], tuple[Reference, ...]] = {}
+
+
+def over_terms(found: IdentifiedField, coefficients: np.ndarray) -> sympy.Expr:
+    """V as a formula, from its coefficients over the library of f."""
+    terms = zip(found.library.terms, coefficients, strict=True)
+    return sympy.Add(*(sympy.Float(float(value)) * term for term, value in terms))
 
 
 def refusals(certificate: Certificate) -> set[str]:
@@ -250,7 +286,7 @@ def test_false_solutions_are_refused_by_the_test_that_is_meant_for_them(name: st
     case = FALSE[name]
     certificate = certified(case.known, case.potential)
     assert not certificate.certified
-    assert case.refused_by <= refusals(certificate), certificate.tests
+    assert case.refused_by | {"characteristics"} <= refusals(certificate), certificate.tests
     assert not case.blind & refusals(certificate), certificate.tests
     assert certificate.reason
     assert certificate.as_data()["certified"] is False
@@ -336,14 +372,19 @@ def test_every_other_invariant_subspace_is_refused(dimension: int, rotation: flo
         candidate = in_basis(basis, own, points, portrait)
         equation = check_hamilton_jacobi(candidate, found, limit=0.05)
         branch = check_branch(candidate, found, limit=0.01)
+        followed, _, _ = check_characteristics(
+            candidate, found, references_of(known), error=1e-6, options=CertificateOptions()
+        )
         if np.allclose(hessian, true, rtol=1e-6, atol=1e-8):
             accepted += 1
             assert equation.passed
             assert branch.passed
+            assert followed.passed
         else:
             zero = np.abs(hessian).max() < 1e-9 * np.abs(true).max()
             assert equation.passed is not zero
             assert not branch.passed
+            assert not followed.passed
     assert accepted == 1
 
 
@@ -354,7 +395,6 @@ def test_every_other_invariant_subspace_is_refused(dimension: int, rotation: flo
 def test_a_network_trained_for_too_short_ends_in_an_exact_false_solution(seed: int) -> None:
     known = archetype(3)
     found, points = exact_field(known, 5), uniform_points(known, 400, share=0.7)
-    setting = portrait_of(known, 300, share=0.6)
     direction = np.random.default_rng(seed).normal(size=3)
     # V as a short training leaves it: hardly any curvature along y - z, and everything a little wrong.
     network = 0.9 * ((points[:, 0] ** 2 - 1) ** 2 / 2 + (points[:, 1] + points[:, 2]) ** 2 / 4)
@@ -362,12 +402,9 @@ def test_a_network_trained_for_too_short_ends_in_an_exact_false_solution(seed: i
     start = fit_values(found.library, points, network)
     refined = refine_globally(start, found.library, found, points, sparse=False)
     rough, exact = (
-        certify_potential(
-            coefficients, found.library, found, setting, points,
-            options=CertificateOptions(), prediction=PASSED,
-        )
+        certified(known, over_terms(found, coefficients), found=found)
         for coefficients in (start, refined.coefficients)
-    )  # fmt: skip
+    )
     assert {"hamilton_jacobi", "branch", "error"} <= refusals(rough)
     # Refined it solves the equation to rounding, and is off by three quarters.
     assert refined.residual < 1e-12
@@ -397,15 +434,9 @@ def test_a_randomised_network_is_refused(seed: int) -> None:
     values = random.evaluate(points).potential
     start = fit_values(found.library, points, values)
     plain, refined = (
-        certify_potential(
-            coefficients, found.library, found, portrait_of(known, 300, share=0.6), points,
-            options=CertificateOptions(), prediction=PASSED,
-        )
-        for coefficients in (
-            start,
-            refine_globally(start, found.library, found, points).coefficients,
-        )
-    )  # fmt: skip
+        certified(known, over_terms(found, coefficients), found=found)
+        for coefficients in (start, refine_globally(start, found.library, found, points).coefficients)
+    )
     assert not plain.certified
     assert {"hamilton_jacobi", "branch"} & refusals(plain)
     if refined.certified:  # Gauss–Newton may find the truth from anywhere, but then it is the truth
@@ -504,8 +535,9 @@ def test_a_wrong_f_is_refused_by_the_prediction_alone() -> None:
     for dynamics, passes in [(known.dynamics, True), (wrong.dynamics, False)]:
         errors = prediction_errors(dynamics, held_out(known))
         prediction = check_prediction(
-            noise_fault=None, errors=errors, mean_probability=None, held_out_ratio=1.0, limit=0.01
-        )
+            noise_fault=None, errors=errors, mean_probability=None, held_out_ratio=1.0,
+            limits=PredictionLimits(),
+        )  # fmt: skip
         assert prediction.passed is passes
     certificate = certified(wrong, wrong.potential, prediction=prediction)
     assert refusals(certificate) == {"prediction"}
@@ -526,10 +558,12 @@ def test_a_wrong_f_is_refused_by_the_prediction_alone() -> None:
 )
 def test_the_verdict_on_f(options: dict, passes: bool, reason: str) -> None:
     settings = {
-        "noise_fault": None, "errors": None, "mean_probability": None, "held_out_ratio": 1.0, "limit": 0.01
+        "noise_fault": None, "errors": None, "mean_probability": None, "held_out_ratio": 1.0,
+        "limits": PredictionLimits(),
     }  # fmt: skip
     verdict = check_prediction(**{**settings, **options})
     assert verdict.passed is passes
+    assert (verdict.value <= verdict.limit) is passes
     assert reason in verdict.reason
     assert verdict.as_data()["passed"] is passes
 
@@ -552,8 +586,8 @@ def test_a_well_that_is_missing_is_refused() -> None:
     known = archetype(2)
     refined = of_wells(known, wells_of(known)[:1])
     certificate = certify_wells(
-        refined, portrait_of(known, 300, share=0.6), options=CertificateOptions(), prediction=PASSED,
-        compared=False,
+        refined, portrait_of(known, 300, share=0.6), held_out_of(known), options=CertificateOptions(),
+        prediction=PASSED, references=references_of(known), compared=False,
     )  # fmt: skip
     assert "branch" in refusals(certificate)
     assert "1 of 2 attractors have no formula" in certificate.reason
@@ -571,9 +605,11 @@ def test_wells_by_both_routes_must_agree() -> None:
     foreign = tuple(
         replace(two, attractor=one.attractor) for one, two in zip(wells, other, strict=True)
     )  # fmt: skip
-    same = certify_wells(of_wells(known, wells, wells), setting, options=options, prediction=PASSED)
+    seen = (setting, held_out_of(known))
+    told = {"options": options, "prediction": PASSED, "references": references_of(known)}
+    same = certify_wells(of_wells(known, wells, wells), *seen, **told)
     assert same.certified, same.reason
-    different = certify_wells(of_wells(known, wells, foreign), setting, options=options, prediction=PASSED)
+    different = certify_wells(of_wells(known, wells, foreign), *seen, **told)
     assert refusals(different) == {"agreement"}
 
 
@@ -598,8 +634,10 @@ def test_the_error_that_is_stated_lies_above_the_true_one(beta: float, barrier: 
         degree=8, generator=np.random.default_rng(0),
     )  # fmt: skip
     certificate = certify_wells(
-        of_wells(known, (well,)), setting, options=CertificateOptions(), prediction=PASSED, compared=False
-    )
+        of_wells(known, (well,)), setting, held_out_of(known, share=1.0, count=600),
+        options=CertificateOptions(), prediction=PASSED,
+        references=references_of(known, share=1.0, count=400), compared=False,
+    )  # fmt: skip
     fan = fan_of(beta, barrier / 2)
     kept = lowest_sheet(fan)
     at, exact = fan.points[kept], fan.values[kept]
@@ -632,8 +670,8 @@ def test_a_phase_portrait_with_a_fault_refuses_whatever_else_passes() -> None:
     assert faulty.fault() is not None
     formulas = exact_decomposition(known.dynamics, 2 * known.potential)
     certificate = certify_formulas(
-        formulas, exact_field(known, 3), faulty, uniform_points(known, 200, share=0.7),
-        options=CertificateOptions(), prediction=PASSED,
+        formulas, exact_field(known, 3), faulty, held_out_of(known), options=CertificateOptions(),
+        prediction=PASSED, references=references_of(known),
     )  # fmt: skip
     assert not certificate.certified
     assert "another attractor" in certificate.reason

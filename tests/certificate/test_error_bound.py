@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+import sympy
 from known_systems import (
     KnownSystem,
     archetype,
@@ -23,7 +24,7 @@ Gradient = Callable[[np.ndarray], np.ndarray]
 def integral(known: KnownSystem, gradient: Gradient, x: np.ndarray) -> np.ndarray:
     rates = [np.linalg.eigvals(known.dynamics.jacobian(one[None])[0]).real for one in known.attractors]
     return residual_integral(
-        gradient, known.dynamics, x,
+        gradient, known.dynamics, x, box=known.domain,
         slowest=-max(rate.max() for rate in rates),
         fastest=float(np.linalg.norm(known.dynamics.jacobian(x), axis=(1, 2)).max()),
     )  # fmt: skip
@@ -103,11 +104,25 @@ def test_other_units_give_the_same_bound() -> None:
         return 1.1 * potential_gradient(known, points) * [1.0, 0.8]
 
     options = {"slowest": 2.0, "fastest": 10.0}
-    one = residual_integral(wrong, known.dynamics, x, **options)
+    one = residual_integral(wrong, known.dynamics, x, box=known.domain, **options)
     two = residual_integral(
         lambda points: wrong(points / units) / units,
         scaled,
         x * units,
+        box=known.domain * units[:, None],
         **options,
     )
     np.testing.assert_allclose(two, one, rtol=1e-6)
+
+
+@pytest.mark.parametrize("units", [np.ones(2), np.array([1.0, 1e4])], ids=["one", "ten thousand"])
+def test_a_path_has_run_away_in_whatever_units_the_other_state_is(units: np.ndarray) -> None:
+    # Upwards in time x falls by x' = -x as it should, and y drifts off by 2 a unit of time.
+    x, y = sympy.symbols("x y", real=True)
+    dynamics = Dynamics.of((x, y), (-x * float(units[0]) / float(units[0]), y * 0 + 2 * float(units[1])))
+    starts = np.array([[0.5, 0.5], [0.2, -0.5]]) * units
+    found = residual_integral(
+        lambda points: np.column_stack([points[:, 0], np.zeros(len(points))]), dynamics, starts,
+        box=np.array([[-1.0, 1.0], [-1.0, 1.0]]) * units[:, None], slowest=1.0, fastest=1.0,
+    )  # fmt: skip
+    assert not np.isfinite(found).any()

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from known_systems import as_system, linear_system
 
+from siq.certificate.tests import PredictionLimits
 from siq.data.recordings import Recordings, snapshot_pairs
 from siq.dynamics.simulation import SimulationOptions, simulate_snapshots
 from siq.errors import NumericalFailure
@@ -37,7 +38,7 @@ def recorded(*, noise: float, units: tuple[str | None, str | None] = (None, None
 
 def identified(recordings: Recordings, space: StateSpace | None = None) -> identify.Identified:
     sampling = Sampling(integrator_step=0.002)
-    settings = identify.IdentifySettings(0, space or StateSpace(), sampling, LINEAR, 0.01)
+    settings = identify.IdentifySettings(0, space or StateSpace(), sampling, LINEAR, PredictionLimits())
     return identify.run(settings, recordings, number=0)
 
 

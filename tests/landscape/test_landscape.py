@@ -139,7 +139,7 @@ def test_the_formula_of_a_well_can_be_taken_elsewhere() -> None:
 
 
 def test_the_report_has_verdict_attractors_and_barriers() -> None:
-    certificate = Certificate({"branch": Verdict(0.0, 0.01, True)}, 0.01, "")
+    certificate = Certificate({"characteristics": Verdict(0.0, 0.01, True)}, 0.01, "")
     text = replace(double(), certificate=certificate, notes=("a limit cycle <x>",)).report()
     assert "certified, with a stated error of V of 0.01" in text
     assert "a limit cycle <x>" in text and "barrier" in text and "attractor" in text

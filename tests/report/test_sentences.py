@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from siq.report.sentences import answer_sentences
+from siq.report.sentences import answer_sentences, control_sentences
 from siq.study.scoring import summary_table
 from siq.study.study import PublishedFigure
 from siq.study.tables import as_table
@@ -94,3 +94,24 @@ def test_a_study_without_any_answer_known_claims_no_error() -> None:
     text = " ".join(answer_sentences(rrmse, outcomes, summary, runs=1, method="regression"))
     assert "Against the exact U" not in text
     assert isinstance(summary, pd.DataFrame)
+
+
+def test_the_control_is_counted_by_what_became_of_it() -> None:
+    rows = [
+        (0, "branch", False), (0, "same_as_refined", False),  # refused, as it should be
+        (1, "branch", True), (1, "same_as_refined", True),  # refined to the same V
+        (2, "branch", True), (2, "same_as_refined", False),  # a false solution with a certificate
+    ]  # fmt: skip
+    table = pd.DataFrame(
+        [
+            {"run": run, "method": "randomised network", "test": test, "passed": passed}
+            for run, test, passed in rows
+        ]
+    )
+    (said,) = control_sentences(table)
+    assert "was refused in 1 of 3 runs" in said
+    assert "in 1 refinement led from it to the same V" in said
+    assert "in 1 ANOTHER V than the refined one was certified" in said
+    (harmless,) = control_sentences(table[table["run"] < 2])
+    assert "ANOTHER" not in harmless
+    assert control_sentences(table.assign(method="refined")) == []
