@@ -1,9 +1,10 @@
 """Refinement: from the identified f, and from what the networks found, to formulas of V and g.
 
-Two routes lead to V and share nothing but f and the recorded points. The *network route* starts from the
-networks and seeks one formula for the whole recorded region; where no single formula can hold, since V has a
-kink between its wells, it takes each well for itself. The *local route* grows V from each attractor, and
-needs no network. Whether to believe either is decided by `siq.certificate.tests`.
+Two routes lead to V. They share f, the recorded points and Gauss–Newton; and by `training.check` networks are
+trained until they agree with the local route, so that their agreement is no evidence from elsewhere. The
+*network route* starts from the networks and seeks one formula for the whole recorded region; where no single
+formula can hold, since V has a kink between its wells, it takes each well for itself. The *local route* grows
+V from each attractor, and needs no network. Whether to believe either is decided by `siq.certificate.tests`.
 """
 
 from __future__ import annotations

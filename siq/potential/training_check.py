@@ -2,6 +2,7 @@
 
 It does, in small, what will be done in earnest afterwards: V_θ is written in powers, refined on the
 Hamilton–Jacobi equation of the identified f, and compared with the local route, which needs no network.
+Whatever passes was thereby selected for agreement: that of a certificate is a test of consistency alone.
 """
 
 from __future__ import annotations
