@@ -2,6 +2,7 @@
 
 ===================  =================================================================
 `recordings`         which trajectories, and which pairs of states a short time apart?
+`selection`          whole recordings, chosen or drawn
 `formats`            how is a CSV, Parquet, HDF5 or MATLAB file read?
 `cells`              which number, label or unit is in a cell?
 `checks`             is the table whole, and do its times increase?

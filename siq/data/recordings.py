@@ -1,7 +1,7 @@
 """Recordings: trajectories as measured, in one long table.
 
 A table has the columns ``recording`` (a label), ``t`` (the time) and one column per measured quantity.
-Here such a table is read and checked, written, cut into snapshot pairs, and resampled. Whatever cannot be
+Here such a table is read and checked, written, and cut into snapshot pairs. Whatever cannot be
 used is refused with its row and column; rows are counted from 1 without the header.
 """
 
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from siq.data.checks import check_times, find_columns
-from siq.data.labels import distinct_labels, sources
+from siq.data.labels import sources
 from siq.errors import InputError
 from siq.files.whole import whole_file
 
@@ -369,56 +369,3 @@ def read_pairs(
         return recordings, snapshot_pairs(recordings, pair_step=pair_step)
     except ValueError as error:
         raise InputError(path, "", str(error), "raise recordings.pair_step in the study") from None
-
-
-def select_recordings(recordings: Recordings, indices: Sequence[int] | np.ndarray) -> Recordings:
-    """Take whole recordings, in the order given.
-
-    Parameters
-    ----------
-    recordings
-        The trajectories.
-    indices
-        Indices into ``recordings.labels``, not of rows. One that stands twice gives copies, told apart by
-        their labels: ``r07``, ``r07#2``.
-
-    Raises
-    ------
-    ValueError
-        When `indices` is empty, is a mask, or points outside the recordings.
-    """
-    chosen = np.asarray(indices)
-    count = len(recordings.labels)
-    if chosen.ndim != 1 or chosen.dtype.kind not in "iu" or chosen.size == 0:
-        raise ValueError("recordings are selected by a list of at least one index")
-    if chosen.min() < 0 or chosen.max() >= count:
-        raise ValueError(f"a selected recording is not one of 0 ... {count - 1}")
-    bounds = np.searchsorted(recordings.recording, np.arange(count + 1))
-    lengths = np.diff(bounds)[chosen]
-    begins = np.cumsum(lengths) - lengths
-    rows = np.arange(lengths.sum()) + np.repeat(bounds[chosen] - begins, lengths)
-    return Recordings(
-        names=recordings.names,
-        units=recordings.units,
-        labels=distinct_labels(recordings.labels, chosen),
-        recording=np.repeat(np.arange(len(chosen)), lengths),
-        t=recordings.t[rows],
-        values=recordings.values[rows],
-        time_unit=recordings.time_unit,
-    )
-
-
-def resample_recordings(recordings: Recordings, *, generator: np.random.Generator) -> Recordings:
-    """Draw as many recordings as there are, with replacement: one bootstrap sample.
-
-    Whole recordings are drawn, not rows, since the samples of one recording are not independent.
-
-    Parameters
-    ----------
-    recordings
-        The trajectories.
-    generator
-        Where the draw comes from; the only source of chance.
-    """
-    count = len(recordings.labels)
-    return select_recordings(recordings, generator.integers(count, size=count))

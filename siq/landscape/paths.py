@@ -40,6 +40,8 @@ TURN = 0.15  # radian from one segment of the first chain to the next
 UNSTABLE_START = 1e-4  # of the distance: where the way down from a saddle starts
 ARRIVED = 1e-3  # of the distance: where it ends
 FAR = 20.0  # in distances: where it has missed the target
+AT_REST = ARRIVED**3  # speed, in units of the linearised equations: where it has ended elsewhere
+PRECISION = AT_REST / 10  # of a step: what jitters about a rest by more than its speed never comes to rest
 LONGEST_DESCENT = 1e5  # in units of the shortest time of the linearised equations
 
 
@@ -227,14 +229,14 @@ def _descent(dynamics: Dynamics, saddle: np.ndarray, target: np.ndarray, nodes: 
         return float(FAR - np.linalg.norm(y))
 
     def rests(_: float, y: np.ndarray) -> float:
-        return float(np.linalg.norm(problem.force(y[None])) - ARRIVED**3)
+        return float(np.linalg.norm(problem.force(y[None])) - AT_REST)
 
     for event in (arrives, leaves, rests):
         event.terminal, event.direction = True, -1  # type: ignore[attr-defined]
     for side in (1, -1):
         begin = side * UNSTABLE_START * upwards / np.linalg.norm(upwards)
         way = solve_ivp(
-            rates, [0, LONGEST_DESCENT], begin, method="DOP853", rtol=1e-8, atol=1e-12,
+            rates, [0, LONGEST_DESCENT], begin, method="DOP853", rtol=PRECISION, atol=1e-12,
             dense_output=True, events=[arrives, leaves, rests],
         )  # fmt: skip
         if len(way.t_events[0]):

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from pydantic.dataclasses import dataclass
 
-from siq.data.recordings import Recordings, read_pairs, resample_recordings, write_recordings
+from siq.data.recordings import Recordings, read_pairs, write_recordings
+from siq.data.selection import resample_recordings
 from siq.dynamics.cards import load_system
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.simulation import SimulationOptions, simulate_snapshots

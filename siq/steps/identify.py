@@ -12,7 +12,8 @@ from pydantic.dataclasses import dataclass
 
 from siq.certificate.tests import PredictionLimits, Verdict, check_prediction
 from siq.data.held_out import held_out_recordings
-from siq.data.recordings import Recordings, SnapshotPairs, select_recordings, snapshot_pairs
+from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
+from siq.data.selection import select_recordings
 from siq.errors import NumericalFailure
 from siq.identify.diffusion import DiffusionSource, check_units, estimated_diffusion
 from siq.identify.flow_regression import refit, residuals

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from siq.data.held_out import held_out_recordings
-from siq.data.recordings import Recordings, resample_recordings, select_recordings
+from siq.data.recordings import Recordings
+from siq.data.selection import resample_recordings, select_recordings
 from siq.errors import NumericalFailure
 
 

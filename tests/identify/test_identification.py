@@ -16,7 +16,8 @@ from known_systems import (
     uniform_points,
 )
 
-from siq.data.recordings import Recordings, SnapshotPairs, select_recordings, snapshot_pairs
+from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
+from siq.data.selection import select_recordings
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.simulation import SimulationOptions, simulate_snapshots
 from siq.errors import NumericalFailure

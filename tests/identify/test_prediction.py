@@ -14,7 +14,8 @@ from known_systems import (
 )
 from scipy.linalg import expm
 
-from siq.data.recordings import Recordings, select_recordings
+from siq.data.recordings import Recordings
+from siq.data.selection import select_recordings
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.simulation import SimulationOptions, simulate_snapshots
 from siq.identify.prediction import predict, prediction_errors

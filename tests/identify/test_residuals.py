@@ -8,7 +8,8 @@ import pytest
 import sympy
 from known_systems import KnownSystem, archetype, as_system, double_well, maier_stein
 
-from siq.data.recordings import Recordings, select_recordings, snapshot_pairs
+from siq.data.recordings import Recordings, snapshot_pairs
+from siq.data.selection import select_recordings
 from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.simulation import SimulationOptions, simulate_snapshots

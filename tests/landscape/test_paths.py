@@ -13,7 +13,9 @@ from known_systems import (
     potential_gradient,
     potential_values,
 )
+from scipy.integrate import solve_ivp
 
+from siq.dynamics.equilibria import find_equilibria
 from siq.errors import NumericalFailure
 from siq.landscape.paths import MinimumActionPath, minimum_action_path, transition_path
 
@@ -192,3 +194,22 @@ def test_a_path_needs_two_states() -> None:
     known = archetype(2)
     with pytest.raises(ValueError, match="where it starts"):
         path_of(known, known.attractors[0])
+
+
+def test_a_way_that_ends_at_another_attractor_is_soon_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    # The first side that is tried leads elsewhere, and comes to rest there only if it is followed finely.
+    known = polynomial_system(2, seed=1)
+    points = np.random.default_rng(0).uniform(*known.domain.T, (200, 2))
+    saddles = [one.position for one in find_equilibria(known.dynamics, points) if one.kind == "saddle"]
+    saddle = min(saddles, key=lambda one: float(np.linalg.norm(one - [-0.709, 0.244])))
+    evaluations = []
+
+    def counted(*arguments: object, **named: object) -> object:
+        way = solve_ivp(*arguments, **named)
+        evaluations.append(way.nfev)
+        return way
+
+    monkeypatch.setattr("siq.landscape.paths.solve_ivp", counted)
+    way = transition_path(known.dynamics, known.attractors[0], saddle, known.attractors[1])
+    np.testing.assert_allclose(way.downhill[-1], known.attractors[1], atol=1e-9)
+    assert len(evaluations) == 2 and sum(evaluations) < 20_000  # 914,767 before

@@ -10,7 +10,8 @@ import pytest
 import torch
 from known_settings import PAPER
 
-from siq.data.recordings import Recordings, SnapshotPairs, resample_recordings, snapshot_pairs
+from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
+from siq.data.selection import resample_recordings
 from siq.dynamics.diffusion import Diffusion
 from siq.errors import InputError, NumericalFailure
 from siq.networks.checkpoint import load_checkpoint, save_checkpoint
