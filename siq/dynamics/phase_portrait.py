@@ -17,6 +17,7 @@ from siq.numerics.thinning import representative_subset
 
 STARTS = 1500  # recorded points from which f is followed
 NEWTON_STARTS = 400
+APART = 0.04  # of each state's range: starts that cover the recorded region evenly
 
 
 @dataclass(frozen=True)
@@ -73,11 +74,14 @@ class PhasePortrait:
 
 
 def evenly_spread(x: np.ndarray, *, generator: np.random.Generator, most: int = 4000) -> np.ndarray:
-    """Rows of states that cover the recorded region evenly, about a twentieth of each state's range apart."""
-    width = np.ptp(x, axis=0)
+    """Rows of states that cover the recorded region evenly, about a twentieth of each state's range apart.
+
+    One state has so many as two have, several hundred: a twentieth apart they would be too few to tell V.
+    """
+    width, dimension = np.ptp(x, axis=0), x.shape[1]
     rows = representative_subset(
         x / np.where(width > 0, width, 1.0),
-        distance=max(0.04, 0.5 * most ** (-1 / x.shape[1])),
+        distance=max(APART ** max(1.0, 2 / dimension), 0.5 * most ** (-1 / dimension)),
         generator=generator,
     )
     return np.sort(generator.choice(rows, most, replace=False)) if len(rows) > most else rows
