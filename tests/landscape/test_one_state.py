@@ -14,8 +14,18 @@ from scipy.integrate import solve_ivp
 from siq.data.recordings import Recordings
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.equilibria import find_equilibria
+from siq.landscape.density_of_wells import (
+    compare_with_samples,
+    known_density,
+    lowest_possible,
+    marginal_of,
+    sample_potential,
+)
+from siq.landscape.ensembles import starting_states
+from siq.landscape.invariant_distribution import marginal_density, normalisation_quadrature
 from siq.landscape.landscape import Landscape, find_landscape
 from siq.landscape.reference import reference_landscape
+from siq.numerics.density_comparison import total_variation
 from siq.potential.local_wells import WellOptions
 
 X = sympy.Symbol("x", real=True)
@@ -131,3 +141,33 @@ def test_characteristics_are_the_reference_of_one_state() -> None:
     values, exact = reference.values, 2 * potential_values(known, reference.points) - left
     low = exact < top - left
     np.testing.assert_allclose(values[low], exact[low], atol=1e-4)
+
+
+def test_the_density_of_one_state_is_exact_from_either_formula() -> None:
+    known, landscape, noise = three_roots(), from_recordings(), 0.2
+    potential = landscape.over_wells
+    assert potential is not None
+    fine, coarse = (sample_potential(potential, known.domain, cells=cells) for cells in (4000, 2000))
+    density = known_density(fine, coarse, lowest_possible(coarse, known.dynamics), intensity=noise)
+    shift = heights(known)[0]
+    exact = 2 * known.potential - shift
+    total = normalisation_quadrature(exact, (X,), intensity=noise, box=known.domain)
+    assert density.normalisation == pytest.approx(total, rel=1e-3)
+    assert density.unknown < 2e-3
+    one, other = marginal_of(density, fine), marginal_density(exact, (X,), intensity=noise, box=known.domain)
+    assert one.plane == other.plane == (0,) and one.values.shape == (1, 4000)
+    at = np.isfinite(one.values[0])
+    np.testing.assert_allclose(one.values[0][at], np.interp(one.x1, other.x1, other.values[0])[at], atol=5e-3)
+    # Draws from the density itself differ from it by no more than draws do.
+    draw = np.random.default_rng(0)
+    start = starting_states(density, fine, 20_000, generator=draw)
+    compared = compare_with_samples(density, fine, start[:, None, :])
+    again = total_variation(other, start[:, None, :])
+    assert compared.total_variation < 0.02 and again.total_variation < 0.02
+    assert compared.histogram.shape == again.histogram.shape == (1, 40)
+    assert (compared.histogram[0] * np.diff(compared.x1_edges)).sum() == pytest.approx(1)
+
+
+def test_the_only_state_is_the_whole_plane() -> None:
+    with pytest.raises(ValueError, match="are not two of 1 states"):
+        marginal_density(X**2, (X,), intensity=0.1, box=np.array([[-1.0, 1.0]]), plane=(0, 1))
