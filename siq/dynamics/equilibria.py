@@ -108,12 +108,21 @@ def find_equilibria(dynamics: Dynamics, points: np.ndarray) -> list[Equilibrium]
     speed = np.linalg.norm(dynamics.drift(points) / width, axis=1)
     converged = np.linalg.norm(dynamics.drift(x) / width, axis=1) < 1e-9 * np.median(speed)
     found: list[np.ndarray] = []
+    # Zero but for what is left of Newton's last step reads better as zero.
+    x = np.where(np.abs(x) < np.finfo(float).eps * width, 0.0, x)
     for candidate in x[inside & converged]:
         if all(np.abs((candidate - other) / width).max() > SAME for other in found):
             found.append(candidate)
     found.sort(key=lambda position: tuple(np.round(position / width, 6)))
-    rate = float(np.median(speed))
+    rate = rate_of(dynamics, points)
     return [classify(dynamics, position, rate=rate) for position in found]
+
+
+def rate_of(dynamics: Dynamics, points: np.ndarray) -> float:
+    """At which f crosses the box of some points ``(n, d)``, per unit of time: the median over them."""
+    width = np.ptp(points, axis=0)
+    speed = np.linalg.norm(dynamics.drift(points) / np.where(width > 0, width, 1.0), axis=1)
+    return float(np.median(speed))
 
 
 def classify(dynamics: Dynamics, position: np.ndarray, *, rate: float = 0.0) -> Equilibrium:

@@ -78,6 +78,10 @@ def landscape_figures(
         if len(escape)
         else sentence_figure("No escape was simulated."),
     }
+    if beside.reference is not None and beside.reference.reason:
+        figures["landscape_errors"] = sentence_figure(
+            f"There is no reference for the landscape: {beside.reference.reason}."
+        )
     if shown is None:
         return figures
     if len(shown.recordings.names) > 2:
@@ -86,7 +90,7 @@ def landscape_figures(
         return figures
     one_state = len(shown.recordings.names) == 1
     figures["landscape"] = (_curve_figure if one_state else _landscape_figure)(space, shown)
-    if beside.reference is not None:
+    if beside.reference is not None and not beside.reference.reason:
         figures |= _maps(settings, shown, beside, beside.reference)
     return figures
 

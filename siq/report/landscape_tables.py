@@ -8,6 +8,7 @@ from pathlib import Path
 import pandas as pd
 
 from siq.report.page import ReportFigure, ReportTable
+from siq.steps.outcomes import Status, Step
 
 CAPTIONS = {
     "landscape": "The quasipotential U over all wells, where its formulas are believed, with attractors,"
@@ -20,6 +21,28 @@ CAPTIONS = {
     " its number of terms.",
     "escape": "Mean escape times: the law from what was identified, and direct simulations of the card.",
 }
+
+
+def landscape_sentences(landscape: pd.DataFrame, outcomes: pd.DataFrame) -> list[str]:
+    """Why there is no landscape, where f was followed and led to no attractor.
+
+    Parameters
+    ----------
+    landscape, outcomes
+        The tables of these names.
+    """
+    asked = outcomes[
+        (outcomes["step"] == Step.LANDSCAPE) & outcomes["status"].isin([Status.WARNING, Status.FAILED])
+    ]
+    without = asked[~asked["run"].isin(landscape[landscape["kind"] == "attractor"]["run"])]
+    if without.empty:
+        return []
+    which = (
+        ""
+        if len(without) == outcomes["run"].nunique()
+        else f" of {len(without)} of {outcomes['run'].nunique()} runs"
+    )
+    return [f"There is no landscape{which}: {without['reason'].iloc[0]}."]
 
 
 def landscape_tables(
