@@ -18,7 +18,7 @@ from siq.dynamics.phase_portrait import PhasePortrait
 from siq.errors import NumericalFailure
 from siq.identify.identification import IdentifiedField
 from siq.landscape.global_quasipotential import GlobalQuasipotential, heights_of_attractors, matched
-from siq.landscape.transitions import Transition, transitions, ways_out
+from siq.landscape.transitions import Transition, missing_diffusion, transitions, ways_out
 from siq.potential.local_wells import WellOptions, local_well, surveyed
 from siq.potential.well import Well
 
@@ -195,12 +195,8 @@ class Landscape:
             When D is the unit matrix although a state is but the derivative of another: no noise drives
             ``dx/dt = v``, and the times follow from D.
         """
-        defined = _defined_states(self.dynamics)
-        if defined and np.array_equal(self.dynamics.diffusion.matrix, np.eye(self.dynamics.dimension)):
-            raise ValueError(
-                f"the equation of {', '.join(defined)} is of the form dx/dt = v, which no noise drives, and D"
-                " is the unit matrix: escape times follow from D, so give the D of this system"
-            )
+        if (missing := missing_diffusion(self.dynamics)) is not None:
+            raise ValueError(missing)
         rows = [(way.start, way.end, *_mean_time(way, noise)) for way in self.transitions]
         table = pd.DataFrame(rows, columns=["start", "end", "mean_time", "note"])
         return table.astype({"start": int, "end": "Int64", "mean_time": float})
@@ -230,15 +226,6 @@ class Landscape:
         from siq.report.plots.landscape_axes import draw_landscape
 
         return draw_landscape(self, ax)
-
-
-def _defined_states(dynamics: Dynamics) -> list[str]:
-    """States whose equation is another state, but for a factor: ``dx/dt = v``."""
-    return [
-        name
-        for name, own, formula in zip(dynamics.states, dynamics.symbols, dynamics.formulas, strict=True)
-        if formula.as_coeff_Mul()[1] in set(dynamics.symbols) - {own}
-    ]
 
 
 def _mean_time(way: Transition, noise: float) -> tuple[float, str]:

@@ -42,7 +42,7 @@ class Transition:
         The path of least action and the way down, None where none was found.
     barrier
         ΔU by the formula and the end of the path; NaN where neither is known.
-    by_formula
+    formula_share
         Share of the barrier that the formula accounts for.
     standard_error
         Of the barrier, from the uncertainty of f.
@@ -57,7 +57,7 @@ class Transition:
     saddle: Equilibrium
     path: TransitionPath | None
     barrier: float
-    by_formula: float
+    formula_share: float
     standard_error: float
     rate: EscapeRate | None
     notes: tuple[str, ...] = ()
@@ -114,6 +114,26 @@ def ways_out(dynamics: Dynamics, portrait: PhasePortrait) -> list[WayOut]:
     return ways
 
 
+def missing_diffusion(dynamics: Dynamics) -> str | None:
+    """Why there are no escape times for want of D, in words; None where nothing speaks against them.
+
+    No noise drives ``dx/dt = v``, where one state is but the derivative of another; a D that is the unit
+    matrix says that it does, and mostly nobody has said so.
+    """
+    defined = [
+        name
+        for name, own, formula in zip(dynamics.states, dynamics.symbols, dynamics.formulas, strict=True)
+        if formula.as_coeff_Mul()[1] in set(dynamics.symbols) - {own}
+    ]
+    noise = dynamics.diffusion
+    if not defined or not np.array_equal(noise.matrix, np.eye(dynamics.dimension)):
+        return None
+    return (
+        f"the equation of {', '.join(defined)} is of the form dx/dt = v, which no noise drives, and D is the"
+        " unit matrix: escape times follow from D, so give the D of this system"
+    )
+
+
 def transitions(
     found: IdentifiedField,
     ways: Sequence[WayOut],
@@ -140,8 +160,10 @@ def _transition(found: IdentifiedField, way: WayOut, well: Well | None) -> Trans
     notes: list[str] = []
     if not path.uphill.converged:
         notes.append("the minimum action path is not converged")
-    rate = None
+    rate, missing = None, missing_diffusion(found.dynamics)
     try:
+        if missing is not None:
+            raise NumericalFailure(missing)
         rate = escape_rate(found.dynamics, path.uphill)
         notes += rate.notes
     except (NumericalFailure, np.linalg.LinAlgError) as error:

@@ -70,7 +70,7 @@ def landscape_tables(
                 "basin": "share of the recorded states that f leads there",
                 "barrier": "of U, by the formula of the well and the end of the path of least action",
                 "standard error": "of the barrier, from the uncertainty of f",
-                "by formula": "share of the barrier that the formula accounts for",
+                "formula share": "share of the barrier that the formula accounts for",
                 "minimum action": "the same barrier by the path alone, without any formula",
                 "prefactor": "of the mean escape time prefactor · exp(barrier/ε)",
             },
