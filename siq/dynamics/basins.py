@@ -79,13 +79,15 @@ def basin_of(
     center, d = attractors[index].position, len(box)
     width = box[:, 1] - box[:, 0]
     recorded = descents.paths[descents.ends == index]
-    # Recordings approach an attractor along its slow directions; V needs all of them.
+    # Recordings approach an attractor along its slow directions; V needs all of them. Of one state there is
+    # but one, and more starts close by would only make light of those far out.
     hessian = hessian_at(dynamics, center)
+    count = NEAREST if d > 1 else 0
     offsets = recorded[:, 0] - center
     reach = np.quantile(np.einsum("ni,ij,nj->n", offsets, hessian, offsets), 0.3)
-    directions = generator.standard_normal((NEAREST, d))
+    directions = generator.standard_normal((count, d))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    radii = np.sqrt(reach) * generator.uniform(0.02, 1.0, (NEAREST, 1))
+    radii = np.sqrt(reach) * generator.uniform(0.02, 1.0, (count, 1))
     starts = center + (radii * directions) @ np.linalg.inv(np.linalg.cholesky(hessian))
     starts = starts[((starts > box[:, 0]) & (starts < box[:, 1])).all(axis=1)]
     near = follow(dynamics, starts, attractors, box=box)

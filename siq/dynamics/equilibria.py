@@ -20,7 +20,7 @@ EquilibriumKind = Literal["attractor", "saddle", "repeller", "degenerate"]
 NEWTON_STEPS = 60
 MARGIN = 0.05  # of the recorded box, by which an equilibrium may lie outside
 SAME = 1e-6  # of the recorded box: closer equilibria are one
-MARGINAL = 1e-6  # of the largest eigenvalue: multiple roots are only found to the root of rounding
+MARGINAL = 1e-6  # of the fastest rate: multiple roots are only found to the root of rounding
 SLOWEST_TIMES = 200.0  # trajectories are followed for so many of the slowest relaxation times, ...
 UNSETTLED_TIMES = 25.0  # ... or times to cross the box where there is no attractor
 MOST_STEPS = 3000
@@ -40,8 +40,9 @@ class Equilibrium:
     eigenvalues
         Of the Jacobian, by falling real part.
     kind
-        ``attractor``: all real parts are negative. ``repeller``: all positive. ``saddle``: some of
-        each. ``degenerate``: a real part is zero to rounding, and the linearisation decides nothing.
+        ``attractor``: all real parts are negative. ``saddle``: some of each, or of one state the positive
+        one: the top between two wells is the pass between them. ``repeller``: all positive, of several
+        states. ``degenerate``: a real part is zero to rounding, and the linearisation decides nothing.
     """
 
     position: np.ndarray
@@ -107,23 +108,45 @@ def find_equilibria(dynamics: Dynamics, points: np.ndarray) -> list[Equilibrium]
     speed = np.linalg.norm(dynamics.drift(points) / width, axis=1)
     converged = np.linalg.norm(dynamics.drift(x) / width, axis=1) < 1e-9 * np.median(speed)
     found: list[np.ndarray] = []
+    # Zero but for what is left of Newton's last step reads better as zero.
+    x = np.where(np.abs(x) < np.finfo(float).eps * width, 0.0, x)
     for candidate in x[inside & converged]:
         if all(np.abs((candidate - other) / width).max() > SAME for other in found):
             found.append(candidate)
     found.sort(key=lambda position: tuple(np.round(position / width, 6)))
-    return [classify(dynamics, position) for position in found]
+    rate = rate_of(dynamics, points)
+    return [classify(dynamics, position, rate=rate) for position in found]
 
 
-def classify(dynamics: Dynamics, position: np.ndarray) -> Equilibrium:
-    """The equilibrium at a position, by the eigenvalues of the Jacobian there."""
+def rate_of(dynamics: Dynamics, points: np.ndarray) -> float:
+    """At which f crosses the box of some points ``(n, d)``, per unit of time: the median over them."""
+    width = np.ptp(points, axis=0)
+    speed = np.linalg.norm(dynamics.drift(points) / np.where(width > 0, width, 1.0), axis=1)
+    return float(np.median(speed))
+
+
+def classify(dynamics: Dynamics, position: np.ndarray, *, rate: float = 0.0) -> Equilibrium:
+    """The equilibrium at a position, by the eigenvalues of the Jacobian there.
+
+    Parameters
+    ----------
+    dynamics
+        f.
+    position
+        Where it vanishes, shape ``(d,)``.
+    rate
+        At which f crosses the region of interest, per unit of time. An eigenvalue counts as zero by it, or by
+        the largest eigenvalue if that is faster: a single eigenvalue can only be told from zero by another
+        rate.
+    """
     eigenvalues = np.linalg.eigvals(dynamics.jacobian(position[None])[0])
     eigenvalues = eigenvalues[np.argsort(-eigenvalues.real)]
     kind: EquilibriumKind = "saddle"
-    if np.abs(eigenvalues.real).min() < MARGINAL * np.abs(eigenvalues).max():
+    if np.abs(eigenvalues.real).min() <= MARGINAL * max(np.abs(eigenvalues).max(), rate):
         kind = "degenerate"
     elif eigenvalues.real.max() < 0:
         kind = "attractor"
-    elif eigenvalues.real.min() > 0:
+    elif eigenvalues.real.min() > 0 and len(eigenvalues) > 1:
         kind = "repeller"
     return Equilibrium(position, eigenvalues, kind)
 

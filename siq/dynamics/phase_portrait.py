@@ -12,11 +12,14 @@ import numpy as np
 
 from siq.dynamics.basins import Basin, basin_of
 from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.equilibria import Descents, Equilibrium, find_equilibria, follow, neighbours
+from siq.dynamics.equilibria import Descents, Equilibrium, find_equilibria, follow, neighbours, rate_of
+from siq.dynamics.recurrence import Recurrence, recurrence_of
 from siq.numerics.thinning import representative_subset
 
 STARTS = 1500  # recorded points from which f is followed
 NEWTON_STARTS = 400
+UNSETTLED = 0.02  # share of the recorded points: as many may be slow, on the ridge between two wells
+APART = 0.04  # of each state's range: starts that cover the recorded region evenly
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,8 @@ class PhasePortrait:
         For each attractor, what leads to it.
     descents
         From recorded points, to whatever end.
+    recurrence
+        Where those lead that come to rest nowhere; None where they are few.
     """
 
     points: np.ndarray
@@ -48,6 +53,7 @@ class PhasePortrait:
     saddles: tuple[tuple[Equilibrium, ...], ...]
     basins: tuple[Basin, ...]
     descents: Descents
+    recurrence: Recurrence | None = None
 
     @property
     def unsettled(self) -> float:
@@ -60,24 +66,25 @@ class PhasePortrait:
         if degenerate:
             place = np.array2string(degenerate[0].position, precision=4)
             return f"the equilibrium at {place} is neither stable nor unstable to first order"
-        if not self.attractors and self.unsettled > 0.5:
-            return "no recorded state leads to a stable equilibrium: the recordings end on a limit cycle"
-        if not self.attractors:
+        ends = "there is another attractor" if self.recurrence is None else self.recurrence.sentence()
+        if not self.attractors and self.unsettled <= UNSETTLED:
             return "f has no stable equilibrium in the recorded region"
-        if self.unsettled > 0.02:
-            return (
-                f"{self.unsettled:.0%} of the recorded states lead to no equilibrium: there is another"
-                " attractor, such as a limit cycle"
-            )
-        return None
+        if self.unsettled <= UNSETTLED:
+            return None
+        if not self.attractors:
+            return f"no recorded state comes to rest at a stable equilibrium: {ends}"
+        return f"{self.unsettled:.0%} of the recorded states lead to no equilibrium: {ends}"
 
 
 def evenly_spread(x: np.ndarray, *, generator: np.random.Generator, most: int = 4000) -> np.ndarray:
-    """Rows of states that cover the recorded region evenly, about a twentieth of each state's range apart."""
-    width = np.ptp(x, axis=0)
+    """Rows of states that cover the recorded region evenly, about a twentieth of each state's range apart.
+
+    One state has so many as two have, several hundred: a twentieth apart they would be too few to tell V.
+    """
+    width, dimension = np.ptp(x, axis=0), x.shape[1]
     rows = representative_subset(
         x / np.where(width > 0, width, 1.0),
-        distance=max(0.04, 0.5 * most ** (-1 / x.shape[1])),
+        distance=max(APART ** max(1.0, 2 / dimension), 0.5 * most ** (-1 / dimension)),
         generator=generator,
     )
     return np.sort(generator.choice(rows, most, replace=False)) if len(rows) > most else rows
@@ -115,7 +122,13 @@ def phase_portrait(dynamics: Dynamics, points: np.ndarray, *, seed: int = 0) -> 
         basin_of(dynamics, descents, index, attractors, box=box, generator=generator)
         for index in range(len(attractors))
     ]
+    unsettled = np.flatnonzero((descents.ends < 0) & ~descents.escaped)
+    recurrence = None
+    if len(unsettled) > UNSETTLED * len(descents.ends):
+        recurrence = recurrence_of(
+            dynamics, descents.paths[unsettled, -1], box=box, rate=rate_of(dynamics, points)
+        )
     return PhasePortrait(
         points, box, tuple(equilibria), tuple(attractors),
-        tuple(tuple(saddles) for saddles in around), tuple(basins), descents,
+        tuple(tuple(saddles) for saddles in around), tuple(basins), descents, recurrence,
     )  # fmt: skip

@@ -27,7 +27,7 @@ from siq.errors import NumericalFailure
 from siq.landscape.global_quasipotential import GlobalQuasipotential
 from siq.numerics.density_comparison import BINS, DensityComparison, MarginalDensity, compare_shares
 
-CELLS = {2: 400, 3: 80}  # along each state, by the number of states; multiples of the bins
+CELLS = {1: 4000, 2: 400, 3: 80}  # along each state, by the number of states; multiples of the bins
 TOLERANCE = 0.02  # relative: by how much Z may change if cells are twice as wide
 STRIDE = 3.0  # cells: longest step along f
 LONGEST = 0.5  # of the shortest time of f: the same
@@ -44,7 +44,7 @@ class SampledPotential:
     box
         Shape ``(d, 2)``.
     values
-        U, shape ``(n, n)`` or ``(n, n, n)``, NaN where it is not known.
+        U, one axis for each state, NaN where it is not known.
     well
         Index of the well whose formula gives U, of the same shape; -1 where none does.
     wells
@@ -139,11 +139,11 @@ def sample_potential(
     Raises
     ------
     NumericalFailure
-        When there are neither two nor three states.
+        When there are more than three states.
     """
     box = np.asarray(box, dtype=float)
     if len(box) not in CELLS:
-        raise NumericalFailure(f"densities over wells are for two or three states, and these are {len(box)}")
+        raise NumericalFailure(f"densities over wells are for three states at most, and these are {len(box)}")
     shape = (cells or CELLS[len(box)],) * len(box)
     empty = SampledPotential(box, np.full(shape, np.nan), np.full(shape, -1), len(potential.wells))
     by_well = potential.by_well(empty.middles(np.ones(shape, dtype=bool)).T).reshape(-1, *shape)
@@ -269,16 +269,19 @@ def known_density(
 
 
 def marginal_of(
-    density: KnownDensity, sampled: SampledPotential, *, plane: tuple[int, int] = (0, 1)
+    density: KnownDensity, sampled: SampledPotential, *, plane: tuple[int, ...] | None = None
 ) -> MarginalDensity:
-    """The density on a plane of two states, within the known region; NaN where nothing is known."""
-    first, second = plane
-    values = _onto(density.probabilities, plane) / (sampled.widths[first] * sampled.widths[second])
+    """The density on a plane of two states, or of the only one, within the known region; elsewhere NaN."""
+    plane = _plane(sampled) if plane is None else plane
+    values = _onto(density.probabilities, plane) / sampled.widths[list(plane)].prod()
     seen = _onto(sampled.known, plane)
-    axes = sampled.axes
-    return MarginalDensity(
-        plane, density.intensity, axes[first], axes[second], np.where(seen > 0, values, np.nan)
-    )
+    first, second = ([sampled.axes[state] for state in plane] + [np.zeros(0)])[:2]
+    return MarginalDensity(plane, density.intensity, first, second, np.where(seen > 0, values, np.nan))
+
+
+def _plane(sampled: SampledPotential) -> tuple[int, ...]:
+    """The states that are shown: the first two, or the only one."""
+    return tuple(range(min(sampled.values.ndim, 2)))
 
 
 def compare_with_samples(
@@ -286,7 +289,7 @@ def compare_with_samples(
     sampled: SampledPotential,
     samples: np.ndarray,
     *,
-    plane: tuple[int, int] = (0, 1),
+    plane: tuple[int, ...] | None = None,
     bins: int = BINS,
 ) -> DensityComparison:
     """Compare the density with a simulation, both within the region where U is known.
@@ -298,22 +301,27 @@ def compare_with_samples(
     samples
         Shape ``(d, times, walkers)``.
     plane
-        Indices of the two states that are compared.
+        Indices of the two states that are compared, by default of the first two, or of the only one.
     bins
         Along each of them, a divisor of the number of cells.
     """
+    plane = _plane(sampled) if plane is None else plane
     index, inside = sampled.places(samples)
     counted = inside & sampled.known[tuple(index)]
     per_bin = [sampled.values.shape[state] // bins for state in plane]
-    column, row = (index[state] // size for state, size in zip(plane, per_bin, strict=True))
+    bin_of = sum(index[state] // size * bins**power
+                 for power, (state, size) in enumerate(zip(plane, per_bin, strict=True)))  # fmt: skip
     onto = _onto(density.probabilities, plane)
-    expected = onto.reshape(bins, per_bin[1], bins, per_bin[0]).sum(axis=(1, 3))
+    rows = bins if len(plane) > 1 else 1
+    expected = onto.reshape(rows, len(onto) // rows, bins, per_bin[0]).sum(axis=(1, 3))
     edges = [np.linspace(low, high, bins + 1) for low, high in sampled.box[list(plane)]]
-    return compare_shares(row * bins + column, np.append(expected, 0.0), edges, counted=counted)
+    return compare_shares(bin_of, np.append(expected, 0.0), edges, counted=counted)
 
 
 def _onto(values: np.ndarray, plane: Sequence[int]) -> np.ndarray:
-    """Values of cells summed onto a plane, the second state's cells by row."""
+    """Values of cells summed onto a plane, the second state's cells by row; a single state has one row."""
     others = tuple(state for state in range(values.ndim) if state not in plane)
     summed = values.sum(axis=others)
+    if len(plane) == 1:
+        return np.asarray(summed[None])
     return np.asarray(summed.T if plane[0] < plane[1] else summed)

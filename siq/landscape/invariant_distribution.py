@@ -129,18 +129,18 @@ def marginal_density(
     *,
     intensity: float,
     box: np.ndarray,
-    plane: tuple[int, int] = (0, 1),
+    plane: tuple[int, ...] | None = None,
     points: int = 201,
     nodes: int = 128,
 ) -> MarginalDensity:
-    """The density on a plane of two states, ``∫ Z⁻¹ exp(-U/ε)`` over the others within a box.
+    """The density on a plane of two states, ``∫ Z⁻¹ exp(-U/ε)`` over the others within a box, or of one.
 
     Parameters
     ----------
     quasipotential, symbols, intensity, box, nodes
         As for `normalisation_quadrature`.
     plane
-        Indices of the two states.
+        Indices of the two states, by default of the first two; of a single state there is but ``(0,)``.
     points
         Grid points along each.
 
@@ -151,11 +151,15 @@ def marginal_density(
     NumericalFailure
         As `normalisation_quadrature`.
     """
-    if len(set(plane)) != 2 or not set(plane) <= set(range(len(symbols))):
+    shown = min(len(symbols), 2)
+    plane = tuple(range(shown)) if plane is None else plane
+    if len(set(plane)) != shown or not set(plane) <= set(range(len(symbols))):
         raise ValueError(f"{plane} are not two of {len(symbols)} states")
     _check_intensity(intensity)
     _, blocks = split_into_blocks(quasipotential, symbols, intensity=intensity, box=box, nodes=nodes)
     axes = {state: np.linspace(box[state][0], box[state][1], points) for state in plane}
+    if shown == 1:
+        return MarginalDensity(plane, intensity, axes[0], np.zeros(0), blocks[0].marginal(axes)[None])
     values = np.ones((points, points))
     for block in blocks:
         kept = [state for state in plane if state in block.states]

@@ -16,10 +16,9 @@ from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.equilibria import Equilibrium
 from siq.dynamics.phase_portrait import PhasePortrait
 from siq.errors import NumericalFailure
-from siq.identify.diffusion import defined_states
 from siq.identify.identified_field import IdentifiedField
 from siq.landscape.global_quasipotential import GlobalQuasipotential, heights_of_attractors, matched
-from siq.landscape.transitions import Transition, transitions, ways_out
+from siq.landscape.transitions import Transition, missing_diffusion, transitions, ways_out
 from siq.potential.local_wells import WellOptions, local_well, surveyed
 from siq.potential.well import Well
 
@@ -192,12 +191,8 @@ class Landscape:
             When D is the unit matrix although a state is but the derivative of another: no noise drives
             ``dx/dt = v``, and the times follow from D.
         """
-        defined = defined_states(self.dynamics)
-        if defined and np.array_equal(self.dynamics.diffusion.matrix, np.eye(self.dynamics.dimension)):
-            raise ValueError(
-                f"the equation of {', '.join(defined)} is of the form dx/dt = v, which no noise drives, and D"
-                " is the unit matrix: escape times follow from D, so give the D of this system"
-            )
+        if (missing := missing_diffusion(self.dynamics)) is not None:
+            raise ValueError(missing)
         rows = [(way.start, way.end, *_mean_time(way, noise)) for way in self.transitions]
         table = pd.DataFrame(rows, columns=["start", "end", "mean_time", "note"])
         return table.astype({"start": int, "end": "Int64", "mean_time": float})

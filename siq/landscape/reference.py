@@ -50,6 +50,8 @@ class ReferenceLandscape:
         The same on the mesh.
     heights
         U at the attractors, shape ``(k,)``.
+    reason
+        Why there is no reference, in words; then k and n are zero. Empty where there is one.
     """
 
     attractors: np.ndarray
@@ -59,6 +61,7 @@ class ReferenceLandscape:
     barriers: np.ndarray
     mesh_barriers: np.ndarray
     heights: np.ndarray
+    reason: str = ""
 
     def below(self, index: int, share: float) -> np.ndarray:
         """Mask of the points of one well below a share of its barrier."""
@@ -150,6 +153,14 @@ def reference_landscape(
     )
 
 
+def no_reference(dimension: int, reason: str) -> ReferenceLandscape:
+    """What stands in the place of a reference where there is none, with the reason."""
+    of_none, nothing = np.zeros((0, dimension)), np.zeros(0)
+    return ReferenceLandscape(
+        of_none, of_none, np.zeros((0, 0)), np.zeros((0, 0)), nothing, nothing, nothing, reason
+    )
+
+
 def _actions(dynamics: Dynamics, portrait: PhasePortrait) -> np.ndarray:
     """Least action from each attractor to each saddle next to it, shape ``(k, s)``, infinite elsewhere."""
     saddles = list({tuple(one.position): one for row in portrait.saddles for one in row}.values())
@@ -187,6 +198,7 @@ def read_reference(path: str | Path) -> ReferenceLandscape:
     """Read what `write_reference` wrote, or refuse the file with an `InputError`."""
     try:
         with np.load(path, allow_pickle=False) as archive:
-            return ReferenceLandscape(**{name: archive[name] for name in archive.files})
-    except (OSError, ValueError, EOFError, TypeError, zipfile.BadZipFile):
+            arrays = {name: archive[name] for name in archive.files}
+            return ReferenceLandscape(**arrays | {"reason": str(arrays["reason"])})
+    except (OSError, ValueError, EOFError, KeyError, TypeError, zipfile.BadZipFile):
         raise InputError(path, "", "it is no reference landscape", "make it again") from None

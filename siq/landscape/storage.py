@@ -103,7 +103,7 @@ def _transition(one: Transition) -> dict[str, Any]:
         "end": one.end,
         "saddle": one.saddle.position.tolist(),
         "barrier": _number(one.barrier),
-        "by_formula": _number(one.by_formula),
+        "formula_share": _number(one.formula_share),
         "standard_error": _number(one.standard_error),
         "minimum_action": None if path is None else path.uphill.action,
         "prefactor": None if rate is None else rate.prefactor,

@@ -17,6 +17,7 @@ from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.equilibria import Equilibrium, neighbours
 from siq.dynamics.phase_portrait import PhasePortrait
 from siq.errors import NumericalFailure
+from siq.identify.diffusion import defined_states
 from siq.identify.identified_field import IdentifiedField
 from siq.landscape.paths import TransitionPath, transition_path
 from siq.landscape.rates import EscapeRate, escape_rate
@@ -42,7 +43,7 @@ class Transition:
         The path of least action and the way down, None where none was found.
     barrier
         ΔU by the formula and the end of the path; NaN where neither is known.
-    by_formula
+    formula_share
         Share of the barrier that the formula accounts for.
     standard_error
         Of the barrier, from the uncertainty of f.
@@ -57,7 +58,7 @@ class Transition:
     saddle: Equilibrium
     path: TransitionPath | None
     barrier: float
-    by_formula: float
+    formula_share: float
     standard_error: float
     rate: EscapeRate | None
     notes: tuple[str, ...] = ()
@@ -114,6 +115,22 @@ def ways_out(dynamics: Dynamics, portrait: PhasePortrait) -> list[WayOut]:
     return ways
 
 
+def missing_diffusion(dynamics: Dynamics) -> str | None:
+    """Why there are no escape times for want of D, in words; None where nothing speaks against them.
+
+    No noise drives ``dx/dt = v``, where one state is but the derivative of another; a D that is the unit
+    matrix says that it does, and mostly nobody has said so.
+    """
+    defined = defined_states(dynamics)
+    noise = dynamics.diffusion
+    if not defined or not np.array_equal(noise.matrix, np.eye(dynamics.dimension)):
+        return None
+    return (
+        f"the equation of {', '.join(defined)} is of the form dx/dt = v, which no noise drives, and D is the"
+        " unit matrix: escape times follow from D, so give the D of this system"
+    )
+
+
 def transitions(
     found: IdentifiedField,
     ways: Sequence[WayOut],
@@ -140,8 +157,10 @@ def _transition(found: IdentifiedField, way: WayOut, well: Well | None) -> Trans
     notes: list[str] = []
     if not path.uphill.converged:
         notes.append("the minimum action path is not converged")
-    rate = None
+    rate, missing = None, missing_diffusion(found.dynamics)
     try:
+        if missing is not None:
+            raise NumericalFailure(missing)
         rate = escape_rate(found.dynamics, path.uphill)
         notes += rate.notes
     except (NumericalFailure, np.linalg.LinAlgError) as error:

@@ -1,4 +1,4 @@
-"""A density on a plane of two states, and how far the samples of a long simulation are from it."""
+"""A density on a plane of two states, or of the only one, and how far samples of a long simulation are."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ import numpy as np
 import scipy.interpolate
 
 GROUPS = 100  # of walkers, among which the sampling error is estimated
-BINS = 40  # along each of the two states
+BINS = 40  # along each of the states
 
 
 @dataclass(frozen=True)
 class MarginalDensity:
-    """The invariant density on a plane of two states, the others integrated out.
+    """The invariant density on a plane of two states, the others integrated out; or of a single state.
 
     Attributes
     ----------
     plane
-        Indices of the two states.
+        Indices of the two states, or of the only one.
     intensity
         ε.
     x1, x2
         The grid, shapes ``(n,)`` and ``(m,)``, evenly spaced: from edge to edge of the box, or, of a
-        landscape, in the middles of its cells.
+        landscape, in the middles of its cells. With one state `x2` is empty.
     values
-        Shape ``(m, n)``: density per unit of the first state and unit of the second; its integral over the
-        box is 1. NaN where it is not known.
+        Shape ``(m, n)``, ``(1, n)`` with one state: density per unit of the first state and unit of the
+        second; its integral over the box is 1. NaN where it is not known.
     """
 
-    plane: tuple[int, int]
+    plane: tuple[int, ...]
     intensity: float
     x1: np.ndarray
     x2: np.ndarray
@@ -55,9 +55,9 @@ class DensityComparison:
         Share of the samples outside the box, which counts as a further bin, of probability 0. Of a
         landscape: share of the samples where U is not known, which are left out.
     x1_edges, x2_edges
-        Edges of the bins, shapes ``(n + 1,)`` and ``(m + 1,)``.
+        Edges of the bins, shapes ``(n + 1,)`` and ``(m + 1,)``; with one state the latter is empty.
     histogram
-        Shape ``(m, n)``: the samples' density, in the unit of the marginal density.
+        Shape ``(m, n)``, ``(1, n)`` with one state: the samples' density, in the marginal density's unit.
     """
 
     total_variation: float
@@ -75,7 +75,7 @@ class ComparedDensity:
     Attributes
     ----------
     density
-        The density on a plane of two states.
+        The density on a plane of two states, or of the only one.
     normalisation
         Z, None where it is not to be written.
     comparison
@@ -104,13 +104,15 @@ def total_variation(density: MarginalDensity, samples: np.ndarray, *, bins: int 
         never leave their well, the floor includes a scatter between wells that the choice of initial states
         avoids.
     bins
-        Bins along each of the two states, over the box of the density.
+        Bins along each of the states, over the box of the density.
     """
-    edges = [np.linspace(axis[0], axis[-1], bins + 1) for axis in (density.x1, density.x2)]
-    chosen = samples[list(density.plane)].reshape(2, -1, samples.shape[-1])
+    axes = (density.x1, density.x2)[: len(density.plane)]
+    edges = [np.linspace(axis[0], axis[-1], bins + 1) for axis in axes]
+    chosen = samples[list(density.plane)].reshape(len(axes), -1, samples.shape[-1])
     places = [np.searchsorted(edge, x, side="right") - 1 for edge, x in zip(edges, chosen, strict=True)]
     inside = np.logical_and.reduce([(place >= 0) & (place < bins) for place in places])
-    bin_of = np.where(inside, places[1] * bins + places[0], bins**2)
+    row_and_column = sum(place * bins**power for power, place in enumerate(places))
+    bin_of = np.where(inside, row_and_column, bins ** len(places))
     return compare_shares(bin_of, np.append(_bin_probabilities(density, edges), 0.0), edges)
 
 
@@ -131,7 +133,7 @@ def compare_shares(
     expected
         Probability of every bin, shape ``(bins + 1,)``.
     edges
-        Of the bins along the first state and the second.
+        Of the bins along the first state and the second, if there is one.
     counted
         The samples that count, of the shape of `bin_of`; by default all.
     """
@@ -145,19 +147,22 @@ def compare_shares(
     shares = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
     # The mean of |x| for a normal x is sqrt(2/π) times its standard deviation.
     errors = shares.std(axis=0, ddof=1) / math.sqrt(groups) if groups > 1 else np.full(width, np.nan)
-    area = (edges[0][1] - edges[0][0]) * (edges[1][1] - edges[1][0])
+    area = math.prod(one[1] - one[0] for one in edges)
     return DensityComparison(
         total_variation=float(np.abs(observed - expected).sum() / 2),
         sampling_floor=float(math.sqrt(2 / math.pi) * errors.sum() / 2),
         outside=float(observed[-1]) if counted is None else 1 - float(counted.mean()),
         x1_edges=edges[0],
-        x2_edges=edges[1],
-        histogram=observed[:-1].reshape(len(edges[1]) - 1, len(edges[0]) - 1) / area,
+        x2_edges=edges[1] if len(edges) > 1 else np.zeros(0),
+        histogram=observed[:-1].reshape(-1, len(edges[0]) - 1) / area,
     )
 
 
 def _bin_probabilities(density: MarginalDensity, edges: Sequence[np.ndarray]) -> np.ndarray:
     """Integrals of the density over the bins, the second state's bins by row, as one flat array."""
+    if len(edges) == 1:
+        curve = scipy.interpolate.InterpolatedUnivariateSpline(density.x1, density.values[0])
+        return np.array([curve.integral(left, right) for left, right in itertools.pairwise(edges[0])])
     surface = scipy.interpolate.RectBivariateSpline(density.x1, density.x2, density.values.T)
     return np.array(
         [

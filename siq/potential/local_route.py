@@ -159,7 +159,7 @@ def _grown(
         solution = gauss_newton(equation, coefficients, free=free, steps=steps, tolerance=tolerance)
         coefficients, residual = solution.coefficients, solution.residual
         values = along(coefficients)
-        recorded = float(np.quantile(values[:, 0], HIGHEST))
+        recorded = _recorded(values, len(attractor))
         limit = min(_lowest(basis.values(tops) @ coefficients, tops, points, width, level), recorded)
         if last and abs(limit - level) < SETTLED * level and len(fitted) <= (1 + SETTLED) * before:
             break
@@ -196,6 +196,15 @@ def _lowest(
     """
     believed = (heights > (1 - AT_LEVEL) * level) | (_distances(tops, points, width) < CLOSE)
     return float(heights[believed & (heights > 0)].min(initial=np.inf))
+
+
+def _recorded(values: np.ndarray, dimension: int) -> float:
+    """The level that recordings reach, of V along descents ``(n, k)``.
+
+    Below it there may be states to every side without a start; but of one state whatever lies below its
+    highest start lies on the way down from it.
+    """
+    return float(np.quantile(values[:, 0], HIGHEST if dimension > 1 else 1.0))
 
 
 def _distances(tops: np.ndarray, points: np.ndarray, width: np.ndarray) -> np.ndarray:
@@ -240,7 +249,7 @@ def fit_well(
     flat = basin.states.reshape(-1, basin.states.shape[2])
     along = (potential(flat) - lowest).reshape(basin.states.shape[:2])
     tops = np.array([one.position for one in saddles]).reshape(-1, flat.shape[1])
-    highest = float(np.quantile(along[:, 0], HIGHEST))
+    highest = _recorded(along, flat.shape[1])
     level = min(float((potential(tops) - lowest).min(initial=np.inf)), highest)
     failure: NumericalFailure | None = None
     for share in STARTS:

@@ -143,12 +143,16 @@ class Well:
         """Mask of the points below `reach`, and among recorded states that lead to the attractor.
 
         V is zero at the attractor and nowhere lower. Where a formula is, it runs away between two of its
-        points.
+        points. One state has nothing beside its points: what lies between two of them is reached, and so is
+        the saddle, to which they lead as close as recordings do.
         """
         values = self.values(x)
         reached: np.ndarray = (values <= self.reach) & (values >= -NEGATIVE * self.reach)
         if not len(self.points):
             return reached
+        if x.shape[1] == 1:
+            known = self.points if self.saddle is None else np.append(self.points, self.saddle[None], axis=0)
+            return reached & (x[:, 0] >= known.min()) & (x[:, 0] <= known.max())
         tree, spacing = self._places
         own, nearest = tree.query(x / self._width)
         reached &= own <= NEAR * spacing[nearest]

@@ -20,6 +20,7 @@ from siq.networks.trained import TrainedNetworks
 from siq.potential.symbolic import SymbolicDecomposition
 from siq.report.plots.landscape import plot_error_maps, plot_landscape
 from siq.report.plots.landscape_curves import plot_degrees, plot_escape
+from siq.report.plots.one_state import DrawnBarrier, plot_error_curves, plot_landscape_curve
 from siq.report.plots.style import sentence_figure
 from siq.report.settings import LandscapeFiguresSettings
 from siq.steps.outcomes import Method
@@ -77,12 +78,43 @@ def landscape_figures(
         if len(escape)
         else sentence_figure("No escape was simulated."),
     }
-    if shown is None or len(shown.recordings.names) != 2:
+    if beside.reference is not None and beside.reference.reason:
+        figures["landscape_errors"] = sentence_figure(
+            f"There is no reference for the landscape: {beside.reference.reason}."
+        )
+    if shown is None:
         return figures
-    figures["landscape"] = _landscape_figure(space, shown)
-    if beside.reference is not None:
+    if len(shown.recordings.names) > 2:
+        of_more = "U is drawn of one state or of two, and these are {}."
+        figures["landscape"] = sentence_figure(of_more.format(len(shown.recordings.names)))
+        return figures
+    one_state = len(shown.recordings.names) == 1
+    figures["landscape"] = (_curve_figure if one_state else _landscape_figure)(space, shown)
+    if beside.reference is not None and not beside.reference.reason:
         figures |= _maps(settings, shown, beside, beside.reference)
     return figures
+
+
+def _curve_figure(space: StateSpace, shown: LandscapeRun) -> Figure:
+    """U over the only state, with its wells and barriers."""
+    stored, recordings = shown.landscape, shown.recordings
+    assert stored.quasipotential is not None
+    x = np.linspace(recordings.values.min(), recordings.values.max(), 4 * GRID)
+    equilibria = _equilibria_table(stored.data)
+    wells = stored.data["wells"]
+    barriers = [
+        DrawnBarrier(
+            wells[way["start"]]["attractor"][0], way["saddle"][0], wells[way["start"]]["height"],
+            wells[way["start"]]["height"] + way["barrier"],
+        )
+        for way in stored.data["transitions"]
+        if way["barrier"] is not None
+    ]  # fmt: skip
+    return plot_landscape_curve(
+        x, stored.quasipotential(x[:, None]), name=recordings.names[0], unit=space.unit(recordings.names[0]),
+        equilibria=equilibria.assign(y=stored.quasipotential(equilibria[["x"]].to_numpy(float))),
+        barriers=barriers,
+    )  # fmt: skip
 
 
 def _landscape_figure(space: StateSpace, shown: LandscapeRun) -> Figure:
@@ -113,25 +145,36 @@ def _maps(
     names = shown.recordings.names
     below = settings.landscape.compare_below or overall_level(reference)
     inside = np.nan_to_num(reference.values, nan=np.inf) < below
-    side = round(len(reference.points) ** 0.5)
-    axes = (reference.points[::side, 0], reference.points[:side, 1])
     maps = {"landscape_errors": _error_maps(shown, reference, inside)}
     if of_others := _published_maps(shown.landscape, reference, beside, inside, names):
         maps["landscape_published"] = of_others
     units = tuple(settings.space.unit(name) for name in names)
+    if len(names) == 1:
+        x = reference.points[:, 0]
+        return {
+            figure: plot_error_curves(x, one, name=names[0], unit=units[0]) for figure, one in maps.items()
+        }
+    side = round(len(reference.points) ** 0.5)
+    axes = (reference.points[::side, 0], reference.points[:side, 1])
     return {
-        figure: plot_error_maps(axes, one, names=names, units=units, energy_unit="")
+        figure: plot_error_maps(
+            axes,
+            {name: values.reshape(side, side) for name, values in one.items()},
+            names=names,
+            units=units,
+            energy_unit="",
+        )
         for figure, one in maps.items()
     }
 
 
 def _equilibria_table(data: Mapping[str, Any]) -> pd.DataFrame:
-    """Equilibria with their labels, in the first two states."""
+    """Equilibria with their labels, of two states or one."""
     labels = {tuple(well["attractor"]): f"A{index + 1}" for index, well in enumerate(data["wells"])}
     return pd.DataFrame(
         [
             {
-                "kind": one["kind"], "x": one["position"][0], "y": one["position"][1],
+                "kind": one["kind"], "x": one["position"][0], "y": one["position"][-1],
                 "label": labels.get(tuple(one["position"]), ""),
             }
             for one in data["equilibria"]
@@ -182,11 +225,10 @@ def _published_maps(
 def _shifted(
     maps: dict[str, np.ndarray], inside: np.ndarray, *, of_any_constant: tuple[str, ...]
 ) -> dict[str, np.ndarray]:
-    """Maps of the points inside as squares; some shifted to the first by the median of their difference."""
-    side = round(len(inside) ** 0.5)
+    """Maps of the points inside; some shifted to the first by the median of their difference."""
     exact = next(iter(maps.values()))
     shown = {}
     for name, values in maps.items():
         shift = np.nanmedian((values - exact)[inside]) if name in of_any_constant else 0.0
-        shown[name] = np.where(inside, values - shift, np.nan).reshape(side, side)
+        shown[name] = np.where(inside, values - shift, np.nan)
     return shown

@@ -8,6 +8,7 @@ from pathlib import Path
 import pandas as pd
 
 from siq.report.page import ReportFigure, ReportTable
+from siq.steps.outcomes import Status, Step
 
 CAPTIONS = {
     "landscape": "The quasipotential U over all wells, where its formulas are believed, with attractors,"
@@ -20,6 +21,28 @@ CAPTIONS = {
     " its number of terms.",
     "escape": "Mean escape times: the law from what was identified, and direct simulations of the card.",
 }
+
+
+def landscape_sentences(landscape: pd.DataFrame, outcomes: pd.DataFrame) -> list[str]:
+    """Why there is no landscape, where f was followed and led to no attractor.
+
+    Parameters
+    ----------
+    landscape, outcomes
+        The tables of these names.
+    """
+    asked = outcomes[
+        (outcomes["step"] == Step.LANDSCAPE) & outcomes["status"].isin([Status.WARNING, Status.FAILED])
+    ]
+    without = asked[~asked["run"].isin(landscape[landscape["kind"] == "attractor"]["run"])]
+    if without.empty:
+        return []
+    which = (
+        ""
+        if len(without) == outcomes["run"].nunique()
+        else f" of {len(without)} of {outcomes['run'].nunique()} runs"
+    )
+    return [f"There is no landscape{which}: {without['reason'].iloc[0]}."]
 
 
 def landscape_tables(
@@ -47,7 +70,7 @@ def landscape_tables(
                 "basin": "share of the recorded states that f leads there",
                 "barrier": "of U, by the formula of the well and the end of the path of least action",
                 "standard error": "of the barrier, from the uncertainty of f",
-                "by formula": "share of the barrier that the formula accounts for",
+                "formula share": "share of the barrier that the formula accounts for",
                 "minimum action": "the same barrier by the path alone, without any formula",
                 "prefactor": "of the mean escape time prefactor · exp(barrier/ε)",
             },

@@ -1,4 +1,4 @@
-"""Projection: a decomposition on the plane of its first two states, or a landscape of two, for drawing."""
+"""Projection, for drawing: a decomposition on the plane of two states, or a landscape of two or of one."""
 
 from __future__ import annotations
 
@@ -69,21 +69,22 @@ def project_landscape(
     trajectories: Sequence[np.ndarray],
     resolution: int = 161,
 ) -> ComponentFields:
-    """Fields of the formulas of all wells, for two states; NaN where none is believed.
+    """Fields of the formulas of all wells, for two states or one; NaN where none is believed.
 
     Parameters
     ----------
     potential
         U over all wells. At each point the formula counts that gives U there.
     domain
-        Shape ``(2, 2)``: the plane's limits.
+        Shape ``(d, 2)``: the limits of the states.
     trajectories
-        States along some trajectories, each of shape ``(k, 2)``.
+        States along some trajectories, each of shape ``(k, d)``.
     resolution
         Points along each axis.
     """
-    x1, x2 = (np.linspace(low, high, resolution) for low, high in domain)
-    x = np.stack(np.meshgrid(x1, x2), axis=-1).reshape(-1, 2)
+    axes = [np.linspace(low, high, resolution) for low, high in domain]
+    x = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, len(axes))
+    x1, x2 = (*axes, np.zeros(0))[:2]
     by_well = potential.by_well(x)
     values = np.where(np.isfinite(by_well), by_well, np.inf)
     least, which = values.min(axis=0), values.argmin(axis=0)
@@ -92,12 +93,12 @@ def project_landscape(
         mine = np.isfinite(least) & (which == index)
         gradient[mine] = one.gradients(x[mine])
         circulatory[mine] = one.dynamics.drift(x[mine]) + one.dynamics.diffusion.push(x[mine], gradient[mine])
-    shape = (resolution, resolution)
+    shape = (resolution if len(axes) > 1 else 1, resolution)
     return ComponentFields(
         x1=x1,
         x2=x2,
-        minus_gradient=-gradient.T.reshape(2, *shape),
-        circulatory=circulatory.T.reshape(2, *shape),
+        minus_gradient=-gradient.T.reshape(len(axes), *shape),
+        circulatory=circulatory.T.reshape(len(axes), *shape),
         quasipotential=np.where(np.isfinite(least), least, np.nan).reshape(shape),
         trajectories=list(trajectories),
     )

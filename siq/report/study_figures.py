@@ -159,7 +159,7 @@ def _component_fields(
     domain = np.stack([low, high], axis=1) if system is None else system.box
     chosen = _some(recordings)
     paths = [recordings.values[recordings.recording == index] for index in chosen]
-    if shown.landscape is not None and len(domain) == 2:
+    if shown.landscape is not None and len(domain) <= 2:
         whole = project_landscape(shown.landscape, domain=domain, trajectories=())
         domain = _limits_of(whole, domain)
         return project_landscape(shown.landscape, domain=domain, trajectories=paths), domain
@@ -175,7 +175,9 @@ def _limits_of(fields: ComponentFields, domain: np.ndarray) -> np.ndarray:
     if fields.quasipotential is None or not np.isfinite(fields.quasipotential).any():
         return domain
     known = np.isfinite(fields.quasipotential)
-    seen = [fields.x1[known.any(axis=0)], fields.x2[known.any(axis=1)]]
+    seen = [fields.x1[known.any(axis=0)]]
+    if len(domain) > 1:
+        seen.append(fields.x2[known.any(axis=1)])
     margin = 0.1 * np.array([np.ptp(one) for one in seen])
     inner = np.array([[one.min(), one.max()] for one in seen]) + margin[:, None] * [-1, 1]
     return np.clip(inner, domain[:, :1], domain[:, 1:])

@@ -15,7 +15,7 @@ import yaml
 from siq.potential.symbolic import SymbolicDecomposition
 from siq.report.formatting import formula_mathml, vector_mathml
 from siq.report.invariant_tables import invariant_tables
-from siq.report.landscape_tables import landscape_figures, landscape_tables
+from siq.report.landscape_tables import landscape_figures, landscape_sentences, landscape_tables
 from siq.report.page import FormulaRow, ReportContent, ReportFigure, ReportTable
 from siq.report.sentences import answer_sentences, control_sentences
 from siq.steps.outcomes import METHODS, Method, Status
@@ -155,6 +155,7 @@ def _answer(study: Study, results: StudyResults) -> list[str]:
     said = answer_sentences(
         rrmse, results.tables["outcomes"], results.tables["summary"], runs=study.runs, method=shown.method
     )
+    said += landscape_sentences(results.tables["landscape"], results.tables["outcomes"])
     if shown.run is not None:
         which = ", the median of the runs by error" if rrmse["rrmse"].notna().any() else ""
         said.append(f"The formulas below are those of run {shown.run}{which}.")

@@ -51,7 +51,7 @@ def landscape_rows(run: int, found: Landscape, remark: str | None = None) -> pd.
                 "U": found.heights[way.start] + way.barrier,
                 "barrier": way.barrier,
                 "standard_error": way.standard_error,
-                "by_formula": way.by_formula,
+                "formula_share": way.formula_share,
                 "minimum_action": np.nan if way.path is None else way.path.uphill.action,
                 "prefactor": np.nan if way.rate is None else way.rate.prefactor,
                 "note": "; ".join([*way.notes, *([] if remark is None else [remark])]),

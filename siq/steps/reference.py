@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 from pydantic.dataclasses import dataclass
 
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.phase_portrait import evenly_spread, phase_portrait
-from siq.landscape.reference import ReferenceLandscape, reference_landscape
+from siq.errors import NumericalFailure
+from siq.landscape.reference import ReferenceLandscape, no_reference, reference_landscape
 from siq.numerics.randomness import Purpose, generator
 from siq.steps.settings import STRICT
 
@@ -22,15 +24,15 @@ class ReferenceSettings:
 
 
 def run(settings: ReferenceSettings, system: Dynamics) -> ReferenceLandscape:
-    """The reference for the landscape of a card."""
+    """The reference for the landscape of a card; an empty one that says why where there is none."""
     draw = generator(settings.seed, Purpose.REFERENCE)
     low, high = system.box.T
     x = draw.uniform(low, high, size=(STARTS, system.dimension))
     points = x[evenly_spread(x, generator=draw)]
-    return reference_landscape(
-        system,
-        phase_portrait(system, points),
-        box=system.box,
-        reach=REACH,
-        generator=draw,
-    )
+    portrait = phase_portrait(system, points)
+    if not portrait.attractors and (fault := portrait.fault()) is not None:
+        return no_reference(system.dimension, fault)
+    try:
+        return reference_landscape(system, portrait, box=system.box, reach=REACH, generator=draw)
+    except (NumericalFailure, np.linalg.LinAlgError) as error:
+        return no_reference(system.dimension, str(error))

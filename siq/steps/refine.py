@@ -103,6 +103,7 @@ def run(settings: RefineSettings, given: RunToRefine) -> RefinedRun:
     certificates: dict[Method, Mapping[str, Any]] = {}
     certificate: Certificate | None = None
     ground: Ground | None = None
+    lost = _lost_networks(settings, given)
     if (missing := _missing(settings, given)) is not None:
         outcome = Outcome(number, Step.REFINE, Status.SKIPPED, missing)
     else:
@@ -112,12 +113,12 @@ def run(settings: RefineSettings, given: RunToRefine) -> RefinedRun:
                 certificates[Method.REGRESSION] = ground.certify(given.regressed).as_data()
             refined, certificate, notes = refine_and_certify(ground, given.regressed)
             formulas[Method.REFINED] = refined
-            certificates[Method.REFINED] = certificate.as_data() | {"notes": list(notes)}
+            certificates[Method.REFINED] = certificate.as_data() | {"notes": [*lost, *notes]}
             status = Status.OK if certificate.certified else Status.WARNING
-            reason = "" if certificate.certified else f"not certified: {certificate.reason}"
-            outcome = Outcome(number, Step.REFINE, status, reason)
+            reason = [] if certificate.certified else [*lost, f"not certified: {certificate.reason}"]
+            outcome = Outcome(number, Step.REFINE, status, "; ".join(reason))
         except (NumericalFailure, np.linalg.LinAlgError) as error:
-            outcome = Outcome(number, Step.REFINE, Status.FAILED, str(error))
+            outcome = Outcome(number, Step.REFINE, Status.FAILED, "; ".join([*lost, str(error)]))
     if ground is not None and ground.networks is not None:
         theirs = (formulas.get(Method.REFINED), certificate)
         certificates[Method.CONTROL] = control(ground, ground.networks, *theirs)
@@ -133,6 +134,12 @@ def _missing(settings: RefineSettings, given: RunToRefine) -> str | None:
     if given.trained.networks is None and settings.refinement.routes == ("network",):
         return given.trained.missing
     return None
+
+
+def _lost_networks(settings: RefineSettings, given: RunToRefine) -> list[str]:
+    """Why there are no networks although they were asked for: the first cause of whatever follows."""
+    asked = given.trained.outcome.status == Status.FAILED or "network" in (settings.refinement.routes or ())
+    return [given.trained.missing] if given.trained.networks is None and asked else []
 
 
 class Ground:

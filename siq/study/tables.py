@@ -61,7 +61,7 @@ COLUMNS: Mapping[str, Mapping[str, str]] = {
         "basin": "float64",
         "barrier": "float64",
         "standard_error": "float64",
-        "by_formula": "float64",
+        "formula_share": "float64",
         "minimum_action": "float64",
         "prefactor": "float64",
         "note": "str",

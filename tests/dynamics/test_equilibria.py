@@ -78,7 +78,7 @@ def test_a_limit_cycle_beside_an_attractor_is_named() -> None:
     found = phase_portrait(dynamics, points)
     assert len(found.attractors) == 1
     assert found.unsettled == pytest.approx((np.linalg.norm(points, axis=1) > 1).mean())
-    assert "there is another attractor, such as a limit cycle" in (found.fault() or "")
+    assert "of the recorded states lead to no equilibrium: they end on a limit cycle" in (found.fault() or "")
 
 
 def test_an_equilibrium_that_is_degenerate_is_named() -> None:

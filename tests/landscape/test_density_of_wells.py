@@ -203,7 +203,7 @@ def test_what_cannot_be_done_is_told(sampled) -> None:
         known_density(fine, coarse, lowest, intensity=0.0)
     with pytest.raises(NumericalFailure, match="too narrow"):
         known_density(fine, coarse, lowest, intensity=1e-4)
-    with pytest.raises(NumericalFailure, match="two or three states"):
+    with pytest.raises(NumericalFailure, match="three states at most"):
         sample_potential(POTENTIAL, np.array([[-1.0, 1.0]] * 4))
     nothing = of_values(np.full((8, 8), np.nan), BOX)
     with pytest.raises(NumericalFailure, match="known nowhere"):

@@ -17,6 +17,7 @@ from known_systems import (
     uniform_points,
 )
 
+from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.phase_portrait import PhasePortrait, phase_portrait
 from siq.errors import NumericalFailure
@@ -26,6 +27,7 @@ from siq.landscape.transitions import (
     Transition,
     barrier_by_formula,
     barrier_standard_error,
+    missing_diffusion,
     transitions,
     ways_out,
 )
@@ -104,7 +106,7 @@ def test_barriers_are_those_of_the_exact_potential(name: str) -> None:
         assert way.barrier == pytest.approx(exact, rel=1e-6)
         assert way.path is not None
         assert way.path.uphill.action == pytest.approx(exact, rel=1e-5)
-        assert 0.95 < way.by_formula <= 1 + 1e-9
+        assert 0.95 < way.formula_share <= 1 + 1e-9
         assert way.rate is not None
         assert way.rate.barrier == way.path.uphill.action
         np.testing.assert_allclose(
@@ -128,7 +130,7 @@ def test_without_a_formula_the_path_alone_tells_the_barrier() -> None:
     for way in ways("double well", with_formulas=False):
         assert way.path is not None
         assert way.barrier == way.path.uphill.action
-        assert way.by_formula == 0
+        assert way.formula_share == 0
 
 
 def test_a_formula_that_is_believed_nowhere_leaves_the_path() -> None:
@@ -240,7 +242,7 @@ def test_a_saddle_that_leads_out_of_the_region_has_no_end() -> None:
     (way,) = ways_of(known, found, (None,))
     assert way.start == 0 and way.end is None
     assert way.path is None and way.rate is None
-    assert np.isnan([way.barrier, way.by_formula, way.standard_error]).all()
+    assert np.isnan([way.barrier, way.formula_share, way.standard_error]).all()
     np.testing.assert_allclose(way.saddle.position, 0, atol=1e-9)
     assert way.notes == ("behind the saddle lies no other attractor of the recorded region",)
 
@@ -265,3 +267,20 @@ def test_where_v_is_not_smooth_at_the_saddle_there_is_a_barrier_but_no_escape_ti
         assert way.barrier == pytest.approx(0.34004, abs=1e-4)
         assert way.rate is None
         assert any("V is not smooth" in note for note in way.notes)
+
+
+def test_where_d_is_missing_there_are_barriers_with_the_words_of_the_landscape() -> None:
+    position, speed = sympy.symbols("x v", real=True)
+    damped = Dynamics.of((position, speed), (speed, position - position**3 - speed))
+    known = KnownSystem(
+        damped, None, np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([[-2.0, 2.0], [-2.0, 2.0]])
+    )
+    setting = portrait_of(known, 250, share=0.9)
+    told = missing_diffusion(damped)
+    assert told is not None and "of the form dx/dt = v" in told
+    for way in transitions(exact_field(known, 3), ways_out(damped, setting), (None, None)):
+        assert np.isfinite(way.barrier) and way.rate is None
+        assert f"no escape time: {told}" in way.notes
+    given = damped.with_diffusion(Diffusion(np.diag([1e-3, 1.0])))
+    assert missing_diffusion(given) is None
+    assert missing_diffusion(maier_stein(1).dynamics) is None

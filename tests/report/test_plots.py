@@ -257,8 +257,12 @@ def test_the_dataset_shows_what_the_regression_sees() -> None:
         assert label in text
     unknown = plot_dataset(Dataset([path], [], points), states="xyz", units=("1", "1", "1"))
     assert "no networks" in words(unknown) and "dashed" not in words(unknown)
-    one_state = plot_dataset(Dataset([path[:, :1]], [], points[:, :1]), states="x", units="1")
-    assert "no plane" in words(one_state)
+    one_state = plot_dataset(
+        Dataset([path[:, :1]], [path[:, :1]], points[:, :1], below), states="x", units=("mV",)
+    )
+    left, middle, right = one_state.axes
+    assert [sum(bar.get_height() for bar in axes.patches) for axes in (middle, right)] == [500, below.sum()]
+    assert "$x$ (mV)" in words(one_state) and "dashed: no noise" in words(one_state)
 
 
 def test_predictions_lie_beside_the_observed_and_their_errors_on_a_logarithmic_axis() -> None:

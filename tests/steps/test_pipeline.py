@@ -14,9 +14,10 @@ from siq.dynamics.simulation import SimulationOptions
 from siq.errors import NumericalFailure
 from siq.networks.options import CheckOptions, TrainingOptions
 from siq.networks.regression import RegressionOptions
+from siq.potential.refinement import RefinementOptions
 from siq.potential.storage import model_to_data
 from siq.potential.symbolic import exact_decomposition
-from siq.steps import draw, identify, score, train
+from siq.steps import draw, identify, refine, score, train
 from siq.steps.outcomes import Method, Outcome, Status, Step
 from siq.steps.pipeline import Analysis, PipelineSettings, analyse
 from siq.steps.settings import Sampling, StateSpace
@@ -186,6 +187,31 @@ def test_why_a_check_could_not_be_prepared_is_the_reason(
     said = train.run(settings, runs, device="cpu").outcomes[0]
     assert said.status == Status.WARNING
     assert said.reason.endswith("could not be prepared: the attractors cannot be told apart")
+
+
+@pytest.mark.parametrize("routes", [None, ("local", "network"), ("network",)])
+def test_why_a_training_failed_is_what_refinement_says_first(
+    recordings: Recordings, analysis: Analysis, routes: tuple[str, ...] | None
+) -> None:
+    failed = TrainedRun(None, Outcome(0, Step.TRAIN, Status.FAILED, "the loss became infinite"))
+    options = replace(SETTINGS, refinement=RefinementOptions(routes=routes, degrees=(2,)))
+    found = refine.run(
+        options.of(refine.RefineSettings), refine.RunToRefine(recordings, analysis.identified, failed)
+    )
+    assert found.outcome.status != Status.OK
+    assert found.outcome.reason.startswith("the training gave no networks (the loss became infinite)")
+
+
+def test_where_refinement_needs_no_networks_their_failure_is_a_note(
+    recordings: Recordings, analysis: Analysis
+) -> None:
+    failed = TrainedRun(None, Outcome(0, Step.TRAIN, Status.FAILED, "the loss became infinite"))
+    found = refine.run(
+        SETTINGS.of(refine.RefineSettings), refine.RunToRefine(recordings, analysis.identified, failed)
+    )
+    assert found.outcome.status == Status.OK
+    notes = found.certificates[Method.REFINED]["notes"]
+    assert notes[0] == "the training gave no networks (the loss became infinite)"
 
 
 def test_scores_are_in_the_columns_of_the_contract(analysis: Analysis) -> None:

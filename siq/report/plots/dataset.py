@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from siq.report.plots.one_state import plot_dataset_curves
 from siq.report.plots.style import (
     BLACK,
     BLUE,
@@ -18,7 +19,6 @@ from siq.report.plots.style import (
     drawn_in_style,
     name_label,
     say,
-    sentence_figure,
     unit_label,
 )
 
@@ -68,10 +68,11 @@ def plot_dataset(data: Dataset, *, states: Sequence[str], units: Sequence[str]) 
     Returns
     -------
     matplotlib.figure.Figure
-        Three panels on the first two states. The closed curve is the level of V_θ.
+        Three panels on the first two states. The closed curve is the level of V_θ. Of a single state
+        trajectories against the number of the sample, and histograms.
     """
     if data.points.shape[1] < 2:
-        return sentence_figure("With one state there is no plane to show the recorded states on.")
+        return plot_dataset_curves(data, state=states[0], unit=units[0])
     figure = Figure(figsize=(PAGE_WIDTH, 2.6))
     left, middle, right = figure.subplots(1, 3, sharex=True, sharey=True)
     for path in data.trajectories:

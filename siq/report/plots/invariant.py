@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
+from siq.report.plots.one_state import plot_invariant_curves
 from siq.report.plots.style import (
     PAGE_WIDTH,
     VERMILLION,
@@ -54,10 +55,13 @@ def plot_invariant_distribution(
         Above, ``p = Z⁻¹ exp(-U/ε)`` as filled contours. Below, where there is a simulation, its histogram in
         the same colours, with lines of the density above at 10, 50 and 90 % of its peak; the titles give
         the total variation distance and what the number of samples alone explains. Where the density is not
-        known the plane is hatched, and the axes end not far from what is known.
+        known the plane is hatched, and the axes end not far from what is known. Of a single state curves over
+        histograms.
     """
     if not panels:
         return sentence_figure("There is no invariant distribution to show.")
+    if len(panels[0].density.plane) == 1:
+        return plot_invariant_curves(panels, state=states[0], unit=units[0])
     simulated = any(panel.comparison is not None for panel in panels)
     rows = 2 if simulated else 1
     width = PAGE_WIDTH * min(len(panels), 3) / 3

@@ -1,0 +1,107 @@
+"""Figures of systems with one state."""
+
+from __future__ import annotations
+
+import functools
+
+import matplotlib.text
+import numpy as np
+import pytest
+from known_systems import double_well, exact_field, portrait_of
+from matplotlib.figure import Figure
+
+from siq.data.recordings import Recordings
+from siq.landscape.density_of_wells import known_density, lowest_possible, marginal_of, sample_potential
+from siq.landscape.landscape import Landscape, find_landscape
+from siq.landscape.options import LandscapeOptions
+from siq.landscape.reference import reference_landscape
+from siq.landscape.storage import StoredLandscape, read_landscape, write_landscape
+from siq.numerics.density_comparison import ComparedDensity, total_variation
+from siq.potential.local_wells import WellOptions
+from siq.report.landscape_figures import LandscapeComparisons, LandscapeRun, landscape_figures
+from siq.report.plots import plot_components, plot_invariant_distribution
+from siq.report.projection import project_landscape
+from siq.report.settings import LandscapeFiguresSettings
+from siq.steps.settings import StateSpace
+from siq.study.tables import as_table
+
+KNOWN = double_well(1)
+
+
+def words(figure: Figure) -> str:
+    return "\n".join(text.get_text() for text in figure.findobj(matplotlib.text.Text))
+
+
+@functools.cache
+def landscape() -> Landscape:
+    return find_landscape(
+        exact_field(KNOWN, 3), portrait_of(KNOWN, share=0.9), options=WellOptions(degrees=(4,))
+    )
+
+
+@pytest.fixture(scope="module")
+def figures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Figure]:
+    file = tmp_path_factory.mktemp("one") / "quasipotential.json"
+    write_landscape(file, landscape(), dynamics=KNOWN.dynamics)
+    stored = read_landscape(file, dynamics=KNOWN.dynamics)
+    assert isinstance(stored, StoredLandscape)
+    x = np.linspace(-1.8, 1.8, 50)
+    recordings = Recordings.from_arrays(np.arange(50.0), x[None, :, None], names=["x"])
+    reference = reference_landscape(
+        KNOWN.dynamics, portrait_of(KNOWN), box=KNOWN.domain, reach=1.2, generator=np.random.default_rng(0)
+    )
+    space = StateSpace(names=("x",), units={"x": "mV", "t": "s"})
+    return landscape_figures(
+        LandscapeFiguresSettings(space=space, landscape=LandscapeOptions()),
+        LandscapeRun(stored, recordings, {}, None),
+        LandscapeComparisons(reference, as_table("escape", []), as_table("degrees", []), {}, None),
+    )
+
+
+def test_u_is_a_curve_with_its_barriers(figures: dict[str, Figure]) -> None:
+    axes = figures["landscape"].axes[0]
+    x, u = axes.lines[0].get_data()
+    np.testing.assert_allclose(u, landscape().quasipotential(np.asarray(x)[:, None]))
+    text = words(figures["landscape"])
+    for barrier in landscape().barriers()["barrier"]:
+        assert f"{barrier:.4g}" in text
+    for label in ("$x$ (mV)", "$U$ (in the unit of ε)", "A1", "A2", "attractor", "saddle"):
+        assert label in text
+
+
+def test_the_errors_are_a_curve_too(figures: dict[str, Figure]) -> None:
+    left, right = figures["landscape_errors"].axes
+    assert len(left.lines) == 2 and len(right.lines) == 1
+    assert np.nanmax(right.lines[0].get_ydata()) < 1e-4
+    text = words(figures["landscape_errors"])
+    assert "characteristics" in text and "local formulas" in text and "$x$ (mV)" in text
+
+
+def test_the_density_is_a_curve_over_a_histogram() -> None:
+    potential = landscape().over_wells
+    assert potential is not None
+    fine, coarse = (sample_potential(potential, KNOWN.domain, cells=cells) for cells in (400, 200))
+    found = known_density(fine, coarse, lowest_possible(coarse, KNOWN.dynamics), intensity=0.1)
+    density = marginal_of(found, fine)
+    whole = ComparedDensity(density, found.normalisation, None, found.unknown)
+    samples = np.random.default_rng(0).normal(-1, 0.1, (1, 4, 200))
+    smooth = ComparedDensity(
+        density.__class__((0,), 0.1, density.x1, density.x2, np.exp(-(density.x1[None] ** 2))),
+        comparison=total_variation(
+            density.__class__((0,), 0.1, density.x1, density.x2, np.exp(-(density.x1[None] ** 2))), samples
+        ),
+    )
+    figure = plot_invariant_distribution([whole, smooth], states=["x"], units=["mV"])
+    assert len(figure.axes) == 2
+    text = words(figure)
+    for label in ("density (per mV)", "$x$ (mV)", "total variation", "a long simulation", "hatched: at most"):
+        assert label in text
+
+
+def test_the_components_of_a_landscape_of_one_state_are_curves() -> None:
+    potential = landscape().over_wells
+    assert potential is not None
+    fields = project_landscape(potential, domain=KNOWN.domain, trajectories=(), resolution=41)
+    assert fields.quasipotential is not None and fields.quasipotential.shape == (1, 41)
+    figure = plot_components(fields, states=["x"], units=["mV"], domain=KNOWN.domain)
+    assert "not identified" not in words(figure)
