@@ -151,9 +151,7 @@ def _grown(
             rows = np.sort(generator.choice(rows, MOST_POINTS, replace=False))
         points = basin.points(rows)
         if len(points) < 2 * basis.size:
-            raise NumericalFailure(
-                f"only {len(points)} recorded states lead to the attractor near {attractor.round(4)}"
-            )
+            raise NumericalFailure(_too_few(attractor, len(points), before=before, needed=2 * basis.size))
         equation = equation_at(basis, points, dynamics)
         steps, tolerance = (40, 1e-13) if last else (8, ON_THE_WAY)
         solution = gauss_newton(equation, coefficients, free=free, steps=steps, tolerance=tolerance)
@@ -184,6 +182,14 @@ def _grown(
             " saddle"
         )
     return Well(dynamics, attractor, basis, coefficients, level, saddle, residual, points)
+
+
+def _too_few(attractor: np.ndarray, count: int, *, before: int, needed: int) -> str:
+    """Why a fit cannot go on, in words: few states lead to the attractor, or V has left them."""
+    place = f"the attractor near {attractor.round(4)}"
+    if not before:
+        return f"only {count} recorded states lead to {place}"
+    return f"V about {place} leaves the recorded states: it came from {before} to {count} and needs {needed}"
 
 
 def _lowest(
@@ -277,7 +283,12 @@ def fit_well(
         start = solution.coefficients
         metric = basis.hessians(attractor.position[None])[0] @ start
         curvature = np.linalg.eigvalsh(metric * np.outer(basis.scale, basis.scale))
-        first = float(np.median(basis.values(points) @ start))
+        # Up to half of these states, but no fewer than the coefficients need: a start that just has enough of
+        # them would otherwise be refused for want of states.
+        ways = basin.highest((basis.values(flat) @ start).reshape(along.shape))
+        heights = np.sort(ways[tuple(basin.chosen[rows].T)])
+        enough = max(len(heights) // 2, 2 * basis.size)
+        first = float(heights[min(enough, len(heights) - 1)]) * (1 + ON_THE_WAY)
         # V = 0 is a solution too, and what tends to it has a residual as large as itself.
         if not solution.residual < NO_SOLUTION or curvature[0] <= FLAT * curvature[-1] or first <= 0:
             failure = NumericalFailure(

@@ -234,6 +234,25 @@ def test_the_network_route_needs_recorded_states_below_the_saddle() -> None:
         )  # fmt: skip
 
 
+def test_a_start_with_just_enough_states_is_not_halved() -> None:
+    # A network that is far too low at the saddle leaves between two and four states for each coefficient.
+    known = archetype(2)
+    found = portrait_of(known)
+    lowest = potential_values(known, found.attractors[0].position[None])
+    top = found.saddles[0][0].position
+
+    def dipped(x: np.ndarray) -> np.ndarray:
+        away = ((x - top) ** 2).sum(axis=1)
+        return potential_values(known, x) - lowest - 0.4996 * np.exp(-20 * away)
+
+    well = fit_well(
+        known.dynamics, found.attractors[0], found.basins[0], found.saddles[0], dipped,
+        degree=8, generator=np.random.default_rng(0),
+    )  # fmt: skip
+    assert well.level == pytest.approx(0.5, rel=1e-9)
+    assert_exact(known, replace(well, level=0.9 * well.level), 1e-9)
+
+
 def test_the_network_route_does_not_follow_networks_in_how_far_a_well_reaches() -> None:
     # Steep along one state and flat along the other: where the network's V is low, V is not, and conversely.
     known = maier_stein(3)
