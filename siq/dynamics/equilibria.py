@@ -95,7 +95,7 @@ def find_equilibria(dynamics: Dynamics, points: np.ndarray) -> list[Equilibrium]
     for _ in range(NEWTON_STEPS):
         # In shares of the box, or states in very different units would damp each other.
         value, jacobian = dynamics.drift(x) / width, dynamics.jacobian(x) * width / width[:, None]
-        size = np.linalg.norm(jacobian, axis=(1, 2))[:, None, None] + 1e-300
+        size = np.linalg.norm(jacobian, axis=(1, 2))[:, None, None] + 1e-100  # its square counts
         # A little damping keeps singular Jacobians harmless and does not spoil convergence to rounding.
         normal = np.einsum("nji,njk->nik", jacobian, jacobian) + 1e-14 * size**2 * np.eye(x.shape[1])
         step = -np.linalg.solve(normal, np.einsum("nji,nj->ni", jacobian, value)[..., None])[..., 0]
