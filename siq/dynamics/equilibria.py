@@ -13,6 +13,7 @@ import numpy as np
 import scipy.linalg
 
 from siq.dynamics.dynamics import Dynamics
+from siq.errors import NumericalFailure
 from siq.numerics.integration import dormand_prince_step, next_step
 
 EquilibriumKind = Literal["attractor", "saddle", "repeller", "degenerate"]
@@ -95,7 +96,7 @@ def find_equilibria(dynamics: Dynamics, points: np.ndarray) -> list[Equilibrium]
     for _ in range(NEWTON_STEPS):
         # In shares of the box, or states in very different units would damp each other.
         value, jacobian = dynamics.drift(x) / width, dynamics.jacobian(x) * width / width[:, None]
-        size = np.linalg.norm(jacobian, axis=(1, 2))[:, None, None] + 1e-300
+        size = np.linalg.norm(jacobian, axis=(1, 2))[:, None, None] + 1e-100  # its square counts
         # A little damping keeps singular Jacobians harmless and does not spoil convergence to rounding.
         normal = np.einsum("nji,njk->nik", jacobian, jacobian) + 1e-14 * size**2 * np.eye(x.shape[1])
         step = -np.linalg.solve(normal, np.einsum("nji,nj->ni", jacobian, value)[..., None])[..., 0]
@@ -188,6 +189,11 @@ def follow(
         Shape ``(d, 2)``: the recorded region. What leaves a box of three times this size has escaped.
     states
         States kept along each trajectory, about evenly spread.
+
+    Raises
+    ------
+    NumericalFailure
+        When nothing moves: f is zero at most of the starts.
     """
     width = box[:, 1] - box[:, 0]
     middle = box.mean(axis=1)
@@ -195,6 +201,8 @@ def follow(
     slowest = (
         min(rates) if rates else float(np.median(np.linalg.norm(dynamics.drift(starts) / width, axis=1)))
     )
+    if not slowest > 0:
+        raise NumericalFailure("f is zero at most of the states: nothing moves, and there is no landscape")
     horizon = (SLOWEST_TIMES if rates else UNSETTLED_TIMES) / slowest
     count = len(starts)
     x, times, steps = starts.copy(), np.zeros(count), np.full(count, 0.01 / slowest)

@@ -11,11 +11,13 @@ from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
+import sympy
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.equilibria import find_equilibria
+from siq.dynamics.formulas import compile_formulas
 from siq.dynamics.simulation import SimulationOptions, sampling_stride
 
 TRAJECTORIES = 1000  # enough for every state of a box in three dimensions, and simulated in seconds
@@ -97,6 +99,27 @@ def rates(dynamics: Dynamics) -> tuple[float, float]:
     ]
     slowest = min(relaxing, default=float(np.quantile(sizes, 1 - FASTEST)))
     return fastest, max(slowest, 1e-6 * fastest)
+
+
+def fault_over_domain(dynamics: Dynamics) -> tuple[str, str] | None:
+    """A state whose equation has no value somewhere in the domain, with what is wrong; None for none.
+
+    States at random and the corners tell what overflows; a divisor that changes its sign between them is zero
+    somewhere, though no state of a sample meets it.
+    """
+    low, high = dynamics.box.T
+    x = np.random.default_rng(0).uniform(low, high, size=(STATES, dynamics.dimension))
+    x = np.concatenate([x, low[None], high[None]])
+    with np.errstate(all="ignore"):
+        flow, slopes = dynamics.drift(x), dynamics.jacobian(x)
+        for index, (name, formula) in enumerate(zip(dynamics.states, dynamics.formulas, strict=True)):
+            bases = [one.base for one in formula.atoms(sympy.Pow) if one.exp.is_negative]
+            divisors = compile_formulas(bases, dynamics.symbols)(np.ascontiguousarray(x.T))
+            if any(values.min() <= 0 <= values.max() for values in divisors):
+                return name, "divides by zero within the domain"
+            if not (np.isfinite(flow[:, index]).all() and np.isfinite(slopes[:, index]).all()):
+                return name, "is too large for a number, or not defined, in a part of the domain"
+    return None
 
 
 def round_down(value: float) -> float:

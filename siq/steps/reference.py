@@ -29,10 +29,10 @@ def run(settings: ReferenceSettings, system: Dynamics) -> ReferenceLandscape:
     low, high = system.box.T
     x = draw.uniform(low, high, size=(STARTS, system.dimension))
     points = x[evenly_spread(x, generator=draw)]
-    portrait = phase_portrait(system, points)
-    if not portrait.attractors and (fault := portrait.fault()) is not None:
-        return no_reference(system.dimension, fault)
     try:
+        portrait = phase_portrait(system, points)
+        if not portrait.attractors and (fault := portrait.fault()) is not None:
+            return no_reference(system.dimension, fault)
         return reference_landscape(system, portrait, box=system.box, reach=REACH, generator=draw)
     except (NumericalFailure, np.linalg.LinAlgError) as error:
         return no_reference(system.dimension, str(error))

@@ -19,7 +19,7 @@ from siq.dynamics.cards import DiffusionEntry, Name, SystemCard, build_system, d
 from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.formulas import FormulaError
-from siq.dynamics.sampling import SimulationEntry, complete
+from siq.dynamics.sampling import SimulationEntry, complete, fault_over_domain
 from siq.errors import InputError
 from siq.files.documents import read_document, validate
 from siq.identify.identification import IdentificationOptions
@@ -285,6 +285,8 @@ def _with_landscape(path: Path) -> Dynamics:
             "the noise does not reach every state, and landscapes are worked out only where it does",
             "give a positive definite matrix, or use the card in a study of mismatch",
         )
+    if (found := fault_over_domain(system)) is not None:
+        refuse(("equations", found[0]), f"the equation {found[1]}", "choose a domain in which it has a value")
     return system
 
 

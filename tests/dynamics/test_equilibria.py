@@ -91,6 +91,11 @@ def test_an_equilibrium_that_is_degenerate_is_named() -> None:
     assert "neither stable nor unstable to first order" in (found.fault() or "")
 
 
+def test_an_f_that_is_constant_has_no_equilibria() -> None:
+    points = np.random.default_rng(0).uniform(-1, 1, (50, 2))
+    assert find_equilibria(Dynamics.of((x, y), (0 * x, 1 + 0 * y)), points) == []
+
+
 def test_kinds_and_numbers_of_unstable_directions() -> None:
     for equations, kind, unstable in [
         ((-x, -2 * y), "attractor", 0),

@@ -44,6 +44,7 @@ ONE_WELL = system((-X, -2 * Y), [[-1.0, 1.0], [-1.0, 1.0]])
         (CYCLE, "limit cycle of period 3.142"),
         (VAN_DER_POL, "limit cycle of period 6.663"),
         (ONE_WELL, "no saddle parts the attractors"),
+        (system((0 * X, 0 * Y), [[-1.0, 1.0], [-1.0, 1.0]]), "nothing moves"),
     ],
 )
 def test_without_wells_there_is_a_reason_and_no_rows(card: Dynamics, reason: str, tmp_path: Path) -> None:

@@ -183,6 +183,28 @@ def test_a_driven_system_is_refused(write: Write, what: str) -> None:
     assert caught.value.place.startswith("line 3")
 
 
+@pytest.mark.parametrize(
+    ("equation", "fault"),
+    [
+        ("-x/(x - 1)", "divides by zero within the domain"),
+        ("-1/x", "divides by zero within the domain"),
+        ("-exp(x)*x", "too large for a number"),
+        ("-x + log(x + 900)", "not defined"),
+    ],
+)
+def test_an_equation_without_a_value_in_the_domain_is_refused(
+    write: Write, equation: str, fault: str
+) -> None:
+    card = write(
+        "name: odd\nstates:\n  x: {unit: '1', domain: [-1000, 1000]}\nequations:\n"
+        f'  x: "{equation}"\ndiffusion: identity\n',
+        "odd.yaml",
+    )
+    study = load_study(write(f"name: odd\nsystem: {card}\n"))
+    with pytest.raises(InputError, match=rf"line 5 \(equations.x\): the equation.*{fault}.*choose a domain"):
+        load_study_system(study, file="study.yaml", systems=CONFIG / "systems")
+
+
 def test_a_missing_card_is_refused_by_name(write: Write) -> None:
     path = write("name: s\nsystem: nowhere\n")
     with pytest.raises(InputError, match=r"nowhere\.yaml"):
