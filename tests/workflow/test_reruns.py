@@ -1,5 +1,6 @@
 """What runs again after a change, and what does not; what an interruption costs."""
 
+import json
 import os
 import signal
 import subprocess
@@ -55,26 +56,46 @@ def test_only_what_depends_on_a_change_runs_again(fresh_project):
     assert changed(project, lambda: project.write_study(threshold=0.2, steps=130)) == [False, True, True]
 
 
-@pytest.mark.parametrize("script", SCRIPTS)
-def test_a_rule_names_every_module_that_its_script_imports(script):
-    program = (
-        "import runpy, sys, pathlib\n"
-        f"runpy.run_path({str(ROOT / 'workflow' / 'scripts' / script)!r}, run_name='imported')\n"
-        "files = {getattr(module, '__file__', None) for module in list(sys.modules.values())}\n"
-        "print('\\n'.join(sorted(str(pathlib.Path(f).resolve()) for f in files if f)))\n"
-    )
-    environment = os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'workflow' / 'scripts'}"}
+# The libraries are imported once; each script then runs in a fork that says which files of ours it loaded.
+IMPORTS = """
+import json, os, pathlib, runpy, sys
+import matplotlib.pyplot, numpy, pandas, pysindy, scipy, sympy, torch
+root = pathlib.Path(sys.argv[1])
+for script in sys.argv[2:]:
+    if os.fork() == 0:
+        runpy.run_path(str(root / "workflow" / "scripts" / script), run_name="imported")
+        files = {getattr(module, "__file__", None) for module in list(sys.modules.values())}
+        ours = [pathlib.Path(file).resolve() for file in files if file]
+        ours = [str(file.relative_to(root)) for file in ours if file.is_relative_to(root)]
+        print(json.dumps([script, ours]), flush=True)
+        os._exit(0)
+    if os.wait()[1]:
+        sys.exit(f"{script} cannot be imported")
+"""
+
+
+@pytest.fixture(scope="module")
+def imported():
+    """The files of the project that each script imports, by the script's name."""
     done = subprocess.run(
-        [sys.executable, "-c", program], env=environment, cwd=ROOT, capture_output=True, text=True, check=True
+        [sys.executable, "-c", IMPORTS, str(ROOT), *SCRIPTS],
+        env=os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'workflow' / 'scripts'}"},
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
     )
-    used = {
-        str(Path(line).relative_to(ROOT))
-        for line in done.stdout.splitlines()
-        if line.startswith((f"{ROOT}/siq/", f"{ROOT}/workflow/"))
-    }
-    assert used, "the script imports nothing of the project"
+    found = dict(json.loads(line) for line in done.stdout.splitlines())
+    parts = ("siq", "workflow")
+    return {name: {file for file in files if Path(file).parts[0] in parts} for name, files in found.items()}
+
+
+@pytest.mark.xdist_group("imported")
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_a_rule_names_every_module_that_its_script_imports(imported, script):
+    assert imported[script], "the script imports nothing of the project"
     # How the interpreter was started changes nothing of what it computes.
-    assert used - {"workflow/warm.py"} <= set(code_digest(ROOT, script))
+    assert imported[script] - {"workflow/warm.py"} <= set(code_digest(ROOT, script))
 
 
 def wait_for(pattern, process, *, within, seconds=120):
