@@ -6,7 +6,14 @@ import re
 import pandas as pd
 import pytest
 
+from siq.dynamics.cards import load_system
 from siq.potential.storage import read_model
+from siq.report.page import render_reproduction
+from siq.report.reproduction_page import Paper, Results, reproduction_page
+from siq.report.settings import ReproductionSettings
+from siq.steps.of_study import settings_of
+from siq.study.reproduction import Parameters, Place
+from siq.study.study import completed, load_published, load_study
 from siq.study.tables import COLUMNS
 
 pytestmark = pytest.mark.workflow
@@ -101,3 +108,21 @@ def test_snakemakes_own_report_is_written_with_captions(finished):
     done = finished.run("results/mini/report.html", "--report", "workflow-report.html")
     assert done.returncode == 0, done.stdout[-2000:]
     assert "inclusion frequency" in finished.path("workflow-report.html").read_text(encoding="utf-8")
+
+
+def test_the_page_beside_the_paper_takes_what_a_study_left(finished):
+    study = load_study(finished.path("study.yaml"))
+    system = load_system(finished.path("config/systems/archetype3d.yaml"))
+    own = settings_of(ReproductionSettings, completed(study, system), system)
+    figures = load_published(finished.path("config/published/archetype3d.yaml")).figures
+    results = Results("mini", finished.path("results/mini"), own, figures, system)
+    places = (
+        Place(place="Table 1", says="the coefficients", study="mini", quantities=("U:*",)),
+        Place(place="Fig. 2", says="the data", study="mini", figures=("dataset",), tables=("timings",)),
+    )
+    paper = Paper(places, Parameters(studies={}, rows=()), {})
+    content, numbers = reproduction_page(paper, {"mini": results}, {"mini": own}, command="make it")
+    assert {"U:x**2", "U:y**2"} <= set(numbers["quantity"])
+    assert set(numbers["place"]) == {"Table 1"} and numbers["published"].notna().all()
+    assert [section.figures != [] for section in content.sections] == [False, True]
+    assert "Table 1" in render_reproduction(content)
