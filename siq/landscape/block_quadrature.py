@@ -27,7 +27,7 @@ TOLERANCE = 1e-6  # relative: what a quadrature's own estimate of its error may 
 
 
 @dataclass(frozen=True)
-class Block:
+class CoupledTerms:
     """The terms of U that couple some states, over these states' part of the box.
 
     Attributes
@@ -130,7 +130,7 @@ def split_into_blocks(
     intensity: float,
     box: np.ndarray,
     nodes: int,
-) -> tuple[float, list[Block]]:
+) -> tuple[float, list[CoupledTerms]]:
     """Split U into a constant and blocks that have no state in common.
 
     Parameters
@@ -148,7 +148,7 @@ def split_into_blocks(
 
     Returns
     -------
-    tuple of float and list of Block
+    tuple of float and list of CoupledTerms
         The constant, in the unit of ε, and the blocks; a state that U does not hold is a block by itself.
 
     Raises
@@ -174,7 +174,7 @@ def split_into_blocks(
                 f" {LARGEST_BLOCK} can be integrated together"
             )
         blocks.append(
-            Block(
+            CoupledTerms(
                 expression=expression,
                 states=states,
                 symbols=tuple(symbols[state] for state in states),

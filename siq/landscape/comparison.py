@@ -18,7 +18,7 @@ Potential = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
-class Comparison:
+class ErrorInRegion:
     """One estimate of U against the reference in one region.
 
     Attributes
@@ -47,7 +47,7 @@ def well_region(index: int) -> str:
     return f"A{index + 1}, below {WELL_SHARE:g} of its barrier"
 
 
-def compare_wells(reference: ReferenceLandscape, wells: Mapping[int, Well]) -> list[Comparison]:
+def compare_wells(reference: ReferenceLandscape, wells: Mapping[int, Well]) -> list[ErrorInRegion]:
     """Formulas of wells against characteristics, each below a share of its barrier.
 
     Parameters
@@ -62,18 +62,18 @@ def compare_wells(reference: ReferenceLandscape, wells: Mapping[int, Well]) -> l
         inside = reference.below(index, WELL_SHARE)
         exact = reference.characteristics[index][inside]
         if index not in wells:
-            rows.append(Comparison(well_region(index), len(exact), 0.0, float("nan")))
+            rows.append(ErrorInRegion(well_region(index), len(exact), 0.0, float("nan")))
             continue
         x = reference.points[inside]
         row = _compared(well_region(index), 2 * wells[index].known_values(x), exact)
         everywhere = relative_l2(2 * wells[index].values(x), exact)
-        rows.append(Comparison(row.region, row.points, row.covered, row.error, everywhere))
+        rows.append(ErrorInRegion(row.region, row.points, row.covered, row.error, everywhere))
     return rows
 
 
 def compare_estimate(
     reference: ReferenceLandscape, potential: Potential, *, below: float | None
-) -> list[Comparison]:
+) -> list[ErrorInRegion]:
     """One estimate of U: in each well from its attractor upwards, and over all wells below a level.
 
     A constant means nothing to U. In a well the estimate is zero at the attractor; over all wells it is
@@ -92,7 +92,7 @@ def compare_estimate(
 
 def compare_overall(
     reference: ReferenceLandscape, values: np.ndarray, *, below: float | None, shifted: bool = False
-) -> Comparison:
+) -> ErrorInRegion:
     """Values of U at the reference's points, over all wells below a level."""
     exact = reference.values
     level = overall_level(reference) if below is None else below
@@ -115,7 +115,7 @@ def relative_l2(values: np.ndarray, exact: np.ndarray) -> float:
     return float(np.linalg.norm(values - exact)) / size if size > 0 else float("nan")
 
 
-def _compared(region: str, values: np.ndarray, exact: np.ndarray) -> Comparison:
+def _compared(region: str, values: np.ndarray, exact: np.ndarray) -> ErrorInRegion:
     known = np.isfinite(values)
     covered = float(known.mean()) if len(values) else 0.0
-    return Comparison(region, len(exact), covered, relative_l2(values[known], exact[known]))
+    return ErrorInRegion(region, len(exact), covered, relative_l2(values[known], exact[known]))

@@ -15,7 +15,7 @@ import sympy
 from pydantic.dataclasses import dataclass
 
 from siq.landscape.comparison import (
-    Comparison,
+    ErrorInRegion,
     Potential,
     compare_estimate,
     compare_overall,
@@ -95,7 +95,7 @@ def run(
     return concatenate(TABLE, tables)
 
 
-def _rows(number: int, source: str, comparisons: Sequence[Comparison]) -> pd.DataFrame:
+def _rows(number: int, source: str, comparisons: Sequence[ErrorInRegion]) -> pd.DataFrame:
     return as_table(TABLE, [{"run": number, "source": source} | asdict(one) for one in comparisons])
 
 
@@ -123,7 +123,7 @@ def _of_landscape(
         ways = [way for way in stored.data["transitions"] if way["start"] == place and way["barrier"]]
         lowest = min((way["barrier"] for way in ways), default=float("nan"))
         error = abs(lowest / reference.barriers[index] - 1)
-        comparisons.append(Comparison(f"barrier from A{index + 1}", 1, float(np.isfinite(error)), error))
+        comparisons.append(ErrorInRegion(f"barrier from A{index + 1}", 1, float(np.isfinite(error)), error))
     return _rows(number, "local formulas", comparisons)
 
 
@@ -132,7 +132,7 @@ def _of_mesh(reference: ReferenceLandscape, below: float | None) -> pd.DataFrame
     whole = compare_overall(reference, reference.mesh_values, below=below)
     errors = np.abs(reference.mesh_barriers / reference.barriers - 1)
     barriers = [
-        Comparison(f"barrier from A{index + 1}", 1, 1.0, float(one)) for index, one in enumerate(errors)
+        ErrorInRegion(f"barrier from A{index + 1}", 1, 1.0, float(one)) for index, one in enumerate(errors)
     ]
     return _rows(NONE_OF_OURS, "mesh", [whole, *barriers])
 
@@ -147,13 +147,13 @@ def _of_networks(one: TrainedNetworks) -> Potential:
     return lambda x: 2 * one.evaluate(x).potential
 
 
-def _of_two(values: np.ndarray, mesh: np.ndarray, level: float) -> Comparison:
+def _of_two(values: np.ndarray, mesh: np.ndarray, level: float) -> ErrorInRegion:
     """An estimate of U against a mesh that is known up to a constant, below a level above its minimum."""
     exact = mesh - np.nanmin(mesh)
     inside = np.nan_to_num(exact, nan=np.inf) < level
     own, exact = values[inside], exact[inside]
     error = relative_l2(own - np.median(own - exact), exact)
-    return Comparison(f"U < {level:.4g}", int(inside.sum()), 1.0, error)
+    return ErrorInRegion(f"U < {level:.4g}", int(inside.sum()), 1.0, error)
 
 
 def _of_published(
