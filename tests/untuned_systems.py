@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from known_systems import (
@@ -16,7 +17,10 @@ from known_systems import (
 )
 
 from siq.data.recordings import Recordings
+from siq.dynamics.equilibria import hessian_at
 from siq.dynamics.simulation import SimulationOptions, simulate_snapshots
+from siq.potential.well import Well
+from siq.reference.mesh import mesh_quasipotential
 
 SYSTEMS = {
     **{f"linear in {d} dimensions": linear_system(d) for d in range(2, 7)},
@@ -56,3 +60,21 @@ def simulated(
         trajectories=trajectories, pairs=pairs, pair_step=step, interval=stride * step / 5
     )
     return simulate_snapshots(system, options=options, generator=np.random.default_rng(seed)), step
+
+
+def error_beside_mesh(known: KnownSystem, wells: Sequence[Well]) -> float:
+    """Relative L2 error of V where the wells claim to hold, against the mesh of two states; the worst."""
+    x = np.random.default_rng(0).uniform(*known.domain.T, (20_000, 2))
+    errors = []
+    for well in wells:
+        mesh = mesh_quasipotential(
+            known.dynamics.drift, well.attractor, hessian=hessian_at(known.dynamics, well.attractor),
+            box=known.domain, shape=(512, 512), diffusion=known.dynamics.diffusion, level=well.level,
+            stop_at_boundary=False,
+        )  # fmt: skip
+        exact = mesh.evaluate(x)
+        claimed = np.isfinite(exact) & (exact < 0.9 * well.level) & well.believed(x)
+        assert claimed.sum() > 100
+        own, exact = well.values(x[claimed]), exact[claimed]
+        errors.append(float(np.linalg.norm(own - exact) / np.linalg.norm(exact)))
+    return max(errors)

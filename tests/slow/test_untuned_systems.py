@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from known_systems import KnownSystem, limit_cycle, maier_stein, potential_values
-from untuned_systems import SYSTEMS, simulated
+from untuned_systems import SYSTEMS, error_beside_mesh, simulated
 
 from siq.data.recordings import snapshot_pairs
 from siq.identify.identification import IdentificationOptions
@@ -108,9 +108,17 @@ def test_maier_stein_with_a_weak_caustic_is_certified_with_an_error():
 
 
 @pytest.mark.slow
-def test_maier_stein_with_a_strong_caustic_has_its_barriers_though_it_is_not_certified():
-    certificate = barriers_beside(10, 0.34004)
-    assert not certificate["certified"]
+def test_maier_stein_with_a_strong_caustic_has_wells_as_good_as_stated():
+    torch.set_num_threads(1)
+    known = maier_stein(10)
+    found, _ = trained_until_certified(known)
+    certificate, wells = certificate_of(found), found.refined.formulas[Method.REFINED].wells
+    error = error_beside_mesh(known, wells)
+    print(
+        f"β = 10: {certificate['reason'] or 'certified'}, stated {certificate['stated_error']}, true {error}"
+    )
+    assert len(wells) == 2
+    assert error < certificate["stated_error"] < 0.15
 
 
 @pytest.mark.slow
