@@ -37,12 +37,25 @@ class DiffusionSource(StrEnum):
         }[self]
 
 
-def estimated_diffusion(found: IdentifiedField) -> Diffusion | None:
+STANDARD_ERRORS = 4.0  # derived: chance passes it once in 16 000 pairs of states
+
+
+def estimated_diffusion(found: IdentifiedField, *, pairs: int) -> Diffusion | None:
     """D as the residuals show it, of determinant 1; None where there is none to be shown.
+
+    States whose noises show no significant correlation have none: an entry of D from chance alone would bring
+    a term into g that nothing else asks for.
 
     The scale of D is a matter of convention, since a factor goes into ε. The determinant, unlike the trace
     or the largest eigenvalue, changes by a mere factor when the unit of one state does. Noise that is alike
-    in all directions has the unit matrix.
+    in all directions has the unit matrix, but for the error of the diagonal.
+
+    Parameters
+    ----------
+    found
+        f with the covariance of its residuals.
+    pairs
+        Number of independent residuals behind it: a correlation of none has the standard error 1/√pairs.
 
     Returns
     -------
@@ -54,6 +67,9 @@ def estimated_diffusion(found: IdentifiedField) -> Diffusion | None:
         return None
     # To the last bit symmetric, as sums over the pairs are not.
     rate = (found.noise_rate + found.noise_rate.T) / 2
+    size = np.sqrt(np.diag(rate))
+    correlated = np.abs(rate) > STANDARD_ERRORS / np.sqrt(pairs) * np.outer(size, size)
+    rate = np.where(correlated | np.eye(len(rate), dtype=bool), rate, 0.0)
     try:
         whole = Diffusion(rate)
     except ValueError:

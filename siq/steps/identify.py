@@ -116,7 +116,7 @@ def _with_diffusion(
     if given is not None:
         found = replace(found, diffusion=given)
         return found, residual_noise(found, recordings, pair_step=step), DiffusionSource.GIVEN
-    estimated = estimated_diffusion(found)
+    estimated = estimated_diffusion(found, pairs=len(snapshot_pairs(recordings, pair_step=step).h))
     if estimated is not None:
         with_own = replace(found, diffusion=estimated)
         noise = residual_noise(with_own, recordings, pair_step=step)

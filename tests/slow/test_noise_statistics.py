@@ -19,7 +19,7 @@ from siq.potential.symbolic import term_coefficients
 from siq.steps import draw
 from siq.steps.outcomes import Method
 from siq.steps.pipeline import PipelineSettings, analyse
-from siq.steps.settings import Sampling
+from siq.steps.settings import Sampling, StateSpace
 
 SEED = 20260102
 RUNS = 50
@@ -78,6 +78,7 @@ def one_run(run: int):
     sampling = Sampling(SIMULATION.pair_step, SIMULATION.pair_step / SIMULATION.substeps)
     settings = PipelineSettings(
         seed=SEED,
+        space=StateSpace(diffusion="identity"),  # as the card has it: the bound is that of known D
         sampling=sampling,
         regression=RegressionOptions(degree=5),
         landscape=None,
