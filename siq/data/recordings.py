@@ -196,6 +196,10 @@ class SnapshotPairs:
     h: np.ndarray
     recording: np.ndarray
 
+    def take(self, rows: np.ndarray) -> SnapshotPairs:
+        """Some of the pairs, by their indices or by a mask."""
+        return SnapshotPairs(self.x0[rows], self.xh[rows], self.h[rows], self.recording[rows])
+
 
 def read_recordings(
     path: str | Path, *, columns: Sequence[str] | None = None, units: Mapping[str, str] | None = None

@@ -92,8 +92,7 @@ class Diffusion:
         NumericalFailure
             Where noise does not reach every state.
         """
-        if not self.regular:
-            raise NumericalFailure("the noise does not reach every state: D has no inverse")
+        self._check_inverse()
         return np.linalg.inv(self.matrix)
 
     @cached_property
@@ -105,9 +104,12 @@ class Diffusion:
         NumericalFailure
             Where noise does not reach every state.
         """
+        self._check_inverse()
+        return np.asarray(solve_triangular(self.root, np.eye(self.dimension), lower=True))
+
+    def _check_inverse(self) -> None:
         if not self.regular:
             raise NumericalFailure("the noise does not reach every state: D has no inverse")
-        return np.asarray(solve_triangular(self.root, np.eye(self.dimension), lower=True))
 
     def extended(self, count: int) -> Diffusion:
         """The same noise in a system of `count` further states, which it does not reach."""

@@ -96,7 +96,7 @@ def identify_vector_field(
     standard errors are given without that gain, as a bound.
     """
     if not carries_noise(library, pairs, options=options, integrator_step=integrator_step):
-        pairs = _rows(pairs, evenly(len(pairs.h), options.pairs))
+        pairs = pairs.take(evenly(len(pairs.h), options.pairs))
     noise = Diffusion.identity(library.dimension) if diffusion is None else diffusion
     return _identify(library, pairs, options, noise, integrator_step)
 
@@ -113,7 +113,7 @@ def carries_noise(
     The arguments are those of `identify_vector_field`.
     """
     _check_count(library, pairs)
-    some = _rows(pairs, evenly(len(pairs.h), max(options.pairs // 4, 4 * library.size)))
+    some = pairs.take(evenly(len(pairs.h), max(options.pairs // 4, 4 * library.size)))
     return fit_everything(library, some, integrator_step=integrator_step).ratio >= NOISE_FREE
 
 
@@ -223,7 +223,3 @@ def _weakest(found: IdentifiedField, problem: FlowRegression, options: Identific
         if np.sum(found.support[:, 0] == found.support[index, 0]) > 1:
             return int(index)
     return None
-
-
-def _rows(pairs: SnapshotPairs, rows: np.ndarray) -> SnapshotPairs:
-    return SnapshotPairs(pairs.x0[rows], pairs.xh[rows], pairs.h[rows], pairs.recording[rows])

@@ -162,7 +162,7 @@ def mean_residual_probability(found: IdentifiedField, pairs: SnapshotPairs) -> f
     """
     # Copies of resampled recordings would count as evidence that there is not.
     _, single = np.unique(np.column_stack([pairs.x0, pairs.xh]), axis=0, return_index=True)
-    pairs = SnapshotPairs(pairs.x0[single], pairs.xh[single], pairs.h[single], pairs.recording[single])
+    pairs = pairs.take(single)
     rest = residuals(found, pairs) / np.sqrt(pairs.h)[:, None]
     design = found.library.evaluate(pairs.x0) * np.sqrt(pairs.h)[:, None]
     design = design / np.where((size := np.linalg.norm(design, axis=0)) > 0, size, 1.0)

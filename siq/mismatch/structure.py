@@ -20,7 +20,7 @@ from siq.estimation.measurements import Measurements
 from siq.mismatch.roles import Roles
 from siq.mismatch.screening import probe_response, projected
 
-KNOTS = 9  # of a test function: a choice, as many wiggles as forces of mechanics and ecology have
+KNOTS = 9  # of the functions that are tried: a choice
 SUBSTEPS = 2  # between samples, for the response to these functions
 LAGS = 12  # of autocorrelations
 

@@ -41,7 +41,7 @@ class TrainingData:
     @property
     def representative(self) -> SnapshotPairs:
         """The training pairs whose X0 are spread evenly."""
-        return _select(self.training, self.representative_rows)
+        return self.training.take(self.representative_rows)
 
 
 def prepare_data(
@@ -69,7 +69,7 @@ def prepare_data(
         raise NumericalFailure("there is only one recording; give at least two, so that one can be held out")
     count = min(max(round(options.training_share * len(names)), 1), len(names) - 1)
     trains = np.isin(pairs.recording, generator.permutation(names)[:count])
-    training, held_out = _select(pairs, trains), _select(pairs, ~trains)
+    training, held_out = pairs.take(trains), pairs.take(~trains)
     spread = training.x0.std(axis=0)
     if not (spread > 0).all():
         raise NumericalFailure("a state does not vary in the recordings; leave it out or record it in motion")
@@ -183,10 +183,6 @@ class Batches:
 def child_seed(seed: np.random.SeedSequence, key: int) -> np.random.SeedSequence:
     """A child seed by its number, without counting how many were taken before."""
     return np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, key))
-
-
-def _select(pairs: SnapshotPairs, rows: np.ndarray) -> SnapshotPairs:
-    return SnapshotPairs(pairs.x0[rows], pairs.xh[rows], pairs.h[rows], pairs.recording[rows])
 
 
 def _table(pairs: SnapshotPairs) -> Tensor:

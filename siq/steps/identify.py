@@ -88,7 +88,9 @@ def _identified(settings: IdentifySettings, recordings: Recordings, number: int)
         fitted = refit(found, parts[0])
     else:
         found = fitted = identify_pairs(parts[0])
-    found, noise, source = _with_diffusion(found, recordings, settings)
+    found, noise, source = _with_diffusion(
+        found, recordings, settings, pairs=sum(len(part.h) for part in parts)
+    )
     verdict = _held_out_verdict(
         found, fitted, parts, held_out, fault=noise.fault(recordings.names), limits=settings.prediction
     )
@@ -105,7 +107,7 @@ def _identified(settings: IdentifySettings, recordings: Recordings, number: int)
 
 
 def _with_diffusion(
-    found: IdentifiedField, recordings: Recordings, settings: IdentifySettings
+    found: IdentifiedField, recordings: Recordings, settings: IdentifySettings, *, pairs: int
 ) -> tuple[IdentifiedField, NoiseDiagnosis, DiffusionSource]:
     """The field with its D, what its residuals say, and where D is from.
 
@@ -116,7 +118,7 @@ def _with_diffusion(
     if given is not None:
         found = replace(found, diffusion=given)
         return found, residual_noise(found, recordings, pair_step=step), DiffusionSource.GIVEN
-    estimated = estimated_diffusion(found, pairs=len(snapshot_pairs(recordings, pair_step=step).h))
+    estimated = estimated_diffusion(found, pairs=pairs)
     if estimated is not None:
         with_own = replace(found, diffusion=estimated)
         noise = residual_noise(with_own, recordings, pair_step=step)

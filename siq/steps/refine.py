@@ -28,7 +28,7 @@ from siq.certificate.characteristics import Reference, references_about
 from siq.certificate.held_out import HeldOut
 from siq.certificate.tests import CertificateOptions, Function, Verdict
 from siq.data.held_out import held_out_recordings
-from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
+from siq.data.recordings import Recordings, snapshot_pairs
 from siq.dynamics.phase_portrait import PhasePortrait, evenly_spread, phase_portrait
 from siq.errors import NumericalFailure
 from siq.identify.identified_field import IdentifiedField
@@ -171,7 +171,7 @@ class Ground:
         draw = generator(settings.seed, self.number, Purpose.REFINE)
         self.points = x[~held][evenly_spread(x[~held], generator=draw)]
         unseen = x[held][evenly_spread(x[held], generator=draw)]
-        self.held_out = HeldOut(unseen, _rows(pairs, held))
+        self.held_out = HeldOut(unseen, pairs.take(held))
         self.portrait: PhasePortrait = phase_portrait(self.found.dynamics, self.points, seed=self.number)
 
     @cached_property
@@ -321,10 +321,6 @@ def _about(formulas: SymbolicDecomposition, attractor: np.ndarray) -> Function |
     if formulas.potential is not None:
         return lambda x: np.asarray(formulas.evaluate(np.ascontiguousarray(x.T))[0])
     return next((one.values for one in formulas.wells if np.array_equal(one.attractor, attractor)), None)
-
-
-def _rows(pairs: SnapshotPairs, rows: np.ndarray) -> SnapshotPairs:
-    return SnapshotPairs(pairs.x0[rows], pairs.xh[rows], pairs.h[rows], pairs.recording[rows])
 
 
 def write(refined: RefinedRun, *, model: str | Path, outcome: str | Path) -> None:
