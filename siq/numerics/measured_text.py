@@ -8,7 +8,10 @@ import re
 from siq.numerics.number_text import MINUS, SMALLEST, SUPERSCRIPTS, number_text
 
 EXACT_DIGITS = 4  # an error below half of the last of so many digits is left out
-SMALLEST_PLAIN, LARGEST_PLAIN = -3, 4  # decimal exponents between which a number is written without a power of ten
+SMALLEST_PLAIN, LARGEST_PLAIN = (
+    -3,
+    4,
+)  # decimal exponents between which a number is written without a power of ten
 
 
 def value_text(value: float, error: float = math.nan, *, unit: str = "") -> str:

@@ -119,7 +119,11 @@ def vector_mathml(expressions: Sequence[sympy.Expr], *, decimals: int = 3) -> Ma
     """
     printer = _MathMLPrinter(decimals)
     table = printer.table([printer.lines(_with_integer_exponents(entry)) for entry in expressions])
-    return _math(printer, printer.bracketed(table), "; ".join(formula_text(entry, decimals=decimals) for entry in expressions))
+    return _math(
+        printer,
+        printer.bracketed(table),
+        "; ".join(formula_text(entry, decimals=decimals) for entry in expressions),
+    )
 
 
 def matrix_mathml(matrix: Sequence[Sequence[float]]) -> Markup:

@@ -11,8 +11,9 @@ import pandas as pd
 
 from siq.landscape.dwell_times import NoiseStrength, exit_time
 from siq.numerics.measured_text import unit_text, value_text
-from siq.report.landscape_answer import SaidLandscape, time_text, well_name
+from siq.report.landscape_answer import time_text
 from siq.report.page import ReportTable
+from siq.report.said_landscape import SaidLandscape, well_name
 from siq.steps.outcomes import Status, Step
 
 
@@ -122,9 +123,7 @@ def _ways(said: SaidLandscape, file: str) -> ReportTable:
 
 
 def _place(said: SaidLandscape, position: Sequence[float]) -> str:
-    size = max(
-        (abs(value) for one in said.data["equilibria"] for value in one["position"]), default=0.0
-    )
+    size = max((abs(value) for one in said.data["equilibria"] for value in one["position"]), default=0.0)
     # What is left of zero by rounding reads as zero.
     values = [0.0 if abs(value) < 1e-12 * size else value for value in position]
     return "(" + ", ".join(value_text(value) for value in values) + ")"
@@ -150,9 +149,7 @@ def _equilibria(said: SaidLandscape, file: str) -> ReportTable:
     if not any(frame[""]):
         frame = frame.drop(columns="")
     explained = {f"rates{unit}": "eigenvalues of f there; a rate that is positive leads away"}
-    return ReportTable(
-        "All states at which f vanishes.", frame.rename(columns={"": "name"}), explained, file
-    )
+    return ReportTable("All states at which f vanishes.", frame.rename(columns={"": "name"}), explained, file)
 
 
 def _rate(real: float, imaginary: float) -> str:
@@ -174,7 +171,9 @@ def _times(said: SaidLandscape, noises: Sequence[float]) -> ReportTable:
                 known if mean is None else time_text(mean, "1", decorated=False)
             )
         rows.append(row)
-    return ReportTable("How long each well lasts, for the noise strengths that the study gives.", pd.DataFrame(rows))
+    return ReportTable(
+        "How long each well lasts, for the noise strengths that the study gives.", pd.DataFrame(rows)
+    )
 
 
 def _over_runs(landscape: pd.DataFrame, folder: Path) -> ReportTable:
@@ -190,7 +189,10 @@ def _over_runs(landscape: pd.DataFrame, folder: Path) -> ReportTable:
         .rename(columns=lambda name: "way" if name == "item" else name.replace("_", " "))
     )  # fmt: skip
     return ReportTable(
-        "Barriers of U over all runs.", counted, {"way": "A1 is A, A2 is B, and so on"}, f"{folder}/landscape.csv"
+        "Barriers of U over all runs.",
+        counted,
+        {"way": "A1 is A, A2 is B, and so on"},
+        f"{folder}/landscape.csv",
     )
 
 

@@ -75,7 +75,11 @@ def _several(
     certified = int(mine["certified"].sum())
     stated = mine[mine["certified"]]["stated_error"].dropna()
     if certified:
-        within = f"; the largest error that a certificate states is {share_text(stated.max())}" if len(stated) else ""
+        within = (
+            f"; the largest error that a certificate states is {share_text(stated.max())}"
+            if len(stated)
+            else ""
+        )
         sentences.append(f"{certified} of {runs} runs are certified{within}.")
     if certified < runs:
         sentences.append(

@@ -13,8 +13,8 @@ from siq.numerics.measured_text import unit_text, value_text
 from siq.potential.symbolic import SymbolicDecomposition
 from siq.potential.well import Well
 from siq.report.formatting import formula_mathml, term_text, vector_mathml
-from siq.report.landscape_answer import well_name
 from siq.report.page import FormulaRow
+from siq.report.said_landscape import well_name
 
 SMALL = 1e-3  # of the depth: a term that contributes less everywhere is left to the whole formula
 SHORT = 8  # terms that are read at a glance: so short a formula is shown as it is
@@ -70,7 +70,9 @@ def _well_row(well: Well, places: Sequence[np.ndarray]) -> FormulaRow:
     note = f"Holds up to U = {value_text(2 * well.level)} above {name}; {offsets}."
     if left_out:
         terms = "one term is" if left_out == 1 else f"{left_out} terms are"
-        note += f" Here {terms} left out that nowhere add more than {SMALL:.1%} of the depth.".replace(".0%", "%")
+        note += f" Here {terms} left out that nowhere add more than {SMALL:.1%} of the depth.".replace(
+            ".0%", "%"
+        )
     return FormulaRow(
         f"U about {name}",
         formula_mathml(_in_offsets(well, kept)),
