@@ -10,7 +10,6 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from siq.files.documents import read_document, validate
 from workflow.proof.keys import CaseKind
 
-PROOFS = Path("config/proof.yaml")
 
 
 class ProofSet(BaseModel):
@@ -55,7 +54,7 @@ class Proofs(BaseModel):
     proof_full: ProofSet
 
 
-def load_proofs(path: str | Path = PROOFS) -> dict[str, ProofSet]:
+def load_proofs(path: str | Path) -> dict[str, ProofSet]:
     """Read the sets of concealed cases.
 
     Raises

@@ -1,8 +1,9 @@
 # Helpers of the rules: studies and their parameters, code dependencies by content, one workflow at a time.
-import fcntl
 import sys
 from functools import cache
 from pathlib import Path
+
+from filelock import FileLock, Timeout
 
 from siq.errors import InputError
 from siq.report.settings import (
@@ -25,7 +26,8 @@ from siq.steps.score import ScoreSettings
 from siq.steps.train import TrainSettings
 from siq.study.study import load_published
 from workflow.code_digest import code_digest
-from workflow.settings import Studies, find_resource, prepare_environment
+from workflow.places import config_path, find_file
+from workflow.settings import Studies, prepare_environment
 from workflow.warm import start
 
 
@@ -149,7 +151,7 @@ def data_source(wildcards):
     study = study_of(wildcards)
     if study.study.recordings is None:
         return ancient(study.source())
-    check_recordings(wildcards.study)
+    check_recordings(wildcards.study)  # which refuses a file that is not there
     return study.source()
 
 
@@ -262,9 +264,8 @@ def published_mesh_if_any(wildcards):
     """Input function: the mesh that was published beside the figures, where SIQ_RESOURCES has it."""
     figures = study_of(wildcards).published()
     mesh = load_published(figures).mesh if figures is not None else None
-    if mesh is None or not Path(file := find_resource(mesh.file)).is_file():
-        return []
-    return ancient(file)
+    file = None if mesh is None else find_file(mesh.file)
+    return [] if file is None else ancient(file)
 
 
 def reproduced_settings(wildcards):
@@ -294,10 +295,10 @@ WARM = None
 
 
 onstart:
-    globals()["LOCK"] = open(".snakemake/siq.lock", "w")
+    globals()["LOCK"] = FileLock(".snakemake/siq.lock", timeout=0)
     try:
-        fcntl.flock(LOCK, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
+        LOCK.acquire()
+    except Timeout:
         say_and_stop(
             "Another snakemake is at work in this folder; wait for it, or stop it."
         )
