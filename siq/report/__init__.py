@@ -17,6 +17,7 @@
 `mismatch_page`      what does the page of a diagnosis say?
 `mismatch_sections`  which sections has it?
 `mismatch_findings`  what is it made from?
+`mismatch_answer`    and what does a terminal print at its end?
 `plots`              the figures themselves
 ===================  ======================================================================
 
