@@ -9,6 +9,9 @@
 `labels`             which recording has which label, and which has a copy of it?
 `held_out`           which recordings does a fit not see?
 `public_recordings`  what do the files of public benchmarks hold?
+`quantum`            how finely were the numbers of a column written?
+`noise_floor`        how strong are the two kinds of noise, at a first look?
+`inspection`         what is in a file, and what will it be good for?
 ===================  =================================================================
 
 Imports `siq.files` and what it may import.

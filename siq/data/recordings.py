@@ -49,6 +49,11 @@ class Recordings:
         Shape ``(n, d)``: what was measured, in `units`.
     time_unit
         The unit of `t`, None where the file does not say.
+    headings
+        What the file calls each measured column, where that is no name for a formula: ``bead x`` of
+        ``bead_x``. Empty where all are called by their names.
+    notes
+        What was assumed or repaired when they were read, each a clause without a full stop.
     """
 
     names: tuple[str, ...]
@@ -58,6 +63,13 @@ class Recordings:
     t: np.ndarray
     values: np.ndarray
     time_unit: str | None = None
+    headings: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def titles(self) -> tuple[str, ...]:
+        """What people call each state: its heading in the file, or else its name."""
+        return self.headings or self.names
 
     @classmethod
     def from_frame(

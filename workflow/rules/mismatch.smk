@@ -179,6 +179,7 @@ rule mismatch_page:
             caption="../report/mismatch.rst",
             category="mismatch",
         ),
+        answer="results/mismatch/{case}/answer.json",
     log:
         "results/mismatch/{case}/logs/mismatch_page.log",
     benchmark:
