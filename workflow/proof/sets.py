@@ -11,7 +11,6 @@ from siq.files.documents import read_document, validate
 from workflow.proof.keys import CaseKind
 
 
-
 class ProofSet(BaseModel):
     """The schema of an entry of ``config/proof.yaml``: a set of cases that conceal something.
 
