@@ -58,6 +58,7 @@ class Progress:
     planned: list[str] = field(default_factory=list)
     _rules: dict[int, str] = field(default_factory=dict)
     _words: dict[int, str] = field(default_factory=dict)
+    _latest_words: str = "starting"
     _work: float = 0.0
     _worked: float = 0.0
     _began: float | None = None
@@ -74,7 +75,7 @@ class Progress:
         elif kind == "job_info":
             job = int(event["jobid"])
             self._rules[job] = event["rule_name"]
-            self._words[job] = self.running[job] = event.get("rule_msg") or event["rule_name"]
+            self._words[job] = self.running[job] = _in_short(event.get("rule_msg") or event["rule_name"])
             self.planned.append(self._words[job])
         elif kind == "job_finished":
             self._end(int(event["job_id"]))
@@ -104,11 +105,20 @@ class Progress:
         if not self.total:
             return "reading and checking your files"
         words = list(self.running.values())
-        what = words[-1] if words else "finishing" if self.done == self.total else "starting the next step"
+        if words:
+            self._latest_words = words[-1]
+        what = "finishing" if self.done == self.total else self._latest_words
         more = f" (and {len(words) - 1} more)" if len(words) > 1 else ""
         left = self.left()
         time_left = "" if left is None else f", {_duration(left)}"
         return f"{min(self.done + 1, self.total)} of {self.total}: {what}{more}{time_left}"
+
+
+def _in_short(message: str) -> str:
+    """``bead, run 000: drawing`` as ``drawing (bead)``: what is done comes first, and the line is short."""
+    of, colon, what = message.partition(": ")
+    name = of.removesuffix(", run 000")
+    return f"{what} ({name})" if colon else message
 
 
 def _seconds(rule: str) -> float:

@@ -167,4 +167,5 @@ def _say(one: Told, said: Sequence[str]) -> None:
     for line in one.lines:
         if line not in said:
             print(line)
-    print(f"The page to read: {one.page}")
+    if (page := f"The page to read: {one.page}") not in said:
+        print(page)

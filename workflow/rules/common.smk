@@ -5,6 +5,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
+from siq.cli.answers import Exit, answer_of_page
 from siq.errors import InputError
 from siq.report.settings import (
     FiguresSettings,
@@ -288,6 +289,24 @@ def figure_output(name):
     )
 
 
+def say_what_has_no_answer():
+    """A study without a formula, or a simulation that cannot be compared, is no success: code 3, and why."""
+    pages = [
+        Path(output)
+        for job in workflow.dag.jobs
+        if job.rule.name in ("page", "mismatch_page")
+        for output in job.output
+        if str(output).endswith("report.html")
+    ]
+    unanswered = [
+        told for told in map(answer_of_page, pages) if told.code == Exit.NO_ANSWER
+    ]
+    for told in unanswered:
+        print(*told.lines, f"The page to read: {told.page}", sep="\n", file=sys.stderr)
+    if unanswered:
+        sys.exit(int(Exit.NO_ANSWER))
+
+
 # Snakemake's own lock outlives a killed process and would ask for --unlock; the profile switches it off.
 # The kernel's lock goes with the process.
 LOCK = None
@@ -305,3 +324,7 @@ onstart:
     globals()[
         "WARM"
     ] = start()  # held until the end of this process, and ends with it
+
+
+onsuccess:
+    say_what_has_no_answer()

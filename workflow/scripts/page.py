@@ -4,7 +4,8 @@ from workflow.warm import run_warm
 
 run_warm()
 
-from importlib.metadata import version
+import contextlib
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import siq
@@ -20,6 +21,16 @@ from siq.study.tables import COLUMNS, read_table
 from step import job
 
 PACKAGES = ("torch", "numpy", "pysindy", "snakemake")
+
+
+def installed(packages: tuple[str, ...]) -> dict[str, str]:
+    """The versions of those packages that are there: without networks, some are not."""
+    found = {}
+    for name in packages:
+        with contextlib.suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found
+
 
 if __name__ == "__main__":
     with job() as now:
@@ -40,7 +51,7 @@ if __name__ == "__main__":
             study,
             results,
             command=now.params.command,
-            versions={"siq": siq.__version__} | {name: version(name) for name in PACKAGES},
+            versions={"siq": siq.__version__} | installed(PACKAGES),
         )
         with whole_file(now.output.html) as partial:
             partial.write_text(render_report(page), encoding="utf-8")
