@@ -137,7 +137,7 @@ class Cases:
             raise InputError(
                 one.file, "", f"the recordings of the benchmark {benchmark} are not there",
                 f"get {one.what} from nonlinearbenchmark.org, put it there below a folder of yours, and name"
-                " that folder by the environment variable SIQ_RESOURCES (or by SIQ_RECORDINGS, its earlier name)",
+                " that folder by the environment variable SIQ_RESOURCES (earlier: SIQ_RECORDINGS)",
             )  # fmt: skip
         return file
 

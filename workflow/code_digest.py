@@ -26,7 +26,7 @@ def code_digest(base: Path, script: str) -> dict[str, str]:
 
 
 def library_of(base: Path) -> Path:
-    """The folder that the package lies in: beside the workflow in a checkout, elsewhere when it is installed."""
+    """The folder that the package lies in: beside the workflow in a checkout, elsewhere when installed."""
     return base if (base / "siq").is_dir() else Path(siq.__file__).resolve().parents[1]
 
 

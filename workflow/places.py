@@ -1,7 +1,7 @@
 """Where does the workflow find its own files, and the files that you name?
 
 The workflow's files lie beside the Snakefile: in a checkout that is the folder in which you work, in an
-installation it is a folder of the package. A file of the same name in the folder in which you work comes first.
+installation it is a folder of the package. A file of the same name where you work comes first.
 """
 
 from __future__ import annotations

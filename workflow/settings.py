@@ -246,8 +246,7 @@ def _need_networks(document: Document) -> None:
     if missing:
         raise InputError(
             document.file, document.place(("training",)),
-            f"the study asks for networks, and {' and '.join(missing)} {'is' if len(missing) == 1 else 'are'} not"
-            " installed",
+            f"the study asks for networks, which need {' and '.join(missing)}",
             f"install them by: pip install '{DISTRIBUTION}[networks]', or leave the key 'training' out",
         )  # fmt: skip
 

@@ -48,7 +48,7 @@ class Told:
 CERTIFIED = {
     "all": "Every formula passed its certificate.",
     "some": "Some of the formulas passed their certificates; the page says which.",
-    "none": "No formula passed its certificate: do not rely on the numbers before you have read on the page why.",
+    "none": "No formula passed its certificate: read on the page why, before you rely on the numbers.",
 }
 
 

@@ -1,4 +1,4 @@
-"""What can be tried without recordings of one's own: a bead in two traps, and a spring with something left out."""
+"""What can be tried without own recordings: a bead in two traps, and a spring with something left out."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from siq.errors import InputError
 from siq.files.whole import whole_file
 
 DOUBLE_WELL = """\
-# A bead hops between two optical traps at -0.5 um and 0.5 um. The recordings were simulated, so that the answer
-# is known: dx = (8 x - 32 x**3) dt + noise of strength 0.3 um**2/s, a barrier of 1 um**2/s in U, 3.3 times the noise.
+# A bead hops between two optical traps at -0.5 um and 0.5 um. The recordings were simulated, so that the
+# answer is known: dx = (8 x - 32 x**3) dt + noise of strength 0.3 um**2/s, and a barrier of 1 um**2/s in U,
+# which is 3.3 times the noise.
 name: double-well
 title: A bead in two optical traps
 recordings:

@@ -26,8 +26,8 @@ def parser() -> argparse.ArgumentParser:
     """The parser of the command line, from which its page in the documentation is made."""
     top = argparse.ArgumentParser(
         prog="siq",
-        description="From recordings to their landscape: stable states, barriers, how long each state lasts; and"
-        " which physics a simulation lacks.",
+        description="From recordings to their landscape: stable states, barriers, how long each state lasts;"
+        " and which physics a simulation lacks.",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -81,15 +81,15 @@ def _add_run(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     one = commands.add_parser(
         "run",
         help="answer a study, or recordings without a study",
-        description="Works out the landscape behind recordings or a system, and writes results/NAME/report.html in"
-        " the folder in which you are.",
+        description="Works out the landscape behind recordings or a system, and writes"
+        " results/NAME/report.html in the folder in which you are.",
         epilog="What stands after -- is passed on to Snakemake: siq run my-study.yaml -- --forceall",
     )
     one.add_argument(
         "study",
         metavar="FILE",
-        help="a study (.yaml), recordings (a file, or a folder with one file for each recording), or the name of a"
-        " study that comes with siq, such as archetype3d",
+        help="a study (.yaml), recordings (a file, or a folder with one file for each recording), or the name"
+        " of a study that comes with siq, such as archetype3d",
     )
     _add_workflow_options(one)
     one.set_defaults(action=_run)
@@ -106,8 +106,8 @@ def _add_diagnose(commands: argparse._SubParsersAction[argparse.ArgumentParser])
     one.add_argument(
         "folder",
         metavar="DIR",
-        help="a folder with system.yaml (the equations) and recordings.csv or recordings.parquet, or a folder of such"
-        " folders",
+        help="a folder with system.yaml (the equations) and recordings.csv or recordings.parquet, or a folder"
+        " of such folders",
     )
     _add_workflow_options(one)
     one.set_defaults(action=_diagnose)
@@ -124,8 +124,8 @@ def _add_inspect(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     one = commands.add_parser(
         "inspect",
         help="say what is in a file of recordings, in seconds",
-        description="Reads recordings and says what is in them: recordings, states, units, steps, noise, and what can"
-        " be learned from them. Computes nothing else and writes nothing.",
+        description="Reads recordings and says what is in them: states, units, steps, noise, and what can be"
+        " learned from them. Computes nothing else and writes nothing.",
     )
     one.add_argument(
         "recordings", metavar="FILE", nargs="+", help="a file of recordings, or a folder of files"
@@ -137,8 +137,8 @@ def _add_init(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     one = commands.add_parser(
         "init",
         help="write a commented study for a file of recordings",
-        description="Looks at recordings and writes a study for them that runs as it is, with comments on what you"
-        " can set.",
+        description="Looks at recordings and writes a study for them that runs as it is, with comments on"
+        " what you can set.",
     )
     one.add_argument("recordings", metavar="FILE", help="a file of recordings, or a folder of files")
     one.add_argument("--output", "-o", metavar="STUDY", help="where to write it (default: NAME.yaml here)")
@@ -150,8 +150,8 @@ def _add_example(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     one = commands.add_parser(
         "example",
         help="write recordings and a study to try",
-        description="Writes an example into a folder: recordings of a bead in two optical traps with a study, or a"
-        " simulation that lacks something with the recordings that show it.",
+        description="Writes an example into a folder: recordings of a bead in two optical traps with a study,"
+        " or a simulation that lacks something with the recordings that show it.",
     )
     one.add_argument(
         "name", nargs="?", default="double-well", choices=("double-well", "mismatch"),

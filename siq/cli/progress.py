@@ -13,9 +13,17 @@ MARK = "\x1e"
 """Begins a line that is an event, as the logger plugin of the workflow writes them."""
 
 SECONDS = {
-    "diagnosis": 40.0, "escapes": 15.0, "figures": 5.0, "identify": 2.0, "landscape_figures": 2.5, "mismatch_figures": 5.0,
-    "mismatch_landscape": 3.0, "reference": 15.0, "refine": 6.0, "train": 17.0,
-}  # fmt: skip
+    "diagnosis": 40.0,
+    "escapes": 15.0,
+    "figures": 5.0,
+    "identify": 2.0,
+    "landscape_figures": 2.5,
+    "mismatch_figures": 5.0,
+    "mismatch_landscape": 3.0,
+    "reference": 15.0,
+    "refine": 6.0,
+    "train": 17.0,
+}
 """What jobs take beside one another, measured on studies of two and three states; others about a second.
 Only their ratios matter once a job has ended: the speed of the machine then follows."""
 

@@ -50,7 +50,9 @@ def run_study(
         When the workflow is not installed.
     """
     need_workflow()
-    path, settings, study = Path(given).expanduser(), (), None
+    path = Path(given).expanduser()
+    settings: tuple[str, ...] = ()
+    study: Path | None = None
     if not path.exists() and given in known_studies():
         name = given
     elif not path.exists():
@@ -123,7 +125,8 @@ def _refuse_card(path: Path) -> None:
     if "equations" in data:
         raise InputError(
             path, "", "this is the card of a system, not a study",
-            f"write a study of two lines, 'name: {data.get('name', 'my-study')}' and 'system: {path.name}', beside it",
+            f"write a study beside it, of two lines: 'name: {data.get('name', 'my-study')}' and"
+            f" 'system: {path.name}'",
         )  # fmt: skip
 
 

@@ -103,7 +103,7 @@ def init_study(path: Path, *, output: Path | None = None, replace: bool = False)
 def commented_study(found: Inspection, path: Path, study: Path) -> str:
     """The text of a study that runs as it is; what is commented out can be used by taking the # away."""
     states = [state.name for state in found.states]
-    unit = f" {found.recordings.time_unit}" if found.recordings.time_unit else ""
+    unit = found.recordings.time_unit or "in the unit of t"
     step = f"{1.5 * found.steps.usual:.3g}" if found.steps is not None else "0.01"
     units = {state.unit for state in found.states}
     diffusion = ", ".join("1.0" for _ in states)
@@ -125,7 +125,7 @@ recordings:
   file: {_scalar(own_path(path, start=study.resolve().parent))}
   # The columns to use, in this order; by default all of them.
   # states: [{", ".join(states)}]
-  # Samples further apart than this ({unit.strip() or "in the unit of t"}) are no neighbours; by default 1.5 usual steps.
+  # Samples further apart than this ({unit}) are no neighbours; by default 1.5 usual steps.
   # pair_step: {step}
   # How noise acts on the states: D, one number for each state, or a matrix. By default it is estimated from
   # the noise in the recordings, or taken as one for each state where they show none.{needed}

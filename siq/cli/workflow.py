@@ -23,7 +23,7 @@ TICK = 1.0  # seconds after which the time left is shown anew
 
 
 def workflow_folder() -> Path:
-    """The folder of the Snakefile: the checkout that this package lies in, or what the wheel brought along."""
+    """The folder of the Snakefile: the checkout that this package lies in, or what the wheel brought."""
     here = Path(__file__).resolve()
     checkout, shipped = here.parents[2], here.parent / "shipped"
     in_checkout = (checkout / "Snakefile").is_file() and (checkout / "workflow" / "places.py").is_file()
@@ -76,7 +76,7 @@ class Request:
     def command(self) -> list[str]:
         """The command line; what it has to make stands behind ``--``, where no option can take it."""
         base = workflow_folder()
-        # -P: a folder `workflow` or a module of yours in the folder in which you work is not mistaken for ours.
+        # -P: a folder `workflow` of yours, where you work, is not mistaken for ours.
         words = [sys.executable, "-P", "-m", "snakemake", "--snakefile", str(base / "Snakefile")]
         words += ["--directory", str(Path.cwd()), "--cores", self.cores]
         words += ["--workflow-profile", str(base / "profiles" / "default")]

@@ -39,7 +39,8 @@ class RecordingsOptions(BaseModel):
     ----------
     file
         Parquet, CSV, HDF5 or MATLAB file with columns ``recording``, ``t`` and the states; a relative
-        path starts from the folder in which the workflow runs, or else from ``SIQ_RESOURCES``.
+        path starts from the folder of the study, or else from the folder in which you work, or from the one
+        that the environment variable ``SIQ_RESOURCES`` names.
     states
         The columns that are states, in order; by default the system's, or all of the file's.
     pair_step
@@ -89,7 +90,8 @@ class Study(BaseModel):
     seed
         Seed of everything random.
     published
-        Name of a file of published figures to be set beside the results.
+        Published figures to be set beside the results: name of a file in ``config/published``, or path of
+        one.
     simulation, identification, regression, refinement, certificate
         The parameters of the steps.
     training
@@ -128,7 +130,9 @@ class Study(BaseModel):
     @field_validator("published")
     @classmethod
     def _plain_name(cls, value: str | None) -> str | None:
-        if value is not None and not value.replace("-", "").replace("_", "").isalnum():
+        if value is None or value.endswith((".yaml", ".yml")):
+            return value
+        if not value.replace("-", "").replace("_", "").isalnum():
             raise ValueError(f"'{value}' is no name of published figures; use letters, digits, '-' and '_'")
         return value
 

@@ -1,4 +1,4 @@
-"""What Snakemake does, one line of JSON for each event: `snakemake --logger siq`, from which `siq run` tells it.
+"""What Snakemake does, one line of JSON for each event, which `siq run` reads: `snakemake --logger siq`.
 
 Each line begins with a control character that no message of a job begins with, so that both may come on
 one stream.
