@@ -138,7 +138,9 @@ def _prospects(recordings: Recordings, states: tuple[StateFacts, ...]) -> tuple[
     said = []
     noises = [state.noise for state in states if state.noise is not None]
     if any(noise.process > 0 for noise in noises):
-        said.append("Random forces are seen: their strength, and with it how long each state lasts, will be found.")
+        said.append(
+            "Random forces are seen: their strength, and with it how long each state lasts, will be found."
+        )
     elif noises:
         said.append(
             "No random forces are seen: the wells and barriers will be found for the noise that you state, and how"
@@ -175,7 +177,11 @@ def _state_text(state: StateFacts) -> str:
     said = [f"{named}: {state.lowest:.4g} to {state.highest:.4g}{unit}"]
     if state.quantum is not None:
         decimals = decimals_of(state.quantum)
-        how = f"written to {decimals} decimals" if decimals else f"written in steps of {state.quantum:.3g}{unit}"
+        how = (
+            f"written to {decimals} decimals"
+            if decimals
+            else f"written in steps of {state.quantum:.3g}{unit}"
+        )
         said.append(f"{how}, an error of {rounding_error(state.quantum):.1g}{unit}")
     if state.noise is not None and state.noise.sensor > 0:
         said.append(f"sensor noise about {state.noise.sensor:.2g}{unit}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -36,14 +37,12 @@ def select_recordings(recordings: Recordings, indices: Sequence[int] | np.ndarra
     lengths = np.diff(bounds)[chosen]
     begins = np.cumsum(lengths) - lengths
     rows = np.arange(lengths.sum()) + np.repeat(bounds[chosen] - begins, lengths)
-    return Recordings(
-        names=recordings.names,
-        units=recordings.units,
+    return replace(
+        recordings,
         labels=distinct_labels(recordings.labels, chosen),
         recording=np.repeat(np.arange(len(chosen)), lengths),
         t=recordings.t[rows],
         values=recordings.values[rows],
-        time_unit=recordings.time_unit,
     )
 
 
