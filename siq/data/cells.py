@@ -208,6 +208,8 @@ def _split_units(name: str, cells: Column) -> tuple[Column, str | None, CellFaul
     found = _unit_of(cell)
     if found is None:
         fault, remedy = f"'{cell}' is no number", "write a number with a decimal point, or remove the row"
+        if not good.to_numpy(zero_copy_only=False).any():
+            remedy = "if the column is no state, name the states in the study, or remove the column"
     else:
         fault = f"mixed units, {found or 'no unit'} after rows in {unit or 'no unit'}"
         remedy = "convert the whole column to one unit"

@@ -55,7 +55,7 @@ def seconds_of_clock(file: str, name: str, cells: Column) -> tuple[np.ndarray, s
         or pa.types.is_time(kind)
         or pa.types.is_duration(kind)
     ):
-        values = cells.to_pandas()
+        values, first = cells.to_pandas(), ""
         if pa.types.is_time(kind):
             values = pd.to_timedelta(values.astype(str))
         elif pa.types.is_date(kind):
@@ -72,7 +72,7 @@ def seconds_of_clock(file: str, name: str, cells: Column) -> tuple[np.ndarray, s
     if len(present) == 0:
         return None
     start = present.iloc[0]
-    return ((values - start) / pd.Timedelta(seconds=1)).to_numpy(dtype=float), str(start)
+    return ((values - start) / pd.Timedelta(seconds=1)).to_numpy(dtype=float), first or str(start)
 
 
 def _parsed(file: str, name: str, text, first: str):  # type: ignore[no-untyped-def]

@@ -86,13 +86,13 @@ def layout_of(file: str, source: ColumnFile, columns: Sequence[str] | None) -> L
     free = [place for place in range(len(parts)) if place not in taken]
     dropped = _row_numbers(source, plain, free, notes)
     free = [place for place in free if place not in dropped]
-    time = _time_column(file, parts, free, notes)
+    time = _time_column(file, source.headings, parts, free, notes)
     free.remove(time)
     recording = _label_column(source, plain, free, notes)
     if recording is not None and recording in free:
         free.remove(recording)
     if columns is None:
-        others = [place for place in free if is_time(plain[place]) and _may_be_time(parts[place])]
+        others = [place for place in free if _second_time(source, parts[place], place)]
         for place in others:
             notes.append(f"the column '{source.headings[place]}' looks like a second time and was left out")
         states = [place for place in free if place not in others]
@@ -173,7 +173,17 @@ def _may_be_time(part: Heading) -> bool:
     return part.unit is None or part.unit.casefold() in {unit.casefold() for unit in TIME_UNITS}
 
 
-def _time_column(file: str, parts: list[Heading], free: list[int], notes: list[str]) -> int:
+def _second_time(source: ColumnFile, part: Heading, place: int) -> bool:
+    """Whether a column is another clock: called so, and ever increasing but where recordings begin."""
+    if not is_time(part.title) or not _may_be_time(part) or part.title == "T":
+        return False
+    values = _numbers(source, place)
+    return values is None or bool((np.diff(values) > 0).mean() > 0.5)
+
+
+def _time_column(
+    file: str, headings: Sequence[str], parts: list[Heading], free: list[int], notes: list[str]
+) -> int:
     found = [place for place in free if parts[place].title == "t"]
     if found:
         return found[0]
@@ -185,7 +195,7 @@ def _time_column(file: str, parts: list[Heading], free: list[int], notes: list[s
         notes.append(f"the column '{parts[found[0]].title}' is the time")
         return found[0]
     if found:
-        names = " and ".join(f"'{parts[place].title}'" for place in found)
+        names = " and ".join(f"'{headings[place].strip()}'" for place in found)
         raise InputError(file, "", f"the columns {names} all look like the time", "call the right one 't'")
     remedy = "add the time of every sample as a column 't'"
     raise InputError(file, "", "the column 't' is missing", remedy)

@@ -9,10 +9,12 @@ maximum likelihood. This takes milliseconds, and is a first look: what f and D a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from siq.data.recordings import Recordings
+if TYPE_CHECKING:
+    from siq.data.recordings import Recordings
 
 WINDOWS = (32, 16, 8)  # samples; the longest of which the recordings hold enough
 ENOUGH = 10  # windows, at least

@@ -17,6 +17,7 @@ import numpy as np
 
 from siq.data.checks import check_times
 from siq.data.labels import sources
+from siq.data.learnable import checked_for_learning
 from siq.errors import InputError
 from siq.files.whole import whole_file
 
@@ -344,10 +345,21 @@ def read_pairs(
     Raises
     ------
     InputError
-        As `read_recordings` does, and when no two samples are close enough to be a pair.
+        As `read_recordings` and `siq.data.learnable.checked_for_learning` do, and when no two samples are
+        close enough to be a pair.
     """
     recordings = read_recordings(path, columns=states, units=units)
+    recordings = checked_for_learning(recordings, file=str(path), chosen=states is not None)
     try:
-        return recordings, snapshot_pairs(recordings, pair_step=pair_step)
+        pairs = snapshot_pairs(recordings, pair_step=pair_step)
     except ValueError as error:
         raise InputError(path, "", str(error), "raise recordings.pair_step in the study") from None
+    without = len(recordings.labels) - len(np.unique(pairs.recording))
+    single = int((np.bincount(recordings.recording) == 1).sum())
+    if without > single:
+        note = (
+            f"{without - single} of {len(recordings.labels)} recordings have longer steps than the others and give"
+            " no pairs; recordings.pair_step in the study says how long a step may be"
+        )
+        recordings = replace(recordings, notes=(*recordings.notes, note))
+    return recordings, pairs
