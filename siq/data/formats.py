@@ -1,8 +1,8 @@
 """Files of recordings: which formats are read, and how.
 
-Parquet, CSV, HDF5, MATLAB and NumPy files are told apart by suffix and all become the same thing: headings, known
-before anything large is read, and columns of cells, read on request. What the headings mean is the matter of
-`siq.data.layout`, what the cells mean that of `siq.data.cells`.
+Parquet, CSV, HDF5, MATLAB and NumPy files are told apart by suffix and all become the same thing: headings,
+known before anything large is read, and columns of cells, read on request. What the headings mean is the
+matter of `siq.data.layout`, what the cells mean that of `siq.data.cells`.
 
 Files are data. Nothing is unpickled, and MATLAB objects and structs are refused before they are read.
 """
@@ -301,7 +301,8 @@ def _open_matlab(file: str) -> ColumnFile:
 def _open_numpy(file: str) -> ColumnFile:
     with _reading(file, "NumPy"):
         kept = np.load(file, allow_pickle=False)
-        columns = {name: kept[name] for name in (kept.dtype.names or kept.files if _named(kept) else ())}
+        fields = kept.dtype.names if isinstance(kept, np.ndarray) else tuple(kept.files)
+        columns = {name: kept[name] for name in fields or ()}
     if not columns:
         raise InputError(
             file, "", "it is one array without names for its columns",
@@ -314,10 +315,6 @@ def _open_numpy(file: str) -> ColumnFile:
         return equally_long(file, {name: _column(file, name, columns[name]) for name in wanted})
 
     return _column_file(names, load)
-
-
-def _named(kept: object) -> bool:
-    return hasattr(kept, "files") or getattr(getattr(kept, "dtype", None), "names", None) is not None
 
 
 SPREADSHEETS = (".xlsx", ".xls", ".xlsm", ".xlsb", ".ods")

@@ -11,100 +11,35 @@ import re
 import unicodedata
 from typing import NamedTuple
 
-RESERVED = frozenset(
-    [
-        "sin",
-        "cos",
-        "tan",
-        "exp",
-        "log",
-        "sqrt",
-        "tanh",
-        "atan",
-        "Abs",
-        "sign",
-        "Max",
-        "Min",
-        "pi",
-        "recording",
-        "t",
-        "delay",
-    ]
-)
+
+def _words(text: str) -> frozenset[str]:
+    return frozenset(text.split())
+
+
+RESERVED = _words("sin cos tan exp log sqrt tanh atan Abs sign Max Min pi recording t delay")
 """What no state may be called, since formulas have another meaning for it (`siq.dynamics.cards`)."""
 
-TIME_NAMES = frozenset(
-    [
-        "t",
-        "time",
-        "times",
-        "zeit",
-        "temps",
-        "tiempo",
-        "tempo",
-        "timestamp",
-        "timestamps",
-        "datetime",
-        "date",
-        "elapsed",
-        "elapsedtime",
-        "clock",
-        "clocktime",
-        "uhrzeit",
-        "seconds",
-    ]
+TIME_NAMES = _words(
+    "t time times zeit temps tiempo tempo timestamp timestamps datetime date elapsed elapsedtime clock"
+    " clocktime uhrzeit seconds"
 )
-LABEL_NAMES = frozenset(
-    [
-        "recording",
-        "recordings",
-        "record",
-        "run",
-        "runs",
-        "trial",
-        "trials",
-        "id",
-        "rec",
-        "experiment",
-        "measurement",
-        "series",
-        "trajectory",
-        "traj",
-        "track",
-        "trackid",
-        "runid",
-        "recordingid",
-        "trialid",
-        "recid",
-        "trajectoryid",
-        "replicate",
-        "repetition",
-        "rep",
-        "file",
-        "filename",
-        "sweep",
-        "ringdown",
-        "label",
-        "particle",
-        "particleid",
-        "messung",
-        "versuch",
-        "aufnahme",
-    ]
+LABEL_NAMES = _words(
+    "recording recordings record run runs trial trials id rec experiment measurement series trajectory traj"
+    " track trackid runid recordingid trialid recid trajectoryid replicate repetition rep file filename sweep"
+    " ringdown label particle particleid messung versuch aufnahme"
 )
-INDEX_NAMES = frozenset(["index", "idx", "row", "rowid", "rownumber", "unnamed"])
-_TIME_UNITS = (
+INDEX_NAMES = _words("index idx row rowid rownumber unnamed")
+TIME_UNITS = _words(
     "ns us µs μs ms s sec secs second seconds min minute minutes h hr hrs hour hours d day days yr year years"
 )
-TIME_UNITS = frozenset(_TIME_UNITS.split())
 
 # Symbols of units, longest first; those after a prefix may also stand alone.
 _PREFIX = "(?:da|[YZEPTGMkhdcmuµμnpfazy])?"
 _PREFIXED = "mol|Ohm|ohm|rad|bar|cal|cd|Hz|Pa|Wb|lm|lx|sr|Da|eV|px|Ω|m|s|g|A|K|N|J|W|V|C|F|H|T|S|L|l|M|B"
 _ALONE = (
-    "counts?|cts|pixels?|px|adu|ADU|a\\.?u\\.?|arb\\.? ?u(?:nits?)?\\.?|n\\.?u\\.?|atm|Torr|mmHg|rpm|ppm|ppb|dB|deg|degrees?|"
-    "radians?|°[CF]?|%|‰|1|-|min|minutes?|hours?|hrs?|h|days?|d|years?|yr|sec(?:ond)?s?|volts?|meters?|metres?|"
-    "k_?B ?T|kT|Å|u|LSB|lsb|bits?"
+    r"counts?|cts|pixels?|px|adu|ADU|a\.?u\.?|arb\.? ?u(?:nits?)?\.?|n\.?u\.?|atm|Torr|mmHg|rpm|ppm|ppb|dB"
+    r"|deg|degrees?|radians?|°[CF]?|%|‰|1|-|min|minutes?|hours?|hrs?|h|days?|d|years?|yr|sec(?:ond)?s?|volts?"
+    r"|meters?|metres?|k_?B ?T|kT|Å|u|LSB|lsb|bits?"
 )
 _POWER = r"(?:(?:\^|\*\*)?\{?[-−+]?\d+(?:[./]\d+)?\}?|[⁺⁻]?[⁰¹²³⁴⁵⁶⁷⁸⁹]+)?"
 _FACTOR = rf"(?:(?:{_ALONE}|{_PREFIX}(?:{_PREFIXED})){_POWER})"

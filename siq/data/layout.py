@@ -1,7 +1,7 @@
 """Which column is the time, which says the recording, and which are states?
 
-``recording`` and ``t`` are the plain names. Where they are missing, a column of another name for the same thing
-takes their place, and that is said; a table that names no recordings is one.
+``recording`` and ``t`` are the plain names. Where they are missing, a column of another name for the same
+thing takes their place, and that is said; a table that names no recordings is one.
 """
 
 from __future__ import annotations

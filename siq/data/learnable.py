@@ -17,8 +17,8 @@ TURNS = {2 * np.pi: "2π", 360.0: "360"}  # of an angle, in radians and in degre
 NEARLY = 0.9  # of a turn: a jump by so much, in a column that stays within one, is no motion
 
 SINGLE = (
-    "there is one recording, and it shows no random forces: it leads into one stable state and tells nothing of"
-    " others, nor of barriers"
+    "there is one recording, and it shows no random forces: it leads into one stable state and tells nothing"
+    " of others, nor of barriers"
 )
 SINGLE_REMEDY = (
     "record how the system settles from many starting points, or one long record in which noise makes it hop"
@@ -47,7 +47,7 @@ def checked_for_learning(recordings: Recordings, *, file: str, chosen: bool) -> 
         floors = noise_floors(recordings)
         if floors is not None and all(floor.process == 0 for floor in floors):
             raise InputError(file, "", SINGLE, SINGLE_REMEDY)
-    return replace(recordings, notes=(*recordings.notes, *_remarks(recordings)))
+    return replace(recordings, notes=(*recordings.notes, *remarks(recordings)))
 
 
 def _moving(recordings: Recordings, *, file: str, chosen: bool) -> Recordings:
@@ -77,7 +77,7 @@ def _moving(recordings: Recordings, *, file: str, chosen: bool) -> Recordings:
     )
 
 
-def _remarks(recordings: Recordings) -> list[str]:
+def remarks(recordings: Recordings) -> list[str]:
     """What is unusual, and may be wrong."""
     said = []
     single = int((np.bincount(recordings.recording) == 1).sum())
@@ -92,7 +92,11 @@ def _remarks(recordings: Recordings) -> list[str]:
         jumps = np.abs(np.diff(values)[inside])
         for turn, text in TURNS.items():
             count = int((jumps > NEARLY * turn).sum())
-            if count and np.ptp(values) <= turn * (1 + 1e-6) and not ((jumps > 0.5 * turn) & (jumps < NEARLY * turn)).any():
+            between = ((jumps > 0.5 * turn) & (jumps < NEARLY * turn)).any()
+            if count and not between and np.ptp(values) <= turn * (1 + 1e-6):
                 times = "once" if count == 1 else f"{count} times"
-                said.append(f"'{title}' jumps by {text} {times}: an angle that wraps around has to be unwrapped first")
+                said.append(
+                    f"'{title}' jumps by {text} {times}, as an angle does that wraps around: unwrap it first,"
+                    " or record its sine and cosine"
+                )
     return said

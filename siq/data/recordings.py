@@ -358,8 +358,8 @@ def read_pairs(
     single = int((np.bincount(recordings.recording) == 1).sum())
     if without > single:
         note = (
-            f"{without - single} of {len(recordings.labels)} recordings have longer steps than the others and give"
-            " no pairs; recordings.pair_step in the study says how long a step may be"
+            f"{without - single} of {len(recordings.labels)} recordings have longer steps than the others and"
+            " give no pairs; recordings.pair_step in the study says how long a step may be"
         )
         recordings = replace(recordings, notes=(*recordings.notes, note))
     return recordings, pairs

@@ -1,8 +1,9 @@
 """What in a table can be put right without a guess: padding, rows that stand twice, or in no order?
 
-Rows without any value are dropped, and those at either end of a recording in which a value is missing. A missing
-value between others is refused, since leaving it out makes a gap that its owner should know of. Rows in no order are
-sorted by time, but never two recordings into one another: where the time starts over, a new one begins.
+Rows without any value are dropped, and those at either end of a recording in which a value is missing. A
+missing value between others is refused, since leaving it out makes a gap that its owner should know of. Rows
+in no order are sorted by time, but never two recordings into one another: where the time starts over, a new
+one begins.
 """
 
 from __future__ import annotations

@@ -171,20 +171,20 @@ def _joined(files: Sequence[Path], tables: Sequence[CheckedTable], folder: str) 
             raise InputError(
                 str(file), "", f"its columns are {', '.join(table.names)}, and those of {files[0].name} are"
                 f" {', '.join(first.names)}",
-                f"give all files the same columns, or name the states in the study (only some have {', '.join(odd)})",
+                f"give {', '.join(odd)} to all files or to none, or name the states in the study",
             )  # fmt: skip
         order += [table.names.index(name) for name in first.names]
         stem = file.stem
         if [other.stem for other in files].count(stem) > 1:
             stem = file.name
         labels += [stem] if len(table.labels) == 1 else [f"{stem}/{label}" for label in table.labels]
-    units = [
-        agree_on_unit(folder, name, {file.name: table.units[order[index]] for file, table, order in zip(files, tables, places, strict=True)}, None)
-        for index, name in enumerate(first.names)
-    ]  # fmt: skip
-    time_unit = agree_on_unit(
-        folder, "t", {f.name: table.time_unit for f, table in zip(files, tables, strict=True)}, None
-    )
+    names = [file.name for file in files]
+    units = []
+    for index, name in enumerate(first.names):
+        stated = [table.units[order[index]] for table, order in zip(tables, places, strict=True)]
+        units.append(agree_on_unit(folder, name, dict(zip(names, stated, strict=True)), None))
+    stated = [table.time_unit for table in tables]
+    time_unit = agree_on_unit(folder, "t", dict(zip(names, stated, strict=True)), None)
     counts = np.cumsum([0, *(len(table.labels) for table in tables)])
     notes = [f"the folder holds {len(files)} files, one recording each" if len(labels) == len(files)
              else f"the folder holds {len(files)} files with {len(labels)} recordings"]  # fmt: skip

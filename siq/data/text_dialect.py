@@ -1,8 +1,8 @@
-"""How is a table of text written: which encoding, which separator, which decimal mark, and where does it begin?
+"""How is a table of text written: which encoding, separator and decimal mark, and where does it begin?
 
-Laboratories write CSV in many ways: a German Excel separates by semicolons and writes decimal commas, a logger puts
-comments above the table, ``numpy.savetxt`` the headings behind ``#``, other programs the units into a second
-line. What was recognised is said, so that a wrong guess is seen.
+Laboratories write CSV in many ways: a German Excel separates by semicolons and writes decimal commas, a
+logger puts comments above the table, ``numpy.savetxt`` the headings behind ``#``, other programs the units
+into a second line. What was recognised is said, so that a wrong guess is seen.
 """
 
 from __future__ import annotations
@@ -75,10 +75,13 @@ def read_text_table(file: str, content: bytes) -> TextTable:
     if all(_is_number(cell) for cell in cells):
         above = split(comments[-1]) if comments else []
         if len(above) != len(cells):
+            example = ",".join(["t", *"xyzuvw"][: len(cells)])
             raise InputError(
-                file, "line 1" if begin == 0 else "", "the first line holds numbers where the headings should stand",
-                "add a first line that names the columns, such as " + ",".join(["t", *"xyzuvw"][: len(cells)]),
-            )  # fmt: skip
+                file,
+                "line 1" if begin == 0 else "",
+                "the first line holds numbers where the headings should stand",
+                f"add a first line that names the columns, such as {example}",
+            )
         headings, rows = above, lines
     else:
         headings, rows = cells, lines[1:]
@@ -198,7 +201,7 @@ def _decimal_mark(file: str, rows: list[list[str]], width: int, separator: str) 
     if separator == ",":
         if rows and all(len(row) > width for row in rows) and all(len(row) == len(rows[0]) for row in rows):
             fault = f"the headings name {width} columns and the rows have {len(rows[0])} cells"
-            remedy = "if decimals are written with commas, separate the columns by semicolons, or write decimal points"
+            remedy = "write decimal points, or separate the columns by semicolons if decimals have commas"
             raise InputError(file, "", fault, remedy)
         return "."
     cells = [cell for row in rows for cell in row]

@@ -1,8 +1,9 @@
 """Were the recordings rounded when they were written, and does it matter?
 
 A value that was written to three decimals is off by up to half of the last one, evenly: a noise of the
-measurement whose strength is known. It enters X0 as well as Xh, and biases the regression by an amount that follows from
-it. Where that is well below the standard errors it does no harm, and they contain what rounding adds to the scatter.
+measurement whose strength is known. It enters X0 as well as Xh, and biases the regression by an amount that
+follows from it. Where that is well below the standard errors it does no harm, and they contain what rounding
+adds to the scatter.
 """
 
 from __future__ import annotations
@@ -15,7 +16,10 @@ from siq.dynamics.formulas import compile_formulas
 from siq.identify.identified_field import NOISE_FREE, IdentifiedField
 
 HARMLESS = 0.5  # of a standard error: with such a bias an error bar holds 0.95 - 0.02 of the time
-LIKE_ROUNDING = (0.3, 1.5)  # measured noise over that of rounding; less where steps are as small as the rounding
+LIKE_ROUNDING = (
+    0.3,
+    1.5,
+)  # measured noise over that of rounding; less where steps are as small as the rounding
 COARSE = 0.05  # of the rms step of a state: rounding to less than that stops no identification
 
 
@@ -40,14 +44,16 @@ def is_rounding(measured: np.ndarray, rounding: np.ndarray, *, correlation: floa
     low, high = LIKE_ROUNDING
     own = rounding > 0
     known = (measured <= high * rounding) & ((measured >= low * rounding) | (rounding < rounding.max()))
-    return bool(own.any() and known[own].all() and (measured[~own] <= rounding.max()).all() and correlation < -0.3)
+    return bool(
+        own.any() and known[own].all() and (measured[~own] <= rounding.max()).all() and correlation < -0.3
+    )
 
 
 def rounding_bias(found: IdentifiedField, pairs: SnapshotPairs, rounding: np.ndarray) -> float:
     """The largest bias that rounding brings into a coefficient of f, in its standard errors.
 
-    The error e of X0 stands in the velocity as ``-e/h``, and in a function θ as ``e ∂θ/∂x``: their product does
-    not average out. To first order the coefficients of an equation are off by
+    The error e of X0 stands in the velocity as ``-e/h``, and in a function θ as ``e ∂θ/∂x``: their product
+    does not average out. To first order the coefficients of an equation are off by
     ``-(Σ h θθᵀ)⁻¹ Σ ∂θ/∂x R``, R the variance of the rounding.
     """
     errors = np.sqrt(np.diag(found.covariance))
@@ -61,7 +67,9 @@ def rounding_bias(found: IdentifiedField, pairs: SnapshotPairs, rounding: np.nda
         slopes = compile_formulas([term.diff(symbol) for term in terms], found.library.symbols)(x)
         scale = np.sqrt((values**2 * pairs.h).sum(axis=1))
         scaled = values / scale[:, None]
-        bias = np.linalg.lstsq((scaled * pairs.h) @ scaled.T, slopes.sum(axis=1) / scale, rcond=None)[0] / scale
+        bias = (
+            np.linalg.lstsq((scaled * pairs.h) @ scaled.T, slopes.sum(axis=1) / scale, rcond=None)[0] / scale
+        )
         largest = max(largest, float((np.abs(bias) * rounding[state] ** 2 / errors[own]).max()))
     return largest
 
@@ -85,8 +93,14 @@ def rounding_text(recordings: Recordings, *, coarse: bool = False) -> str | None
             continue
         decimals = decimals_of(step)
         behind = f" {unit}" if unit else ""
-        how = f"to {decimals} decimal{'s' if decimals > 1 else ''}" if decimals else f"in steps of {step:.3g}{behind}"
-        said.append(f"'{name}' is written {how}, an error of {rounding_error(step):.1g}{behind} in each value")
+        how = (
+            f"to {decimals} decimal{'s' if decimals > 1 else ''}"
+            if decimals
+            else f"in steps of {step:.3g}{behind}"
+        )
+        said.append(
+            f"'{name}' is written {how}, an error of {rounding_error(step):.1g}{behind} in each value"
+        )
     return ", and ".join(said) or None
 
 
