@@ -1,18 +1,21 @@
 """How strong are the two kinds of noise, as far as a look at neighbouring samples can tell?
 
 Within a short window a motion without noise is nearly a polynomial of time. What is left of the samples
-besides polynomials of low degree is noise: of random forces, whose effect adds up from sample to sample, or of
-the sensor, which is new in each. Their covariances differ, and both strengths follow from that of the windows by
-maximum likelihood. This takes milliseconds, and is a first look: what f and D are is found by `siq.identify`.
+besides polynomials of low degree is noise: of random forces, whose effect adds up from sample to sample, or
+of the sensor, which is new in each. Their covariances differ, and both strengths follow from that of the
+windows by maximum likelihood. This takes milliseconds, and is a first look: what f and D are is found by
+`siq.identify`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from siq.data.recordings import Recordings
+if TYPE_CHECKING:
+    from siq.data.recordings import Recordings
 
 WINDOWS = (32, 16, 8)  # samples; the longest of which the recordings hold enough
 ENOUGH = 10  # windows, at least
@@ -102,7 +105,7 @@ def _floor(recordings: Recordings, begins: np.ndarray, column: int, width: int) 
 
 
 def _most_likely(parts: np.ndarray, empirical: np.ndarray, count: float) -> tuple[np.ndarray, np.ndarray]:
-    """Two variances θ ≥ 0 for which θ₁A + θ₂B is most likely to have the empirical covariance; with errors."""
+    """Two variances θ ≥ 0 with which θ₁A + θ₂B explains the empirical covariance best; with their errors."""
     size = float(np.trace(empirical))
     if size <= 0:
         return np.zeros(2), np.zeros(2)
