@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from siq.dynamics.dynamics import Dynamics
 from siq.estimation.estimation import Fit
 from siq.estimation.innovations import Noise, solve, whiten
 from siq.estimation.measurements import Measurements
 from siq.mismatch.investigation import Investigation, MismatchVerdict
 from siq.mismatch.roles import Roles
 from siq.mismatch.structure import Curve, Structure
+from siq.numerics.measured_text import measured_text, unit_text
 
 VISIBLE = 0.1  # of the largest value of a curve
 TWO_ERRORS = 2.0
@@ -88,7 +91,6 @@ def locate(investigation: Investigation, data: Measurements) -> Location | None:
         equations, coordinate, curve = tuple(name for name, q in driven if q > 0), "random", None
     region = visible_region(curve) if curve is not None else {}
     recordings = affected(investigation.search.recalibrated, investigation.search.fit.noise, data)
-    everywhere = len(recordings) == len(data.labels)
     time = (float(data.t.min()), float(data.t.max())) if coordinate == "t" else None
     return Location(
         equations=equation_shares(investigation, equations),
@@ -96,7 +98,10 @@ def locate(investigation: Investigation, data: Measurements) -> Location | None:
         region=region,
         time=time,
         recordings=recordings,
-        sentence=_sentence(equations, coordinate, region, recordings, everywhere=everywhere),
+        sentence=where_it_sits(
+            equations, coordinate, region, affected=len(recordings), recordings=len(data.labels),
+            units=_units_of(investigation.model),
+        ),  # fmt: skip
         curve=curve,
     )
 
@@ -162,24 +167,50 @@ def affected(recalibrated: Fit, noise: Noise, data: Measurements) -> tuple[str, 
     )
 
 
-def _sentence(
+def where_it_sits(
     equations: tuple[str, ...],
     coordinate: str,
-    region: dict[str, tuple[float, float]],
-    recordings: tuple[str, ...],
+    region: Mapping[str, tuple[float, float]],
     *,
-    everywhere: bool,
+    affected: int,
+    recordings: int,
+    units: Mapping[str, str] | None = None,
 ) -> str:
-    where = (
-        f"In the equation{'s' if len(equations) > 1 else ''} of {' and '.join(equations)}"
-        if equations
-        else ("In what is measured")
-    )
+    """Say in a sentence where a mismatch sits.
+
+    Parameters
+    ----------
+    equations
+        States in whose equations it shows; none for a fault of the sensor.
+    coordinate, region
+        Along which it acts, and where it can be seen.
+    affected, recordings
+        In how many recordings it shows, and how many there are to learn from.
+    units
+        Of states, inputs and time, by name.
+    """
+    many = "s" if len(equations) > 1 else ""
+    where = f"in the equation{many} of {' and '.join(equations)}" if equations else "in what is measured"
     along = {
-        "t": ", along time", "constant": ", everywhere alike", "random": ", at random",
+        "t": ", in the course of time", "constant": ", to the same amount everywhere", "random": ", at random",
         "measurement": "", "unknown": "",
-    }.get(coordinate, f", along {coordinate}")  # fmt: skip
-    for name, (lower, upper) in region.items():
-        along += f" from {lower:.3g} to {upper:.3g}" if name == coordinate else ""
-    who = "in every recording" if everywhere else f"mostly in {len(recordings)} recordings"
-    return f"{where}{along}, {who}."
+    }.get(coordinate, f", as a function of {coordinate}")  # fmt: skip
+    if coordinate in region:
+        lower, upper = (measured_text(limit) for limit in region[coordinate])
+        unit = unit_text((units or {}).get(coordinate, "1"))
+        after = f" {unit}" if unit else ""
+        along += f" (near {lower}{after})" if lower == upper else f" (between {lower} and {upper}{after})"
+    if recordings == 1:
+        who = ""
+    elif affected == recordings:
+        who = f", in all {recordings} recordings that it was sought in"
+    else:
+        who = f", mainly in {affected} of {recordings} recordings"
+    return f"The difference sits {where}{along}{who}."
+
+
+def _units_of(model: Dynamics) -> dict[str, str]:
+    """Units of everything that a coordinate may be."""
+    units = dict(zip(model.states, model.units, strict=True))
+    units |= {entry.name: entry.unit for entry in model.inputs}
+    return units | {"t": model.time_unit}
