@@ -12,7 +12,6 @@ from siq.estimation.free_runs import FreeRun, free_run, normalised_rms
 from siq.estimation.measurements import Measurements
 from siq.mismatch.investigation import Investigation
 
-
 Change = Literal["better", "same", "worse", "unknown"]
 WIDE = 1.96  # standard errors within which 95 % lie
 

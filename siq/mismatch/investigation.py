@@ -266,11 +266,11 @@ def remains(left: Remainder) -> str:
     """How much of the excess over noise is left by what was found, and whether it looks like noise."""
     size = percent(1 - left.share)
     if not left.doubtful:
-        return "" if size == "none" else f"It leaves {size} of the excess over noise."
+        return "" if size == "none" else f"It leaves {size} of the difference unexplained."
     chance = f"(p = {p_text(left.after.p_value)})"
     if size == "none":
-        return f"What it leaves is as small as noise, but does not look like noise {chance}."
-    return f"It leaves {size} of the excess over noise, which does not look like noise {chance}."
+        return f"What it leaves is as small as noise, but does not look like it {chance}."
+    return f"It leaves {size} of the difference unexplained, and this rest does not look like noise {chance}."
 
 
 def shift_probability(model: Dynamics, recalibrated: Fit) -> float:

@@ -40,6 +40,8 @@ class Location:
         First and last time of it, where it acts along time only.
     recordings
         Labels of those that show it.
+    recordings_total
+        How many it was sought in.
     sentence
         All of it in words.
     curve
@@ -53,6 +55,7 @@ class Location:
     recordings: tuple[str, ...]
     sentence: str
     curve: Curve | None
+    recordings_total: int = 0
 
     def as_data(self) -> dict[str, Any]:
         """What the verdict's file says of it."""
@@ -62,6 +65,7 @@ class Location:
             "region": {name: list(limits) for name, limits in self.region.items()},
             "time": None if self.time is None else list(self.time),
             "recordings": list(self.recordings),
+            "recordings_total": self.recordings_total,
             "sentence": self.sentence,
         }
 
@@ -99,10 +103,15 @@ def locate(investigation: Investigation, data: Measurements) -> Location | None:
         time=time,
         recordings=recordings,
         sentence=where_it_sits(
-            equations, coordinate, region, affected=len(recordings), recordings=len(data.labels),
+            equations,
+            coordinate,
+            region,
+            affected=len(recordings),
+            recordings=len(data.labels),
             units=_units_of(investigation.model),
-        ),  # fmt: skip
+        ),
         curve=curve,
+        recordings_total=len(data.labels),
     )
 
 
@@ -192,9 +201,12 @@ def where_it_sits(
     many = "s" if len(equations) > 1 else ""
     where = f"in the equation{many} of {' and '.join(equations)}" if equations else "in what is measured"
     along = {
-        "t": ", in the course of time", "constant": ", to the same amount everywhere", "random": ", at random",
-        "measurement": "", "unknown": "",
-    }.get(coordinate, f", as a function of {coordinate}")  # fmt: skip
+        "t": ", in the course of time",
+        "constant": ", to the same amount everywhere",
+        "random": ", at random",
+        "measurement": "",
+        "unknown": "",
+    }.get(coordinate, f", as a function of {coordinate}")
     if coordinate in region:
         lower, upper = (measured_text(limit) for limit in region[coordinate])
         unit = unit_text((units or {}).get(coordinate, "1"))

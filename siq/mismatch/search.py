@@ -136,9 +136,7 @@ def _extended(
             most=options.fitted, least_gain=options.same, blocks=options.blocks,
         )  # fmt: skip
         untried = _together(progress.untried, (*overflowing(screened), *failed), trials)
-        progress = replace(
-            progress, screened=tuple(screened), untried=untried, screened_beside=tuple(labels)
-        )
+        progress = replace(progress, screened=tuple(screened), untried=untried, screened_beside=tuple(labels))
         for trial in trials:
             LOGGER.info(
                 "%s: chi2 better by %.1f, BIC %.1f, p %.1e white, %.1e clustered",

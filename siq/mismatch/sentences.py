@@ -162,7 +162,7 @@ LOOKS_RANDOM = 2e-3  # the p-value below which a name is refused; siq.mismatch.r
 
 
 def shifted(recalibration: Mapping[str, Recalibrated], units: Mapping[str, str]) -> str:
-    """Which parameters are others than the card says, the most certain first, with the values before and after."""
+    """Which parameters differ from those on the card, the most certain first, with both values."""
     changes = {
         name: abs(each.after - each.before) / each.standard_error if each.standard_error > 0 else float("inf")
         for name, each in recalibration.items()
@@ -185,9 +185,7 @@ def shifted(recalibration: Mapping[str, Recalibrated], units: Mapping[str, str])
     return shown if more <= 0 else f"{shown}; and {more} more differ{'s' * (more == 1)}"
 
 
-def gained(
-    errors: HeldOutErrors, first: float | None, second: float | None, *, it: str, them: str
-) -> str:
+def gained(errors: HeldOutErrors, first: float | None, second: float | None, *, it: str, them: str) -> str:
     """What the error on held-out recordings says, whichever way it went; empty where it is not known.
 
     Parameters
@@ -204,16 +202,28 @@ def gained(
     if first is None or second is None:
         if change == "unknown":
             known = errors.noise_floor is not None
-            return f"The simulation runs away on the held-out recordings, {it.lower()} or without." if known else ""
+            return (
+                f"The simulation runs away on the held-out recordings, {it.lower()} or without."
+                if known
+                else ""
+            )
         if change == "worse":
-            return f"{it}, the simulation runs away on the held-out recordings, where its error was {_error(first)}."
-        return f"{it}, the error on held-out recordings is {_error(second)}, where the simulation ran away{noise}."
+            return (
+                f"{it}, the simulation runs away on the held-out recordings; its error was {_error(first)}"
+                " of their spread."
+            )
+        return (
+            f"{it}, the error on held-out recordings is {_error(second)} of their spread; without"
+            f" {them}, the simulation runs away{noise}."
+        )
     if change == "better" and _error(first) != _error(second):
         before = f"{_error(first)} of their spread"
         if errors.before is None and errors.recalibrated is not None:
             before += " (with its own parameters refitted; as given, the simulation runs away)"
         elif errors.change(errors.before, first) == "better":
-            before = f"{_error(errors.before)} of their spread ({_error(first)} with its own parameters refitted)"
+            before = (
+                f"{_error(errors.before)} of their spread ({_error(first)} with its own parameters refitted)"
+            )
         return f"{it}, the error on held-out recordings falls from {before} to {_error(second)}{noise}."
     if errors.at_noise(first) and change != "worse":
         return (
@@ -226,8 +236,8 @@ def gained(
         else "makes the prediction of recordings held out worse"
     )
     return (
-        f"This explains the recordings that it was found in, but {what}: their error is {_error(first)} without"
-        f" {them} and {_error(second)} with {them}{noise}."
+        f"This explains the recordings that it was found in, but {what}: their error is {_error(first)}"
+        f" without {them} and {_error(second)} with {them}{noise}."
     )
 
 
@@ -239,7 +249,7 @@ def _as_it_is(errors: HeldOutErrors) -> str:
     if errors.at_noise(errors.before):
         return f"Its error on held-out recordings is {_error(errors.before)} of their spread{_noise(errors)}."
     return (
-        f"On held-out recordings, however, its error is {_error(errors.before)}, which is more than noise"
+        f"On held-out recordings, however, its error is {_error(errors.before)}, more than noise alone"
         f" ({_error(errors.noise_floor)}): they may differ from those that it was compared with."
     )
 
@@ -251,9 +261,10 @@ def _error_stays(errors: HeldOutErrors) -> str:
         return "The simulation runs away on the held-out recordings."
     given = "runs away" if errors.before is None else f"is off by {_error(errors.before)} of their spread"
     fitted = "runs away" if errors.recalibrated is None else _error(errors.recalibrated)
+    by = "" if errors.recalibrated is None else "by "
     return (
-        f"On held-out recordings the simulation {given} as given, and"
-        f" {'' if errors.recalibrated is None else 'by '}{fitted} with its own parameters refitted{_noise(errors)}."
+        f"On held-out recordings the simulation {given} as given, and {by}{fitted} with its own parameters"
+        f" refitted{_noise(errors)}."
     )
 
 
@@ -268,7 +279,8 @@ def _not_foreseen(errors: HeldOutErrors) -> str:
 
 def _random_forces(mechanism: StatedMechanism) -> str:
     sizes = [
-        f"{measured_text(entry.estimate, entry.standard_error, entry.unit)} on {name.removeprefix('intensity_')}"
+        f"{measured_text(entry.estimate, entry.standard_error, entry.unit)} on"
+        f" {name.removeprefix('intensity_')}"
         for name, entry in mechanism.parameters.items()
     ]
     size = f", with an intensity of {_listed(sizes, 'and')}" if sizes else ""
@@ -288,9 +300,14 @@ def _unexplained(statement: Statement) -> str:
     if description.too_faint:
         return f"{begin}. It looks like {what}, but is too faint to be named."
     if description.share_described > 1 - SMALLEST_SHARE:
-        return f"{begin}. {_capital(what)} would account for {share} of it, but not convincingly enough to be named."
+        return (
+            f"{begin}. {_capital(what)} would account for {share} of it, but not convincingly enough to be"
+            " named."
+        )
     amount = "no part" if share == "none" else share
-    return f"{begin}, and nothing explains it fully. The best description is {what}: it covers {amount} of it."
+    return (
+        f"{begin}, and nothing explains it fully. The best description is {what}: it covers {amount} of it."
+    )
 
 
 def _equals(mechanism: StatedMechanism) -> list[Rival]:
@@ -300,9 +317,7 @@ def _equals(mechanism: StatedMechanism) -> list[Rival]:
 def _names(rivals: Sequence[Rival], mechanism: StatedMechanism) -> list[str]:
     """Names of rivals, each once; their labels where the name alone is that of the mechanism itself."""
     return list(
-        dict.fromkeys(
-            each.label if each.name in (mechanism.name, GENERIC) else each.name for each in rivals
-        )
+        dict.fromkeys(each.label if each.name in (mechanism.name, GENERIC) else each.name for each in rivals)
     )
 
 
@@ -335,7 +350,7 @@ def _capital(text: str) -> str:
 
 
 def _noise(errors: HeldOutErrors) -> str:
-    return "" if errors.noise_floor is None else f"; noise alone makes {_error(errors.noise_floor)}"
+    return "" if errors.noise_floor is None else f" (noise alone: {_error(errors.noise_floor)})"
 
 
 def _error(value: float | None) -> str:

@@ -89,7 +89,9 @@ def statement_from(number: int, verdict: MismatchVerdict, **changes: Any) -> Sta
 
 def said(statement: Statement) -> str:
     words = words_of(statement)
-    return " ".join([sentence_of(statement, {"k": "N/m"}), *(line for lines in words.values() for line in lines)])
+    return " ".join(
+        [sentence_of(statement, {"k": "N/m"}), *(line for lines in words.values() for line in lines)]
+    )
 
 
 def percentages(text: str) -> list[float]:
@@ -152,7 +154,7 @@ def test_a_gain_is_said_only_where_the_held_out_error_falls(verdict):
         if falls:
             *before, after, _noise = percentages(text.split("falls from")[1])
             assert after < min(before)
-        elif errors.at_noise(first) and not errors.change(first, second) == "worse":
+        elif errors.at_noise(first) and errors.change(first, second) != "worse":
             assert "too noisy to show it" in text
         else:
             assert "does not improve" in text or "worse" in text
