@@ -16,6 +16,8 @@ from siq.numerics.number_text import LARGEST_PLAIN_NUMBER, number_text
 
 NOTICED = 1.96  # standard errors beyond which a parameter counts as changed
 LISTED = 2  # names in a sentence, before the rest is counted
+MOSTLY = 0.99  # share of the difference that is nearly all; siq.mismatch.investigation.MOSTLY
+LOOKS_RANDOM = 2e-3  # the p-value below which a name is refused; siq.mismatch.remainder.DOUBTFUL
 COUNTABLE = {"bias", "coupling", "delay", "drift", "drive", "offset"}  # last words that take an article
 
 
@@ -35,7 +37,9 @@ def sentence_of(statement: Statement, units: Mapping[str, str]) -> str:
     if statement.verdict is MismatchVerdict.PARAMETER_SHIFT:
         said = shifted(statement.recalibration or {}, units)
         gain = gained(errors, errors.before, errors.recalibrated, it="With the new values", them="them")
-        return f"The simulation has the right equations, but not the right parameters: {said}. {gain}".strip()
+        return (
+            f"The simulation's equations explain the recordings, but with other parameters: {said}. {gain}"
+        ).strip()
     if statement.verdict is MismatchVerdict.UNEXPLAINED:
         return f"{_unexplained(statement)} {_error_stays(errors)}".strip()
     if statement.random_forces:
@@ -115,12 +119,14 @@ def alternatives(mechanism: StatedMechanism) -> tuple[str, ...]:
     if not same and not needless:
         others = [each for each in mechanism.rivals if each.standing == "less"]
         best = max((each.delta_chi2 for each in others), default=None)
-        if best is None or mechanism.evidence.delta_chi2 is None:
+        gain = mechanism.evidence.delta_chi2
+        if best is None or gain is None:
             lines.append(f"No other mechanism promised enough to be compared with {own}.")
         else:
+            next_best = f"the next best gains {best:.0f} in χ², {own} {gain:.0f}"
             lines.append(
-                f"No other mechanism that was fitted explains the recordings as well as {own}: the next best"
-                f" gains {mechanism.evidence.delta_chi2 - best:.3g} less in χ²."
+                f"No other mechanism that was fitted explains the recordings as well as {own}:"
+                f" {next_best if best >= 1 else 'the others gain nothing'}."
             )
     return tuple(lines)
 
@@ -132,7 +138,7 @@ def explained(mechanisms: Sequence[StatedMechanism]) -> tuple[str, ...]:
     share = percent(mechanisms[0].share_of_excess)
     who = _capital(_listed([each.label for each in mechanisms], "and"))
     verb = "explains" if len(mechanisms) == 1 else "together explain"
-    return (f"{who} {verb} {share} of what the recalibrated simulation leaves beyond noise.",)
+    return (f"{who} {verb} {share} of the difference that other parameters cannot explain.",)
 
 
 def left_over(description: Description) -> tuple[str, ...]:
@@ -144,8 +150,10 @@ def left_over(description: Description) -> tuple[str, ...]:
             "It is not named, since an effect as faint as this one could as well be one that the dictionary"
             " does not have."
         )
+    elif description.by and description.share_described > MOSTLY:
+        lines.append("It is not named, since something else could look the same.")
     elif description.by:
-        lines.append("It is not named, since a description as good may belong to something else.")
+        lines.append("It is not named: what explains only a part may be standing in for something else.")
     if p >= LOOKS_RANDOM:
         lines.append(f"What is left looks like noise (p = {p_text(p)}).")
     else:
@@ -156,9 +164,6 @@ def left_over(description: Description) -> tuple[str, ...]:
     if description.random_forces_admitted:
         lines.append("Random forces had to stand in for it in the fit.")
     return tuple(lines)
-
-
-LOOKS_RANDOM = 2e-3  # the p-value below which a name is refused; siq.mismatch.remainder.DOUBTFUL
 
 
 def shifted(recalibration: Mapping[str, Recalibrated], units: Mapping[str, str]) -> str:

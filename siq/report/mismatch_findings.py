@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,6 +12,7 @@ from markupsafe import Markup, escape
 
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.formulas import FormulaError, parse_formula
+from siq.dynamics.parametric import symbol
 from siq.mismatch.dictionary import Mechanism
 from siq.report.formatting import formula_mathml
 from siq.report.page import ReportFigure
@@ -103,10 +104,21 @@ def listed(names: Sequence[str], word: str = "or") -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} {word} {names[-1]}"
 
 
-def typeset(text: str, model: Dynamics) -> Markup | str:
-    """A formula of the verdict, typeset; as text where it cannot be read as one."""
+def typeset(text: str, model: Dynamics, further: Iterable[str] = ()) -> Markup | str:
+    """A formula of the verdict, typeset; as text where it cannot be read as one.
+
+    Parameters
+    ----------
+    text
+        The formula.
+    model
+        Whose names it may use.
+    further
+        Names that the model does not have, such as parameters of what is only described.
+    """
+    names = {**model.names, **{name: symbol(name) for name in further}}
     try:
-        formula = parse_formula(text, model.names, inputs=tuple(entry.name for entry in model.inputs))
+        formula = parse_formula(text, names, inputs=tuple(entry.name for entry in model.inputs))
     except FormulaError:
         return text
     return mathml(formula)

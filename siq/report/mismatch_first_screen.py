@@ -104,10 +104,15 @@ def numbers(findings: Findings) -> ReportTable | None:
     shown = ["before", "recalibrated", "augmented"]
     if not mechanisms_said(findings) or findings.kind == "random forces":
         shown.remove("augmented")
+    if fit["before"] == fit["recalibrated"]:  # no parameter was free, or none changed
+        shown.remove("recalibrated")
     rows = []
     for name in shown:
         error = fit[name]
-        row = {"simulation": SIMULATIONS[name], **own.get(name, {})}
+        words = SIMULATIONS[name]
+        if name == "augmented" and findings.kind == "unexplained":
+            words = "with what comes closest"
+        row = {"simulation": words, **own.get(name, {})}
         row["of the spread"] = "ran away" if error is None else _percent(error)
         row["times noise"] = "" if error is None or not floor > 0 else measured_text(error / floor, digits=2)
         rows.append(row)

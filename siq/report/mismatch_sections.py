@@ -9,6 +9,7 @@ from typing import Any
 import pandas as pd
 from markupsafe import Markup
 
+from siq.mismatch.dictionary import Mechanism
 from siq.numerics.measured_text import measured_text, p_text, percent, unit_text
 from siq.report.mismatch_findings import (
     SIMULATIONS,
@@ -27,8 +28,8 @@ RECORDINGS_LISTED = 12
 CAPTIONS = {
     "curves": "What is missing, as a function of one coordinate in each panel: before anything was added"
     " (blue) and after (orange, dashed). What the simulation's own parameters can do is taken off. Where a"
-    " blue band stays clear of zero, something is missing; a band that is wider than the panel is cut off or"
-    " left out.",
+    " blue band stays clear of zero, something is missing. Bands are cut off at the edge of the panel, and"
+    " left out where they would fill it.",
     "map": "What is missing, over the two states along which most of it can be seen, averaged over cells;"
     " one panel for each equation. Grey: no recordings.",
     "candidates": "How much each mechanism explains. Fitted: what was found, and what was fitted in its"
@@ -114,15 +115,19 @@ def _formula(findings: Findings) -> MismatchSection | None:
     known = {entry.name: entry for entry in findings.dictionary}
     lines, rows, notes = [], [], []
     for each in named:
+        entry = known.get(each["name"])
         lines += [
-            FormulaLine(each["label"], typeset(formula, findings.after), _of_what(name, findings))
+            FormulaLine(
+                each["label"],
+                typeset(formula, findings.after, each["parameters"]),
+                _of_what(name, entry, findings),
+            )
             for name, formula in each["terms"].items()
         ]
         rows += [
             {"of": each["label"], "parameter": name, "value": _value(value)}
             for name, value in each["parameters"].items()
         ]
-        entry = known.get(each["name"])
         if entry is not None and entry.reference:
             notes.append(f"{capital(each['name'])}: {entry.reference}.")
     if findings.kind == "missing physics":
@@ -138,11 +143,15 @@ def _formula(findings: Findings) -> MismatchSection | None:
     return MismatchSection(heading, (), lines, tables, notes=list(dict.fromkeys(notes)))
 
 
-def _of_what(name: str, findings: Findings) -> str:
-    if name in findings.before.states:
-        return f"added to the equation of {name}, or in the place of one of its terms"
-    measured = [output for output, _ in findings.before.outputs]
-    return f"what is measured as {name}" if name in measured else f"in the place of {name}"
+def _of_what(name: str, entry: Mechanism | None, findings: Findings) -> str:
+    """What a formula of a mechanism is; see `siq.mismatch.candidates.MechanismCandidate.changes`."""
+    measured = name in [output for output, _ in findings.before.outputs]
+    if measured and entry is not None and any(form.outputs for form in entry.forms):
+        return f"what is measured as {name}"
+    if name not in findings.before.states:
+        return f"the rate of change of {name}, which is new"
+    replaced = entry is not None and any(form.replace for form in entry.forms)
+    return f"in the equation of {name}" if replaced else f"added to the equation of {name}"
 
 
 def _value(entry: Mapping[str, Any]) -> str:
@@ -154,8 +163,8 @@ def _how_sure(findings: Findings) -> MismatchSection:
     rows = [
         {
             "mechanism": each["label"],
-            "gain in χ²": evidence["delta_chi2"],
-            "ΔBIC": evidence["delta_bic"],
+            "gain in χ²": round(evidence["delta_chi2"]),
+            "ΔBIC": round(evidence["delta_bic"]),
             "p, independent errors": p_text(evidence["p_white"]),
             "p, errors of a recording together": p_text(evidence["p_cluster"]),
         }
@@ -191,9 +200,9 @@ def _how_sure(findings: Findings) -> MismatchSection:
 
 
 NOTHING_FOUND = {
-    "no mismatch": "Every mechanism of the dictionary was tried, and none gains more than it would by"
-    " chance.",
-    "parameter shift": "With the new parameters, no mechanism of the dictionary gains more than it would by"
+    "no mismatch": "Every mechanism of the dictionary that could act in this system was tried, and none"
+    " stood the tests against chance.",
+    "parameter shift": "With the new parameters, no mechanism of the dictionary stood the tests against"
     " chance.",
     "missing physics": "",
     "random forces": "",
@@ -232,8 +241,8 @@ def _where(findings: Findings) -> MismatchSection | None:
     for name, share in place["equations"].items():
         if share > 0:
             text.append(
-                f"A function of one coordinate in the equation of {name} explains {percent(share)} of what"
-                " the recalibrated simulation leaves beyond noise."
+                f"The best function of one coordinate, added to the equation of {name}, would explain"
+                f" {percent(share)} of the difference."
             )
     figures = [*findings.figure("curves", CAPTIONS["curves"]), *findings.figure("map", CAPTIONS["map"])]
     return MismatchSection("Where it sits", text, figures=figures)
@@ -279,7 +288,8 @@ def _wells(findings: Findings) -> MismatchSection | None:
         figures = findings.figure("escapes", CAPTIONS["escapes"])
     if not text and not tables:
         return None
-    return MismatchSection("What it does to wells and escape times", text, tables=tables, figures=figures)
+    heading = "What it does to wells and escape times"
+    return MismatchSection(heading, text, tables=tables, figures=figures, folded=not tables)
 
 
 def _excluded(findings: Findings) -> MismatchSection | None:
@@ -334,11 +344,13 @@ def _held_out(findings: Findings) -> MismatchSection | None:
 
 def _candidates(findings: Findings) -> MismatchSection | None:
     table = findings.candidates
-    best = table[table["gain"] > 0] if len(table) else table
+    best = table[table["gain"] >= 1] if len(table) else table
     if not len(best):
         return None
     best = best.loc[best.groupby(["label", "stage"], sort=False)["gain"].idxmax()]
-    best = best.assign(first=best["stage"] != "found", what=best["stage"].map(STAGES))
+    best = best.assign(
+        first=best["stage"] != "found", what=best["stage"].map(STAGES), gain=best["gain"].round().astype(int)
+    )
     best = best.sort_values(["first", "gain"], ascending=[True, False], kind="stable")
     if not mechanisms_said(findings):
         best["what"] = "would explain (estimate)"

@@ -160,6 +160,7 @@ def _draw(
     largest = 0.0
     for name in shown:
         label, colour, style = WORDS[name]
+        style = "-" if len(shown) == 1 else style
         if distinct and name == "recalibrated":
             colour, style = GREY, ":"
         values = rows[name].to_numpy(float)

@@ -71,7 +71,9 @@ def plot_curves(
     shown = list(order.index)
     if named is not None:
         shown.sort(key=lambda key: (key[0], key[1]) != named)
-    shown = shown[:CURVES]
+    visible = before[before["missing"].abs() > 2 * before["standard_error"]].groupby(keys).size()
+    # The first is what the page speaks of; others only if they show something.
+    shown = [key for place, key in enumerate(shown) if place == 0 or key in visible.index][:CURVES]
     figure = Figure(figsize=(WIDTH, 0.7 + 2.3 * len(shown)))
     for axes, key in zip(np.atleast_1d(figure.subplots(len(shown), 1)), shown, strict=True):
         equation, coordinate, across = key
@@ -111,8 +113,11 @@ def _draw_curves(axes: Axes, stages: Mapping[str, pd.DataFrame]) -> None:
         at, value, error = (
             stages[stage][name].to_numpy(float) for name in ("at", "missing", "standard_error")
         )
-        # A band that leaves the panel everywhere would only tint it.
-        if len(at) and (2 * error < high - low).any():
+        wide = float(np.mean(2 * error > (high - low) / 2)) > 0.5 if len(at) else True
+        if wide and stage == "after":
+            continue  # the recordings say nothing about it
+        # A band that fills the panel would only tint it.
+        if not wide:
             band = [np.clip(value + sign * 2 * error, low, high) for sign in (-1, 1)]
             axes.fill_between(at, *band, color=colour, alpha=0.2, linewidth=0)
         axes.plot(at, value, color=colour, linestyle=style, marker=marker, markersize=4)
