@@ -15,7 +15,7 @@ from siq.estimation.measurements import Measurements
 from siq.mismatch.investigation import Investigation, MismatchVerdict
 from siq.mismatch.roles import Roles
 from siq.mismatch.structure import Curve, Structure
-from siq.numerics.measured_text import measured_text, unit_text
+from siq.numerics.quantity_text import measured_text, unit_text
 
 VISIBLE = 0.1  # of the largest value of a curve
 TWO_ERRORS = 2.0

@@ -11,8 +11,8 @@ from siq.mismatch.candidates import GENERIC, PROCESS_NOISE
 from siq.mismatch.held_out import HeldOutErrors
 from siq.mismatch.investigation import MismatchVerdict
 from siq.mismatch.statement import Description, Recalibrated, Rival, StatedMechanism, Statement
-from siq.numerics.measured_text import SMALLEST_SHARE, measured_text, p_text, percent
 from siq.numerics.number_text import LARGEST_PLAIN_NUMBER, number_text
+from siq.numerics.quantity_text import SMALLEST_SHARE, measured_text, p_text, percent
 
 NOTICED = 1.96  # standard errors beyond which a parameter counts as changed
 LISTED = 2  # names in a sentence, before the rest is counted

@@ -6,7 +6,7 @@ from html import escape
 
 from siq.dynamics.dynamics import Dynamics
 from siq.mismatch.statement import METRIC, Estimate, StatedMechanism, Statement
-from siq.numerics.measured_text import measured_text, p_text
+from siq.numerics.quantity_text import measured_text, p_text
 
 DIGITS = 4
 Section = tuple[str, list[str]]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from siq.numerics.measured_text import measured_text, unit_text
+from siq.numerics.quantity_text import measured_text, unit_text
 from siq.report.mismatch_findings import SIMULATIONS, Findings, capital, mechanisms_said
 from siq.report.page import ReportFigure, ReportTable
 

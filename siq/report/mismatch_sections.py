@@ -10,7 +10,7 @@ import pandas as pd
 from markupsafe import Markup
 
 from siq.mismatch.dictionary import Mechanism
-from siq.numerics.measured_text import measured_text, p_text, percent, unit_text
+from siq.numerics.quantity_text import measured_text, p_text, percent, unit_text
 from siq.report.mismatch_findings import (
     SIMULATIONS,
     Findings,

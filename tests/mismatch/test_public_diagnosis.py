@@ -19,7 +19,7 @@ from siq.mismatch import diagnosis as module
 from siq.mismatch.case import comparison_of
 from siq.mismatch.tables import tables_of, tables_of_failure
 from siq.mismatch.verdict import statement_of_failure
-from siq.numerics.measured_text import measured_text
+from siq.numerics.quantity_text import measured_text
 from siq.report.diagnosis_report import diagnosis_html, diagnosis_text
 
 n, r = sympy.symbols("n r", real=True)

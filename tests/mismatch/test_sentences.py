@@ -23,7 +23,7 @@ from siq.mismatch.statement import (
     Statement,
 )
 from siq.mismatch.verdict import statement_of_failure
-from siq.numerics.measured_text import p_text, percent
+from siq.numerics.quantity_text import p_text, percent
 
 NAMES = ("dry friction", "Stribeck friction", "hysteresis", "quadratic drag", "cubic damping", "input delay")
 SAME = 10.0

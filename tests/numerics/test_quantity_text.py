@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from siq.numerics.measured_text import measured_text, unit_text
+from siq.numerics.quantity_text import measured_text, unit_text
 
 
 @pytest.mark.parametrize(
@@ -29,7 +29,7 @@ def test_a_value_ends_with_the_last_digit_of_its_error(value, error, unit, text)
     ("unit", "text"),
     [
         ("m/s**2", "m/s²"), ("1", ""), ("", ""), ("1/(m**2*s)", "1/(m²·s)"), ("s**(-2)", "1/s²"),
-        ("°C", "°C"), ("um/ms", "um/ms"), ("s**(-1)", "1/s"), ("m**12", "m¹²"),
+        ("°C", "°C"), ("um/ms", "µm/ms"), ("s**(-1)", "1/s"), ("m**12", "m¹²"),
         ("1/(m**2*s**2)", "1/(m²·s²)"),
     ],
 )  # fmt: skip

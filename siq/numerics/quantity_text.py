@@ -63,6 +63,7 @@ def unit_text(unit: str) -> str:
         lambda power: (power[1] or power[2]).translate(SUPERSCRIPTS),
         unit,
     )
+    factors = re.sub(r"(?<![A-Za-z])u(?=(?:m|s|g|N|V|A|W|K|L|J|Pa|Hz|mol|rad)(?![A-Za-z]))", "µ", factors)
     factors = factors.replace("**", "^").replace("*", "·")
     factors = re.sub(r"\b([A-Za-zµΩ°]+)⁻¹(?!\d)", r"1/\1", factors) if "/" not in factors else factors
     inverse = re.fullmatch(r"([A-Za-zµΩ°]+)⁻([²³⁴-⁹])", factors)
