@@ -24,7 +24,7 @@ from siq.mismatch.steadiness import unsteadiness
 from siq.mismatch.structure import Structure
 from siq.mismatch.study import MismatchStudy
 from siq.mismatch.trials import UntriedMechanism
-from siq.numerics.quantity_text import p_text, percent
+from siq.numerics.quantity_text import p_equation, percent
 
 
 class MismatchVerdict(StrEnum):
@@ -266,11 +266,11 @@ def remains(left: Remainder) -> str:
     """How much of the excess over noise is left by what was found, and whether it looks like noise."""
     size = percent(1 - left.share)
     if not left.doubtful:
-        return "" if size == "none" else f"It leaves {size} of the difference unexplained."
-    chance = f"(p = {p_text(left.after.p_value)})"
+        return "" if size == "none" else f"What was found leaves {size} of the difference."
+    chance = f"({p_equation(left.after.p_value)})"
     if size == "none":
-        return f"What it leaves is as small as noise, but does not look like it {chance}."
-    return f"It leaves {size} of the difference unexplained, and this rest does not look like noise {chance}."
+        return f"What is left is as small as noise, but does not look like it {chance}."
+    return f"What was found leaves {size} of the difference, and this rest does not look like noise {chance}."
 
 
 def shift_probability(model: Dynamics, recalibrated: Fit) -> float:

@@ -12,7 +12,7 @@ from siq.mismatch.held_out import HeldOutErrors
 from siq.mismatch.investigation import MismatchVerdict
 from siq.mismatch.statement import Description, Recalibrated, Rival, StatedMechanism, Statement
 from siq.numerics.number_text import LARGEST_PLAIN_NUMBER, number_text
-from siq.numerics.quantity_text import SMALLEST_SHARE, measured_text, p_text, percent
+from siq.numerics.quantity_text import SMALLEST_SHARE, measured_text, p_equation, p_text, percent
 
 NOTICED = 1.96  # standard errors beyond which a parameter counts as changed
 LISTED = 2  # names in a sentence, before the rest is counted
@@ -155,7 +155,7 @@ def left_over(description: Description) -> tuple[str, ...]:
     elif description.by:
         lines.append("It is not named: what explains only a part may be standing in for something else.")
     if p >= LOOKS_RANDOM:
-        lines.append(f"What is left looks like noise (p = {p_text(p)}).")
+        lines.append(f"What is left looks like noise ({p_equation(p)}).")
     else:
         lines.append(
             f"What is left is not noise: noise alone would look as structured with a probability of"

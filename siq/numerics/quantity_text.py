@@ -98,6 +98,11 @@ def p_text(p: float) -> str:
     return f"{p:.2g}" if p >= 0.01 else _small(p)
 
 
+def p_equation(p: float) -> str:
+    """Write a p-value as an equation: ``p = 0.034``, ``p < 10⁻¹²``."""
+    return "p < 10⁻¹²" if p < SMALLEST_P else f"p = {p_text(p)}"
+
+
 def _small(p: float) -> str:
     mantissa, power = f"{p:.1e}".split("e")
     return f"{mantissa} × 10{str(int(power)).translate(SUPERSCRIPTS)}"

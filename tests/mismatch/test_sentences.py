@@ -192,7 +192,7 @@ def test_all_of_it_is_never_said_of_what_is_not_explained():
             assert " all of " not in text
         if description.share_described > 0.999:
             assert "nothing explains it fully" not in text
-        assert ("looks like noise (p" in text) == (description.p_residuals_random >= 2e-3)
+        assert ("looks like noise (p =" in text) == (description.p_residuals_random >= 2e-3)
 
 
 def test_random_forces_are_a_verdict_of_their_own():
