@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from siq.report.mismatch_findings import FINAL
+
 
 def mismatch_answer(verdict: Mapping[str, Any], *, title: str) -> dict[str, Any]:
     """The content of ``answer.json``: the sentence that the page opens with, and the number beside it.
@@ -25,7 +27,7 @@ def mismatch_answer(verdict: Mapping[str, Any], *, title: str) -> dict[str, Any]
         of the spread of what was measured; null where a simulation ran away.
     """
     fit = verdict["fit"]
-    after = AFTER.get(str(verdict["verdict"]), "recalibrated")
+    after = FINAL.get(str(verdict["verdict"]), "recalibrated")
     return {
         "title": title,
         "sentence": verdict["sentence"],
@@ -35,7 +37,3 @@ def mismatch_answer(verdict: Mapping[str, Any], *, title: str) -> dict[str, Any]
         "held_out_after": fit[after],
         "held_out_noise": fit["noise_floor"],
     }
-
-
-AFTER = {"missing physics": "augmented", "no mismatch": "before"}
-"""Which of the three simulations a verdict ends with; the recalibrated one where nothing is said."""

@@ -31,11 +31,14 @@ def main(snakemake: Any) -> None:
         after=load_system(source.system),
         dictionary=dictionary_of(without=study.without, further=study.mechanisms, file="the study"),
         candidates=read_table(source.candidates),
-        figures={Path(path).stem: Path(path).read_bytes() for path in source.figures},
+        figures={
+            Path(path).stem: Path(path).read_bytes() for path in sorted(Path(source.figures).glob("*.svg"))
+        },
         wells=read_table(source.wells),
         escape=read_table(source.escape),
         notes=read_json(source.notes),
         scores=read_table(source.scores) if source.get("scores") else pd.DataFrame(),
+        held_out=read_table(source.held_out),
         folder=str(Path(source.candidates).parent),
     )
     commands = [
