@@ -3,6 +3,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 CORES ?= 2
+# Where torch comes from on Linux, whose usual build brings 3 GB for graphics cards along. `make TORCH_INDEX=`
+# takes that one.
+TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 
 .PHONY: statistics examples test full untuned noise wheel docs lint format environment clean
 
@@ -53,7 +56,11 @@ environment: $(VENV)/installed
 $(VENV)/installed: pyproject.toml requirements/pinned.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 	  || { echo "siq needs Python 3.11 or newer; name one with 'make PYTHON=python3.12 ...'." >&2; exit 1; }
+	@echo "Installing siq with all of its tools below $(VENV): about 2.2 GB, 1 GB of it for networks (CPU only)."
 	$(PYTHON) -m venv $(VENV)
+	@test -z "$(TORCH_INDEX)" || test "$$(uname)" != Linux || $(BIN)/python -m pip install --quiet --no-deps \
+	  --retries 0 --timeout 15 --index-url $(TORCH_INDEX) --constraint requirements/pinned.txt torch 2> /dev/null \
+	  || echo "$(TORCH_INDEX) does not answer; torch comes from the usual index."
 	$(BIN)/python -m pip install --quiet --constraint requirements/pinned.txt --editable '.[dev]'
 	touch $@
 
