@@ -4,6 +4,7 @@ import sys
 from functools import cache
 from pathlib import Path
 
+from siq.data.folders import files_of
 from siq.errors import InputError
 from siq.report.settings import (
     FiguresSettings,
@@ -151,6 +152,15 @@ def data_source(wildcards):
         return ancient(study.source())
     check_recordings(wildcards.study)
     return study.source()
+
+
+def files_in_folder(wildcards):
+    """Input function: the files of a folder of recordings, so that a change of one is seen; of a file none."""
+    folder = Path(study_of(wildcards).source())
+    try:
+        return [str(file) for file in files_of(folder)] if folder.is_dir() else []
+    except InputError as error:
+        say_and_stop(error)
 
 
 @cache
