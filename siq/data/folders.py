@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from siq.errors import InputError
+
+SUFFIXES = (".parquet", ".csv", ".tsv", ".txt", ".dat", ".h5", ".hdf5", ".mat", ".npz", ".npy")
+"""Of files that can be read; `siq.data.formats.READERS` has a reader for each."""
 
 
 def missing_file(file: str, looked_at: Sequence[Path]) -> InputError:
@@ -39,15 +42,13 @@ def missing_file(file: str, looked_at: Sequence[Path]) -> InputError:
     return InputError(file, "", fault, remedy)
 
 
-def files_of(folder: Path, suffixes: Collection[str]) -> list[Path]:
+def files_of(folder: Path) -> list[Path]:
     """The files of recordings in a folder, in the order of their names.
 
     Parameters
     ----------
     folder
-        Hidden files in it are left out, and those with other suffixes.
-    suffixes
-        Of files that can be read, with their dots.
+        Hidden files in it are left out, and those that cannot be read.
 
     Raises
     ------
@@ -57,12 +58,12 @@ def files_of(folder: Path, suffixes: Collection[str]) -> list[Path]:
     found = sorted(
         path
         for path in folder.iterdir()
-        if path.is_file() and path.suffix.lower() in suffixes and not path.name.startswith((".", "~"))
+        if path.is_file() and path.suffix.lower() in SUFFIXES and not path.name.startswith((".", "~"))
         and path.stem.casefold() not in ("readme", "notes", "license")
     )  # fmt: skip
     if not found:
         raise InputError(
             str(folder), "", "the folder holds no recordings",
-            f"put one file per recording into it, with one of the suffixes {', '.join(suffixes)}",
+            f"put one file per recording into it, with one of the suffixes {', '.join(SUFFIXES)}",
         )  # fmt: skip
     return found

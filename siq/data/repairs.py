@@ -136,7 +136,7 @@ def _restarts(rows: np.ndarray, t: np.ndarray) -> list[np.ndarray]:
     time = t[rows]
     cuts = np.flatnonzero(np.diff(time) < 0) + 1
     begin = 0
-    for cut in cuts:
+    for cut in cuts.tolist():
         if time[cut] > time[begin] + RESTART * (time[cut - 1] - time[begin]):
             return [rows]
         begin = cut

@@ -12,7 +12,7 @@ from siq.data.cells import CellFault, agree_on_unit, parse_labels, parse_numbers
 from siq.data.checks import check_times
 from siq.data.clock_times import seconds_of_clock
 from siq.data.folders import files_of
-from siq.data.formats import READERS, ColumnFile, open_columns
+from siq.data.formats import ColumnFile, open_columns
 from siq.data.layout import layout_of
 from siq.data.repairs import Rows, put_in_order, trim
 from siq.errors import InputError
@@ -41,7 +41,7 @@ def read_tables(
     """
     if not Path(path).is_dir():
         return checked_table(str(path), open_columns(path), columns, units)
-    files = files_of(Path(path), READERS)
+    files = files_of(Path(path))
     tables = [checked_table(str(file), open_columns(file), columns, units) for file in files]
     return _joined(files, tables, str(path))
 
@@ -80,8 +80,9 @@ def checked_table(
     notes = list(layout.notes)
     for index, (name, place) in enumerate(zip(names, used, strict=True)):
         clock = seconds_of_clock(file, called[index], cells[index]) if name == "t" else None
+        cell_unit: str | None = "s"
         if clock is not None:
-            numbers[index], cell_unit = clock[0], "s"
+            numbers[index] = clock[0]
             notes.append(f"the times were turned into seconds since the first, {clock[1]}")
         else:
             shown = name if name == "t" else called[index]

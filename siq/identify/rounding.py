@@ -84,24 +84,29 @@ def rounding_text(recordings: Recordings, *, coarse: bool = False) -> str | None
     coarse
         Whether only rounding counts that is not small beside the steps from sample to sample.
     """
-    said = []
+    alike: dict[tuple[float, str | None], list[str]] = {}
     for name, unit, values in zip(recordings.titles, recordings.units, recordings.values.T, strict=True):
         step = quantum(values)
         if step is None:
             continue
         if coarse and rounding_error(step) < COARSE * np.sqrt(np.mean(np.diff(values) ** 2)):
             continue
-        decimals = decimals_of(step)
-        behind = f" {unit}" if unit else ""
-        how = (
-            f"to {decimals} decimal{'s' if decimals > 1 else ''}"
-            if decimals
-            else f"in steps of {step:.3g}{behind}"
-        )
-        said.append(
-            f"'{name}' is written {how}, an error of {rounding_error(step):.1g}{behind} in each value"
-        )
+        alike.setdefault((step, unit), []).append(f"'{name}'")
+    said = [_written(names, step, unit) for (step, unit), names in alike.items()]
     return ", and ".join(said) or None
+
+
+def _written(names: list[str], step: float, unit: str | None) -> str:
+    decimals, behind = decimals_of(step), f" {unit}" if unit else ""
+    how = (
+        f"to {decimals} decimal{'s' if decimals > 1 else ''}"
+        if decimals
+        else f"in steps of {step:.3g}{behind}"
+    )
+    error = f"{rounding_error(step):.1g}{behind}"
+    if len(names) == 1:
+        return f"{names[0]} is written {how}, an error of {error} in each value"
+    return f"{', '.join(names[:-1])} and {names[-1]} are written {how}, an error of {error} in each value"
 
 
 def decimals_needed(recordings: Recordings, pairs: SnapshotPairs) -> int:

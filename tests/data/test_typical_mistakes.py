@@ -282,11 +282,11 @@ def test_reserved_names_are_those_that_formulas_refuse() -> None:
     [
         ("x [mm]", "x", "mm"), ("x (mm)", "x", "mm"), ("x / mm", "x", "mm"), ("x in mm", "x", "mm"),
         ("x, mm", "x", "mm"), ("t_s", "t", "s"), ("Time (ms)", "Time", "ms"), ("x(t)", "x", None),
-        ("x(t) [nm]", "x", "nm"), ("x (raw)", "x (raw)", None), ("dx/dt", "dx/dt", None), ("v_x", "v_x", None),
+        ("x(t) [nm]", "x", "nm"), ("x (raw)", "x (raw)", None), ("dx/dt", "dx/dt", None), ("v", "v", None),
         ("P (kg m^-3)", "P", "kg m^-3"), ("F (pN/µm²)", "F", "pN/µm²"), ("n (1)", "n", "1"),
     ],
 )  # fmt: skip
-def test_a_unit_in_brackets_is_a_unit_and_a_word_is_not(heading: str, title: str, unit: str | None) -> None:
+def test_a_unit_in_brackets_is_one_and_a_word_is_not(heading: str, title: str, unit: str | None) -> None:
     assert read_heading(heading) == (title, unit)
 
 

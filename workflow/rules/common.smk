@@ -6,6 +6,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from siq.cli.answers import Exit, answer_of_page
+from siq.data.folders import files_of
 from siq.errors import InputError
 from siq.report.settings import (
     FiguresSettings,
@@ -154,6 +155,15 @@ def data_source(wildcards):
         return ancient(study.source())
     check_recordings(wildcards.study)  # which refuses a file that is not there
     return study.source()
+
+
+def files_in_folder(wildcards):
+    """Input function: the files of a folder of recordings, so that a change of one is seen; of a file none."""
+    folder = Path(study_of(wildcards).source())
+    try:
+        return [str(file) for file in files_of(folder)] if folder.is_dir() else []
+    except InputError as error:
+        say_and_stop(error)
 
 
 @cache
