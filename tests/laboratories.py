@@ -80,13 +80,12 @@ def double_well(state: FloatArray) -> FloatArray:
     return -gradient + np.array([-gradient[1], gradient[0]])  # a circulation along the contours
 
 
-def triple_state(state: FloatArray) -> FloatArray:
-    """Two wells in three states, with a circulation about the third."""
-    x, y, z = state
-    return np.array([x - x**3 - y, -y + x - x**3, -z])
+def three_states(state: FloatArray) -> FloatArray:
+    """The same two traps with a third state, which relaxes by itself."""
+    return np.append(double_well(state[:2]), -state[2])
 
 
-def shear(state: FloatArray) -> FloatArray:
+def rotation(state: FloatArray) -> FloatArray:
     """An oscillator that runs on a cycle: no well that a formula could be about."""
     x, y = state
     return np.array([x - y - x * (x**2 + y**2), x + y - y * (x**2 + y**2)])
@@ -107,9 +106,9 @@ def write_studies(folder: Path) -> dict[str, Path]:
             double_well, names=["x [um]", "y [um]"], box=[0.9, 0.6], recordings=120, **options
         ),
         "three-states": ring_downs(
-            triple_state, names=["a", "b", "c"], box=[1.5, 1.0, 1.0], recordings=150, **options
+            three_states, names=["a", "b", "c"], box=[1.5, 1.0, 1.0], recordings=150, **options
         ),
-        "cycle": ring_downs(shear, names=["x", "y"], box=[1.5, 1.5], recordings=60, **options),
+        "cycle": ring_downs(rotation, names=["x", "y"], box=[1.5, 1.5], recordings=60, **options),
         "one-state": hopping(intensity=0.25, samples=20_000, step=0.02, traces=4, seed=5),
     }
     files = {}
