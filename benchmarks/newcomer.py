@@ -2,9 +2,9 @@
 
     make newcomer
 
-makes the wheel and runs this: a fresh environment, `pip install` of the wheel with its workflow, `siq run` of a CSV
-file without any study, `siq diagnose` of a card and a CSV file. Ends with exit code 1 where an answer is wrong or
-comes later than promised.
+makes the wheel and runs this: a fresh environment, `pip install` of the wheel with its workflow, `siq run`
+of a CSV file without any study, `siq diagnose` of a card and a CSV file. Ends with exit code 1 where an
+answer is wrong or comes later than promised.
 """
 
 from __future__ import annotations
