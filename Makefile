@@ -7,7 +7,7 @@ CORES ?= 2
 # takes that one.
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 
-.PHONY: statistics examples test full untuned noise wheel docs lint format environment clean
+.PHONY: statistics examples test full untuned noise wheel test-pages newcomer docs lint format environment clean
 
 statistics: environment
 	$(BIN)/snakemake --cores $(CORES) statistics
@@ -33,6 +33,15 @@ wheel: environment
 	rm -rf build dist
 	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
 	PYTHON=$(BIN)/python .ci/check-wheel
+
+# Every kind of page in Chromium, on a desk and on a phone; skipped where there is no Chromium.
+test-pages: environment docs
+	$(BIN)/python -m pip install --quiet --constraint requirements/pinned.txt --editable '.[pages]'
+	$(BIN)/pytest -m pages tests/pages
+
+# A fresh environment, a wheel, recordings: how long until a certified barrier and until a verdict.
+newcomer: wheel
+	$(BIN)/python benchmarks/newcomer.py
 
 # docs/_build/html/index.html: the pages and the reference. A warning is an error.
 docs: environment
