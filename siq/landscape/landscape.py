@@ -119,11 +119,11 @@ class Landscape:
             unit or settings.space.unit(name, unknown="1")
             for name, unit in zip(recordings.names, recordings.units, strict=True)
         )
-        return found.in_units(units)
+        return found.in_units(units, recordings.time_unit or settings.space.unit("t", unknown="1"))
 
-    def in_units(self, units: Sequence[str]) -> Landscape:
-        """The same with the units of the states said; nothing is converted."""
-        dynamics = replace(self.dynamics, units=tuple(units))
+    def in_units(self, units: Sequence[str], time_unit: str | None = None) -> Landscape:
+        """The same with the units of the states, and of the time, said; nothing is converted."""
+        dynamics = replace(self.dynamics, units=tuple(units), time_unit=time_unit or self.dynamics.time_unit)
         wells = tuple(None if well is None else replace(well, dynamics=dynamics) for well in self.wells)
         return replace(self, dynamics=dynamics, wells=wells)
 
@@ -209,19 +209,16 @@ class Landscape:
         return landscape_html(self)
 
     def plot(self, ax: Axes | None = None) -> Axes:
-        """Draw U with its equilibria and paths.
-
-        Of one state a curve; of two, contours; of more, the plane of the first two states through the lowest
-        saddle.
+        """Draw U with its wells, passes and paths; see `siq.plot_quasipotential`, which this calls.
 
         Parameters
         ----------
         ax
             Where; by default new axes.
         """
-        from siq.report.plots.landscape_axes import draw_landscape
+        from siq.report.plots.quasipotential import plot_quasipotential
 
-        return draw_landscape(self, ax)
+        return plot_quasipotential(self, ax=ax)
 
 
 def _mean_time(way: Transition, noise: float) -> tuple[float, str]:
