@@ -5,6 +5,7 @@
 `landscape_text`     how does a landscape read, as text and in a notebook?
 `diagnosis_report`   and a diagnosis?
 `sentences`          what is the answer in words?
+`answer`             and as plain data, for a terminal?
 `projection`         what of many states is drawn on a plane?
 `page`               how is a page made that needs nothing else?
 `settings`           what do figures and pages of a study depend on?

@@ -6,20 +6,21 @@ one formula alone.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from string import ascii_uppercase
+from typing import Any
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
 from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.equilibria import find_equilibria
 from siq.dynamics.formulas import compile_formulas
 from siq.dynamics.parametric import symbol
 from siq.landscape.global_quasipotential import least_over_wells
 from siq.landscape.landscape import Landscape
-from siq.landscape.storage import StoredLandscape
+from siq.landscape.storage import landscape_data
+from siq.numerics.measured_text import squared
 from siq.potential.symbolic import SymbolicDecomposition
 from siq.potential.well import Well
 
@@ -27,8 +28,7 @@ Potential = Callable[[np.ndarray], np.ndarray]
 """U at points ``(n, d)``, NaN where it is not known: shape ``(n,)``."""
 
 MARGIN = 0.05  # of what is shown: left free around it
-STARTS = 400  # recorded states from which the equilibria of a formula are sought
-BOTTOM = 1e-6  # of the largest U among recorded states: an attractor so low is the deepest one
+PARTS = ("uphill", "downhill")
 
 
 @dataclass(frozen=True)
@@ -155,29 +155,21 @@ class DrawnLandscape:
         return _error_of_one_state(self.dynamics, x, float(deepest.position[0]))
 
 
-def well_letter(place: int) -> str:
+def well_name(place: int) -> str:
     """The letter by which text, tables and figures call a well: A, B, C, and after Z A1, B1."""
     turn, letter = divmod(place, len(ascii_uppercase))
     return ascii_uppercase[letter] + (str(turn) if turn else "")
 
 
-def unit_of_u(units: Sequence[str], time_unit: str, dynamics: Dynamics) -> str:
-    """The unit of U: unit²/time where all states have one unit and D is the unit matrix; otherwise that of ε.
-
-    ``U/ε`` is a number, and ``εD`` is a squared state per time. A given D may carry its own unit, which
-    nobody says.
-    """
-    unit = units[0] if units else ""
-    if unit in ("", "1") or set(units) != {unit} or time_unit in ("", "1"):
+def energy_unit(units: Sequence[str], time_unit: str) -> str:
+    """The unit of U where all states have one: its square per time. Otherwise D carries it: U is a number."""
+    if len(set(units)) > 1:
         return ""
-    if not np.array_equal(dynamics.diffusion.matrix, np.eye(dynamics.dimension)):
-        return ""
-    return f"{unit}²/{time_unit}"
+    state, time = squared(units[0]), "" if time_unit == "1" else time_unit
+    return f"{state or '1'}/{time}" if time else state
 
 
-def drawn(
-    landscape: Landscape, *, points: np.ndarray | None = None, time_unit: str | None = None
-) -> DrawnLandscape:
+def drawn(landscape: Landscape, *, points: np.ndarray | None = None) -> DrawnLandscape:
     """What is drawn of a landscape in memory.
 
     Parameters
@@ -186,156 +178,113 @@ def drawn(
         The landscape.
     points
         Recorded states, shape ``(n, d)``; by default those to which its formulas were fitted.
-    time_unit
-        In which time was recorded; by default that of its dynamics.
     """
-    kinds = [(one.kind, one.position) for one in landscape.equilibria]
     dynamics = landscape.dynamics
-    places = [one.position for one in landscape.attractors]
-    none = np.zeros((0, dynamics.dimension))
-    ways = [
-        DrawnWay(
-            way.start, way.end, way.saddle.position, way.barrier, way.standard_error,
-            none if way.path is None else way.path.uphill.points,
-            none if way.path is None else way.path.downhill,
-        )
-        for way in landscape.transitions
-    ]  # fmt: skip
     if points is None:
         fitted = [well.points for well in landscape.wells if well is not None]
-        points = np.concatenate([none, *fitted])
-    unit = unit_of_u(dynamics.units, time_unit or dynamics.time_unit, dynamics)
-    labels = (dynamics.units, unit)
-    return _assembled(dynamics, labels, landscape.wells, landscape.heights, (places, kinds, ways), points)
+        points = np.concatenate([np.zeros((0, dynamics.dimension)), *fitted])
+    data = landscape_data(landscape, dynamics=dynamics)
+    return drawn_data(data, wells=landscape.wells, dynamics=dynamics, points=points)
 
 
-def drawn_stored(
-    stored: StoredLandscape,
+def drawn_data(
+    data: Mapping[str, Any],
     *,
+    wells: Sequence[Well | None],
     dynamics: Dynamics,
-    units: Sequence[str],
-    time_unit: str = "1",
     points: np.ndarray | None = None,
+    formula: SymbolicDecomposition | None = None,
 ) -> DrawnLandscape:
-    """What is drawn of a landscape from a file; for the parameters see `drawn`."""
-    data = stored.data
-    none = np.zeros((0, dynamics.dimension))
-    ways = [
-        DrawnWay(
-            way["start"], way["end"], np.array(way["saddle"]), _number(way["barrier"]),
-            _number(way["standard_error"]), np.array(way["uphill"]) if way["uphill"] else none,
-            np.array(way["downhill"]) if way["downhill"] else none,
-        )
-        for way in data["transitions"]
-    ]  # fmt: skip
-    places = [np.array(well["attractor"]) for well in data["wells"]]
-    kinds = [(one["kind"], np.array(one["position"])) for one in data["equilibria"]]
-    return _assembled(
-        dynamics, (tuple(units), unit_of_u(units, time_unit, dynamics)), stored.wells,
-        np.array([_number(well["height"]) for well in data["wells"]]), (places, kinds, ways), points,
-    )  # fmt: skip
-
-
-def drawn_formula(
-    formula: SymbolicDecomposition,
-    *,
-    points: np.ndarray,
-    units: Sequence[str],
-    time_unit: str = "1",
-    dynamics: Dynamics | None = None,
-) -> DrawnLandscape:
-    """What is drawn of a single formula of V: U where states were recorded, and the equilibria of f.
+    """What is drawn of a landscape from a file.
 
     Parameters
     ----------
-    formula
-        With V, or with V about each attractor.
-    points
-        Recorded states, shape ``(n, d)``. Away from their box nothing is drawn.
-    units, time_unit
-        As recorded.
+    data
+        Plain data, see `siq.landscape.storage.landscape_data`.
+    wells
+        V about each attractor, None where there is none.
     dynamics
-        f and D; by default f of the formula, with D = 1.
+        f and D.
+    points
+        Recorded states, shape ``(n, d)``.
+    formula
+        With one V that holds over all wells: it is drawn in the box of the recorded states where no well
+        has a formula of its own.
     """
-    dynamics = dynamics or Dynamics.of(formula.symbols, formula.vector_field)
-    unit = unit_of_u(units, time_unit, dynamics)
-    low, high = points.min(axis=0), points.max(axis=0)
-    few = points[:: max(len(points) // STARTS, 1)]
-    if formula.potential is None:
-        places = [well.attractor for well in formula.wells]
-        heights = np.zeros(len(places)) if len(places) == 1 else np.full(len(places), np.nan)
-        kinds = [(one.kind, one.position) for one in find_equilibria(dynamics, few)]
-        return _assembled(dynamics, (tuple(units), unit), formula.wells, heights, (places, kinds, []), points)
-
-    def everywhere(x: np.ndarray) -> np.ndarray:
-        inside = ((x >= low) & (x <= high)).all(axis=1)
-        return np.where(inside, 2 * formula.evaluate(np.ascontiguousarray(x.T))[0], np.nan)
-
-    def at(position: np.ndarray) -> float:
-        return float(2 * formula.evaluate(position[:, None])[0, 0])
-
-    found = find_equilibria(dynamics, few)
-    attractors = [one for one in found if one.kind == "attractor"]
-    margin = MARGIN * np.where(high > low, high - low, 1.0)
-    wells = tuple(
-        DrawnPoint(one.kind, one.position, at(one.position), well_letter(place))
-        for place, one in enumerate(attractors)
-    )
-    others = (one for one in found if one.kind != "attractor")
-    return DrawnLandscape(
-        dynamics.states, tuple(units), everywhere, wells,
-        tuple(DrawnPoint(one.kind, one.position, at(one.position)) for one in others), (),
-        np.stack([low - margin, high + margin], axis=1), unit, points, (), dynamics,
-    )  # fmt: skip
-
-
-def _assembled(
-    dynamics: Dynamics,
-    labels: tuple[tuple[str, ...], str],
-    formulas: Sequence[Well | None],
-    heights: np.ndarray,
-    found: tuple[Sequence[np.ndarray], Sequence[tuple[str, np.ndarray]], Sequence[DrawnWay]],
-    points: np.ndarray | None,
-) -> DrawnLandscape:
-    """A landscape of wells, each with its formula, at their heights where these are known.
-
-    The labels are the units of the states and of U; what was found are attractors, equilibria, ways out.
-    """
-    (units, energy_unit), (places, kinds, ways) = labels, found
+    attractors = [np.array(one["attractor"], dtype=float) for one in data["wells"]]
+    heights = np.array([_number(one["height"]) for one in data["wells"]])
+    single = None if any(well is not None for well in wells) else _everywhere(formula, points)
+    if single is not None and attractors:
+        heights = single(np.array(attractors))
+        heights = heights - np.nanmin(heights, initial=np.inf) if np.isfinite(heights).all() else heights
     matched = bool(len(heights)) and bool(np.isfinite(heights).all())
-    lifts = heights if matched else np.zeros(len(places))
-    known = [(lift, well) for lift, well in zip(lifts, formulas, strict=True) if well is not None]
+    lifts = heights if matched else np.zeros(len(attractors))
+    known = [(lift, well) for lift, well in zip(lifts, wells, strict=True) if well is not None]
 
-    def potential(x: np.ndarray) -> np.ndarray:
+    def of_wells(x: np.ndarray) -> np.ndarray:
         if not known:
             return np.full(len(x), np.nan)
         return least_over_wells(np.stack([lift + 2 * well.known_values(x) for lift, well in known]))
 
+    ways = tuple(_way(one, dynamics.dimension) for one in data["transitions"])
+    seen = [np.array(attractors), *(way.saddle[None] for way in ways), *(well.points for _, well in known)]
+    if points is not None and (single is not None or not any(map(len, seen))):
+        seen.append(points)
+    if not any(map(len, seen)):
+        seen += [np.array([one["position"]]) for one in data["equilibria"]]
+    units = tuple(data.get("units") or ("1",) * dynamics.dimension)
+    return DrawnLandscape(
+        names=tuple(data["states"]),
+        units=units,
+        potential=of_wells if single is None else single,
+        wells=tuple(
+            DrawnPoint("attractor", place, float(lift), well_name(index))
+            for index, (place, lift) in enumerate(zip(attractors, lifts, strict=True))
+        ),
+        others=_others(data, ways, lifts),
+        ways=ways,
+        box=_limits(np.concatenate([np.reshape(one, (-1, dynamics.dimension)) for one in seen])),
+        energy_unit=energy_unit(units, str(data.get("time_unit") or "1")),
+        points=points,
+        formulas=tuple(wells),
+        dynamics=dynamics,
+        matched=matched,
+    )
+
+
+def _everywhere(formula: SymbolicDecomposition | None, points: np.ndarray | None) -> Potential | None:
+    """U by one formula, within the box of the recorded states."""
+    if formula is None or formula.potential is None or points is None or not len(points):
+        return None
+    low, high = points.min(axis=0), points.max(axis=0)
+
+    def potential(x: np.ndarray) -> np.ndarray:
+        inside = ((x >= low) & (x <= high)).all(axis=1)
+        return np.where(inside, 2 * formula.evaluate(np.ascontiguousarray(x.T))[0], np.nan)
+
+    return potential
+
+
+def _way(data: Mapping[str, Any], dimension: int) -> DrawnWay:
+    paths = (np.reshape(np.array(data[part] or [], dtype=float), (-1, dimension)) for part in PARTS)
+    error = data.get("error", data["standard_error"])
+    return DrawnWay(
+        data["start"], data["end"], np.array(data["saddle"]), _number(data["barrier"]), _number(error), *paths
+    )
+
+
+def _others(data: Mapping[str, Any], ways: Sequence[DrawnWay], lifts: np.ndarray) -> tuple[DrawnPoint, ...]:
+    """Equilibria other than the wells; a pass is as high as the lowest way over it."""
     tops: dict[tuple[float, ...], float] = {}
     for way in ways:
-        key, top = tuple(way.saddle), lifts[way.start] + way.barrier
+        key, top = tuple(way.saddle.tolist()), float(lifts[way.start] + way.barrier)
         tops[key] = top if np.isnan(tops.get(key, np.nan)) else min(top, tops[key])
-    stable = {tuple(place) for place in places}
-    wells = tuple(
-        DrawnPoint("attractor", place, float(lift), well_letter(index))
-        for index, (place, lift) in enumerate(zip(places, lifts, strict=True))
+    stable = {tuple(one["attractor"]) for one in data["wells"]}
+    return tuple(
+        DrawnPoint(one["kind"], np.array(one["position"]), tops.get(tuple(one["position"]), np.nan))
+        for one in data["equilibria"]
+        if tuple(one["position"]) not in stable
     )
-    others = tuple(
-        DrawnPoint(kind, place, tops.get(tuple(place), np.nan))
-        for kind, place in kinds
-        if tuple(place) not in stable
-    )
-    seen = [np.asarray(well.points).reshape(-1, dynamics.dimension) for _, well in known]
-    seen += [np.array(places).reshape(-1, dynamics.dimension)]
-    seen += [way.saddle[None] for way in ways]
-    if not any(map(len, seen)) and points is not None:
-        seen.append(points)
-    seen += [one.position[None] for one in others] if not any(map(len, seen)) else []
-    box = _limits(np.concatenate(seen))
-    return DrawnLandscape(
-        dynamics.states, units, potential, wells, others, tuple(ways), box, energy_unit, points,
-        tuple(formulas), dynamics, matched,
-    )  # fmt: skip
 
 
 def _limits(points: np.ndarray) -> np.ndarray:

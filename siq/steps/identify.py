@@ -102,6 +102,7 @@ def _identified(settings: IdentifySettings, recordings: Recordings, number: int)
         "correlation_score": noise.correlation_score,
         "measurement": noise.measurement.tolist(),
         "diffusion": str(source),
+        "pairs": sum(len(part.h) for part in parts),
     }
     return FieldRecord(found, verdict.as_data(), kept)
 

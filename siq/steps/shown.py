@@ -29,6 +29,11 @@ class ModelFiles:
         """The runs with one formula of V for the whole region."""
         return [run for run, one in enumerate(self._methods) if one.get(method, {}).get("V")]
 
+    def with_any_formula(self, method: Method) -> list[int]:
+        """The runs with a formula of V, be it of the whole region or of single wells."""
+        have = [one.get(method, {}) for one in self._methods]
+        return [run for run, one in enumerate(have) if one.get("V") or one.get("wells")]
+
     def first_wells(self) -> Shown:
         """The first run that has a formula about each attractor, where none has a single one."""
         for run, methods in enumerate(self._methods):

@@ -63,6 +63,7 @@ rule page:
             caption="../report/report.rst",
             category="{study}",
         ),
+        answer="results/{study}/answer.json",
     log:
         "results/{study}/logs/page.log",
     benchmark:

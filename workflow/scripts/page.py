@@ -9,9 +9,11 @@ from pathlib import Path
 
 import siq
 from siq.files.whole import whole_file
+from siq.report.answer import answer_of, write_answer
 from siq.report.page import render_report
 from siq.report.settings import PageSettings
 from siq.report.study_page import StudyResults, study_page
+from siq.steps.outcomes import Method
 from siq.steps.shown import ModelFiles, shown_formula
 from siq.study.scoring import exact_answer
 from siq.study.tables import COLUMNS, read_table
@@ -33,11 +35,21 @@ if __name__ == "__main__":
             None if card is None else exact_answer(card),
             {Path(path).stem: Path(path).read_bytes() for path in images},
         )
+        study = now.settings(PageSettings).study
         page = study_page(
-            now.settings(PageSettings).study,
+            study,
             results,
             command=now.params.command,
             versions={"siq": siq.__version__} | {name: version(name) for name in PACKAGES},
         )
         with whole_file(now.output.html) as partial:
             partial.write_text(render_report(page), encoding="utf-8")
+        answer = answer_of(
+            page.title,
+            " ".join(page.answer[:1]),
+            rrmse=tables["rrmse"],
+            outcomes=tables["outcomes"],
+            formulas=len(models.with_any_formula(Method.REFINED)),
+            runs=study.runs,
+        )
+        write_answer(now.output.answer, answer)

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
+from siq.numerics.measured_text import unit_text
 from siq.report.plots.style import (
     BLACK,
     BLUE,
@@ -29,7 +30,6 @@ from siq.report.plots.style import (
     say,
     sentence_figure,
     unit_label,
-    unit_text,
 )
 
 COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, BLACK)

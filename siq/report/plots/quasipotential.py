@@ -15,6 +15,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
 from siq.landscape.landscape import Landscape
+from siq.numerics.measured_text import unit_text
 from siq.report.drawn_landscape import DrawnLandscape, drawn
 from siq.report.plots.landscape_curves import power_of_ten, scaled_label
 from siq.report.plots.planes import Plane, View, plane_of
@@ -26,7 +27,6 @@ from siq.report.plots.style import (
     VERMILLION,
     drawn_in_style,
     name_label,
-    unit_text,
 )
 
 if TYPE_CHECKING:
@@ -150,7 +150,7 @@ def as_drawn(landscape: Landscape | DrawnLandscape, recordings: Recordings | Non
             f"the recordings have the states {', '.join(recordings.names)}, and the landscape has"
             f" {', '.join(landscape.dynamics.states)}"
         )
-    return drawn(landscape, points=recordings.values, time_unit=recordings.time_unit)
+    return drawn(landscape, points=recordings.values)
 
 
 def new_axes(**options: Any) -> Axes:

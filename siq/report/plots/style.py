@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.rcsetup import cycler
 
-from siq.numerics.number_text import SUPERSCRIPTS
+from siq.numerics.measured_text import unit_text
 
 # Inches. A figure is no wider than its letters allow: a phone of 400 pixels leaves it 368, and there text of
 # `SMALLEST` points in a figure of `PAGE_WIDTH` is 9 pixels high.
@@ -64,9 +64,6 @@ _GREEK = re.compile(
 
 Parameters = ParamSpec("Parameters")
 Drawn = TypeVar("Drawn", Figure, Figure | None)
-
-_MICRO = re.compile(r"(?<![A-Za-z])u(?=(m|s|V|A|N|g|L|l|W|K|mol|Hz|Pa|J|M|F|H|T)(?![A-Za-z]))")
-_POWER = re.compile(r"(?:\^|\*\*)\(?(-?\d+)\)?")
 
 
 def drawing_style() -> AbstractContextManager[None]:
@@ -156,12 +153,6 @@ def _powers(term: str) -> list[tuple[str, int]] | None:
 def sorted_terms(terms: Iterable[str]) -> list[str]:
     """Order different terms by degree, otherwise as they first appear in the table."""
     return sorted(dict.fromkeys(terms), key=degree)
-
-
-def unit_text(unit: str) -> str:
-    """Write a unit as it is printed: ``um`` as µm, ``m/s^2`` as m/s²."""
-    powers = _POWER.sub(lambda found: found[1].translate(SUPERSCRIPTS), unit)
-    return _MICRO.sub("µ", powers).replace("*", "·")
 
 
 def unit_label(unit: str) -> str:

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from siq.landscape.landscape import Landscape
+from siq.numerics.measured_text import unit_text
 from siq.potential.well import Well
 from siq.report.drawn_landscape import DrawnLandscape, DrawnWay
 from siq.report.plots.planes import POINTS, chosen_states, in_blocks
@@ -25,7 +26,7 @@ from siq.report.plots.quasipotential import (
     name_axes,
     new_axes,
 )
-from siq.report.plots.style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY_BLUE, VERMILLION, unit_text
+from siq.report.plots.style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY_BLUE, VERMILLION
 
 if TYPE_CHECKING:
     from siq.data.recordings import Recordings

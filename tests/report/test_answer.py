@@ -1,0 +1,34 @@
+import json
+
+import pytest
+
+from siq.report.answer import answer_of, write_answer
+from siq.study.tables import as_table
+
+
+def answer(certified: list[bool], *, failed: list[int] | None = None):
+    rows = [{"run": run, "method": "refined", "certified": one} for run, one in enumerate(certified)]
+    # What the published method's certificate says does not count.
+    rows += [{"run": run, "method": "regression", "certified": True} for run in range(len(certified))]
+    outcomes = [
+        {"run": run, "step": "refine", "status": "failed" if run in (failed or []) else "ok", "reason": ""}
+        for run in range(len(certified))
+    ]
+    return answer_of(
+        "A study", "Two wells.", rrmse=as_table("rrmse", rows), outcomes=as_table("outcomes", outcomes),
+        formulas=len(certified) - len(failed or []), runs=len(certified),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "certified, said", [([True, True], "all"), ([True, False], "some"), ([False], "none"), ([True], "all")]
+)
+def test_how_many_runs_are_certified_is_one_word(certified, said):
+    assert answer(certified).certified == said
+
+
+def test_the_file_says_what_a_terminal_needs(tmp_path):
+    write_answer(tmp_path / "answer.json", answer([True, False], failed=[1]))
+    assert json.loads((tmp_path / "answer.json").read_text(encoding="utf-8")) == {
+        "title": "A study", "sentence": "Two wells.", "certified": "some", "formulas": 1, "runs": 2, "failed": 1,
+    }  # fmt: skip
