@@ -48,7 +48,8 @@ def value_text(value: float, error: float = math.nan, *, unit: str = "") -> str:
     power_left = _exponent(abs(value), EXACT_DIGITS) if value else 0
     written = known and error >= 0.5 * 10.0 ** (power_left - EXACT_DIGITS + 1)
     if written or (known and value == 0):
-        decimals = max(1 - _exponent(error, 2), 0)
+        decimals = 1 - _exponent(error, 2)
+        value, error, decimals = round(value, decimals), round(error, decimals), max(decimals, 0)
         text = f"{_plain(value, decimals)} ± {error:.{decimals}f}"
     else:
         text = _plain(value, max(EXACT_DIGITS - 1 - power_left, 0))

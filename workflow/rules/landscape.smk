@@ -144,8 +144,7 @@ rule landscape_figures:
         published=published_if_any,
         mesh=published_mesh_if_any,
     output:
-        [figure_output(name) for name in LANDSCAPE_FIGURES],
-        expand("results/{{study}}/figures/{name}.png", name=LANDSCAPE_FIGURES),
+        drawn=directory("results/{study}/drawn/landscape"),
     log:
         "results/{study}/logs/landscape_figures.log",
     benchmark:
@@ -156,7 +155,7 @@ rule landscape_figures:
     params:
         code=code("landscape_figures.py"),
         settings=settings_of(LandscapeFiguresSettings),
-        folder="results/{study}/figures",
+        folder=lambda wildcards, output: output.drawn,
     message:
         "{wildcards.study}: drawing the landscape"
     script:

@@ -49,5 +49,8 @@ if __name__ == "__main__":
             None if card is None else load_system(card),
             {} if published is None else load_published(published).figures,
         )
+        drawn = Path(now.params.folder)
+        drawn.mkdir(parents=True, exist_ok=True)
         for name, figure in figures.items():
-            save_figure(figure, Path(now.params.folder) / name)
+            if figure is not None:
+                save_figure(figure, drawn / name)
