@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from string import ascii_uppercase
 from typing import Any
 
 import numpy as np
@@ -20,9 +19,9 @@ from siq.dynamics.parametric import symbol
 from siq.landscape.global_quasipotential import least_over_wells
 from siq.landscape.landscape import Landscape
 from siq.landscape.storage import landscape_data
-from siq.numerics.measured_text import squared
 from siq.potential.symbolic import SymbolicDecomposition
 from siq.potential.well import Well
+from siq.report.landscape_answer import SaidLandscape, well_name
 
 Potential = Callable[[np.ndarray], np.ndarray]
 """U at points ``(n, d)``, NaN where it is not known: shape ``(n,)``."""
@@ -155,20 +154,6 @@ class DrawnLandscape:
         return _error_of_one_state(self.dynamics, x, float(deepest.position[0]))
 
 
-def well_name(place: int) -> str:
-    """The letter by which text, tables and figures call a well: A, B, C, and after Z A1, B1."""
-    turn, letter = divmod(place, len(ascii_uppercase))
-    return ascii_uppercase[letter] + (str(turn) if turn else "")
-
-
-def energy_unit(units: Sequence[str], time_unit: str) -> str:
-    """The unit of U where all states have one: its square per time. Otherwise D carries it: U is a number."""
-    if len(set(units)) > 1:
-        return ""
-    state, time = squared(units[0]), "" if time_unit == "1" else time_unit
-    return f"{state or '1'}/{time}" if time else state
-
-
 def drawn(landscape: Landscape, *, points: np.ndarray | None = None) -> DrawnLandscape:
     """What is drawn of a landscape in memory.
 
@@ -243,8 +228,11 @@ def drawn_data(
         ),
         others=_others(data, ways, lifts),
         ways=ways,
-        box=_limits(np.concatenate([np.reshape(one, (-1, dynamics.dimension)) for one in seen])),
-        energy_unit=energy_unit(units, str(data.get("time_unit") or "1")),
+        box=_limits(
+            np.concatenate([np.reshape(one, (-1, dynamics.dimension)) for one in seen]),
+            margin=MARGIN if single is None else 0.0,  # which is known up to the rim
+        ),
+        energy_unit=SaidLandscape(data).energy_unit,
         points=points,
         formulas=tuple(wells),
         dynamics=dynamics,
@@ -287,12 +275,12 @@ def _others(data: Mapping[str, Any], ways: Sequence[DrawnWay], lifts: np.ndarray
     )
 
 
-def _limits(points: np.ndarray) -> np.ndarray:
+def _limits(points: np.ndarray, *, margin: float) -> np.ndarray:
     if not len(points):
         raise ValueError("the landscape has neither wells nor equilibria: there is nothing to draw")
     low, high = points.min(axis=0), points.max(axis=0)
-    margin = MARGIN * np.where(high > low, high - low, 1.0)
-    return np.stack([low - margin, high + margin], axis=1)
+    room = np.where(high > low, margin * (high - low), MARGIN)
+    return np.stack([low - room, high + room], axis=1)
 
 
 def _number(value: float | None) -> float:

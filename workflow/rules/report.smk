@@ -13,6 +13,8 @@ rule figures:
         blocks=networks_of_runs("train.json"),
         fields=of_landscapes("results/{study}/runs/{run}/vector_field.json"),
         landscapes=of_landscapes("results/{study}/runs/{run}/quasipotential.json"),
+        every_field=all_runs("results/{study}/runs/{run}/vector_field.json"),
+        overview="results/{study}/overview.json",
         card=card_if_any,
         published=published_if_any,
     output:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
@@ -18,7 +20,7 @@ from siq.landscape.landscape import Landscape
 from siq.report.plots.diagnosis import draw_errors
 from siq.report.plots.landscape_curves import scaled_label
 from siq.report.plots.quasipotential import add_legend, new_axes
-from siq.report.plots.style import BLUE, GREY, magnitude_label, name_label
+from siq.report.plots.style import BLUE, COLUMN_WIDTH, GREY, drawn_in_style, magnitude_label, name_label
 
 if TYPE_CHECKING:
     from siq.mismatch.diagnosis import Diagnosis
@@ -108,26 +110,26 @@ def plot_residuals(
     if state is not None and state not in dynamics.states:
         raise ValueError(f"there is no state {state}; name one of {', '.join(dynamics.states)}")
     place = 0 if state is None else dynamics.states.index(state)
-    binned = binned_residuals(dynamics, recordings, place)
     axes = new_axes() if ax is None else ax
-    _draw(axes, binned)
-    name, unit = dynamics.states[place], dynamics.units[place]
     time_unit = recordings.time_unit or dynamics.time_unit
-    axes.set_xlabel(scaled_label(axes.xaxis, f"${name_label(name)}$", unit, float(np.abs(binned.at).max())))
-    largest = max(abs(limit) for limit in axes.get_ylim())
-    what = f"left of d${name_label(name)}$/d$t$"
-    axes.set_ylabel(scaled_label(axes.yaxis, what, rate_unit(unit, time_unit), largest))
-    within = int((np.abs(binned.mean) <= 2 * binned.standard_error).sum())
-    title = f"{within} of {len(binned.at)} bins within the band"
-    if binned.share < NOISE_FREE:  # rounding and the integrator, of which no band is the measure
-        title = f"no noise: {magnitude_label(binned.share, digits=1)} of the increments is left"
-    axes.set_title(title, loc="left", fontsize="medium")
+    handles = _draw(axes, binned_residuals(dynamics, recordings, place), dynamics.states[place],
+                    (dynamics.units[place], time_unit))  # fmt: skip
     if legend:
-        add_legend(axes, [
-            Line2D([], [], color=BLUE, marker="o", linestyle="none", label="mean of a bin"),
-            Patch(color=GREY, alpha=0.3, label="noise alone: ± 2 standard errors"),
-        ])  # fmt: skip
+        add_legend(axes, handles)
     return axes
+
+
+@drawn_in_style
+def residuals_figure(
+    dynamics: Dynamics, recordings: Recordings, *, units: Sequence[str], time_unit: str = "1"
+) -> Figure:
+    """The figure of a page: what f leaves of the recorded increments, a panel for each state."""
+    figure = Figure(figsize=(COLUMN_WIDTH, 2.3 * len(dynamics.states) + 0.5))
+    for place, axes in enumerate(figure.subplots(len(dynamics.states), squeeze=False)[:, 0]):
+        binned = binned_residuals(dynamics, recordings, place)
+        handles = _draw(axes, binned, dynamics.states[place], (units[place], time_unit))
+    figure.legend(handles=handles, loc="outside lower center", ncols=1)
+    return figure
 
 
 def rate_unit(unit: str, time_unit: str) -> str:
@@ -166,9 +168,24 @@ def binned_residuals(dynamics: Dynamics, recordings: Recordings, place: int) -> 
     )
 
 
-def _draw(axes: Axes, binned: BinnedResiduals) -> None:
+def _draw(axes: Axes, binned: BinnedResiduals, name: str, units: tuple[str, str]) -> list[Any]:
+    """Draw residuals of a state on axes, with the units of the state and of time."""
     axes.fill_between(
         binned.at, -2 * binned.standard_error, 2 * binned.standard_error, color=GREY, alpha=0.3, linewidth=0
-    )  # fmt: skip
+    )
     axes.axhline(0.0, color=GREY, linewidth=0.8)
     axes.plot(binned.at, binned.mean, marker="o", markersize=4, linestyle="none", color=BLUE)
+    largest = float(np.abs(binned.at).max())
+    axes.set_xlabel(scaled_label(axes.xaxis, f"${name_label(name)}$", units[0], largest))
+    largest = max(abs(limit) for limit in axes.get_ylim())
+    what = f"left of d${name_label(name)}$/d$t$"
+    axes.set_ylabel(scaled_label(axes.yaxis, what, rate_unit(*units), largest))
+    within = int((np.abs(binned.mean) <= 2 * binned.standard_error).sum())
+    title = f"{within} of {len(binned.at)} bins within the band"
+    if binned.share < NOISE_FREE:  # rounding and the integrator, of which no band is the measure
+        title = f"no noise: {magnitude_label(binned.share, digits=1)} of the increments is left"
+    axes.set_title(title, loc="left", fontsize="medium")
+    return [
+        Line2D([], [], color=BLUE, marker="o", linestyle="none", label="mean of a bin"),
+        Patch(color=GREY, alpha=0.3, label="noise alone: ± 2 standard errors"),
+    ]
