@@ -44,6 +44,18 @@ class FieldRecord:
         """Where D is from."""
         return DiffusionSource(self.noise.get("diffusion", DiffusionSource.GIVEN))
 
+    @property
+    def noise_strength(self) -> tuple[float, float] | None:
+        """ε and its standard error, None where the recordings show no white noise.
+
+        The variance of n residuals of d states has the relative standard error ``√(2/nd)``.
+        """
+        intensity = float(self.noise.get("intensity", 0.0))
+        if self.noise.get("kind") != "process" or not intensity > 0:
+            return None
+        samples = int(self.noise.get("pairs", 0)) * self.found.library.dimension
+        return intensity, intensity * (2 / samples) ** 0.5 if samples else 0.0
+
 
 def field_library(states: Sequence[str], options: IdentificationOptions) -> CandidateLibrary:
     """The functions in which f is sought."""

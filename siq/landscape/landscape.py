@@ -17,8 +17,15 @@ from siq.dynamics.equilibria import Equilibrium
 from siq.dynamics.phase_portrait import PhasePortrait
 from siq.errors import NumericalFailure
 from siq.identify.identified_field import IdentifiedField
+from siq.landscape.dwell_times import Exit, NoiseStrength, dwell_time
 from siq.landscape.global_quasipotential import GlobalQuasipotential, heights_of_attractors, matched
-from siq.landscape.transitions import Transition, missing_diffusion, transitions, ways_out
+from siq.landscape.transitions import (
+    Transition,
+    missing_diffusion,
+    position_standard_errors,
+    transitions,
+    ways_out,
+)
 from siq.potential.local_wells import WellOptions, local_well, surveyed
 from siq.potential.well import Well
 
@@ -59,6 +66,10 @@ class Landscape:
     Notes
     -----
         What could not be done, in words; limit cycles among it.
+    position_errors
+        Standard error of each attractor's position, shape ``(k, d)``; None where not known.
+    noise
+        Strength of the noise that drives the system, None where nobody knows it.
     """
 
     dynamics: Dynamics
@@ -70,6 +81,8 @@ class Landscape:
     heights: np.ndarray
     notes: tuple[str, ...]
     certificate: Certificate | None = None
+    position_errors: np.ndarray | None = None
+    noise: NoiseStrength | None = None
 
     @classmethod
     def from_recordings(cls, recordings: Recordings, settings: PipelineSettings | None = None) -> Landscape:
@@ -119,11 +132,12 @@ class Landscape:
             unit or settings.space.unit(name, unknown="1")
             for name, unit in zip(recordings.names, recordings.units, strict=True)
         )
-        return found.in_units(units)
+        time = recordings.time_unit or settings.space.unit("t", unknown="1")
+        return found.in_units(units, time=time)
 
-    def in_units(self, units: Sequence[str]) -> Landscape:
-        """The same with the units of the states said; nothing is converted."""
-        dynamics = replace(self.dynamics, units=tuple(units))
+    def in_units(self, units: Sequence[str], *, time: str = "1") -> Landscape:
+        """The same with the units of the states and of the time said; nothing is converted."""
+        dynamics = replace(self.dynamics, units=tuple(units), time_unit=time)
         wells = tuple(None if well is None else replace(well, dynamics=dynamics) for well in self.wells)
         return replace(self, dynamics=dynamics, wells=wells)
 
@@ -171,6 +185,42 @@ class Landscape:
             }
         )
 
+    def dwell_times(self, *, noise: float | None = None) -> pd.DataFrame:
+        """How long each well lasts in the mean, one row for every attractor.
+
+        Parameters
+        ----------
+        noise
+            ε, in the unit of U; by default as the recordings show it.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Columns ``attractor mean_time data_error law_error``: the time, NaN where it is not known, its
+            relative standard error from the uncertainty of f and of the noise, and the relative error of the
+            law itself (`siq.landscape.dwell_times`).
+
+        Raises
+        ------
+        ValueError
+            When no noise is known.
+        """
+        strength = self.noise if noise is None else NoiseStrength(noise)
+        if strength is None:
+            raise ValueError(
+                "the recordings show no noise, and how long a well lasts follows from it; give 'noise'"
+            )
+        rows = []
+        for index in range(len(self.attractors)):
+            found = dwell_time(self.exits(index), strength)
+            said = (np.nan,) * 3 if found is None else (found.value, found.data_error, found.law_error)
+            rows.append((index, *said))
+        return pd.DataFrame(rows, columns=["attractor", "mean_time", "data_error", "law_error"])
+
+    def exits(self, well: int) -> list[Exit]:
+        """The ways out of a well with what its times follow from."""
+        return [way.exit for way in self.transitions if way.start == well]
+
     def escape_times(self, *, noise: float) -> pd.DataFrame:
         """Mean times until noise has led from each attractor to the next, one row for every way out.
 
@@ -209,19 +259,16 @@ class Landscape:
         return landscape_html(self)
 
     def plot(self, ax: Axes | None = None) -> Axes:
-        """Draw U with its equilibria and paths.
-
-        Of one state a curve; of two, contours; of more, the plane of the first two states through the lowest
-        saddle.
+        """Draw U with its wells, passes and paths; see `siq.plot_quasipotential`, which this calls.
 
         Parameters
         ----------
         ax
             Where; by default new axes.
         """
-        from siq.report.plots.landscape_axes import draw_landscape
+        from siq.report.plots.quasipotential import plot_quasipotential
 
-        return draw_landscape(self, ax)
+        return plot_quasipotential(self, ax=ax)
 
 
 def _mean_time(way: Transition, noise: float) -> tuple[float, str]:
@@ -240,6 +287,7 @@ def find_landscape(
     wells: Sequence[Well] | None = None,
     certificate: Certificate | None = None,
     options: WellOptions | None = None,
+    noise: NoiseStrength | None = None,
     seed: int = 0,
 ) -> Landscape:
     """Find the landscape of an identified vector field.
@@ -256,6 +304,8 @@ def find_landscape(
         Of these wells.
     options
         Of the local route.
+    noise
+        That drives the system, where it is known.
     seed
         Decides which points are used where there are too many.
     """
@@ -276,6 +326,8 @@ def find_landscape(
         _heights(len(portrait.attractors), ways, notes),
         tuple(notes),
         certificate,
+        np.array([position_standard_errors(found, one.position) for one in portrait.attractors]),
+        noise,
     )
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -48,8 +48,20 @@ class StoredLandscape:
 
 def write_landscape(path: str | Path, landscape: Landscape, *, dynamics: Dynamics) -> None:
     """Write a landscape whole or not at all."""
-    data = {
+    data = landscape_data(landscape, dynamics=dynamics)
+    with whole_file(path) as partial:
+        partial.write_text(json.dumps(data, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def landscape_data(landscape: Landscape, *, dynamics: Dynamics) -> dict[str, Any]:
+    """A landscape as plain data, as it stands in the file."""
+    errors = landscape.position_errors
+    noise = landscape.noise
+    return {
         "states": [symbol.name for symbol in dynamics.symbols],
+        "units": list(landscape.dynamics.units),
+        "time_unit": landscape.dynamics.time_unit,
+        "noise": None if noise is None else asdict(noise),
         "equilibria": [
             {
                 "position": one.position.tolist(),
@@ -61,19 +73,18 @@ def write_landscape(path: str | Path, landscape: Landscape, *, dynamics: Dynamic
         "wells": [
             {
                 "attractor": attractor.position.tolist(),
+                "standard_errors": None if errors is None else [_number(one) for one in errors[index]],
                 "basin": float(basin),
                 "height": _number(height),
                 "V": None if well is None else _formula(well),
             }
-            for attractor, basin, height, well in zip(
-                landscape.attractors, landscape.basins, landscape.heights, landscape.wells, strict=True
+            for index, (attractor, basin, height, well) in enumerate(
+                zip(landscape.attractors, landscape.basins, landscape.heights, landscape.wells, strict=True)
             )
         ],
         "transitions": [_transition(one) for one in landscape.transitions],
         "notes": list(landscape.notes),
     }
-    with whole_file(path) as partial:
-        partial.write_text(json.dumps(data, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def _number(value: float) -> float | None:
@@ -105,6 +116,7 @@ def _transition(one: Transition) -> dict[str, Any]:
         "barrier": _number(one.barrier),
         "formula_share": _number(one.formula_share),
         "standard_error": _number(one.standard_error),
+        "error": _number(one.error),
         "minimum_action": None if path is None else path.uphill.action,
         "prefactor": None if rate is None else rate.prefactor,
         "exponent": None if rate is None else rate.exponent,

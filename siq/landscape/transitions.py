@@ -19,6 +19,7 @@ from siq.dynamics.phase_portrait import PhasePortrait
 from siq.errors import NumericalFailure
 from siq.identify.diffusion import defined_states
 from siq.identify.identified_field import IdentifiedField
+from siq.landscape.dwell_times import Exit
 from siq.landscape.paths import TransitionPath, transition_path
 from siq.landscape.rates import EscapeRate, escape_rate
 from siq.potential.well import Well
@@ -62,6 +63,18 @@ class Transition:
     standard_error: float
     rate: EscapeRate | None
     notes: tuple[str, ...] = ()
+
+    @property
+    def error(self) -> float:
+        """Standard error of the barrier: from f, and by how much the formula and the path alone differ."""
+        if self.path is None:
+            return self.standard_error
+        return float(np.hypot(self.standard_error, self.barrier - self.path.uphill.action))
+
+    @property
+    def exit(self) -> Exit:
+        """What the time of this way out follows from."""
+        return Exit(self.barrier, self.error, None if self.rate is None else self.rate.prefactor)
 
 
 @dataclass(frozen=True)
@@ -207,3 +220,16 @@ def barrier_standard_error(path: TransitionPath, found: IdentifiedField) -> floa
     terms = found.library.evaluate(middle)[:, found.support[:, 1]]
     slope = -2 * (spent[:, None] * force[:, found.support[:, 0]] * terms).sum(axis=0)
     return float(np.sqrt(max(slope @ found.covariance @ slope, 0.0)))
+
+
+def position_standard_errors(found: IdentifiedField, position: np.ndarray) -> np.ndarray:
+    """Standard errors of an equilibrium's position, shape ``(d,)``: of f = 0 follows δx = -J⁻¹ δf."""
+    terms = found.library.evaluate(position[None])[0]
+    components, which = found.support.T
+    change = np.zeros((found.library.dimension, len(found.support)))
+    change[components, np.arange(len(found.support))] = terms[which]
+    try:
+        moved = np.linalg.solve(found.dynamics.jacobian(position[None])[0], change)
+    except np.linalg.LinAlgError:
+        return np.full(found.library.dimension, np.nan)
+    return np.sqrt(np.maximum(np.einsum("ik,kl,il->i", moved, found.covariance, moved), 0.0))

@@ -8,6 +8,7 @@
 `thinning`            which points represent a region evenly?
 `density_comparison`  how far are samples from a density on a plane of two states?
 `number_text`         how is a number written for a reader?
+`measured_text`       and a measured value, with its error and its unit?
 ====================  ==========================================================================
 
 Imports `siq.errors`.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 LARGEST_PLAIN_NUMBER = 1e5  # a longer row of digits is not read, but counted
+SMALLEST = 1e-300  # less is what rounding left of zero: no measurement has such numbers
 SUPERSCRIPTS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 MINUS = "−"
 
@@ -28,6 +29,8 @@ def number_text(value: float, *, decimals: int = 3) -> str:
         return "—"
     if math.isinf(value):
         return f"{MINUS if value < 0 else ''}∞"
+    if abs(value) < SMALLEST:
+        value = 0.0
     mantissa, exponent = mantissa_and_exponent(abs(value), decimals)
     sign = MINUS if value < 0 else ""
     return f"{sign}{mantissa}" + (f" × 10{str(exponent).translate(SUPERSCRIPTS)}" if exponent else "")

@@ -4,12 +4,17 @@
 `formatting`         how is a formula written for a reader?
 `landscape_text`     how does a landscape read, as text and in a notebook?
 `diagnosis_report`   and a diagnosis?
-`sentences`          what is the answer in words?
+`sentences`          what do all runs say together, in words?
+`landscape_answer`   what is the answer in one sentence?
+`certificate_text`   what does the certificate promise, in plain words?
 `answer`             and as plain data, for a terminal?
 `projection`         what of many states is drawn on a plane?
-`page`               how is a page made that needs nothing else?
+`page`               what is a page made from, that needs nothing else?
+`rendering`          how does it become HTML?
 `settings`           what do figures and pages of a study depend on?
 `study_page`         what does the page of a study say?
+`study_formulas`     which formulas?
+`study_captions`     what do its figures show, and where do they stand?
 `study_figures`      and which figures has it?
 `landscape_tables`   what does it say of the landscape?
 `landscape_figures`  and which figures of it?

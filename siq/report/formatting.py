@@ -20,6 +20,7 @@ from sympy.printing.precedence import PRECEDENCE
 from sympy.printing.str import StrPrinter
 
 from siq.dynamics.formulas import CONSTANTS, FUNCTIONS, parse_formula
+from siq.numerics.measured_text import value_text
 from siq.numerics.number_text import MINUS, SUPERSCRIPTS, mantissa_and_exponent, number_text
 
 CHARACTERS_PER_LINE = 56  # a longer formula is broken between its terms: browsers do not break MathML
@@ -69,6 +70,18 @@ def formula_text(expression: sympy.Expr, *, decimals: int = 3) -> str:
     return str(_TextPrinter(decimals).doprint(_with_integer_exponents(expression)))
 
 
+def term_text(term: str) -> str:
+    """Write a term of a table for a reader: ``x**2*y`` as ``x² y``, and the constant as it is.
+
+    Examples
+    --------
+    >>> term_text("x**2*y"), term_text("1")
+    ('x² y', '1')
+    """
+    names = {name for name in re.findall(r"[^\W\d]\w*", term)} - {*FUNCTIONS, *CONSTANTS}
+    return formula_text(parse_formula(term, {name: sympy.Symbol(name, real=True) for name in names}))
+
+
 def formula_mathml(expression: sympy.Expr, *, decimals: int = 3) -> Markup:
     """Typeset a formula as MathML, which browsers show without scripts or fonts from elsewhere.
 
@@ -106,8 +119,25 @@ def vector_mathml(expressions: Sequence[sympy.Expr], *, decimals: int = 3) -> Ma
     """
     printer = _MathMLPrinter(decimals)
     table = printer.table([printer.lines(_with_integer_exponents(entry)) for entry in expressions])
-    column = printer.element("mrow", printer.leaf("mo", "["), table, printer.leaf("mo", "]"))
-    return _math(printer, column, "; ".join(formula_text(entry, decimals=decimals) for entry in expressions))
+    return _math(
+        printer,
+        printer.bracketed(table),
+        "; ".join(formula_text(entry, decimals=decimals) for entry in expressions),
+    )
+
+
+def matrix_mathml(matrix: Sequence[Sequence[float]]) -> Markup:
+    """Typeset a matrix of numbers in brackets; a number that stands alone without them."""
+    printer = _MathMLPrinter(3)
+    texts = [[value_text(float(value)) for value in row] for row in matrix]
+    spoken = "; ".join(", ".join(row) for row in texts)
+    if texts == [[texts[0][0]]]:
+        return _math(printer, printer.leaf("mn", texts[0][0]), spoken)
+    rows = [
+        printer.element("mtr", *(printer.element("mtd", printer.leaf("mn", text)) for text in row))
+        for row in texts
+    ]
+    return _math(printer, printer.bracketed(printer.element("mtable", *rows)), spoken)
 
 
 def _math(printer: _MathMLPrinter, content: Any, spoken: str) -> Markup:
@@ -202,6 +232,14 @@ class _MathMLPrinter(MathMLPresentationPrinter):
 
     def leaf(self, tag: str, text: str) -> Any:
         return self.element(tag, self.dom.createTextNode(text))
+
+    def bracketed(self, content: Any) -> Any:
+        """Brackets as high as what stands between them."""
+        brackets = [self.leaf("mo", text) for text in "[]"]
+        for bracket in brackets:
+            for attribute in ("fence", "stretchy", "symmetric"):
+                bracket.setAttribute(attribute, "true")
+        return self.element("mrow", brackets[0], content, brackets[1])
 
     def table(self, rows: Sequence[Any]) -> Any:
         """Stack elements, flush left."""

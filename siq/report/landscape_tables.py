@@ -1,26 +1,19 @@
-"""What the page of a study says of its landscape."""
+"""What the page of a study says of its landscape beyond the first screen."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pandas as pd
 
-from siq.report.page import ReportFigure, ReportTable
+from siq.landscape.dwell_times import NoiseStrength, exit_time
+from siq.numerics.measured_text import unit_text, value_text
+from siq.report.landscape_answer import SaidLandscape, time_text, well_name
+from siq.report.page import ReportTable
 from siq.steps.outcomes import Status, Step
-
-CAPTIONS = {
-    "landscape": "The quasipotential U over all wells, where its formulas are believed, with attractors,"
-    " saddles and paths of least action (solid: uphill, dashed: downhill).",
-    "landscape_errors": "U by every source, and its difference from characteristics of the exact vector field"
-    " (the paper: fig2b, c to e, and Appendix E).",
-    "landscape_published": "What was published of U, its formula as printed and, where SIQ_RESOURCES has it,"
-    " its mesh, and its difference from characteristics of the exact vector field.",
-    "degrees": "Accuracy of the formula about each attractor on points that took no part in the fit, against"
-    " its number of terms.",
-    "escape": "Mean escape times: the law from what was identified, and direct simulations of the card.",
-}
 
 
 def landscape_sentences(landscape: pd.DataFrame, outcomes: pd.DataFrame) -> list[str]:
@@ -46,66 +39,171 @@ def landscape_sentences(landscape: pd.DataFrame, outcomes: pd.DataFrame) -> list
 
 
 def landscape_tables(
-    landscape: pd.DataFrame, errors: pd.DataFrame | None, escape: pd.DataFrame | None, folder: Path
+    overview: Mapping[str, Any] | None,
+    landscape: pd.DataFrame,
+    *,
+    noises: Sequence[float],
+    folder: Path,
 ) -> list[ReportTable]:
-    """Equilibria, transitions, errors and escape times, where the study asked for a landscape.
+    """The ways out of the wells, all equilibria, times for other noises, and barriers over the runs.
 
     Parameters
     ----------
-    landscape, errors, escape
-        The tables `landscape`, `landscape_errors` and `escape`; the latter two with a card only.
+    overview
+        The landscape that is shown, as plain data; None where there is none.
+    landscape
+        The table of that name, of all runs; empty where the study asked for none.
+    noises
+        Noise strengths that the study gives.
     folder
         Where the whole tables are.
     """
-    if landscape.empty:
-        return []
-    first = landscape[landscape["run"] == landscape["run"].min()].drop(columns="run")
-    ways = landscape[landscape["kind"] == "transition"]
-    tables = [
-        ReportTable(
-            f"Landscape of run {landscape['run'].min()}: equilibria, and the ways out of each well.",
-            first.dropna(axis=1, how="all").rename(columns=lambda name: name.replace("_", " ")),
-            {
-                "U": "above its lowest attractor",
-                "basin": "share of the recorded states that f leads there",
-                "barrier": "of U, by the formula of the well and the end of the path of least action",
-                "standard error": "of the barrier, from the uncertainty of f",
-                "formula share": "share of the barrier that the formula accounts for",
-                "minimum action": "the same barrier by the path alone, without any formula",
-                "prefactor": "of the mean escape time prefactor · exp(barrier/ε)",
-            },
-            f"{folder}/landscape.csv",
-            30,
-        ),
-        ReportTable(
-            "Barriers of U over all runs.",
-            ways.groupby("item", sort=False)
-            .agg(
-                runs=("barrier", "size"), mean=("barrier", "mean"), lowest=("barrier", "min"),
-                highest=("barrier", "max"), minimum_action=("minimum_action", "mean"),
-                prefactor=("prefactor", "mean"),
-            )
-            .reset_index()
-            .rename(columns=lambda name: name.replace("_", " ")),
-            {},
-            f"{folder}/landscape.csv",
-            30,
-        ),
-    ]  # fmt: skip
-    if errors is not None:
-        tables.append(errors_table(errors, folder))
-    if escape is not None:
-        tables.append(
-            ReportTable(
-                "Mean escape times, in the time unit of the card: the law, and simulations with their"
-                " standard error.",
-                escape.rename(columns=lambda name: name.replace("_", " ")),
-                {},
-                f"{folder}/escape.csv",
-                30,
-            )
-        )
+    tables = []
+    if overview is not None and overview["wells"]:
+        said = SaidLandscape(overview)
+        file = f"{folder}/landscape.csv" if len(landscape) else ""
+        if overview["transitions"]:
+            tables.append(_ways(said, file))
+        tables.append(_equilibria(said, file))
+        if noises and any(way["prefactor"] is not None for way in overview["transitions"]):
+            tables.append(_times(said, noises))
+    if len(landscape) and landscape["run"].nunique() > 1:
+        tables.append(_over_runs(landscape, folder))
     return tables
+
+
+def _ways(said: SaidLandscape, file: str) -> ReportTable:
+    """One row for every way out of every well."""
+    unit = unit_text(said.energy_unit)
+    barrier = "barrier ΔU" + (f" ({unit})" if unit else "")
+    time = "mean time" + (f" ({unit_text(said.time_unit)})" if unit_text(said.time_unit) else "")
+    rows, numbers = [], []
+    for way in said.data["transitions"]:
+        known = way["barrier"] is not None
+        exit_ = said.exits(way["start"])[
+            [one for one in said.data["transitions"] if one["start"] == way["start"]].index(way)
+        ]
+        mean = None if said.noise is None or not known else exit_time(exit_, said.noise)
+        beyond = "out of the recorded region" if way["end"] is None else well_name(way["end"])
+        rows.append(
+            {
+                "way": f"{well_name(way['start'])} to {beyond}",
+                "over the saddle at": _place(said, way["saddle"]),
+                barrier: value_text(exit_.barrier, exit_.standard_error) if known else "",
+                "the same by the path alone": value_text(way["minimum_action"])
+                if way["minimum_action"] is not None
+                else "",
+                time: "" if mean is None else time_text(mean, "1", decorated=False),
+                "to be known": "; ".join(way["notes"]),
+            }
+        )
+        numbers.append(
+            {
+                "start": well_name(way["start"]),
+                "end": "" if way["end"] is None else well_name(way["end"]),
+                **{f"saddle_{name}": value for name, value in zip(said.states, way["saddle"], strict=True)},
+                "barrier": way["barrier"], "barrier_error": way.get("error"),
+                "minimum_action": way["minimum_action"], "prefactor": way["prefactor"],
+                "mean_time": np.nan if mean is None else mean.value,
+                "data_error": np.nan if mean is None else mean.data_error,
+                "law_error": np.nan if mean is None else mean.law_error,
+            }
+        )  # fmt: skip
+    explained = {
+        barrier: "by the formula of the well and the end of the way; its error is that of f, and by how much the"
+        " formula and the way alone differ",
+        "the same by the path alone": "the least action of the way, without any formula of U",
+        time: "prefactor · exp(ΔU/ε), until the next well is reached over this saddle alone",
+    }
+    return ReportTable(
+        "Every way out of every well.", pd.DataFrame(rows), explained, file, data=pd.DataFrame(numbers),
+        rows_named=True,
+    )  # fmt: skip
+
+
+def _place(said: SaidLandscape, position: Sequence[float]) -> str:
+    size = max((abs(value) for one in said.data["equilibria"] for value in one["position"]), default=0.0)
+    # What is left of zero by rounding reads as zero.
+    values = [0.0 if abs(value) < 1e-12 * size else value for value in position]
+    return "(" + ", ".join(value_text(value) for value in values) + ")"
+
+
+def _equilibria(said: SaidLandscape, file: str) -> ReportTable:
+    letters = {tuple(one["attractor"]): well_name(index) for index, one in enumerate(said.data["wells"])}
+    kinds = {"attractor": "stable state", "saddle": "saddle", "repeller": "unstable in all directions"}
+    unit = f" (1/{unit_text(said.time_unit)})" if unit_text(said.time_unit) else ""
+    position = f"({', '.join(said.states)})" if len(said.states) > 1 else said.states[0]
+    if len(set(said.units)) == 1 and unit_text(said.units[0]):
+        position += f" ({unit_text(said.units[0])})"
+    rows = [
+        {
+            "": letters.get(tuple(one["position"]), ""),
+            "what": kinds.get(one["kind"], one["kind"]),
+            position: _place(said, one["position"]),
+            f"rates{unit}": ", ".join(_rate(*value) for value in one["eigenvalues"]),
+        }
+        for one in said.data["equilibria"]
+    ]
+    frame = pd.DataFrame(rows)
+    if not any(frame[""]):
+        frame = frame.drop(columns="")
+    explained = {f"rates{unit}": "eigenvalues of f there; a rate that is positive leads away"}
+    return ReportTable("All states at which f vanishes.", frame.rename(columns={"": "name"}), explained, file)
+
+
+def _rate(real: float, imaginary: float) -> str:
+    if not imaginary:
+        return value_text(real)
+    return f"{value_text(real)} {'−' if imaginary < 0 else '+'} {value_text(abs(imaginary))} i"
+
+
+def _times(said: SaidLandscape, noises: Sequence[float]) -> ReportTable:
+    """How long each well lasts under the noise strengths that the study gives."""
+    unit, time = unit_text(said.energy_unit), unit_text(said.time_unit)
+    rows = []
+    for strength in noises:
+        row = {"noise strength ε" + (f" ({unit})" if unit else ""): value_text(strength)}
+        for index, well in enumerate(said.wells):
+            mean = said.dwell_time(index, NoiseStrength(strength))
+            known = "too strong a noise" if strength >= well.depth else ""
+            row[f"{well.name} lasts" + (f" ({time})" if time else "")] = (
+                known if mean is None else time_text(mean, "1", decorated=False)
+            )
+        rows.append(row)
+    return ReportTable(
+        "How long each well lasts, for the noise strengths that the study gives.", pd.DataFrame(rows)
+    )
+
+
+def _over_runs(landscape: pd.DataFrame, folder: Path) -> ReportTable:
+    ways = landscape[landscape["kind"] == "transition"]
+    counted = (
+        ways.groupby("item", sort=False)
+        .agg(
+            runs=("barrier", "size"), mean=("barrier", "mean"), lowest=("barrier", "min"),
+            highest=("barrier", "max"), by_the_path_alone=("minimum_action", "mean"),
+            prefactor=("prefactor", "mean"),
+        )
+        .reset_index()
+        .rename(columns=lambda name: "way" if name == "item" else name.replace("_", " "))
+    )  # fmt: skip
+    return ReportTable(
+        "Barriers of U over all runs.",
+        counted,
+        {"way": "A1 is A, A2 is B, and so on"},
+        f"{folder}/landscape.csv",
+    )
+
+
+def escape_table(escape: pd.DataFrame, time_unit: str, folder: Path) -> ReportTable:
+    """Mean escape times by the law beside direct simulation."""
+    unit = f", in {unit_text(time_unit)}" if unit_text(time_unit) else ""
+    return ReportTable(
+        f"Mean escape times{unit}: by the law, and in direct simulations of the card with their standard error.",
+        escape.rename(columns=lambda name: name.replace("_", " ")),
+        {"intensity": "the strength ε of the noise", "escapes": "how many were seen"},
+        f"{folder}/escape.csv",
+    )
 
 
 def errors_table(errors: pd.DataFrame, folder: Path) -> ReportTable:
@@ -132,12 +230,3 @@ def errors_table(errors: pd.DataFrame, folder: Path) -> ReportTable:
         f"{folder}/landscape_errors.csv",
         40,
     )
-
-
-def landscape_figures(images: Mapping[str, bytes]) -> list[ReportFigure]:
-    """The figures of the landscape, none where none was asked for; `images` by their names."""
-    return [
-        ReportFigure(caption, caption, images[name], "png")
-        for name, caption in CAPTIONS.items()
-        if name in images
-    ]

@@ -1,68 +1,66 @@
-"""The report: one self-contained HTML page that answers a study in words, formulas, tables and figures.
+"""What a page is made from: sections with formulas, tables and figures, and what it opens with.
 
-The page asks nothing of any other machine: style, figures and formulas stand in it, and it has no scripts.
+The page asks nothing of any other machine: style, figures, formulas and downloads stand in it. It has no
+scripts, but for the view of U that can be turned, where there is one. `siq.report.rendering` makes HTML of it.
 """
 
 from __future__ import annotations
 
-import base64
-import datetime
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
-import numpy as np
 import pandas as pd
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from siq.numerics.number_text import number_text
+from siq.report.rendering import render_template as render_template
 
 
 @dataclass(frozen=True)
 class FormulaRow:
-    """One formula that a method found.
+    """One formula.
 
     Attributes
     ----------
     quantity
-        What the formula gives: ``"U(x, y, z)"``, ``"∇V"``, ``"g"``.
-    method
-        The method that found it.
-    identified, exact
-        The formulas, typeset by `siq.report.formatting`; plain text is shown as text. None where there is
-        none.
-    certified
-        Whether the formula passed every test of its certificate.
-    reason
-        If it did not, the test that it failed.
+        What the formula gives: ``"U"``, ``"f"``.
+    formula
+        Typeset by `siq.report.formatting`; plain text is shown as text.
+    note
+        What to know of it, in a sentence.
+    exact
+        The exact formula, where one is known.
+    whole
+        The formula in full, folded away, where `formula` leaves small terms out.
     """
 
     quantity: str
-    method: str
-    identified: Markup | str | None
+    formula: Markup | str
+    note: str = ""
     exact: Markup | str | None = None
-    certified: bool = False
-    reason: str = ""
+    whole: Markup | str | None = None
 
 
 @dataclass(frozen=True)
 class ReportTable:
-    """A table of the report.
+    """A table of the report; it can be downloaded as CSV, with all its rows.
 
     Attributes
     ----------
     caption
         What the table shows, in a sentence.
     frame
-        The table; its index is not shown.
+        The table; its index is not shown, and neither are columns that hold nothing.
     column_help
         What the columns mean, by name.
     whole
-        Where the whole table is, for one that is cut.
+        Where it lies as a file, for one that is cut.
     rows_shown
         After how many rows the table is cut.
+    data
+        What is downloaded, where that is more than what is shown.
+    rows_named
+        Whether the first column names the rows.
     """
 
     caption: str
@@ -70,11 +68,13 @@ class ReportTable:
     column_help: Mapping[str, str] = field(default_factory=dict)
     whole: str = ""
     rows_shown: int = 30
+    data: pd.DataFrame | None = None
+    rows_named: bool = False
 
 
 @dataclass(frozen=True)
 class ReportFigure:
-    """A figure of the report.
+    """A figure of the report; it can be downloaded.
 
     Attributes
     ----------
@@ -86,52 +86,95 @@ class ReportFigure:
         The bytes of the file.
     kind
         Its format.
+    vector
+        The same as SVG, for the download.
     """
 
     caption: str
     alternative: str
     image: bytes
     kind: Literal["svg", "png"] = "svg"
+    vector: bytes | None = None
+
+
+@dataclass(frozen=True)
+class ReportSection:
+    """A section of the report.
+
+    Attributes
+    ----------
+    heading
+        Its heading.
+    text
+        Paragraphs.
+    formulas, tables, figures
+        Below the text, in this order.
+    notes
+        Paragraphs below all of it, in small print.
+    folded
+        Whether it is closed until a reader opens it.
+    listing
+        Lines of code, such as commands.
+    """
+
+    heading: str
+    text: Sequence[str] = ()
+    formulas: Sequence[FormulaRow] = ()
+    tables: Sequence[ReportTable] = ()
+    figures: Sequence[ReportFigure] = ()
+    notes: Sequence[str] = ()
+    folded: bool = False
+    listing: str = ""
+
+
+@dataclass(frozen=True)
+class Badge:
+    """Whether the answer may be believed.
+
+    Attributes
+    ----------
+    label
+        In two words.
+    good
+        Whether it may.
+    promise
+        What that means, in plain words.
+    """
+
+    label: str
+    good: bool
+    promise: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
 class ReportContent:
-    """All that a report says.
+    """All that a report says, in the order in which it is read.
 
     Attributes
     ----------
     title
         Title of the study.
-    question
-        What was asked, in paragraphs.
     answer
-        The answer, in sentences.
-    formulas, tables, figures
-        In the order in which they are shown.
-    failures
-        Runs that failed or are not certified: columns ``run step status reason``, empty if there is none.
-    commands
-        Command lines that make everything again.
-    study
-        The study as YAML text.
-    provenance
-        Versions, cores and the like, by name.
+        The answer: a sentence that stands alone, and what has to be known of it.
+    badge
+        Whether it may be believed.
+    figure, table
+        What it looks like, beside each other.
+    interactive
+        A view that can be turned, with its script; None where there is none.
+    sections
+        Everything else.
     language
         Language of the page, for hyphenation and screen readers.
     """
 
     title: str
-    question: Sequence[str] = ()
     answer: Sequence[str] = ()
-    formulas: Sequence[FormulaRow] = ()
-    tables: Sequence[ReportTable] = ()
-    figures: Sequence[ReportFigure] = ()
-    failures: pd.DataFrame = field(
-        default_factory=lambda: pd.DataFrame(columns=["run", "step", "status", "reason"])
-    )
-    commands: Sequence[str] = ()
-    study: str = ""
-    provenance: Mapping[str, str] = field(default_factory=dict)
+    badge: Badge | None = None
+    figure: ReportFigure | None = None
+    table: ReportTable | None = None
+    interactive: Markup | None = None
+    sections: Sequence[ReportSection] = ()
     language: str = "en"
 
 
@@ -148,14 +191,7 @@ def render_report(content: ReportContent) -> str:
     str
         The page. The same content gives the same page.
     """
-    groups = [
-        (*key, list(rows))
-        for key, rows in itertools.groupby(
-            content.formulas, key=lambda row: (row.method, row.certified, row.reason)
-        )
-    ]
-    template = _environment().get_template("report.html.j2")
-    return template.render(content=content, formula_groups=groups)
+    return render_template("report.html.j2", content)
 
 
 @dataclass(frozen=True)
@@ -210,61 +246,3 @@ class ReproductionContent:
 def render_reproduction(content: ReproductionContent) -> str:
     """Render a reproduction as one HTML page; all text is escaped."""
     return render_template("reproduction.html.j2", content)
-
-
-def render_template(name: str, content: object) -> str:
-    """Render a page of its own kind as HTML; all text is escaped, but for what is `markupsafe.Markup`."""
-    return _environment().get_template(name).render(content=content)
-
-
-def _environment() -> Environment:
-    environment = Environment(
-        loader=PackageLoader("siq.report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters |= {
-        "cell": _cell_text,
-        "is_number": _is_number_column,
-        "data_address": _data_address,
-        "page_width": _page_width,
-        "unbroken": lambda text: text.replace(" × 10", "\u00a0×\u00a010"),
-        "records": lambda frame: list(frame.itertuples(index=False, name=None)),
-    }
-    return environment
-
-
-def _data_address(figure: ReportFigure) -> str:
-    # An SVG inside <img> keeps its identifiers to itself and cannot run or load anything.
-    kind = {"svg": "image/svg+xml", "png": "image/png"}[figure.kind]
-    return f"data:{kind};base64,{base64.b64encode(figure.image).decode('ascii')}"
-
-
-def _page_width(figure: ReportFigure) -> int:
-    # The first chunk of every PNG holds its width in dots, of which there are 200 to the inch; pages have 96.
-    return round(int.from_bytes(figure.image[16:20], "big") * 96 / 200)
-
-
-def _is_number_column(column: pd.Series) -> bool:
-    return pd.api.types.is_numeric_dtype(column) and not pd.api.types.is_bool_dtype(column)
-
-
-def _cell_text(value: object) -> str:
-    if value is None or value is pd.NA or value is pd.NaT:
-        return "—"
-    if isinstance(value, bool | np.bool_):
-        return "yes" if value else "no"
-    if isinstance(value, int | np.integer):
-        return str(value).replace("-", "−")
-    if isinstance(value, float | np.floating):
-        return str(int(value)).replace("-", "−") if _is_whole(float(value)) else number_text(float(value))
-    if isinstance(value, datetime.datetime):
-        return value.isoformat(sep=" ", timespec="seconds")
-    return str(value)
-
-
-def _is_whole(value: float) -> bool:
-    # Counts become floating-point numbers as soon as one of their column is missing.
-    return value.is_integer() and abs(value) < 1e5

@@ -184,7 +184,10 @@ class _Page:
         figures = []
         for picture in place.figures:
             assert study is not None  # as for tables
-            image = (study.folder / "figures" / f"{picture}.png").read_bytes()
+            file = study.folder / "figures" / f"{picture}.png"
+            if not file.is_file():
+                continue
+            image = file.read_bytes()
             caption = f"Ours, study {place.study}: {picture.replace('_', ' ')}."
             figures.append(ReportFigure(caption, f"{caption} {place.says}", image, "png"))
         return ReproductionSection(place.place, text, tables, figures)

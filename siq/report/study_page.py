@@ -1,64 +1,48 @@
-"""The report of a study: one page that needs nothing else."""
+"""The page of a study: the answer first, then formulas, then evidence, then the workings."""
 
 from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 import yaml
+from markupsafe import Markup
 
+from siq.identify.diffusion import DiffusionSource
+from siq.identify.storage import FieldRecord
 from siq.potential.symbolic import SymbolicDecomposition
-from siq.report.formatting import formula_mathml, vector_mathml
+from siq.report.certificate_text import certificate_badge, tests_table
+from siq.report.formatting import matrix_mathml
 from siq.report.invariant_tables import invariant_tables
-from siq.report.landscape_tables import landscape_figures, landscape_sentences, landscape_tables
-from siq.report.page import FormulaRow, ReportContent, ReportFigure, ReportTable
-from siq.report.sentences import answer_sentences, control_sentences
-from siq.steps.outcomes import METHODS, Method, Status
+from siq.report.landscape_answer import SaidLandscape, headline, remarks, wells_table
+from siq.report.landscape_tables import errors_table, escape_table, landscape_sentences, landscape_tables
+from siq.report.page import Badge, FormulaRow, ReportContent, ReportSection, ReportTable
+from siq.report.sentences import control_sentences, run_sentences
+from siq.report.study_captions import LEADING, Part, figure_of, figures_of, shown_figures
+from siq.report.study_formulas import coefficient_table, formula_rows
+from siq.steps.outcomes import Method, Status
 from siq.steps.shown import ModelFiles, Shown
 from siq.study.study import Study
 
-CAPTIONS = {
-    "dataset": "Trajectories, all recorded states, and those below the level of the regression, by the"
-    " networks of the run shown above (the paper: fig2a; fig1_noisy a).",
-    "components": "Trajectories, downhill component −∇V, circulatory component g, exact and identified U of"
-    " the run shown above, projected on the first two states (the paper: Fig. 1).",
-    "coefficients_refined": "Refined: coefficients of U over the runs, one panel for each term that belongs"
-    " there; the last panel shows the terms that do not (the paper: Fig. 2).",
-    "coefficients_regression": "The same by the published regression, from the networks as they are.",
-    "error_distribution": "Relative root mean square error of the coefficients of U, one dot a run"
-    " (the paper: Fig. 3).",
-    "inclusion_refined": "Refined: how often each term was found, by component.",
-    "inclusion_regression": "The same by the published regression.",
-    "prediction": "Long-term prediction of unseen trajectories, and its errors (the paper: Fig. 4a).",
-    "invariant": "Invariant distribution from the refined U, or from U over all wells where no single formula"
-    " holds, and a long simulation (the paper: fig1b and fig2c, b to d).",
-    "training": "Loss on held-out recordings during training, one line a run.",
-}
-OF_NETWORKS = ("coefficients_regression", "inclusion_regression", "training")
-"""Figures that say nothing where no networks were asked for."""
-
-SUMMARY_COLUMNS = (
-    "method",
-    "quantity",
-    "exact",
-    "mean",
-    "standard_deviation",
-    "median",
-    "inclusion_frequency",
-    "published",
-    "published_standard_deviation",
-    "runs",
-)
+SUMMARY_COLUMNS = ("method", "quantity", "exact", "mean", "standard_deviation", "median", "inclusion_frequency",
+                   "published", "published_standard_deviation", "runs")  # fmt: skip
 SUMMARY_HELP = {
     "quantity": "component:term for coefficients; those of V = U/2 and of f are in the file",
     "inclusion frequency": "share of runs in which the term was found",
     "runs": "runs that have a value",
     "published": "the published figure, with its source",
+}
+SOURCES = {
+    DiffusionSource.GIVEN: "As given.",
+    DiffusionSource.ESTIMATED: "Estimated from the noise in the recordings, since none was given, and scaled to the"
+    " determinant 1, so that ε is the size of the noise.",
+    DiffusionSource.UNIT: "Taken as the unit matrix: none was given, and the recordings show no noise that would tell."
+    " U and the barriers follow from it.",
 }
 
 
@@ -78,8 +62,14 @@ class StudyResults:
         The run whose formulas are printed.
     exact
         The exact ones, where they are known.
-    images
-        The figures by name, as PNG.
+    images, vectors
+        The figures that there are by name, as PNG and as SVG.
+    overview
+        The landscape that the page opens with, as plain data; None where there is none.
+    record
+        f and D of the run that is shown, None where there is none.
+    interactive
+        A view of U that can be turned, None where there is none.
     """
 
     tables: Mapping[str, pd.DataFrame]
@@ -88,12 +78,16 @@ class StudyResults:
     shown: Shown
     exact: SymbolicDecomposition | None
     images: Mapping[str, bytes]
+    vectors: Mapping[str, bytes]
+    overview: Mapping[str, Any] | None = None
+    record: FieldRecord | None = None
+    interactive: Markup | None = None
 
 
 def study_page(
     study: Study, results: StudyResults, *, command: str, versions: Mapping[str, str]
 ) -> ReportContent:
-    """All that the report of a study says.
+    """All that the page of a study says.
 
     Parameters
     ----------
@@ -102,84 +96,328 @@ def study_page(
     results
         What came of it.
     command
-        How to make the report again.
+        How to make the page again.
     versions
         Of the programs that took part, by name.
     """
-    tables, folder, shown = results.tables, results.folder, results.shown
-    rrmse, outcomes, certificates = tables["rrmse"], tables["outcomes"], tables["certificates"]
-    troubled = outcomes[outcomes["status"].isin([Status.FAILED, Status.WARNING])]
-    failures = pd.concat([troubled, _refusals(rrmse, certificates)])[["run", "step", "status", "reason"]]
+    networks = study.training is not None
+    drawn = shown_figures(set(results.images), runs=study.runs, networks=networks)
+    results_drawn = {name: results.images[name] for name in results.images if name in drawn}
+    lead = next((name for name in LEADING if name in drawn), None)
+    beside_paper = study.published is not None
+    page = _Page(study, results, results_drawn, lead, beside_paper)
+    overview = results.overview
+    table = None
+    if overview is not None and overview["wells"]:
+        shown, data = wells_table(overview)
+        table = ReportTable("Stable states, barriers and times.", shown, data=data, rows_named=True)
+    figure = None
+    if lead is not None:
+        figure = figure_of(lead, results.images, results.vectors, beside_paper=beside_paper)
+    sections = [
+        page.formulas(),
+        page.evidence(),
+        page.landscape(),
+        page.over_runs(),
+        page.published(),
+        page.workings(),
+        ReportSection("How to run it again", listing=command, text=[AGAIN]),
+        page.provenance(versions),
+    ]
     return ReportContent(
         title=study.title or study.name,
-        question=_question(study),
-        answer=_answer(study, results),
-        formulas=_formulas(results),
-        tables=[
+        answer=page.answer(),
+        badge=page.badge(),
+        figure=figure,
+        table=table,
+        interactive=results.interactive,
+        sections=[section for section in sections if section is not None],
+    )
+
+
+AGAIN = "Change one parameter of the study and run it again: only what depends on it is made again."
+
+
+@dataclass(frozen=True)
+class _Page:
+    """The parts of the page; `images` are the figures that are shown, one of which it opens with."""
+
+    study: Study
+    results: StudyResults
+    images: Mapping[str, bytes]
+    lead: str | None
+    beside_paper: bool
+
+    def _figures(self, part: Part) -> list[Any]:
+        images = {name: image for name, image in self.images.items() if name != self.lead}
+        return figures_of(part, images, self.results.vectors, beside_paper=self.beside_paper)
+
+    @property
+    def _method(self) -> Method:
+        return self.results.shown.method
+
+    def _certificate(self) -> Mapping[str, Any] | None:
+        shown = self.results.shown
+        if shown.run is None:
+            return None
+        found: Mapping[str, Any] | None = self.results.models.certificates(shown.run).get(str(shown.method))
+        return found
+
+    def answer(self) -> list[str]:
+        """The sentence, and what has to be known of it."""
+        results = self.results
+        if results.shown.run is None and results.overview is None:
+            return [f"No formula was found: {self._why()}."]
+        said = [headline(results.overview, missing=self._why())]
+        said += remarks(results.overview)
+        return said
+
+    def _why(self) -> str:
+        """The first reason for which a step ended without a result, or with a reservation."""
+        outcomes = self.results.tables["outcomes"]
+        for status in (Status.FAILED, Status.WARNING, Status.SKIPPED):
+            reasons = outcomes[outcomes["status"] == status]["reason"]
+            if len(reasons) and str(reasons.iloc[0]):
+                return str(reasons.iloc[0]).rstrip(".")
+        return "nothing led to a stable state"
+
+    def badge(self) -> Badge:
+        """Whether the answer may be believed."""
+        rrmse, certificates = self.results.tables["rrmse"], self.results.tables["certificates"]
+        mine = rrmse[rrmse["method"] == self._method]
+        refused = certificates[(certificates["method"] == self._method) & ~certificates["passed"]]
+        refused = refused[refused["run"] == self.results.shown.run]
+        return certificate_badge(
+            self._certificate(),
+            certified=int(mine["certified"].sum()),
+            runs=self.study.runs,
+            refusals=dict(zip(refused["test"], refused["reason"], strict=True)),
+        )
+
+    def formulas(self) -> ReportSection | None:
+        """What was found, typeset, with coefficients and their errors."""
+        results, shown = self.results, self.results.shown
+        rows = self._formulas_of(self._method)
+        record = results.record
+        if record is not None:
+            note = SOURCES[record.diffusion_source]
+            rows.append(FormulaRow("D", matrix_mathml(record.found.diffusion.matrix.tolist()), note))
+        if not rows:
+            return None
+        text = []
+        if self.study.runs > 1 and shown.run is not None:
+            known = results.tables["rrmse"]["rrmse"].notna().any()
+            text.append(
+                f"The formulas are those of run {shown.run}"
+                + (", the median of the runs by error." if known else ".")
+            )
+        if self._method == Method.REGRESSION and shown.run is not None:
+            text.append("They are those of the published method: no refined formula was found.")
+        return ReportSection(
+            "Formulas", text, formulas=rows, tables=self._coefficients(), notes=[DECOMPOSITION]
+        )
+
+    def _formulas_of(self, method: Method) -> list[FormulaRow]:
+        shown = self.results.shown
+        found = {} if shown.run is None else self.results.models.formulas(shown.run)
+        if method not in found:
+            return []
+        places = [] if self.results.overview is None else self.results.overview["wells"]
+        return formula_rows(found[method], self.results.exact, places=[one["attractor"] for one in places])
+
+    def _coefficients(self) -> list[ReportTable]:
+        coefficients, shown = self.results.tables["coefficients"], self.results.shown
+        mine = coefficients[
+            (coefficients["run"] == shown.run) & (coefficients["method"] == str(shown.method))
+        ]
+        units: dict[str, str] = {}
+        if self.results.overview is not None:
+            said = SaidLandscape(self.results.overview)
+            units = dict(zip(said.states, said.units, strict=True)) | {"t": said.time_unit}
+        table = coefficient_table(mine, units=units, components="U$|g_|f_")
+        if table is None:
+            return []
+        chosen = mine[mine["component"].str.match("U$|g_|f_") & (mine["estimate"] != 0)]
+        caption = "Coefficients with their standard errors; those without ± are exact to the digits shown."
+        file = f"{self.results.folder}/coefficients.csv"
+        return [ReportTable(caption, table, {}, file, 40, data=chosen.drop(columns=["run", "method"]))]
+
+    def evidence(self) -> ReportSection | None:
+        """Why the answer may be believed, or may not."""
+        tables, shown, folder = self.results.tables, self.results.shown, self.results.folder
+        found = []
+        if shown.run is not None:
+            mine = tests_table(tables["certificates"], shown.run, shown.method)
+            if len(mine):
+                caption = "The tests of the certificate"
+                caption += f", of run {shown.run}." if self.study.runs > 1 else "."
+                found.append(ReportTable(caption, mine, {}, f"{folder}/certificates.csv", rows_named=True))
+        if "landscape_errors" in tables and len(tables["landscape_errors"]):
+            found.append(errors_table(tables["landscape_errors"], folder))
+        if "escape" in tables and len(tables["escape"]):
+            time = "1" if self.results.overview is None else SaidLandscape(self.results.overview).time_unit
+            found.append(escape_table(tables["escape"], time, folder))
+        troubled = self._troubled()
+        if len(troubled):
+            caption = "What went wrong, or was not certified."
+            found.append(ReportTable(caption, troubled, {}, f"{folder}/outcomes.csv", rows_shown=60))
+        text = [] if self.study.runs > 1 else self._runs_said()
+        text += control_sentences(tables["certificates"])
+        text += [
+            line
+            for line in landscape_sentences(tables["landscape"], tables["outcomes"])
+            if shown.run is not None
+        ]
+        figures = self._figures(Part.EVIDENCE)
+        if not (text or found or figures):
+            return None
+        return ReportSection(
+            "How far it can be trusted", text, tables=found, figures=figures, notes=self._remarks()
+        )
+
+    def _remarks(self) -> list[str]:
+        """What steps that went well have to say, each once; where D is from stands beside D."""
+        outcomes = self.results.tables["outcomes"]
+        known = {source.note for source in DiffusionSource}
+        texts = outcomes[outcomes["status"] == Status.OK]["reason"].dropna()
+        return [
+            f"{text[0].upper()}{text[1:]}." for text in dict.fromkeys(texts) if text and text not in known
+        ]
+
+    def _runs_said(self) -> list[str]:
+        tables = self.results.tables
+        return run_sentences(
+            tables["rrmse"], tables["outcomes"], tables["summary"], runs=self.study.runs, method=self._method
+        )
+
+    def _troubled(self) -> pd.DataFrame:
+        """Steps that failed, and refined formulas that are not certified; the run where there are several."""
+        outcomes, rrmse = self.results.tables["outcomes"], self.results.tables["rrmse"]
+        troubled = outcomes[outcomes["status"].isin([Status.FAILED, Status.WARNING])]
+        rows = pd.concat([troubled, _refusals(rrmse, self.results.tables["certificates"])])
+        rows = rows[["run", "step", "status", "reason"]].sort_values(["run", "step"])
+        return rows.drop(columns="run") if self.study.runs == 1 else rows
+
+    def landscape(self) -> ReportSection | None:
+        """Every way out, every equilibrium, the density."""
+        tables, folder = self.results.tables, self.results.folder
+        options = self.study.landscape
+        found = landscape_tables(
+            self.results.overview,
+            tables["landscape"],
+            noises=() if options is None else options.noise_intensities,
+            folder=folder,
+        )
+        found += invariant_tables(tables["invariant"], tables["well_shares"], folder)
+        figures = self._figures(Part.LANDSCAPE)
+        if not found and not figures:
+            return None
+        text = []
+        overview = self.results.overview
+        if overview is not None and self.study.runs > 1:
+            text = [f"The landscape is that of run {overview['run']}."]
+        return ReportSection("The landscape in full", text, tables=found, figures=figures)
+
+    def over_runs(self) -> ReportSection | None:
+        """What varies from run to run; of one run nothing does."""
+        if self.study.runs == 1:
+            return None
+        tables, folder = self.results.tables, self.results.folder
+        counted = (
+            tables["certificates"]
+            .groupby(["method", "test"], sort=False)
+            .agg(
+                passed=("passed", "sum"),
+                runs=("passed", "size"),
+                median=("value", "median"),
+                worst=("value", "max"),
+            )
+            .reset_index()
+        )
+        found = [
             ReportTable(
-                "Every figure over the runs, beside the exact and the published one.",
-                _summary_shown(tables["summary"]),
-                SUMMARY_HELP,
-                f"{folder}/summary.csv",
-                rows_shown=60,
+                "Every figure over the runs" + (", beside the published one." if self.beside_paper else "."),
+                _summary_shown(tables["summary"]), SUMMARY_HELP, f"{folder}/summary.csv", 60,
             ),
-            *_certificate_tables(certificates, tables["coefficients"], shown.run, shown.method, folder),
-            *landscape_tables(
-                tables["landscape"], tables.get("landscape_errors"), tables.get("escape"), folder
+            ReportTable(
+                "How many runs passed each test of the certificate.", counted, {}, f"{folder}/certificates.csv", 40
             ),
-            *invariant_tables(tables["invariant"], tables["well_shares"], folder),
-            ReportTable("Errors by run.", rrmse, {}, f"{folder}/rrmse.csv", rows_shown=50),
-            ReportTable("What became of each step of each run.", outcomes, {}, f"{folder}/outcomes.csv", 12),
-        ],
-        figures=[
-            *(
-                ReportFigure(caption, caption, results.images[name], "png")
-                for name, caption in CAPTIONS.items()
-                if study.training is not None or name not in OF_NETWORKS
-            ),
-            *landscape_figures(results.images),
-        ],
-        failures=failures.sort_values(["run", "step"]),
-        commands=[
-            command,
-            "# change one parameter of the study and run it again: only what depends on it is made again",
-        ],
-        study=yaml.safe_dump(_printed(study), sort_keys=False, allow_unicode=True),
-        provenance=_provenance(tables["timings"], versions),
-    )
+            ReportTable("Errors by run.", _words(tables["rrmse"]), {}, f"{folder}/rrmse.csv", 50),
+        ]  # fmt: skip
+        return ReportSection(
+            f"What {self.study.runs} runs say together", self._runs_said(), tables=[one for one in found if len(one.frame)],
+            figures=self._figures(Part.RUNS),
+        )  # fmt: skip
+
+    def published(self) -> ReportSection | None:
+        """What the published method made of the networks, and what was published; folded away without a paper."""
+        other = self.study.training is not None and self._method != Method.REGRESSION
+        rows = self._formulas_of(Method.REGRESSION) if other else []
+        figures = self._figures(Part.PUBLISHED)
+        if not rows and not figures:
+            return None
+        text = []
+        training, regression = self.study.training, self.study.regression
+        if training is not None:
+            text.append(
+                f"The published method trains two networks, here for at most {training.steps} steps on batches of"
+                f" {training.batch_size}, and regresses formulas of degree {regression.degree} at most on them. Terms"
+                f" below {regression.threshold} are dropped (of the {regression.threshold_on})."
+            )
+        if rows:
+            text.append(self._regression_verdict())
+        return ReportSection(
+            "The published method", text, formulas=rows, figures=figures, folded=not self.beside_paper
+        )
+
+    def _regression_verdict(self) -> str:
+        shown = self.results.shown
+        assert shown.run is not None  # it has formulas
+        one = self.results.models.certificates(shown.run)[str(Method.REGRESSION)]
+        if one["certified"]:
+            return "Its formulas are certified."
+        return f"Its formulas are not certified: {one['reason']}."
+
+    def workings(self) -> ReportSection:
+        """The recordings, and what became of each step."""
+        outcomes = self.results.tables["outcomes"]
+        steps = outcomes.drop(columns="run") if self.study.runs == 1 else outcomes
+        caption = "What became of each step" + (" of each run." if self.study.runs > 1 else ".")
+        return ReportSection(
+            "The recordings and the workings", [self._source(), self._method_said()],
+            tables=[ReportTable(caption, steps, {}, f"{self.results.folder}/outcomes.csv", 12)],
+            figures=self._figures(Part.WORKINGS), folded=True,
+        )  # fmt: skip
+
+    def _source(self) -> str:
+        recordings = self.study.recordings
+        if recordings is not None:
+            return f"The recordings are those in {recordings.file}."
+        return f"The recordings are simulated trajectories of the system {self.study.system}."
+
+    def _method_said(self) -> str:
+        routes = self.study.refinement.with_routes(networks=self.study.training is not None).routes or ()
+        return (
+            "f was identified from neighbouring samples alone. The formulas solve the Hamilton–Jacobi equation of this"
+            f" f, by the {' and the '.join(routes)} route, and have to pass the tests of the certificate."
+        )
+
+    def provenance(self, versions: Mapping[str, str]) -> ReportSection:
+        """The study as it was asked, with what, and how long."""
+        timings = self.results.tables["timings"]
+        total = timings.groupby("step")["seconds"].sum()
+        spent = ", ".join(f"{step} {seconds:.0f} s" for step, seconds in total.items())
+        named = ", ".join(f"{name} {version}" for name, version in versions.items())
+        machine = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"
+        text = [f"{named}; {machine}, {os.cpu_count()} cores.", f"Processor time by step: {spent}."]
+        printed = yaml.safe_dump(_printed(self.study), sort_keys=False, allow_unicode=True)
+        return ReportSection("The study and the versions", text, listing=printed, folded=True)
 
 
-def _answer(study: Study, results: StudyResults) -> list[str]:
-    """The answer in sentences, and which run is shown."""
-    rrmse, shown = results.tables["rrmse"], results.shown
-    said = answer_sentences(
-        rrmse, results.tables["outcomes"], results.tables["summary"], runs=study.runs, method=shown.method
-    )
-    said += landscape_sentences(results.tables["landscape"], results.tables["outcomes"])
-    if shown.run is not None:
-        which = ", the median of the runs by error" if rrmse["rrmse"].notna().any() else ""
-        said.append(f"The formulas below are those of run {shown.run}{which}.")
-    return said + _remarks(results.tables["outcomes"])
-
-
-def _remarks(outcomes: pd.DataFrame) -> list[str]:
-    """What steps that went well have to say, each once: where D is from, if nobody gave it."""
-    texts = outcomes[outcomes["status"] == Status.OK]["reason"].dropna()
-    return [f"{text[0].upper()}{text[1:]}." for text in dict.fromkeys(texts) if text]
-
-
-def _formulas(results: StudyResults) -> list[FormulaRow]:
-    """The formulas of the run that is shown, ours first."""
-    if results.shown.run is None:
-        return []
-    formulas = results.models.formulas(results.shown.run)
-    certificates = results.models.certificates(results.shown.run)
-    return [
-        row
-        for method in reversed(METHODS)
-        if method in formulas
-        for row in _formula_rows(method, formulas[method], results.exact, certificates[method])
-    ]
+DECOMPOSITION = (
+    "f is split as f = −D∇V + g with ∇V·g = 0, and U = 2V. For the noise √ε σ dW with D = σσᵀ the density of states is"
+    " exp(−U/ε) to leading order."
+)
 
 
 def _printed(study: Study) -> dict[str, Any]:
@@ -192,91 +430,11 @@ def _summary_shown(summary: pd.DataFrame) -> pd.DataFrame:
     """Errors, U and g; the headings in words, so that they wrap."""
     shown = summary[~summary["quantity"].str.match("V:|f_")]
     columns = [name for name in SUMMARY_COLUMNS if shown[name].notna().any()]
-    return shown[columns].rename(columns=lambda name: name.replace("_", " "))
+    return _words(shown[columns])
 
 
-def _formula_rows(
-    method: str,
-    identified: SymbolicDecomposition,
-    exact: SymbolicDecomposition | None,
-    certificate: dict[str, Any],
-) -> list[FormulaRow]:
-    """U, ∇V, g and f, exact and identified; U of each well where no single formula holds."""
-
-    def typeset(one: SymbolicDecomposition | None) -> dict[str, Any]:
-        if one is None:
-            return {}
-        if one.potential is None:
-            wells = {
-                f"U about {_place(well.attractor)}, up to {2 * well.level:.4g}": formula_mathml(
-                    2 * well.expression
-                )
-                for well in one.wells
-            }
-            return wells | {"f": vector_mathml(one.vector_field)}
-        return {
-            "U": formula_mathml(one.quasipotential),
-            "∇V": vector_mathml(one.gradient),
-            "g": vector_mathml(one.circulatory),
-            "f": vector_mathml(one.vector_field),
-        }
-
-    truths = typeset(exact)
-    return [
-        FormulaRow(
-            quantity=name,
-            method=method,
-            identified=formula,
-            exact=truths.get(name),
-            certified=certificate["certified"],
-            reason=_certificate_sentence(certificate),
-        )
-        for name, formula in typeset(identified).items()
-    ]
-
-
-def _place(position: Iterable[float]) -> str:
-    """A point as text."""
-    return "(" + ", ".join(f"{value:.4g}" for value in position) + ")"
-
-
-def _certificate_sentence(certificate: dict[str, Any]) -> str:
-    """What a certificate says, in words."""
-    said = [certificate["reason"]] if certificate["reason"] else []
-    if certificate["certified"]:
-        said.append(f"all tests passed; stated relative error of V {certificate['stated_error']:.1e}")
-    return "; ".join([*said, *certificate.get("notes", [])])
-
-
-def _question(study: Study) -> list[str]:
-    """What was asked, in words."""
-    source = (
-        f"the recordings in {study.recordings.file}"
-        if study.recordings is not None
-        else f"simulated trajectories of the system {study.system}"
-    )
-    refinement = study.refinement.with_routes(networks=study.training is not None)
-    return [
-        f"From {source} alone: which orthogonal decomposition f = −D∇V + g, with ∇V·g = 0, and which"
-        " formula of the quasipotential U = 2V lie behind them, and how much does the answer vary over"
-        f" {study.runs} independent run{'s' if study.runs > 1 else ''}?",
-        f"Each run identified f from the pairs alone{_networks(study)} “Refined” are the formulas that solve"
-        f" the Hamilton–Jacobi equation of f, by the {' and the '.join(refinement.routes or ())} route, and"
-        f" that have to pass a certificate.",
-    ]
-
-
-def _networks(study: Study) -> str:
-    """What was asked of networks, in words that follow what was asked of the identification."""
-    training, regression = study.training, study.regression
-    if training is None:
-        return "; no networks were asked for."
-    return (
-        f", and trained two tanh networks for at most {training.steps} steps on batches of"
-        f" {training.batch_size}. The published method, “regression”, seeks formulas of the networks, of"
-        f" degree {regression.degree} at most, dropping terms below {regression.threshold} (acting on the"
-        f" {regression.threshold_on})."
-    )
+def _words(table: pd.DataFrame) -> pd.DataFrame:
+    return table.rename(columns=lambda name: name.replace("_", " "))
 
 
 def _refusals(rrmse: pd.DataFrame, certificates: pd.DataFrame) -> pd.DataFrame:
@@ -292,51 +450,3 @@ def _refusals(rrmse: pd.DataFrame, certificates: pd.DataFrame) -> pd.DataFrame:
             "reason": rows["run"].map(reasons).fillna("there is no refined formula"),
         }
     )
-
-
-def _certificate_tables(
-    certificates: pd.DataFrame, coefficients: pd.DataFrame, run: int | None, method: Method, folder: Path
-) -> list[ReportTable]:
-    """How often each test passed, and for the run shown its figures and its standard errors."""
-    if run is None:
-        return []
-    counted = certificates.groupby(["method", "test"], sort=False).agg(
-        passed=("passed", "sum"), runs=("passed", "size"), median=("value", "median"), worst=("value", "max")
-    )
-    mine = certificates[certificates["run"] == run].drop(columns="run")
-    chosen = coefficients[
-        (coefficients["run"] == run)
-        & (coefficients["method"] == method)
-        & coefficients["component"].str.match("U$|g_")
-        & (coefficients["estimate"] != 0)
-    ]
-    shown = chosen[["component", "term", "estimate", "standard_error", "exact"]].rename(
-        columns={"standard_error": "standard error"}
-    )
-    return [
-        ReportTable(
-            " ".join([
-                "The certificate: how many runs passed each test.", *control_sentences(certificates)
-            ]),
-            counted.reset_index(), {}, f"{folder}/certificates.csv", rows_shown=40,
-        ),
-        ReportTable(
-            f"The certificate of run {run}, with its limits.", mine, {}, f"{folder}/certificates.csv", 40
-        ),
-        ReportTable(
-            f"Coefficients of run {run} with their standard errors.", shown, {},
-            f"{folder}/coefficients.csv", 60,
-        ),
-    ]  # fmt: skip
-
-
-def _provenance(timings: pd.DataFrame, versions: Mapping[str, str]) -> dict[str, str]:
-    """With what, and how long."""
-    cores = os.cpu_count()
-    total = timings.groupby("step")["seconds"].sum()
-    spent = ", ".join(f"{step} {seconds:.0f} s" for step, seconds in total.items())
-    return {
-        "Versions": ", ".join(f"{name} {version}" for name, version in versions.items()),
-        "Python": f"{platform.python_version()} on {platform.system()} {platform.machine()}, {cores} cores",
-        "Processor time of all runs": spent,
-    }

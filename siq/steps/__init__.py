@@ -19,6 +19,7 @@ regress               which sparse formulas are these (the published method)?
 refine                which V solves the Hamilton–Jacobi equation of f, and may it be believed?
 landscape             which wells, barriers and ways are there?
 score                 how far is all this from exact answers, where these are known?
+overview              which landscape does the page open with?
 collect               what do all runs say together?
 reference             what do methods say of a card that share nothing with ours?
 landscape_errors      how far are the landscapes from these references?

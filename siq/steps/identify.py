@@ -109,6 +109,7 @@ def _identified(settings: IdentifySettings, recordings: Recordings, number: int)
         "measurement": noise.measurement.tolist(),
         "diffusion": str(source),
         "note": noise.note,
+        "pairs": sum(len(part.h) for part in parts),
     }
     return FieldRecord(found, verdict.as_data(), kept)
 

@@ -15,7 +15,9 @@ from siq.data.recordings import Recordings, snapshot_pairs
 from siq.dynamics.phase_portrait import evenly_spread, phase_portrait
 from siq.errors import NumericalFailure
 from siq.identify.storage import FieldRecord
+from siq.landscape.dwell_times import NoiseStrength
 from siq.landscape.landscape import Landscape, find_landscape
+from siq.landscape.options import LandscapeOptions
 from siq.landscape.storage import write_landscape
 from siq.numerics.randomness import Purpose, generator
 from siq.potential.refinement import RefinementOptions
@@ -23,7 +25,7 @@ from siq.potential.storage import read_model
 from siq.potential.well import Well
 from siq.steps.landscape_tables import degree_rows, landscape_rows
 from siq.steps.outcomes import Method, Outcome, Status, Step, write_outcomes
-from siq.steps.settings import STRICT, Sampling
+from siq.steps.settings import STRICT, Sampling, StateSpace
 from siq.study.tables import as_table, write_table
 
 
@@ -32,8 +34,10 @@ class LandscapeSettings:
     """What a landscape depends on."""
 
     seed: int
+    space: StateSpace
     sampling: Sampling
     refinement: RefinementOptions
+    landscape: LandscapeOptions | None
 
 
 @plain_dataclass(frozen=True)
@@ -52,12 +56,13 @@ def run(
     *,
     number: int,
     wells: Sequence[Well] = (),
+    seek_wells: bool = True,
     certificate: Certificate | None = None,
 ) -> FoundLandscape:
     """The landscape of the identified f within the recorded region.
 
     The wells are those of the refinement, with their certificate; where it found none, the local route is
-    asked once more, within the whole recorded region.
+    asked once more, within the whole recorded region, unless `seek_wells` says that it shall not.
     """
     if recordings is None or record is None:
         reason = "no vector field was identified"
@@ -68,8 +73,8 @@ def run(
     try:
         portrait = phase_portrait(record.found.dynamics, points, seed=number)
         found = find_landscape(
-            record.found, portrait, wells=wells or None, certificate=certificate,
-            options=settings.refinement, seed=number,
+            record.found, portrait, wells=wells if wells or not seek_wells else None, certificate=certificate,
+            options=settings.refinement, noise=noise_strength(settings, record), seed=number,
         )  # fmt: skip
     except (NumericalFailure, np.linalg.LinAlgError) as error:
         return FoundLandscape(None, record, Outcome(number, Step.LANDSCAPE, Status.FAILED, str(error)))
@@ -79,7 +84,26 @@ def run(
     note = record.diffusion_source.note
     if note is not None:
         found = replace(found, notes=(*found.notes, note))
+    units, time = units_of(recordings, settings.space)
+    found = found.in_units(units, time=time)
     return FoundLandscape(found, record, outcome)
+
+
+def noise_strength(settings: LandscapeSettings, record: FieldRecord) -> NoiseStrength | None:
+    """The noise that the recordings show, or else the first that the study gives."""
+    if (shown := record.noise_strength) is not None:
+        return NoiseStrength(*shown, source="estimated")
+    given = () if settings.landscape is None else settings.landscape.noise_intensities
+    return NoiseStrength(given[0]) if given else None
+
+
+def units_of(recordings: Recordings, space: StateSpace) -> tuple[tuple[str, ...], str]:
+    """Units of the states and of the time: as the recordings say, or else the card; ``1`` where none does."""
+    states = tuple(
+        unit or space.unit(name, unknown="1")
+        for name, unit in zip(recordings.names, recordings.units, strict=True)
+    )
+    return states, recordings.time_unit or space.unit("t", unknown="1")
 
 
 def read_wells(model: str | Path) -> tuple[Well, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
+from siq.landscape.dwell_times import MeanTime, dwell_time, exit_time
 from siq.landscape.landscape import Landscape
 from siq.potential.local_wells import best_trial
 from siq.study.tables import as_table
@@ -16,13 +17,18 @@ def place(position: np.ndarray) -> str:
 
 
 def landscape_rows(run: int, found: Landscape, remark: str | None = None) -> pd.DataFrame:
-    """One row for each equilibrium and each way out of a well; `remark` is of what all barriers hang on."""
+    """One row for each equilibrium and each way out of a well; `remark` is of what all barriers hang on.
+
+    Mean times are for the noise of the landscape: of an attractor the time in its well, of a transition that
+    over its saddle alone; the error is that of data and law together.
+    """
     names = [f"A{index + 1}" for index in range(len(found.attractors))]
     heights = {place(one.position): index for index, one in enumerate(found.attractors)}
     tops: dict[str, float] = {}
     for way in found.transitions:
         top = found.heights[way.start] + way.barrier
         tops[place(way.saddle.position)] = min(top, tops.get(place(way.saddle.position), np.inf))
+    noise = found.noise
     rows: list[dict[str, object]] = []
     for one in found.equilibria:
         index = heights.get(place(one.position))
@@ -39,6 +45,7 @@ def landscape_rows(run: int, found: Landscape, remark: str | None = None) -> pd.
                 "U": tops.get(place(one.position), np.nan) if index is None else found.heights[index],
                 "basin": np.nan if index is None else found.basins[index],
             }
+            | ({} if index is None else _time(found, dwell_time(found.exits(index), found.noise)))
         )
     for way in found.transitions:
         beyond = "outside" if way.end is None else names[way.end]
@@ -54,10 +61,19 @@ def landscape_rows(run: int, found: Landscape, remark: str | None = None) -> pd.
                 "formula_share": way.formula_share,
                 "minimum_action": np.nan if way.path is None else way.path.uphill.action,
                 "prefactor": np.nan if way.rate is None else way.rate.prefactor,
+                "barrier_over_noise": np.nan if noise is None else way.barrier / noise.intensity,
                 "note": "; ".join([*way.notes, *([] if remark is None else [remark])]),
             }
+            | _time(found, None if noise is None else exit_time(way.exit, noise))
         )
     return as_table("landscape", rows)
+
+
+def _time(found: Landscape, mean: MeanTime | None) -> dict[str, object]:
+    noise = np.nan if found.noise is None else found.noise.intensity
+    if mean is None:
+        return {"noise": noise}
+    return {"noise": noise, "mean_time": mean.value, "mean_time_error": mean.value * mean.error}
 
 
 def degree_rows(run: int, found: Landscape) -> pd.DataFrame:

@@ -64,6 +64,10 @@ COLUMNS: Mapping[str, Mapping[str, str]] = {
         "formula_share": "float64",
         "minimum_action": "float64",
         "prefactor": "float64",
+        "noise": "float64",
+        "barrier_over_noise": "float64",
+        "mean_time": "float64",
+        "mean_time_error": "float64",
         "note": "str",
     },
     "degrees": {

@@ -14,6 +14,7 @@ from siq.report.settings import (
     PageSettings,
     ReproductionSettings,
 )
+from siq.report.study_captions import CAPTIONS as STUDY_CAPTIONS
 from siq.steps.draw import DrawSettings
 from siq.steps.escapes import EscapesSettings
 from siq.steps.identify import IdentifySettings
@@ -47,26 +48,8 @@ except InputError as error:
     say_and_stop(error)
 
 
-FIGURES = {
-    "dataset": "dataset.rst",
-    "error_distribution": "error.rst",
-    "coefficients_refined": "coefficients.rst",
-    "coefficients_regression": "coefficients.rst",
-    "inclusion_refined": "inclusion.rst",
-    "inclusion_regression": "inclusion.rst",
-    "components": "components.rst",
-    "training": "training.rst",
-    "prediction": "prediction.rst",
-}
 REPRODUCED = ["archetype3d", "archetype3d-noise", "archetype4d", "resonator"]
-LANDSCAPE_FIGURES = {
-    "landscape": "landscape.rst",
-    "landscape_errors": "landscape_errors.rst",
-    "landscape_published": "landscape_published.rst",
-    "degrees": "degrees.rst",
-    "escape": "escape.rst",
-}
-CAPTIONS = FIGURES | {"invariant": "invariant.rst"}
+CAPTIONS = {name: caption.text for name, caption in STUDY_CAPTIONS.items()}
 
 
 wildcard_constraints:
@@ -290,13 +273,12 @@ def of_reproduced(method):
     return lambda wildcards: [getattr(STUDIES[name], method)() for name in REPRODUCED]
 
 
-def figure_output(name):
-    return report(
-        f"results/{{study}}/figures/{name}.svg",
-        caption=f"../report/{(CAPTIONS | LANDSCAPE_FIGURES)[name]}",
-        category="{study}",
-        subcategory="figures",
-    )
+def figure_labels(wildcards):
+    """Labels of a figure in Snakemake's report, numbered in the order of the page."""
+    order = list(CAPTIONS)
+    name = wildcards.name
+    number = order.index(name) + 2 if name in order else len(order) + 2
+    return {"order": f"{number:02d}", "what": name.replace("_", " ")}
 
 
 def say_what_has_no_answer():

@@ -14,8 +14,7 @@ rule invariant:
         csv="results/{study}/tables/invariant.csv",
         shares="results/{study}/tables/well_shares.parquet",
         shares_csv="results/{study}/tables/well_shares.csv",
-        svg=figure_output("invariant"),
-        png="results/{study}/figures/invariant.png",
+        drawn=directory("results/{study}/drawn/invariant"),
     log:
         "results/{study}/logs/invariant.log",
     benchmark:
@@ -27,7 +26,6 @@ rule invariant:
         code=code("invariant.py"),
         settings=settings_of(InvariantSettings),
         card=card_says,
-        figure="results/{study}/figures/invariant",
     message:
         "{wildcards.study}: computing the invariant distribution"
     script:

@@ -27,6 +27,33 @@ rule landscape:
         "../scripts/landscape.py"
 
 
+rule overview:
+    # The landscape of the run that is shown; where the study asks for none, it is found for this run alone.
+    input:
+        rrmse="results/{study}/tables/rrmse.parquet",
+        models=all_runs("results/{study}/runs/{run}/model.json"),
+        fields=all_runs("results/{study}/runs/{run}/vector_field.json"),
+        recordings=all_runs("results/{study}/runs/{run}/recordings.parquet"),
+        landscapes=of_landscapes("results/{study}/runs/{run}/quasipotential.json"),
+    output:
+        overview="results/{study}/overview.json",
+    log:
+        "results/{study}/logs/overview.log",
+    benchmark:
+        "results/{study}/benchmarks/overview.tsv"
+    conda:
+        "../envs/siq.yaml"
+    threads: 1
+    params:
+        code=code("overview.py"),
+        settings=settings_of(LandscapeSettings),
+        every_run=lambda wildcards: study_of(wildcards).study.landscape is not None,
+    message:
+        "{wildcards.study}: choosing the landscape that the page opens with"
+    script:
+        "../scripts/overview.py"
+
+
 rule reference:
     # What methods say of the card's own vector field that share no code with ours.
     input:
@@ -117,8 +144,7 @@ rule landscape_figures:
         published=published_if_any,
         mesh=published_mesh_if_any,
     output:
-        [figure_output(name) for name in LANDSCAPE_FIGURES],
-        expand("results/{{study}}/figures/{name}.png", name=LANDSCAPE_FIGURES),
+        drawn=directory("results/{study}/drawn/landscape"),
     log:
         "results/{study}/logs/landscape_figures.log",
     benchmark:
@@ -129,7 +155,7 @@ rule landscape_figures:
     params:
         code=code("landscape_figures.py"),
         settings=settings_of(LandscapeFiguresSettings),
-        folder="results/{study}/figures",
+        folder=lambda wildcards, output: output.drawn,
     message:
         "{wildcards.study}: drawing the landscape"
     script:

@@ -13,11 +13,12 @@ rule figures:
         blocks=networks_of_runs("train.json"),
         fields=of_landscapes("results/{study}/runs/{run}/vector_field.json"),
         landscapes=of_landscapes("results/{study}/runs/{run}/quasipotential.json"),
+        every_field=all_runs("results/{study}/runs/{run}/vector_field.json"),
+        overview="results/{study}/overview.json",
         card=card_if_any,
         published=published_if_any,
     output:
-        [figure_output(name) for name in FIGURES],
-        expand("results/{{study}}/figures/{name}.png", name=FIGURES),
+        drawn=directory("results/{study}/drawn/study"),
     log:
         "results/{study}/logs/figures.log",
     benchmark:
@@ -30,7 +31,7 @@ rule figures:
         settings=settings_of(FiguresSettings),
         card=card_says,
         exact=exact_answer,
-        folder="results/{study}/figures",
+        folder=lambda wildcards, output: output.drawn,
     message:
         "{wildcards.study}: drawing the figures"
     script:
@@ -48,11 +49,12 @@ rule page:
         models=all_runs("results/{study}/runs/{run}/model.json"),
         invariant="results/{study}/tables/invariant.parquet",
         well_shares="results/{study}/tables/well_shares.parquet",
-        figures=expand("results/{{study}}/figures/{name}.png", name=CAPTIONS),
+        overview="results/{study}/overview.json",
+        fields=all_runs("results/{study}/runs/{run}/vector_field.json"),
+        drawn="results/{study}/drawn/study",
+        drawn_landscape=with_landscape("results/{study}/drawn/landscape"),
+        drawn_density="results/{study}/drawn/invariant",
         landscape="results/{study}/tables/landscape.parquet",
-        landscape_figures=with_landscape(
-            *(f"results/{{study}}/figures/{name}.png" for name in LANDSCAPE_FIGURES)
-        ),
         landscape_errors=landscape_table("landscape_errors"),
         escape=landscape_table("escape"),
         card=card_if_any,
@@ -62,6 +64,15 @@ rule page:
             "results/{study}/report.html",
             caption="../report/report.rst",
             category="{study}",
+            labels={"order": "1", "what": "the page: the answer, and everything else"},
+        ),
+        figures=report(
+            directory("results/{study}/figures"),
+            patterns=["{name}.svg"],
+            caption="../report/figure.rst",
+            category="{study}",
+            subcategory="figures",
+            labels=figure_labels,
         ),
         answer="results/{study}/answer.json",
     log:
@@ -75,9 +86,10 @@ rule page:
         code=code("page.py"),
         command=lambda wildcards: study_of(wildcards).command(),
         settings=settings_of(PageSettings),
+        captions=CAPTIONS,
         card=card_says,
         exact=exact_answer,
     message:
-        "{wildcards.study}: writing the report"
+        "{wildcards.study}: writing the page"
     script:
         "../scripts/page.py"

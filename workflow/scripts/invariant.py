@@ -4,9 +4,10 @@ from workflow.warm import run_warm
 
 run_warm()
 
+from pathlib import Path
+
 from siq.dynamics.cards import load_system
 from siq.report.plots import plot_invariant_distribution, save_figure
-from siq.report.plots.style import sentence_figure
 from siq.steps import invariant
 from siq.steps.landscapes import first_stored
 from siq.steps.outcomes import Method
@@ -40,11 +41,12 @@ if __name__ == "__main__":
             shown_in(now) if asked else None,
             {} if published is None else load_published(published).figures,
         )
-        figure = sentence_figure("No invariant distribution was asked for.")
-        if asked:
+        drawn = Path(now.output.drawn)
+        drawn.mkdir(parents=True, exist_ok=True)
+        if found.densities:
             names, space = settings.space.names or (), settings.space
             units = [space.unit(name) for name in names]
             figure = plot_invariant_distribution(found.densities, states=names, units=units)
+            save_figure(figure, drawn / "invariant")
         write_table(now.output.table, found.table)
         write_table(now.output.shares, found.shares)
-        save_figure(figure, now.params.figure)

@@ -47,5 +47,8 @@ if __name__ == "__main__":
             {} if figures is None else figures.figures,
             mesh,
         )
+        drawn = Path(now.params.folder)
+        drawn.mkdir(parents=True, exist_ok=True)
         for name, figure in landscape_figures(settings, shown, beside).items():
-            save_figure(figure, Path(now.params.folder) / name)
+            if figure is not None:
+                save_figure(figure, drawn / name)

@@ -4,12 +4,13 @@ from workflow.warm import run_warm
 
 run_warm()
 
-import contextlib
-from importlib.metadata import PackageNotFoundError, version
+from collections.abc import Iterable
+from importlib.metadata import version
 from pathlib import Path
 
 import siq
 from siq.files.whole import whole_file
+from siq.identify.storage import read_field
 from siq.report.answer import answer_of, write_answer
 from siq.report.page import render_report
 from siq.report.settings import PageSettings
@@ -18,49 +19,55 @@ from siq.steps.outcomes import Method
 from siq.steps.shown import ModelFiles, shown_formula
 from siq.study.scoring import exact_answer
 from siq.study.tables import COLUMNS, read_table
-from step import job
+from step import job, read_json
 
-PACKAGES = ("torch", "numpy", "pysindy", "snakemake")
+PACKAGES = ("numpy", "snakemake")
+OF_NETWORKS = ("torch", "pysindy")
 
 
-def installed(packages: tuple[str, ...]) -> dict[str, str]:
-    """The versions of those packages that are there: without networks, some are not."""
-    found = {}
-    for name in packages:
-        with contextlib.suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return found
+def files(folders: Iterable[str], suffix: str) -> dict[str, bytes]:
+    """What was drawn, by name."""
+    found = [path for folder in folders for path in sorted(Path(folder).glob(f"*{suffix}"))]
+    return {path.stem: path.read_bytes() for path in found}
 
 
 if __name__ == "__main__":
     with job() as now:
+        source, study = now.input, now.settings(PageSettings).study
         tables = {name: read_table(path) for name in COLUMNS if (path := now.given(name)) is not None}
-        models = ModelFiles(tuple(now.input.models))
+        models = ModelFiles(tuple(source.models))
         shown, card = shown_formula(tables["rrmse"], models), now.given("card")
-        images = [*now.input.figures, *now.input.landscape_figures]
+        shown = shown if shown.run is not None else models.first_wells()
+        overview = read_json(source.overview)
+        run = shown.run if shown.run is not None else (overview or {}).get("run", 0)
+        folders = [source.drawn, *source.drawn_landscape, source.drawn_density]
         results = StudyResults(
             tables,
-            Path(now.input.summary).parent,
+            Path(source.summary).parent,
             models,
-            shown if shown.run is not None else models.first_wells(),
+            shown,
             None if card is None else exact_answer(card),
-            {Path(path).stem: Path(path).read_bytes() for path in images},
+            images=files(folders, ".png"),
+            vectors=files(folders, ".svg"),
+            overview=overview,
+            record=read_field(source.fields[run]),
         )
-        study = now.settings(PageSettings).study
-        page = study_page(
-            study,
-            results,
-            command=now.params.command,
-            versions={"siq": siq.__version__} | installed(PACKAGES),
-        )
-        with whole_file(now.output.html) as partial:
-            partial.write_text(render_report(page), encoding="utf-8")
+        programs = PACKAGES if study.training is None else (*PACKAGES, *OF_NETWORKS)
+        versions = {"siq": siq.__version__} | {name: version(name) for name in programs}
+        page = study_page(study, results, command=now.params.command, versions=versions)
         answer = answer_of(
             page.title,
-            " ".join(page.answer[:1]),
+            page.answer[0],
             rrmse=tables["rrmse"],
             outcomes=tables["outcomes"],
             formulas=len(models.with_any_formula(Method.REFINED)),
             runs=study.runs,
         )
+        gathered = Path(now.output.figures)
+        gathered.mkdir(parents=True, exist_ok=True)
+        for suffix in (".png", ".svg"):
+            for name, content in files(folders, suffix).items():
+                (gathered / f"{name}{suffix}").write_bytes(content)
+        with whole_file(now.output.html) as partial:
+            partial.write_text(render_report(page), encoding="utf-8")
         write_answer(now.output.answer, answer)

@@ -12,7 +12,7 @@ import yaml
 
 from siq.files.whole import whole_file
 from siq.numerics.number_text import number_text
-from siq.report.page import ReportContent, ReportFigure, ReportTable, render_report
+from siq.report.page import ReportContent, ReportFigure, ReportSection, ReportTable, render_report
 from siq.report.plots.proof import plot_proof
 from siq.report.plots.saving import save_figure
 from siq.study.tables import read_table, write_table
@@ -69,25 +69,32 @@ def main(snakemake: Any) -> None:
         asked.append(
             f"{missing} of the {settings['cases']} cases are missing, since their motion was not bounded."
         )
+    failures = pd.DataFrame({"case": failed["case"], "verdict": failed["verdict"], "reason": failed["note"]})
+    tables = [ReportTable(said, frame, rows_shown=200) for said, frame in lists]
+    if len(failures):
+        tables.append(ReportTable("Cases that the diagnosis could not finish.", failures, rows_shown=200))
     content = ReportContent(
         title=snakemake.params.title,
-        question=asked,
         answer=answer(targets, scores),
-        tables=[
-            ReportTable("Targets and what was measured.", target_table(targets), HELP, rows_shown=100),
-            *(ReportTable(said, frame, rows_shown=200) for said, frame in lists),
+        sections=[
+            ReportSection(
+                "What was asked, and what was measured",
+                asked,
+                tables=[
+                    ReportTable("Targets and what was measured.", target_table(targets), HELP, rows_shown=100)
+                ],
+                figures=[ReportFigure(CAPTION, CAPTION, stem.with_suffix(".png").read_bytes(), "png")],
+            ),
+            ReportSection("Cases that count against it", tables=tables),
+            ReportSection("How to run it again", listing=snakemake.params.command),
+            *(
+                []
+                if settings is None
+                else [
+                    ReportSection("Settings", listing=yaml.safe_dump(settings, sort_keys=False), folded=True)
+                ]
+            ),
         ],
-        figures=[ReportFigure(CAPTION, CAPTION, stem.with_suffix(".png").read_bytes(), "png")],
-        failures=pd.DataFrame(
-            {
-                "run": failed["case"],
-                "step": "diagnosis",
-                "status": failed["verdict"],
-                "reason": failed["note"],
-            }
-        ),
-        commands=[snakemake.params.command],
-        study="" if settings is None else yaml.safe_dump(settings, sort_keys=False),
     )
     with whole_file(snakemake.output.html) as partial:
         partial.write_text(render_report(content), encoding="utf-8")

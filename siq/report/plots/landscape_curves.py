@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
+from siq.numerics.measured_text import unit_text
 from siq.report.plots.style import (
     BLACK,
     BLUE,
@@ -226,11 +227,12 @@ def scaled_label(axis: Axis, symbol: str, unit: str, largest: float) -> str:
         The largest number that occurs.
     """
     power = power_of_ten(largest)
+    plain = unit in ("1", "")
     if not power:
-        return f"{symbol} {unit_label(unit)}"
+        return symbol if plain else f"{symbol} {unit_label(unit)}"
     axis.set_major_formatter(FuncFormatter(_without(power)))
     factor = rf"$10^{{{power}}}$"
-    return f"{symbol} ({factor})" if unit in ("1", "") else f"{symbol} ({factor} {unit})"
+    return f"{symbol} ({factor})" if plain else f"{symbol} ({factor} {unit_text(unit)})"
 
 
 def _without(power: int) -> Callable[[float, object], str]:

@@ -1,0 +1,121 @@
+"""How is a measured value written: with its error, to matching digits, and with its unit?"""
+
+from __future__ import annotations
+
+import math
+import re
+
+from siq.numerics.number_text import MINUS, SMALLEST, SUPERSCRIPTS, number_text
+
+EXACT_DIGITS = 4  # an error below half of the last of so many digits is left out
+SMALLEST_PLAIN, LARGEST_PLAIN = (
+    -3,
+    4,
+)  # decimal exponents between which a number is written without a power of ten
+
+
+def value_text(value: float, error: float = math.nan, *, unit: str = "") -> str:
+    """Write a value with its standard error, both to the digits that the error leaves.
+
+    Parameters
+    ----------
+    value, error
+        The value and its standard error; NaN where it is not known.
+    unit
+        As `unit_text` takes it.
+
+    Returns
+    -------
+    str
+        Such as ``"1.115 ± 0.031 µm"`` or ``"(1.047 ± 0.012) × 10⁻⁸"``. An error that does not reach the
+        fourth digit of the value is not written, and neither is one that is not known.
+
+    Examples
+    --------
+    >>> value_text(1.11512, 0.0312, unit="um")
+    '1.115 ± 0.031 µm'
+    >>> value_text(0.2500001, 1e-9)
+    '0.2500'
+    """
+    if not math.isfinite(value):
+        return number_text(value)
+    if abs(value) < SMALLEST:
+        value = 0.0
+    known = math.isfinite(error) and error > 0
+    largest = max(abs(value), error if known else 0.0)
+    if largest == 0:
+        return _with_unit("0", unit)
+    power = _exponent(largest, 2 if known and error > abs(value) else EXACT_DIGITS)
+    scale = 10.0**power if not SMALLEST_PLAIN <= power <= LARGEST_PLAIN else 1.0
+    value, error = value / scale, error / scale
+    power_left = _exponent(abs(value), EXACT_DIGITS) if value else 0
+    written = known and error >= 0.5 * 10.0 ** (power_left - EXACT_DIGITS + 1)
+    if written or (known and value == 0):
+        decimals = 1 - _exponent(error, 2)
+        value, error, decimals = round(value, decimals), round(error, decimals), max(decimals, 0)
+        text = f"{_plain(value, decimals)} ± {error:.{decimals}f}"
+    else:
+        text = _plain(value, max(EXACT_DIGITS - 1 - power_left, 0))
+    if scale != 1.0:
+        text = f"({text})" if "±" in text else text
+        text += f" × 10{str(power).translate(SUPERSCRIPTS)}"
+    elif unit and "±" in text and unit_text(unit).startswith("("):
+        text = f"({text})"
+    return _with_unit(text, unit)
+
+
+def _plain(value: float, decimals: int) -> str:
+    text = f"{abs(value):.{decimals}f}"
+    return (MINUS if value < 0 and float(text) != 0 else "") + text
+
+
+def _exponent(magnitude: float, digits: int) -> int:
+    """The decimal exponent once the number is rounded to so many digits: 9.99 is 10."""
+    return int(f"{magnitude:.{digits - 1}e}".split("e")[1])
+
+
+def _with_unit(text: str, unit: str) -> str:
+    shown = unit_text(unit)
+    return f"{text}\u00a0{shown}" if shown else text
+
+
+def range_text(low: float, high: float, *, unit: str = "") -> str:
+    """Write a range by its ends, to two digits: what stands for ``±`` where the error is as large as the value.
+
+    Examples
+    --------
+    >>> range_text(3.14, 33.3, unit="s")
+    '3.1 to 33 s'
+    """
+    return _with_unit(f"{_two_digits(low)} to {_two_digits(high)}", unit)
+
+
+def _two_digits(value: float) -> str:
+    power = _exponent(abs(value), 2) if value else 0
+    if SMALLEST_PLAIN <= power <= LARGEST_PLAIN:
+        return _plain(round(value, 1 - power), max(1 - power, 0))
+    return f"{_plain(value / 10.0**power, 1)} × 10{str(power).translate(SUPERSCRIPTS)}"
+
+
+def unit_text(unit: str | None) -> str:
+    """A unit as it is printed: ``um^2/s`` as µm²/s; nothing for ``1``.
+
+    Examples
+    --------
+    >>> unit_text("um**2/s")
+    'µm²/s'
+    """
+    text = "" if unit is None else unit.strip()
+    if text in ("1", "-", ""):
+        return ""
+    text = re.sub(r"(?<![A-Za-z])u(?=(m|s|g|N|V|A|W|K|L|l|J|Pa|Hz|M|mol|rad)(?![A-Za-z]))", "µ", text)
+    text = re.sub(r"(?:\*\*|\^)\s*\(?(-?\d+)\)?", lambda found: found[1].translate(SUPERSCRIPTS), text)
+    return text.replace("*", "·")
+
+
+def squared(unit: str) -> str:
+    """The square of a unit: ``um`` gives ``um^2``, ``m/s`` gives ``(m/s)^2``."""
+    unit = unit.strip()
+    if unit in ("1", "-", ""):
+        return ""
+    return f"{unit}^2" if re.fullmatch(r"[^\W\d_]+|[%°]", unit) else f"({unit})^2"

@@ -1,0 +1,372 @@
+"""The answer in one sentence: how many stable states, where, how deep, how long each lasts.
+
+What is said here is said by the page of a study and by `siq.Landscape.report` alike: both hand in a landscape
+as plain data, see `siq.landscape.storage.landscape_data`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from siq.landscape.dwell_times import FEWEST, Exit, MeanTime, NoiseStrength, dwell_time
+from siq.numerics.measured_text import range_text, squared, unit_text, value_text
+
+COUNTS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine")
+LISTED = 3  # stable states that one sentence can list
+LONGEST_PLACE = 4  # states of which a sentence writes out a position
+LARGE = 0.5  # relative error from which a range says more than ±
+
+
+@dataclass(frozen=True)
+class SaidWell:
+    """A stable state as it is told.
+
+    Attributes
+    ----------
+    name
+        A, B, and so on, in the order of the attractors.
+    position, position_errors
+        Of the attractor, with standard errors, NaN where not known.
+    basin
+        Share of the recorded states that lead there.
+    depth, depth_error
+        The lowest barrier of U out of it, NaN where none is known.
+    beyond
+        The name of the well behind that barrier, None where it leads out of the recorded region.
+    known_up_to
+        U up to which the formula holds, NaN where there is none.
+    time
+        How long the well lasts, None where not known.
+    """
+
+    name: str
+    position: np.ndarray
+    position_errors: np.ndarray
+    basin: float
+    depth: float
+    depth_error: float
+    beyond: str | None
+    known_up_to: float
+    time: MeanTime | None
+
+
+@dataclass(frozen=True)
+class SaidLandscape:
+    """A landscape as it is told, from plain data."""
+
+    data: Mapping[str, Any]
+
+    @property
+    def states(self) -> list[str]:
+        """Names of the states."""
+        return list(self.data["states"])
+
+    @property
+    def units(self) -> list[str]:
+        """Of each state, ``1`` where nobody said."""
+        return list(self.data.get("units") or ["1"] * len(self.states))
+
+    @property
+    def time_unit(self) -> str:
+        """Of the recordings, ``1`` where nobody said."""
+        return str(self.data.get("time_unit") or "1")
+
+    @property
+    def energy_unit(self) -> str:
+        """Unit of U and of ε.
+
+        D is read as a matrix of ratios, so that U is in the states' unit squared per time. States of different
+        units leave this to D, which then carries the units: U is a number.
+        """
+        if len(set(self.units)) > 1:
+            return ""
+        length, time = squared(self.units[0]), "" if self.time_unit == "1" else self.time_unit
+        return f"{length or '1'}/{time}" if time else length
+
+    @property
+    def noise(self) -> NoiseStrength | None:
+        """That drives the system, None where nobody knows it."""
+        noise = self.data.get("noise")
+        return None if noise is None else NoiseStrength(**noise)
+
+    @cached_property
+    def wells(self) -> list[SaidWell]:
+        """Every stable state."""
+        return [self._well(index, one) for index, one in enumerate(self.data["wells"])]
+
+    def exits(self, well: int) -> list[Exit]:
+        """What the times out of a well follow from; of a barrier that nobody knows, NaN."""
+        return [
+            Exit(_float(way["barrier"]), _float(way.get("error", way["standard_error"])), way["prefactor"])
+            for way in self.data["transitions"]
+            if way["start"] == well
+        ]
+
+    def dwell_time(self, well: int, noise: NoiseStrength | None) -> MeanTime | None:
+        """How long a well lasts under some noise."""
+        return dwell_time(self.exits(well), noise)
+
+    def _well(self, index: int, one: Mapping[str, Any]) -> SaidWell:
+        ways = [
+            way for way in self.data["transitions"] if way["start"] == index and way["barrier"] is not None
+        ]
+        lowest = min(ways, key=lambda way: way["barrier"], default=None)
+        place = np.array(one["attractor"], dtype=float)
+        errors = one.get("standard_errors")
+        formula = one.get("V")
+        return SaidWell(
+            well_name(index),
+            place,
+            np.full(len(place), np.nan) if errors is None else np.array([_float(each) for each in errors]),
+            float(one["basin"]),
+            math.nan if lowest is None else lowest["barrier"],
+            math.nan if lowest is None else _float(lowest.get("error", lowest["standard_error"])),
+            None if lowest is None or lowest["end"] is None else well_name(lowest["end"]),
+            math.nan if formula is None else 2 * float(formula.get("depth") or formula["level"]),
+            self.dwell_time(index, self.noise),
+        )
+
+    def relative_depth(self, well: SaidWell) -> tuple[float, float]:
+        """ΔU/ε with its standard error, NaN where no noise is known."""
+        if self.noise is None or not math.isfinite(well.depth):
+            return math.nan, math.nan
+        ratio = well.depth / self.noise.intensity
+        parts = (well.depth_error / well.depth, self.noise.standard_error / self.noise.intensity)
+        return ratio, abs(ratio) * float(np.sqrt(np.nansum(np.square(parts))))
+
+
+def _float(value: float | None) -> float:
+    return math.nan if value is None else float(value)
+
+
+def well_name(index: int) -> str:
+    """A, B, … Z, A1, B1, … by the place of the attractor.
+
+    Examples
+    --------
+    >>> [well_name(index) for index in (0, 1, 26)]
+    ['A', 'B', 'A1']
+    """
+    letter, round_ = chr(ord("A") + index % 26), index // 26
+    return letter + (str(round_) if round_ else "")
+
+
+def headline(data: Mapping[str, Any] | None, *, missing: str = "") -> str:
+    """The answer in one sentence.
+
+    Parameters
+    ----------
+    data
+        The landscape as plain data, None where there is none.
+    missing
+        Why there is none, in words.
+    """
+    if data is None or not data["wells"]:
+        notes = [] if data is None else list(data["notes"])
+        reason = missing or (notes[0] if notes else "")
+        return "No stable state was found in the recorded region" + (f": {reason}." if reason else ".")
+    said = SaidLandscape(data)
+    wells = said.wells
+    count = COUNTS[len(wells)] if len(wells) < len(COUNTS) else str(len(wells))
+    opening = f"The recordings show {count} stable state{'s' if len(wells) > 1 else ''}"
+    if len(wells) == 1:
+        return _alone(said, wells[0], opening)
+    if len(wells) > LISTED:
+        return _many(said, opening)
+    facts = [_facts(said, well) for well in wells]
+    if len(set(facts)) == 1 and facts[0]:
+        places = _listed([f"{well.name} at {place_text(said, well)}" for well in wells])
+        return f"{opening}, {places}; each {facts[0]}."
+    told = [
+        f"{well.name} at {place_text(said, well)} {fact or 'has no barrier that could be found'}"
+        for well, fact in zip(wells, facts, strict=True)
+    ]
+    return f"{opening}: {_listed(told, last='; and ', between='; ')}."
+
+
+def _alone(said: SaidLandscape, well: SaidWell, opening: str) -> str:
+    fact = _facts(said, well)
+    if fact:
+        return f"{opening}, at {place_text(said, well)}: it {fact}."
+    text = f"{opening}, at {place_text(said, well)}, and no way out of it within the recorded region"
+    if math.isfinite(well.known_up_to):
+        text += f"; U is known up to {value_text(well.known_up_to, unit=said.energy_unit)} above it"
+    return f"{text}."
+
+
+def _many(said: SaidLandscape, opening: str) -> str:
+    known = [well for well in said.wells if math.isfinite(well.depth)]
+    if not known:
+        return f"{opening}, and no barrier between them could be found."
+    deepest, shallowest = (pick(known, key=lambda well: well.depth) for pick in (max, min))
+    text = f"{opening}: the deepest, {deepest.name} at {place_text(said, deepest)}, {_facts(said, deepest)}"
+    return f"{text}; the shallowest, {shallowest.name}, {_facts(said, shallowest)}."
+
+
+def _listed(parts: Sequence[str], *, last: str = " and ", between: str = ", ") -> str:
+    return parts[0] if len(parts) == 1 else between.join(parts[:-1]) + last + parts[-1]
+
+
+def _facts(said: SaidLandscape, well: SaidWell) -> str:
+    """How deep a well is, and how long it lasts: ``is 0.25 µm²/s deep and lasts 33 ± 4 s``."""
+    if not math.isfinite(well.depth):
+        return ""
+    ratio, error = said.relative_depth(well)
+    text = f"is {value_text(well.depth, well.depth_error, unit=said.energy_unit)} deep"
+    if math.isfinite(ratio):
+        text += f" ({value_text(ratio, error)} times the noise strength)"
+    if well.time is not None:
+        text += f" and lasts {time_text(well.time, said.time_unit)}"
+    elif said.noise is not None and ratio <= 1:
+        text += ", too shallow to hold the state against this noise"
+    return text
+
+
+def time_text(mean: MeanTime, unit: str, *, decorated: bool = True) -> str:
+    """A mean time with its error; a range where the error is as large as the time.
+
+    Parameters
+    ----------
+    mean
+        The time.
+    unit
+        Of the time, ``1`` where nobody said.
+    decorated
+        Whether to name a unit that nobody said, and to say of which kind the figure is.
+    """
+    named = unit if unit_text(unit) or not decorated else "time units"
+    if mean.error > LARGE:
+        text = range_text(*mean.limits, unit=named)
+    else:
+        text = value_text(mean.value, mean.value * mean.error, unit=named)
+    return text if mean.complete else f"at most {text}"
+
+
+def place_text(said: SaidLandscape, well: SaidWell) -> str:
+    """Where a well is: ``x = −0.996 ± 0.005 nm``, ``(x, y) = (−0.50, 0.00) µm``."""
+    names, units = said.states, said.units
+    if len(names) > LONGEST_PLACE:
+        return "the place that the table gives"
+    if len(names) == 1:
+        return f"{names[0]} = {value_text(well.position[0], well.position_errors[0], unit=units[0])}"
+    size = float(np.abs([one.position for one in said.wells]).max())
+    values = [
+        _rounded(value, error, size=size)
+        for value, error in zip(well.position, well.position_errors, strict=True)
+    ]
+    if len(set(units)) == 1:
+        unit = unit_text(units[0])
+        return f"({', '.join(names)}) = ({', '.join(values)})" + (f"\u00a0{unit}" if unit else "")
+    pairs = zip(names, values, units, strict=True)
+    return ", ".join(f"{name} = {value}\u00a0{unit_text(unit)}".rstrip() for name, value, unit in pairs)
+
+
+def _rounded(value: float, error: float, *, size: float) -> str:
+    """A value to the digits that its error leaves, without the error."""
+    if not math.isfinite(error) or error < 1e-4 * size:
+        error = 1e-3 * size if size else 1.0
+    decimals = max(0, -math.floor(math.log10(error))) if error > 0 else 3
+    if decimals > 6 or size >= 1e5:
+        return value_text(value)
+    text = f"{abs(value):.{decimals}f}"
+    return ("−" if value < 0 and float(text) else "") + text
+
+
+def remarks(data: Mapping[str, Any] | None) -> list[str]:
+    """What has to be known of the sentence: what the times mean, or what would make times of the depths."""
+    if data is None or not data["wells"]:
+        return []
+    said = SaidLandscape(data)
+    deep = [well for well in said.wells if math.isfinite(well.depth)]
+    if not deep:
+        return []
+    noise = said.noise
+    if noise is None:
+        return [
+            "How long a stable state lasts depends on the noise, and these recordings show none. Give its"
+            " strength ε, in the unit of U, as “landscape: {noise_intensities: [ε]}” in the study, and the times"
+            " follow."
+        ]
+    lines = []
+    if any(well.time is not None for well in deep):
+        strength = value_text(noise.intensity, noise.standard_error, unit=said.energy_unit)
+        whence = "as the recordings show it" if noise.source == "estimated" else "as given"
+        lines.append(
+            "A time is the mean until the state has reached the next well, at the noise strength"
+            f" ε = {strength}, {whence}. Its error covers f, the noise and the law itself, which is good to about"
+            " ε/ΔU."
+        )
+    low = [well.name for well in deep if said.relative_depth(well)[0] < FEWEST]
+    if low:
+        lines.append(
+            f"The law of escape holds for barriers far above the noise. Here {_listed(low)}"
+            f" {'is' if len(low) == 1 else 'are'} less than {FEWEST:.0f} times the noise strength deep: take the"
+            " times as orders of magnitude."
+        )
+    without = [well.name for well in deep if well.time is None and said.relative_depth(well)[0] > 1]
+    if without:
+        notes = [note for way in data["transitions"] for note in way["notes"] if "no escape time" in note]
+        lines.append(
+            f"No time can be given for {_listed(without)}"
+            + (f": {notes[0].split(': ', 1)[-1]}." if notes else ".")
+        )
+    return lines
+
+
+def wells_table(data: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """The wells for a reader, a column for each, and the same as numbers, a row for each."""
+    said = SaidLandscape(data)
+    rows: dict[str, list[str]] = {}
+    numbers = []
+    for well in said.wells:
+        ratio, ratio_error = said.relative_depth(well)
+        mean = well.time
+        numbers.append(
+            {"well": well.name}
+            | dict(zip(said.states, well.position.tolist(), strict=True))
+            | {
+                f"{name}_error": error
+                for name, error in zip(said.states, well.position_errors.tolist(), strict=True)
+            }
+            | {
+                "depth": well.depth, "depth_error": well.depth_error, "depth_over_noise": ratio,
+                "depth_over_noise_error": ratio_error,
+                "mean_time": math.nan if mean is None else mean.value,
+                "mean_time_relative_error": math.nan if mean is None else mean.error,
+                "next": well.beyond or "", "share_of_recorded_states": well.basin,
+            }
+        )  # fmt: skip
+        for name, unit, value, error in zip(
+            said.states, said.units, well.position, well.position_errors, strict=True
+        ):
+            rows.setdefault(_headed(name, unit), []).append(value_text(value, error))
+        deep = math.isfinite(well.depth)
+        rows.setdefault(_headed("depth ΔU", said.energy_unit), []).append(
+            value_text(well.depth, well.depth_error) if deep else ""
+        )
+        rows.setdefault("ΔU/ε", []).append(value_text(ratio, ratio_error) if math.isfinite(ratio) else "")
+        rows.setdefault(_headed("lasts", said.time_unit), []).append(
+            "" if mean is None else time_text(mean, "1", decorated=False)
+        )
+        rows.setdefault("next well", []).append(well.beyond or "")
+        rows.setdefault("recorded states that lead there", []).append(f"{100 * well.basin:.0f} %")
+    kept = {name: cells for name, cells in rows.items() if any(cells)}
+    if len(said.wells) == 1:
+        kept.pop("recorded states that lead there", None)
+    names = [f"{well.name}" for well in said.wells]
+    table = pd.DataFrame([[name, *cells] for name, cells in kept.items()], columns=["stable state", *names])
+    if len(names) > LISTED + 1:  # as many columns would be too wide: a row for each
+        table = pd.DataFrame({"stable state": names} | kept)
+    return table, pd.DataFrame(numbers).dropna(axis=1, how="all")
+
+
+def _headed(name: str, unit: str) -> str:
+    shown = unit_text(unit)
+    return f"{name} ({shown})" if shown else name

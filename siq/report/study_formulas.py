@@ -1,0 +1,161 @@
+"""Which formulas does the page show, and how much of a long one?"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+import sympy
+from markupsafe import Markup
+
+from siq.numerics.measured_text import unit_text, value_text
+from siq.potential.symbolic import SymbolicDecomposition
+from siq.potential.well import Well
+from siq.report.formatting import formula_mathml, term_text, vector_mathml
+from siq.report.landscape_answer import well_name
+from siq.report.page import FormulaRow
+
+SMALL = 1e-3  # of the depth: a term that contributes less everywhere is left to the whole formula
+SHORT = 8  # terms that are read at a glance: so short a formula is shown as it is
+
+
+def formula_rows(
+    found: SymbolicDecomposition, exact: SymbolicDecomposition | None, *, places: Sequence[np.ndarray] = ()
+) -> list[FormulaRow]:
+    """U, g and f of one method; U about each well where no single formula holds.
+
+    Parameters
+    ----------
+    found
+        The formulas.
+    exact
+        The exact ones, where they are known.
+    places
+        The attractors in the order of their letters; by default that of the wells.
+    """
+    truths: Mapping[str, Markup] = {} if exact is None else _typeset(exact)
+    rows = [
+        FormulaRow(name, formula, NOTES.get(name, ""), truths.get(name))
+        for name, formula in _typeset(found).items()
+    ]
+    wells = [] if found.potential is not None else [_well_row(well, places) for well in found.wells]
+    return [*wells, *rows]
+
+
+NOTES = {
+    "U": "The quasipotential, zero at its lowest point. exp(−U/ε) is the density of states, to leading order.",
+    "g": "The circulatory part: it moves the state without changing U.",
+    "f": "The vector field dx/dt without noise, as identified.",
+}
+
+
+def _typeset(one: SymbolicDecomposition) -> dict[str, Markup]:
+    formulas = {}
+    if one.potential is not None:
+        formulas = {"U": formula_mathml(one.quasipotential), "g": vector_mathml(one.circulatory)}
+    return formulas | {"f": vector_mathml(one.vector_field)}
+
+
+def _well_row(well: Well, places: Sequence[np.ndarray]) -> FormulaRow:
+    """U about one attractor in offsets from it: the terms that count, and the whole formula."""
+    name = _letter(well, places)
+    kept, left_out = _counting(well)
+    offsets = ", ".join(
+        f"Δ{symbol} = {symbol}" + ("" if abs(value) < 1e-12 * size else _offset(value))
+        for symbol, value, size in zip(
+            well.basis.symbols, well.basis.center, np.maximum(well.basis.scale, 1e-300), strict=True
+        )
+    )
+    note = f"Holds up to U = {value_text(2 * well.level)} above {name}; {offsets}."
+    if left_out:
+        terms = "one term is" if left_out == 1 else f"{left_out} terms are"
+        note += f" Here {terms} left out that nowhere add more than {SMALL:.1%} of the depth.".replace(
+            ".0%", "%"
+        )
+    return FormulaRow(
+        f"U about {name}",
+        formula_mathml(_in_offsets(well, kept)),
+        note,
+        whole=formula_mathml(_in_offsets(well, np.ones(len(kept), dtype=bool))) if left_out else None,
+    )
+
+
+def _offset(value: float) -> str:
+    return f" {'−' if value > 0 else '+'} {value_text(abs(value))}"
+
+
+def _letter(well: Well, places: Sequence[np.ndarray]) -> str:
+    if not len(places):
+        return "(" + ", ".join(value_text(value) for value in well.attractor) + ")"
+    away = [float(np.abs((np.asarray(place) - well.attractor) / well.basis.scale).max()) for place in places]
+    return well_name(int(np.argmin(away)))
+
+
+def _counting(well: Well) -> tuple[np.ndarray, int]:
+    """Which terms contribute more than a small share of the depth somewhere, and how many do not."""
+    size = np.abs(well.coefficients)
+    if len(well.points):
+        size = size * np.abs(well.basis.values(well.points)).max(axis=0)
+    kept = size > SMALL * well.level
+    if kept.sum() == 0 or len(kept) <= SHORT:
+        kept = well.coefficients != 0
+    return kept, int(((well.coefficients != 0) & ~kept).sum())
+
+
+def _in_offsets(well: Well, kept: np.ndarray) -> sympy.Expr:
+    basis = well.basis
+    offsets = [sympy.Symbol(f"Δ{symbol}", real=True) for symbol in basis.symbols]
+    terms = []
+    for exponents, coefficient in zip(basis.exponents[kept], well.coefficients[kept], strict=True):
+        value = 2 * float(coefficient) / float(np.prod(basis.scale**exponents))
+        powers = [offset ** int(n) for offset, n in zip(offsets, exponents, strict=True) if n]
+        if value:
+            terms.append(sympy.Mul(sympy.Float(value), *powers))
+    return sympy.Add(*terms)
+
+
+def coefficient_table(
+    coefficients: pd.DataFrame, *, units: Mapping[str, str], components: str
+) -> pd.DataFrame | None:
+    """Coefficients with their standard errors, for a reader; None where there are none.
+
+    Parameters
+    ----------
+    coefficients
+        Of one run and one method.
+    units
+        Of the states and of the time.
+    components
+        Which components, as a regular expression.
+    """
+    chosen = coefficients[coefficients["component"].str.match(components) & (coefficients["estimate"] != 0)]
+    if chosen.empty:
+        return None
+    return pd.DataFrame(
+        {
+            "in": [component_text(str(name), units) for name in chosen["component"]],
+            "term": [term_text(str(name)) for name in chosen["term"]],
+            "coefficient": [
+                value_text(value, error)
+                for value, error in zip(chosen["estimate"], chosen["standard_error"], strict=True)
+            ],
+            "exact": chosen["exact"].to_numpy(),
+        }
+    )
+
+
+def component_text(component: str, units: Mapping[str, str]) -> str:
+    """``f_x`` as ``dx/dt``, ``g_x`` as it stands."""
+    kind, _, state = component.partition("_")
+    if kind != "f":
+        return f"{kind}, {state}" if state else kind
+    unit = _rate(units.get(state, ""), units.get("t", ""))
+    return f"d{state}/dt" + (f" ({unit})" if unit else "")
+
+
+def _rate(state: str, time: str) -> str:
+    state, time = unit_text(state), unit_text(time)
+    if not time:
+        return state
+    return f"{state or '1'}/{time}"
