@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 CORES ?= 2
 
-.PHONY: statistics examples test full untuned noise wheel docs lint format environment clean
+.PHONY: statistics examples test full untuned noise wheel docs docs-full lint format environment clean
 
 statistics: environment
 	$(BIN)/snakemake --cores $(CORES) statistics
@@ -35,6 +35,14 @@ wheel: environment
 docs: environment
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet -b html docs docs/_build/html
 
+# Runs the examples and notebooks of the documentation, draws its pictures, reads its figures from results, and builds it.
+docs-full: environment
+	$(BIN)/python docs/make/gallery.py
+	$(BIN)/python docs/make/notebooks.py
+	$(BIN)/python docs/make/concepts.py
+	$(BIN)/python docs/make/figures.py
+	$(MAKE) docs
+
 lint: environment
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -58,4 +66,4 @@ $(VENV)/installed: pyproject.toml requirements/pinned.txt
 	touch $@
 
 clean:
-	rm -rf $(VENV) .snakemake .mypy_cache .ruff_cache .pytest_cache build dist docs/_build docs/reference
+	rm -rf $(VENV) .snakemake .mypy_cache .ruff_cache .pytest_cache build dist docs/_build docs/api
