@@ -35,7 +35,7 @@ wheel: environment
 docs: environment
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet -b html docs docs/_build/html
 
-# Runs the examples and notebooks of the documentation, draws its pictures, reads its figures from results, and builds it.
+# The documentation from its beginnings: examples, notebooks and pictures are made anew, figures read from results.
 docs-full: environment
 	$(BIN)/python docs/make/gallery.py
 	$(BIN)/python docs/make/notebooks.py

@@ -62,8 +62,7 @@ def type_in_words(hint: Any) -> str:
     """A type as a person would write it: `list of numbers > 0`."""
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is typing.Annotated:
-        limits = [one for part in arguments[1:] for one in getattr(part, "metadata", [part])]
-        return (type_in_words(arguments[0]) + limits_in_words(limits)).strip()
+        return (type_in_words(arguments[0]) + limits_in_words(_limits(arguments[1:]))).strip()
     if origin is Literal:
         return " or ".join(f"`{one}`" for one in arguments)
     if origin in (Union, types.UnionType):
@@ -77,6 +76,10 @@ def type_in_words(hint: Any) -> str:
     if isinstance(hint, type) and (issubclass(hint, BaseModel) or dataclasses.is_dataclass(hint)):
         return "mapping"
     return WORDS.get(hint, "text")
+
+
+def _limits(metadata: Any) -> list[Any]:
+    return [one for part in metadata for one in getattr(part, "metadata", [part])]
 
 
 def limits_in_words(limits: Any) -> str:
@@ -105,14 +108,13 @@ def default_in_words(field: FieldInfo) -> str:
 def rows(schema: type, prefix: str = "") -> list[tuple[str, str, str, str]]:
     """Key, type, default, meaning of every key of a schema."""
     said, result = meanings(schema), []
-    hints = typing.get_type_hints(schema, include_extras=True)
     for key, field in fields(schema).items():
         meaning = said.get(key, "")
         if not meaning:
             LOG.warning(
                 "%s.%s has no meaning: say it under Attributes in the docstring", schema.__name__, key
             )
-        words = type_in_words(hints[key])
+        words = (type_in_words(field.annotation) + limits_in_words(_limits(field.metadata))).strip()
         result.append((f"`{prefix}{key}`", words, default_in_words(field), markdown(meaning)))
     return result
 

@@ -278,12 +278,33 @@ def of_reproduced(method):
     return lambda wildcards: [getattr(STUDIES[name], method)() for name in REPRODUCED]
 
 
+# Parts of `snakemake --report`, in the order of the page; Snakemake sorts them by their names.
+ANSWER, FORMULAS, EVIDENCE, WORKINGS = "1 The answer", "2 Formulas", "3 Evidence", "4 The workings"
+REPORTED = {
+    "landscape": (ANSWER, "Landscape U with wells, saddles and paths"),
+    "escape": (ANSWER, "Dwell times against simulation"),
+    "components": (FORMULAS, "Downhill and circulating part"),
+    "coefficients": (FORMULAS, "Coefficients over the runs"),
+    "inclusion": (FORMULAS, "How often each term was found"),
+    "error": (EVIDENCE, "Error of the coefficients"),
+    "landscape_errors": (EVIDENCE, "U against independent methods"),
+    "prediction": (EVIDENCE, "Prediction of unseen recordings"),
+    "invariant": (EVIDENCE, "Probability density against simulation"),
+    "degrees": (WORKINGS, "Accuracy against number of terms"),
+    "dataset": (WORKINGS, "Recordings"),
+    "training": (WORKINGS, "Training of the networks"),
+    "landscape_published": (WORKINGS, "What was published"),
+}
+
+
 def figure_output(name):
+    part, label = REPORTED.get(name, (WORKINGS, name.replace("_", " ")))
     return report(
         f"results/{{study}}/figures/{name}.svg",
         caption=f"../report/{(CAPTIONS | LANDSCAPE_FIGURES)[name]}",
         category="{study}",
-        subcategory="figures",
+        subcategory=part,
+        labels={"shows": label, "kind": "figure"},
     )
 
 

@@ -177,7 +177,8 @@ rule mismatch_page:
         html=report(
             "results/mismatch/{case}/report.html",
             caption="../report/mismatch.rst",
-            category="mismatch",
+            category="What a simulation lacks",
+            labels={"shows": "{case}", "kind": "page"},
         ),
     log:
         "results/mismatch/{case}/logs/mismatch_page.log",

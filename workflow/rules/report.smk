@@ -62,6 +62,8 @@ rule page:
             "results/{study}/report.html",
             caption="../report/report.rst",
             category="{study}",
+            subcategory=ANSWER,
+            labels={"shows": "The page: everything in one file", "kind": "page"},
         ),
     log:
         "results/{study}/logs/page.log",
