@@ -1,4 +1,4 @@
-"""The documents name what there is: paths, names, keys; and say what was measured, and what was really run."""
+"""The documents name what there is, quote what was measured, and show what was really run."""
 
 from __future__ import annotations
 
@@ -46,7 +46,11 @@ def name_of(page: Path) -> str:
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_paths_of_the_sources_exist(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
-    named = set(re.findall(r"\b(?:siq|tests|workflow|benchmarks|config|docs)/[\w/.-]*\.(?:py|yaml|smk|md|rst)\b", text))
+    named = set(
+        re.findall(
+            r"\b(?:siq|tests|workflow|benchmarks|config|docs)/[\w/.-]*\.(?:py|yaml|smk|md|rst)\b", text
+        )
+    )
     assert not {path for path in named if "NAME" not in path and not (ROOT / path).exists()}
 
 
@@ -69,7 +73,9 @@ def test_measured_figures_are_those_of_the_tables(page: Path) -> None:
     assert not named - set(known)
     if page.name != "results.md":  # which has the tables that others quote from
         unmarked = MARK.sub("", text)
-        long = {value for value in known.values() if len(value) > 6} - {"50 of 50"}  # which the paper has, too
+        long = {value for value in known.values() if len(value) > 6} - {
+            "50 of 50"
+        }  # which the paper has, too
         typed = {value for value in long if re.search(rf"(?<!\d){re.escape(value)}", unmarked)}
         assert not typed, f"quote these from docs/figures.json: {typed}"
 
@@ -82,18 +88,25 @@ def test_figures_are_read_from_tables(tmp_path: Path) -> None:
     tables.mkdir()
     kinds = ["null", "null", "mechanism", "mechanism", "mechanism"]
     pd.DataFrame(
-        {"kind": kinds, "false_alarm": [True, False, False, False, False],
-         "oracle_delta_chi2": [0.0, 0.0, 500.0, 500.0, 5.0], "truth_in_class": [False, False, True, False, False]}
+        {"kind": kinds, "false_alarm": [True, *4 * [False]],
+         "oracle_delta_chi2": [0.0, 0.0, 500.0, 500.0, 5.0],
+         "truth_in_class": [False, False, True, False, False]}
     ).to_parquet(tables / "score.parquet")  # fmt: skip
     assert figures.proof(tables) == {
         "cases": "5", "quiet": "2", "false_alarms": "1", "knowable": "2", "named": "1"
     }  # fmt: skip
     scores = pd.DataFrame(
-        {"run": [0, 0], "method": ["regression", "refined"], "rrmse": [0.1, 3.25e-11], "certified": [False, True],
-         "support_correct": pd.array([False, True], dtype="boolean"), "network_error": [0.2, 0.2]}
+        {"run": [0, 0], "method": ["regression", "refined"], "rrmse": [0.1, 3.25e-11],
+         "certified": [False, True], "support_correct": pd.array([False, True], dtype="boolean"),
+         "network_error": [0.2, 0.2]}
     )  # fmt: skip
     scores.to_parquet(tables / "rrmse.parquet")
-    errors = {"run": [0, 0], "method": ["regression", "refined"], "trajectory": [0, 0], "error": [0.05, 4e-11]}
+    errors = {
+        "run": [0, 0],
+        "method": ["regression", "refined"],
+        "trajectory": [0, 0],
+        "error": [0.05, 4e-11],
+    }
     pd.DataFrame(errors).to_parquet(tables / "prediction.parquet")
     terms = {"method": ["refined"], "component": ["U"], "estimate": [1.0], "exact": [1.0 + 1e-10]}
     pd.DataFrame(terms).to_parquet(tables / "coefficients.parquet")
@@ -138,7 +151,9 @@ def test_notebooks_belong_to_their_text_and_ran_through(script: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", [*EXAMPLES, *NOTEBOOKS, *sorted((DOCS / "how-to").glob("*.md")), DOCS / "start-here.md"], ids=name_of
+    "text",
+    [*EXAMPLES, *NOTEBOOKS, *sorted((DOCS / "how-to").glob("*.md")), DOCS / "start-here.md"],
+    ids=name_of,
 )
 def test_names_of_the_library_exist(text: Path) -> None:
     blocks = [text.read_text(encoding="utf-8")]
@@ -180,11 +195,22 @@ def nested(schema: Any) -> set[str]:
 
 @pytest.mark.parametrize(
     "schema",
-    [Study, RecordingsOptions, TrainingOptions, SystemCard, MismatchStudy, Mechanism, Form, MechanismParameter],
+    [
+        Study,
+        RecordingsOptions,
+        TrainingOptions,
+        SystemCard,
+        MismatchStudy,
+        Mechanism,
+        Form,
+        MechanismParameter,
+    ],
 )
 def test_the_reference_has_every_class_of_keys(schema: Any) -> None:
     shown = {name for _, name in SCHEMAS}
-    asked = {name for name in nested(schema) if name.endswith(("Options", "Entry", "Mechanism", "Form", "Shape"))}
+    asked = {
+        name for name in nested(schema) if name.endswith(("Options", "Entry", "Mechanism", "Form", "Shape"))
+    }
     assert asked - {"DiffusionEntry"} <= shown
 
 

@@ -1,8 +1,8 @@
 """Tables of every key of a schema, written from the schema itself when the pages are built.
 
 `{schema} siq.study.study:Study` becomes a table: key, type, default, meaning. Types and limits come from
-the annotations, meanings from the `Attributes` of the class's docstring. A key without a meaning is a warning, and
-`make docs` makes that an error: whoever adds a key has to say what it is.
+the annotations, meanings from the `Attributes` of the docstring. A key without a meaning is a warning,
+and `make docs` makes that an error: whoever adds a key has to say what it is.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Make the notebooks from their texts and run them: `python docs/make/notebooks.py`.
 
-The text of each is a script in the percent format, which people and git can read; the notebook with its outputs
-is committed beside it, so that the pages are built without running anything.
+The text of each is a script in the percent format, which people and git can read; the notebook with its
+outputs is committed beside it, so that the pages are built without running anything.
 """
 
 from __future__ import annotations
@@ -49,6 +49,9 @@ def make(script: Path) -> None:
         NotebookClient(
             notebook, timeout=300, resources={"metadata": {"path": empty}}, record_timing=False
         ).execute()
+    for output in (one for cell in notebook.cells for one in cell.get("outputs", [])):
+        if "text/html" in (shown := output.get("data", {})):
+            shown["text/plain"] = ""  # the whole object as text, which nobody sees
     nbformat.write(notebook, script.with_suffix(".ipynb"))
 
 

@@ -61,7 +61,7 @@ landscape
 # the stated error says how far V may be off. See [what a certificate means](../concepts/certificate.md).
 
 # %%
-landscape.plot()
+axes = landscape.plot()
 # %% [markdown]
 # ## 4. Barriers and times
 #

@@ -52,8 +52,8 @@ class StateEntry(_CardPart):
     unit
         Compared with the units of recordings; nothing is converted.
     domain
-        The interval ``[lower, upper]``, in this unit: initial states are drawn from it, and scores use it. Only
-        a simulation needs it. Where there are recordings to compare with, they tell it.
+        The interval ``[lower, upper]``, in this unit: initial states are drawn from it, and scores use it.
+        Only a simulation needs it. Where there are recordings to compare with, they tell it.
     """
 
     unit: str = "1"

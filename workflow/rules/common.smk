@@ -279,7 +279,12 @@ def of_reproduced(method):
 
 
 # Parts of `snakemake --report`, in the order of the page; Snakemake sorts them by their names.
-ANSWER, FORMULAS, EVIDENCE, WORKINGS = "1 The answer", "2 Formulas", "3 Evidence", "4 The workings"
+ANSWER, FORMULAS, EVIDENCE, WORKINGS = (
+    "1 The answer",
+    "2 Formulas",
+    "3 Evidence",
+    "4 The workings",
+)
 REPORTED = {
     "landscape": (ANSWER, "Landscape U with wells, saddles and paths"),
     "escape": (ANSWER, "Dwell times against simulation"),
