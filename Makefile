@@ -7,7 +7,8 @@ CORES ?= 2
 # takes that one.
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 
-.PHONY: statistics examples test full untuned noise wheel test-pages newcomer docs lint format environment clean
+.PHONY: statistics examples test full untuned noise wheel test-pages newcomer docs docs-full lint format \
+        environment clean
 
 statistics: environment
 	$(BIN)/snakemake --cores $(CORES) statistics
@@ -47,6 +48,14 @@ newcomer: wheel
 docs: environment
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet -b html docs docs/_build/html
 
+# The documentation from its beginnings: examples, notebooks and pictures are made anew, figures read from results.
+docs-full: environment
+	$(BIN)/python docs/make/gallery.py
+	$(BIN)/python docs/make/notebooks.py
+	$(BIN)/python docs/make/concepts.py
+	$(BIN)/python docs/make/figures.py
+	$(MAKE) docs
+
 lint: environment
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -74,4 +83,4 @@ $(VENV)/installed: pyproject.toml requirements/pinned.txt
 	touch $@
 
 clean:
-	rm -rf $(VENV) .snakemake .mypy_cache .ruff_cache .pytest_cache build dist docs/_build docs/reference
+	rm -rf $(VENV) .snakemake .mypy_cache .ruff_cache .pytest_cache build dist docs/_build docs/api

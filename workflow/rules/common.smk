@@ -15,6 +15,7 @@ from siq.report.settings import (
     ReproductionSettings,
 )
 from siq.report.study_captions import CAPTIONS as STUDY_CAPTIONS
+from siq.report.study_captions import Part, figure_place
 from siq.steps.draw import DrawSettings
 from siq.steps.escapes import EscapesSettings
 from siq.steps.identify import IdentifySettings
@@ -273,12 +274,33 @@ def of_reproduced(method):
     return lambda wildcards: [getattr(STUDIES[name], method)() for name in REPRODUCED]
 
 
+# Parts of `snakemake --report`, in the order of the page; Snakemake sorts them by their names.
+ANSWER, EVIDENCE, LANDSCAPE, RUNS, PUBLISHED, WORKINGS = (
+    "1 The answer",
+    "2 Evidence",
+    "3 The landscape",
+    "4 The runs",
+    "5 The published method",
+    "6 The workings",
+)
+PARTS = {
+    Part.LEAD: ANSWER,
+    Part.EVIDENCE: EVIDENCE,
+    Part.LANDSCAPE: LANDSCAPE,
+    Part.RUNS: RUNS,
+    Part.PUBLISHED: PUBLISHED,
+    Part.WORKINGS: WORKINGS,
+}
+
+
+def figure_part(wildcards):
+    """The part of Snakemake's report in which a figure stands, as on the page."""
+    return PARTS[figure_place(wildcards.name)]
+
+
 def figure_labels(wildcards):
-    """Labels of a figure in Snakemake's report, numbered in the order of the page."""
-    order = list(CAPTIONS)
-    name = wildcards.name
-    number = order.index(name) + 2 if name in order else len(order) + 2
-    return {"order": f"{number:02d}", "what": name.replace("_", " ")}
+    """Labels of a figure in Snakemake's report."""
+    return {"shows": wildcards.name.replace("_", " "), "kind": "figure"}
 
 
 def say_what_has_no_answer():

@@ -173,7 +173,8 @@ rule mismatch_page:
         html=report(
             "results/mismatch/{case}/report.html",
             caption="../report/mismatch.rst",
-            category="mismatch",
+            category="What a simulation lacks",
+            labels={"shows": "{case}", "kind": "page"},
         ),
         answer="results/mismatch/{case}/answer.json",
     log:
