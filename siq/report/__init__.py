@@ -5,6 +5,7 @@
 `landscape_text`     how does a landscape read, as text and in a notebook?
 `diagnosis_report`   and a diagnosis?
 `sentences`          what do all runs say together, in words?
+`said_landscape`     how is a landscape told: letters, units, errors, times?
 `landscape_answer`   what is the answer in one sentence?
 `certificate_text`   what does the certificate promise, in plain words?
 `answer`             and as plain data, for a terminal?
@@ -12,7 +13,8 @@
 `page`               what is a page made from, that needs nothing else?
 `rendering`          how does it become HTML?
 `settings`           what do figures and pages of a study depend on?
-`study_page`         what does the page of a study say?
+`study_page`         what does the page of a study say, in which order?
+`study_sections`     and in each of its parts?
 `study_formulas`     which formulas?
 `study_captions`     what do its figures show, and where do they stand?
 `study_figures`      and which figures has it?

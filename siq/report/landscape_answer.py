@@ -8,154 +8,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from siq.landscape.dwell_times import FEWEST, Exit, MeanTime, NoiseStrength, dwell_time
-from siq.numerics.measured_text import range_text, squared, unit_text, value_text
+from siq.landscape.dwell_times import FEWEST, MeanTime
+from siq.numerics.measured_text import range_text, unit_text, value_text
+from siq.report.said_landscape import SaidLandscape, SaidWell
 
 COUNTS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine")
 LISTED = 3  # stable states that one sentence can list
 LONGEST_PLACE = 4  # states of which a sentence writes out a position
 LARGE = 0.5  # relative error from which a range says more than ±
-
-
-@dataclass(frozen=True)
-class SaidWell:
-    """A stable state as it is told.
-
-    Attributes
-    ----------
-    name
-        A, B, and so on, in the order of the attractors.
-    position, position_errors
-        Of the attractor, with standard errors, NaN where not known.
-    basin
-        Share of the recorded states that lead there.
-    depth, depth_error
-        The lowest barrier of U out of it, NaN where none is known.
-    beyond
-        The name of the well behind that barrier, None where it leads out of the recorded region.
-    known_up_to
-        U up to which the formula holds, NaN where there is none.
-    time
-        How long the well lasts, None where not known.
-    """
-
-    name: str
-    position: np.ndarray
-    position_errors: np.ndarray
-    basin: float
-    depth: float
-    depth_error: float
-    beyond: str | None
-    known_up_to: float
-    time: MeanTime | None
-
-
-@dataclass(frozen=True)
-class SaidLandscape:
-    """A landscape as it is told, from plain data."""
-
-    data: Mapping[str, Any]
-
-    @property
-    def states(self) -> list[str]:
-        """Names of the states."""
-        return list(self.data["states"])
-
-    @property
-    def units(self) -> list[str]:
-        """Of each state, ``1`` where nobody said."""
-        return list(self.data.get("units") or ["1"] * len(self.states))
-
-    @property
-    def time_unit(self) -> str:
-        """Of the recordings, ``1`` where nobody said."""
-        return str(self.data.get("time_unit") or "1")
-
-    @property
-    def energy_unit(self) -> str:
-        """Unit of U and of ε.
-
-        D is read as a matrix of ratios, so that U is in the states' unit squared per time. States of different
-        units leave this to D, which then carries the units: U is a number.
-        """
-        if len(set(self.units)) > 1:
-            return ""
-        length, time = squared(self.units[0]), "" if self.time_unit == "1" else self.time_unit
-        return f"{length or '1'}/{time}" if time else length
-
-    @property
-    def noise(self) -> NoiseStrength | None:
-        """That drives the system, None where nobody knows it."""
-        noise = self.data.get("noise")
-        return None if noise is None else NoiseStrength(**noise)
-
-    @cached_property
-    def wells(self) -> list[SaidWell]:
-        """Every stable state."""
-        return [self._well(index, one) for index, one in enumerate(self.data["wells"])]
-
-    def exits(self, well: int) -> list[Exit]:
-        """What the times out of a well follow from; of a barrier that nobody knows, NaN."""
-        return [
-            Exit(_float(way["barrier"]), _float(way.get("error", way["standard_error"])), way["prefactor"])
-            for way in self.data["transitions"]
-            if way["start"] == well
-        ]
-
-    def dwell_time(self, well: int, noise: NoiseStrength | None) -> MeanTime | None:
-        """How long a well lasts under some noise."""
-        return dwell_time(self.exits(well), noise)
-
-    def _well(self, index: int, one: Mapping[str, Any]) -> SaidWell:
-        ways = [
-            way for way in self.data["transitions"] if way["start"] == index and way["barrier"] is not None
-        ]
-        lowest = min(ways, key=lambda way: way["barrier"], default=None)
-        place = np.array(one["attractor"], dtype=float)
-        errors = one.get("standard_errors")
-        formula = one.get("V")
-        return SaidWell(
-            well_name(index),
-            place,
-            np.full(len(place), np.nan) if errors is None else np.array([_float(each) for each in errors]),
-            float(one["basin"]),
-            math.nan if lowest is None else lowest["barrier"],
-            math.nan if lowest is None else _float(lowest.get("error", lowest["standard_error"])),
-            None if lowest is None or lowest["end"] is None else well_name(lowest["end"]),
-            math.nan if formula is None else 2 * float(formula.get("depth") or formula["level"]),
-            self.dwell_time(index, self.noise),
-        )
-
-    def relative_depth(self, well: SaidWell) -> tuple[float, float]:
-        """ΔU/ε with its standard error, NaN where no noise is known."""
-        if self.noise is None or not math.isfinite(well.depth):
-            return math.nan, math.nan
-        ratio = well.depth / self.noise.intensity
-        parts = (well.depth_error / well.depth, self.noise.standard_error / self.noise.intensity)
-        return ratio, abs(ratio) * float(np.sqrt(np.nansum(np.square(parts))))
-
-
-def _float(value: float | None) -> float:
-    return math.nan if value is None else float(value)
-
-
-def well_name(index: int) -> str:
-    """A, B, … Z, A1, B1, … by the place of the attractor.
-
-    Examples
-    --------
-    >>> [well_name(index) for index in (0, 1, 26)]
-    ['A', 'B', 'A1']
-    """
-    letter, round_ = chr(ord("A") + index % 26), index // 26
-    return letter + (str(round_) if round_ else "")
 
 
 def headline(data: Mapping[str, Any] | None, *, missing: str = "") -> str:
@@ -255,7 +120,9 @@ def place_text(said: SaidLandscape, well: SaidWell) -> str:
     if len(names) > LONGEST_PLACE:
         return "the place that the table gives"
     if len(names) == 1:
-        return f"{names[0]} = {value_text(well.position[0], well.position_errors[0], unit=units[0])}"
+        return (
+            f"{names[0]}\u00a0=\u00a0{value_text(well.position[0], well.position_errors[0], unit=units[0])}"
+        )
     size = float(np.abs([one.position for one in said.wells]).max())
     values = [
         _rounded(value, error, size=size)
@@ -263,9 +130,12 @@ def place_text(said: SaidLandscape, well: SaidWell) -> str:
     ]
     if len(set(units)) == 1:
         unit = unit_text(units[0])
-        return f"({', '.join(names)}) = ({', '.join(values)})" + (f"\u00a0{unit}" if unit else "")
+        listed = ",\u00a0".join(values)
+        return f"({', '.join(names)})\u00a0=\u00a0({listed})" + (f"\u00a0{unit}" if unit else "")
     pairs = zip(names, values, units, strict=True)
-    return ", ".join(f"{name} = {value}\u00a0{unit_text(unit)}".rstrip() for name, value, unit in pairs)
+    return ", ".join(
+        f"{name}\u00a0=\u00a0{value}\u00a0{unit_text(unit)}".rstrip() for name, value, unit in pairs
+    )
 
 
 def _rounded(value: float, error: float, *, size: float) -> str:

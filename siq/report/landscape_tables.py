@@ -11,8 +11,9 @@ import pandas as pd
 
 from siq.landscape.dwell_times import NoiseStrength, exit_time
 from siq.numerics.measured_text import unit_text, value_text
-from siq.report.landscape_answer import SaidLandscape, time_text, well_name
+from siq.report.landscape_answer import time_text
 from siq.report.page import ReportTable
+from siq.report.said_landscape import SaidLandscape, well_name
 from siq.steps.outcomes import Status, Step
 
 

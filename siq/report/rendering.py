@@ -17,6 +17,7 @@ LARGEST_VECTOR = 400_000  # bytes: a larger SVG is offered as the PNG that is sh
 DOTS_PER_INCH = 200  # of the PNG files; pages have 96
 CHARACTER = 7.6  # pixels, about: the width of a figure in a table
 CELL = 18.0  # pixels around it
+SHORT_TEXT, LINE = 24, 34  # characters: longer texts wrap, to lines no shorter than the latter
 PHONE, PAGE = 360, 950  # pixels that a table may fill
 
 
@@ -105,14 +106,17 @@ def _page_width(figure: Any) -> int:
 
 
 def _wide_for(frame: pd.DataFrame, rows: int) -> str:
-    """For which screens a table is too wide: ``page phone``, ``phone``, or none."""
-    width = sum(
-        CELL
-        + CHARACTER
-        * max([longest_word(str(name)), *(len(cell_text(value)) for value in frame[name].head(rows))])
-        for name in frame.columns
-    )
+    """For which screens a table is about too wide: ``page phone``, ``phone``, or none."""
+    width = 0.0
+    for name in frame.columns:
+        cells = [_least_width(cell_text(value)) for value in frame[name].head(rows)]
+        width += CELL + CHARACTER * max([longest_word(str(name)), *cells])
     return "page phone" if width > PAGE else "phone" if width > PHONE else ""
+
+
+def _least_width(text: str) -> int:
+    """Characters on the narrowest line that a cell can be set in: long texts wrap."""
+    return len(text) if len(text) <= SHORT_TEXT else min(LINE, max(longest_word(text), SHORT_TEXT // 2))
 
 
 def longest_word(text: str) -> int:

@@ -135,7 +135,7 @@ LEADING = ("quasipotential", "landscape")
 """Figures that a page can open with, the best first."""
 
 
-def shown_figures(names: set[str], *, runs: int, networks: bool) -> set[str]:
+def shown_figures(names: set[str], *, runs: int, networks: bool, published: bool) -> set[str]:
     """Which figures a page shows of those that exist.
 
     Parameters
@@ -146,7 +146,11 @@ def shown_figures(names: set[str], *, runs: int, networks: bool) -> set[str]:
         Number of runs.
     networks
         Whether networks were asked for.
+    published
+        Whether the study names published figures.
     """
+    if not published:
+        names = names - {"landscape_published"}
     if not networks:
         names = names - set(OF_NETWORKS)
     if runs == 1:

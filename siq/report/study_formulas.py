@@ -13,8 +13,8 @@ from siq.numerics.measured_text import unit_text, value_text
 from siq.potential.symbolic import SymbolicDecomposition
 from siq.potential.well import Well
 from siq.report.formatting import formula_mathml, term_text, vector_mathml
-from siq.report.landscape_answer import well_name
 from siq.report.page import FormulaRow
+from siq.report.said_landscape import well_name
 
 SMALL = 1e-3  # of the depth: a term that contributes less everywhere is left to the whole formula
 SHORT = 8  # terms that are read at a glance: so short a formula is shown as it is

@@ -14,7 +14,8 @@ from siq.identify.storage import read_field
 from siq.report.answer import answer_of, write_answer
 from siq.report.page import render_report
 from siq.report.settings import PageSettings
-from siq.report.study_page import StudyResults, study_page
+from siq.report.study_page import study_page
+from siq.report.study_sections import StudyResults
 from siq.steps.outcomes import Method
 from siq.steps.shown import ModelFiles, shown_formula
 from siq.study.scoring import exact_answer
