@@ -43,7 +43,6 @@ terms = {library.names[k]: round(float(found.coefficients[k, i]), 5) for i, k in
 assert terms == {"x": 1.0, "x**3": -1.0}, terms
 
 
-
 def command(*arguments: str) -> subprocess.CompletedProcess[str]:
     """The command as it was installed."""
     return subprocess.run([Path(sys.executable).parent / "siq", *arguments], capture_output=True, text=True)

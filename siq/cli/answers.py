@@ -88,6 +88,6 @@ def _of_diagnosis(answer: Mapping[str, Any], page: Path) -> Told:
     before, after = answer.get("held_out_before"), answer.get("held_out_after")
     if before is not None and after is not None and before != after:
         lines.append(
-            f"On recordings held out its error is {before:.2g} of their spread as it is, and {after:.2g} with that."
+            f"On recordings held out its error is {before:.2g} of their spread, and {after:.2g} with that."
         )
     return Told(tuple(lines), page, code)

@@ -6,13 +6,12 @@ import pytest
 pytestmark = [pytest.mark.workflow, pytest.mark.slow]
 
 
-def test_a_study_whose_every_training_fails_ends_in_a_report_that_says_so_and_a_code(fresh_project):
+def test_a_study_whose_every_training_fails_still_ends_in_a_report_that_says_so(fresh_project):
     project = fresh_project
     project.write_study(steps=30)
     study = project.path("study.yaml")
     study.write_text(study.read_text().replace("  steps: 30\n", "  steps: 30\n  learning_rate: 1.0e+30\n"))
-    done = project.run("results/mini/report.html")
-    assert done.returncode == 3 and "No formula was found" in done.stdout, done.stdout[-2000:]
+    project.make("results/mini/report.html")
     outcomes = pd.read_parquet(project.path("results/mini/tables/outcomes.parquet")).set_index("step")
     assert outcomes["status"].to_dict() == {
         "simulate": "ok",
