@@ -53,3 +53,15 @@ def test_a_job_that_refuses_its_input_is_heard_and_nothing_else(tmp_path: Path) 
     assert done.returncode == 1 and done.stdout == ""
     assert "did you mean 'archetype4d'" in done.stderr and "Traceback" not in done.stderr
     assert not (tmp_path / "results").exists()
+
+
+def test_a_run_without_a_formula_is_no_success(tmp_path: Path) -> None:
+    """Growth without a stable state: there is a page, a sentence and a code, by the workflow itself, too."""
+    rows = [f"r{k},{i / 20},{(k - 4.5) * 1.025**i!r}" for k in range(10) for i in range(60)]
+    (tmp_path / "growth.csv").write_text("\n".join(["recording,t,x", *rows]) + "\n")
+    done = siq(tmp_path, "run", "growth.csv", "--cores", "2", "--", "--max-jobs-per-timespan", "100/1s")
+    assert done.returncode == 3, done.stderr
+    assert "No formula was found" in done.stderr + done.stdout
+    again = siq(tmp_path, "run", "growth.csv")
+    assert again.returncode == 3 and "No formula was found" in again.stdout
+    assert again.stdout.endswith("The page to read: results/growth/report.html\n")
