@@ -4,8 +4,8 @@ A well is left over every one of its saddles, and the rates add. Over one saddle
 
     E[τ] = K exp(ΔU/ε)
 
-(`siq.landscape.rates`), from the well to the neighbourhood of the next attractor; the saddle itself is reached
-in half of it. The relative error of E[τ] has three parts:
+(`siq.landscape.rates`), from the well to the neighbourhood of the next attractor; the saddle itself is
+reached in half of it. The relative error of E[τ] has three parts:
 
 - from f: the standard error of ΔU/ε, and that of K, which is taken to be relatively as uncertain as ΔU, since
   both follow from f to the first order;

@@ -80,7 +80,7 @@ def _with_unit(text: str, unit: str) -> str:
 
 
 def range_text(low: float, high: float, *, unit: str = "") -> str:
-    """Write a range by its ends, to two digits: what stands for ``±`` where the error is as large as the value.
+    """Write a range by its ends, to two digits, where an error is as large as the value.
 
     Examples
     --------

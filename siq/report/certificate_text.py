@@ -24,6 +24,18 @@ TESTS = {
 }
 """What each test asks, as a reader is told."""
 
+FAILURES = {
+    "identity": "the formulas do not add up to the identified f",
+    "hamilton_jacobi": "U does not solve its equation at points that were held out",
+    "branch": "U does not have the curvature at the stable states that f asks for",
+    "descent": "U does not fall along recordings that were held out",
+    "error": "the error that remains is too large to be stated",
+    "characteristics": "an independent calculation, along characteristics of f, gives another U",
+    "agreement": "two routes to U lead to different ones",
+    "prediction": "f does not predict recordings that were held out",
+}
+"""The same where the answer is no."""
+
 PERCENT = 1e-4  # a smaller share is written with a power of ten
 
 
@@ -77,16 +89,23 @@ def _refused(
     certificate: Mapping[str, Any], certified: int, runs: int, refusals: Mapping[str, str]
 ) -> list[str]:
     failed = [name for name, test in certificate.get("tests", {}).items() if not test["passed"]]
-    asked = [TESTS.get(name, name) for name in failed]
     lines = []
-    if asked:
-        lines.append(f"Not passed: {'; '.join(asked)}.")
-    reason = str(certificate.get("reason") or "; ".join(refusals.values()))
-    if reason:
+    if failed:
+        told = "; ".join(FAILURES.get(name, name.replace("_", " ")) for name in failed)
+        lines.append(f"{told[0].upper()}{told[1:]}.")
+    elif reason := str(certificate.get("reason") or "; ".join(refusals.values())):
         lines.append(f"{reason[0].upper()}{reason[1:]}.".replace("..", "."))
+    tests = certificate.get("tests", {})
+    if tests.get("prediction", {}).get("passed"):
+        lines.append(
+            "Positions, depths and times above follow from f, along its most likely ways out. It is U as a"
+            " formula"
+            " that failed."
+        )
     lines.append(
-        "A formula that fails a test may belong to another landscape that fits the recordings just as well. Do not"
-        " rely on these numbers before you have checked them in another way."
+        "A formula that fails a test may belong to another landscape that fits the recordings just as"
+        " well. Do not"
+        " rely on it before you have checked it in another way."
     )
     if runs > 1:
         lines.append(f"{certified} of {runs} runs are certified.")

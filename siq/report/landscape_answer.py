@@ -161,7 +161,8 @@ def remarks(data: Mapping[str, Any] | None) -> list[str]:
     if noise is None:
         return [
             "How long a stable state lasts depends on the noise, and these recordings show none. Give its"
-            " strength ε, in the unit of U, as “landscape: {noise_intensities: [ε]}” in the study, and the times"
+            " strength ε, in the unit of U, as “landscape: {noise_intensities: [ε]}” in the study, and the"
+            " times"
             " follow."
         ]
     lines = []
@@ -170,14 +171,16 @@ def remarks(data: Mapping[str, Any] | None) -> list[str]:
         whence = "as the recordings show it" if noise.source == "estimated" else "as given"
         lines.append(
             "A time is the mean until the state has reached the next well, at the noise strength"
-            f" ε = {strength}, {whence}. Its error covers f, the noise and the law itself, which is good to about"
+            f" ε = {strength}, {whence}. Its error covers f, the noise and the law itself, which is good"
+            f" to about"
             " ε/ΔU."
         )
     low = [well.name for well in deep if said.relative_depth(well)[0] < FEWEST]
     if low:
         lines.append(
             f"The law of escape holds for barriers far above the noise. Here {_listed(low)}"
-            f" {'is' if len(low) == 1 else 'are'} less than {FEWEST:.0f} times the noise strength deep: take the"
+            f" {'is' if len(low) == 1 else 'are'} less than {FEWEST:.0f} times the noise strength deep:"
+            f" take the"
             " times as orders of magnitude."
         )
     without = [well.name for well in deep if well.time is None and said.relative_depth(well)[0] > 1]
@@ -226,10 +229,10 @@ def wells_table(data: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.DataFrame]:
             "" if mean is None else time_text(mean, "1", decorated=False)
         )
         rows.setdefault("next well", []).append(well.beyond or "")
-        rows.setdefault("recorded states that lead there", []).append(f"{100 * well.basin:.0f} %")
+        rows.setdefault("recorded states", []).append(f"{100 * well.basin:.0f} %")
     kept = {name: cells for name, cells in rows.items() if any(cells)}
     if len(said.wells) == 1:
-        kept.pop("recorded states that lead there", None)
+        kept.pop("recorded states", None)
     names = [f"{well.name}" for well in said.wells]
     table = pd.DataFrame([[name, *cells] for name, cells in kept.items()], columns=["stable state", *names])
     if len(names) > LISTED + 1:  # as many columns would be too wide: a row for each

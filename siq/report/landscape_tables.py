@@ -111,8 +111,8 @@ def _ways(said: SaidLandscape, file: str) -> ReportTable:
             }
         )  # fmt: skip
     explained = {
-        barrier: "by the formula of the well and the end of the way; its error is that of f, and by how much the"
-        " formula and the way alone differ",
+        barrier: "by the formula of the well and the end of the way; its error is that of f, and the"
+        " difference between formula and way",
         "the same by the path alone": "the least action of the way, without any formula of U",
         time: "prefactor · exp(ΔU/ε), until the next well is reached over this saddle alone",
     }
@@ -123,9 +123,7 @@ def _ways(said: SaidLandscape, file: str) -> ReportTable:
 
 
 def _place(said: SaidLandscape, position: Sequence[float]) -> str:
-    size = max((abs(value) for one in said.data["equilibria"] for value in one["position"]), default=0.0)
-    # What is left of zero by rounding reads as zero.
-    values = [0.0 if abs(value) < 1e-12 * size else value for value in position]
+    values, _ = said.settled(np.array(position, dtype=float), np.zeros(len(position)))
     return "(" + ", ".join(value_text(value) for value in values) + ")"
 
 
@@ -200,7 +198,8 @@ def escape_table(escape: pd.DataFrame, time_unit: str, folder: Path) -> ReportTa
     """Mean escape times by the law beside direct simulation."""
     unit = f", in {unit_text(time_unit)}" if unit_text(time_unit) else ""
     return ReportTable(
-        f"Mean escape times{unit}: by the law, and in direct simulations of the card with their standard error.",
+        f"Mean escape times{unit}: by the law, and in direct simulations of the card with their standard"
+        f" error.",
         escape.rename(columns=lambda name: name.replace("_", " ")),
         {"intensity": "the strength ε of the noise", "escapes": "how many were seen"},
         f"{folder}/escape.csv",

@@ -1,7 +1,8 @@
 """What a page is made from: sections with formulas, tables and figures, and what it opens with.
 
 The page asks nothing of any other machine: style, figures, formulas and downloads stand in it. It has no
-scripts, but for the view of U that can be turned, where there is one. `siq.report.rendering` makes HTML of it.
+scripts, but for the view of U that can be turned, where there is one. `siq.report.rendering` makes HTML
+of it.
 """
 
 from __future__ import annotations

@@ -13,6 +13,8 @@ import numpy as np
 from siq.landscape.dwell_times import Exit, MeanTime, NoiseStrength, dwell_time
 from siq.numerics.measured_text import squared
 
+NOTHING = 1e-6  # of the size of a state
+
 
 @dataclass(frozen=True)
 class SaidWell:
@@ -72,19 +74,37 @@ class SaidLandscape:
     def energy_unit(self) -> str:
         """Unit of U and of ε.
 
-        D is read as a matrix of ratios, so that U is in the states' unit squared per time. States of different
-        units leave this to D, which then carries the units: U is a number.
+        D is read as a matrix of ratios, so that U is in the states' unit squared per time. Of states of
+        different units D carries the units, and U is a number.
         """
         if len(set(self.units)) > 1:
             return ""
         length, time = squared(self.units[0]), "" if self.time_unit == "1" else self.time_unit
-        return f"{length or '1'}/{time}" if time else length
+        if not length:
+            return f"{time}^-1" if time else ""
+        return f"{length}/{time}" if time else length
 
     @property
     def noise(self) -> NoiseStrength | None:
         """That drives the system, None where nobody knows it."""
         noise = self.data.get("noise")
         return None if noise is None else NoiseStrength(**noise)
+
+    @cached_property
+    def size(self) -> np.ndarray:
+        """How large each state becomes, shape ``(d,)``: what is 10⁻⁶ of it, with its error, reads as zero."""
+        places = [one["position"] for one in self.data["equilibria"]]
+        places += [one["attractor"] for one in self.data["wells"]]
+        for one in self.data["wells"]:
+            places += (one.get("V") or {}).get("points", [])
+        return np.abs(np.array(places, dtype=float).reshape(-1, len(self.states))).max(axis=0, initial=0.0)
+
+    def settled(self, position: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """A position without what rounding left of zero, and its errors."""
+        # In units of the largest state where all states have the same, or a state that is zero has no size.
+        size = self.size if len(set(self.units)) > 1 else np.full(len(self.states), self.size.max())
+        nothing = np.hypot(position, np.nan_to_num(errors)) < NOTHING * size
+        return np.where(nothing, 0.0, position), np.where(nothing, 0.0, errors)
 
     @cached_property
     def wells(self) -> list[SaidWell]:
@@ -110,11 +130,13 @@ class SaidLandscape:
         lowest = min(ways, key=lambda way: way["barrier"], default=None)
         place = np.array(one["attractor"], dtype=float)
         errors = one.get("standard_errors")
+        known = np.full(len(place), np.nan) if errors is None else np.array([_float(each) for each in errors])
+        place, known = self.settled(place, known)
         formula = one.get("V")
         return SaidWell(
             well_name(index),
             place,
-            np.full(len(place), np.nan) if errors is None else np.array([_float(each) for each in errors]),
+            known,
             float(one["basin"]),
             math.nan if lowest is None else lowest["barrier"],
             math.nan if lowest is None else _float(lowest.get("error", lowest["standard_error"])),

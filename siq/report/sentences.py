@@ -38,7 +38,8 @@ def run_sentences(
     networks = mine["network_error"].dropna()
     if len(networks):
         sentences.append(
-            f"The U of the networks, before any formula, is off by {_with_spread(networks)} (relative L2 over the"
+            f"The U of the networks, before any formula, is off by {_with_spread(networks)} (relative L2"
+            f" over the"
             " domain, which reaches beyond the recorded states)."
         )
     predicted = summary[(summary["method"] == method) & (summary["quantity"] == "prediction_error")]
@@ -46,7 +47,8 @@ def run_sentences(
         row = predicted.iloc[0]
         median = f" (median {number_text(row['median'], decimals=1)})" if runs > 1 else ""
         sentences.append(
-            f"f predicts unseen trajectories with a relative error of {number_text(row['mean'], decimals=1)} in the"
+            f"f predicts unseen trajectories with a relative error of"
+            f" {number_text(row['mean'], decimals=1)} in the"
             f" mean{median}."
         )
     return sentences
@@ -83,8 +85,10 @@ def _several(
         sentences.append(f"{certified} of {runs} runs are certified{within}.")
     if certified < runs:
         sentences.append(
-            f"{runs - certified} of {runs} runs are not certified. A formula that is not certified may belong to"
-            " another landscape that fits just as well: do not build on it before you have checked it in another"
+            f"{runs - certified} of {runs} runs are not certified. A formula that is not certified may"
+            f" belong to"
+            " another landscape that fits just as well: do not build on it before you have checked it in"
+            " another"
             " way."
         )
     return sentences
@@ -100,13 +104,16 @@ def _against_exact(
     if runs == 1:
         right = "with exactly the right terms" if correct else "with wrong terms among them"
         return [
-            f"Against the exact U the coefficients are off by {share_text(errors.iloc[0])} (relative root mean"
+            f"Against the exact U the coefficients are off by {share_text(errors.iloc[0])} (relative root"
+            f" mean"
             f" square), {right}."
         ]
     sentences = [
-        f"Against the exact U the relative root mean square error of the coefficients is {_with_spread(errors)}"
+        f"Against the exact U the relative root mean square error of the coefficients is"
+        f" {_with_spread(errors)}"
         f" (median {number_text(errors.median(), decimals=2)}, worst run"
-        f" {number_text(errors.max(), decimals=2)}); {correct} of {len(errors)} runs found exactly the right terms."
+        f" {number_text(errors.max(), decimals=2)}); {correct} of {len(errors)} runs found exactly the"
+        f" right terms."
     ]
     published = summary[(summary["method"] == method) & (summary["quantity"] == "rrmse")]
     if len(published) and pd.notna(published["published"].iloc[0]):
@@ -142,7 +149,8 @@ def control_sentences(certificates: pd.DataFrame) -> list[str]:
     same = mine[compared].set_index("run")["passed"].reindex(certified.index, fill_value=False).astype(bool)
     runs = len(certified)
     sentence = (
-        "As a control, a network with its weights in random order was refined and tested in the same way. It was"
+        "As a control, a network with its weights in random order was refined and tested in the same way."
+        " It was"
         f" refused in {int((~certified).sum())} of {runs} runs"
     )
     if (certified & same).any():

@@ -47,7 +47,8 @@ CAPTIONS: Mapping[str, Caption] = {
     ),
     "landscape": Caption(
         Part.LANDSCAPE,
-        "U over all wells where its formulas hold, with stable states, saddles, and the ways of least action: solid"
+        "U over all wells where its formulas hold, with stable states, saddles, and the ways of least"
+        " action: solid"
         " on the way up, dashed on the way down.",
     ),
     "residuals": Caption(
@@ -63,23 +64,27 @@ CAPTIONS: Mapping[str, Caption] = {
     ),
     "escape": Caption(
         Part.EVIDENCE,
-        "Mean escape times against the strength of the noise: lines by the law of Eyring and Kramers, points by"
+        "Mean escape times against the strength of the noise: lines by the law of Eyring and Kramers,"
+        " points by"
         " direct simulation of the card, with standard errors.",
     ),
     "landscape_errors": Caption(
         Part.EVIDENCE,
-        "U by every source, and below each its difference from U along characteristics of the exact vector field.",
+        "U by every source, and below each its difference from U along characteristics of the exact vector"
+        " field.",
         "fig2b, c to e, and Appendix E",
     ),
     "invariant": Caption(
         Part.LANDSCAPE,
-        "The density of states exp(−U/ε) that follows from U, a panel for each ε; below each, a long simulation"
+        "The density of states exp(−U/ε) that follows from U, a panel for each ε; below each, a long"
+        " simulation"
         " with lines of the same density.",
         "fig1b and fig2c, b to d",
     ),
     "degrees": Caption(
         Part.WORKINGS,
-        "How well formulas of rising degree solve the equation of U about each stable state, on points that took no"
+        "How well formulas of rising degree solve the equation of U about each stable state, on points"
+        " that took no"
         " part in the fit, against their number of terms. The ring marks the degree that was chosen.",
     ),
     "error_distribution": Caption(
@@ -87,14 +92,16 @@ CAPTIONS: Mapping[str, Caption] = {
     ),
     "coefficients_refined": Caption(
         Part.RUNS,
-        "Coefficients of U over the runs, a panel for each term that belongs there; the last panel shows the terms"
+        "Coefficients of U over the runs, a panel for each term that belongs there; the last panel shows"
+        " the terms"
         " that do not.",
         "Fig. 2",
     ),
     "inclusion_refined": Caption(Part.RUNS, "How often each term was found, by component."),
     "coefficients_regression": Caption(
         Part.PUBLISHED,
-        "Coefficients of U over the runs by the published regression, from the networks as they are; a panel for"
+        "Coefficients of U over the runs by the published regression, from the networks as they are; a"
+        " panel for"
         " each term that belongs there, and one for those that do not.",
     ),
     "inclusion_regression": Caption(
@@ -102,23 +109,27 @@ CAPTIONS: Mapping[str, Caption] = {
     ),
     "landscape_published": Caption(
         Part.PUBLISHED,
-        "What was published of U, as a formula and, where it is at hand, on a mesh; below each, its difference from U"
+        "What was published of U, as a formula and, where it is at hand, on a mesh; below each, its"
+        " difference from U"
         " along characteristics of the exact vector field.",
     ),
     "training": Caption(
         Part.PUBLISHED,
-        "The networks' training, one line for each run: loss on training pairs and on held-out pairs, its two parts,"
+        "The networks' training, one line for each run: loss on training pairs and on held-out pairs, its"
+        " two parts,"
         " and the learning rate.",
     ),
     "dataset": Caption(
         Part.WORKINGS,
-        "The recordings: some trajectories; all recorded states; and, where networks were regressed, the states below"
+        "The recordings: some trajectories; all recorded states; and, where networks were regressed, the"
+        " states below"
         " the level of the regression.",
         "fig2a; fig1_noisy a",
     ),
     "components": Caption(
         Part.WORKINGS,
-        "The decomposition of f on the plane of the first two states: trajectories, the downhill part −D∇V, the"
+        "The decomposition of f on the plane of the first two states: trajectories, the downhill part"
+        " −D∇V, the"
         " circulatory part g, and U; where it is known, the exact U beside it.",
         "Fig. 1",
     ),

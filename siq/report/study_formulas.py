@@ -17,6 +17,7 @@ from siq.report.page import FormulaRow
 from siq.report.said_landscape import well_name
 
 SMALL = 1e-3  # of the depth: a term that contributes less everywhere is left to the whole formula
+NOTHING = 1e-9  # of the depth
 SHORT = 8  # terms that are read at a glance: so short a formula is shown as it is
 
 
@@ -33,27 +34,33 @@ def formula_rows(
         The exact ones, where they are known.
     places
         The attractors in the order of their letters; by default that of the wells.
+    depth
+        Of the deepest well: a constant far below it is what rounding left of zero.
     """
     truths: Mapping[str, Markup] = {} if exact is None else _typeset(exact)
     rows = [
         FormulaRow(name, formula, NOTES.get(name, ""), truths.get(name))
-        for name, formula in _typeset(found).items()
+        for name, formula in _typeset(found, depth=depth).items()
     ]
     wells = [] if found.potential is not None else [_well_row(well, places) for well in found.wells]
     return [*wells, *rows]
 
 
 NOTES = {
-    "U": "The quasipotential, zero at its lowest point. exp(−U/ε) is the density of states, to leading order.",
+    "U": "The quasipotential, zero at its lowest point. exp(−U/ε) is the density of states, to leading"
+    " order.",
     "g": "The circulatory part: it moves the state without changing U.",
     "f": "The vector field dx/dt without noise, as identified.",
 }
 
 
-def _typeset(one: SymbolicDecomposition) -> dict[str, Markup]:
+def _typeset(one: SymbolicDecomposition, *, depth: float = 0.0) -> dict[str, Markup]:
     formulas = {}
     if one.potential is not None:
-        formulas = {"U": formula_mathml(one.quasipotential), "g": vector_mathml(one.circulatory)}
+        whole = one.quasipotential
+        constant, rest = whole.as_coeff_Add()
+        shown = rest if rest != 0 and abs(float(constant)) < NOTHING * depth else whole
+        formulas = {"U": formula_mathml(shown), "g": vector_mathml(one.circulatory)}
     return formulas | {"f": vector_mathml(one.vector_field)}
 
 

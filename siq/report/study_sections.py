@@ -17,7 +17,7 @@ from siq.identify.diffusion import DiffusionSource
 from siq.identify.storage import FieldRecord
 from siq.potential.symbolic import SymbolicDecomposition
 from siq.report.certificate_text import certificate_badge, tests_table
-from siq.report.formatting import matrix_mathml
+from siq.report.formatting import matrix_mathml, vector_mathml
 from siq.report.invariant_tables import invariant_tables
 from siq.report.landscape_answer import headline, remarks
 from siq.report.landscape_tables import errors_table, escape_table, landscape_sentences, landscape_tables
@@ -26,12 +26,22 @@ from siq.report.said_landscape import SaidLandscape
 from siq.report.sentences import control_sentences, run_sentences
 from siq.report.study_captions import Part, figures_of
 from siq.report.study_formulas import coefficient_table, formula_rows
-from siq.steps.outcomes import Method, Status
+from siq.steps.outcomes import Method, Status, Step
 from siq.steps.shown import ModelFiles, Shown
 from siq.study.study import Study
 
-SUMMARY_COLUMNS = ("method", "quantity", "exact", "mean", "standard_deviation", "median", "inclusion_frequency",
-                   "published", "published_standard_deviation", "runs")  # fmt: skip
+SUMMARY_COLUMNS = (
+    "method",
+    "quantity",
+    "exact",
+    "mean",
+    "standard_deviation",
+    "median",
+    "inclusion_frequency",
+    "published",
+    "published_standard_deviation",
+    "runs",
+)
 SUMMARY_HELP = {
     "quantity": "component:term for coefficients; those of V = U/2 and of f are in the file",
     "inclusion frequency": "share of runs in which the term was found",
@@ -40,10 +50,10 @@ SUMMARY_HELP = {
 }
 SOURCES = {
     DiffusionSource.GIVEN: "As given.",
-    DiffusionSource.ESTIMATED: "Estimated from the noise in the recordings, since none was given, and scaled to the"
-    " determinant 1, so that ε is the size of the noise.",
-    DiffusionSource.UNIT: "Taken as the unit matrix: none was given, and the recordings show no noise that would tell."
-    " U and the barriers follow from it.",
+    DiffusionSource.ESTIMATED: "Estimated from the noise in the recordings, since none was given, and"
+    " scaled to the determinant 1, so that ε is the size of the noise.",
+    DiffusionSource.UNIT: "Taken as the unit matrix: none was given, and the recordings show no noise that"
+    " would tell. U and the barriers follow from it.",
 }
 
 
@@ -87,7 +97,7 @@ class StudyResults:
 
 @dataclass(frozen=True)
 class StudyParts:
-    """What each part of the page says; `images` are the figures that are shown, one of which it opens with."""
+    """What each part of the page says; `images` are the figures that are shown, with the `lead`."""
 
     study: Study
     results: StudyResults
@@ -112,21 +122,21 @@ class StudyParts:
 
     def answer(self) -> list[str]:
         """The sentence, and what has to be known of it."""
-        results = self.results
-        if results.shown.run is None and results.overview is None:
-            return [f"No formula was found: {self._why()}."]
-        said = [headline(results.overview, missing=self._why())]
-        said += remarks(results.overview)
-        return said
+        overview = self.results.overview
+        if overview is None or not overview["wells"]:
+            return [f"No landscape was found: {self._why()}."]
+        return [headline(overview), *remarks(overview)]
 
     def _why(self) -> str:
-        """The first reason for which a step ended without a result, or with a reservation."""
+        """Why there is none: what the step said that came as far as any."""
         outcomes = self.results.tables["outcomes"]
         for status in (Status.FAILED, Status.WARNING, Status.SKIPPED):
-            reasons = outcomes[outcomes["status"] == status]["reason"]
-            if len(reasons) and str(reasons.iloc[0]):
-                return str(reasons.iloc[0]).rstrip(".")
-        return "nothing led to a stable state"
+            mine = outcomes[(outcomes["status"] == status) & (outcomes["reason"].fillna("") != "")]
+            of_landscape = mine[mine["step"] == Step.LANDSCAPE]
+            for rows in (of_landscape, mine):
+                if len(rows):
+                    return str(rows["reason"].iloc[0]).removeprefix("not certified: ").rstrip(".")
+        return "the recorded states lead to no stable state"
 
     def badge(self) -> Badge:
         """Whether the answer may be believed."""
@@ -146,6 +156,9 @@ class StudyParts:
         results, shown = self.results, self.results.shown
         rows = self._formulas_of(self._method)
         record = results.record
+        if record is not None and not rows:
+            field = vector_mathml(record.found.dynamics.formulas)
+            rows.append(FormulaRow("f", field, "The vector field dx/dt without noise, as identified."))
         if record is not None:
             note = SOURCES[record.diffusion_source]
             rows.append(FormulaRow("D", matrix_mathml(record.found.diffusion.matrix.tolist()), note))
@@ -169,8 +182,12 @@ class StudyParts:
         found = {} if shown.run is None else self.results.models.formulas(shown.run)
         if method not in found:
             return []
-        places = [] if self.results.overview is None else self.results.overview["wells"]
-        return formula_rows(found[method], self.results.exact, places=[one["attractor"] for one in places])
+        overview = self.results.overview or {"wells": [], "transitions": []}
+        depths = [way["barrier"] for way in overview["transitions"] if way["barrier"] is not None]
+        return formula_rows(
+            found[method], self.results.exact,
+            places=[one["attractor"] for one in overview["wells"]], depth=max(depths, default=0.0),
+        )  # fmt: skip
 
     def _coefficients(self) -> list[ReportTable]:
         coefficients, shown = self.results.tables["coefficients"], self.results.shown
@@ -181,13 +198,13 @@ class StudyParts:
         if self.results.overview is not None:
             said = SaidLandscape(self.results.overview)
             units = dict(zip(said.states, said.units, strict=True)) | {"t": said.time_unit}
-        table = coefficient_table(mine, units=units, components="U$|g_|f_")
+        table = coefficient_table(mine, units=units, components=SHOWN)
         if table is None:
             return []
         chosen = mine[mine["component"].str.match("U$|g_|f_") & (mine["estimate"] != 0)]
         caption = "Coefficients with their standard errors; those without ± are exact to the digits shown."
         file = f"{self.results.folder}/coefficients.csv"
-        return [ReportTable(caption, table, {}, file, 40, data=chosen.drop(columns=["run", "method"]))]
+        return [ReportTable(caption, table, {}, file, 30, data=chosen.drop(columns=["run", "method"]))]
 
     def evidence(self) -> ReportSection | None:
         """Why the answer may be believed, or may not."""
@@ -241,6 +258,8 @@ class StudyParts:
         """Steps that failed, and refined formulas that are not certified; the run where there are several."""
         outcomes, rrmse = self.results.tables["outcomes"], self.results.tables["rrmse"]
         troubled = outcomes[outcomes["status"].isin([Status.FAILED, Status.WARNING])]
+        # Which tests refused a formula is said once.
+        troubled = troubled[~troubled["reason"].fillna("").str.startswith("not certified")]
         rows = pd.concat([troubled, _refusals(rrmse, self.results.tables["certificates"])])
         rows = rows[["run", "step", "status", "reason"]].sort_values(["run", "step"])
         return rows.drop(columns="run") if self.study.runs == 1 else rows
@@ -287,17 +306,19 @@ class StudyParts:
                 _summary_shown(tables["summary"]), SUMMARY_HELP, f"{folder}/summary.csv", 60,
             ),
             ReportTable(
-                "How many runs passed each test of the certificate.", counted, {}, f"{folder}/certificates.csv", 40
+                "How many runs passed each test of the certificate.",
+                counted, {}, f"{folder}/certificates.csv", 40,
             ),
             ReportTable("Errors by run.", _words(tables["rrmse"]), {}, f"{folder}/rrmse.csv", 50),
         ]  # fmt: skip
         return ReportSection(
-            f"What {self.study.runs} runs say together", self._runs_said(), tables=[one for one in found if len(one.frame)],
+            f"What {self.study.runs} runs say together", self._runs_said(),
+            tables=[one for one in found if len(one.frame)],
             figures=self._figures(Part.RUNS),
         )  # fmt: skip
 
     def published(self) -> ReportSection | None:
-        """What the published method made of the networks, and what was published; folded away without a paper."""
+        """What the published method made of the networks, and what was published."""
         other = self.study.training is not None and self._method != Method.REGRESSION
         rows = self._formulas_of(Method.REGRESSION) if other else []
         figures = self._figures(Part.PUBLISHED)
@@ -307,8 +328,10 @@ class StudyParts:
         training, regression = self.study.training, self.study.regression
         if training is not None:
             text.append(
-                f"The published method trains two networks, here for at most {training.steps} steps on batches of"
-                f" {training.batch_size}, and regresses formulas of degree {regression.degree} at most on them. Terms"
+                f"The published method trains two networks, here for at most {training.steps} steps on"
+                f" batches of"
+                f" {training.batch_size}, and regresses formulas of degree {regression.degree} at most on"
+                f" them. Terms"
                 f" below {regression.threshold} are dropped (of the {regression.threshold_on})."
             )
         if rows:
@@ -345,7 +368,8 @@ class StudyParts:
     def _method_said(self) -> str:
         routes = self.study.refinement.with_routes(networks=self.study.training is not None).routes or ()
         return (
-            "f was identified from neighbouring samples alone. The formulas solve the Hamilton–Jacobi equation of this"
+            "f was identified from neighbouring samples alone. The formulas solve the Hamilton–Jacobi"
+            " equation of this"
             f" f, by the {' and the '.join(routes)} route, and have to pass the tests of the certificate."
         )
 
@@ -361,8 +385,12 @@ class StudyParts:
         return ReportSection("The study and the versions", text, listing=printed, folded=True)
 
 
+SHOWN = "U$|f_"
+"""Components whose coefficients are shown; those of g follow from them, and can be downloaded."""
+
 DECOMPOSITION = (
-    "f is split as f = −D∇V + g with ∇V·g = 0, and U = 2V. For the noise √ε σ dW with D = σσᵀ the density of states is"
+    "f is split as f = −D∇V + g with ∇V·g = 0, and U = 2V. For the noise √ε σ dW with D = σσᵀ the density"
+    " of states is"
     " exp(−U/ε) to leading order."
 )
 

@@ -30,5 +30,6 @@ def test_how_many_runs_are_certified_is_one_word(certified, said):
 def test_the_file_says_what_a_terminal_needs(tmp_path):
     write_answer(tmp_path / "answer.json", answer([True, False], failed=[1]))
     assert json.loads((tmp_path / "answer.json").read_text(encoding="utf-8")) == {
-        "title": "A study", "sentence": "Two wells.", "certified": "some", "formulas": 1, "runs": 2, "failed": 1,
+        "title": "A study", "sentence": "Two wells.", "certified": "some", "formulas": 1, "runs": 2,
+        "failed": 1,
     }  # fmt: skip
