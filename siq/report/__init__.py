@@ -9,6 +9,8 @@
 `landscape_answer`   what is the answer in one sentence?
 `certificate_text`   what does the certificate promise, in plain words?
 `answer`             and as plain data, for a terminal?
+`drawn_landscape`    what of a landscape is drawn?
+`interactive`        how is U turned and cut in a page?
 `projection`         what of many states is drawn on a plane?
 `page`               what is a page made from, that needs nothing else?
 `rendering`          how does it become HTML?

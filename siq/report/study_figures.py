@@ -21,6 +21,7 @@ from siq.networks.trained import TrainedNetworks
 from siq.numerics.randomness import Purpose, generator
 from siq.potential.symbolic import SymbolicDecomposition
 from siq.report.drawn_landscape import DrawnLandscape, drawn_data
+from siq.report.landscape_answer import SaidLandscape
 from siq.report.plots import (
     ComponentFields,
     Dataset,
@@ -201,7 +202,11 @@ def _components_figure(shown: ShownRun, system: Dynamics | None) -> Figure | Non
         recordings = Recordings(("x",), (None,), ("none",), np.zeros(1, int), np.zeros(1), np.zeros((1, 1)))
     fields, domain = _component_fields(recordings, shown, system)
     units = _units(recordings, system)
-    return plot_components(fields, states=recordings.names, units=units, domain=domain)
+    time_unit = recordings.time_unit or ("1" if system is None else system.time_unit)
+    said = SaidLandscape({"states": recordings.names, "units": units, "time_unit": time_unit})
+    return plot_components(
+        fields, states=recordings.names, units=units, domain=domain, energy_unit=said.energy_unit
+    )
 
 
 def _component_fields(
