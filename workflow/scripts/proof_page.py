@@ -90,7 +90,9 @@ def main(snakemake: Any) -> None:
             *(
                 []
                 if settings is None
-                else [ReportSection("Settings", listing=yaml.safe_dump(settings, sort_keys=False), folded=True)]
+                else [
+                    ReportSection("Settings", listing=yaml.safe_dump(settings, sort_keys=False), folded=True)
+                ]
             ),
         ],
     )
