@@ -3,8 +3,12 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 CORES ?= 2
+# Where torch comes from on Linux, whose usual build brings 3 GB for graphics cards along. `make TORCH_INDEX=`
+# takes that one.
+TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 
-.PHONY: statistics examples test full untuned noise wheel docs lint format environment clean
+.PHONY: statistics examples test full untuned noise wheel test-pages newcomer docs docs-full lint format \
+        environment clean
 
 statistics: environment
 	$(BIN)/snakemake --cores $(CORES) statistics
@@ -31,9 +35,26 @@ wheel: environment
 	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
 	PYTHON=$(BIN)/python .ci/check-wheel
 
+# Every kind of page in Chromium, on a desk and on a phone; skipped where there is no Chromium.
+test-pages: environment docs
+	$(BIN)/python -m pip install --quiet --constraint requirements/pinned.txt --editable '.[pages]'
+	$(BIN)/pytest -m pages tests/pages
+
+# A fresh environment, a wheel, recordings: how long until a certified barrier and until a verdict.
+newcomer: wheel
+	$(BIN)/python benchmarks/newcomer.py
+
 # docs/_build/html/index.html: the pages and the reference. A warning is an error.
 docs: environment
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet -b html docs docs/_build/html
+
+# The documentation from its beginnings: examples, notebooks and pictures are made anew, figures read from results.
+docs-full: environment
+	$(BIN)/python docs/make/gallery.py
+	$(BIN)/python docs/make/notebooks.py
+	$(BIN)/python docs/make/concepts.py
+	$(BIN)/python docs/make/figures.py
+	$(MAKE) docs
 
 lint: environment
 	$(BIN)/ruff check .
@@ -53,9 +74,13 @@ environment: $(VENV)/installed
 $(VENV)/installed: pyproject.toml requirements/pinned.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 	  || { echo "siq needs Python 3.11 or newer; name one with 'make PYTHON=python3.12 ...'." >&2; exit 1; }
+	@echo "Installing siq with all of its tools below $(VENV): about 2.2 GB, 1 GB of it for networks (CPU only)."
 	$(PYTHON) -m venv $(VENV)
+	@test -z "$(TORCH_INDEX)" || test "$$(uname)" != Linux || $(BIN)/python -m pip install --quiet --no-deps \
+	  --retries 0 --timeout 15 --index-url $(TORCH_INDEX) --constraint requirements/pinned.txt torch 2> /dev/null \
+	  || echo "$(TORCH_INDEX) does not answer; torch comes from the usual index."
 	$(BIN)/python -m pip install --quiet --constraint requirements/pinned.txt --editable '.[dev]'
 	touch $@
 
 clean:
-	rm -rf $(VENV) .snakemake .mypy_cache .ruff_cache .pytest_cache build dist docs/_build docs/reference
+	rm -rf $(VENV) .snakemake .mypy_cache .ruff_cache .pytest_cache build dist docs/_build docs/api

@@ -2,10 +2,13 @@
 # workflow/rules/, what a study asks is in config/studies/.
 from snakemake.utils import min_version
 
+from workflow.places import configuration
+
 min_version("9.0")
 
 
-configfile: "config/config.yaml"
+# Beside this file, or yours of that name in the folder in which you work.
+configfile: configuration(given=bool(workflow.overwrite_configfiles))
 
 
 include: "workflow/rules/common.smk"

@@ -1,5 +1,6 @@
 """What an installation without extras can do, from a folder that is not the repository's."""
 
+import subprocess
 import sys
 from dataclasses import replace
 from importlib import metadata, resources
@@ -20,6 +21,10 @@ for package, name in (
     ("mismatch", "mechanisms.yaml"),
     ("report", "templates/base.html.j2"),
     (".", "py.typed"),
+    ("cli/shipped", "Snakefile"),
+    ("cli/shipped", "config/systems/archetype3d.yaml"),
+    ("cli/shipped", "workflow/rules/common.smk"),
+    ("cli/shipped", "profiles/default/config.yaml"),
 ):
     assert resources.files("siq").joinpath(package, name).is_file(), f"{package}/{name} is not in the wheel"
 
@@ -36,6 +41,21 @@ library = candidate_library(["x", "y"], degree=3)
 found = identify_vector_field(library, pairs, options=IdentificationOptions(degree=3))
 terms = {library.names[k]: round(float(found.coefficients[k, i]), 5) for i, k in found.support if i == 0}
 assert terms == {"x": 1.0, "x**3": -1.0}, terms
+
+
+def command(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """The command as it was installed."""
+    return subprocess.run([Path(sys.executable).parent / "siq", *arguments], capture_output=True, text=True)
+
+
+assert command("--version").stdout == f"siq {siq.__version__}\n"
+assert "siq run my-recordings.csv" in command("--help").stdout
+looked_at = command("inspect", "trajectories.csv")
+assert looked_at.returncode == 0 and "20 recordings" in looked_at.stdout, looked_at
+assert command("init", "trajectories.csv").returncode == 0 and Path("trajectories.yaml").is_file()
+refused = command("run", "trajectories.csv")
+assert refused.returncode == 1 and refused.stderr.count("\n") == 1, refused
+assert "pip install 'quasipotential[workflow]'" in refused.stderr, refused
 
 try:
     siq.train  # noqa: B018

@@ -6,7 +6,9 @@ at the end.
 
 from __future__ import annotations
 
+import json
 import re
+import sys
 from pathlib import Path
 
 from docutils import nodes
@@ -18,19 +20,37 @@ from sphinx.util.docutils import SphinxDirective
 
 import siq
 
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "docs" / "extensions"))
+
 project = "siq"
 author = "The siq developers"
 copyright = author
+language = "en"
 release = version = siq.__version__
 
 extensions = [
-    "myst_parser",
+    "mathml",  # docs/extensions
+    "myst_nb",
+    "schemas",  # docs/extensions
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
     "sphinx.ext.napoleon",
+    "sphinx_copybutton",
+    "sphinx_design",
 ]
-exclude_patterns = ["_build"]
+exclude_patterns = ["_build", "make", "**/.ipynb_checkpoints"]
+nb_execution_mode = "off"  # `make docs` shows the outputs that `make docs-full` has made
 myst_heading_anchors = 3
+myst_enable_extensions = ["attrs_inline", "colon_fence", "deflist", "dollarmath", "substitution"]
+# Figures that pages quote, as `{{ figures.archetype3d.certified }}`; `docs/make/figures.py` writes the file.
+myst_substitutions = {
+    "figures": {
+        study: {name: one["value"] for name, one in group.items()}
+        for study, group in json.loads((ROOT / "docs" / "figures.json").read_text(encoding="utf-8")).items()
+    }
+}
+html_math_renderer = "mathml"
 
 autodoc_default_options = {"members": True, "member-order": "bysource", "show-inheritance": True}
 autodoc_typehints = "signature"
@@ -52,6 +72,10 @@ maximum_signature_line_length = 90
 html_theme = "furo"
 html_title = f"siq {release}"
 html_copy_source = False
+html_static_path = ["static"]
+html_css_files = ["pages.css"]
+copybutton_prompt_text = r">>> |\.\.\. |\$ "
+copybutton_prompt_is_regexp = True
 html_show_sphinx = False
 
 _ELSEWHERE = re.compile(
@@ -59,9 +83,6 @@ _ELSEWHERE = re.compile(
     r"|<link(?![^>]*rel=[\"']canonical)[^>]*\shref=[\"'](?:https?:)?//[^\"']*"
     r"|(?:url\(|@import )\s*[\"']?(?:https?:)?//[^\"')]*"
 )
-
-
-ROOT = Path(__file__).parents[1]
 
 
 class Name(PyXRefRole):
@@ -77,7 +98,7 @@ class Name(PyXRefRole):
 
 def write_reference(app: Sphinx, config: Config) -> None:
     """Write a page for each package, with a section for each of its modules."""
-    folder = Path(app.srcdir) / "reference"
+    folder = Path(app.srcdir) / "api"
     folder.mkdir(exist_ok=True)
     packages = sorted(file.parent for file in (ROOT / "siq").rglob("__init__.py"))
     pages = {name: [name] for name in ("siq.errors", "siq.version")}

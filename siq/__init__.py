@@ -33,6 +33,11 @@ if TYPE_CHECKING:
     from siq.networks.training import train
     from siq.potential.storage import read_model
     from siq.potential.symbolic import SymbolicDecomposition
+    from siq.report.plots.barriers import plot_barriers
+    from siq.report.plots.diagnosis import plot_diagnosis
+    from siq.report.plots.quasipotential import plot_quasipotential
+    from siq.report.plots.residuals import plot_residuals
+    from siq.report.plots.wells import plot_paths, plot_wells
     from siq.steps.pipeline import PipelineSettings
     from siq.study.study import Study, load_study
 
@@ -60,6 +65,12 @@ __all__ = [
     "load_study",
     "load_system",
     "parse_formula",
+    "plot_barriers",
+    "plot_diagnosis",
+    "plot_paths",
+    "plot_quasipotential",
+    "plot_residuals",
+    "plot_wells",
     "read_case",
     "read_model",
     "read_recordings",
@@ -93,6 +104,12 @@ _MODULES = {
     "load_study": "siq.study.study",
     "load_system": "siq.dynamics.cards",
     "parse_formula": "siq.dynamics.formulas",
+    "plot_barriers": "siq.report.plots.barriers",
+    "plot_diagnosis": "siq.report.plots.diagnosis",
+    "plot_paths": "siq.report.plots.wells",
+    "plot_quasipotential": "siq.report.plots.quasipotential",
+    "plot_residuals": "siq.report.plots.residuals",
+    "plot_wells": "siq.report.plots.wells",
     "read_case": "siq.mismatch.case",
     "read_model": "siq.potential.storage",
     "read_recordings": "siq.data.recordings",

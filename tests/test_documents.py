@@ -1,81 +1,254 @@
-"""The documents name what there is: modules and tests by their paths, keys of studies with their defaults."""
+"""The documents name what there is, quote what was measured, and show what was really run."""
 
 from __future__ import annotations
 
-import dataclasses
+import importlib.util
+import json
 import re
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
 import yaml
 from pydantic import BaseModel
 
-from siq.certificate.tests import CertificateOptions
-from siq.dynamics.sampling import SimulationEntry
-from siq.identify.identification import IdentificationOptions
-from siq.landscape.options import LandscapeOptions
-from siq.networks.options import CheckOptions, TrainingOptions
-from siq.networks.regression import RegressionOptions
-from siq.potential.refinement import RefinementOptions
+import siq
+from siq.dynamics.cards import SystemCard
+from siq.mismatch.dictionary import Form, Mechanism, MechanismParameter, standard_dictionary
+from siq.mismatch.study import MismatchStudy
+from siq.networks.options import TrainingOptions
 from siq.study.study import RecordingsOptions, Study
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
-SECTIONS = {
-    "Study: `config/studies/NAME.yaml`": Study,
-    "`recordings`": RecordingsOptions,
-    "`simulation`": SimulationEntry,
-    "`identification`": IdentificationOptions,
-    "`training`": TrainingOptions,
-    "`training.check`": CheckOptions,
-    "`regression`": RegressionOptions,
-    "`refinement`": RefinementOptions,
-    "`certificate`": CertificateOptions,
-    "`landscape`": LandscapeOptions,
-}
+DOCS = ROOT / "docs"
+WRITTEN = [page for page in sorted(DOCS.rglob("*.md")) if "_build" not in page.parts]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "config" / "README.md", *WRITTEN]
+FIGURES = json.loads((DOCS / "figures.json").read_text(encoding="utf-8"))
+EXAMPLES = sorted((DOCS / "gallery").glob("*.py"))
+NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.py"))
+MARK = re.compile(r"<!--=([\w.]+)-->(.*?)<!--/-->", re.DOTALL)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def loaded(path: Path) -> ModuleType:
+    """A script of the documentation as a module."""
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def name_of(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_paths_of_the_sources_exist(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
-    named = set(re.findall(r"\b(?:siq|tests|workflow|benchmarks|config)/[\w/.-]*\.(?:py|yaml|smk)\b", text))
+    named = set(
+        re.findall(
+            r"\b(?:siq|tests|workflow|benchmarks|config|docs)/[\w/.-]*\.(?:py|yaml|smk|md|rst)\b", text
+        )
+    )
     assert not {path for path in named if "NAME" not in path and not (ROOT / path).exists()}
 
 
-def documented(heading: str) -> dict[str, str]:
-    """The first table below a heading: default by key."""
-    text = (ROOT / "docs" / "system-cards-and-studies.md").read_text(encoding="utf-8")
-    section = re.split(r"^#+ ", text.split(f"# {heading}\n", 1)[1], maxsplit=1, flags=re.MULTILINE)[0]
-    rows = re.findall(r"^\| (`.+?`) \| .+? \| (.*?) ?\| .*\|$", section, flags=re.MULTILINE)
-    return {
-        key: default
-        for keys, defaults in rows
-        for key, default in zip(
-            keys.replace("`", "").split(", "), spread(defaults, keys.count(",") + 1), strict=True
-        )
+@pytest.mark.parametrize("page", [ROOT / "README.md", ROOT / "CONTRIBUTING.md"], ids=name_of)
+def test_links_lead_somewhere(page: Path) -> None:
+    links = re.findall(r"\]\((?!https?://|#)([^)#]+)", page.read_text(encoding="utf-8"))
+    assert not [link for link in links if not (page.parent / link).exists()]
+
+
+# Figures that were measured.
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_measured_figures_are_those_of_the_tables(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    known = {f"{group}.{name}": one["value"] for group, of in FIGURES.items() for name, one in of.items()}
+    marked = MARK.findall(text)
+    assert [(name, value) for name, value in marked if known.get(name) != value] == []
+    named = set(re.findall(r"\{\{ *figures\.([\w.]+) *\}\}", text))
+    assert not named - set(known)
+    if page.name != "results.md":  # which has the tables that others quote from
+        unmarked = MARK.sub("", text)
+        long = {value for value in known.values() if len(value) > 6} - {
+            "50 of 50"
+        }  # which the paper has, too
+        typed = {value for value in long if re.search(rf"(?<!\d){re.escape(value)}", unmarked)}
+        assert not typed, f"quote these from docs/figures.json: {typed}"
+
+
+def test_figures_are_read_from_tables(tmp_path: Path) -> None:
+    import pandas as pd
+
+    figures = loaded(DOCS / "make" / "figures.py")
+    tables = tmp_path / "tables"
+    tables.mkdir()
+    kinds = ["null", "null", "mechanism", "mechanism", "mechanism"]
+    pd.DataFrame(
+        {"kind": kinds, "false_alarm": [True, *4 * [False]],
+         "oracle_delta_chi2": [0.0, 0.0, 500.0, 500.0, 5.0],
+         "truth_in_class": [False, False, True, False, False]}
+    ).to_parquet(tables / "score.parquet")  # fmt: skip
+    assert figures.proof(tables) == {
+        "cases": "5", "quiet": "2", "false_alarms": "1", "knowable": "2", "named": "1"
+    }  # fmt: skip
+    scores = pd.DataFrame(
+        {"run": [0, 0], "method": ["regression", "refined"], "rrmse": [0.1, 3.25e-11],
+         "certified": [False, True], "support_correct": pd.array([False, True], dtype="boolean"),
+         "network_error": [0.2, 0.2]}
+    )  # fmt: skip
+    scores.to_parquet(tables / "rrmse.parquet")
+    errors = {
+        "run": [0, 0],
+        "method": ["regression", "refined"],
+        "trajectory": [0, 0],
+        "error": [0.05, 4e-11],
     }
+    pd.DataFrame(errors).to_parquet(tables / "prediction.parquet")
+    terms = {"method": ["refined"], "component": ["U"], "estimate": [1.0], "exact": [1.0 + 1e-10]}
+    pd.DataFrame(terms).to_parquet(tables / "coefficients.parquet")
+    found = figures.archetype3d(tables)
+    assert set(found) == set(FIGURES["archetype3d"])
+    assert found["rrmse_mean"] == "3.2·10⁻¹¹" and found["regression_right_terms"] == "0 of 1"
 
 
-def spread(defaults: str, count: int) -> list[str]:
-    """What a row says of several keys: a default for each, or one for all."""
-    return [defaults] * count if count == 1 or ", " not in defaults else defaults.split(", ")
+def test_the_readme_is_filled_in_by_the_script() -> None:
+    figures = loaded(DOCS / "make" / "figures.py")
+    assert figures.filled("so <!--=a.b-->old<!--/-->!", {"a.b": "new"}) == "so <!--=a.b-->new<!--/-->!"
 
 
-def defaults_of(schema: Any) -> dict[str, Any]:
-    """Defaults by key, as a YAML file would have them; none where a key has to be given."""
-    if issubclass(schema, BaseModel):
-        return {name: None if one.is_required() else one.default for name, one in schema.model_fields.items()}
-    return {one.name: one.default for one in dataclasses.fields(schema)}
+# Examples and notebooks that were run.
 
 
-@pytest.mark.parametrize(("heading", "schema"), SECTIONS.items(), ids=SECTIONS)
-def test_keys_of_studies_stand_with_their_defaults(heading: str, schema: Any) -> None:
-    said, there = documented(heading), defaults_of(schema)
-    assert set(said) == set(there)
-    # What holds where the default is nothing, or the options of a step, is said in words.
-    plain = {
-        key: one for key, one in there.items() if isinstance(one, int | float | tuple | str) and one != ""
+def test_every_example_has_a_page_and_every_page_an_example() -> None:
+    pages = {page.stem for page in (DOCS / "gallery").glob("*.md")} - {"index"}
+    assert pages == {script.stem for script in EXAMPLES}
+    assert len(EXAMPLES) >= 5
+
+
+@pytest.mark.parametrize("script", EXAMPLES, ids=lambda script: script.stem)
+def test_outputs_of_examples_belong_to_their_text(script: Path) -> None:
+    outputs = DOCS / "gallery" / "outputs" / script.stem
+    made = json.loads((outputs / "made-from.json").read_text(encoding="utf-8"))
+    assert made["sha256"] == loaded(DOCS / "make" / "gallery.py").digest(script), "run `make docs-full`"
+    assert made["seconds"] <= 60
+    assert {"output.txt", "figure.png", "table.csv"} <= {file.name for file in outputs.iterdir()}
+    assert (outputs / "output.txt").read_text(encoding="utf-8").strip()
+
+
+@pytest.mark.parametrize("script", NOTEBOOKS, ids=lambda script: script.stem)
+def test_notebooks_belong_to_their_text_and_ran_through(script: Path) -> None:
+    notebook = json.loads(script.with_suffix(".ipynb").read_text(encoding="utf-8"))
+    module = loaded(DOCS / "make" / "notebooks.py")
+    assert notebook["metadata"]["made_from"]["sha256"] == module.digest(script), "run `make docs-full`"
+    assert len(notebook["cells"]) == len(module.cells(script.read_text(encoding="utf-8")))
+    code = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert code and all(cell["execution_count"] for cell in code)
+    assert not [out for cell in code for out in cell["outputs"] if out["output_type"] == "error"]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [*EXAMPLES, *NOTEBOOKS, *sorted((DOCS / "how-to").glob("*.md")), DOCS / "start-here.md"],
+    ids=name_of,
+)
+def test_names_of_the_library_exist(text: Path) -> None:
+    blocks = [text.read_text(encoding="utf-8")]
+    if text.suffix == ".md":
+        blocks = re.findall(r"```python\n(.*?)```", blocks[0], flags=re.DOTALL)
+    for block in blocks:
+        for name in re.findall(r"(?<![\w.\"/])siq\.([A-Za-z_]\w*)", block):
+            module = importlib.util.find_spec(f"siq.{name}") if name.islower() else None
+            assert name in siq.__all__ or module is not None, f"siq.{name}"
+
+
+# The reference.
+
+
+SCHEMAS = re.findall(
+    r"```\{schema\} ([\w.]+):(\w+)",
+    "\n".join(page.read_text(encoding="utf-8") for page in (DOCS / "reference").glob("*.md")),
+)
+
+
+@pytest.mark.parametrize(("module", "name"), SCHEMAS, ids=lambda one: one.rpartition(".")[2])
+def test_every_key_has_a_meaning(module: str, name: str) -> None:
+    schemas = pytest.importorskip("docutils") and loaded(DOCS / "extensions" / "schemas.py")
+    schema = getattr(importlib.import_module(module), name)
+    said = schemas.meanings(schema)
+    assert not [key for key in schemas.fields(schema) if not said.get(key)]
+    assert len(schemas.rows(schema)) == len(schemas.fields(schema))
+
+
+def nested(schema: Any) -> set[str]:
+    """Names of all classes of options that a schema leads to."""
+    found = {schema.__name__}
+    items = schema.model_fields if issubclass(schema, BaseModel) else schema.__pydantic_fields__
+    for field in items.values():
+        for part in re.findall(r"\b[A-Z]\w+", str(field.annotation)):
+            found.add(part)
+    return found
+
+
+@pytest.mark.parametrize(
+    "schema",
+    [
+        Study,
+        RecordingsOptions,
+        TrainingOptions,
+        SystemCard,
+        MismatchStudy,
+        Mechanism,
+        Form,
+        MechanismParameter,
+    ],
+)
+def test_the_reference_has_every_class_of_keys(schema: Any) -> None:
+    shown = {name for _, name in SCHEMAS}
+    asked = {
+        name for name in nested(schema) if name.endswith(("Options", "Entry", "Mechanism", "Form", "Shape"))
     }
-    read = {key: yaml.safe_load(re.sub(r"(\d)e-", r"\1.0e-", said[key].replace("`", ""))) for key in plain}
-    assert read == {key: list(one) if isinstance(one, tuple) else one for key, one in plain.items()}
+    assert asked - {"DiffusionEntry"} <= shown
+
+
+def test_types_and_defaults_stand_as_a_study_writes_them() -> None:
+    schemas = loaded(DOCS / "extensions" / "schemas.py")
+    rows = {row[0]: row for row in schemas.rows(Study)}
+    assert rows["`runs`"][1:3] == ("whole number ≥ 1, ≤ 10,000", "`1`")
+    assert rows["`name`"][2] == "required"
+    assert rows["`invariant`"][1] == "list of: number > 0"
+    rows = {row[0]: row for row in schemas.rows(TrainingOptions, "training.")}
+    assert rows["`training.widths`"][2] == "`[50, 50, 50]`"
+    assert rows["`training.precision`"][1:3] == ("`float32` or `float64`", "`float32`")
+    assert yaml.safe_load(rows["`training.relative_dynamics`"][2].strip("`")) is True
+
+
+def test_the_reference_says_how_many_mechanisms_there_are_by_listing_them() -> None:
+    assert len(standard_dictionary()) >= 20
+    assert "```{mechanisms}" in (DOCS / "reference" / "mechanisms.md").read_text(encoding="utf-8")
+
+
+# Snakemake's conventions.
+
+
+def test_the_catalogue_of_workflows_finds_what_it_expects() -> None:
+    catalogue = yaml.safe_load((ROOT / ".snakemake-workflow-catalog.yml").read_text(encoding="utf-8"))
+    assert catalogue["usage"]["software-stack-deployment"]
+    assert (ROOT / "config" / "README.md").is_file()
+    assert (ROOT / "workflow" / "report" / "workflow.rst").is_file()
+
+
+def test_every_caption_is_used_and_every_used_caption_exists() -> None:
+    rules = "".join(file.read_text(encoding="utf-8") for file in (ROOT / "workflow").rglob("*.smk"))
+    rules += (ROOT / "Snakefile").read_text(encoding="utf-8")
+    captions = {file.name for file in (ROOT / "workflow" / "report").glob("*.rst")}
+    assert captions == set(re.findall(r"\b(\w+\.rst)\b", rules))
+
+
+def test_the_configuration_is_described() -> None:
+    told = (ROOT / "config" / "README.md").read_text(encoding="utf-8")
+    config = yaml.safe_load((ROOT / "config" / "config.yaml").read_text(encoding="utf-8"))
+    assert not [key for key in config if f"`{key}`" not in told]

@@ -19,7 +19,8 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["
 LIGHT = ("numerics", "files", "data", "dynamics", "identify", "estimation", "reference", "potential",
          "certificate", "landscape", "mismatch", "study")  # fmt: skip
 ABSENT = ("torch", "pysindy", "sklearn", "cvxpy", "matplotlib", "snakemake", "pygments", "pyarrow", "h5py")
-READERS = ("siq.data.cells", "siq.data.formats")  # of files of recordings: these are pyarrow's
+# Of files of recordings: these are pyarrow's.
+READERS = tuple(f"siq.data.{name}" for name in ("cells", "clock_times", "formats", "layout", "tables"))
 
 
 BLOCK = """

@@ -42,7 +42,7 @@ ORDER = (
 UPWARDS: frozenset[tuple[str, str]] = frozenset(
     {
         ("siq.landscape.landscape", "siq.report.landscape_text"),
-        ("siq.landscape.landscape", "siq.report.plots.landscape_axes"),
+        ("siq.landscape.landscape", "siq.report.plots.quasipotential"),
         ("siq.landscape.landscape", "siq.steps.pipeline"),
         ("siq.mismatch.diagnosis", "siq.report.diagnosis_report"),
     }

@@ -17,10 +17,8 @@ from siq.data.public_recordings import BENCHMARKS
 from siq.dynamics.cards import SystemCard
 from siq.errors import InputError
 from siq.files.documents import Document, read_document, validate
-from siq.study.study import system_path
-from workflow.settings import SYSTEMS, find_resource
+from workflow.places import config_path, find_file, needed_file, system_card
 
-FOLDER = Path("config/mismatch")
 MADE = "results/recordings"
 CARD, STUDY = "system.yaml", "study.yaml"
 RECORDINGS = ("recordings.parquet", "recordings.csv")
@@ -134,12 +132,12 @@ class Cases:
             Where it is not there, with what to get and where to put it.
         """
         one = BENCHMARKS[benchmark]
-        file = find_resource(one.file)
-        if not Path(file).is_file():
+        file = find_file(one.file)
+        if file is None:
             raise InputError(
                 one.file, "", f"the recordings of the benchmark {benchmark} are not there",
                 f"get {one.what} from nonlinearbenchmark.org, put it there below a folder of yours, and name"
-                " that folder by the environment variable SIQ_RECORDINGS",
+                " that folder by the environment variable SIQ_RESOURCES (earlier: SIQ_RECORDINGS)",
             )  # fmt: skip
         return file
 
@@ -152,10 +150,12 @@ class Cases:
         return ""
 
     def _folders(self) -> dict[str, Path]:
-        """The cases of the folder: every folder in it with a card or with recordings."""
+        """The cases of the folder: itself, or every folder in it with a card or with recordings."""
         base = Path(str(self._folder)).expanduser()
         if not base.is_dir():
             raise InputError(str(self._folder), "", "there is no such folder", "correct --config cases=DIR")
+        if (base / CARD).is_file():
+            return {base.resolve().name: base}
         return {
             path.name: path
             for path in sorted(base.iterdir())
@@ -168,10 +168,8 @@ class Cases:
                 folder, "", f"'{name}' cannot name a folder of results",
                 "rename it, with letters, digits, dots, dashes and underscores",
             )  # fmt: skip
-        if (FOLDER / f"{name}.yaml").exists():
-            raise InputError(
-                folder, "", f"a study of that name stands in {FOLDER}", "rename the folder of the case"
-            )
+        if (taken := config_path("mismatch", f"{name}.yaml")).exists():
+            raise InputError(folder, "", f"a study of that name is {taken}", "rename the folder of the case")
         found = [str(folder / each) for each in RECORDINGS if (folder / each).is_file()]
         if len(found) != 1:
             fault = "it has no recordings" if not found else "it has two files of recordings"
@@ -179,13 +177,13 @@ class Cases:
         if not (folder / CARD).is_file():
             raise InputError(folder, "", "it has no card of the simulation", f"add {CARD}")
         study = str(folder / STUDY) if (folder / STUDY).is_file() else None
-        command = f"snakemake --cores 2 diagnose --config cases={self._folder}"
+        command = f"siq diagnose {self._folder}"
         return _checked(name, str(folder / CARD), found[0], study, command)
 
     def _of_study(self, name: str) -> CheckedCase:
         from siq.mismatch.study import MismatchStudy
 
-        file = str(FOLDER / f"{name}.yaml")
+        file = str(config_path("mismatch", f"{name}.yaml"))
         document = read_document(file)
         study = validate(document, MismatchStudy)
         for key in ("system", "recordings"):
@@ -193,8 +191,10 @@ class Cases:
                 raise InputError(file, "", f"the key '{key}' is missing", f"add '{key}: ...'")
         assert study.system is not None and study.recordings is not None  # just checked
         command = f"snakemake --cores 2 results/mismatch/{name}/report.html"
-        card = str(system_path(study.system, systems=SYSTEMS))
-        return _checked(name, card, find_resource(study.recordings), file, command)
+        start = Path(file).parent
+        card = str(system_card(study.system, start=start))
+        recordings = needed_file(study.recordings, start=start, where=(file, document.place(("recordings",))))
+        return _checked(name, card, recordings, file, command)
 
 
 def _checked(name: str, card: str, recordings: str, study: str | None, command: str) -> CheckedCase:

@@ -7,6 +7,8 @@ import hashlib
 from functools import cache
 from pathlib import Path
 
+import siq
+
 
 @cache
 def code_digest(base: Path, script: str) -> dict[str, str]:
@@ -16,9 +18,16 @@ def code_digest(base: Path, script: str) -> dict[str, str]:
     script imports. As a parameter of the rule, this tells it.
     """
     digests = {}
-    for file in imported_files(base, base / "workflow" / "scripts" / script):
-        digests[str(file.relative_to(base))] = _digest(file)
+    library = library_of(base)
+    for file in imported_files(base, base / "workflow" / "scripts" / script, library=library):
+        beside = base if file.is_relative_to(base) else library
+        digests[file.relative_to(beside).as_posix()] = _digest(file)
     return digests
+
+
+def library_of(base: Path) -> Path:
+    """The folder that the package lies in: beside the workflow in a checkout, elsewhere when installed."""
+    return base if (base / "siq").is_dir() else Path(siq.__file__).resolve().parents[1]
 
 
 @cache
@@ -26,13 +35,15 @@ def _digest(file: Path) -> str:
     return hashlib.sha256(file.read_bytes()).hexdigest()[:12]
 
 
-def imported_files(base: Path, script: Path) -> list[Path]:
+def imported_files(base: Path, script: Path, *, library: Path | None = None) -> list[Path]:
     """The Python files of this project that a script runs, itself included, found from its imports.
 
     Imports within functions count as well, and so do the packages that a module lies in. Imports for
     type checking alone, under ``if TYPE_CHECKING:``, are not made when the script runs and do not count. All
-    are read as text, nothing is run. How a script is started changes nothing that it computes.
+    are read as text, nothing is run. How a script is started changes nothing that it computes. The package
+    is sought in `library` where it does not lie beside the workflow.
     """
+    folders = dict.fromkeys((base, library or base))
     found: dict[Path, None] = {}
     waiting = [script]
     while waiting:
@@ -42,7 +53,8 @@ def imported_files(base: Path, script: Path) -> list[Path]:
         found[file] = None
         for module in _imported_modules(file):
             # A script finds its neighbours by their bare names.
-            waiting += [*_module_files(base, module), *_module_files(script.parent, module)]
+            places = (*(folders if module.partition(".")[0] == "siq" else (base,)), script.parent)
+            waiting += [path for place in places for path in _module_files(place, module)]
     return sorted(found)
 
 

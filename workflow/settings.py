@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import difflib
+import importlib.util
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,12 +18,13 @@ from siq.dynamics.dynamics import Dynamics
 from siq.errors import InputError
 from siq.files.documents import Document, read_document, validate
 from siq.steps.of_study import StudyParts, settings_of
-from siq.study.study import Study, check_states, completed, load_published, load_study_system, system_path
+from siq.study.study import Study, check_states, completed, load_published, load_study_system
+from siq.version import DISTRIBUTION
+from workflow.places import BASE, config_path, names_in, needed_file, published_figures, system_card
 
-WORKFLOW_KEYS = ("statistics", "device", "runs_per_training", "mismatch", "cases", "keys", "proof")
-SYSTEMS = Path("config/systems")
-STUDIES = Path("config/studies")
-PUBLISHED = Path("config/published")
+WORKFLOW_KEYS = ("statistics", "device", "runs_per_training", "mismatch", "cases", "keys", "proof", "origin")
+NETWORKS = ("torch", "pysindy")
+"""What a study that asks for networks needs beside the rest."""
 
 
 @dataclass(frozen=True)
@@ -38,18 +41,29 @@ class CheckedStudy:
         Its system, where it names one.
     runs_per_training
         Runs that one training job takes.
+    origin
+        What `siq run` was given where it wrote the study itself: the file of recordings.
+    recordings_at
+        The place of their name in the study's file, for messages.
     """
 
     study: Study
     file: str
     system: Dynamics | None
     runs_per_training: int
+    origin: str | None = None
+    recordings_at: str = "recordings.file"
+
+    @property
+    def folder(self) -> Path:
+        """Where the relative paths of the study start."""
+        return Path(self.file).parent
 
     def command(self) -> str:
         """How to make this study's report again."""
-        own = Path(self.file) != STUDIES / f"{self.study.name}.yaml"
-        option = f" --configfile {self.file}" if own else ""
-        return f"snakemake --cores 2 results/{self.study.name}/report.html{option}"
+        if Path(self.file) == config_path("studies", f"{self.study.name}.yaml"):
+            return f"snakemake --cores 2 results/{self.study.name}/report.html"
+        return f"siq run {self.origin or _from_here(self.file)}"
 
     def run_names(self) -> list[str]:
         """``000``, ``001``, …, one for every run."""
@@ -68,9 +82,11 @@ class CheckedStudy:
     def source(self) -> str:
         """The file that the data come from: the recordings, or the card that is simulated."""
         if self.study.recordings is not None:
-            return find_resource(self.study.recordings.file)
-        assert self.study.system is not None  # the schema asks for one of the two
-        return str(system_path(self.study.system, systems=SYSTEMS))
+            where = (self.file, self.recordings_at)
+            return needed_file(self.study.recordings.file, start=self.folder, where=where)
+        card = self.card()
+        assert card is not None  # the schema asks for one of the two
+        return card
 
     def check_recordings(self) -> None:
         """Refuse recordings that cannot be used before any job starts; those that a rule makes come later.
@@ -99,11 +115,13 @@ class CheckedStudy:
 
     def card(self) -> str | None:
         """The system card, where the study names one."""
-        return None if self.study.system is None else str(system_path(self.study.system, systems=SYSTEMS))
+        return None if self.study.system is None else str(system_card(self.study.system, start=self.folder))
 
     def published(self) -> str | None:
         """The file of published figures, where the study names one."""
-        return None if self.study.published is None else str(PUBLISHED / f"{self.study.published}.yaml")
+        if self.study.published is None:
+            return None
+        return str(published_figures(self.study.published, start=self.folder))
 
     def exact(self) -> str | None:
         """The card's exact answer as text, on which scoring alone depends."""
@@ -142,6 +160,7 @@ class Studies(Mapping[str, CheckedStudy]):
                 "write 1 or more",
             )
         self._defaults = config.get("statistics", [])
+        self._origin = config.get("origin")
         self._own: str | None = None
         if any(key not in WORKFLOW_KEYS for key in config):
             self._own = self._user_study(config, configfiles)
@@ -167,8 +186,22 @@ class Studies(Mapping[str, CheckedStudy]):
                 document.file, document.place(("name",)), f"the study is named '{study.name}'",
                 f"name it '{name}' as its file, or rename the file",
             )  # fmt: skip
-        system = load_study_system(study, file=document.file, systems=SYSTEMS)
-        checked = CheckedStudy(completed(study, system), document.file, system, self._runs_per_training)
+        if study.training is not None:
+            _need_networks(document)
+        if study.system is not None:
+            card = _existing_card(study.system, document)
+            named = study.model_copy(update={"system": str(card)})
+            system = load_study_system(named, file=document.file, systems=card.parent)
+        else:
+            system = load_study_system(study, file=document.file, systems=BASE)
+        checked = CheckedStudy(
+            completed(study, system),
+            document.file,
+            system,
+            self._runs_per_training,
+            self._origin,
+            document.place(("recordings", "file")),
+        )
         if (published := checked.published()) is not None:
             load_published(published)
         self._checked[study.name] = checked
@@ -180,24 +213,48 @@ class Studies(Mapping[str, CheckedStudy]):
 
     def __getitem__(self, name: str) -> CheckedStudy:
         if name not in self._checked:
-            self._check(read_document(STUDIES / f"{name}.yaml"), name)
+            self._check(read_document(config_path("studies", f"{name}.yaml")), name)
         return self._checked[name]
 
     def __iter__(self):  # type: ignore[no-untyped-def]
         own = [] if self._own is None else [self._own]
-        yield from dict.fromkeys([*own, *sorted(path.stem for path in STUDIES.glob("*.yaml"))])
+        yield from dict.fromkeys([*own, *names_in("studies")])
 
     def __len__(self) -> int:
         return len(list(iter(self)))
 
 
-def find_resource(file: str) -> str:
-    """A file of the user's: where it says, or else in a folder of ``SIQ_RESOURCES`` or ``SIQ_RECORDINGS``."""
-    for variable in ("SIQ_RESOURCES", "SIQ_RECORDINGS"):
-        folder = os.environ.get(variable)
-        if folder and not Path(file).exists() and (found := Path(folder) / file).exists():
-            return str(found)
-    return file
+def _existing_card(system: str, document: Document) -> Path:
+    """The card that a study names, which has to be there."""
+    card = system_card(system, start=Path(document.file).parent)
+    if card.is_file():
+        return card
+    where = (document.file, document.place(("system",)))
+    if system.endswith((".yaml", ".yml")):
+        return Path(needed_file(system, start=Path(document.file).parent, where=where))
+    known = names_in("systems")
+    near = difflib.get_close_matches(system, known, n=1)
+    raise InputError(
+        *where, f"there is no card of a system '{system}'",
+        f"did you mean '{near[0]}'" if near else f"give the path of one, or use one of {', '.join(known)}",
+    )  # fmt: skip
+
+
+def _need_networks(document: Document) -> None:
+    """Refuse a study that asks for networks where the packages for them are not installed."""
+    missing = [name for name in NETWORKS if importlib.util.find_spec(name) is None]
+    if missing:
+        raise InputError(
+            document.file, document.place(("training",)),
+            f"the study asks for networks, which need {' and '.join(missing)}",
+            f"install them by: pip install '{DISTRIBUTION}[networks]', or leave the key 'training' out",
+        )  # fmt: skip
+
+
+def _from_here(file: str) -> str:
+    """A file as you would write it in the folder in which you work."""
+    path = Path(file)
+    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else file
 
 
 def prepare_environment() -> None:
@@ -208,7 +265,7 @@ def prepare_environment() -> None:
     of some 100 kB all the time, which glibc would return to the system each time: a fifth of every step.
     Scripts import modules of the workflow by their full names, as the rules do.
     """
-    root = str(Path(__file__).resolve().parents[1])
+    root = str(BASE)
     paths = [path for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
     if root not in paths:
         os.environ["PYTHONPATH"] = os.pathsep.join([root, *paths])

@@ -2,10 +2,21 @@
 
 ===================  =================================================================
 `recordings`         which trajectories, and which pairs of states a short time apart?
-`selection`          whole recordings, chosen or drawn
-`formats`            how is a CSV, Parquet, HDF5 or MATLAB file read?
+`selection`          whole recordings, chosen or drawn; stretches of a single one
+`tables`             from cells to checked numbers: what is read, put right, refused?
+`folders`            which files are in a folder, and what did a wrong path mean?
+`formats`            how is a CSV, Parquet, HDF5, MATLAB or NumPy file read?
+`text_dialect`       how is a table of text written: separators, decimals, comments?
+`headings`           which name and which unit are in a heading?
+`layout`             which column is the time, which says the recording?
 `cells`              which number, label or unit is in a cell?
+`clock_times`        how many seconds are between dates?
+`repairs`            what can be put right without a guess?
 `checks`             is the table whole, and do its times increase?
+`learnable`          can anything be learned from these recordings?
+`quantum`            how finely were the numbers of a column written?
+`noise_floor`        how strong are the two kinds of noise, at a first look?
+`inspection`         what is in a file, and what will it be good for?
 `labels`             which recording has which label, and which has a copy of it?
 `held_out`           which recordings does a fit not see?
 `public_recordings`  what do the files of public benchmarks hold?

@@ -34,7 +34,7 @@ class CellFault(NamedTuple):
 
 
 def parse_numbers(file: str, name: str, cells: Column) -> tuple[np.ndarray, str | None, CellFault | None]:
-    """Turn the cells of a column into finite numbers.
+    """Turn the cells of a column into numbers.
 
     Parameters
     ----------
@@ -46,11 +46,11 @@ def parse_numbers(file: str, name: str, cells: Column) -> tuple[np.ndarray, str 
     Returns
     -------
     values : numpy.ndarray
-        Shape ``(n,)``, float64; only to be used where there is no fault.
+        Shape ``(n,)``, float64, NaN where nothing stands; only to be used where there is no fault.
     unit : str or None
         The unit that all cells carry.
     fault : CellFault or None
-        The first cell that is missing, not finite, no number, or in another unit than the first row.
+        The first cell that is infinite, no number, or in another unit than the first row.
 
     Raises
     ------
@@ -71,18 +71,19 @@ def parse_numbers(file: str, name: str, cells: Column) -> tuple[np.ndarray, str 
     except pa.ArrowInvalid:
         remedy = "subtract a constant, such as the time of the first sample"
         raise InputError(file, f"column {name}", "its integers are too large to be exact", remedy) from None
-    finite = np.isfinite(values)
-    if not finite.all():
-        row = int(np.argmin(finite))
+    infinite = np.isinf(values)
+    if infinite.any():
+        row = int(np.argmax(infinite))
         if fault is None or row + 1 < fault.row:
-            what = "missing (empty or NaN)" if np.isnan(values[row]) else "infinite"
             fault = CellFault(
-                row + 1, name, f"the value is {what}", "remove the row or write a finite number"
+                row + 1, name, "the value is infinite", "remove the row or write a finite number"
             )
     return values, unit, fault
 
 
-def parse_labels(file: str, cells: Column) -> tuple[np.ndarray, tuple[str, ...], CellFault | None]:
+def parse_labels(
+    file: str, cells: Column, *, blank: np.ndarray | None = None
+) -> tuple[np.ndarray, tuple[str, ...], CellFault | None]:
     """Give every label of the column ``recording`` a number, in order of first appearance.
 
     Parameters
@@ -91,11 +92,13 @@ def parse_labels(file: str, cells: Column) -> tuple[np.ndarray, tuple[str, ...],
         The file, for messages.
     cells
         Text, or whole numbers.
+    blank
+        Shape ``(n,)``: rows in which nothing else stands either, and which need no label.
 
     Returns
     -------
     recording : numpy.ndarray
-        Shape ``(n,)``, int64: the index of every row's label.
+        Shape ``(n,)``, int64: the index of every row's label, -1 of a blank row.
     labels : tuple of str
         The labels as text without outer spaces; 3 and 3.0 both become ``"3"``.
     fault : CellFault or None
@@ -121,12 +124,13 @@ def parse_labels(file: str, cells: Column) -> tuple[np.ndarray, tuple[str, ...],
     merged = np.append(texts.indices.to_numpy(), -1)
     codes = merged[cells.indices.cast(pa.int64()).fill_null(len(merged) - 1).to_numpy()]
     missing = (codes == -1) | (codes == texts.dictionary.index("").as_py())
-    if missing.any():
+    needed = missing if blank is None else missing & ~blank
+    if needed.any():
         remedy = "write the label of the row's recording"
-        return codes, (), CellFault(int(np.argmax(missing)) + 1, "recording", "the label is missing", remedy)
-    present = pa.array(codes).dictionary_encode()  # numbers again, now in order of first appearance
+        return codes, (), CellFault(int(np.argmax(needed)) + 1, "recording", "the label is missing", remedy)
+    present = pa.array(codes, mask=missing).dictionary_encode()  # again, now in order of first appearance
     labels = tuple(texts.dictionary.take(present.dictionary).to_pylist())
-    return present.indices.to_numpy().astype(np.int64), labels, None
+    return present.indices.fill_null(-1).to_numpy().astype(np.int64), labels, None
 
 
 def agree_on_unit(file: str, name: str, stated: Mapping[str, str | None], expected: str | None) -> str | None:
@@ -168,12 +172,6 @@ def agree_on_unit(file: str, name: str, stated: Mapping[str, str | None], expect
     return unit
 
 
-def split_heading(heading: str) -> tuple[str, str | None]:
-    """Split the heading of a column, such as ``x [mm]``, into its name and its unit, if stated."""
-    match = re.fullmatch(r"\s*(.*?)\s*\[\s*(.*?)\s*\]\s*", heading)
-    return (match[1], match[2] or None) if match else (heading.strip(), None)
-
-
 def _same_unit(left: str, right: str) -> bool:
     # The micro sign and the Greek letter look the same, as do m/s² and m/s2 to a reader.
     plain = [unicodedata.normalize("NFKC", unit).replace(" ", "") for unit in (left, right)]
@@ -210,6 +208,8 @@ def _split_units(name: str, cells: Column) -> tuple[Column, str | None, CellFaul
     found = _unit_of(cell)
     if found is None:
         fault, remedy = f"'{cell}' is no number", "write a number with a decimal point, or remove the row"
+        if not good.to_numpy(zero_copy_only=False).any():
+            remedy = "if the column is no state, name the states in the study, or remove the column"
     else:
         fault = f"mixed units, {found or 'no unit'} after rows in {unit or 'no unit'}"
         remedy = "convert the whole column to one unit"

@@ -1,16 +1,16 @@
 """Files of recordings: which formats are read, and how.
 
-Parquet, CSV, HDF5 and MATLAB files are told apart by suffix and all become the same thing: names, known
-before anything large is read, and columns of cells, read on request. What the cells mean is the matter of
-`siq.data.cells`.
+Parquet, CSV, HDF5, MATLAB and NumPy files are told apart by suffix and all become the same thing: headings,
+known before anything large is read, and columns of cells, read on request. What the headings mean is the
+matter of `siq.data.layout`, what the cells mean that of `siq.data.cells`.
 
 Files are data. Nothing is unpickled, and MATLAB objects and structs are refused before they are read.
 """
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import json
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,9 +18,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
-from siq.data.cells import Column, split_heading
+from siq.data.cells import Column
 from siq.data.checks import equally_long
+from siq.data.folders import missing_file
+from siq.data.headings import is_label, read_heading
+from siq.data.text_dialect import TextTable, read_text_table
 from siq.errors import InputError
 
 if TYPE_CHECKING:
@@ -35,18 +39,24 @@ class ColumnFile:
 
     Attributes
     ----------
-    names
-        The columns' names, in the order of the file.
+    headings
+        What stands above the columns, in the order of the file, a unit included where there is one.
     units
-        The units stated outside the cells, by the place that states them: ``"name"`` where the heading is
-        ``x [mm]``, ``"metadata"`` where the format keeps a unit (Parquet field metadata, HDF5 attribute).
+        The unit of each column that stands neither in its heading nor in its cells (Parquet field metadata,
+        HDF5 attribute, a second line of headings), None where there is none.
     load
-        Reads the columns of the given positions in `names`; all have the same length.
+        Reads the columns of the given positions in `headings`; all have the same length.
+    titles
+        What people call each column, where the file keeps that beside a name (Parquet that we wrote).
+    notes
+        What was recognised or assumed.
     """
 
-    names: tuple[str, ...]
-    units: tuple[Mapping[str, str | None], ...]
+    headings: tuple[str, ...]
+    units: tuple[str | None, ...]
     load: Callable[[Sequence[int]], list[Column]]
+    titles: tuple[str | None, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 def open_columns(path: str | Path) -> ColumnFile:
@@ -55,7 +65,7 @@ def open_columns(path: str | Path) -> ColumnFile:
     Parameters
     ----------
     path
-        A file named ``.parquet``, ``.csv``, ``.h5``, ``.hdf5`` or ``.mat``. HDF5 holds one dataset per
+        A file with one of the suffixes of `READERS`. HDF5 holds one dataset per
         column at the root, or a single compound dataset; a MATLAB file holds one vector per column.
 
     Raises
@@ -64,26 +74,34 @@ def open_columns(path: str | Path) -> ColumnFile:
         When the suffix is unknown, or the file is missing, empty or damaged; `ColumnFile.load` raises it
         for columns that are no vectors of numbers or text, or that differ in length.
     """
-    file = str(path)
-    reader = READERS.get(Path(path).suffix.lower())
-    if reader is None:
-        raise InputError(
-            file, "", f"the suffix '{Path(path).suffix}' is unknown", f"use one of {', '.join(READERS)}"
-        )
+    file, suffix = str(path), Path(path).suffix.lower()
+    if not Path(path).exists() and (suffix in READERS or not suffix):
+        raise missing_file(file, [Path(path)])
+    begin = b""
     try:
-        with Path(path).open("rb") as stream:
-            empty = not stream.read(1)
+        if suffix in READERS or Path(path).exists():
+            with Path(path).open("rb") as stream:
+                begin = stream.read(8)
     except OSError as error:
         raise InputError(
             file, "", f"it cannot be read ({error.strerror})", "check the name and permissions"
         ) from None
-    if empty:
+    if not begin and suffix in READERS:
         raise InputError(file, "", "the file is empty", "write the recordings again")
+    if (suffix in SPREADSHEETS or begin.startswith(b"PK\x03\x04")) and suffix != ".npz":
+        raise InputError(
+            file, "", "it is a spreadsheet", "save the sheet as CSV (in Excel: Save As, CSV UTF-8)"
+        )
+    reader = READERS.get(suffix)
+    if reader is None:
+        raise InputError(
+            file, "", f"the suffix '{Path(path).suffix}' is unknown", f"use one of {', '.join(READERS)}"
+        )
     return reader(file)
 
 
 def frame_columns(file: str, frame: pd.DataFrame) -> ColumnFile:
-    """The columns of a table in memory, as those of a file; without labels all rows are one recording.
+    """The columns of a table in memory, as those of a file.
 
     Parameters
     ----------
@@ -93,16 +111,12 @@ def frame_columns(file: str, frame: pd.DataFrame) -> ColumnFile:
         Columns may have a unit behind their name, or in ``frame.attrs["units"]``.
     """
     headings = [str(heading) for heading in frame.columns]
-    labelled = any(split_heading(heading)[0] == "recording" for heading in headings)
     known = frame.attrs.get("units", {})
-    units = [known.get(split_heading(heading)[0]) for heading in headings]
+    units = [known.get(read_heading(heading).title) for heading in headings]
 
     def load(positions: Sequence[int]) -> list[Column]:
         columns = []
         for position in positions:
-            if position == len(headings):
-                columns.append(pa.array(["0"] * len(frame)))
-                continue
             try:
                 columns.append(pa.Array.from_pandas(frame.iloc[:, position]))
             except (pa.ArrowInvalid, pa.ArrowTypeError, pa.ArrowNotImplementedError):
@@ -110,18 +124,15 @@ def frame_columns(file: str, frame: pd.DataFrame) -> ColumnFile:
                 raise InputError(file, f"column {headings[position]}", fault, "make it numbers") from None
         return columns
 
-    return _column_file(headings + ([] if labelled else ["recording"]), load, units + [None] * (not labelled))
+    return _column_file(headings, load, units)
 
 
 def _column_file(
     headings: Sequence[str],
     load: Callable[[Sequence[int]], list[Column]],
-    metadata: Sequence[str | None] | None = None,
+    units: Sequence[str | None] | None = None,
 ) -> ColumnFile:
-    parts = [split_heading(heading) for heading in headings]
-    places = zip(parts, metadata or [None] * len(parts), strict=True)
-    units = tuple({"name": unit, "metadata": kept} for (_, unit), kept in places)
-    return ColumnFile(names=tuple(name for name, _ in parts), units=units, load=load)
+    return ColumnFile(tuple(headings), tuple(units or [None] * len(headings)), load)
 
 
 @contextmanager
@@ -149,38 +160,33 @@ def _open_parquet(file: str) -> ColumnFile:
             table = handle.read(columns=[schema.names[position] for position in positions])
         return [table.column(schema.names[position]) for position in positions]
 
-    units = tuple(_text((field.metadata or {}).get(b"unit")) for field in schema)
-    return _column_file(schema.names, load, units)
+    def kept(what: bytes) -> tuple[str | None, ...]:
+        return tuple(_text((field.metadata or {}).get(what)) for field in schema)
+
+    notes = json.loads((schema.metadata or {}).get(b"notes", b"[]"))
+    return ColumnFile(tuple(schema.names), kept(b"unit"), load, kept(b"heading"), tuple(map(str, notes)))
 
 
-def _open_csv(file: str) -> ColumnFile:
-    with _reading(file, "CSV"):
-        try:
-            with Path(file).open(encoding="utf-8-sig", newline="") as stream:
-                lines = csv.reader(stream)
-                header = next((line for line in lines if any(cell.strip() for cell in line)), [])
-                skip = lines.line_num
-        except UnicodeDecodeError:
-            raise InputError(file, "", "the text is not UTF-8", "save it as CSV in UTF-8") from None
-    if len(header) == 1 and any(separator in header[0] for separator in ";\t"):
-        raise InputError(file, "line 1", "the columns are not separated by commas", "separate them by commas")
-    labels = [position for position, name in enumerate(header) if split_heading(name)[0] == "recording"]
+def _open_text(file: str) -> ColumnFile:
+    table = read_text_table(file, Path(file).read_bytes())
+    labels = [place for place, heading in enumerate(table.headings) if is_label(read_heading(heading).title)]
 
     def load(positions: Sequence[int]) -> list[Column]:
         numbers = {str(position) for position in positions if position not in labels}
         try:
-            table = _read_csv(file, len(header), skip, numbers)
+            cells = _read_cells(file, table, numbers)
         except pa.ArrowInvalid:  # text among the numbers, or a line of another length: find out where
-            table = _read_csv(file, len(header), skip, set())
-        return [table.column(str(position)) for position in positions]
+            cells = _read_cells(file, table, set())
+        return [cells.column(str(position)) for position in positions]
 
-    return _column_file(header, load)
+    return ColumnFile(table.headings, table.units, load, notes=table.notes)
 
 
-def _read_csv(file: str, width: int, skip: int, numbers: set[str]) -> pa.Table:
+def _read_cells(file: str, table: TextTable, numbers: set[str]) -> pa.Table:
     """Read the columns named `numbers` (by position, as text) as numbers, all others as text."""
     from pyarrow import csv as arrow_csv
 
+    width = len(table.headings)
     names = [str(position) for position in range(width)]
     ragged = []
 
@@ -191,29 +197,44 @@ def _read_csv(file: str, width: int, skip: int, numbers: set[str]) -> pa.Table:
     options = {
         "read_options": arrow_csv.ReadOptions(
             column_names=names,
-            skip_rows=skip,
             use_threads=bool(numbers),  # rows are counted only when one thread reads
         ),
-        "parse_options": arrow_csv.ParseOptions(invalid_row_handler=None if numbers else keep_first),
+        "parse_options": arrow_csv.ParseOptions(
+            delimiter=table.separator, invalid_row_handler=None if numbers else keep_first
+        ),
         "convert_options": arrow_csv.ConvertOptions(
             column_types={name: pa.float64() if name in numbers else pa.string() for name in names},
+            decimal_point=table.decimal_mark,
             strings_can_be_null=True,
             quoted_strings_can_be_null=True,
         ),
     }
+    if not table.body.strip():
+        return pa.table({name: pa.array([], pa.string()) for name in names})
+    source = pa.BufferReader(table.body)
     if numbers:
-        return arrow_csv.read_csv(file, **options)
+        return arrow_csv.read_csv(source, **options)
     with _reading(file, "CSV"):
         try:
-            return arrow_csv.read_csv(file, **options)
+            cells = arrow_csv.read_csv(source, **options)
         except pa.ArrowInvalid:
             if not ragged:
                 raise
+        else:
+            return _with_decimal_points(cells) if table.decimal_mark == "," else cells
     raise InputError(
         file,
-        f"row {ragged[0].number - skip}",
+        f"row {ragged[0].number}",
         f"it has {ragged[0].actual_columns} cells while the header has {width}",
         "give every row one cell per column, and quote cells that hold a comma",
+    )
+
+
+def _with_decimal_points(cells: pa.Table) -> pa.Table:
+    """The same text with ``1.5 mm`` in the place of ``1,5 mm``."""
+    comma = r"^(\s*[+-]?[0-9]*),([0-9])"
+    return pa.table(
+        {name: pc.replace_substring_regex(cells[name], comma, r"\1.\2") for name in cells.column_names}
     )
 
 
@@ -277,12 +298,37 @@ def _open_matlab(file: str) -> ColumnFile:
     return _column_file(names, load)
 
 
+def _open_numpy(file: str) -> ColumnFile:
+    with _reading(file, "NumPy"):
+        kept = np.load(file, allow_pickle=False)
+        fields = kept.dtype.names if isinstance(kept, np.ndarray) else tuple(kept.files)
+        columns = {name: kept[name] for name in fields or ()}
+    if not columns:
+        raise InputError(
+            file, "", "it is one array without names for its columns",
+            "write numpy.savez(file, t=..., x=...), or a table with headings",
+        )  # fmt: skip
+    names = tuple(columns)
+
+    def load(positions: Sequence[int]) -> list[Column]:
+        wanted = [names[position] for position in positions]
+        return equally_long(file, {name: _column(file, name, columns[name]) for name in wanted})
+
+    return _column_file(names, load)
+
+
+SPREADSHEETS = (".xlsx", ".xls", ".xlsm", ".xlsb", ".ods")
 READERS: dict[str, Callable[[str], ColumnFile]] = {
     ".parquet": _open_parquet,
-    ".csv": _open_csv,
+    ".csv": _open_text,
+    ".tsv": _open_text,
+    ".txt": _open_text,
+    ".dat": _open_text,
     ".h5": _open_hdf5,
     ".hdf5": _open_hdf5,
     ".mat": _open_matlab,
+    ".npz": _open_numpy,
+    ".npy": _open_numpy,
 }
 """How the columns of a file are read, by the suffix of its name."""
 

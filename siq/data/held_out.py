@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from siq.data.labels import sources
+from siq.data.learnable import SINGLE_REMEDY
 from siq.data.recordings import Recordings
 from siq.errors import NumericalFailure
 
@@ -26,6 +27,9 @@ def held_out_recordings(
     groups = np.asarray(sources(recordings.labels))
     names = np.unique(groups)
     if len(names) < 2:
-        raise NumericalFailure("there is only one recording; give at least two, so that one can be held out")
+        raise NumericalFailure(
+            "there is only one recording, and it shows no random forces or is too short to be divided, so"
+            f" that none can be held out; {SINGLE_REMEDY}"
+        )
     count = min(max(round(share * len(names)), 1), len(names) - 1)
     return np.isin(groups, generator.permutation(names)[:count])

@@ -7,6 +7,7 @@ used is refused with its row and column; rows are counted from 1 without the hea
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,15 +15,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from siq.data.checks import check_times, find_columns
+from siq.data.checks import check_times
 from siq.data.labels import sources
+from siq.data.learnable import checked_for_learning
 from siq.errors import InputError
 from siq.files.whole import whole_file
 
 if TYPE_CHECKING:
     import pandas as pd
-
-    from siq.data.formats import ColumnFile
 
 LONGEST_STEP = 1.5  # of the median step: a missing sample makes two of it, jitter rarely a half more
 
@@ -49,6 +49,11 @@ class Recordings:
         Shape ``(n, d)``: what was measured, in `units`.
     time_unit
         The unit of `t`, None where the file does not say.
+    headings
+        What the file calls each measured column, where that is no name for a formula: ``bead x`` of
+        ``bead_x``. Empty where all are called by their names.
+    notes
+        What was assumed or repaired when they were read, each a clause without a full stop.
     """
 
     names: tuple[str, ...]
@@ -58,6 +63,13 @@ class Recordings:
     t: np.ndarray
     values: np.ndarray
     time_unit: str | None = None
+    headings: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def titles(self) -> tuple[str, ...]:
+        """What people call each state: its heading in the file, or else its name."""
+        return self.headings or self.names
 
     @classmethod
     def from_frame(
@@ -93,11 +105,12 @@ class Recordings:
         >>> recordings.names, recordings.units, recordings.labels
         (('x',), ('mm',), ('0',))
         """
-        from siq.data.formats import frame_columns  # which imports pyarrow
+        from siq.data.formats import frame_columns  # these import pyarrow
+        from siq.data.tables import checked_table
 
         levels = [name for name in frame.index.names if name in ("recording", "t")]
         source = frame_columns(TABLE, frame.reset_index(level=levels) if levels else frame)
-        read = _checked(TABLE, source, columns, units)
+        read = cls(**checked_table(TABLE, source, columns, units)._asdict())
         given = units or {}
         return replace(
             read,
@@ -206,13 +219,15 @@ def read_recordings(
 ) -> Recordings:
     """Read a long table of trajectories and check it.
 
-    Rows of one recording need not stand together; they are grouped, in order of first appearance.
+    Rows of one recording need not stand together; they are grouped, in order of first appearance. What had to
+    be assumed, or could be put right without a guess, stands in `Recordings.notes`.
 
     Parameters
     ----------
     path
-        A file that `siq.data.formats.open_columns` can read. A unit may stand behind a name
-        (``x [mm]``), in the file's metadata, or in every cell of a column (``1.2 mm``).
+        A file that `siq.data.formats.open_columns` can read, or a folder with one file per recording. A
+        unit may stand behind a name (``x [mm]``, ``x (mm)``), in the file's metadata, or in every cell of a
+        column (``1.2 mm``).
     columns
         The measured columns wanted, in the order of the state vector; the file's others are then ignored.
         Default: all columns but ``recording`` and ``t``, in the order of the file.
@@ -225,48 +240,9 @@ def read_recordings(
     InputError
         For the first thing in the file that cannot be used, with its row and column.
     """
-    from siq.data.formats import open_columns  # which imports pyarrow
+    from siq.data.tables import read_tables  # which imports pyarrow
 
-    return _checked(str(path), open_columns(path), columns, units)
-
-
-def _checked(
-    file: str, source: ColumnFile, columns: Sequence[str] | None, units: Mapping[str, str] | None
-) -> Recordings:
-    from siq.data.cells import agree_on_unit, parse_labels, parse_numbers  # these import pyarrow
-
-    positions = find_columns(file, source.names, columns)
-    used = [source.names[position] for position in positions]
-    cells = source.load(positions)
-    if len(cells[0]) == 0:
-        raise InputError(file, "", "the table has no rows", "write at least two samples of one recording")
-
-    numbers = np.empty((len(used) - 1, len(cells[0])))
-    found_units: list[str | None] = []
-    faults = []
-    for index, name in enumerate(used[1:]):
-        numbers[index], cell_unit, fault = parse_numbers(file, name, cells[index + 1])
-        faults += [fault] if fault else []
-        stated = {**source.units[positions[index + 1]], "cells": cell_unit}
-        found_units.append(agree_on_unit(file, name, stated, (units or {}).get(name)))
-    recording, labels, fault = parse_labels(file, cells[0])
-    faults += [fault] if fault else []
-    if faults:
-        first = min(faults, key=lambda each: each.row)
-        raise InputError(file, f"row {first.row}, column {first.column}", first.fault, first.remedy)
-
-    order = np.argsort(recording, kind="stable")
-    recording, numbers = recording[order], numbers[:, order]
-    check_times(file, numbers[0], recording, labels, order)
-    return Recordings(
-        names=tuple(used[2:]),
-        units=tuple(found_units[1:]),
-        labels=labels,
-        recording=recording,
-        t=numbers[0].copy(),
-        values=np.ascontiguousarray(numbers[1:].T),
-        time_unit=found_units[0],
-    )
+    return Recordings(**read_tables(path, columns=columns, units=units)._asdict())
 
 
 def write_recordings(path: str | Path, recordings: Recordings) -> None:
@@ -293,17 +269,20 @@ def write_recordings(path: str | Path, recordings: Recordings) -> None:
     if path.suffix.lower() != ".parquet":
         raise ValueError(f"recordings are written as .parquet, not as '{path.name}'")
 
-    def field(name: str, unit: str | None) -> pa.Field:
-        return pa.field(name, pa.float64(), metadata=None if unit is None else {"unit": unit})
+    def field(name: str, unit: str | None, title: str | None) -> pa.Field:
+        said = {key: text for key, text in (("unit", unit), ("heading", title)) if text is not None}
+        return pa.field(name, pa.float64(), metadata=said or None)
 
     label = pa.DictionaryArray.from_arrays(
         pa.array(recordings.recording.astype(np.int32)), pa.array(recordings.labels, type=pa.string())
     )
     names, units = ("t", *recordings.names), (recordings.time_unit, *recordings.units)
-    fields = [field(name, unit) for name, unit in zip(names, units, strict=True)]
+    titles = (None, *(recordings.headings or (None,) * len(recordings.names)))
+    fields = [field(name, unit, title) for name, unit, title in zip(names, units, titles, strict=True)]
+    notes = {"notes": json.dumps(recordings.notes, ensure_ascii=False)} if recordings.notes else None
     table = pa.table(
         [label, pa.array(recordings.t), *(pa.array(column) for column in recordings.values.T)],
-        schema=pa.schema([pa.field("recording", label.type), *fields]),
+        schema=pa.schema([pa.field("recording", label.type), *fields], metadata=notes),
     )
     with whole_file(path) as partial:
         parquet.write_table(table, partial, compression="zstd", use_dictionary=["recording"])
@@ -366,10 +345,21 @@ def read_pairs(
     Raises
     ------
     InputError
-        As `read_recordings` does, and when no two samples are close enough to be a pair.
+        As `read_recordings` and `siq.data.learnable.checked_for_learning` do, and when no two samples are
+        close enough to be a pair.
     """
     recordings = read_recordings(path, columns=states, units=units)
+    recordings = checked_for_learning(recordings, file=str(path), chosen=states is not None)
     try:
-        return recordings, snapshot_pairs(recordings, pair_step=pair_step)
+        pairs = snapshot_pairs(recordings, pair_step=pair_step)
     except ValueError as error:
         raise InputError(path, "", str(error), "raise recordings.pair_step in the study") from None
+    without = len(recordings.labels) - len(np.unique(pairs.recording))
+    single = int((np.bincount(recordings.recording) == 1).sum())
+    if without > single:
+        note = (
+            f"{without - single} of {len(recordings.labels)} recordings have longer steps than the others and"
+            " give no pairs; recordings.pair_step in the study says how long a step may be"
+        )
+        recordings = replace(recordings, notes=(*recordings.notes, note))
+    return recordings, pairs

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from siq.data.labels import distinct_labels
+from siq.data.labels import distinct_labels, sources
+from siq.data.noise_floor import noise_floors
 from siq.data.recordings import Recordings
 
 
@@ -36,14 +38,12 @@ def select_recordings(recordings: Recordings, indices: Sequence[int] | np.ndarra
     lengths = np.diff(bounds)[chosen]
     begins = np.cumsum(lengths) - lengths
     rows = np.arange(lengths.sum()) + np.repeat(bounds[chosen] - begins, lengths)
-    return Recordings(
-        names=recordings.names,
-        units=recordings.units,
+    return replace(
+        recordings,
         labels=distinct_labels(recordings.labels, chosen),
         recording=np.repeat(np.arange(len(chosen)), lengths),
         t=recordings.t[rows],
         values=recordings.values[rows],
-        time_unit=recordings.time_unit,
     )
 
 
@@ -61,3 +61,28 @@ def resample_recordings(recordings: Recordings, *, generator: np.random.Generato
     """
     count = len(recordings.labels)
     return select_recordings(recordings, generator.integers(count, size=count))
+
+
+STRETCHES = 10  # of a single recording, two of which are held out
+
+
+def in_stretches(recordings: Recordings) -> Recordings:
+    """Cut a recording that is the only one into stretches, of which some can be held out, or drawn again.
+
+    Several recordings come back as they are, and so does one of fewer than `STRETCHES` pairs, or without
+    random forces: a system that settles once is not seen again in another stretch.
+    """
+    count = len(recordings.t)
+    if len(np.unique(sources(recordings.labels))) > 1 or len(recordings.labels) > 1 or count < 2 * STRETCHES:
+        return recordings
+    floors = noise_floors(recordings)
+    if floors is not None and all(floor.process == 0 for floor in floors):
+        return recordings
+    label = recordings.labels[0]
+    note = f"there is one recording; it was cut into {STRETCHES} stretches, so that some can be held out"
+    return replace(
+        recordings,
+        labels=tuple(f"{label} ({number} of {STRETCHES})" for number in range(1, STRETCHES + 1)),
+        recording=np.arange(count) * STRETCHES // count,
+        notes=(*recordings.notes, note),
+    )

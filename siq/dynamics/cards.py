@@ -47,7 +47,13 @@ class _CardPart(BaseModel):
 class StateEntry(_CardPart):
     """One state of a card: its unit, and the interval in which initial states are drawn.
 
-    Only a simulation needs the interval. Where there are recordings to compare with, they tell it.
+    Attributes
+    ----------
+    unit
+        Compared with the units of recordings; nothing is converted.
+    domain
+        The interval ``[lower, upper]``, in this unit: initial states are drawn from it, and scores use it.
+        Only a simulation needs it. Where there are recordings to compare with, they tell it.
     """
 
     unit: str = "1"
@@ -62,7 +68,17 @@ class StateEntry(_CardPart):
 
 
 class ParameterEntry(_CardPart):
-    """One parameter of a card. ``fixed: true`` keeps it out of any recalibration."""
+    """One parameter of a card.
+
+    Attributes
+    ----------
+    value
+        Its value.
+    unit
+        Its unit, for people.
+    fixed
+        ``true`` when you are sure of the value: no recalibration changes it then.
+    """
 
     value: Number
     unit: str = "1"
@@ -72,8 +88,13 @@ class ParameterEntry(_CardPart):
 class InputEntry(_CardPart):
     """An exogenous signal u(t), a column of the recordings.
 
-    `interpolation` says how it holds between samples: ``zero_order`` for what a converter puts out,
-    ``linear``, or ``band_limited`` for what was filtered before it was sampled.
+    Attributes
+    ----------
+    unit
+        Compared with the units of recordings.
+    interpolation
+        How it runs between samples: ``zero_order`` for what a converter puts out, ``linear``, or
+        ``band_limited`` for what was filtered before it was sampled.
     """
 
     unit: str = "1"
@@ -81,7 +102,13 @@ class InputEntry(_CardPart):
 
 
 class ExactEntry(_CardPart):
-    """Exact answers, where known. They serve scoring only; no method reads them."""
+    """Exact answers, where known. They serve scoring only; no method reads them.
+
+    Attributes
+    ----------
+    quasipotential
+        U as a formula of the states.
+    """
 
     quasipotential: Formula | None = None
 
@@ -91,6 +118,31 @@ class SystemCard(_CardPart):
 
     A state that is in no output is hidden. The time is called ``t`` in formulas of a system with inputs or
     of a mismatch study; see `siq.dynamics.parametric`.
+
+    Attributes
+    ----------
+    name
+        Letters, digits, ``_``, ``.`` and ``-``; in ``config/systems/`` the file is called the same.
+    title
+        What people call the system; by default the name.
+    time_unit
+        Unit of t.
+    states
+        The states by name. Their order is that of the state vector.
+    inputs
+        Signals that drive the system, by name. Only a diagnosis reads them.
+    parameters
+        Constants of the equations, by name.
+    equations
+        The time derivative of each state, as a formula.
+    outputs
+        What a recording measures, as formulas by name; by default the states. Only a diagnosis reads them.
+    diffusion
+        D of ``dx = f dt + √ε D^(1/2) dW``: ``identity``, the diagonal as a list, or the whole matrix as a
+        list of rows, in squared units of the states per unit of time. A zero says that no noise reaches a
+        state; where a landscape is asked for, it has to reach every state.
+    exact
+        Exact answers, where they are known.
     """
 
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")

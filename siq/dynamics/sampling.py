@@ -33,6 +33,23 @@ class SimulationEntry:
     """What a study says of its simulation; what it leaves out follows from the system, see `complete`.
 
     The fields are those of `siq.dynamics.simulation.SimulationOptions`.
+
+    Attributes
+    ----------
+    trajectories
+        How many trajectories are simulated.
+    pairs
+        Pairs along each trajectory.
+    pair_step
+        h, the time between the two states of a pair, in the card's unit of time; by default a tenth of the
+        fastest time constant, rounded down.
+    interval
+        Time between the starts of pairs; by default such that a trajectory lasts three of the slowest time
+        constants at an attractor.
+    substeps
+        Runge–Kutta steps within h; with noise, steps of Euler and Maruyama.
+    noise_intensity
+        ε of ``√ε D^(1/2) dW``. The paper's ε = 0.01 in section 3.1.1 is 0.02 here.
     """
 
     trajectories: Annotated[int, Field(ge=2)] = TRAJECTORIES

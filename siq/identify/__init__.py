@@ -8,6 +8,7 @@
 `flow`              where does f lead within the step of a pair?
 `diffusion`         which D, where nobody gave it?
 `residuals`         what do its residuals say: no noise, process noise, noise of the measurement?
+`rounding`          were values rounded when they were written, and does it matter?
 `prediction`        where does f lead in the long run?
 `storage`           how is it kept in a file?
 ==================  ===========================================================================

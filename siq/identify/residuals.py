@@ -16,8 +16,16 @@ import scipy.special
 from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
 from siq.identify.flow_regression import refit, residuals
 from siq.identify.identified_field import IdentifiedField
+from siq.identify.rounding import (
+    HARMLESS,
+    decimals_needed,
+    is_rounding,
+    rounding_bias,
+    rounding_errors,
+    rounding_text,
+)
 
-NoiseKind = Literal["none", "process", "measurement", "coloured"]
+NoiseKind = Literal["none", "process", "measurement", "rounding", "coloured"]
 
 LONGEST_GAP = 10.0  # steps of a pair: samples farther apart say little of noise
 SIGNIFICANT = 5.0  # standard errors
@@ -33,7 +41,8 @@ class NoiseDiagnosis:
     ----------
     kind
         ``none``: only the integrator's error and rounding. ``process``: white. ``measurement``:
-        neighbouring residuals are anticorrelated. ``coloured``: they are positively correlated.
+        neighbouring residuals are anticorrelated. ``rounding``: the same, and no more than the values were
+        rounded by when they were written. ``coloured``: they are positively correlated.
     intensity
         ε of ``√ε D^(1/2) dW``, estimated.
     covariance
@@ -46,6 +55,12 @@ class NoiseDiagnosis:
         Of neighbouring residuals, the strongest over the states; and in standard errors.
     measurement
         Shape ``(d,)``: standard deviation of measurement noise; zero where none is recognised.
+    rounding
+        How the values were written and which error that means, in words; None where it is not seen.
+    rounding_bias
+        The largest bias that rounding brings into a coefficient of f, in its standard errors.
+    decimals
+        How many would leave no trace of rounding.
     """
 
     kind: NoiseKind
@@ -56,6 +71,16 @@ class NoiseDiagnosis:
     correlation: float
     correlation_score: float
     measurement: np.ndarray
+    rounding: str | None = None
+    rounding_bias: float = 0.0
+    decimals: int = 0
+
+    @property
+    def note(self) -> str | None:
+        """What a reader has to know of recordings that can be used all the same."""
+        if self.kind == "rounding" and self.rounding_bias <= HARMLESS:
+            return f"{self.rounding}: the standard errors of the formulas contain it"
+        return None
 
     def fault(self, states: tuple[str, ...]) -> str | None:
         """Why formulas from these recordings would be biased, in words; None where they are not."""
@@ -65,6 +90,11 @@ class NoiseDiagnosis:
                 f"the recordings carry measurement noise, of about {self.measurement[worst]:.2g} in"
                 f" {states[worst]}: residuals of neighbouring pairs are anticorrelated"
                 f" ({self.correlation:.2f}); smooth or average the recordings first"
+            )
+        if self.kind == "rounding" and self.rounding_bias > HARMLESS:
+            return (
+                f"{self.rounding}: that is too much for the formulas, which it biases by"
+                f" {self.rounding_bias:.1f} standard errors; write at least {self.decimals} decimals"
             )
         if self.kind == "coloured":
             return (
@@ -123,6 +153,14 @@ def residual_noise(
         kind = "measurement" if scores[worst] < 0 else "coloured"
         if kind == "measurement":
             measurement = _measurement_errors(found, sample)
+            rounding = rounding_errors(recordings)
+            if is_rounding(measurement, rounding, correlation=float(correlations[worst])):
+                return NoiseDiagnosis(
+                    "rounding", 0.0, noise.matrix, 0.0, 0.0,
+                    float(correlations[worst]), float(scores[worst]), measurement,
+                    rounding_text(recordings),
+                    rounding_bias(found, pairs, rounding), decimals_needed(recordings, pairs),
+                )  # fmt: skip
     return NoiseDiagnosis(
         kind, intensity, covariance, deviation, score,
         float(correlations[worst]), float(scores[worst]), measurement,

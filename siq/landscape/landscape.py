@@ -259,19 +259,16 @@ class Landscape:
         return landscape_html(self)
 
     def plot(self, ax: Axes | None = None) -> Axes:
-        """Draw U with its equilibria and paths.
-
-        Of one state a curve; of two, contours; of more, the plane of the first two states through the lowest
-        saddle.
+        """Draw U with its wells, passes and paths; see `siq.plot_quasipotential`, which this calls.
 
         Parameters
         ----------
         ax
             Where; by default new axes.
         """
-        from siq.report.plots.landscape_axes import draw_landscape
+        from siq.report.plots.quasipotential import plot_quasipotential
 
-        return draw_landscape(self, ax)
+        return plot_quasipotential(self, ax=ax)
 
 
 def _mean_time(way: Transition, noise: float) -> tuple[float, str]:

@@ -24,7 +24,9 @@
 `investigation`   what is the verdict, and which fits does it rest on?
 `location`        where does the mismatch sit?
 `held_out`        how well does it run on recordings that had no part in it?
-`verdict`         what is stated, and as data?
+`verdict`         what is the verdict?
+`statement`       what is stated, and as data?
+`sentences`       and how would a colleague say it?
 `augmented`       what is the simulation with what was found?
 `tables`          which tables are figures drawn from?
 `scores`          how large are errors in the recordings' own units?

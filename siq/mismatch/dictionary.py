@@ -23,7 +23,25 @@ class _Part(BaseModel):
 
 
 class Shape(_Part):
-    """Where a parameter is looked for that the mechanism does not depend on linearly; see the dictionary."""
+    """Where a parameter is looked for that the mechanism does not depend on linearly.
+
+    Give one way of looking.
+
+    Attributes
+    ----------
+    at
+        Multiples, or probabilities for `quantiles_of`, that are tried.
+    scale_of
+        A formula: multiples of its root mean square along the recordings are tried.
+    inverse_scale_of
+        The same of its inverse.
+    quantiles_of
+        A formula: its quantiles at these probabilities are tried.
+    samples
+        Multiples of the time between samples are tried.
+    frequencies
+        So many angular frequencies that the recordings can resolve are tried.
+    """
 
     at: tuple[float, ...] = (1.0,)
     scale_of: str | None = None
@@ -41,7 +59,17 @@ class Shape(_Part):
 
 
 class MechanismParameter(_Part):
-    """A parameter that a mechanism brings: an amplitude, or a shape."""
+    """A parameter that a mechanism brings: an amplitude, or a shape.
+
+    Attributes
+    ----------
+    unit
+        In terms of the roles and the time T: ``v/T/x**3``.
+    sign
+        ``positive`` where passivity, or the meaning of the word, demands it.
+    shape
+        Where to look for it. Left out, it is an amplitude, which is zero where the mechanism is absent.
+    """
 
     unit: str = "1"
     sign: Literal["any", "positive"] = "any"
@@ -49,7 +77,17 @@ class MechanismParameter(_Part):
 
 
 class FurtherState(_Part):
-    """A state that a mechanism brings, with its equation; `scale` is a formula of its size."""
+    """A state that a mechanism brings. It begins at zero.
+
+    Attributes
+    ----------
+    equation
+        Its time derivative.
+    unit
+        In terms of the roles.
+    scale
+        A formula of its size.
+    """
 
     equation: Formula
     unit: str = "1"
@@ -57,7 +95,29 @@ class FurtherState(_Part):
 
 
 class Form(_Part):
-    """How a mechanism shows in one kind of system; see the head of the dictionary."""
+    """How a mechanism shows in one kind of system.
+
+    Attributes
+    ----------
+    roles
+        What each name in the formulas stands for. Several roles are filled by different states.
+    terms
+        Formulas that are added to the equation of the state in that role.
+    replace
+        Formulas that take the place of an input or a parameter, wherever it stands.
+    outputs
+        Formulas of what a sensor reads instead; ``y`` stands for what it read before.
+    states
+        Further states, by name.
+    noise
+        The state on which random forces act.
+    parameters
+        What the mechanism's formulas need to know, by name.
+    coordinate
+        Along which role the mechanism acts.
+    symmetric
+        Whether exchanging the roles gives the same mechanism.
+    """
 
     roles: dict[Name, Role]
     terms: dict[Name, Formula] = {}
@@ -80,7 +140,23 @@ class Form(_Part):
 
 
 class Mechanism(_Part):
-    """An entry of the dictionary."""
+    """An entry of the dictionary.
+
+    Attributes
+    ----------
+    name
+        What pages and tables call it.
+    sentence
+        What it means, in a sentence.
+    forms
+        One for each kind of system in which it shows.
+    generalises
+        Mechanisms that are special cases of it.
+    look_alikes
+        Mechanisms that are easily taken for it.
+    reference
+        Where it is described.
+    """
 
     name: Annotated[str, Field(min_length=1)]
     sentence: str

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -10,6 +11,9 @@ from siq.dynamics.dynamics import Dynamics
 from siq.estimation.free_runs import FreeRun, free_run, normalised_rms
 from siq.estimation.measurements import Measurements
 from siq.mismatch.investigation import Investigation
+
+Change = Literal["better", "same", "worse", "unknown"]
+WIDE = 1.96  # standard errors within which 95 % lie
 
 
 @dataclass(frozen=True)
@@ -22,12 +26,45 @@ class HeldOutErrors:
         Of the simulation as it is, with its parameters refitted, and with what was found.
     noise_floor
         What measurement noise alone amounts to.
+    values
+        Number of measured values that the errors are means over; 0 where it is not known.
     """
 
     before: float | None
     recalibrated: float | None
     augmented: float | None
     noise_floor: float | None
+    values: int = 0
+
+    @property
+    def tolerance(self) -> float:
+        """Relative difference of two errors that so many values show by chance in one case out of twenty.
+
+        The root mean square of n independent values has the relative standard error 1/√(2n).
+        """
+        return WIDE / float(np.sqrt(2 * self.values)) if self.values else 0.0
+
+    def change(self, first: float | None, second: float | None) -> Change:
+        """Whether one error is better than another, by more than the number of values lets appear by chance.
+
+        Parameters
+        ----------
+        first, second
+            Without and with what is judged; None where the simulation ran away.
+        """
+        if first is None and second is None:
+            return "unknown"
+        if first is None or second is None:
+            return "better" if first is None else "worse"
+        if second < first * (1 - self.tolerance):
+            return "better"
+        return "worse" if second * (1 - self.tolerance) > first else "same"
+
+    def at_noise(self, error: float | None) -> bool:
+        """Whether an error is that of measurement noise alone."""
+        if error is None or self.noise_floor is None:
+            return False
+        return error * (1 - self.tolerance) <= self.noise_floor
 
 
 @dataclass(frozen=True)
@@ -84,4 +121,6 @@ def held_out_runs(investigation: Investigation, learned: Measurements, data: Mea
     scored = runs["before"].scored
     spread = np.nanvar(data.outputs[scored], axis=0)
     floor = np.sqrt(np.mean(search.fit.noise.measurement / np.where(spread > 0, spread, 1.0)))
-    return HeldOutRuns(**runs, model=augmented, errors=HeldOutErrors(**scores, noise_floor=float(floor)))
+    values = int(np.isfinite(data.outputs[scored]).sum())
+    errors = HeldOutErrors(**scores, noise_floor=float(floor), values=values)
+    return HeldOutRuns(**runs, model=augmented, errors=errors)

@@ -24,6 +24,7 @@ from siq.mismatch.steadiness import unsteadiness
 from siq.mismatch.structure import Structure
 from siq.mismatch.study import MismatchStudy
 from siq.mismatch.trials import UntriedMechanism
+from siq.numerics.quantity_text import p_equation, percent
 
 
 class MismatchVerdict(StrEnum):
@@ -45,10 +46,10 @@ ENOUGH = 0.998  # share of the excess that mechanisms explain, beyond which a re
 MOSTLY = 0.99  # share that the first of several must explain alone for that
 MANY = 3  # mechanisms that together are a description rather than an explanation
 UNSTEADY = 6.0  # twice the difference of log-likelihoods, from which random forces follow the motion
-GROWING = "Random forces that would explain it grow with the motion: a hidden state is likelier."
+GROWING = "Random forces would explain it only if they grew with the motion; a hidden state is more likely."
 EXACT = (
-    "The estimates admit random forces for what remains; the augmented card has those of least squares where "
-    "it runs better with them."
+    "The estimates allow for random forces that stand for what remains. The new card has the estimates of"
+    " least squares instead, where it runs better with them."
 )
 
 
@@ -77,13 +78,15 @@ class Investigation:
     process_noise
         Whether random forces are part of the verdict.
     p_shift
-        Probability that the parameters of the card are the true ones.
+        p-value of the test that the parameters of the card are the true ones.
     share
         Of the excess that the mechanisms explain.
     remarks
         Sentences about reservations.
     candidates
         All mechanisms that were considered.
+    too_faint
+        Whether what was found leaves nothing, and is not named since it gains too little.
     """
 
     verdict: MismatchVerdict
@@ -99,6 +102,7 @@ class Investigation:
     share: float
     remarks: tuple[str, ...]
     candidates: tuple[MechanismCandidate, ...]
+    too_faint: bool = False
 
     @property
     def final(self) -> Fit:
@@ -148,10 +152,12 @@ def investigate(
     doubtful = left.doubtful or found.fit.has_process_noise or len(found.found) >= MANY
     p_shift = shift_probability(model, recalibrated)
     exact: Fit | None = None
+    too_faint = False
     verdict: MismatchVerdict
     if found.found:
         good = not doubtful or (left.share >= ENOUGH and first.share >= MOSTLY)
         verdict, remarks = named_or_not(found, left, doubtful, good, least=study.search.named)
+        too_faint = good and verdict is MismatchVerdict.UNEXPLAINED
         if verdict is MismatchVerdict.MISSING_PHYSICS and found.fit.has_process_noise:
             still = replace(found.fit, noise=found.fit.noise.without_process())
             followed = fit_with_and_without_process_noise(found.fit.model, data, still)[1]
@@ -183,6 +189,7 @@ def investigate(
         share=left.share,
         remarks=remarks,
         candidates=tuple(candidates),
+        too_faint=too_faint,
     )
 
 
@@ -241,7 +248,7 @@ def named_or_not(
     """
     if not good:
         return MismatchVerdict.UNEXPLAINED, ()
-    remarks = (f"{1 - left.share:.2g} of the excess remains, and is not noise.",) if doubtful else ()
+    remarks = tuple(filter(None, [remains(left)])) if doubtful else ()
     found = [each.best for each in search.found]
     faintest = min(found, key=lambda each: each.delta_chi2)
     if faintest.delta_chi2 >= least:
@@ -249,14 +256,25 @@ def named_or_not(
     names = " and ".join(each.candidate.name for each in found)
     which = "is" if len(found) == 1 else f"{faintest.candidate.name} is"
     faint = (
-        f"It looks like {names}, but {which} too faint to be named: that gains "
-        f"{faintest.delta_chi2:.0f} in chi2, and {least:g} are asked for."
+        f"It looks like {names}, but {which} too faint to be named: it gains {faintest.delta_chi2:.0f} in χ²,"
+        f" and a name takes {least:g}."
     )
     return MismatchVerdict.UNEXPLAINED, (*remarks, faint)
 
 
+def remains(left: Remainder) -> str:
+    """How much of the excess over noise is left by what was found, and whether it looks like noise."""
+    size = percent(1 - left.share)
+    if not left.doubtful:
+        return "" if size == "none" else f"What was found leaves {size} of the difference."
+    chance = f"({p_equation(left.after.p_value)})"
+    if size == "none":
+        return f"What is left is as small as noise, but does not look like it {chance}."
+    return f"What was found leaves {size} of the difference, and this rest does not look like noise {chance}."
+
+
 def shift_probability(model: Dynamics, recalibrated: Fit) -> float:
-    """Probability that the card's parameters are the true ones, given the recalibrated ones."""
+    """p-value of the test that the card's parameters are the true ones, given the recalibrated ones."""
     free = np.array(model.free, dtype=int)
     if not len(free):
         return 1.0

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from siq.dynamics.dynamics import Dynamics
 from siq.estimation.estimation import Fit
 from siq.estimation.innovations import Noise, solve, whiten
 from siq.estimation.measurements import Measurements
 from siq.mismatch.investigation import Investigation, MismatchVerdict
 from siq.mismatch.roles import Roles
 from siq.mismatch.structure import Curve, Structure
+from siq.numerics.quantity_text import measured_text, unit_text
 
 VISIBLE = 0.1  # of the largest value of a curve
 TWO_ERRORS = 2.0
@@ -37,6 +40,8 @@ class Location:
         First and last time of it, where it acts along time only.
     recordings
         Labels of those that show it.
+    recordings_total
+        How many it was sought in.
     sentence
         All of it in words.
     curve
@@ -50,6 +55,7 @@ class Location:
     recordings: tuple[str, ...]
     sentence: str
     curve: Curve | None
+    recordings_total: int = 0
 
     def as_data(self) -> dict[str, Any]:
         """What the verdict's file says of it."""
@@ -59,6 +65,7 @@ class Location:
             "region": {name: list(limits) for name, limits in self.region.items()},
             "time": None if self.time is None else list(self.time),
             "recordings": list(self.recordings),
+            "recordings_total": self.recordings_total,
             "sentence": self.sentence,
         }
 
@@ -88,7 +95,6 @@ def locate(investigation: Investigation, data: Measurements) -> Location | None:
         equations, coordinate, curve = tuple(name for name, q in driven if q > 0), "random", None
     region = visible_region(curve) if curve is not None else {}
     recordings = affected(investigation.search.recalibrated, investigation.search.fit.noise, data)
-    everywhere = len(recordings) == len(data.labels)
     time = (float(data.t.min()), float(data.t.max())) if coordinate == "t" else None
     return Location(
         equations=equation_shares(investigation, equations),
@@ -96,8 +102,16 @@ def locate(investigation: Investigation, data: Measurements) -> Location | None:
         region=region,
         time=time,
         recordings=recordings,
-        sentence=_sentence(equations, coordinate, region, recordings, everywhere=everywhere),
+        sentence=where_it_sits(
+            equations,
+            coordinate,
+            region,
+            affected=len(recordings),
+            recordings=len(data.labels),
+            units=_units_of(investigation.model),
+        ),
         curve=curve,
+        recordings_total=len(data.labels),
     )
 
 
@@ -162,24 +176,53 @@ def affected(recalibrated: Fit, noise: Noise, data: Measurements) -> tuple[str, 
     )
 
 
-def _sentence(
+def where_it_sits(
     equations: tuple[str, ...],
     coordinate: str,
-    region: dict[str, tuple[float, float]],
-    recordings: tuple[str, ...],
+    region: Mapping[str, tuple[float, float]],
     *,
-    everywhere: bool,
+    affected: int,
+    recordings: int,
+    units: Mapping[str, str] | None = None,
 ) -> str:
-    where = (
-        f"In the equation{'s' if len(equations) > 1 else ''} of {' and '.join(equations)}"
-        if equations
-        else ("In what is measured")
-    )
+    """Say in a sentence where a mismatch sits.
+
+    Parameters
+    ----------
+    equations
+        States in whose equations it shows; none for a fault of the sensor.
+    coordinate, region
+        Along which it acts, and where it can be seen.
+    affected, recordings
+        In how many recordings it shows, and how many there are to learn from.
+    units
+        Of states, inputs and time, by name.
+    """
+    many = "s" if len(equations) > 1 else ""
+    where = f"in the equation{many} of {' and '.join(equations)}" if equations else "in what is measured"
     along = {
-        "t": ", along time", "constant": ", everywhere alike", "random": ", at random",
-        "measurement": "", "unknown": "",
-    }.get(coordinate, f", along {coordinate}")  # fmt: skip
-    for name, (lower, upper) in region.items():
-        along += f" from {lower:.3g} to {upper:.3g}" if name == coordinate else ""
-    who = "in every recording" if everywhere else f"mostly in {len(recordings)} recordings"
-    return f"{where}{along}, {who}."
+        "t": ", in the course of time",
+        "constant": ", to the same amount everywhere",
+        "random": ", at random",
+        "measurement": "",
+        "unknown": "",
+    }.get(coordinate, f", as a function of {coordinate}")
+    if coordinate in region:
+        lower, upper = (measured_text(limit) for limit in region[coordinate])
+        unit = unit_text((units or {}).get(coordinate, "1"))
+        after = f" {unit}" if unit else ""
+        along += f" (near {lower}{after})" if lower == upper else f" (between {lower} and {upper}{after})"
+    if recordings == 1:
+        who = ""
+    elif affected == recordings:
+        who = f", in all {recordings} recordings that it was sought in"
+    else:
+        who = f", mainly in {affected} of {recordings} recordings"
+    return f"The difference sits {where}{along}{who}."
+
+
+def _units_of(model: Dynamics) -> dict[str, str]:
+    """Units of everything that a coordinate may be."""
+    units = dict(zip(model.states, model.units, strict=True))
+    units |= {entry.name: entry.unit for entry in model.inputs}
+    return units | {"t": model.time_unit}

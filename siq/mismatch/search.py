@@ -39,10 +39,24 @@ LEFT = 0.01  # probability that residuals are random, above which no further mec
 
 @dataclass(frozen=True)
 class Found:
-    """A mechanism that stood the tests, and what cannot be told from it."""
+    """A mechanism that stood the tests, and what else was fitted in its place.
+
+    Attributes
+    ----------
+    best
+        The mechanism.
+    indistinguishable
+        Those that explain the recordings as well.
+    needless
+        Those that explain as much, but with further parameters that do not earn their place.
+    lesser
+        Those that explain less.
+    """
 
     best: TriedMechanism
     indistinguishable: tuple[TriedMechanism, ...]
+    needless: tuple[TriedMechanism, ...] = ()
+    lesser: tuple[TriedMechanism, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -59,6 +73,9 @@ class Search:
         Of the simulation with all of them.
     screened
         The last screening: every candidate with what it would gain.
+    screened_beside
+        Labels of the mechanisms that were in place for it. Where nothing was left to be explained, nothing
+        was screened on top of the last mechanism.
     untried
         Candidates whose fit gave nothing that could be judged, with the reason.
     """
@@ -68,6 +85,7 @@ class Search:
     fit: Fit
     screened: tuple[tuple[Probe, Screened], ...]
     untried: tuple[UntriedMechanism, ...] = ()
+    screened_beside: tuple[str, ...] = ()
 
 
 def search(
@@ -118,7 +136,7 @@ def _extended(
             most=options.fitted, least_gain=options.same, blocks=options.blocks,
         )  # fmt: skip
         untried = _together(progress.untried, (*overflowing(screened), *failed), trials)
-        progress = replace(progress, screened=tuple(screened), untried=untried)
+        progress = replace(progress, screened=tuple(screened), untried=untried, screened_beside=tuple(labels))
         for trial in trials:
             LOGGER.info(
                 "%s: chi2 better by %.1f, BIC %.1f, p %.1e white, %.1e clustered",
@@ -234,14 +252,15 @@ def accepted(
         # What is left is no noise, and white errors mean little: of equals, what all recordings ask for.
         equals = [each for each in significant if each.delta_bic < best.delta_bic + options.same]
         best = min(equals, key=lambda each: each.p_cluster)
-    alternatives = tuple(
-        other
-        for other in trials
-        if other is not best
-        and best.delta_chi2 - other.delta_chi2 < options.same
-        and not _needless(other, best)
+    least = best.delta_chi2 - options.same
+    others = [other for other in trials if other is not best]
+    equals = [other for other in others if other.delta_chi2 > least]
+    return Found(
+        best,
+        indistinguishable=tuple(other for other in equals if not _needless(other, best)),
+        needless=tuple(other for other in equals if _needless(other, best)),
+        lesser=tuple(other for other in others if not other.delta_chi2 > least),
     )
-    return Found(best, alternatives)
 
 
 def _needless(other: TriedMechanism, best: TriedMechanism) -> bool:

@@ -12,11 +12,12 @@ from siq.estimation.estimation import Fit
 from siq.mismatch.case import Comparison
 from siq.mismatch.diagnosis import Diagnosis
 from siq.mismatch.investigation import Investigation
+from siq.mismatch.search import Search
 
 CURVE_COLUMNS = [
     "equation", "coordinate", "across", "at", "missing", "standard_error", "gain", "p_value", "stage",
 ]  # fmt: skip
-CANDIDATE_COLUMNS = ["mechanism", "label", "shapes", "gain", "process_noise_level", "stage"]
+CANDIDATE_COLUMNS = ["mechanism", "label", "shapes", "gain", "process_noise_level", "stage", "beside"]
 HELD_OUT_COLUMNS = [
     "recording", "t", "output", "measured", "before", "recalibrated", "augmented", "scored",
 ]  # fmt: skip
@@ -30,7 +31,10 @@ def tables_of(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:
     -------
     dict
         ``curves``: what is missing against each coordinate, in the unit of the equation.
-        ``candidates``: every probe, with what it would gain first, or on top of what was found.
+        ``candidates``: every mechanism that was fitted, and every probe that was only screened, with what it
+        gains ``beside`` the mechanisms that were in place. Stages: ``found``; fitted in its place: ``same``,
+        ``needless`` and ``less`` (see `siq.mismatch.statement.Rival`); screened: ``further``, on top of all
+        that was found, and ``instead``, in the place of the last that was found.
         ``held_out``: recordings and their three simulations.
         ``forces``: what the recalibrated simulation lacks at each sample, as far as random forces were
         admitted.
@@ -53,29 +57,7 @@ def tables_of(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:
         for curve in structure.curves
         for at, value, error in zip(curve.direction.knots, curve.values, curve.standard_errors, strict=True)
     ]
-    candidates: list[dict[str, Any]] = [
-        {
-            "mechanism": trial.candidate.name,
-            "label": trial.candidate.label,
-            "shapes": "",
-            "gain": trial.delta_chi2,
-            "process_noise_level": 1.0,
-            "stage": stage,
-        }
-        for each in found.search.found
-        for stage, trial in (("found", each.best), *(("same", other) for other in each.indistinguishable))
-    ]
-    candidates += [
-        {
-            "mechanism": probe.candidate.name,
-            "label": probe.candidate.label,
-            "shapes": ", ".join(f"{name}={value:.4g}" for name, value in probe.shapes),
-            "gain": result.gain,
-            "process_noise_level": result.level,
-            "stage": "further",
-        }
-        for probe, result in found.search.screened
-    ]
+    candidates = _candidates(found.search)
     data = case.kept
     rows = []
     for place, name in enumerate(case.system.output_names):
@@ -113,6 +95,42 @@ def tables_of_failure(case: Comparison) -> dict[str, pd.DataFrame]:
         "forces": pd.DataFrame(columns=["recording", "t", *system.states]),
         "noise": noise.assign(stage="recalibrated", kind="measurement")[NOISE_COLUMNS],
     }
+
+
+def _candidates(search: Search) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = []
+    labels = [each.best.candidate.label for each in search.found]
+    fitted: set[tuple[str, str]] = set()
+    for place, each in enumerate(search.found):
+        beside = ", ".join(labels[:place])
+        for stage, trials in (
+            ("found", (each.best,)), ("same", each.indistinguishable), ("needless", each.needless),
+            ("less", each.lesser),
+        ):  # fmt: skip
+            fitted |= {(trial.candidate.label, beside) for trial in trials}
+            rows += [
+                {
+                    "mechanism": trial.candidate.name, "label": trial.candidate.label, "shapes": "",
+                    "gain": trial.delta_chi2, "process_noise_level": 1.0, "stage": stage, "beside": beside,
+                }
+                for trial in trials
+            ]  # fmt: skip
+    beside = ", ".join(search.screened_beside)
+    stage = "further" if list(search.screened_beside) == labels else "instead"
+    return rows + [
+        {
+            "mechanism": probe.candidate.name,
+            "label": probe.candidate.label,
+            "shapes": ", ".join(f"{name}={value:.4g}" for name, value in probe.shapes),
+            "gain": result.gain,
+            "process_noise_level": result.level,
+            "stage": stage,
+            "beside": beside,
+        }
+        for probe, result in search.screened
+        # Of what was fitted, what the screening had promised is of no interest.
+        if (probe.candidate.label, beside) not in fitted
+    ]
 
 
 def _noise(model: Dynamics, recalibrated: Fit, final: Fit) -> pd.DataFrame:

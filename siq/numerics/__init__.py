@@ -2,6 +2,7 @@
 
 ====================  ==========================================================================
 `integration`         how do many trajectories take a step of order eight at once, each its own?
+`quantity_text`       how is a quantity written: a value, a share, a p-value?
 `machine_code`        how does a loop become machine code?
 `randomness`          where do the random numbers of a study come from?
 `thinning`            which points represent a region evenly?

@@ -9,6 +9,8 @@
 `landscape_answer`   what is the answer in one sentence?
 `certificate_text`   what does the certificate promise, in plain words?
 `answer`             and as plain data, for a terminal?
+`drawn_landscape`    what of a landscape is drawn?
+`interactive`        how is U turned and cut in a page?
 `projection`         what of many states is drawn on a plane?
 `page`               what is a page made from, that needs nothing else?
 `rendering`          how does it become HTML?
@@ -23,8 +25,10 @@
 `invariant_tables`   what does it say of the invariant distribution?
 `reproduction_page`  what does the page say that lists a publication's results beside ours?
 `mismatch_page`      what does the page of a diagnosis say?
+`mismatch_first_screen` and what does it open with?
 `mismatch_sections`  which sections has it?
 `mismatch_findings`  what is it made from?
+`mismatch_answer`    and what does a terminal print at its end?
 `plots`              the figures themselves
 ===================  ======================================================================
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from html import escape
 
 from siq.dynamics.dynamics import Dynamics
-from siq.mismatch.investigation import MismatchVerdict
-from siq.mismatch.verdict import METRIC, Estimate, StatedMechanism, Statement
+from siq.mismatch.statement import METRIC, Estimate, StatedMechanism, Statement
+from siq.numerics.quantity_text import measured_text, p_text
 
 DIGITS = 4
 Section = tuple[str, list[str]]
@@ -40,30 +40,27 @@ def diagnosis_html(statement: Statement, system: Dynamics) -> str:
 
 def _sections(statement: Statement, system: Dynamics) -> list[Section]:
     """Every section that has something to say."""
+    described = () if statement.description is None else statement.description.by
     found = [
-        ("Verdict", [f"{statement.verdict}: {statement.sentence}"]),
+        (f"Verdict: {statement.verdict}", [statement.sentence, *statement.remarks]),
         ("Mechanisms", [line for each in statement.mechanisms for line in _mechanism(each)]),
-        ("Description", _description(statement)),
+        ("What comes closest", [line for each in described for line in _mechanism(each)]),
+        ("How sure it is", [line for lines in statement.words.values() for line in lines]),
         ("Location", _location(statement)),
         ("Parameters", _parameters(statement, system)),
         (f"Error ({METRIC})", _errors(statement)),
-        ("Could not be told apart", _alike(statement)),
         ("Could not be judged", [f"{each.label}: {each.reason}" for each in statement.not_fitted]),
-        ("Excluded (95 %)", _excluded(statement)),
-        ("Remarks", list(statement.remarks)),
+        ("At most (95 %)", _excluded(statement)),
     ]
     return [(heading, lines) for heading, lines in found if lines]
 
 
 def with_error(entry: Estimate) -> str:
-    """A value ± its error, the error in per cent, and the unit."""
-    value = f"{entry.estimate:.{DIGITS}g}"
-    if entry.standard_error is None:
-        text = f"{value} (no error known)"
-    else:
-        share = f" ({100 * entry.standard_error / abs(entry.estimate):.2g} %)" if entry.estimate else ""
-        text = f"{value} ± {entry.standard_error:.2g}{share}"
-    return text if entry.unit in ("", "1") else f"{text} {entry.unit}"
+    """A value with its error and unit, and the error in per cent."""
+    text = measured_text(entry.estimate, entry.standard_error, entry.unit)
+    if not entry.standard_error or not entry.estimate:
+        return text
+    return f"{text} ({100 * entry.standard_error / abs(entry.estimate):.2g} %)"
 
 
 def _mechanism(mechanism: StatedMechanism) -> list[str]:
@@ -73,32 +70,30 @@ def _mechanism(mechanism: StatedMechanism) -> list[str]:
     evidence = mechanism.evidence
     if evidence.delta_chi2 is not None and evidence.delta_bic is not None:
         lines.append(
-            f"  Δχ² = {evidence.delta_chi2:.{DIGITS}g}, ΔBIC = {evidence.delta_bic:.{DIGITS}g},"
-            f" p = {evidence.p_white:.1e} (white errors), {evidence.p_cluster:.1e} (clustered errors)"
+            f"  gain in χ² {evidence.delta_chi2:.0f}, ΔBIC {evidence.delta_bic:.0f},"
+            f" p = {_p(evidence.p_white)} (independent errors), {_p(evidence.p_cluster)} (errors of a"
+            " recording together)"
         )
     return lines
 
 
-def _description(statement: Statement) -> list[str]:
-    if statement.description is None or not statement.description.by:
-        return []
-    share = f"a share of {statement.description.share_described:.3g} is described by"
-    return [share, *(f"  {line}" for each in statement.description.by for line in _mechanism(each))]
+def _p(value: float | None) -> str:
+    return "unknown" if value is None else p_text(value)
 
 
 def _location(statement: Statement) -> list[str]:
     place = statement.location
     if place is None:
         return []
-    shares = [f"{name}: {share:.3g} of the excess" for name, share in place.equations.items()]
-    return [place.sentence, *shares, f"recordings: {', '.join(place.recordings)}"]
+    some = 0 < len(place.recordings) < place.recordings_total
+    return [place.sentence, *([f"recordings: {', '.join(place.recordings)}"] if some else [])]
 
 
 def _parameters(statement: Statement, system: Dynamics) -> list[str]:
     units = {entry.name: entry.unit for entry in system.parameters}
     return [
         f"{name} = {with_error(Estimate(each.after, each.standard_error, units.get(name, '1')))}"
-        f"  (before: {each.before:.{DIGITS}g})"
+        f"  (on the card: {each.before:.{DIGITS}g})"
         for name, each in (statement.recalibration or {}).items()
     ]
 
@@ -116,20 +111,8 @@ def _errors(statement: Statement) -> list[str]:
     return [f"{name}: {'ran away' if value is None else f'{value:.3g}'}" for name, value in shown.items()]
 
 
-def _alike(statement: Statement) -> list[str]:
-    lines = [
-        f"{each.name}: not to be told from {', '.join(each.indistinguishable_from)}"
-        for each in statement.mechanisms
-        if each.indistinguishable_from
-    ]
-    if statement.verdict is MismatchVerdict.MISSING_PHYSICS and not lines:
-        return ["nothing: no other mechanism explains the recordings as well"]
-    return lines
-
-
 def _excluded(statement: Statement) -> list[str]:
     return [
-        f"{label}: {bound.parameter} at most {bound.upper_bound_95:.2g}"
-        + ("" if bound.unit in ("", "1") else f" {bound.unit}")
+        f"{label}: {bound.parameter} = {measured_text(bound.upper_bound_95, unit=bound.unit, digits=2)}"
         for label, bound in (statement.excluded or {}).items()
     ]

@@ -1,10 +1,9 @@
-"""Figures of the landscape: U with wells, paths and validity; error maps; degrees; escape times."""
+"""Figures of the landscape: error maps, degrees, escape times; `siq.report.study_figures` draws U itself."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -18,17 +17,14 @@ from siq.landscape.reference import ReferenceLandscape
 from siq.landscape.storage import StoredLandscape
 from siq.networks.trained import TrainedNetworks
 from siq.potential.symbolic import SymbolicDecomposition
-from siq.report.plots.landscape import plot_error_maps, plot_landscape
+from siq.report.landscape_answer import SaidLandscape
+from siq.report.plots.landscape import plot_error_maps
 from siq.report.plots.landscape_curves import plot_degrees, plot_escape
-from siq.report.plots.one_state import DrawnBarrier, plot_error_curves, plot_landscape_curve
-from siq.report.plots.style import sentence_figure
+from siq.report.plots.one_state import plot_error_curves
 from siq.report.settings import LandscapeFiguresSettings
 from siq.steps.outcomes import Method
-from siq.steps.settings import StateSpace
 from siq.study.published import published_formula
 from siq.study.study import PublishedFigure
-
-GRID = 161
 
 
 @dataclass(frozen=True)
@@ -66,73 +62,21 @@ class LandscapeComparisons:
 
 def landscape_figures(
     settings: LandscapeFiguresSettings, shown: LandscapeRun | None, beside: LandscapeComparisons
-) -> dict[str, Figure]:
-    """All figures of a landscape by name; None is shown where no run knows U over all wells."""
-    space, escape = settings.space, beside.escape
-    figures = {
-        "landscape": sentence_figure("No run found U over all wells."),
-        "landscape_errors": sentence_figure("There is nothing to compare the landscape with."),
-        "landscape_published": sentence_figure("No landscape was published."),
+) -> dict[str, Figure | None]:
+    """All figures of a landscape by name, None for one that has nothing to show.
+
+    Nothing is `shown` where no run knows U over all wells.
+    """
+    time_unit = settings.space.unit("t", unknown="1")
+    figures: dict[str, Figure | None] = {
         "degrees": plot_degrees(beside.degrees),
-        "escape": plot_escape(escape, time_unit=space.unit("t", unknown="1"))
-        if len(escape)
-        else sentence_figure("No escape was simulated."),
+        "escape": plot_escape(beside.escape, time_unit=time_unit),
     }
-    if beside.reference is not None and beside.reference.reason:
-        figures["landscape_errors"] = sentence_figure(
-            f"There is no reference for the landscape: {beside.reference.reason}."
-        )
-    if shown is None:
+    if shown is None or beside.reference is None or beside.reference.reason:
         return figures
-    if len(shown.recordings.names) > 2:
-        of_more = "U is drawn of one state or of two, and these are {}."
-        figures["landscape"] = sentence_figure(of_more.format(len(shown.recordings.names)))
+    if len(shown.recordings.names) > 2:  # errors are drawn on a plane, or along a line
         return figures
-    one_state = len(shown.recordings.names) == 1
-    figures["landscape"] = (_curve_figure if one_state else _landscape_figure)(space, shown)
-    if beside.reference is not None and not beside.reference.reason:
-        figures |= _maps(settings, shown, beside, beside.reference)
-    return figures
-
-
-def _curve_figure(space: StateSpace, shown: LandscapeRun) -> Figure:
-    """U over the only state, with its wells and barriers."""
-    stored, recordings = shown.landscape, shown.recordings
-    assert stored.quasipotential is not None
-    x = np.linspace(recordings.values.min(), recordings.values.max(), 4 * GRID)
-    equilibria = _equilibria_table(stored.data)
-    wells = stored.data["wells"]
-    barriers = [
-        DrawnBarrier(
-            wells[way["start"]]["attractor"][0], way["saddle"][0], wells[way["start"]]["height"],
-            wells[way["start"]]["height"] + way["barrier"],
-        )
-        for way in stored.data["transitions"]
-        if way["barrier"] is not None
-    ]  # fmt: skip
-    return plot_landscape_curve(
-        x, stored.quasipotential(x[:, None]), name=recordings.names[0], unit=space.unit(recordings.names[0]),
-        equilibria=equilibria.assign(y=stored.quasipotential(equilibria[["x"]].to_numpy(float))),
-        barriers=barriers,
-    )  # fmt: skip
-
-
-def _landscape_figure(space: StateSpace, shown: LandscapeRun) -> Figure:
-    """U over both states, with equilibria and paths."""
-    stored, recordings = shown.landscape, shown.recordings
-    assert stored.quasipotential is not None
-    box = np.stack([recordings.values.min(axis=0), recordings.values.max(axis=0)], axis=1)
-    axes = tuple(np.linspace(low, high, GRID) for low, high in box)
-    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-    ways = [way for way in stored.data["transitions"] if way["uphill"]]
-    tops = [stored.data["wells"][way["start"]]["height"] + way["barrier"] for way in ways]
-    return plot_landscape(
-        axes, stored.quasipotential(grid).reshape(GRID, GRID), names=recordings.names,
-        units=tuple(space.unit(name) for name in recordings.names), energy_unit="",
-        equilibria=_equilibria_table(stored.data),
-        paths=[(np.array(way["uphill"]), np.array(way["downhill"])) for way in ways],
-        level=1.2 * max(tops) if tops else None,
-    )  # fmt: skip
+    return figures | _maps(settings, shown, beside, beside.reference)
 
 
 def _maps(
@@ -140,7 +84,7 @@ def _maps(
     shown: LandscapeRun,
     beside: LandscapeComparisons,
     reference: ReferenceLandscape,
-) -> dict[str, Figure]:
+) -> dict[str, Figure | None]:
     """U by every source beside the reference: ours, and what was published."""
     names = shown.recordings.names
     below = settings.landscape.compare_below or overall_level(reference)
@@ -148,11 +92,14 @@ def _maps(
     maps = {"landscape_errors": _error_maps(shown, reference, inside)}
     if of_others := _published_maps(shown.landscape, reference, beside, inside, names):
         maps["landscape_published"] = of_others
-    units = tuple(settings.space.unit(name) for name in names)
+    units = tuple(settings.space.unit(name, unknown="1") for name in names)
+    said = {"states": names, "units": units, "time_unit": settings.space.unit("t", unknown="1")}
+    energy = SaidLandscape(said).energy_unit
     if len(names) == 1:
         x = reference.points[:, 0]
         return {
-            figure: plot_error_curves(x, one, name=names[0], unit=units[0]) for figure, one in maps.items()
+            figure: plot_error_curves(x, one, name=names[0], unit=units[0], energy_unit=energy)
+            for figure, one in maps.items()
         }
     side = round(len(reference.points) ** 0.5)
     axes = (reference.points[::side, 0], reference.points[:side, 1])
@@ -162,25 +109,10 @@ def _maps(
             {name: values.reshape(side, side) for name, values in one.items()},
             names=names,
             units=units,
-            energy_unit="",
+            energy_unit=energy,
         )
         for figure, one in maps.items()
     }
-
-
-def _equilibria_table(data: Mapping[str, Any]) -> pd.DataFrame:
-    """Equilibria with their labels, of two states or one."""
-    labels = {tuple(well["attractor"]): f"A{index + 1}" for index, well in enumerate(data["wells"])}
-    return pd.DataFrame(
-        [
-            {
-                "kind": one["kind"], "x": one["position"][0], "y": one["position"][-1],
-                "label": labels.get(tuple(one["position"]), ""),
-            }
-            for one in data["equilibria"]
-        ],
-        columns=["kind", "x", "y", "label"],
-    )  # fmt: skip
 
 
 def _error_maps(

@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import pandas as pd
+import sympy
+from markupsafe import Markup, escape
 
 from siq.dynamics.dynamics import Dynamics
+from siq.dynamics.formulas import FormulaError, parse_formula
+from siq.dynamics.parametric import symbol
 from siq.mismatch.dictionary import Mechanism
-from siq.numerics.number_text import number_text
+from siq.report.formatting import formula_mathml
+from siq.report.page import ReportFigure
 
 DIGITS = 3
+FINAL = {"missing physics": "augmented", "no mismatch": "before"}
+"""Which of the three simulations a verdict ends with; the recalibrated one where nothing is said."""
+SIMULATIONS = {
+    "before": "as given",
+    "recalibrated": "its own parameters refitted",
+    "augmented": "with what was found",
+}
 
 
 @dataclass(frozen=True)
@@ -28,13 +40,16 @@ class Findings:
     dictionary
         The mechanisms that could be named.
     candidates
-        Columns ``label shapes gain stage``.
+        Columns ``label shapes gain stage beside``.
     figures
-        SVG files by the names of `siq.report.mismatch_sections.CAPTIONS`.
+        SVG files by the names of `siq.report.mismatch_sections.CAPTIONS`, as far as there was something to
+        draw.
     wells, escape, notes
         See `siq.mismatch.consequences.Consequences`.
     scores
         Columns ``simulation score output rms unit published``, of public benchmarks only.
+    held_out
+        Columns ``output measured before recalibrated augmented scored``, one row per sample.
     folder
         Where the whole tables are.
     """
@@ -49,7 +64,28 @@ class Findings:
     escape: pd.DataFrame = field(default_factory=pd.DataFrame)
     notes: Sequence[str] = ()
     scores: pd.DataFrame = field(default_factory=pd.DataFrame)
+    held_out: pd.DataFrame = field(default_factory=pd.DataFrame)
     folder: str = "tables"
+
+    @property
+    def kind(self) -> str:
+        """The verdict in two words, random forces being a kind of their own."""
+        named = [each["name"] for each in self.verdict["mechanisms"]]
+        return "random forces" if named == ["process noise"] else str(self.verdict["verdict"])
+
+    @property
+    def final(self) -> str:
+        """Which of the three simulations the verdict ends with."""
+        return "recalibrated" if self.kind == "random forces" else FINAL.get(self.kind, "recalibrated")
+
+    def words(self, about: str) -> list[str]:
+        """Sentences of the verdict; see `siq.mismatch.sentences.words_of`."""
+        return list(self.verdict.get("words", {}).get(about, []))
+
+    def figure(self, name: str, caption: str) -> list[ReportFigure]:
+        """A figure as a list, which is empty where there was nothing to draw."""
+        image = self.figures.get(name)
+        return [] if image is None else [ReportFigure(caption, caption, image, "svg")]
 
 
 def mechanisms_said(findings: Findings) -> list[Mapping[str, Any]]:
@@ -58,20 +94,50 @@ def mechanisms_said(findings: Findings) -> list[Mapping[str, Any]]:
     return [*findings.verdict["mechanisms"], *description.get("by", [])]
 
 
-def sizes(mechanism: Mapping[str, Any]) -> str:
-    """Its parameters with their errors, in a line."""
-    return ", ".join(
-        f"{name} = {_with_error(entry)}" for name, entry in mechanism.get("parameters", {}).items()
-    )
+def capital(text: str) -> str:
+    """The same with its first letter in upper case."""
+    return text[:1].upper() + text[1:]
 
 
-def _with_error(entry: Mapping[str, Any]) -> str:
-    error = entry.get("standard_error")
-    text = number(entry["estimate"]) + (f" ± {number(error)}" if error is not None else "")
-    unit = entry.get("unit", "1")
-    return text if unit in ("1", "") else f"({text}) {unit}" if error is not None else f"{text} {unit}"
+def listed(names: Sequence[str], word: str = "or") -> str:
+    """Names in a sentence."""
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} {word} {names[-1]}"
 
 
-def number(value: float | None) -> str:
-    """A number in words: few digits, and none of what ran away."""
-    return "ran away" if value is None else number_text(float(value), decimals=DIGITS)
+def typeset(text: str, model: Dynamics, further: Iterable[str] = ()) -> Markup | str:
+    """A formula of the verdict, typeset; as text where it cannot be read as one.
+
+    Parameters
+    ----------
+    text
+        The formula.
+    model
+        Whose names it may use.
+    further
+        Names that the model does not have, such as parameters of what is only described.
+    """
+    names = {**model.names, **{name: symbol(name) for name in further}}
+    try:
+        formula = parse_formula(text, names, inputs=tuple(entry.name for entry in model.inputs))
+    except FormulaError:
+        return text
+    return mathml(formula)
+
+
+def mathml(formula: sympy.Expr) -> Markup | str:
+    """A formula, typeset; as text where it has a function that is not known."""
+    try:
+        return formula_mathml(formula, decimals=DIGITS)
+    except (AttributeError, NotImplementedError, TypeError, ValueError):
+        return str(formula)
+
+
+def rate_of(name: str) -> Markup:
+    """The left side of an equation: dx/dt, typeset."""
+    inner = formula_mathml(sympy.Symbol(name, real=True))
+    inside = inner[inner.index(">") + 1 : inner.rindex("<")]
+    spoken = escape(f"d{name}/dt")
+    return Markup(
+        '<math aria-label="{}"><mfrac><mrow><mi>d</mi>{}</mrow><mrow><mi>d</mi><mi>t</mi></mrow></mfrac>'
+        "<mo>=</mo></math>"
+    ).format(spoken, Markup(inside))

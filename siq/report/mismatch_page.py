@@ -1,40 +1,45 @@
-"""The page of a diagnosis: what a simulation lacks, where, how sure that is, and what follows from it."""
+"""The page of a diagnosis: what a simulation lacks, how sure that is, where it sits, and what follows."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from siq.report.mismatch_findings import Findings, mechanisms_said, number, sizes
+from siq.report.mismatch_findings import Findings
+from siq.report.mismatch_first_screen import VerdictBadge, answer, badge, numbers, picture
 from siq.report.mismatch_sections import MismatchSection, sections
-from siq.report.page import render_template
+from siq.report.page import ReportFigure, ReportTable, render_template
 
 
 @dataclass(frozen=True)
 class MismatchContent:
-    """All that the page says.
+    """All that the page says, in the order in which it is read.
 
     Attributes
     ----------
     title
         What was asked.
-    verdict
-        In two words.
     answer
-        The same in sentences.
+        The verdict in a sentence that stands alone, and what has to be known with it.
+    badge
+        The same in two words.
+    figure, table
+        The recording before and after, and the number.
     sections
-        In the order of the page.
-    commands
-        Command lines that make everything again.
+        Everything else.
+    interactive
+        A view that can be turned; there is none.
     language
         Of the page.
     """
 
     title: str
-    verdict: str
     answer: Sequence[str]
+    badge: VerdictBadge
+    figure: ReportFigure | None
+    table: ReportTable | None
     sections: Sequence[MismatchSection]
-    commands: Sequence[str] = ()
+    interactive: None = None
     language: str = "en"
 
 
@@ -42,28 +47,10 @@ def mismatch_page(findings: Findings, *, title: str, commands: Sequence[str]) ->
     """Write the page as HTML."""
     content = MismatchContent(
         title=title,
-        verdict=str(findings.verdict["verdict"]),
         answer=answer(findings),
-        sections=[section for section in sections(findings) if section is not None],
-        commands=commands,
+        badge=badge(findings),
+        figure=picture(findings),
+        table=numbers(findings),
+        sections=sections(findings, commands=commands),
     )
     return render_template("mismatch.html.j2", content)
-
-
-def answer(findings: Findings) -> list[str]:
-    """The verdict in sentences: what, how large, and how much better the fit is."""
-    verdict = findings.verdict
-    lines = [str(verdict["sentence"])]
-    for each in mechanisms_said(findings):
-        if known := sizes(each):
-            lines.append(f"{each['label'][:1].upper()}{each['label'][1:]}: {known}.")
-    fit = verdict["fit"]
-    named = ("before", "recalibrated", "augmented")
-    words = dict(zip(named, ("as it is", "recalibrated", "with what was found"), strict=True))
-    parts = [f"{number(fit[name])} {words[name]}" for name in named]
-    floor = number(fit["noise_floor"])
-    lines.append(
-        f"On held-out recordings the simulation's error, in units of their spread, is {', '.join(parts)};"
-        f" noise alone would be {floor}."
-    )
-    return lines

@@ -1,34 +1,63 @@
-"""The sections of a diagnosis' page: where it sits, what is missing, how sure that is, and what follows."""
+"""The sections of a diagnosis' page: how sure it is, where it sits, what follows, and what else was tried."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import pandas as pd
-import sympy
 from markupsafe import Markup
 
-from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.formulas import FormulaError, parse_formula
-from siq.report.formatting import formula_mathml
-from siq.report.mismatch_findings import DIGITS, Findings, mechanisms_said, number
+from siq.mismatch.dictionary import Mechanism
+from siq.numerics.quantity_text import measured_text, p_text, percent, unit_text
+from siq.report.mismatch_findings import (
+    SIMULATIONS,
+    Findings,
+    capital,
+    listed,
+    mathml,
+    mechanisms_said,
+    rate_of,
+    typeset,
+)
 from siq.report.page import ReportFigure, ReportTable
 
 CANDIDATES_SHOWN = 12
+RECORDINGS_LISTED = 12
 CAPTIONS = {
-    "curves": "What is missing in an equation against a coordinate: in the recalibrated simulation, and in"
-    " the one that the verdict ends with. What the simulation's own parameters can do is taken off; where a"
-    " band leaves zero, something is missing there.",
-    "map": "The missing part over the two states along which most of it can be seen, averaged over cells;"
-    " grey where there are no recordings.",
-    "candidates": "How much what was found explains, and how much further mechanisms of the dictionary would"
-    " explain on top of it, beside the simulation's own parameters.",
-    "held_out": "Held-out recordings with free runs of the three simulations, and the errors of these. A free"
-    " run knows the recording's first part and its inputs only; of long recordings the end is shown.",
-    "escapes": "Mean escape times from well to well by the law of Eyring and Kramers: without what was found,"
-    " and with it.",
+    "curves": "What is missing, as a function of one coordinate in each panel: before anything was added"
+    " (blue) and after (orange, dashed). What the simulation's own parameters can do is taken off. Where a"
+    " blue band stays clear of zero, something is missing. Bands are cut off at the edge of the panel, and"
+    " left out where they would fill it.",
+    "map": "What is missing, over the two states along which most of it can be seen, averaged over cells;"
+    " one panel for each equation. Grey: no recordings.",
+    "candidates": "How much each mechanism explains. Fitted: what was found, and what was fitted in its"
+    " place. Grey bars are estimates for mechanisms that were not fitted.",
+    "held_out": "Held-out recordings with all three simulations. For each recording above: the course in"
+    " time; below: simulation minus recording. Of long recordings the last part is shown.",
+    "escapes": "Mean escape times from well to well against the inverse noise intensity, by the law of Eyring"
+    " and Kramers: without what was found (dashed) and with it (solid), one colour for each way out.",
 }
+STAGES = {
+    "found": "found",
+    "same": "explains as much",
+    "needless": "explains as much, with more parameters",
+    "less": "explains less",
+    "further": "would add to what was found (estimate)",
+    "instead": "in its place (rough estimate)",
+}
+
+
+@dataclass(frozen=True)
+class FormulaLine:
+    """A formula with what it is of; the attributes are those that the pages' templates ask for."""
+
+    quantity: Markup | str
+    formula: Markup | str
+    note: str = ""
+    exact: None = None
+    whole: None = None
 
 
 @dataclass(frozen=True)
@@ -41,255 +70,205 @@ class MismatchSection:
         Its heading.
     text
         Paragraphs.
-    formulas
-        Typeset formulas with their names.
-    tables, figures
+    formulas, tables, figures
         Below the text, in this order.
+    notes
+        Paragraphs in small print.
+    folded
+        Whether it is closed until a reader opens it.
+    listing
+        Lines of code, such as commands.
     """
 
     heading: str
     text: Sequence[str] = ()
-    formulas: Sequence[tuple[str, Markup | str]] = ()
+    formulas: Sequence[FormulaLine] = ()
     tables: Sequence[ReportTable] = ()
     figures: Sequence[ReportFigure] = ()
+    notes: Sequence[str] = ()
+    folded: bool = False
+    listing: str = ""
 
 
-def sections(findings: Findings) -> list[MismatchSection | None]:
-    """Every section that has something to say."""
-    return [
-        _where(findings),
-        _what(findings),
+def sections(findings: Findings, *, commands: Sequence[str] = ()) -> list[MismatchSection]:
+    """Every section that has something to say, in the order of the page."""
+    found = [
+        _formula(findings),
         _how_sure(findings),
-        _what_else(findings),
-        _fit(findings),
-        _recalibration(findings),
-        _excluded(findings),
+        _where(findings),
         _wells(findings),
-        _remarks(findings),
+        _excluded(findings),
+        _parameters(findings),
+        _held_out(findings),
+        _candidates(findings),
+        MismatchSection("How to run it again", listing="\n".join(commands), folded=True)
+        if commands
+        else None,
     ]
+    return [section for section in found if section is not None]
 
 
-def _figure(findings: Findings, name: str) -> list[ReportFigure]:
-    image = findings.figures.get(name)
-    return [] if image is None else [ReportFigure(CAPTIONS[name], CAPTIONS[name], image, "svg")]
-
-
-def _where(findings: Findings) -> MismatchSection | None:
-    place = findings.verdict["location"]
-    figures = [*_figure(findings, "curves"), *_figure(findings, "map")]
-    if place is None:
-        text = ["There is no mismatch that could sit anywhere."]
-        return MismatchSection("Where it sits", text, figures=_figure(findings, "curves"))
-    text = [place["sentence"]]
-    if place["time"] is not None:
-        begin, end = place["time"]
-        unit = findings.before.time_unit
-        after = "" if unit == "1" else f" {unit}"
-        text.append(f"It is seen from t = {number(begin)} to {number(end)}{after}.")
-    if place["recordings"]:
-        text.append(f"It shows in the recordings {', '.join(place['recordings'])}.")
-    shares = pd.DataFrame(
-        [{"equation": name, "share of the excess": share} for name, share in place["equations"].items()]
-    )
-    tables = []
-    if len(shares):
-        caption = "Share of what the recalibrated simulation leaves beyond noise that one function of one"
-        tables = [ReportTable(f"{caption} coordinate can explain, by equation.", shares)]
-    return MismatchSection("Where it sits", text, tables=tables, figures=figures)
-
-
-def _what(findings: Findings) -> MismatchSection | None:
+def _formula(findings: Findings) -> MismatchSection | None:
     named = mechanisms_said(findings)
     if not named:
         return None
     known = {entry.name: entry for entry in findings.dictionary}
-    text, formulas, rows = [], [], []
-    if findings.verdict["verdict"] == "unexplained":
-        share = number((findings.verdict.get("description") or {}).get("share_described", 0.0))
-        text.append(f"Nothing accounts for the whole; what follows describes a share of {share} of it.")
+    lines, rows, notes = [], [], []
     for each in named:
         entry = known.get(each["name"])
-        sentence = entry.sentence if entry is not None else "A term that has no name of its own."
-        reference = f" ({entry.reference})" if entry is not None and entry.reference else ""
-        text.append(f"{each['label'][:1].upper()}{each['label'][1:]}. {sentence}{reference}")
-        formulas += [
-            (f"{each['label']}: {name}", _typeset(formula, findings.after))
+        lines += [
+            FormulaLine(
+                each["label"],
+                typeset(formula, findings.after, each["parameters"]),
+                _of_what(name, entry, findings),
+            )
             for name, formula in each["terms"].items()
         ]
         rows += [
-            {
-                "mechanism": each["label"], "parameter": name, "estimate": value["estimate"],
-                "standard error": value["standard_error"], "unit": value["unit"],
-            }
+            {"of": each["label"], "parameter": name, "value": _value(value)}
             for name, value in each["parameters"].items()
-        ]  # fmt: skip
-    formulas += [
-        (f"d{name}/d{'t'}", _mathml(formula))
-        for name, formula in zip(findings.after.states, findings.after.equations, strict=True)
-        if findings.verdict["verdict"] == "missing physics"
-    ]
+        ]
+        if entry is not None and entry.reference:
+            notes.append(f"{capital(each['name'])}: {entry.reference}.")
+    if findings.kind == "missing physics":
+        lines += [
+            FormulaLine(rate_of(name), mathml(formula))
+            for name, formula in zip(findings.after.states, findings.after.equations, strict=True)
+        ]
+        notes.append("The simulation with what was found is a system card like any other: system.yaml.")
+    heading = "What comes closest, as a formula" if findings.verdict["description"] else "The formula"
+    if findings.kind == "random forces":
+        heading = "The random forces"
     tables = [ReportTable("Parameters of what is missing.", pd.DataFrame(rows))] if rows else []
-    return MismatchSection("What is missing", text, formulas, tables)
+    return MismatchSection(heading, (), lines, tables, notes=list(dict.fromkeys(notes)))
 
 
-def _typeset(text: str, model: Dynamics) -> Markup | str:
-    """A formula of the verdict, typeset; as text where it cannot be read as one."""
-    try:
-        formula = parse_formula(text, model.names, inputs=tuple(entry.name for entry in model.inputs))
-    except FormulaError:
-        return text
-    return _mathml(formula)
+def _of_what(name: str, entry: Mechanism | None, findings: Findings) -> str:
+    """What a formula of a mechanism is; see `siq.mismatch.candidates.MechanismCandidate.changes`."""
+    measured = name in [output for output, _ in findings.before.outputs]
+    if measured and entry is not None and any(form.outputs for form in entry.forms):
+        return f"what is measured as {name}"
+    if name not in findings.before.states:
+        return f"the rate of change of {name}, which is new"
+    replaced = entry is not None and any(form.replace for form in entry.forms)
+    return f"in the equation of {name}" if replaced else f"added to the equation of {name}"
 
 
-def _mathml(formula: sympy.Expr) -> Markup | str:
-    try:
-        return formula_mathml(formula, decimals=DIGITS)
-    except (AttributeError, NotImplementedError, TypeError, ValueError):  # an unknown function, in words
-        return str(formula)
+def _value(entry: Mapping[str, Any]) -> str:
+    return measured_text(entry["estimate"], entry.get("standard_error"), entry.get("unit", "1"))
 
 
 def _how_sure(findings: Findings) -> MismatchSection:
+    named = mechanisms_said(findings)
     rows = [
-        {"mechanism": each["label"], **each["evidence"], "share of excess": each["share_of_excess"]}
-        for each in mechanisms_said(findings)
+        {
+            "mechanism": each["label"],
+            "gain in χ²": round(evidence["delta_chi2"]),
+            "ΔBIC": round(evidence["delta_bic"]),
+            "p, independent errors": p_text(evidence["p_white"]),
+            "p, errors of a recording together": p_text(evidence["p_cluster"]),
+        }
+        for each in named
+        if (evidence := each["evidence"])["delta_chi2"] is not None
     ]
+    text = [*findings.words("explained"), *findings.words("left"), *findings.words("alternatives")]
+    text += _look_alikes(findings, named)
+    if not named:
+        text.append(NOTHING_FOUND[findings.kind])
     tables = []
-    text = []
     if rows:
-        names = {
-            "delta_chi2": "Δχ²", "delta_bic": "ΔBIC", "p_white": "p, white errors",
-            "p_cluster": "p, clustered errors",
-        }  # fmt: skip
-        frame = pd.DataFrame(rows).rename(columns=names)
-        for column in names.values():
-            frame[column] = frame[column].astype(float)
         tables.append(
             ReportTable(
-                "Evidence. Each mechanism was judged with those before it in place.",
-                frame,
+                "The evidence for each mechanism, with those above it in place.",
+                pd.DataFrame(rows),
                 {
-                    "Δχ²": "by how much twice the log-likelihood rises with it",
-                    "ΔBIC": "change of the Bayesian information criterion, negative where it pays",
-                    "p, white errors": "probability of as much by chance, if errors are independent",
-                    "p, clustered errors": "the same, if only recordings are independent of each other",
-                    "share of excess": "of what the recalibrated simulation leaves beyond noise",
+                    "gain in χ²": "by how much twice the log-likelihood rises with it",
+                    "ΔBIC": "change of the Bayesian information criterion; negative where the gain is worth"
+                    " the further parameters",
+                    "p, independent errors": "how often chance alone would gain as much, if all errors were"
+                    " independent",
+                    "p, errors of a recording together": "the same, if only errors of different recordings"
+                    " (or distant parts of one) are independent",
                 },
             )
         )
-    else:
-        text.append("No mechanism stood the tests, so that none is named.")
-    description = findings.verdict.get("description")
-    if description:
-        chance = number(description["p_residuals_random"])
-        text.append(f"That what is left is random has the probability {chance}.")
-    return MismatchSection("How sure that is", text, tables=tables, figures=_figure(findings, "candidates"))
-
-
-def _what_else(findings: Findings) -> MismatchSection:
-    known = {entry.name: entry for entry in findings.dictionary}
-    text = []
-    for each in mechanisms_said(findings):
-        others = each.get("indistinguishable_from", [])
-        if others:
-            text.append(f"The recordings cannot tell {each['name']} from {_listed(others)}.")
-        else:
-            text.append(f"No other mechanism explains the recordings as well as {each['name']}.")
-        entry = known.get(each["name"])
-        alike = [name for name in (entry.look_alikes if entry is not None else ()) if name not in others]
-        if alike:
-            text.append(f"It is often mistaken for {_listed(alike)}; the figure tells how far these are.")
-    text += [
-        f"{each['label'][:1].upper()}{each['label'][1:]} could not be judged: {each['reason']}."
+    notes = [
+        f"{capital(each['label'])} could not be judged: {each['reason']}."
         for each in findings.verdict.get("not_fitted", [])
     ]
-    table = findings.candidates
-    tables = []
-    if len(table):
-        words = {"found": "found", "same": "not to be told from it", "further": "on top of what was found"}
-        best = table.loc[table.groupby("label")["gain"].idxmax()].sort_values("gain", ascending=False)
-        best = best[best["gain"] > 0].assign(as_what=best["stage"].map(words))
-        shown = best[["label", "as_what", "shapes", "gain"]]
-        shown = shown.rename(columns={"as_what": "as what", "gain": "gain in χ²"})
-        tables.append(
-            ReportTable(
-                "Candidates by what they explain.",
-                shown.reset_index(drop=True),
-                {"shapes": "where a parameter was tried that the mechanism does not depend on linearly"},
-                f"{findings.folder}/candidates.csv",
-                CANDIDATES_SHOWN,
+    return MismatchSection("How sure it is", text, tables=tables, notes=notes)
+
+
+NOTHING_FOUND = {
+    "no mismatch": "Every mechanism of the dictionary that could act in this system was tried, and none"
+    " stood the tests against chance.",
+    "parameter shift": "With the new parameters, no mechanism of the dictionary stood the tests against"
+    " chance.",
+    "missing physics": "",
+    "random forces": "",
+    "unexplained": "No mechanism of the dictionary stood the tests.",
+}
+
+
+def _look_alikes(findings: Findings, named: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What a mechanism is often confused with, where that was fitted and explains less."""
+    known = {entry.name: entry for entry in findings.dictionary}
+    lines = []
+    for each in named:
+        entry = known.get(each["name"])
+        less = [other["name"] for other in each.get("rivals", []) if other["standing"] == "less"]
+        alike = [name for name in (entry.look_alikes if entry else ()) if name in less]
+        if alike:
+            verb = "explains" if len(alike) == 1 else "explain"
+            lines.append(
+                f"{capital(each['name'])} is often confused with {listed(alike)}, which {verb} less here."
             )
-        )
-    return MismatchSection("What else it could be", text, tables=tables)
+    return lines
 
 
-def _listed(names: Sequence[str]) -> str:
-    return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " or " + names[-1]
-
-
-def _fit(findings: Findings) -> MismatchSection:
-    fit = findings.verdict["fit"]
-    words = {
-        "before": "as the card has it", "recalibrated": "its own parameters fitted",
-        "augmented": "with what was found", "noise_floor": "noise alone",
-    }  # fmt: skip
-    frame = pd.DataFrame([{"simulation": word, "error": number(fit[name])} for name, word in words.items()])
-    tables = [ReportTable(f"The fit: {fit['metric']}.", frame)]
-    if len(findings.scores):
-        caption = "Scores of the public benchmark: root mean square errors on held-out recordings."
-        tables.append(ReportTable(caption, findings.scores, {}, f"{findings.folder}/real_recordings.csv"))
-    return MismatchSection("The fit before and after", tables=tables, figures=_figure(findings, "held_out"))
-
-
-def _recalibration(findings: Findings) -> MismatchSection | None:
-    units = {entry.name: entry.unit for entry in findings.before.parameters}
-    rows = [
-        {
-            "parameter": name, "on the card": entry["before"], "fitted": entry["after"],
-            "standard error": entry["standard_error"], "unit": units.get(name, "1"),
-            "change, in standard errors": (entry["after"] - entry["before"]) / entry["standard_error"]
-            if entry["standard_error"] else float("nan"),
-        }
-        for name, entry in findings.verdict["recalibration"].items()
-    ]  # fmt: skip
-    if not rows:
+def _where(findings: Findings) -> MismatchSection | None:
+    place = findings.verdict["location"]
+    if place is None:
         return None
-    table = ReportTable(
-        "The simulation's own parameters, in the simulation that the verdict ends with.", pd.DataFrame(rows)
-    )
-    return MismatchSection("Its own parameters", tables=[table])
+    text = [place["sentence"]]
+    if place["time"] is not None:
+        begin, end = (measured_text(limit) for limit in place["time"])
+        unit = unit_text(findings.before.time_unit)
+        text.append(f"The recordings run from {begin} to {end}{f' {unit}' if unit else ''}.")
+    total = place.get("recordings_total", 0)
+    if 0 < len(place["recordings"]) < total and len(place["recordings"]) <= RECORDINGS_LISTED:
+        text.append(f"It shows most clearly in {listed(place['recordings'], 'and')}.")
+    for name, share in place["equations"].items():
+        if share > 0:
+            text.append(
+                f"The best function of one coordinate, added to the equation of {name}, would explain"
+                f" {percent(share)} of the difference."
+            )
+    figures = [*findings.figure("curves", CAPTIONS["curves"]), *findings.figure("map", CAPTIONS["map"])]
+    return MismatchSection("Where it sits", text, figures=figures)
 
 
-def _excluded(findings: Findings) -> MismatchSection | None:
-    bounds = findings.verdict["excluded"]
-    if not bounds:
+def _wells(findings: Findings) -> MismatchSection | None:
+    if findings.kind in ("no mismatch", "unexplained"):
         return None
-    rows = [
-        {
-            "mechanism": label, "parameter": entry.get("parameter", ""),
-            "at most (95 %)": entry["upper_bound_95"], "unit": entry["unit"],
-        }
-        for label, entry in bounds.items()
-    ]  # fmt: skip
-    text = ["What was looked for and not found can be at most so large and still agree with the recordings."]
-    table = ReportTable("Upper bounds of mechanisms that were not found.", pd.DataFrame(rows), {}, "", 60)
-    return MismatchSection("What is excluded", text, tables=[table])
-
-
-def _wells(findings: Findings) -> MismatchSection:
-    text = list(findings.notes)
-    tables = []
+    text, tables, figures = list(findings.notes), [], []
     if len(findings.wells):
-        text.insert(0, "U is the quasipotential for the noise of the card; equal names are the same well.")
-        shown = findings.wells.replace("", None).dropna(axis=1, how="all")
+        text.insert(0, "U is the quasipotential for the noise of the card. Equal names are the same well.")
+        shown = (
+            findings.wells.replace({"": None}).replace({"simulation": SIMULATIONS}).dropna(axis=1, how="all")
+        )
         tables.append(
             ReportTable(
-                "Wells and ways out of them, without what was found and with it.",
+                "Wells, and the ways out of them, without what was found and with it.",
                 shown,
-                {"prefactor": "of the mean escape time prefactor · exp(barrier/ε)", "barrier": "of U"},
+                {
+                    "position": f"({', '.join(findings.before.states)})",
+                    "prefactor": "of the mean escape time, prefactor · exp(barrier / ε)",
+                    "barrier": "of U",
+                },
                 f"{findings.folder}/wells.csv",
             )
         )
-    figures = []
     if len(findings.escape):
         pivot = findings.escape.pivot_table(
             index=["transition", "intensity"], columns="simulation", values="time", sort=False
@@ -298,16 +277,98 @@ def _wells(findings: Findings) -> MismatchSection:
         if len(names) == 2:
             pivot["changed by a factor"] = pivot[names[1]] / pivot[names[0]]
         pivot.columns.name = None
-        unit = "" if findings.before.time_unit == "1" else f", in {findings.before.time_unit}"
+        pivot = pivot.rename(columns={**SIMULATIONS, "transition": "way out", "intensity": "ε"})
+        unit = unit_text(findings.before.time_unit)
         tables.append(
             ReportTable(
-                f"Mean escape times by intensity ε{unit}.", pivot, {}, f"{findings.folder}/escape.csv", 12
+                f"Mean escape times{f' in {unit}' if unit else ''}, by noise intensity ε.",
+                pivot, {}, f"{findings.folder}/escape.csv", 12,
             )
-        )
-        figures = _figure(findings, "escapes")
-    return MismatchSection("What it does to wells and escape times", text, tables=tables, figures=figures)
+        )  # fmt: skip
+        figures = findings.figure("escapes", CAPTIONS["escapes"])
+    if not text and not tables:
+        return None
+    heading = "What it does to wells and escape times"
+    return MismatchSection(heading, text, tables=tables, figures=figures, folded=not tables)
 
 
-def _remarks(findings: Findings) -> MismatchSection | None:
-    remarks = list(findings.verdict["remarks"])
-    return MismatchSection("Remarks", remarks) if remarks else None
+def _excluded(findings: Findings) -> MismatchSection | None:
+    bounds = findings.verdict["excluded"]
+    if not bounds:
+        return None
+    rows = [
+        {
+            "mechanism": label,
+            "parameter": entry.get("parameter", ""),
+            "at most (95 %)": measured_text(entry["upper_bound_95"], unit=entry["unit"], digits=2),
+        }
+        for label, entry in bounds.items()
+    ]
+    text = ["What was looked for and not found may still be there, but no larger than this."]
+    table = ReportTable("Upper bounds for mechanisms that were not found.", pd.DataFrame(rows), {}, "", 60)
+    return MismatchSection("How large could something missing be?", text, tables=[table])
+
+
+def _parameters(findings: Findings) -> MismatchSection | None:
+    units = {entry.name: entry.unit for entry in findings.before.parameters}
+    rows = [
+        {
+            "parameter": name,
+            "on the card": measured_text(entry["before"], unit=units.get(name, "1"), digits=4),
+            "fitted": measured_text(entry["after"], entry["standard_error"], units.get(name, "1")),
+            "change, in standard errors": (entry["after"] - entry["before"]) / entry["standard_error"]
+            if entry["standard_error"]
+            else float("nan"),
+        }
+        for name, entry in findings.verdict["recalibration"].items()
+    ]
+    if not rows:
+        return None
+    end = "with what was found" if findings.final == "augmented" else "with nothing added"
+    table = ReportTable(
+        f"The simulation's own parameters, on the card and fitted, {end}.", pd.DataFrame(rows)
+    )
+    return MismatchSection("Its own parameters", tables=[table])
+
+
+def _held_out(findings: Findings) -> MismatchSection | None:
+    tables = []
+    if len(findings.scores):
+        caption = "Scores of the public benchmark: root mean square errors on its held-out recordings."
+        tables.append(ReportTable(caption, findings.scores, {}, f"{findings.folder}/real_recordings.csv"))
+    figures = findings.figure("held_out", CAPTIONS["held_out"])
+    if not tables and not figures:
+        return None
+    return MismatchSection("More held-out recordings", tables=tables, figures=figures)
+
+
+def _candidates(findings: Findings) -> MismatchSection | None:
+    table = findings.candidates
+    best = table[table["gain"] >= 1] if len(table) else table
+    if not len(best):
+        return None
+    best = best.loc[best.groupby(["label", "stage"], sort=False)["gain"].idxmax()]
+    best = best.assign(
+        first=best["stage"] != "found", what=best["stage"].map(STAGES), gain=best["gain"].round().astype(int)
+    )
+    best = best.sort_values(["first", "gain"], ascending=[True, False], kind="stable")
+    if not mechanisms_said(findings):
+        best["what"] = "would explain (estimate)"
+    shown = best[["label", "what", "gain", "beside", "shapes"]].rename(
+        columns={"label": "mechanism", "what": "how it compares", "gain": "gain in χ²", "beside": "on top of"}
+    )
+    for column in ("on top of", "shapes"):
+        if not shown[column].fillna("").astype(bool).any():
+            shown = shown.drop(columns=column)
+    whole = ReportTable(
+        "All mechanisms by what they explain, those that were found first.",
+        shown.fillna("").reset_index(drop=True),
+        {
+            "gain in χ²": "compared with the recalibrated simulation, or with what it stands on top of",
+            "shapes": "where a parameter was tried that the mechanism does not depend on linearly",
+        },
+        f"{findings.folder}/candidates.csv",
+        CANDIDATES_SHOWN,
+    )
+    figures = findings.figure("candidates", CAPTIONS["candidates"])
+    return MismatchSection("All that was tried", tables=[whole], figures=figures)

@@ -169,6 +169,11 @@ def shown_figures(names: set[str], *, runs: int, networks: bool, published: bool
     return names - {"landscape"} if "quasipotential" in names else names
 
 
+def figure_place(name: str) -> Part:
+    """In which part of the page a figure stands; one that nobody described, with the workings."""
+    return CAPTIONS[name].part if name in CAPTIONS else Part.WORKINGS
+
+
 def figures_of(
     part: Part, images: Mapping[str, bytes], vectors: Mapping[str, bytes], *, beside_paper: bool
 ) -> list[ReportFigure]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -19,6 +20,8 @@ from siq.networks.regression import highest_used, points_below
 from siq.networks.trained import TrainedNetworks
 from siq.numerics.randomness import Purpose, generator
 from siq.potential.symbolic import SymbolicDecomposition
+from siq.report.drawn_landscape import DrawnLandscape, drawn_data
+from siq.report.landscape_answer import SaidLandscape
 from siq.report.plots import (
     ComponentFields,
     Dataset,
@@ -30,7 +33,8 @@ from siq.report.plots import (
     plot_prediction,
     plot_training,
 )
-from siq.report.plots.style import sentence_figure
+from siq.report.plots.quasipotential import quasipotential_figure
+from siq.report.plots.residuals import residuals_figure
 from siq.report.projection import project, project_landscape
 from siq.report.settings import FiguresSettings
 from siq.steps.outcomes import METHODS, Method
@@ -72,6 +76,56 @@ class ShownRun:
 
 
 @dataclass(frozen=True)
+class PicturedRun:
+    """The run of the first picture: what of its landscape is drawn, its f, its recordings with their units.
+
+    Attributes
+    ----------
+    overview
+        Its landscape as plain data, None where f has no attractor.
+    stored
+        The same with the formulas about the attractors.
+    formula
+        Its refined formula, None where there is none.
+    dynamics
+        Its f and D.
+    recordings
+        Its trajectories.
+    """
+
+    overview: Mapping[str, Any] | None
+    stored: StoredLandscape | None
+    formula: SymbolicDecomposition | None
+    dynamics: Dynamics
+    recordings: Recordings
+
+    def drawn(self) -> DrawnLandscape:
+        """What is drawn of it."""
+        data = self.overview
+        if data is None:
+            units = [unit or "1" for unit in self.recordings.units]
+            data = {
+                "states": self.recordings.names, "units": units,
+                "time_unit": self.recordings.time_unit or "1",
+                "wells": [], "equilibria": [], "transitions": [],
+            }  # fmt: skip
+        return drawn_data(
+            data, wells=() if self.stored is None else self.stored.wells, dynamics=self.dynamics,
+            points=self.recordings.values, formula=self.formula,
+        )  # fmt: skip
+
+
+def leading_figures(run: PicturedRun) -> dict[str, Figure | None]:
+    """What a page opens with, `quasipotential`, and the first of its evidence, `residuals`."""
+    shown = run.drawn()
+    time_unit = str((run.overview or {}).get("time_unit") or run.recordings.time_unit or "1")
+    return {
+        "quasipotential": quasipotential_figure(shown),
+        "residuals": residuals_figure(run.dynamics, run.recordings, units=shown.units, time_unit=time_unit),
+    }
+
+
+@dataclass(frozen=True)
 class StudyTables:
     """The tables that are drawn, see `siq.study.tables.COLUMNS`."""
 
@@ -110,10 +164,10 @@ def study_figures(
     shown: ShownRun,
     system: Dynamics | None,
     published: Mapping[str, PublishedFigure],
-) -> dict[str, Figure]:
-    """All figures of a study by name."""
+) -> dict[str, Figure | None]:
+    """All figures of a study by name, None for one that has nothing to show."""
     rrmse = tables.rrmse[tables.rrmse["method"].isin(METHODS)]
-    figures = {}
+    figures: dict[str, Figure | None] = {}
     for method in METHODS:
         coefficients = tables.coefficients
         figures[f"coefficients_{method}"] = plot_coefficient_distributions(coefficients, method=method)
@@ -141,14 +195,18 @@ def _units(recordings: Recordings, system: Dynamics | None) -> tuple[str, ...]:
     return system.units if system is not None else tuple(unit or "1" for unit in recordings.units)
 
 
-def _components_figure(shown: ShownRun, system: Dynamics | None) -> Figure:
+def _components_figure(shown: ShownRun, system: Dynamics | None) -> Figure | None:
     """The decomposition on the plane of the first two states."""
     recordings = shown.recordings
     if recordings is None:
         recordings = Recordings(("x",), (None,), ("none",), np.zeros(1, int), np.zeros(1), np.zeros((1, 1)))
     fields, domain = _component_fields(recordings, shown, system)
     units = _units(recordings, system)
-    return plot_components(fields, states=recordings.names, units=units, domain=domain)
+    time_unit = recordings.time_unit or ("1" if system is None else system.time_unit)
+    said = SaidLandscape({"states": recordings.names, "units": units, "time_unit": time_unit})
+    return plot_components(
+        fields, states=recordings.names, units=units, domain=domain, energy_unit=said.energy_unit
+    )
 
 
 def _component_fields(
@@ -189,10 +247,10 @@ def _prediction_figure(
     shown: ShownRun,
     system: Dynamics | None,
     published: PublishedFigure | None,
-) -> Figure:
+) -> Figure | None:
     """Unseen trajectories beside those of the identified f, and the errors over all of them."""
     if errors.empty or shown.dynamics is None or system is None or settings.simulation is None:
-        return sentence_figure("Nothing was predicted: no system is known to simulate unseen trajectories.")
+        return None
     options = replace(settings.simulation, trajectories=PREDICTED, noise_intensity=0.0)
     draw = generator(settings.seed, Purpose.UNSEEN)
     unseen = simulate_snapshots(system, options=options, generator=draw)
@@ -208,11 +266,11 @@ def _prediction_figure(
     )
 
 
-def _dataset_figure(settings: FiguresSettings, shown: ShownRun, system: Dynamics | None) -> Figure:
+def _dataset_figure(settings: FiguresSettings, shown: ShownRun, system: Dynamics | None) -> Figure | None:
     """The recorded states of a run, and those that its regression sees."""
     recordings = shown.recordings
     if recordings is None:
-        return sentence_figure("No trajectories were drawn.")
+        return None
     data = _dataset(settings, recordings, shown.networks, system)
     return plot_dataset(data, states=recordings.names, units=_units(recordings, system))
 

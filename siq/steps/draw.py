@@ -8,7 +8,7 @@ from pathlib import Path
 from pydantic.dataclasses import dataclass
 
 from siq.data.recordings import Recordings, read_pairs, write_recordings
-from siq.data.selection import resample_recordings
+from siq.data.selection import in_stretches, resample_recordings
 from siq.dynamics.cards import load_system
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.simulation import SimulationOptions, simulate_snapshots
@@ -49,10 +49,11 @@ def run(settings: DrawSettings, source: Dynamics | Recordings, *, number: int) -
         Of the run.
     """
     if isinstance(source, Recordings):
+        source = in_stretches(source)
         if number > 0:
             draw = generator(settings.seed, number, Purpose.RESAMPLE)
             source = resample_recordings(source, generator=draw)
-        return Drawn(source, Outcome(number, Step.RESAMPLE))
+        return Drawn(source, Outcome(number, Step.RESAMPLE, reason="; ".join(source.notes)))
     assert settings.simulation is not None  # a system is simulated
     try:
         draw = generator(settings.seed, number, Purpose.SIMULATE)

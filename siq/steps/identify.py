@@ -25,6 +25,7 @@ from siq.identify.identification import (
 from siq.identify.identified_field import IdentifiedField
 from siq.identify.prediction import prediction_errors
 from siq.identify.residuals import NoiseDiagnosis, mean_residual_probability, residual_noise
+from siq.identify.rounding import rounding_text
 from siq.identify.storage import FieldRecord, field_library, read_field, write_field
 from siq.numerics.randomness import Purpose, generator
 from siq.steps.outcomes import Outcome, Status, Step, read_outcomes, write_outcomes
@@ -60,11 +61,16 @@ def run(settings: IdentifySettings, recordings: Recordings | None, *, number: in
     try:
         record = _identified(settings, recordings, number)
     except (NumericalFailure, np.linalg.LinAlgError) as error:
-        return Identified(None, Outcome(number, Step.IDENTIFY, Status.FAILED, str(error)))
+        rounding = rounding_text(recordings, coarse=True)
+        reason = str(error) if rounding is None else f"{error}; mind that {rounding}"
+        return Identified(None, Outcome(number, Step.IDENTIFY, Status.FAILED, reason))
     if record.prediction["passed"]:
-        note = record.diffusion_source.note or ""
-        return Identified(record, Outcome(number, Step.IDENTIFY, reason=note))
-    return Identified(record, Outcome(number, Step.IDENTIFY, Status.WARNING, record.prediction["reason"]))
+        notes = [note for note in (record.diffusion_source.note, record.noise.get("note")) if note]
+        return Identified(record, Outcome(number, Step.IDENTIFY, reason="; ".join(notes)))
+    notes = [str(record.prediction["reason"]), record.noise.get("note")]
+    return Identified(
+        record, Outcome(number, Step.IDENTIFY, Status.WARNING, "; ".join(note for note in notes if note))
+    )
 
 
 def _identified(settings: IdentifySettings, recordings: Recordings, number: int) -> FieldRecord:
@@ -102,6 +108,7 @@ def _identified(settings: IdentifySettings, recordings: Recordings, number: int)
         "correlation_score": noise.correlation_score,
         "measurement": noise.measurement.tolist(),
         "diffusion": str(source),
+        "note": noise.note,
         "pairs": sum(len(part.h) for part in parts),
     }
     return FieldRecord(found, verdict.as_data(), kept)

@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from siq.certificate.tests import CertificateOptions
+from siq.data.headings import read_heading, usable_name
 from siq.dynamics.cards import DiffusionEntry, Name, SystemCard, build_system, diffusion_matrix
 from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.dynamics import Dynamics
@@ -38,10 +39,13 @@ class RecordingsOptions(BaseModel):
     Attributes
     ----------
     file
-        Parquet, CSV, HDF5 or MATLAB file with columns ``recording``, ``t`` and the states; a relative
-        path starts from the folder in which the workflow runs, or else from ``SIQ_RESOURCES``.
+        Parquet, CSV, HDF5, MATLAB or NumPy file with columns ``recording``, ``t`` and the states, or a
+        folder with one such file for each recording; a relative path starts from the folder of the study, or
+        else from the folder in which you work, or from the one that the environment variable
+        ``SIQ_RESOURCES`` names.
     states
-        The columns that are states, in order; by default the system's, or all of the file's.
+        The columns that are states, in order, by their headings or by their names in formulas; by default the
+        system's, or all of the file's.
     pair_step
         Consecutive samples no further apart than this are pairs; by default those no further apart than
         one and a half of their median distance, since what is longer is a gap.
@@ -60,6 +64,16 @@ class RecordingsOptions(BaseModel):
     pair_step: Annotated[float, Field(gt=0)] | None = None
     diffusion: DiffusionEntry | None = None
     integrator_step: Annotated[float, Field(gt=0)] | None = None
+
+    @field_validator("states", mode="before")
+    @classmethod
+    def _as_in_formulas(cls, states: object) -> object:
+        # Somebody who copies "bead x (µm)" from the file means the state that is called bead_x in formulas.
+        if not isinstance(states, list | tuple) or not all(isinstance(each, str) for each in states):
+            return states
+        return [
+            each if each in ("t", "recording") else usable_name(read_heading(each).title) for each in states
+        ]
 
     @field_validator("states")
     @classmethod
@@ -89,7 +103,8 @@ class Study(BaseModel):
     seed
         Seed of everything random.
     published
-        Name of a file of published figures to be set beside the results.
+        Published figures to be set beside the results: name of a file in ``config/published``, or path of
+        one.
     simulation, identification, regression, refinement, certificate
         The parameters of the steps.
     training
@@ -128,7 +143,9 @@ class Study(BaseModel):
     @field_validator("published")
     @classmethod
     def _plain_name(cls, value: str | None) -> str | None:
-        if value is not None and not value.replace("-", "").replace("_", "").isalnum():
+        if value is None or value.endswith((".yaml", ".yml")):
+            return value
+        if not value.replace("-", "").replace("_", "").isalnum():
             raise ValueError(f"'{value}' is no name of published figures; use letters, digits, '-' and '_'")
         return value
 

@@ -204,13 +204,11 @@ def test_units_come_from_names_metadata_and_cells(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "place", "fault", "remedy"),
     [
-        ("t,x\n0,1\n1,2\n", "", "the column 'recording' is missing", "one label for all rows"),
-        ("recording,time,x\na,0,1\na,1,2\n", "", "'t' is missing", "rename 'time' to 't'"),
+        ("recording,q,x\na,0,1\na,1,2\n", "", "'t' is missing", "add the time of every sample"),
+        ("recording,t,x,\na,0,1,4\na,1,2,7.5\n", "column 4", "has no name", "name it"),
         ("recording,t\na,0\na,1\n", "", "no measured column", "add one"),
         ("recording,t,x,x [m]\na,0,1,2\n", "column x", "stands twice", "rename"),
-        (",recording,t,x\n0,a,0,1\n", "column 1", "has no name", "without the row index"),
         ("recording,t,x\n", "", "has no rows", "at least two samples"),
-        ("recording;t;x\na;0;1\n", "line 1", "not separated by commas", "by commas"),
         ("recording,t,x\na,0,1\na,1\n", "row 2", "2 cells while the header has 3", "one cell per column"),
         ("recording,t,x\na,0,1\na,1,\n", "row 2, column x", "missing", "remove the row"),
         ("recording,t,x\na,0,1\na,NaN,2\n", "row 2, column t", "missing", "remove the row"),
@@ -219,7 +217,7 @@ def test_units_come_from_names_metadata_and_cells(tmp_path: Path) -> None:
         ("recording,t,x\na,0,1\n,1,2\n", "row 2, column recording", "label is missing", "label"),
         ('recording,t,x\na,0,1\na,1,"2,5"\n', "row 2, column x", "'2,5' is no number", "decimal point"),
         ("recording,t,x\na,0,1\na,noon,2\na,2,n/a!\n", "row 2, column t", "'noon' is no number", "number"),
-        ("recording,t,x,y\na,0,1,\na,1,z,2\n", "row 1, column y", "missing", "remove the row"),
+        ("recording,t,x,y\na,0,1,\na,1,z,2\n", "row 2, column x", "'z' is no number", "remove the row"),
         ("recording,t,x\na,0,1 mm\na,1,2 cm\na,2,\n", "row 2, column x", "mixed units, cm", "one unit"),
         ("recording,t,x\na,0,1 mm\na,1,2\n", "row 2, column x", "no unit after rows in mm", "one unit"),
         ("recording,t,x [m]\na,0,1 mm\na,1,2 mm\n", "column x", "m in the name but mm in the cells", "one"),
@@ -256,7 +254,7 @@ def test_unreadable_files_are_refused(tmp_path: Path, suffix: str) -> None:
     assert refusal(path).fault
     path.unlink()
     path.mkdir()
-    assert "cannot be read" in refusal(path).fault
+    assert "the folder holds no recordings" in refusal(path).fault
 
 
 @pytest.mark.parametrize("kind", ["parquet", "h5 columns", "mat"])
@@ -295,10 +293,14 @@ def test_columns_that_are_no_vectors_are_refused(tmp_path: Path) -> None:
 
 def test_columns_of_other_types_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.parquet"
-    for t, words in [(pd.to_datetime([0, 1]), "timestamp"), (np.array([2**53, 2**53 + 1]), "too large")]:
-        pd.DataFrame({"recording": "a", "t": t, "x": [1, 2]}).to_parquet(path)
+    whole = {"recording": "a", "t": [0, 1], "x": [1, 2]}
+    for name, cells, words in [
+        ("x", pd.to_datetime([0, 1]), "timestamp"),
+        ("t", np.array([2**53, 2**53 + 1]), "too large"),
+    ]:
+        pd.DataFrame(whole | {name: cells}).to_parquet(path)
         error = refusal(path)
-        assert error.place == "column t" and words in error.fault
+        assert error.place == f"column {name}" and words in error.fault
     table = pa.table({"recording": [[1], [2]], "t": [0, 1], "x": [1, 2]})
     parquet.write_table(table, path)
     assert refusal(path).place == "column recording"

@@ -19,6 +19,7 @@ from siq.mismatch import diagnosis as module
 from siq.mismatch.case import comparison_of
 from siq.mismatch.tables import tables_of, tables_of_failure
 from siq.mismatch.verdict import statement_of_failure
+from siq.numerics.quantity_text import measured_text
 from siq.report.diagnosis_report import diagnosis_html, diagnosis_text
 
 n, r = sympy.symbols("n r", real=True)
@@ -64,10 +65,13 @@ def test_the_report_says_all_of_it(diagnosis: siq.Diagnosis) -> None:
     text = diagnosis.report()
     (found,) = diagnosis.mechanisms
     size = found.parameters["c_1"]
-    assert f"c_1 = {size.estimate:.4g} ± {size.standard_error:.2g} (" in text and "%) 1/(kg*d)" in text
-    assert f"r = {diagnosis.statement.recalibration['r'].after:.4g} ± " in text and "(before: 1)" in text
-    assert diagnosis.statement.sentence in text
-    for heading in ("Verdict", "Mechanisms", "Location", "Error (normalised rms", "Could not be told apart"):
+    assert f"c_1 = {measured_text(size.estimate, size.standard_error, size.unit)} (" in text
+    assert "1/(kg·d)" in text
+    r = diagnosis.statement.recalibration["r"]
+    assert f"r = {measured_text(r.after, r.standard_error, '1/d')} (" in text and "(on the card: 1)" in text
+    # It opens with the sentence that the page opens with.
+    assert text.splitlines()[1].strip() == diagnosis.statement.sentence
+    for heading in ("Verdict", "Mechanisms", "Location", "Error (normalised rms", "How sure it is"):
         assert f"[[{heading}" in text
     assert f"noise alone: {diagnosis.held_out.errors.noise_floor:.3g}" in text
 

@@ -20,7 +20,9 @@ from siq.mismatch.verdict import statement_of_failure
 from siq.report.mismatch_findings import Findings
 from siq.report.mismatch_page import mismatch_page
 from siq.report.mismatch_sections import CAPTIONS
-from siq.report.plots.mismatch import plot_candidates, plot_curves, plot_escapes, plot_held_out, plot_missing
+from siq.report.plots.before_after import most_telling, plot_before_after, plot_held_out
+from siq.report.plots.mismatch import limits_of, plot_candidates, plot_curves, plot_escapes, plot_missing
+from siq.report.plots.reading import rate_unit
 
 CARD = """\
 name: spring
@@ -49,6 +51,14 @@ VERDICT = {
             "evidence": {"delta_chi2": 300.0, "delta_bic": -290.0, "p_white": 1e-60, "p_cluster": 1e-9},
             "share_of_excess": 0.99,
             "indistinguishable_from": ["quintic stiffness"],
+            "equations": ["v"],
+            "beside": [],
+            "rivals": [
+                {
+                    "name": "quintic stiffness", "label": "quintic stiffness in v", "delta_chi2": 296.0,
+                    "further_parameters": 0, "standing": "same",
+                }
+            ],
         }
     ],
     "description": None,
@@ -58,6 +68,7 @@ VERDICT = {
         "region": {"x": [-2.0, 2.0]},
         "time": None,
         "recordings": ["r01", "r02"],
+        "recordings_total": 3,
         "sentence": "In the equation of v, along x from -2 to 2, in every recording.",
     },
     "recalibration": {"k": {"before": 1.0, "after": 1.1, "standard_error": 0.02}},
@@ -70,7 +81,8 @@ VERDICT = {
     },
     "excluded": {},
     "remarks": ["A <b>reservation</b>."],
-}
+    "words": {"alternatives": ["These recordings cannot tell cubic stiffness from quintic stiffness."]},
+}  # fmt: skip
 
 
 @pytest.fixture
@@ -90,6 +102,7 @@ def candidates() -> pd.DataFrame:
             "shapes": ["", "", ""],
             "gain": [300.0, 296.0, 2.0],
             "stage": ["found", "same", "further"],
+            "beside": "",
         }
     )
 
@@ -132,16 +145,16 @@ def test_page_says_what_where_how_sure_and_what_else(models):
     for part in (
         "missing physics",
         "lacks cubic stiffness",
-        "c_1 = (0.250 ± 0.010) 1/(mm**2*s**2)",
+        "0.250 ± 0.010 1/(mm²·s²)",
         "Duffing",
         "cannot tell cubic stiffness from quintic stiffness",
         "ran away",
-        "r01, r02",
+        "r01 and r02",
         "make it",
     ):
         assert part in page
     assert "<b>reservation</b>" not in page
-    assert page.count("<math") == 3  # the term, and both equations
+    assert page.count("<math") == 5  # the term, and both equations with their left sides
 
 
 def test_page_is_self_contained_and_well_formed(models):
@@ -160,8 +173,8 @@ def test_page_without_a_mechanism_tells_what_is_excluded(models, verdict):
     page = page_of(
         models, verdict={"verdict": verdict, "mechanisms": [], "location": None, "excluded": excluded}
     )
-    assert "at most (95 %)" in page
-    assert "none is named" in page
+    assert "at most (95 %)" in page and "0.50 mm/s²" in page
+    assert "against chance" in page
 
 
 def test_page_of_an_unexplained_mismatch_describes_it(models):
@@ -171,9 +184,11 @@ def test_page_of_an_unexplained_mismatch_describes_it(models):
         "p_residuals_random": 1e-9,
         "random_forces_admitted": True,
     }
-    page = page_of(models, verdict={"verdict": "unexplained", "mechanisms": [], "description": description})
-    assert "a share of 0.700" in page
-    assert "1.000 × 10⁻⁹" in page.replace("\u00a0", " ")
+    words = {"explained": ["Cubic stiffness explains 70 %."], "left": ["What is left is not noise."]}
+    said = {"verdict": "unexplained", "mechanisms": [], "description": description, "words": words}
+    page = page_of(models, verdict=said)
+    assert "What comes closest, as a formula" in page
+    assert "Cubic stiffness explains 70 %." in page and "What is left is not noise." in page
 
 
 def test_formula_that_cannot_be_read_is_shown_as_text(models):
@@ -211,16 +226,56 @@ def curves() -> pd.DataFrame:
 
 def test_held_out_figure_keeps_a_runaway_out_of_its_limits():
     figure = plot_held_out(held_out(), units={"x": "mm"}, time_unit="s")
-    left, right = figure.axes
-    assert left.get_ylabel() == "$x$ (mm)" and left.get_xlabel() == "$t$ (s)"
-    assert max(np.abs(left.get_ylim())) < 5 and max(np.abs(right.get_ylim())) < 10
+    upper, lower = figure.axes
+    assert upper.get_ylabel() == "$x$ (mm)" and lower.get_xlabel() == "$t$ (s)"
+    assert max(np.abs(upper.get_ylim())) < 5 and max(np.abs(lower.get_ylim())) < 10
+
+
+@pytest.mark.parametrize(("after", "curves"), [("augmented", 2), ("recalibrated", 2), ("before", 1)])
+def test_the_first_picture_shows_one_recording_before_and_after(after, curves):
+    figure = plot_before_after(held_out(), after=after, noise={"x": 1e-4}, units={"x": "mm"}, time_unit="s")
+    upper, lower = figure.axes
+    assert len(upper.lines) == curves + 1  # and what was recorded
+    assert len(lower.lines) == curves + 1  # and zero
+    (band,) = lower.patches
+    assert band.get_height() == pytest.approx(0.04)
+    assert lower.get_ylabel() == "error (mm)"
+
+
+def test_the_first_picture_is_of_the_output_that_is_furthest_off_and_a_typical_recording():
+    t = np.arange(20.0)
+    parts = [
+        pd.DataFrame(
+            {
+                "recording": recording, "t": t, "output": output, "measured": np.sin(t), "scored": True,
+                "before": np.sin(t) + off, "recalibrated": 0.0, "augmented": 0.0,
+            }
+        )
+        for output, scale in (("x", 0.1), ("y", 1.0))
+        for recording, off in (("best", 0.1 * scale), ("worst", np.nan), ("typical", 0.5 * scale))
+    ]  # fmt: skip
+    assert most_telling(pd.concat(parts)) == ("typical", "y")
 
 
 def test_curve_of_the_named_mechanism_comes_first():
     figure = plot_curves(curves(), named=("v", "x"), units={"x": "mm", "v": "mm/s"}, time_unit="s")
     labels = [axes.get_xlabel() for axes in figure.axes]
     assert labels == ["$x$ (mm)", "$t$ (s)", "amplitude (mm)"]
-    assert figure.axes[0].get_ylabel() == "missing in $v'$ (mm/s/s)"
+    assert figure.axes[0].get_ylabel() == "missing in $\\dot{v}$\n(mm/s²)"
+    # One below the other, so that a phone can show them.
+    assert len({round(axes.get_position().x0, 2) for axes in figure.axes}) == 1
+
+
+@pytest.mark.parametrize("error", [0.05, 250.0, np.inf])
+def test_a_wide_band_does_not_hide_the_curve(error):
+    at = np.linspace(-1, 1, 9)
+    errors = np.where(np.abs(at) > 0.9, error, 0.05)
+    table = pd.DataFrame({"missing": 8 * at, "standard_error": errors})
+    low, high = limits_of([table])
+    assert -15 < low < -6 and 6 < high < 15
+    # Even if no knot is known well, the axis is that of the values.
+    low, high = limits_of([table.assign(standard_error=250.0)])
+    assert -15 < low <= -8 and 8 <= high < 15
 
 
 def test_map_has_a_panel_for_each_of_two_equations():
@@ -228,7 +283,17 @@ def test_map_has_a_panel_for_each_of_two_equations():
     missing = {"x": 0.1 * points[:, 0], "v": points[:, 0] ** 3, "w": np.full(500, np.nan)}
     figure = plot_missing(points, missing, names=("x", "v"), units={"v": "mm/s"}, time_unit="s")
     bars = [axes.get_ylabel() for axes in figure.axes if "missing" in axes.get_ylabel()]
-    assert bars == ["missing in $v'$ (mm/s/s)", "missing in $x'$ (1/s)"]
+    assert bars == ["missing in $\\dot{v}$ (mm/s²)", "missing in $\\dot{x}$ (1/s)"]
+
+
+@pytest.mark.parametrize(
+    ("unit", "time", "rate"),
+    [("mm/s", "s", "mm/s**2"), ("m", "s", "m/s"), ("1", "s", "1/s"), ("kg", "1", "kg"),
+     ("m/s**2", "s", "m/s**3"),
+     ("N/m", "s", "(N/m)/s")],
+)  # fmt: skip
+def test_the_unit_of_a_rate(unit, time, rate):
+    assert rate_unit(unit, time) == rate
 
 
 def test_candidates_are_told_apart_by_what_they_are():
@@ -241,21 +306,21 @@ def test_candidates_are_told_apart_by_what_they_are():
     "figure",
     [
         lambda: plot_held_out(held_out().assign(scored=False)),
+        lambda: plot_before_after(held_out().assign(scored=False), after="augmented"),
         lambda: plot_curves(pd.DataFrame()),
         lambda: plot_missing(np.zeros((3, 2)), {"x": np.zeros(3)}, names=("x", "v")),
         lambda: plot_candidates(pd.DataFrame()),
         lambda: plot_escapes(pd.DataFrame()),
     ],
 )
-def test_figures_without_data_say_so(figure):
-    (axes,) = figure().axes
-    assert axes.texts
+def test_there_is_no_figure_without_data(figure):
+    assert figure() is None
 
 
 def test_a_simulation_that_cannot_be_fitted_has_a_page(models):
     said = findings(models, verdict=statement_of_failure("the simulation runs away").as_data())
     page = mismatch_page(replace(said, candidates=candidates()[:0]), title="t", commands=())
-    assert "no fit of it has a result" in page and "The simulation runs away." in page
+    assert "no fit of it to them has a result" in page and "The simulation runs away." in page
 
 
 def test_what_could_not_be_judged_is_on_the_page(models):

@@ -10,8 +10,6 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from siq.files.documents import read_document, validate
 from workflow.proof.keys import CaseKind
 
-PROOFS = Path("config/proof.yaml")
-
 
 class ProofSet(BaseModel):
     """The schema of an entry of ``config/proof.yaml``: a set of cases that conceal something.
@@ -55,7 +53,7 @@ class Proofs(BaseModel):
     proof_full: ProofSet
 
 
-def load_proofs(path: str | Path = PROOFS) -> dict[str, ProofSet]:
+def load_proofs(path: str | Path) -> dict[str, ProofSet]:
     """Read the sets of concealed cases.
 
     Raises

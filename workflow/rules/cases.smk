@@ -3,7 +3,6 @@ from siq.data.public_recordings import BENCHMARKS
 from workflow.cases import Cases
 
 MISMATCH_TABLES = ["curves", "candidates", "held_out", "forces", "noise"]
-MISMATCH_FIGURES = ["held_out", "curves", "map", "candidates", "escapes"]
 
 try:
     CASES = Cases(config)

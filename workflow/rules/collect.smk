@@ -27,7 +27,8 @@ rule collect:
             "results/{study}/tables/summary.csv",
             caption="../report/summary.rst",
             category="{study}",
-            subcategory="tables",
+            subcategory=EVIDENCE,
+            labels={"shows": "All quantities over the runs", "kind": "table"},
         ),
     log:
         "results/{study}/logs/collect.log",

@@ -1,9 +1,12 @@
 # Helpers of the rules: studies and their parameters, code dependencies by content, one workflow at a time.
-import fcntl
 import sys
 from functools import cache
 from pathlib import Path
 
+from filelock import FileLock, Timeout
+
+from siq.cli.answers import Exit, answer_of_page
+from siq.data.folders import files_of
 from siq.errors import InputError
 from siq.report.settings import (
     FiguresSettings,
@@ -12,6 +15,7 @@ from siq.report.settings import (
     ReproductionSettings,
 )
 from siq.report.study_captions import CAPTIONS as STUDY_CAPTIONS
+from siq.report.study_captions import Part, figure_place
 from siq.steps.draw import DrawSettings
 from siq.steps.escapes import EscapesSettings
 from siq.steps.identify import IdentifySettings
@@ -26,7 +30,8 @@ from siq.steps.score import ScoreSettings
 from siq.steps.train import TrainSettings
 from siq.study.study import load_published
 from workflow.code_digest import code_digest
-from workflow.settings import Studies, find_resource, prepare_environment
+from workflow.places import config_path, find_file
+from workflow.settings import Studies, prepare_environment
 from workflow.warm import start
 
 
@@ -82,8 +87,8 @@ def exact_answer(wildcards):
 
 
 def code(script):
-    """Params: fingerprint of the script and of every module of siq that it imports, by content."""
-    return code_digest(Path(workflow.basedir), script)
+    """Params function: fingerprint of the script and of every module of siq that it imports, by content."""
+    return lambda wildcards: code_digest(Path(workflow.basedir), script)
 
 
 def block_of(wildcards):
@@ -132,8 +137,17 @@ def data_source(wildcards):
     study = study_of(wildcards)
     if study.study.recordings is None:
         return ancient(study.source())
-    check_recordings(wildcards.study)
+    check_recordings(wildcards.study)  # which refuses a file that is not there
     return study.source()
+
+
+def files_in_folder(wildcards):
+    """Input function: the files of a folder of recordings, so that a change of one is seen; of a file none."""
+    folder = Path(study_of(wildcards).source())
+    try:
+        return [str(file) for file in files_of(folder)] if folder.is_dir() else []
+    except InputError as error:
+        say_and_stop(error)
 
 
 @cache
@@ -245,9 +259,8 @@ def published_mesh_if_any(wildcards):
     """Input function: the mesh that was published beside the figures, where SIQ_RESOURCES has it."""
     figures = study_of(wildcards).published()
     mesh = load_published(figures).mesh if figures is not None else None
-    if mesh is None or not Path(file := find_resource(mesh.file)).is_file():
-        return []
-    return ancient(file)
+    file = None if mesh is None else find_file(mesh.file)
+    return [] if file is None else ancient(file)
 
 
 def reproduced_settings(wildcards):
@@ -261,12 +274,51 @@ def of_reproduced(method):
     return lambda wildcards: [getattr(STUDIES[name], method)() for name in REPRODUCED]
 
 
+# Parts of `snakemake --report`, in the order of the page; Snakemake sorts them by their names.
+ANSWER, EVIDENCE, LANDSCAPE, RUNS, PUBLISHED, WORKINGS = (
+    "1 The answer",
+    "2 Evidence",
+    "3 The landscape",
+    "4 The runs",
+    "5 The published method",
+    "6 The workings",
+)
+PARTS = {
+    Part.LEAD: ANSWER,
+    Part.EVIDENCE: EVIDENCE,
+    Part.LANDSCAPE: LANDSCAPE,
+    Part.RUNS: RUNS,
+    Part.PUBLISHED: PUBLISHED,
+    Part.WORKINGS: WORKINGS,
+}
+
+
+def figure_part(wildcards):
+    """The part of Snakemake's report in which a figure stands, as on the page."""
+    return PARTS[figure_place(wildcards.name)]
+
+
 def figure_labels(wildcards):
-    """Labels of a figure in Snakemake's report, numbered in the order of the page."""
-    order = list(CAPTIONS)
-    name = wildcards.name
-    number = order.index(name) + 2 if name in order else len(order) + 2
-    return {"order": f"{number:02d}", "what": name.replace("_", " ")}
+    """Labels of a figure in Snakemake's report."""
+    return {"shows": wildcards.name.replace("_", " "), "kind": "figure"}
+
+
+def say_what_has_no_answer():
+    """A study without a formula, or a simulation that cannot be compared, is no success: code 3, and why."""
+    pages = [
+        Path(output)
+        for job in workflow.dag.jobs
+        if job.rule.name in ("page", "mismatch_page")
+        for output in job.output
+        if str(output).endswith("report.html")
+    ]
+    unanswered = [
+        told for told in map(answer_of_page, pages) if told.code == Exit.NO_ANSWER
+    ]
+    for told in unanswered:
+        print(*told.lines, f"The page to read: {told.page}", sep="\n", file=sys.stderr)
+    if unanswered:
+        sys.exit(int(Exit.NO_ANSWER))
 
 
 # Snakemake's own lock outlives a killed process and would ask for --unlock; the profile switches it off.
@@ -276,13 +328,17 @@ WARM = None
 
 
 onstart:
-    globals()["LOCK"] = open(".snakemake/siq.lock", "w")
+    globals()["LOCK"] = FileLock(".snakemake/siq.lock", timeout=0)
     try:
-        fcntl.flock(LOCK, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
+        LOCK.acquire()
+    except Timeout:
         say_and_stop(
             "Another snakemake is at work in this folder; wait for it, or stop it."
         )
     globals()[
         "WARM"
     ] = start()  # held until the end of this process, and ends with it
+
+
+onsuccess:
+    say_what_has_no_answer()

@@ -5,6 +5,7 @@ rule draw:
     # One rule for both entrances: whatever follows cannot tell them apart.
     input:
         source=data_source,
+        files=files_in_folder,
     output:
         recordings="results/{study}/runs/{run}/recordings.parquet",
         outcome="results/{study}/runs/{run}/draw.json",

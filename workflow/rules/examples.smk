@@ -3,7 +3,7 @@
 
 rule example_recordings:
     input:
-        card=ancient("config/systems/archetype3d.yaml"),
+        card=ancient(str(config_path("systems", "archetype3d.yaml"))),
     output:
         recordings="results/examples/archetype3d.parquet",
     log:

@@ -136,13 +136,11 @@ rule mismatch_figures:
         candidates="results/mismatch/{case}/tables/candidates.parquet",
         held_out="results/mismatch/{case}/tables/held_out.parquet",
         forces="results/mismatch/{case}/tables/forces.parquet",
+        noise="results/mismatch/{case}/tables/noise.parquet",
         escape="results/mismatch/{case}/tables/escape.parquet",
     output:
-        expand(
-            "results/mismatch/{{case}}/figures/{name}.{kind}",
-            name=MISMATCH_FIGURES,
-            kind=["svg", "png"],
-        ),
+        # Which figures there are depends on what was found.
+        folder=directory("results/mismatch/{case}/figures"),
     log:
         "results/mismatch/{case}/logs/mismatch_figures.log",
     benchmark:
@@ -152,7 +150,6 @@ rule mismatch_figures:
     threads: 1
     params:
         code=code("mismatch_figures.py"),
-        folder="results/mismatch/{case}/figures",
     message:
         "{wildcards.case}: drawing what is missing"
     script:
@@ -170,15 +167,16 @@ rule mismatch_page:
         escape="results/mismatch/{case}/tables/escape.parquet",
         notes="results/mismatch/{case}/landscape.json",
         scores=scores_if_any,
-        figures=expand(
-            "results/mismatch/{{case}}/figures/{name}.svg", name=MISMATCH_FIGURES
-        ),
+        held_out="results/mismatch/{case}/tables/held_out.parquet",
+        figures="results/mismatch/{case}/figures",
     output:
         html=report(
             "results/mismatch/{case}/report.html",
             caption="../report/mismatch.rst",
-            category="mismatch",
+            category="What a simulation lacks",
+            labels={"shows": "{case}", "kind": "page"},
         ),
+        answer="results/mismatch/{case}/answer.json",
     log:
         "results/mismatch/{case}/logs/mismatch_page.log",
     benchmark:

@@ -166,7 +166,8 @@ rule score_proof:
         html=report(
             "results/proof/{proof}/report.html",
             caption="../report/proof.rst",
-            category="proof",
+            category="Blind test of the diagnosis",
+            labels={"shows": "{proof}", "kind": "page"},
         ),
         figure="results/proof/{proof}/figures/verdicts.svg",
         png="results/proof/{proof}/figures/verdicts.png",

@@ -2,7 +2,7 @@
 from workflow.proof.sets import load_proofs
 
 try:
-    PROOF_SETS = load_proofs()
+    PROOF_SETS = load_proofs(config_path("proof.yaml"))
 except InputError as error:
     say_and_stop(error)
 

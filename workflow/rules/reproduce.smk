@@ -7,9 +7,9 @@ rule reproduction:
         reports=expand("results/{study}/report.html", study=REPRODUCED),
         published=of_reproduced("published"),
         cards=of_reproduced("card"),
-        contents="config/published/contents.yaml",
-        parameters="config/published/parameters.yaml",
-        contradictions="config/published/contradictions.yaml",
+        contents=str(config_path("published", "contents.yaml")),
+        parameters=str(config_path("published", "parameters.yaml")),
+        contradictions=str(config_path("published", "contradictions.yaml")),
     output:
         html="results/reproduction.html",
         csv="results/reproduction.csv",

@@ -8,9 +8,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from siq.dynamics.cards import load_system
+from siq.identify.storage import read_field
+from siq.landscape.storage import read_landscape
 from siq.report.plots import save_figure
 from siq.report.settings import FiguresSettings
-from siq.report.study_figures import StudyTables, study_figures, what_is_shown
+from siq.report.study_figures import PicturedRun, StudyTables, leading_figures, study_figures, what_is_shown
 from siq.steps.files import read_run
 from siq.steps.landscapes import first_stored
 from siq.steps.outcomes import Method
@@ -19,7 +21,7 @@ from siq.steps.trained import read_trained
 from siq.study.scoring import exact_answer
 from siq.study.study import load_published
 from siq.study.tables import read_table
-from step import job
+from step import job, read_json
 
 if __name__ == "__main__":
     with job() as now:
@@ -49,6 +51,13 @@ if __name__ == "__main__":
             None if card is None else load_system(card),
             {} if published is None else load_published(published).figures,
         )
+        overview = read_json(source.overview)
+        first = run if overview is None else overview["run"]
+        record, recorded = read_field(source.every_field[first]), read_run(source.recordings[first])
+        if record is not None and recorded is not None:
+            dynamics, own = record.found.dynamics, models.formulas(first).get(Method.REFINED)
+            stored = read_landscape(source.overview, dynamics=dynamics)
+            figures |= leading_figures(PicturedRun(overview, stored, own, dynamics, recorded))
         drawn = Path(now.params.folder)
         drawn.mkdir(parents=True, exist_ok=True)
         for name, figure in figures.items():

@@ -16,9 +16,17 @@ from siq.dynamics.cards import load_system
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.formulas import compile_formulas
 from siq.dynamics.parametric import symbol
-from siq.report.plots.mismatch import plot_candidates, plot_curves, plot_escapes, plot_held_out, plot_missing
+from siq.mismatch.candidates import PROCESS_NOISE
+from siq.report.mismatch_findings import FINAL
+from siq.report.plots.mismatch import (
+    plot_before_after,
+    plot_candidates,
+    plot_curves,
+    plot_escapes,
+    plot_held_out,
+    plot_missing,
+)
 from siq.report.plots.saving import save_figure
-from siq.report.plots.style import sentence_figure
 from siq.study.tables import read_table
 from step import job, read_json
 
@@ -57,12 +65,10 @@ def added_terms(after: Dynamics, before: Dynamics, table: pd.DataFrame) -> dict[
 
 def missing_map(
     before: Dynamics, after: Dynamics, forces: pd.DataFrame, curves: pd.DataFrame, verdict: dict[str, Any]
-) -> Figure:
-    """The missing part over the plane of the two most relevant states."""
-    if verdict["location"] is None:
-        return sentence_figure("Nothing is missing that a map could show.")
-    if before.dimension < 2:
-        return sentence_figure("There is one state only; the curve above tells all.")
+) -> Figure | None:
+    """The missing part over the plane of the two most relevant states, where there are two."""
+    if verdict["location"] is None or before.dimension < 2:
+        return None
     names = plane(list(before.states), curves, verdict["location"])
     known = forces.dropna(subset=list(names))
     missing = {
@@ -82,20 +88,31 @@ def missing_map(
 
 def main(snakemake: Any) -> None:
     """Run as a rule's script."""
-    source, folder = snakemake.input, Path(snakemake.params.folder)
+    source, folder = snakemake.input, Path(snakemake.output.folder)
     verdict, before, after = read_json(source.verdict), load_system(source.card), load_system(source.system)
     curves, place = read_table(source.curves), verdict["location"]
     named = None if place is None else (", ".join(place["equations"]), place["coordinate"])
     units, time_unit = units_of(before), before.time_unit
+    held_out, noise = read_table(source.held_out), read_table(source.noise)
+    sensors = noise[(noise["stage"] == "final") & (noise["kind"] == "measurement")]
+    random_forces = [each["name"] for each in verdict["mechanisms"]] == [PROCESS_NOISE]
+    final = "recalibrated" if random_forces else FINAL.get(verdict["verdict"], "recalibrated")
     figures = {
-        "held_out": plot_held_out(read_table(source.held_out), units=units, time_unit=time_unit),
-        "curves": plot_curves(curves, named=named, units=units, time_unit=time_unit),
+        "before_after": plot_before_after(
+            held_out, after=final, noise=dict(zip(sensors["name"], sensors["variance"], strict=True)),
+            units=units, time_unit=time_unit,
+        ),
+        "held_out": plot_held_out(held_out, units=units, time_unit=time_unit),
+        "curves": plot_curves(curves, named=named, units=units, time_unit=time_unit)
+        if verdict["location"] is not None else None,
         "map": missing_map(before, after, read_table(source.forces), curves, verdict),
         "candidates": plot_candidates(read_table(source.candidates)),
         "escapes": plot_escapes(read_table(source.escape), time_unit=time_unit),
-    }
+    }  # fmt: skip
+    folder.mkdir(parents=True, exist_ok=True)
     for name, figure in figures.items():
-        save_figure(figure, folder / name)
+        if figure is not None:
+            save_figure(figure, folder / name)
 
 
 if __name__ == "__main__":

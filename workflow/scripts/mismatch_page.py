@@ -4,6 +4,7 @@ from workflow.warm import run_warm
 
 run_warm()
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from siq.dynamics.cards import load_system
 from siq.files.whole import whole_file
 from siq.mismatch.dictionary import dictionary_of
 from siq.mismatch.study import MismatchStudy, load_mismatch_study
+from siq.report.mismatch_answer import mismatch_answer
 from siq.report.mismatch_findings import Findings
 from siq.report.mismatch_page import mismatch_page
 from siq.study.tables import read_table
@@ -29,11 +31,14 @@ def main(snakemake: Any) -> None:
         after=load_system(source.system),
         dictionary=dictionary_of(without=study.without, further=study.mechanisms, file="the study"),
         candidates=read_table(source.candidates),
-        figures={Path(path).stem: Path(path).read_bytes() for path in source.figures},
+        figures={
+            Path(path).stem: Path(path).read_bytes() for path in sorted(Path(source.figures).glob("*.svg"))
+        },
         wells=read_table(source.wells),
         escape=read_table(source.escape),
         notes=read_json(source.notes),
         scores=read_table(source.scores) if source.get("scores") else pd.DataFrame(),
+        held_out=read_table(source.held_out),
         folder=str(Path(source.candidates).parent),
     )
     commands = [
@@ -44,6 +49,9 @@ def main(snakemake: Any) -> None:
         partial.write_text(
             mismatch_page(findings, title=snakemake.params.title, commands=commands), encoding="utf-8"
         )
+    answer = mismatch_answer(findings.verdict, title=snakemake.params.title)
+    with whole_file(snakemake.output.answer) as partial:
+        partial.write_text(json.dumps(answer, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -19,14 +19,15 @@ from siq.report.plots.style import (
     drawn_in_style,
     magnitude_label,
     mean_and_spread,
-    sentence_figure,
 )
 
 GOLDEN_RATIO = (5**0.5 - 1) / 2
 
 
 @drawn_in_style
-def plot_error_distribution(rrmse: pd.DataFrame, *, published: tuple[float, float] | None = None) -> Figure:
+def plot_error_distribution(
+    rrmse: pd.DataFrame, *, published: tuple[float, float] | None = None
+) -> Figure | None:
     """Draw the error of the coefficients of U, one dot a run.
 
     Parameters
@@ -41,14 +42,13 @@ def plot_error_distribution(rrmse: pd.DataFrame, *, published: tuple[float, floa
     -------
     matplotlib.figure.Figure
         Relative root-mean-square error on a logarithmic axis, by method. Shape and colour tell whether the
-        terms are exactly the right ones, a hollow mark that the run is not certified.
+        terms are exactly the right ones, a hollow mark that the run is not certified. None where fewer than
+        two runs have an error.
     """
-    if rrmse.empty:
-        return sentence_figure("There is no run to show.")
-    if rrmse["rrmse"].isna().all():
-        return sentence_figure(f"The error of none of {counted(len(rrmse), 'formula')} is known.")
+    if rrmse["run"].nunique() < 2 or not (rrmse["rrmse"] > 0).any():
+        return None
     methods = list(dict.fromkeys(rrmse["method"]))
-    figure = Figure(figsize=(COLUMN_WIDTH if len(methods) <= 3 else PAGE_WIDTH, 4.0))
+    figure = Figure(figsize=(COLUMN_WIDTH if len(methods) <= 2 else PAGE_WIDTH, 4.8))
     axes = figure.add_subplot()
     axes.set_yscale("log")
     labels = []
@@ -69,9 +69,9 @@ def plot_error_distribution(rrmse: pd.DataFrame, *, published: tuple[float, floa
     axes.grid(axis="y", linewidth=0.3, color="#CCCCCC")
     axes.set_axisbelow(True)
     handles = _legend(rrmse, axes)
-    figure.legend(handles=handles, loc="outside upper left", ncols=1 if len(methods) <= 3 else 2)
+    figure.legend(handles=handles, loc="outside upper left", ncols=1)
     if notes:
-        figure.supxlabel("\n".join(notes), fontsize=7)
+        figure.supxlabel("\n".join(notes))
     return figure
 
 

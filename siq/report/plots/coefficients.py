@@ -20,20 +20,19 @@ from siq.report.plots.style import (
     magnitude_label,
     mean_and_spread,
     name_label,
-    sentence_figure,
     sorted_terms,
     term_label,
 )
 
 NARROW = 1e-4  # coefficients that scatter less than this share of their value are drawn as deviations
-BARS_IN_A_PANEL = 8
-BARS_IN_A_ROW = 56
+BARS_IN_A_PANEL = 6
+BARS_IN_A_ROW = 20
 
 
 @drawn_in_style
 def plot_coefficient_distributions(
     coefficients: pd.DataFrame, *, method: str, component: str = "U"
-) -> Figure:
+) -> Figure | None:
     """Draw the distribution of every non-trivial coefficient over the runs.
 
     Parameters
@@ -51,12 +50,13 @@ def plot_coefficient_distributions(
     matplotlib.figure.Figure
         A histogram of the non-zero estimates for each non-trivial term (exact coefficient not zero or, where
         it is unknown, estimate not zero in at least half of the runs), then one panel on all other terms.
+        None of fewer than two runs, which have no distribution.
     """
     chosen = (coefficients["method"] == method) & (coefficients["component"] == component)
     rows = coefficients[chosen].dropna(subset=["estimate"])
     runs = rows["run"].nunique()
-    if runs == 0:
-        return sentence_figure(f"No run has coefficients of {component}\nby the method “{method}”.")
+    if runs < 2:
+        return None
     terms = sorted_terms(rows["term"])
     estimates = {term: group.to_numpy(float) for term, group in rows.groupby("term")["estimate"]}
     exact = rows.groupby("term")["exact"].first()
@@ -66,9 +66,9 @@ def plot_coefficient_distributions(
 
     wide = false_terms > BARS_IN_A_PANEL
     panels = len(shown) + (0 if wide else 1)
-    columns = 3 if panels <= 9 else 4
+    columns = 2  # more could not be read on a phone
     lines = math.ceil(panels / columns) + (1 if wide else 0)
-    figure = Figure(figsize=(PAGE_WIDTH, (1.85 if columns == 3 else 1.65) * lines + 0.4))
+    figure = Figure(figsize=(PAGE_WIDTH, 2.3 * lines + 0.6))
     grid = figure.add_gridspec(lines, columns)
     for index, term in enumerate(shown):
         axes = figure.add_subplot(grid[index // columns, index % columns])
@@ -78,9 +78,9 @@ def plot_coefficient_distributions(
     last = grid[-1, :] if wide else grid[(panels - 1) // columns, (panels - 1) % columns]
     known = bool(exact.notna().any())
     figure.suptitle(
-        f"Coefficients of ${name_label(component)}$ in {counted(runs, 'run')}, method “{method}”\n"
-        + ("(mean ± standard deviation, " if runs > 1 else "(")
-        + ("in the units of the system card" + ("; dashed: exact)" if known else ")"))
+        f"Coefficients of ${name_label(component)}$ in {counted(runs, 'run')}, “{method}”\n"
+        + "(mean ± standard deviation,\n"
+        + ("in the units of the states" + ("; dashed: exact)" if known else ")"))
     )
     _draw_other_terms(figure.add_subplot(last), others, runs, known=known, wide=wide)
     return figure
@@ -92,7 +92,7 @@ def _is_nontrivial(exact: float, estimates: np.ndarray) -> bool:
 
 def _draw_histogram(axes: Axes, term: str, estimates: np.ndarray, exact: float) -> None:
     found = estimates[estimates != 0]
-    axes.set_xlabel("coefficient", fontsize=7)
+    axes.set_xlabel("coefficient")
     known = math.isfinite(exact)
     reference = exact if known else float(f"{np.median(found):.4g}") if found.size else 0.0
     width = float(np.max(np.abs(found - reference), initial=0.0))
@@ -105,7 +105,7 @@ def _draw_histogram(axes: Axes, term: str, estimates: np.ndarray, exact: float) 
         deviation = mean_and_spread((found - reference).mean(), spread)
         title = f"${reference:g}$ + {deviation}"
         sign = "−" if reference > 0 else "+"
-        axes.set_xlabel(f"coefficient {sign} ${abs(reference):g}$", fontsize=7)
+        axes.set_xlabel(f"coefficient {sign} ${abs(reference):g}$")
         found = found - reference
         exact = exact - reference
     if found.size:
@@ -115,7 +115,7 @@ def _draw_histogram(axes: Axes, term: str, estimates: np.ndarray, exact: float) 
     absent = int(np.sum(estimates == 0))
     if absent:
         note = f"zero in {counted(absent, 'run')}\n(left out)"
-        axes.text(0.03, 0.97, note, transform=axes.transAxes, fontsize=7, va="top", color=VERMILLION)
+        axes.text(0.03, 0.97, note, transform=axes.transAxes, va="top", color=VERMILLION)
     axes.set_title(f"{term_label(term)}\n{title}")
     axes.xaxis.set_major_locator(MaxNLocator(3))
     axes.yaxis.set_major_locator(MaxNLocator(4, integer=True))
@@ -157,7 +157,7 @@ def _draw_other_terms(
     for place, term in enumerate(drawn):
         largest = magnitude_label(float(np.max(np.abs(others[term]))), digits=1)
         text = f" {largest}"
-        axes.text(place, frequency[term], text, rotation=90, ha="center", va="bottom", fontsize=7)
+        axes.text(place, frequency[term], text, rotation=90, ha="center", va="bottom")
     axes.set_xticks(range(len(drawn)), [term_label(term) for term in drawn], rotation=90)
     axes.set_xlim(-0.7, max(len(drawn), 4) - 0.3)
     axes.set_ylim(0, max(frequency.values()) * 1.9)

@@ -2,30 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from string import ascii_lowercase
 from typing import Literal
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm
-from matplotlib.contour import QuadContourSet
-from matplotlib.figure import Figure, SubFigure
+from matplotlib.figure import Figure
 
 from siq.report.plots.style import (
     BLUE,
     PAGE_WIDTH,
     VERMILLION,
+    axis_label,
+    counted,
     drawn_in_style,
+    energy_label,
     name_label,
-    say,
-    unit_label,
 )
 
 TRAJECTORIES_SHOWN = 5
 LEVELS = 14
+ROUNDING = 1e-9  # of the largest slope
 COLOUR_MAP = "viridis"
-NO_EXACT = "the exact quasipotential\nis not known"
+LANDSCAPES = ("exact", "identified")
 Extend = Literal["neither", "both", "min", "max"]
 
 
@@ -59,9 +61,14 @@ class ComponentFields:
 
 @drawn_in_style
 def plot_components(
-    fields: ComponentFields, *, states: Sequence[str], units: Sequence[str], domain: np.ndarray
-) -> Figure:
-    """Draw trajectories, -∇V, g, the exact U and the identified U, projected on the first two states.
+    fields: ComponentFields,
+    *,
+    states: Sequence[str],
+    units: Sequence[str],
+    domain: np.ndarray,
+    energy_unit: str = "",
+) -> Figure | None:
+    """Draw trajectories, -D∇V, g, the exact U and the identified U, projected on the first two states.
 
     Parameters
     ----------
@@ -71,49 +78,88 @@ def plot_components(
         Names and units of the states.
     domain
         Shape ``(d, 2)``: the limits of the axes.
+    energy_unit
+        Unit of U; empty where it is that of ε.
 
     Returns
     -------
     matplotlib.figure.Figure
-        Five panels. The width of stream lines grows with speed; both contour plots share one colour scale.
-        With one state, V and g are drawn as curves.
+        A panel for each part that is known, two side by side. The width of stream lines grows with speed; the
+        maps of U share one colour scale. With one state, V and g are drawn as curves. None where nothing but
+        trajectories is known.
     """
-    labels = [f"${name_label(name)}$ {unit_label(unit)}" for name, unit in zip(states, units, strict=True)]
-    if len(states) == 1:
-        return _plot_curves(fields, labels[0], np.asarray(domain))
-    figure = Figure(figsize=(PAGE_WIDTH, 4.7))
-    top, bottom = figure.subfigures(2, 1, squeeze=False)[:, 0]
-    all_axes = [*top.subplots(1, 3), *bottom.subplots(1, 2)]
-    _draw_trajectories(all_axes[0], fields.trajectories)
-    _draw_streams(all_axes[1], fields, fields.minus_gradient, BLUE)
-    _draw_streams(all_axes[2], fields, fields.circulatory, VERMILLION)
-    _draw_contours(bottom, all_axes[3:], fields)
-    titles = _titles(len(fields.trajectories))
-    if len(fields.trajectories):
-        titles[0] += ", • to ×"
-    for axes, title in zip(all_axes, titles, strict=True):
-        axes.set_title(title, loc="left")
-        if axes.axison:
-            axes.set_xlim(*domain[0])
-            axes.set_ylim(*domain[1])
-            axes.set_xlabel(labels[0])
-            axes.set_ylabel(labels[1])
+    one_state = len(states) == 1
+    known = _known(fields, one_state=one_state)
+    if known in ([], ["trajectories"]):
+        return None
+    rows = -(-len(known) // 2)
+    figure = Figure(figsize=(PAGE_WIDTH, 2.6 * rows + 0.5))
+    panels = figure.subplots(rows, 2, squeeze=False).ravel()
+    for axes in panels[len(known) :]:
+        axes.remove()
+    chosen = dict(zip(known, panels, strict=False))
+    label = [axis_label(name, unit) for name, unit in zip(states, units, strict=True)]
+    (_draw_curves if one_state else _draw_planes)(chosen, fields, label, np.asarray(domain))
+    for letter, (name, axes) in zip(ascii_lowercase, chosen.items(), strict=False):
+        axes.set_title(f"({letter}) {_title(name, fields, one_state=one_state)}", loc="left")
+    maps = [axes for name, axes in chosen.items() if name in LANDSCAPES]
+    if maps and not one_state:
+        _draw_landscapes(
+            figure, {name: chosen[name] for name in LANDSCAPES if name in chosen}, fields, energy_unit
+        )
+    elif maps:
+        lower, upper = zip(*(axes.get_ylim() for axes in maps), strict=True)
+        for axes in maps:
+            axes.set_ylim(min(lower), max(upper))
+            axes.set_ylabel(energy_label(energy_unit))
     if len(states) > 2:
-        plane = f"${name_label(states[0])}$, ${name_label(states[1])}$"
-        figure.suptitle(f"Projection on the plane of {plane}", fontsize=8)
+        figure.suptitle(f"On the plane of ${name_label(states[0])}$ and ${name_label(states[1])}$")
     return figure
 
 
-def _titles(trajectories: int) -> list[str]:
-    shown = f"{min(trajectories, TRAJECTORIES_SHOWN)} " if trajectories else ""
-    noun = "trajectory" if trajectories == 1 else "trajectories"
-    return [
-        f"(a) {shown}{noun}",
-        r"(b) $-\nabla V$, identified",
-        r"(c) $g$, identified",
-        r"(d) $U$, exact",
-        r"(e) $U$, identified",
-    ]
+def _known(fields: ComponentFields, *, one_state: bool) -> list[str]:
+    """Which panels there are."""
+    gradient = fields.quasipotential if one_state else fields.minus_gradient
+    circulates = False
+    if fields.circulatory is not None and not _is_missing(fields.circulatory):
+        # What is left of g in a gradient system is rounding.
+        size = 0.0 if _is_missing(fields.minus_gradient) else np.nanmax(np.abs(fields.minus_gradient))
+        circulates = bool(np.nanmax(np.abs(fields.circulatory)) > ROUNDING * size)
+    parts = {
+        "trajectories": bool(len(fields.trajectories)),
+        "gradient": not _is_missing(gradient),
+        "circulatory": circulates,
+        "exact": not _is_missing(fields.exact_quasipotential),
+        "identified": not _is_missing(fields.quasipotential),
+    }
+    return [name for name, there in parts.items() if there]
+
+
+def _title(name: str, fields: ComponentFields, *, one_state: bool) -> str:
+    shown = min(len(fields.trajectories), TRAJECTORIES_SHOWN)
+    return {
+        "trajectories": counted(shown, "recording") + ("" if one_state else ", • to ×"),
+        "gradient": "$V$, identified" if one_state else r"$-\nabla V$, identified",
+        "circulatory": "$g$, identified",
+        "exact": "$U$, exact",
+        "identified": "$U$, identified",
+    }[name]
+
+
+def _draw_planes(
+    chosen: Mapping[str, Axes], fields: ComponentFields, label: Sequence[str], domain: np.ndarray
+) -> None:
+    for name, axes in chosen.items():
+        if name == "trajectories":
+            _draw_trajectories(axes, fields.trajectories)
+        elif name == "gradient":
+            _draw_streams(axes, fields, np.asarray(fields.minus_gradient), BLUE)
+        elif name == "circulatory":
+            _draw_streams(axes, fields, np.asarray(fields.circulatory), VERMILLION)
+        axes.set_xlim(*domain[0])
+        axes.set_ylim(*domain[1])
+        axes.set_xlabel(label[0])
+        axes.set_ylabel(label[1])
 
 
 def _is_missing(values: np.ndarray | None) -> bool:
@@ -121,23 +167,16 @@ def _is_missing(values: np.ndarray | None) -> bool:
 
 
 def _draw_trajectories(axes: Axes, trajectories: Sequence[np.ndarray]) -> None:
-    if not len(trajectories):
-        say(axes, "no trajectories")
     for path in trajectories[:TRAJECTORIES_SHOWN]:
         colour = axes.plot(path[:, 0], path[:, 1])[0].get_color()
         axes.plot(path[0, 0], path[0, 1], marker="o", markersize=3, color=colour)
         axes.plot(path[-1, 0], path[-1, 1], marker="x", markersize=4, color=colour)
 
 
-def _draw_streams(axes: Axes, fields: ComponentFields, field: np.ndarray | None, colour: str) -> None:
-    if field is None or _is_missing(field):
-        say(axes, "not identified")
-        return
+def _draw_streams(axes: Axes, fields: ComponentFields, field: np.ndarray, colour: str) -> None:
     speed = np.hypot(field[0], field[1])
     fastest = float(np.nanmax(speed))
-    if fastest == 0:
-        say(axes, "zero everywhere")
-        return
+    fastest = fastest or 1.0
     # The square root keeps the slow flow between the wells visible beside the fast flow at the corners.
     width = 0.25 + 1.75 * np.sqrt(speed / fastest)
     streams = axes.streamplot(
@@ -154,64 +193,51 @@ def _draw_streams(axes: Axes, fields: ComponentFields, field: np.ndarray | None,
     streams.lines.set_rasterized(True)
 
 
-def _draw_contours(figure: SubFigure, panels: Sequence[Axes], fields: ComponentFields) -> None:
-    landscapes = [fields.exact_quasipotential, fields.quasipotential]
-    known = [landscape for landscape in landscapes if landscape is not None and not _is_missing(landscape)]
-    drawn: QuadContourSet | None = None
-    if known:
-        # The exact landscape sets the scale where there is one: a wrong formula may fall to −∞ at the rim.
-        # Levels lie closer at the bottom, where the wells and the saddle between them are.
-        lowest, highest = float(np.nanmin(known[0])), float(np.nanmax(known[0]))
-        levels = lowest + (highest - lowest or abs(lowest) or 1.0) * np.linspace(0, 1, LEVELS) ** 2
-        below = any(np.nanmin(landscape) < levels[0] for landscape in known)
-        above = any(np.nanmax(landscape) > levels[-1] for landscape in known)
-        extend: Extend = "both" if below and above else "min" if below else "max" if above else "neither"
-        options = {"levels": levels, "norm": BoundaryNorm(levels, 256, extend=extend), "extend": extend}
-    absent = (NO_EXACT, "not identified")
-    for axes, landscape, sentence in zip(panels, landscapes, absent, strict=True):
-        if landscape is None or _is_missing(landscape):
-            say(axes, sentence)
-            continue
-        drawn = axes.contourf(fields.x1, fields.x2, landscape, cmap=COLOUR_MAP, **options)
+def _draw_landscapes(
+    figure: Figure, panels: Mapping[str, Axes], fields: ComponentFields, energy_unit: str
+) -> None:
+    values = {"exact": fields.exact_quasipotential, "identified": fields.quasipotential}
+    maps = [(axes, np.asarray(values[name], dtype=float)) for name, axes in panels.items()]
+    # The exact landscape sets the scale where there is one: a wrong formula may fall to −∞ at the rim.
+    # Levels lie closer at the bottom, where the wells and the saddle between them are.
+    lowest, highest = float(np.nanmin(maps[0][1])), float(np.nanmax(maps[0][1]))
+    levels = lowest + (highest - lowest or abs(lowest) or 1.0) * np.linspace(0, 1, LEVELS) ** 2
+    below = any(np.nanmin(landscape) < levels[0] for _, landscape in maps)
+    above = any(np.nanmax(landscape) > levels[-1] for _, landscape in maps)
+    extend: Extend = "both" if below and above else "min" if below else "max" if above else "neither"
+    norm = BoundaryNorm(levels, 256, extend=extend)
+    for axes, landscape in maps:
+        drawn = axes.contourf(
+            fields.x1, fields.x2, landscape, cmap=COLOUR_MAP, levels=levels, norm=norm, extend=extend
+        )
         axes.contour(fields.x1, fields.x2, landscape, levels=levels, colors="white", linewidths=0.3)
-    if drawn is not None:
-        bar = figure.colorbar(drawn, ax=list(panels), label="$U$ (in the unit of ε)", pad=0.02, aspect=25)
-        bar.set_ticks(levels[::2].tolist())
-        bar.minorticks_off()
-        bar.ax.set_yticklabels([f"{level:.2g}" for level in levels[::2]])
+    bar = figure.colorbar(
+        drawn, ax=[axes for axes, _ in maps], label=energy_label(energy_unit), location="bottom", aspect=30
+    )
+    bar.set_ticks(levels[::3].tolist())
+    bar.minorticks_off()
+    bar.ax.set_xticklabels([f"{level:.2g}" for level in levels[::3]])
 
 
-def _plot_curves(fields: ComponentFields, label: str, domain: np.ndarray) -> Figure:
-    figure = Figure(figsize=(PAGE_WIDTH, 4.0))
-    panels = figure.subplots(2, 3).ravel()
-    panels[5].remove()
-    titles = _titles(len(fields.trajectories))
-    titles[1:3] = [r"(b) $V$, identified", r"(c) $g$, identified"]
+def _draw_curves(
+    chosen: Mapping[str, Axes], fields: ComponentFields, label: Sequence[str], domain: np.ndarray
+) -> None:
     potential = None if fields.quasipotential is None else np.asarray(fields.quasipotential) / 2
-    curves = [
-        (potential, "$V$ (in the unit of ε)", "not identified"),
-        (fields.circulatory, "$g$ (state per time)", "not identified"),
-        (fields.exact_quasipotential, "$U$ (in the unit of ε)", NO_EXACT),
-        (fields.quasipotential, "$U$ (in the unit of ε)", "not identified"),
-    ]
-    for path in fields.trajectories[:TRAJECTORIES_SHOWN]:
-        panels[0].plot(np.asarray(path)[:, 0])
-    panels[0].set_xlabel("number of the sample")
-    panels[0].set_ylabel(label)
-    if not len(fields.trajectories):
-        say(panels[0], "no trajectories")
-    for axes, (curve, unit, sentence) in zip(panels[1:5], curves, strict=True):
-        if curve is None or _is_missing(curve):
-            say(axes, sentence)
+    curves = {
+        "gradient": (potential, "$V$"),
+        "circulatory": (fields.circulatory, "$g$"),
+        "exact": (fields.exact_quasipotential, "$U$"),
+        "identified": (fields.quasipotential, "$U$"),
+    }
+    for name, axes in chosen.items():
+        if name == "trajectories":
+            for path in fields.trajectories[:TRAJECTORIES_SHOWN]:
+                axes.plot(np.asarray(path)[:, 0])
+            axes.set_xlabel("number of the sample")
+            axes.set_ylabel(label[0])
             continue
+        curve, symbol = curves[name]
         axes.plot(fields.x1, np.asarray(curve).reshape(-1)[: len(fields.x1)], color=BLUE)
         axes.set_xlim(*domain[0])
-        axes.set_xlabel(label)
-        axes.set_ylabel(unit)
-    if panels[3].axison and panels[4].axison:
-        lower, upper = zip(panels[3].get_ylim(), panels[4].get_ylim(), strict=True)
-        for axes in panels[3:5]:
-            axes.set_ylim(min(lower), max(upper))
-    for axes, title in zip(panels[:5], titles, strict=True):
-        axes.set_title(title, loc="left")
-    return figure
+        axes.set_xlabel(label[0])
+        axes.set_ylabel(symbol)

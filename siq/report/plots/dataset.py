@@ -16,10 +16,9 @@ from siq.report.plots.style import (
     GREY,
     PAGE_WIDTH,
     VERMILLION,
+    axis_label,
+    counted,
     drawn_in_style,
-    name_label,
-    say,
-    unit_label,
 )
 
 MOST_POINTS = 40_000  # drawn; more would only take longer
@@ -68,36 +67,39 @@ def plot_dataset(data: Dataset, *, states: Sequence[str], units: Sequence[str]) 
     Returns
     -------
     matplotlib.figure.Figure
-        Three panels on the first two states. The closed curve is the level of V_θ. Of a single state
-        trajectories against the number of the sample, and histograms.
+        Two panels on the first two states, and a third where something says what the regression sees. The
+        closed curve is the level of V_θ. Of a single state trajectories against the number of the sample, and
+        histograms.
     """
     if data.points.shape[1] < 2:
         return plot_dataset_curves(data, state=states[0], unit=units[0])
-    figure = Figure(figsize=(PAGE_WIDTH, 2.6))
-    left, middle, right = figure.subplots(1, 3, sharex=True, sharey=True)
+    count = 2 if data.below is None else 3
+    figure = Figure(figsize=(PAGE_WIDTH, 2.9 if count == 2 else 5.4))
+    every = figure.subplots(-(-count // 2), 2, sharex=True, sharey=True, squeeze=False).ravel()
+    left, middle, *others = every
     for path in data.trajectories:
         left.plot(path[:, 0], path[:, 1], linewidth=0.6)
         left.plot(path[0, 0], path[0, 1], marker="o", markersize=3, color=BLACK)
     for path in data.without_noise:
         left.plot(path[:, 0], path[:, 1], color=BLACK, linewidth=0.9, linestyle="--")
-    dashed = "; dashed: no noise" if len(data.without_noise) else ""
-    left.set_title(f"(a) {len(data.trajectories)} trajectories{dashed}", loc="left")
-    count = len(data.points)
-    kept = np.arange(0, count, max(count // MOST_POINTS, 1))
+    dashed = ";\ndashed: no noise" if len(data.without_noise) else ""
+    left.set_title(f"(a) {counted(len(data.trajectories), 'recording')}{dashed}", loc="left")
+    whole = len(data.points)
+    kept = np.arange(0, whole, max(whole // MOST_POINTS, 1))
     _scatter(middle, data.points[kept], GREY)
     _draw_level(middle, data)
-    middle.set_title(f"(b) recorded: {count} pairs", loc="left")
-    if data.below is None:
-        say(right, "no networks say\nwhat the regression sees")
-    else:
-        _scatter(right, data.points[kept][data.below[kept]], BLUE)
-        _draw_level(right, data)
-    seen = "" if data.below is None else f": {100 * data.below.mean():.3g} %"
-    right.set_title(f"(c) seen by the regression{seen}", loc="left")
-    labels = [f"${name_label(name)}$ {unit_label(unit)}" for name, unit in zip(states, units, strict=True)]
-    for axes in (left, middle, right):
+    middle.set_title(f"(b) recorded: {whole} pairs", loc="left")
+    if data.below is not None:
+        _scatter(others[0], data.points[kept][data.below[kept]], BLUE)
+        _draw_level(others[0], data)
+        others[0].set_title(f"(c) seen by the\nregression: {100 * data.below.mean():.3g} %", loc="left")
+        others[1].remove()
+        middle.tick_params(labelbottom=True)
+    labels = [axis_label(name, unit) for name, unit in zip(states, units, strict=True)]
+    for axes in every[:count]:
         axes.set_xlabel(labels[0])
-    left.set_ylabel(labels[1])
+    for axes in every[:count:2]:
+        axes.set_ylabel(labels[1])
     return figure
 
 

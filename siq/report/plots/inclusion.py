@@ -15,14 +15,13 @@ from siq.report.plots.style import (
     counted,
     drawn_in_style,
     name_label,
-    sentence_figure,
     sorted_terms,
     term_label,
 )
 
 
 @drawn_in_style
-def plot_inclusion(coefficients: pd.DataFrame, *, method: str) -> Figure:
+def plot_inclusion(coefficients: pd.DataFrame, *, method: str) -> Figure | None:
     """Draw how often every term is non-zero in every component.
 
     Parameters
@@ -40,8 +39,8 @@ def plot_inclusion(coefficients: pd.DataFrame, *, method: str) -> Figure:
     """
     rows = coefficients[coefficients["method"] == method].dropna(subset=["estimate"])
     runs = rows["run"].nunique()
-    if runs == 0:
-        return sentence_figure(f"No run has coefficients\nby the method “{method}”.")
+    if runs < 2:
+        return None
     components = list(dict.fromkeys(rows["component"]))
     terms = sorted_terms(rows["term"])
     cells = rows.assign(used=rows["estimate"] != 0, wanted=rows["exact"].fillna(0) != 0)
@@ -51,10 +50,10 @@ def plot_inclusion(coefficients: pd.DataFrame, *, method: str) -> Figure:
     kept = (frequency.fillna(0) > 0).any(axis=1) | wanted.any(axis=1)
     unused = int((~kept).sum())
     if not kept.any():
-        return sentence_figure(f"No term is used in any of {counted(runs, 'run')} by “{method}”.")
+        return None
 
-    height = 0.17 * int(kept.sum()) + 1.35
-    width = min(max(COLUMN_WIDTH, 1.2 + 0.42 * len(components)), PAGE_WIDTH)
+    height = 0.23 * int(kept.sum()) + 1.6
+    width = min(max(COLUMN_WIDTH, 1.4 + 0.5 * len(components)), PAGE_WIDTH)
     figure = Figure(figsize=(width, height))
     axes = figure.add_subplot()
     _draw_cells(axes, frequency[kept].to_numpy(float), wanted[kept].to_numpy(bool))
@@ -62,12 +61,12 @@ def plot_inclusion(coefficients: pd.DataFrame, *, method: str) -> Figure:
     axes.set_yticks(range(int(kept.sum())), [term_label(term) for term in frequency.index[kept]])
     axes.set_xlabel("component")
     axes.set_ylabel("term")
-    figure.suptitle(f"Share of {counted(runs, 'run')} that use a term (%),\nmethod “{method}”", fontsize=8)
+    figure.suptitle(f"Share of {counted(runs, 'run')} that use a term (%),\nmethod “{method}”")
     sentences = ["outlined: in the exact formula"] if wanted.to_numpy().any() else []
     if unused:
         every = "the run" if runs == 1 else f"every component of all {runs} runs"
         sentences.append(f"the other {counted(unused, 'term')}: zero in {every}")
-    figure.supxlabel("\n".join(sentences), fontsize=7)
+    figure.supxlabel("\n".join(sentences))
     return figure
 
 
@@ -84,7 +83,7 @@ def _draw_cells(axes: Axes, frequency: np.ndarray, wanted: np.ndarray) -> None:
         if share > 0 or wanted[row, column]:
             text = "<1" if 0 < share < 0.005 else ">99" if 0.995 < share < 1 else f"{100 * share:.0f}"
             colour = "white" if share > 0.5 else "black"
-            axes.text(column, row, text, ha="center", va="center", fontsize=7, color=colour)
+            axes.text(column, row, text, ha="center", va="center", color=colour)
         if wanted[row, column]:
             box = Rectangle(
                 (column - 0.5, row - 0.5),

@@ -16,14 +16,12 @@ from matplotlib.ticker import MaxNLocator
 
 from siq.report.plots.one_state import plot_invariant_curves
 from siq.report.plots.style import (
+    COLUMN_WIDTH,
     PAGE_WIDTH,
     VERMILLION,
+    axis_label,
     drawn_in_style,
     magnitude_label,
-    name_label,
-    say,
-    sentence_figure,
-    unit_label,
 )
 
 if TYPE_CHECKING:  # to draw a density takes none of what it takes to compute one
@@ -39,62 +37,67 @@ LINES = (0.1, 0.5, 0.9)  # shares of the peak at which the density's lines lie o
 @drawn_in_style
 def plot_invariant_distribution(
     panels: Sequence[ComparedDensity], *, states: Sequence[str], units: Sequence[str]
-) -> Figure:
-    """Draw the invariant density on a plane of two states, one column for each ε.
+) -> Figure | None:
+    """Draw the invariant density on a plane of two states, one ε after the other.
 
     Parameters
     ----------
     panels
-        The columns, three in the paper.
+        The densities, three in the paper.
     states, units
         Names and units of all d states; the plane picks from them.
 
     Returns
     -------
     matplotlib.figure.Figure
-        Above, ``p = Z⁻¹ exp(-U/ε)`` as filled contours. Below, where there is a simulation, its histogram in
-        the same colours, with lines of the density above at 10, 50 and 90 % of its peak; the titles give
-        the total variation distance and what the number of samples alone explains. Where the density is not
-        known the plane is hatched, and the axes end not far from what is known. Of a single state curves over
-        histograms.
+        ``p = Z⁻¹ exp(-U/ε)`` as filled contours, a panel for each ε. Where there is a simulation, a row for
+        each ε, on the right the simulation's histogram in the same colours, with lines of the density at 10,
+        50 and 90 % of its peak; the titles give the total variation distance and what the number of samples
+        alone explains. Where the density is not known the plane is hatched, and the axes end not far from
+        what is known. Of a single state curves over histograms. None where there is no density.
     """
     if not panels:
-        return sentence_figure("There is no invariant distribution to show.")
+        return None
     if len(panels[0].density.plane) == 1:
         return plot_invariant_curves(panels, state=states[0], unit=units[0])
     simulated = any(panel.comparison is not None for panel in panels)
-    rows = 2 if simulated else 1
-    width = PAGE_WIDTH * min(len(panels), 3) / 3
-    figure = Figure(figsize=(max(width, PAGE_WIDTH / 2), 2.1 * rows + 0.7))
-    all_axes = figure.subplots(rows, len(panels), squeeze=False, sharex=True, sharey=True)
+    columns = 2 if simulated or len(panels) > 1 else 1
+    rows = len(panels) if simulated else -(-len(panels) // columns)
+    figure = Figure(figsize=(PAGE_WIDTH if columns > 1 else COLUMN_WIDTH, 3.1 * rows + 0.5))
+    all_axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     letters = iter(ascii_lowercase)
-    for row in range(rows):
-        for column, panel in enumerate(panels):
-            axes = all_axes[row, column]
-            colours = _colours(panel.density)
-            draw = _draw_density if row == 0 else _draw_histogram
-            axes.set_title(f"({next(letters, '')}) {draw(axes, panel, colours)}", loc="left")
-    _limit(all_axes[0, 0], [panel.density for panel in panels])
-    for column, panel in enumerate(panels):
-        first, second = panel.density.plane
-        all_axes[-1, column].xaxis.set_major_locator(MaxNLocator(4))
-        all_axes[-1, column].set_xlabel(f"${name_label(states[first])}$ {unit_label(units[first])}")
-        if column == 0:
-            for axes in all_axes[:, 0]:
-                axes.set_ylabel(f"${name_label(states[second])}$ {unit_label(units[second])}")
+    for place, panel in enumerate(panels):
+        colours, (first, second) = _colours(panel.density), panel.density.plane
+        row, column = (place, 0) if simulated else divmod(place, columns)
+        drawn = [all_axes[row, column]]
+        drawn[0].set_title(f"({next(letters, '')}) {_draw_density(drawn[0], panel, colours)}", loc="left")
+        drawn[0].set_ylabel(axis_label(states[second], units[second]))
+        if panel.comparison is not None:
+            drawn.append(all_axes[row, 1])
+            drawn[1].set_title(
+                f"({next(letters, '')}) {_draw_histogram(drawn[1], panel, colours)}", loc="left"
+            )
+        for axes in drawn:
+            axes.xaxis.set_major_locator(MaxNLocator(4))
+            axes.set_xlabel(axis_label(states[first], units[first]))
+            axes.tick_params(labelbottom=True)
         bar = figure.colorbar(
-            ScalarMappable(**_colours(panel.density)), ax=list(all_axes[:, column]), location="bottom",
-            aspect=25, pad=0.02, label=f"density {_density_unit(units[first], units[second])}",
+            ScalarMappable(**colours), ax=drawn, location="bottom", aspect=30, pad=0.02,
+            label=f"density {_density_unit(units[first], units[second])}".strip(),
         )  # fmt: skip
-        levels = _levels(panel.density)
-        bar.set_ticks(levels[:: (LEVELS - 1) // 4].tolist())
+        levels = _levels(panel.density)[:: (LEVELS - 1) // 4]
+        bar.set_ticks(levels.tolist())
         bar.minorticks_off()
-        texts = [f"{level:.2g}".replace("e+0", "e") for level in levels[:: (LEVELS - 1) // 4]]
-        bar.ax.set_xticklabels(texts)
+        bar.ax.set_xticklabels([f"{level:.2g}".replace("e+0", "e") for level in levels])
+    _limit(all_axes[0, 0], [panel.density for panel in panels])
+    for axes in all_axes.ravel():
+        if not axes.has_data():
+            axes.remove()
     if simulated:
         shares = ", ".join(f"{share:.0%}" for share in LINES).replace("%", " %")
-        figure.suptitle(f"Below: a long simulation, with lines of the density above at {shares} of its peak",
-                        fontsize=8)  # fmt: skip
+        figure.suptitle(
+            f"Right: a long simulation, with lines of the density\non its left at {shares} of its peak"
+        )
     return figure
 
 
@@ -126,7 +129,7 @@ def _draw_unknown(axes: Axes, density: MarginalDensity) -> None:
 def _density_unit(first: str, second: str) -> str:
     parts = [unit for unit in (first, second) if unit not in ("1", "")]
     if not parts:
-        return "(dimensionless)"
+        return ""
     return (
         f"(per {parts[0]}²)" if parts[0] == parts[-1] and len(parts) == 2 else f"(per {' per '.join(parts)})"
     )
@@ -150,9 +153,7 @@ def _draw_density(axes: Axes, panel: ComparedDensity, colours: dict[str, Any]) -
 
 def _draw_histogram(axes: Axes, panel: ComparedDensity, colours: dict[str, Any]) -> str:
     comparison, density = panel.comparison, panel.density
-    if comparison is None:
-        say(axes, "not simulated")
-        return ""
+    assert comparison is not None
     _draw_unknown(axes, density)
     empty = np.isnan(density.values).any() & (comparison.histogram == 0)
     # As an image: thousands of small rectangles would make a megabyte of vector graphics.
@@ -162,7 +163,7 @@ def _draw_histogram(axes: Axes, panel: ComparedDensity, colours: dict[str, Any])
     )  # fmt: skip
     levels = float(np.nanmax(density.values)) * np.array(LINES)
     axes.contour(density.x1, density.x2, density.values, levels=levels, colors=VERMILLION, linewidths=0.7)
-    title = f"simulation; total variation\n{comparison.total_variation:.2g}"
+    title = f"simulation; total\nvariation {comparison.total_variation:.2g}"
     if np.isfinite(comparison.sampling_floor):
-        title += f" (sampling alone: {comparison.sampling_floor:.2g})"
+        title += f"\n(sampling alone: {comparison.sampling_floor:.2g})"
     return title

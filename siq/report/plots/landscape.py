@@ -1,4 +1,4 @@
-"""What U looks like over all wells, and how far its estimates are from a reference."""
+"""How far are estimates of U from a reference?"""
 
 from __future__ import annotations
 
@@ -6,28 +6,24 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
-import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import BoundaryNorm, LogNorm
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
+from siq.numerics.measured_text import unit_text
 from siq.report.plots.landscape_curves import plot_degrees, plot_escape, power_of_ten, scaled_label
 from siq.report.plots.style import (
-    BLACK,
-    ORANGE,
     PAGE_WIDTH,
     drawn_in_style,
     magnitude_label,
     name_label,
-    sentence_figure,
 )
 
-__all__ = ["plot_degrees", "plot_error_maps", "plot_escape", "plot_landscape"]
+__all__ = ["plot_degrees", "plot_error_maps", "plot_escape"]
 
 Extend = Literal["neither", "both", "min", "max"]
 
@@ -37,80 +33,7 @@ LEVELS = 14
 DECADES = 4  # of differences, below the largest one
 MARGIN = 0.06  # of what is known: shown around it
 UNKNOWN: dict[str, Any] = {"facecolor": "#F0F0F0", "edgecolor": "#C8C8C8", "hatch": "////", "linewidth": 0}
-# White with a black rim, and black with a white one: both are seen on every colour.
-UPHILL: dict[str, Any] = {
-    "color": "white", "linewidth": 1.2, "path_effects": [withStroke(linewidth=2.2, foreground=BLACK)],
-}  # fmt: skip
-DOWNHILL: dict[str, Any] = {
-    "color": BLACK, "linewidth": 1.0, "linestyle": (0, (4, 2)),
-    "path_effects": [withStroke(linewidth=2.0, foreground="white")],
-}  # fmt: skip
 RIM: dict[str, Any] = {"path_effects": [withStroke(linewidth=2.0, foreground="white")]}
-# Marker and its look, for each kind of equilibrium.
-MARKS: dict[str, dict[str, Any]] = {
-    "attractor": {"marker": "o", "markersize": 6, "markerfacecolor": ORANGE, "markeredgecolor": BLACK},
-    "saddle": {"marker": "x", "markersize": 6, "markeredgecolor": BLACK, "markeredgewidth": 1.4} | RIM,
-    "repeller": {"marker": "o", "markersize": 6, "markerfacecolor": "none", "markeredgecolor": BLACK} | RIM,
-    "degenerate": {"marker": "D", "markersize": 5, "markerfacecolor": "none", "markeredgecolor": BLACK} | RIM,
-}
-
-
-@drawn_in_style
-def plot_landscape(
-    axes_values: Sequence[np.ndarray],
-    values: np.ndarray,
-    *,
-    names: Sequence[str],
-    units: Sequence[str],
-    energy_unit: str,
-    equilibria: pd.DataFrame,
-    paths: Sequence[tuple[np.ndarray, np.ndarray]] = (),
-    level: float | None = None,
-) -> Figure:
-    """Draw U of two states with its equilibria and the paths of least action.
-
-    Parameters
-    ----------
-    axes_values
-        The grid, shapes ``(nx,)`` and ``(ny,)``, ascending, in the states' units.
-    values
-        Shape ``(nx, ny)``: U, not V, NaN where it is not known.
-    names, units
-        Of the two states.
-    energy_unit
-        Unit of U and ε; ``1`` and the empty text mean that of ε.
-    equilibria
-        Columns ``kind x y label``; the kind is ``attractor``, ``saddle``, ``repeller`` or ``degenerate``.
-    paths
-        Pairs of an uphill and a downhill part, of shapes ``(n, 2)``; each may be empty.
-    level
-        U of the top contour, by default the highest value.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Filled contours; what lies above the top contour has the colour of the bar's pointed end, and where U
-        is not known the plane is hatched.
-    """
-    values = np.asarray(values, dtype=float)
-    if not np.isfinite(values).any():
-        return sentence_figure("U is known nowhere.")
-    figure = Figure(figsize=(0.75 * PAGE_WIDTH, 4.4))
-    axes = figure.add_subplot()
-    shades = _shades(values, level)
-    _draw_values(axes, axes_values, values, shades)
-    ways = [[np.asarray(part, dtype=float).reshape(-1, 2) for part in pair] for pair in paths]
-    places = np.concatenate(
-        [equilibria[["x", "y"]].to_numpy(float), *(part for pair in ways for part in pair)]
-    )
-    _limit(axes, axes_values, values, places)
-    handles = _draw_paths(axes, ways) + _draw_equilibria(axes, equilibria)
-    handles += [Patch(label="$U$ is not known", **UNKNOWN)] if np.isnan(values).any() else []
-    _name_axes(axes, axes_values, names, units)
-    _add_bar(figure, [axes], shades, energy_unit)
-    if handles:
-        figure.legend(handles=handles, loc="outside lower center", ncols=3)
-    return figure
 
 
 def _shades(values: np.ndarray, level: float | None) -> dict[str, Any]:
@@ -163,35 +86,6 @@ def _limit(
     axes.set_ylim(*limits[1])
 
 
-def _draw_paths(axes: Axes, ways: Sequence[Sequence[np.ndarray]]) -> list[Any]:
-    """Downhill parts lie above: where both coincide, dashes on the line show that they do."""
-    handles = []
-    for part, style, text in ((0, UPHILL, "least action, uphill"), (1, DOWNHILL, "downhill, without noise")):
-        lines = [pair[part] for pair in ways if len(pair[part])]
-        for line in lines:
-            axes.plot(line[:, 0], line[:, 1], zorder=3 + 0.1 * part, **style)
-        handles += [Line2D([], [], label=text, **style)] if lines else []
-    return handles
-
-
-def _draw_equilibria(axes: Axes, equilibria: pd.DataFrame) -> list[Any]:
-    handles = []
-    low, high = (np.array(limits) for limits in zip(axes.get_xlim(), axes.get_ylim(), strict=True))
-    for kind, style in MARKS.items():
-        rows = equilibria[equilibria["kind"] == kind]
-        for x, y, label in rows[["x", "y", "label"]].itertuples(index=False):
-            axes.plot(x, y, linestyle="none", zorder=4, **style)
-            # Names lie towards the middle, where there is room for them.
-            side = np.where(np.array([x, y]) > low + 0.85 * (high - low), -1, 1)
-            axes.annotate(
-                str(label), (x, y), xytext=(5 * side[0], 5 * side[1]), textcoords="offset points", zorder=5,
-                ha="left" if side[0] > 0 else "right", va="bottom" if side[1] > 0 else "top",
-                annotation_clip=True, **RIM,
-            )  # fmt: skip
-        handles += [Line2D([], [], linestyle="none", label=kind, **style)] if len(rows) else []
-    return handles
-
-
 def _name_axes(
     axes: Axes, axes_values: Sequence[np.ndarray], names: Sequence[str], units: Sequence[str]
 ) -> None:
@@ -204,15 +98,16 @@ def _add_bar(figure: Figure, panels: Sequence[Axes], shades: dict[str, Any], ene
     levels = shades["levels"]
     power = power_of_ten(float(np.abs(levels).max()))
     factor = f"$10^{{{power}}}$" if power else ""
-    unit = [factor, "in the unit of ε"] if energy_unit in ("1", "") else [f"{factor} {energy_unit}".strip()]
+    unit = f"{factor} {unit_text(energy_unit) or 'unit of ε'}".strip()
     bar = figure.colorbar(
-        ScalarMappable(norm=shades["norm"], cmap=shades["cmap"]), ax=list(panels), pad=0.02, aspect=25,
-        label=f"$U$ ({', '.join(filter(None, unit))})", spacing="proportional",
+        ScalarMappable(norm=shades["norm"], cmap=shades["cmap"]), ax=list(panels), location="bottom",
+        pad=0.02, aspect=25,
+        label=f"$U$ ({unit})", spacing="proportional",
     )  # fmt: skip
-    shown = levels[:: 2 if len(levels) > 8 else 1]
+    shown = levels[:: 4 if len(levels) > 8 else 2]
     bar.set_ticks(shown.tolist())
     bar.minorticks_off()
-    bar.ax.set_yticklabels([f"{one / 10.0**power:.4g}".replace("-", "−") for one in shown])
+    bar.ax.set_xticklabels([f"{one / 10.0**power:.4g}".replace("-", "−") for one in shown])
 
 
 @drawn_in_style
@@ -223,7 +118,7 @@ def plot_error_maps(
     names: Sequence[str],
     units: Sequence[str],
     energy_unit: str,
-) -> Figure:
+) -> Figure | None:
     """Draw U by several sources, and how far each is from the first one.
 
     Parameters
@@ -240,34 +135,31 @@ def plot_error_maps(
     Returns
     -------
     matplotlib.figure.Figure
-        Above, U by each source in the colours of the reference; below, the absolute difference in units of
-        the reference's highest value, on a logarithmic scale, with its root mean square.
+        A row for each source: on the left U in the colours of the reference; on the right the absolute
+        difference as a share of the reference's highest value, on a logarithmic scale, with its root mean
+        square. None where there is nothing to compare.
     """
-    if not maps:
-        return sentence_figure("There is no U to compare.")
     fields = {name: np.asarray(values, dtype=float) for name, values in maps.items()}
-    (reference_name, reference), *others = fields.items()
-    if not np.isfinite(reference).any():
-        return sentence_figure(f"U by {reference_name} is known nowhere: nothing can be compared with it.")
+    fields = {name: values for name, values in fields.items() if np.isfinite(values).any()}
+    if len(fields) < 2 or next(iter(fields)) != next(iter(maps)):
+        return None
+    reference_name, reference = next(iter(fields.items()))
     highest = float(np.nanmax(np.abs(reference))) or 1.0
-    figure = Figure(figsize=(PAGE_WIDTH, 3.8 if others else 2.2))
-    panels = figure.subplots(2 if others else 1, len(fields), squeeze=False, sharex=True, sharey=True)
+    figure = Figure(figsize=(PAGE_WIDTH, 1.9 * len(fields) + 0.9))
+    panels = figure.subplots(len(fields), 2, sharex=True, sharey=True)
     shades = _shades(reference, None) | {"extend": "both"}
     shades["norm"] = BoundaryNorm(shades["levels"], 256, extend="both")
-    for axes, (name, values) in zip(panels[0], fields.items(), strict=True):
-        axes.set_title(name)
-        if np.isfinite(values).any():
-            _draw_values(axes, axes_values, values, shades, as_image=True)
-        else:
-            _draw_nothing(axes)
-    _add_bar(figure, list(panels[0]), shades, energy_unit)
-    if others:
-        differences = [np.abs(values - reference) / highest for _, values in others]
-        _draw_differences(figure, list(panels[1]), axes_values, differences, np.isfinite(reference).sum())
-        corner = panels[1, 0]
-        text = f"difference from\n{reference_name},\nin units of\nits highest $U$"
-        corner.text(0.5, 0.6, text, transform=corner.transAxes, ha="center", va="center", fontsize=7)
-        corner.legend(handles=[Patch(label="not known", **UNKNOWN)], loc="lower center", borderpad=0)
+    differences = [np.abs(values - reference) / highest for values in list(fields.values())[1:]]
+    for axes, (name, values) in zip(panels[:, 0], fields.items(), strict=True):
+        axes.set_title(name, loc="left")
+        _draw_values(axes, axes_values, values, shades, as_image=True)
+    _add_bar(figure, list(panels[:, 0]), shades, energy_unit)
+    _draw_differences(figure, list(panels[:, 1]), axes_values, differences, np.isfinite(reference).sum())
+    corner = panels[0, 1]
+    corner.set_axis_off()
+    text = f"right: difference\nfrom {reference_name}\n/ highest $U$"
+    corner.text(0.5, 0.65, text, transform=corner.transAxes, ha="center", va="center")
+    corner.legend(handles=[Patch(label="not known", **UNKNOWN)], loc="lower center", borderpad=0)
     _limit(panels[0, 0], axes_values, reference)
     for axes in panels.ravel().tolist():
         axes.xaxis.set_major_locator(MaxNLocator(3))
@@ -305,10 +197,10 @@ def _draw_differences(
         )  # fmt: skip
         title = f"rms {magnitude_label(float(np.sqrt((found**2).mean())))}"
         if found.size < compared:
-            title += f"\nat {100 * found.size / compared:.3g} % of the points"
-        axes.set_title(title, fontsize=7)
+            title += f", at {100 * found.size / compared:.3g} %"
+        axes.set_title(title, loc="left")
     bar = figure.colorbar(
         ScalarMappable(norm=norm, cmap=DIFFERENCE_MAP), ax=panels, label="difference / highest $U$",
-        pad=0.02, aspect=25, extend="min",
+        location="bottom", pad=0.02, aspect=25, extend="min",
     )  # fmt: skip
     bar.minorticks_off()

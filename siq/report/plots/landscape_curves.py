@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -14,6 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
+from siq.numerics.measured_text import unit_text
+from siq.report.landscape_answer import well_name
 from siq.report.plots.style import (
     BLACK,
     BLUE,
@@ -21,13 +24,10 @@ from siq.report.plots.style import (
     GREEN,
     GREY,
     ORANGE,
-    PAGE_WIDTH,
     PURPLE,
     VERMILLION,
     counted,
     drawn_in_style,
-    say,
-    sentence_figure,
     unit_label,
 )
 
@@ -37,7 +37,7 @@ LINE_STYLES = ("-", "--", "-.", ":")
 
 
 @drawn_in_style
-def plot_degrees(table: pd.DataFrame) -> Figure:
+def plot_degrees(table: pd.DataFrame) -> Figure | None:
     """Draw how formulas about the attractors improve with their number of terms.
 
     Parameters
@@ -50,14 +50,15 @@ def plot_degrees(table: pd.DataFrame) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        Two panels against the number of terms: the residual on a logarithmic axis, and the share covered. A
-        thin line a run, a thick one for the median, wherever at least half of the runs are; a dot marks the
-        degree that was chosen in a run, a ring the one that was chosen most often.
+        Two panels against the number of terms, None where no residual is known: the residual on a logarithmic
+        axis, and the share covered. A thin line a run, a thick one for the median, wherever at least half of
+        the runs are; a dot marks the degree that was chosen in a run, a ring the one that was chosen most
+        often.
     """
-    if table.empty:
-        return sentence_figure("No formula was tried about any attractor.")
-    figure = Figure(figsize=(PAGE_WIDTH, 3.3))
-    left, right = figure.subplots(1, 2, sharex=True)
+    if not (table["residual"] > 0).any():
+        return None
+    figure = Figure(figsize=(COLUMN_WIDTH, 6.6))
+    left, right = figure.subplots(2, 1, sharex=True)
     names = list(dict.fromkeys(table["attractor"]))
     left.set_yscale("log")
     for place, name in enumerate(names):
@@ -75,23 +76,26 @@ def plot_degrees(table: pd.DataFrame) -> Figure:
         axes.set_axisbelow(True)
     left.set_ylabel("Hamilton–Jacobi residual\n(median over held-out points, relative)")
     right.set_ylabel("share of the held-out points\nat which the formula is believed")
-    if not (table["residual"] > 0).any():
-        say(left, "no residual is known")
     runs = table["run"].nunique()
     handles = [
         Line2D(
-            [], [], color=colour, linestyle=style, marker=marker, markersize=3.5, linewidth=1.6, label=name
+            [],
+            [],
+            color=colour,
+            linestyle=style,
+            marker=marker,
+            markersize=3.5,
+            linewidth=1.6,
+            label=by_letters(name),
         )
         for name, (colour, style, marker) in zip(names, map(_look, range(len(names))), strict=True)
     ]
     handles.append(_ring(GREY, label="chosen" if runs == 1 else "chosen most often"))
     if runs > 1:
         thin: dict[str, Any] = {"color": GREY, "linewidth": 0.5, "alpha": 0.7}
-        handles.append(
-            Line2D([], [], marker="o", markersize=2, label=f"one run ({runs} in all) and its choice", **thin)
-        )
-        handles.append(Line2D([], [], color=GREY, linewidth=1.6, label=f"median of {counted(runs, 'run')}"))
-    figure.legend(handles=handles, loc="outside upper center", ncols=min(len(handles), 5))
+        handles.append(Line2D([], [], marker="o", markersize=2, label=f"each of {runs} runs", **thin))
+        handles.append(Line2D([], [], color=GREY, linewidth=1.6, label="their median"))
+    figure.legend(handles=handles, loc="outside upper center", ncols=2)
     return figure
 
 
@@ -138,7 +142,7 @@ def _draw_runs(axes: Axes, rows: pd.DataFrame, column: str, place: int) -> None:
 
 
 @drawn_in_style
-def plot_escape(table: pd.DataFrame, *, time_unit: str = "1", energy_unit: str = "1") -> Figure:
+def plot_escape(table: pd.DataFrame, *, time_unit: str = "1", energy_unit: str = "1") -> Figure | None:
     """Draw mean escape times against the inverse of the noise intensity.
 
     Parameters
@@ -158,8 +162,8 @@ def plot_escape(table: pd.DataFrame, *, time_unit: str = "1", energy_unit: str =
     """
     rows = table[table["predicted"] > 0] if len(table) else table
     if rows.empty:
-        return sentence_figure("No escape time is known.")
-    figure = Figure(figsize=(COLUMN_WIDTH, 3.2))
+        return None
+    figure = Figure(figsize=(COLUMN_WIDTH, 3.8))
     axes = figure.add_subplot()
     axes.set_yscale("log")
     handles, missing = [], 0
@@ -180,19 +184,21 @@ def plot_escape(table: pd.DataFrame, *, time_unit: str = "1", energy_unit: str =
         )  # fmt: skip
         handles.append(
             Line2D([], [], color=colour, linestyle=style, marker=marker, markersize=4,
-                   markerfacecolor="white", label=name)
+                   markerfacecolor="white", label=by_letters(name))
         )  # fmt: skip
     _limit(axes, rows)
     largest = float((1 / rows["intensity"]).max())
-    inverse_unit = "" if energy_unit in ("1", "") else f"1/{energy_unit}"
+    inverse_unit = "" if energy_unit in ("1", "") else f"1/({energy_unit})"
     axes.set_xlabel(scaled_label(axes.xaxis, r"$1/\varepsilon$", inverse_unit, largest))
-    axes.set_ylabel("mean escape time " + ("(time units)" if time_unit in ("1", "") else f"({time_unit})"))
+    axes.set_ylabel(
+        "mean escape time " + ("(time units)" if time_unit in ("1", "") else f"({unit_text(time_unit)})")
+    )
     figure.legend(
-        handles=handles, loc="outside upper center", ncols=min(len(handles), 3),
-        title="lines: law, points: simulation ± standard error", title_fontsize=7,
+        handles=handles, loc="outside upper center", ncols=2,
+        title="lines: law, points: simulation ± standard error",
     )  # fmt: skip
     if missing:
-        figure.supxlabel(f"{missing} of {counted(len(rows), 'time')} without a simulation", fontsize=7)
+        figure.supxlabel(f"{missing} of {counted(len(rows), 'time')} without a simulation")
     return figure
 
 
@@ -202,6 +208,11 @@ def _limit(axes: Axes, rows: pd.DataFrame) -> None:
     times = times[np.isfinite(times) & (times > 0)]
     room = max((times.max() / times.min()) ** 0.08, 1.3)
     axes.set_ylim(times.min() / room, times.max() * room)
+
+
+def by_letters(name: str) -> str:
+    """The letters by which pages call wells, for the numbers that tables have: ``A1 to A2`` as A to B."""
+    return re.sub(r"\bA(\d+)\b", lambda found: well_name(int(found[1]) - 1), name)
 
 
 def power_of_ten(largest: float) -> int:
@@ -226,11 +237,12 @@ def scaled_label(axis: Axis, symbol: str, unit: str, largest: float) -> str:
         The largest number that occurs.
     """
     power = power_of_ten(largest)
+    plain = unit in ("1", "")
     if not power:
-        return f"{symbol} {unit_label(unit)}"
+        return symbol if plain else f"{symbol} {unit_label(unit)}"
     axis.set_major_formatter(FuncFormatter(_without(power)))
     factor = rf"$10^{{{power}}}$"
-    return f"{symbol} ({factor})" if unit in ("1", "") else f"{symbol} ({factor} {unit})"
+    return f"{symbol} ({factor})" if plain else f"{symbol} ({factor} {unit_text(unit)})"
 
 
 def _without(power: int) -> Callable[[float, object], str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 import pandas as pd
@@ -11,108 +11,39 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from siq.report.plots.style import (
-    BLACK,
-    BLUE,
-    COLUMN_WIDTH,
-    GREY,
-    ORANGE,
-    PAGE_WIDTH,
-    VERMILLION,
-    counted,
-    drawn_in_style,
-    name_label,
-    sentence_figure,
-    unit_label,
-)
+from siq.report.plots.before_after import plot_before_after, plot_held_out
+from siq.report.plots.reading import WIDTH, axis_unit, drawn_to_be_read, rate_unit
+from siq.report.plots.style import BLACK, BLUE, GREY, ORANGE, SKY_BLUE, VERMILLION, counted, name_label
 
-SIMULATIONS = {"before": (GREY, ":"), "recalibrated": (BLUE, "--"), "augmented": (VERMILLION, "-")}
-SAMPLES_SHOWN = 300
-PANELS = 4  # pairs of recording and output
+__all__ = [
+    "plot_before_after",
+    "plot_candidates",
+    "plot_curves",
+    "plot_escapes",
+    "plot_held_out",
+    "plot_missing",
+]
+
+SIMULATIONS = {"before": "as given", "recalibrated": "refitted", "augmented": "with what was found"}
 CURVES = 3
-CANDIDATES = 12
+CANDIDATES = 10
 CELLS = 22  # of the map, in each direction
-BEYOND = 0.6  # of the range of what was measured, by which a panel is higher
+SUPPORTED = 3.0  # times the median error of a curve: what is known less well does not decide about its axis
+STAGES = {
+    "found": ("found", VERMILLION), "same": ("explains as much", ORANGE),
+    "needless": ("explains as much, with more parameters", SKY_BLUE), "less": ("explains less", BLUE),
+    "further": ("would add, on top of what was found", GREY), "instead": ("in its place, roughly", GREY),
+}  # fmt: skip
 
 
-@drawn_in_style
-def plot_held_out(
-    table: pd.DataFrame, *, units: Mapping[str, str] | None = None, time_unit: str = "1"
-) -> Figure:
-    """Draw held-out recordings with the free runs of three simulations, and how far these are off.
-
-    Parameters
-    ----------
-    table
-        Columns ``recording t output measured before recalibrated augmented scored``, one row per sample and
-        output.
-    units
-        Units of the outputs.
-    time_unit
-        Of ``t``.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        A row for each of up to four pairs of recording and output: the courses, and simulation - recording.
-        Of a long recording the end is drawn, where simulations are off the furthest.
-    """
-    scored = table[table["scored"].astype(bool)]
-    if scored.empty:
-        return sentence_figure("No recording was held out.")
-    outputs = list(dict.fromkeys(scored["output"]))
-    recordings = list(dict.fromkeys(scored["recording"]))[: max(1, PANELS // len(outputs))]
-    pairs = [(recording, output) for recording in recordings for output in outputs][:PANELS]
-    figure = Figure(figsize=(PAGE_WIDTH, 0.6 + 1.5 * len(pairs)))
-    axes = figure.subplots(len(pairs), 2, squeeze=False)
-    for (recording, output), (left, right) in zip(pairs, axes, strict=True):
-        rows = scored[(scored["recording"] == recording) & (scored["output"] == output)].tail(SAMPLES_SHOWN)
-        _draw_run(left, right, rows)
-        unit = unit_label((units or {}).get(output, "1"))
-        left.set_ylabel(f"${name_label(output)}$ {unit}")
-        right.set_ylabel(f"error of ${name_label(output)}$ {unit}")
-        left.set_title(f"recording {recording}", loc="left")
-        right.set_title("simulation − recording", loc="left")
-    for side in axes[-1]:
-        side.set_xlabel(f"$t$ {unit_label(time_unit)}")
-    handles = [Line2D([], [], color=ORANGE, linewidth=2.6, alpha=0.7, label="recording")]
-    handles += [
-        Line2D([], [], color=colour, linestyle=style, label=name)
-        for name, (colour, style) in SIMULATIONS.items()
-    ]
-    figure.legend(handles=handles, loc="outside upper center", ncols=4)
-    return figure
-
-
-def _draw_run(left: Axes, right: Axes, rows: pd.DataFrame) -> None:
-    t, measured = rows["t"].to_numpy(float), rows["measured"].to_numpy(float)
-    left.plot(t, measured, color=ORANGE, linewidth=2.6, alpha=0.7)
-    right.axhline(0.0, color=ORANGE, linewidth=2.6, alpha=0.7)
-    # A simulation that runs away would leave the others no room.
-    low, high = np.nanmin(measured), np.nanmax(measured)
-    room = BEYOND * ((high - low) or abs(high) or 1.0)
-    sizes = []
-    for name, (colour, style) in SIMULATIONS.items():
-        values = rows[name].to_numpy(float)
-        left.plot(t, values, color=colour, linestyle=style)
-        right.plot(t, values - measured, color=colour, linestyle=style)
-        if name != "before":
-            error = np.abs(values - measured)
-            sizes += [float(np.nanmax(error))] if np.isfinite(error).any() else []
-    left.set_ylim(low - room, high + room)
-    largest = 1.15 * min(max(sizes, default=room), high - low + room)
-    if largest > 0:
-        right.set_ylim(-largest, largest)
-
-
-@drawn_in_style
+@drawn_to_be_read
 def plot_curves(
     curves: pd.DataFrame,
     *,
     named: tuple[str, str] | None = None,
     units: Mapping[str, str] | None = None,
     time_unit: str = "1",
-) -> Figure:
+) -> Figure | None:
     """Draw what is missing in equations against coordinates, before and after mechanisms were added.
 
     Parameters
@@ -128,56 +59,99 @@ def plot_curves(
 
     Returns
     -------
-    matplotlib.figure.Figure
-        Up to three panels, by what a function of the coordinate alone explains; bands: ± 2 standard errors.
+    matplotlib.figure.Figure or None
+        Up to three panels below each other, by what a function of the coordinate alone explains; bands: ± 2
+        standard errors, cut off at the edge of the panel. None where there is no curve.
     """
     before = curves[curves["stage"] == "before"] if len(curves) else curves
     if before.empty:
-        return sentence_figure("There is no coordinate along which anything could be missing.")
+        return None
     keys = ["equation", "coordinate", "across"]
     order = before.groupby(keys, sort=False)["gain"].first().sort_values(ascending=False, kind="stable")
     shown = list(order.index)
     if named is not None:
         shown.sort(key=lambda key: (key[0], key[1]) != named)
-    shown = shown[:CURVES]
-    figure = Figure(figsize=(PAGE_WIDTH, 2.6))
-    for axes, key in zip(np.atleast_1d(figure.subplots(1, len(shown))), shown, strict=True):
+    visible = before[before["missing"].abs() > 2 * before["standard_error"]].groupby(keys).size()
+    # The first is what the page speaks of; others only if they show something.
+    shown = [key for place, key in enumerate(shown) if place == 0 or key in visible.index][:CURVES]
+    figure = Figure(figsize=(WIDTH, 0.7 + 2.3 * len(shown)))
+    for axes, key in zip(np.atleast_1d(figure.subplots(len(shown), 1)), shown, strict=True):
         equation, coordinate, across = key
-        for stage, colour, style in (("before", BLUE, "-"), ("after", VERMILLION, "--")):
-            rows = curves[(curves[keys] == list(key)).all(axis=1) & (curves["stage"] == stage)]
-            at, value, error = (rows[name].to_numpy(float) for name in ("at", "missing", "standard_error"))
-            axes.fill_between(at, value - 2 * error, value + 2 * error, color=colour, alpha=0.22, linewidth=0)
-            axes.plot(at, value, color=colour, linestyle=style, marker="o", markersize=2.5)
-        axes.axhline(0.0, color=GREY, linewidth=0.6)
+        stages = {
+            stage: curves[(curves[keys] == list(key)).all(axis=1) & (curves["stage"] == stage)]
+            for stage in ("before", "after")
+        }
+        _draw_curves(axes, stages)
         first = equation.split(", ")[0]
         unit = (units or {}).get(coordinate if coordinate != "amplitude" else first, "1")
         unit = time_unit if coordinate == "t" else unit
         symbol = coordinate if coordinate == "amplitude" else f"${name_label(coordinate)}$"
-        axes.set_xlabel(f"{symbol} {unit_label(unit)}")
-        where = " and ".join(f"${name_label(name)}'$" for name in equation.split(", "))
-        axes.set_ylabel(f"missing in {where} {_rate(units, first, time_unit)}")
-        direction = ", across" if across else ""
-        axes.set_title(f"explains $\\Delta\\chi^2$ = {order[key]:.3g}{direction}", loc="left")
+        axes.set_xlabel(f"{symbol}{axis_unit(unit)}")
+        rate = axis_unit(rate_unit((units or {}).get(first, "1"), time_unit))
+        where = " and ".join(f"$\\dot{{{name_label(name)}}}$" for name in equation.split(", "))
+        axes.set_ylabel(f"missing in {where}\n{rate.strip()}" if rate else f"missing in {where}")
+        if across:
+            axes.set_title("across the amplitude", loc="left")
     figure.legend(
         handles=[
-            Line2D([], [], color=BLUE, marker="o", markersize=2.5, label="recalibrated"),
-            Line2D([], [], color=VERMILLION, linestyle="--", marker="o", markersize=2.5, label="at the end"),
+            Line2D([], [], color=BLUE, marker="o", markersize=4, label="before"),
+            Line2D([], [], color=VERMILLION, linestyle="--", marker="s", markersize=4, label="after"),
             Patch(color=GREY, alpha=0.3, label="± 2 standard errors"),
         ],
-        loc="outside upper center",
+        loc="outside upper left",
         ncols=3,
+        columnspacing=1.2,
     )  # fmt: skip
     return figure
 
 
-def _rate(units: Mapping[str, str] | None, name: str, time_unit: str) -> str:
-    unit = (units or {}).get(name, "1")
-    if time_unit in ("1", ""):
-        return unit_label(unit)
-    return f"({unit}/{time_unit})" if unit not in ("1", "") else f"(1/{time_unit})"
+def _draw_curves(axes: Axes, stages: Mapping[str, pd.DataFrame]) -> None:
+    """Both curves, with an axis on which the values can be seen, however wide the bands are."""
+    low, high = limits_of(stages.values())
+    looks = {"before": (BLUE, "-", "o"), "after": (VERMILLION, "--", "s")}
+    for stage, (colour, style, marker) in looks.items():
+        at, value, error = (
+            stages[stage][name].to_numpy(float) for name in ("at", "missing", "standard_error")
+        )
+        wide = float(np.mean(2 * error > (high - low) / 2)) > 0.5 if len(at) else True
+        if wide and stage == "after":
+            continue  # the recordings say nothing about it
+        # A band that fills the panel would only tint it.
+        if not wide:
+            band = [np.clip(value + sign * 2 * error, low, high) for sign in (-1, 1)]
+            axes.fill_between(at, *band, color=colour, alpha=0.2, linewidth=0)
+        axes.plot(at, value, color=colour, linestyle=style, marker=marker, markersize=4)
+    axes.axhline(0.0, color=GREY, linewidth=0.8)
+    axes.set_ylim(low, high)
 
 
-@drawn_in_style
+def limits_of(curves: Iterable[pd.DataFrame]) -> tuple[float, float]:
+    """Limits of an axis by the values of curves where these are supported by data, and zero.
+
+    Parameters
+    ----------
+    curves
+        Each with the columns ``missing standard_error``; a knot whose error is several times the median of
+        its curve has hardly any data.
+    """
+    values = [np.zeros(1)]
+    for curve in curves:
+        value, error = (curve[name].to_numpy(float) for name in ("missing", "standard_error"))
+        known = np.isfinite(value) & np.isfinite(error)
+        if known.any():
+            supported = known & (error <= SUPPORTED * np.median(error[known]))
+            values.append(value[supported])
+            # The error of a value that is well known belongs to the picture.
+            largest = float(np.abs(value[supported]).max())
+            small = supported & (2 * error < largest)
+            values += [value[small] - 2 * error[small], value[small] + 2 * error[small]]
+    together = np.concatenate(values)
+    low, high = float(together.min()), float(together.max())
+    margin = 0.15 * ((high - low) or 1.0)
+    return low - margin, high + margin
+
+
+@drawn_to_be_read
 def plot_missing(
     points: np.ndarray,
     missing: Mapping[str, np.ndarray],
@@ -186,7 +160,7 @@ def plot_missing(
     units: Mapping[str, str] | None = None,
     time_unit: str = "1",
     source: str = "",
-) -> Figure:
+) -> Figure | None:
     """Draw the missing part of equations over a plane of the state space.
 
     Parameters
@@ -204,15 +178,15 @@ def plot_missing(
 
     Returns
     -------
-    matplotlib.figure.Figure
-        A panel for each of up to two equations.
+    matplotlib.figure.Figure or None
+        A panel for each of up to two equations, below each other; None where nothing is missing anywhere.
     """
     shown = {name: values for name, values in missing.items() if np.isfinite(values).any()}
     shown = dict(sorted(shown.items(), key=lambda each: -float(np.nanstd(each[1])))[:2])
     if not len(points) or not any(np.any(values) for values in shown.values()):
-        return sentence_figure("Nothing is missing at any recorded state.")
-    figure = Figure(figsize=(COLUMN_WIDTH * max(len(shown), 1.3), 3.0))
-    panels = np.atleast_1d(figure.subplots(1, len(shown)))
+        return None
+    figure = Figure(figsize=(WIDTH, 0.4 + 3.2 * len(shown)))
+    panels = np.atleast_1d(figure.subplots(len(shown), 1))
     for axes, (name, values) in zip(panels, shown.items(), strict=True):
         known = np.isfinite(values)
         x, y = points[known, 0], points[known, 1]
@@ -225,55 +199,58 @@ def plot_missing(
         )
         axes.set_facecolor("#EDEDED")
         first, second = names
-        axes.set_xlabel(f"${name_label(first)}$ {unit_label((units or {}).get(first, '1'))}")
-        axes.set_ylabel(f"${name_label(second)}$ {unit_label((units or {}).get(second, '1'))}")
-        label = f"missing in ${name_label(name)}'$ {_rate(units, name, time_unit)}"
+        axes.set_xlabel(f"${name_label(first)}${axis_unit((units or {}).get(first, '1'))}")
+        axes.set_ylabel(f"${name_label(second)}${axis_unit((units or {}).get(second, '1'))}")
+        rate = axis_unit(rate_unit((units or {}).get(name, "1"), time_unit))
+        label = f"missing in $\\dot{{{name_label(name)}}}${rate}"
         axes.figure.colorbar(image, ax=axes, extend="both", label=label)
     if source:
-        figure.suptitle(source, fontsize=8)
+        figure.suptitle(source)
     return figure
 
 
-@drawn_in_style
-def plot_candidates(table: pd.DataFrame) -> Figure:
-    """Draw how much mechanisms explain: what was found, and what others would add to it.
+@drawn_to_be_read
+def plot_candidates(table: pd.DataFrame) -> Figure | None:
+    """Draw how much mechanisms explain: what was found, what was fitted in its place, what would add to it.
 
     Parameters
     ----------
     table
-        Columns ``label gain stage``, one row per probe; of each label the best counts. Stages are ``found``,
-        ``same`` for what cannot be told from it, and ``further``.
+        Columns ``label gain stage``, one row per probe; of each label the best counts. For the stages see
+        `siq.mismatch.tables.tables_of`.
 
     Returns
     -------
-    matplotlib.figure.Figure
-        The best twelve, as bars.
+    matplotlib.figure.Figure or None
+        The best ten, as bars, those that were found first; None where nothing would gain anything.
     """
     positive = table[table["gain"] > 0] if len(table) else table
     if positive.empty:
-        return sentence_figure("No mechanism of the dictionary would explain anything.")
+        return None
     best = positive.groupby(["label", "stage"], sort=False)["gain"].max().reset_index()
-    best = best.sort_values("gain", ascending=False, kind="stable").head(CANDIDATES)[::-1]
-    kinds = {
-        "found": ("found", VERMILLION), "same": ("not to be told from it", ORANGE),
-        "further": ("would explain on top of what was found", GREY),
-    }  # fmt: skip
-    figure = Figure(figsize=(PAGE_WIDTH, 0.8 + 0.21 * len(best)))
+    best = best.assign(first=best["stage"] != "found")
+    best = best.sort_values(["first", "gain"], ascending=[True, False], kind="stable").head(CANDIDATES)[::-1]
+    figure = Figure(figsize=(WIDTH, 1.3 + 0.27 * len(best) + 0.1 * best["stage"].nunique()))
     axes = figure.add_subplot()
-    colours = [kinds[stage][1] for stage in best["stage"]]
-    axes.barh(np.arange(len(best)), best["gain"], color=colours, height=0.7)
-    axes.set_yticks(np.arange(len(best)), [text.replace("$", r"\$") for text in best["label"]])
+    places = np.arange(len(best))
+    axes.barh(places, best["gain"], color=[STAGES[stage][1] for stage in best["stage"]], height=0.7)
+    axes.set_yticks(places, [shortened(text).replace("$", r"\$") for text in best["label"]])
     axes.set_xscale("log")
-    lowest = float(best["gain"].min())
-    axes.set_xlim(left=min(1.0, lowest / 2))
-    axes.set_xlabel(r"gain in $\chi^2$ over the simulation without it")
-    handles = [Patch(color=colour, label=words) for words, colour in kinds.values() if colour in colours]
-    figure.legend(handles=handles, loc="outside upper center", ncols=3)
+    axes.set_xlim(left=min(1.0, float(best["gain"].min()) / 2))
+    axes.set_xlabel(r"gain in $\chi^2$")
+    present = [stage for stage in STAGES if stage in set(best["stage"])]
+    handles = [Patch(color=STAGES[stage][1], label=STAGES[stage][0]) for stage in present]
+    figure.legend(handles=handles, loc="outside upper left", ncols=1)
     return figure
 
 
-@drawn_in_style
-def plot_escapes(table: pd.DataFrame, *, time_unit: str = "1") -> Figure:
+def shortened(label: str, most: int = 30) -> str:
+    """A label that leaves room for its bar."""
+    return label if len(label) <= most else f"{label[: most - 1]}…"
+
+
+@drawn_to_be_read
+def plot_escapes(table: pd.DataFrame, *, time_unit: str = "1") -> Figure | None:
     """Draw mean escape times of two simulations against the inverse of the noise intensity.
 
     Parameters
@@ -285,12 +262,12 @@ def plot_escapes(table: pd.DataFrame, *, time_unit: str = "1") -> Figure:
 
     Returns
     -------
-    matplotlib.figure.Figure
-        A colour for each way out, a line style for each simulation.
+    matplotlib.figure.Figure or None
+        A colour for each way out, a line style for each simulation; None where there is no way out.
     """
     if table.empty:
-        return sentence_figure("There is no way out of any well in both simulations.")
-    figure = Figure(figsize=(COLUMN_WIDTH * 1.3, 3.0))
+        return None
+    figure = Figure(figsize=(WIDTH, 3.8))
     axes = figure.add_subplot()
     axes.set_yscale("log")
     colours = (BLUE, VERMILLION, BLACK, ORANGE)
@@ -302,12 +279,13 @@ def plot_escapes(table: pd.DataFrame, *, time_unit: str = "1") -> Figure:
             if len(rows):
                 # Two ways of the same height would hide each other.
                 axes.plot(
-                    1 / rows["intensity"], rows["time"], color=colours[place], label=f"{way}, {name}",
-                    linestyle=styles[name], linewidth=2.2 - 1.2 * (place % 2),
+                    1 / rows["intensity"], rows["time"], color=colours[place],
+                    label=f"{way}, {SIMULATIONS.get(name, name)}",
+                    linestyle=styles[name], linewidth=2.6 - 1.2 * (place % 2),
                 )  # fmt: skip
     axes.set_xlabel(r"$1/\varepsilon$, inverse of the noise intensity")
-    axes.set_ylabel("mean escape time " + ("(time units)" if time_unit in ("1", "") else f"({time_unit})"))
-    figure.legend(loc="outside upper center", ncols=2)
+    axes.set_ylabel(f"mean escape time{axis_unit(time_unit)}")
+    figure.legend(loc="outside upper left", ncols=1)
     if len(ways) > len(colours):
-        figure.supxlabel(f"{counted(len(ways) - len(colours), 'further way')} out not drawn", fontsize=7)
+        figure.supxlabel(f"{counted(len(ways) - len(colours), 'further way')} out not drawn")
     return figure

@@ -3,30 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from string import ascii_lowercase
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from siq.report.plots.landscape import MARKS, UNKNOWN
+from siq.report.plots.landscape import UNKNOWN
 from siq.report.plots.landscape_curves import COLOURS, LINE_STYLES, scaled_label
 from siq.report.plots.style import (
     BLACK,
     BLUE,
+    COLUMN_WIDTH,
     GREY,
     ORANGE,
     PAGE_WIDTH,
+    counted,
     drawn_in_style,
     magnitude_label,
     name_label,
     say,
-    sentence_figure,
     unit_label,
 )
 
@@ -35,67 +34,8 @@ if TYPE_CHECKING:  # to draw takes none of what it takes to compute
     from siq.report.plots.dataset import Dataset
 
 BINS = 60  # of histograms of recorded states
-ENERGY = "in the unit of ε"
-ROOM = 1.25  # of the highest saddle: what is shown of U
+ENERGY = "unit of ε"
 DECADES = 6  # of differences, below the largest one
-
-
-@dataclass(frozen=True)
-class DrawnBarrier:
-    """A way out of a well: where its attractor and its saddle lie, and U at both."""
-
-    attractor: float
-    saddle: float
-    bottom: float
-    top: float
-
-
-@drawn_in_style
-def plot_landscape_curve(
-    x: np.ndarray,
-    values: np.ndarray,
-    *,
-    name: str,
-    unit: str,
-    equilibria: pd.DataFrame,
-    barriers: Sequence[DrawnBarrier] = (),
-) -> Figure:
-    """Draw U of one state with its wells and barriers.
-
-    Parameters
-    ----------
-    x, values
-        States in ascending order, shape ``(n,)``, and U there, NaN where it is not known.
-    name, unit
-        Of the state.
-    equilibria
-        Columns ``kind x y label``: where each lies, and U there.
-    barriers
-        Of the ways out; each is an arrow from the well's bottom to the height of its saddle.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        One panel, hatched where U is not known.
-    """
-    if not np.isfinite(values).any():
-        return sentence_figure("U is known nowhere.")
-    figure = Figure(figsize=(0.75 * PAGE_WIDTH, 3.4))
-    axes = figure.add_subplot()
-    axes.plot(x, values, color=BLUE, linewidth=1.4)
-    tops = [one.top for one in barriers if np.isfinite(one.top)]
-    lowest, highest = float(np.nanmin(values)), float(np.nanmax(values))
-    reach = lowest + ROOM * (max(tops) - lowest) if tops else highest
-    axes.set_ylim(lowest - 0.06 * (reach - lowest), reach)
-    axes.set_xlim(x[0], x[-1])
-    handles = _draw_unknown(axes, x, values) + _draw_equilibria(axes, equilibria)
-    for one in barriers:
-        if np.isfinite(one.top):
-            _draw_barrier(axes, one)
-    axes.set_xlabel(scaled_label(axes.xaxis, f"${name_label(name)}$", unit, float(np.abs(x).max())))
-    axes.set_ylabel(scaled_label(axes.yaxis, "$U$", ENERGY, reach))
-    figure.legend(handles=handles, loc="outside lower center", ncols=4)
-    return figure
 
 
 def _draw_unknown(axes: Axes, x: np.ndarray, values: np.ndarray) -> list[Any]:
@@ -105,32 +45,10 @@ def _draw_unknown(axes: Axes, x: np.ndarray, values: np.ndarray) -> list[Any]:
     return [Patch(label="$U$ is not known", **UNKNOWN)] if len(edges) else []
 
 
-def _draw_equilibria(axes: Axes, equilibria: pd.DataFrame) -> list[Any]:
-    handles = []
-    for kind, style in MARKS.items():
-        rows = equilibria[equilibria["kind"] == kind]
-        for x, y, label in rows[["x", "y", "label"]].itertuples(index=False):
-            axes.plot(x, y, linestyle="none", zorder=4, **style)
-            if np.isfinite(y):
-                axes.annotate(str(label), (x, y), xytext=(6, 3), textcoords="offset points", zorder=5)
-        handles += [Line2D([], [], linestyle="none", label=kind, **style)] if len(rows) else []
-    return handles
-
-
-def _draw_barrier(axes: Axes, one: DrawnBarrier) -> None:
-    axes.plot([one.attractor, one.saddle], [one.top] * 2, color=GREY, linewidth=0.8, linestyle="--")
-    axes.annotate(
-        "", (one.attractor, one.top), xytext=(one.attractor, one.bottom),
-        arrowprops={"arrowstyle": "<->", "color": GREY, "shrinkA": 0, "shrinkB": 0},
-    )  # fmt: skip
-    axes.annotate(
-        rf"$\Delta U$ = {magnitude_label(one.top - one.bottom, digits=4)}", (one.attractor, one.top),
-        xytext=(0, 3), textcoords="offset points", ha="center",
-    )  # fmt: skip
-
-
 @drawn_in_style
-def plot_error_curves(x: np.ndarray, curves: Mapping[str, np.ndarray], *, name: str, unit: str) -> Figure:
+def plot_error_curves(
+    x: np.ndarray, curves: Mapping[str, np.ndarray], *, name: str, unit: str, energy_unit: str = ""
+) -> Figure | None:
     """Draw U of one state by several sources, and how far each is from the first one.
 
     Parameters
@@ -141,21 +59,23 @@ def plot_error_curves(x: np.ndarray, curves: Mapping[str, np.ndarray], *, name: 
         U by each source, shape ``(n,)``, NaN where it says nothing. The first one is the reference.
     name, unit
         Of the state.
+    energy_unit
+        Unit of U; empty where it is that of ε.
 
     Returns
     -------
     matplotlib.figure.Figure
-        On the left U; on the right the absolute difference as a share of the reference's highest value, on a
+        Above U; below the absolute difference as a share of the reference's highest value, on a
         logarithmic axis.
     """
     (reference_name, reference), *others = [
         (key, one) for key, one in curves.items() if np.isfinite(one).any()
     ] or [("the reference", np.zeros(0))]
     if not reference.size or not others:
-        return sentence_figure("There is no U to compare.")
+        return None
     highest = float(np.nanmax(np.abs(reference))) or 1.0
-    figure = Figure(figsize=(PAGE_WIDTH, 3.0))
-    left, right = figure.subplots(1, 2)
+    figure = Figure(figsize=(COLUMN_WIDTH, 5.4))
+    left, right = figure.subplots(2, 1, sharex=True)
     left.plot(x, reference, color=BLACK, linewidth=2.4, alpha=0.4, label=reference_name)
     right.set_yscale("log")
     shares = []
@@ -172,21 +92,23 @@ def plot_error_curves(x: np.ndarray, curves: Mapping[str, np.ndarray], *, name: 
         right.set_ylim(largest / 10**DECADES, 2 * largest)
     else:
         say(right, "no difference at all")
-    left.set_ylabel(scaled_label(left.yaxis, "$U$", ENERGY, highest))
-    right.set_ylabel(f"difference from {reference_name} / highest $U$")
+    left.set_ylabel(scaled_label(left.yaxis, "$U$", energy_unit or ENERGY, highest))
+    right.set_ylabel(f"difference from\n{reference_name} / highest $U$")
     for axes in (left, right):
         axes.set_xlabel(scaled_label(axes.xaxis, f"${name_label(name)}$", unit, float(np.abs(x).max())))
-    figure.legend(loc="outside upper center", ncols=4)
+    figure.legend(loc="outside upper center", ncols=2)
     return figure
 
 
 @drawn_in_style
 def plot_invariant_curves(panels: Sequence[ComparedDensity], *, state: str, unit: str) -> Figure:
     """Draw the invariant density of one state, with a long simulation's histogram: a panel for each ε."""
-    figure = Figure(figsize=(PAGE_WIDTH, 2.9))
-    for place, (axes, panel) in enumerate(
-        zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True)
-    ):
+    rows = -(-len(panels) // 2)
+    figure = Figure(figsize=(PAGE_WIDTH, 3.1 * rows + 0.4))
+    every = figure.subplots(rows, min(len(panels), 2), squeeze=False).ravel()
+    for axes in every[len(panels) :]:
+        axes.remove()
+    for place, (axes, panel) in enumerate(zip(every[: len(panels)], panels, strict=True)):
         density, comparison = panel.density, panel.comparison
         if comparison is not None:
             axes.stairs(comparison.histogram[0], comparison.x1_edges, color=ORANGE, fill=True, alpha=0.5)
@@ -206,8 +128,8 @@ def plot_invariant_curves(panels: Sequence[ComparedDensity], *, state: str, unit
             if np.isfinite(comparison.sampling_floor):
                 title += f"\n(sampling alone: {comparison.sampling_floor:.2g})"
         axes.set_title(title, loc="left")
-        if place == 0:
-            axes.set_ylabel(f"density {unit_label('1' if unit in ('1', '') else f'per {unit}')}")
+        if place % 2 == 0:
+            axes.set_ylabel(f"density {'' if unit in ('1', '') else unit_label(f'per {unit}')}")
     handles: list[Any] = [Line2D([], [], color=BLUE, label=r"$Z^{-1}\exp(-U/\varepsilon)$")]
     if any(panel.comparison is not None for panel in panels):
         handles.append(Patch(color=ORANGE, alpha=0.5, label="a long simulation"))
@@ -218,9 +140,10 @@ def plot_invariant_curves(panels: Sequence[ComparedDensity], *, state: str, unit
 @drawn_in_style
 def plot_dataset_curves(data: Dataset, *, state: str, unit: str) -> Figure:
     """Draw trajectories of one state, histograms of what was recorded and of what the regression sees."""
-    figure = Figure(figsize=(PAGE_WIDTH, 2.6))
-    left, middle, right = figure.subplots(1, 3)
-    label = f"${name_label(state)}$ {unit_label(unit)}"
+    count = 2 if data.below is None else 3
+    figure = Figure(figsize=(COLUMN_WIDTH, 2.3 * count))
+    left, middle, *others = figure.subplots(count, 1)
+    label = f"${name_label(state)}$ {unit_label('' if unit == '1' else unit)}".strip()
     for path in data.trajectories:
         left.plot(path[:, 0], linewidth=0.7)
     for path in data.without_noise:
@@ -228,18 +151,15 @@ def plot_dataset_curves(data: Dataset, *, state: str, unit: str) -> Figure:
     left.set_xlabel("number of the sample")
     left.set_ylabel(label)
     dashed = "; dashed: no noise" if len(data.without_noise) else ""
-    left.set_title(f"(a) {len(data.trajectories)} trajectories{dashed}", loc="left")
+    left.set_title(f"(a) {counted(len(data.trajectories), 'recording')}{dashed}", loc="left")
     x = data.points[:, 0]
     edges = np.linspace(x.min(), x.max(), BINS + 1)
     middle.hist(x, edges, color=GREY)
     middle.set_title(f"(b) recorded: {len(x)} pairs", loc="left")
-    if data.below is None:
-        say(right, "no networks say\nwhat the regression sees")
-    else:
-        right.hist(x[data.below], edges, color=BLUE)
-    seen = "" if data.below is None else f": {100 * data.below.mean():.3g} %"
-    right.set_title(f"(c) seen by the regression{seen}", loc="left")
-    for axes in (middle, right):
+    if data.below is not None:
+        others[0].hist(x[data.below], edges, color=BLUE)
+        others[0].set_title(f"(c) seen by the regression: {100 * data.below.mean():.3g} %", loc="left")
+    for axes in (middle, *others):
         axes.set_xlabel(label)
-    middle.set_ylabel("number of pairs")
+        axes.set_ylabel("number of pairs")
     return figure

@@ -14,19 +14,17 @@ from matplotlib.lines import Line2D
 from siq.report.plots.style import (
     BLACK,
     BLUE,
+    COLUMN_WIDTH,
     GREEN,
     GREY,
     ORANGE,
-    PAGE_WIDTH,
     PURPLE,
     VERMILLION,
+    axis_label,
     counted,
     drawn_in_style,
     magnitude_label,
     mean_and_spread,
-    name_label,
-    say,
-    unit_label,
 )
 
 TRAJECTORIES_SHOWN = 6
@@ -45,7 +43,7 @@ def plot_prediction(
     states: Sequence[str],
     units: Sequence[str],
     published: tuple[float, float] | None = None,
-) -> Figure:
+) -> Figure | None:
     """Draw held-out trajectories beside predicted ones, and the distribution of the errors.
 
     Parameters
@@ -64,30 +62,28 @@ def plot_prediction(
     Returns
     -------
     matplotlib.figure.Figure
-        Two panels; the errors by method on a logarithmic axis, medians as vertical lines.
+        Two panels, one above the other; the errors by method on a logarithmic axis, medians as vertical
+        lines. None where no prediction has an error.
     """
-    figure = Figure(figsize=(PAGE_WIDTH, 3.8))
-    left, right = figure.subplots(1, 2)
+    known = errors["error"].to_numpy(float)
+    if not len(observed) or not len(predicted) or not (np.isfinite(known) & (known > 0)).any():
+        return None
+    figure = Figure(figsize=(COLUMN_WIDTH, 7.8))
+    left, right = figure.subplots(2, 1, height_ratios=[1.2, 1])
     _draw_trajectories(left, observed, predicted)
-    labels = [f"${name_label(name)}$ {unit_label(unit)}" for name, unit in zip(states, units, strict=True)]
-    if left.axison:
-        left.set_xlabel("number of the sample" if len(states) == 1 else labels[0])
-        left.set_ylabel(labels[0] if len(states) == 1 else labels[1])
+    labels = [axis_label(name, unit) for name, unit in zip(states, units, strict=True)]
+    left.set_xlabel("number of the sample" if len(states) == 1 else labels[0])
+    left.set_ylabel(labels[0] if len(states) == 1 else labels[1])
     shown = min(len(observed), len(predicted), TRAJECTORIES_SHOWN)
     noun = "trajectory" if shown == 1 else "trajectories"
-    left.set_title(f"(a) {shown} held-out {noun}, • start" if shown else "(a) trajectories", loc="left")
-    notes = _draw_errors(right, errors, published)
+    left.set_title(f"(a) {shown} held-out {noun}, • start", loc="left")
+    _draw_errors(right, errors, published)
     right.set_title("(b) errors of the predictions, with medians", loc="left")
-    if notes:
-        figure.supxlabel("\n".join(notes), fontsize=7)
     return figure
 
 
 def _draw_trajectories(axes: Axes, observed: Sequence[np.ndarray], predicted: Sequence[np.ndarray]) -> None:
     pairs = list(zip(observed, predicted, strict=False))[:TRAJECTORIES_SHOWN]
-    if not pairs:
-        say(axes, "no trajectories")
-        return
     for truth, prediction in pairs:
         # The observed curve is wide and pale: a prediction that lies on it leaves its rims visible.
         for path, style in ((truth, OBSERVED), (prediction, PREDICTED)):
@@ -104,13 +100,10 @@ def _draw_trajectories(axes: Axes, observed: Sequence[np.ndarray], predicted: Se
     )
 
 
-def _draw_errors(axes: Axes, errors: pd.DataFrame, published: tuple[float, float] | None) -> list[str]:
+def _draw_errors(axes: Axes, errors: pd.DataFrame, published: tuple[float, float] | None) -> None:
     values = errors["error"].to_numpy(float)
     positive = values[np.isfinite(values) & (values > 0)]
     notes = []
-    if positive.size == 0:
-        say(axes, "no prediction has an error")
-        return []
     axes.set_xscale("log")
     lowest, highest = positive.min(), positive.max()
     spread = max(highest / lowest, 1.1)  # errors that are all alike have no width of their own
@@ -129,17 +122,17 @@ def _draw_errors(axes: Axes, errors: pd.DataFrame, published: tuple[float, float
         shares = np.histogram(found[found > 0], edges)[0] / len(all_of)
         axes.stairs(shares, edges, color=colour, linestyle=style, linewidth=1.2)
         axes.axvline(float(np.median(found)), color=colour, linestyle=style, linewidth=0.8)
-        text = f"{method}, {counted(len(all_of), 'prediction')}\n"
-        text += f"median {magnitude_label(float(np.median(found)))}\nmean "
+        text = f"{method}, {counted(len(all_of), 'prediction')}: "
+        text += f"median {magnitude_label(float(np.median(found)))},\nmean "
         text += mean_and_spread(found.mean(), found.std(ddof=1) if found.size > 1 else float("nan"))
         handles.append(Line2D([], [], color=colour, linestyle=style, label=text))
     if published is not None:
         handles.append(_draw_published(axes, *published))
-    axes.set_xlabel("relative error of a trajectory (dimensionless)")
+    axes.set_xlabel("relative error of a trajectory")
     axes.set_ylabel("share of the predictions")
     axes.set_ylim(bottom=0)
-    axes.figure.legend(handles=handles, loc="outside upper center", ncols=min(len(handles), 3))
-    return notes
+    handles += [Line2D([], [], linestyle="none", label=note) for note in notes]
+    axes.figure.legend(handles=handles, loc="outside lower center", ncols=1)
 
 
 def _draw_published(axes: Axes, mean: float, spread: float) -> Line2D:

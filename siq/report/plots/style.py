@@ -7,15 +7,20 @@ import math
 import re
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
-from typing import ParamSpec
+from typing import ParamSpec, TypeVar
 
 import matplotlib.style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.rcsetup import cycler
 
-COLUMN_WIDTH = 3.5  # inches; one column of a journal page
-PAGE_WIDTH = 7.0
+from siq.numerics.measured_text import unit_text
+
+# Inches. A figure is no wider than its letters allow: a phone of 400 pixels leaves it 368, and there text of
+# `SMALLEST` points in a figure of `PAGE_WIDTH` is 9 pixels high.
+COLUMN_WIDTH = 4.2
+PAGE_WIDTH = 5.4
+SMALLEST = 9.5
 
 # The palette of Okabe and Ito, which readers with any common colour blindness can tell apart.
 BLACK = "#000000"
@@ -29,14 +34,16 @@ GREY = "#6E6E6E"
 
 _SETTINGS = {
     "font.family": "DejaVu Sans",  # comes with matplotlib: the same on every machine
-    "font.size": 8,
-    "axes.titlesize": 8,
-    "axes.labelsize": 8,
-    "xtick.labelsize": 7,
-    "ytick.labelsize": 7,
-    "legend.fontsize": 7,
+    "font.size": 10,
+    "axes.titlesize": 10,
+    "axes.labelsize": 10,
+    "xtick.labelsize": SMALLEST,
+    "ytick.labelsize": SMALLEST,
+    "legend.fontsize": SMALLEST,
+    "legend.title_fontsize": SMALLEST,
     "legend.frameon": False,
-    "figure.titlesize": 9,
+    "figure.titlesize": 10,
+    "figure.labelsize": SMALLEST,
     "figure.constrained_layout.use": True,
     "axes.linewidth": 0.6,
     "axes.spines.top": False,
@@ -56,6 +63,7 @@ _GREEK = re.compile(
 )
 
 Parameters = ParamSpec("Parameters")
+Drawn = TypeVar("Drawn", Figure, Figure | None)
 
 
 def drawing_style() -> AbstractContextManager[None]:
@@ -64,13 +72,18 @@ def drawing_style() -> AbstractContextManager[None]:
     return context
 
 
-def drawn_in_style(function: Callable[Parameters, Figure]) -> Callable[Parameters, Figure]:
-    """Decorate a plot function: common style while it draws, fixed layout afterwards."""
+def drawn_in_style(function: Callable[Parameters, Drawn]) -> Callable[Parameters, Drawn]:
+    """Decorate a plot function: common style while it draws, fixed layout afterwards.
+
+    A function gives None where there is nothing to draw: a figure that says so is none.
+    """
 
     @functools.wraps(function)
-    def draw(*arguments: Parameters.args, **options: Parameters.kwargs) -> Figure:
+    def draw(*arguments: Parameters.args, **options: Parameters.kwargs) -> Drawn:
         with drawing_style():
             figure = function(*arguments, **options)
+            if figure is None:
+                return figure
             # The constrained layout moves on a little with every drawing. Worked out once and then
             # frozen, the same figure gives the same file however often it is saved.
             figure.draw_without_rendering()
@@ -143,8 +156,20 @@ def sorted_terms(terms: Iterable[str]) -> list[str]:
 
 
 def unit_label(unit: str) -> str:
-    """Write a unit behind a name: ``(mV)``; the unit ``1`` means a plain number."""
-    return "(dimensionless)" if unit in ("1", "") else f"({unit})"
+    """Write a unit behind a name: ``(mV)``; ``1`` is that of a plain number, and nothing that of nobody."""
+    if unit == "":
+        return ""
+    return "(dimensionless)" if unit == "1" else f"({unit_text(unit)})"
+
+
+def axis_label(name: str, unit: str) -> str:
+    """Typeset a state with its unit; the unit ``1`` needs no word where a name stands alone."""
+    return f"${name_label(name)}$ {unit_label('' if unit == '1' else unit)}".strip()
+
+
+def energy_label(unit: str, *, what: str = "$U$") -> str:
+    """Typeset U with its unit; nothing is that of ε."""
+    return f"{what} ({unit_text(unit)})" if unit not in ("", "1") else f"{what} (unit of ε)"
 
 
 def magnitude_label(value: float, *, digits: int = 2) -> str:

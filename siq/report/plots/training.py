@@ -7,19 +7,19 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from siq.report.plots.style import BLACK, PAGE_WIDTH, SKY_BLUE, counted, drawn_in_style, say, sentence_figure
+from siq.report.plots.style import BLACK, PAGE_WIDTH, SKY_BLUE, counted, drawn_in_style
 
 _PANELS = {
-    "training_loss": "loss on the training pairs",
-    "held_out_loss": "loss on the held-out pairs",
-    "dynamics": "dynamics part of the loss",
-    "orthogonality": "orthogonality part of the loss",
+    "training_loss": "on training pairs",
+    "held_out_loss": "on held-out pairs",
+    "dynamics": "dynamics part",
+    "orthogonality": "orthogonality part",
     "learning_rate": "learning rate",
 }
 
 
 @drawn_in_style
-def plot_training(training: pd.DataFrame) -> Figure:
+def plot_training(training: pd.DataFrame) -> Figure | None:
     """Draw the course of training, one thin line a run.
 
     Parameters
@@ -30,36 +30,37 @@ def plot_training(training: pd.DataFrame) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        Five panels with logarithmic axes, and the median of the runs wherever at least half of them are.
+        A panel with logarithmic axes for each column that was recorded, and the median of several runs
+        wherever at least half of them are. None where nothing was trained.
     """
     # Step zero has no place on a logarithmic axis.
     rows = training[training["step"] > 0]
-    if rows.empty:
-        return sentence_figure("No training is recorded.")
+    if not (rows[list(_PANELS)] > 0).any(axis=None):
+        return None
     runs = rows["run"].nunique()
-    figure = Figure(figsize=(PAGE_WIDTH, 3.9))
-    panels = figure.subplots(2, 3, sharex=True).T.ravel()
-    legend, *panels = panels[[4, 0, 1, 2, 3, 5]]
-    for axes, (column, title) in zip(panels, _PANELS.items(), strict=True):
+    shown = {column: title for column, title in _PANELS.items() if (rows[column] > 0).any()}
+    figure = Figure(figsize=(PAGE_WIDTH, 2.3 * -(-len(shown) // 2) + 0.6))
+    panels = figure.subplots(-(-len(shown) // 2), 2, sharex=True, squeeze=False).ravel()
+    for axes in panels[len(shown) :]:
+        axes.remove()
+    for axes, (column, title) in zip(panels, shown.items(), strict=False):
         _draw_column(axes, rows, column)
-        axes.set_title(title)
-        axes.set_ylabel("rate (dimensionless)" if column == "learning_rate" else "loss (units of the card)")
-    for axes in (panels[1], panels[3], panels[4]):
+        axes.set_title(title, loc="left")
+        axes.set_ylabel("rate" if column == "learning_rate" else "loss")
+    for axes in panels[max(len(shown) - 2, 0) : len(shown)]:
         axes.set_xlabel("training step")
-    legend.set_axis_off()
-    handles = [
-        Line2D([], [], color=SKY_BLUE, linewidth=0.8, label=f"one run ({runs} in all)"),
-        Line2D([], [], color=BLACK, linewidth=1.6, label=f"median of {counted(runs, 'run')}"),
-    ]
-    legend.legend(handles=handles, loc="center")
+        axes.tick_params(labelbottom=True)
+    if runs > 1:
+        handles = [
+            Line2D([], [], color=SKY_BLUE, linewidth=0.8, label=f"one run ({runs} in all)"),
+            Line2D([], [], color=BLACK, linewidth=1.6, label=f"median of {counted(runs, 'run')}"),
+        ]
+        figure.legend(handles=handles, loc="outside lower center", ncols=2)
     return figure
 
 
 def _draw_column(axes: Axes, rows: pd.DataFrame, column: str) -> None:
     measured = rows[rows[column] > 0]
-    if measured.empty:
-        say(axes, "not recorded")
-        return
     table = measured.pivot_table(index="step", columns="run", values=column)
     for run in table:
         course = table[run].dropna()

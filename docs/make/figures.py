@@ -1,0 +1,107 @@
+"""Read the figures that pages quote from the tables of results: `python docs/make/figures.py [RESULTS]`.
+
+`docs/figures.json` is the one place where a measured figure stands. Pages name it as
+`{{ figures.archetype3d.certified }}`; README.md, which no program fills in, has it between the marks
+`<!--=archetype3d.certified-->` and `<!--/-->`, and this script writes it there. Figures whose tables are not
+among the results stay as they were measured before, and the script says so.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pandas as pd
+
+ROOT = Path(__file__).parents[2]
+FIGURES = ROOT / "docs" / "figures.json"
+README = ROOT / "README.md"
+MARK = re.compile(r"<!--=([\w.]+)-->(.*?)<!--/-->")
+SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+Found = dict[str, str]
+
+
+def power(value: float) -> str:
+    """A number with two digits and a power of ten, as pages write it."""
+    digits, exponent = f"{value:.1e}".split("e")
+    return f"{digits}·10{str(int(exponent)).translate(SUPERSCRIPTS)}"
+
+
+def archetype3d(tables: Path) -> Found:
+    """The 50 runs of `make statistics`."""
+    scores = pd.read_parquet(tables / "rrmse.parquet")
+    errors = pd.read_parquet(tables / "prediction.parquet")
+    coefficients = pd.read_parquet(tables / "coefficients.parquet")
+    found: Found = {}
+    for method, prefix in (("refined", ""), ("regression", "regression_")):
+        of = scores[scores["method"] == method]
+        found[f"{prefix}certified"] = f"{int(of['certified'].sum())} of {len(of)}"
+        found[f"{prefix}right_terms"] = f"{int(of['support_correct'].fillna(False).sum())} of {len(of)}"
+        found[f"{prefix}rrmse_mean"] = power(of["rrmse"].mean())
+        found[f"{prefix}rrmse_worst"] = power(of["rrmse"].max())
+        predicted = errors.loc[errors["method"] == method, "error"]
+        found[f"{prefix}prediction_mean"] = power(predicted.mean())
+        found[f"{prefix}prediction_median"] = power(predicted.median())
+    terms = coefficients[(coefficients["method"] == "refined") & (coefficients["component"] == "U")]
+    found["coefficients_worst"] = power((terms["estimate"] - terms["exact"]).abs().max())
+    refined = scores[scores["method"] == "refined"]
+    found["network_error"] = f"{refined['network_error'].mean():.2f}"
+    return found | {"runs": str(len(refined))}
+
+
+def proof(tables: Path) -> Found:
+    """Concealed cases: what was said of them."""
+    scores = pd.read_parquet(tables / "score.parquet")
+    quiet = scores[scores["kind"].isin(["null", "shift"])]
+    strong = scores[(scores["kind"] == "mechanism") & (scores["oracle_delta_chi2"] >= 100)]
+    return {
+        "cases": str(len(scores)),
+        "quiet": str(len(quiet)),
+        "false_alarms": str(int(quiet["false_alarm"].sum())),
+        "knowable": str(len(strong)),
+        "named": str(int(strong["truth_in_class"].sum())),
+    }
+
+
+SOURCES: dict[str, tuple[str, Callable[[Path], Found], str]] = {
+    "archetype3d": ("archetype3d/tables", archetype3d, "make statistics"),
+    "proof": ("proof/proof/tables", proof, "snakemake --cores 2 proof"),
+    "proof_full": ("proof/proof_full/tables", proof, "snakemake --cores 2 proof_full"),
+}
+
+
+def values() -> dict[str, str]:
+    """Every figure by its name."""
+    known = json.loads(FIGURES.read_text(encoding="utf-8"))
+    return {f"{group}.{name}": one["value"] for group, of in known.items() for name, one in of.items()}
+
+
+def filled(text: str, known: dict[str, str]) -> str:
+    """A text with the figures between its marks."""
+    return MARK.sub(lambda found: f"<!--={found[1]}-->{known[found[1]]}<!--/-->", text)
+
+
+def main(results: Path) -> None:
+    """Write what the results give, and fill in the README."""
+    known = json.loads(FIGURES.read_text(encoding="utf-8"))
+    for group, (tables, read, command) in SOURCES.items():
+        try:
+            found = read(results / tables)
+        except FileNotFoundError:
+            print(
+                f"{group}: {results / tables} has no tables; its figures stay as they were", file=sys.stderr
+            )
+            continue
+        known.setdefault(group, {}).update(
+            {name: {"value": value, "command": command} for name, value in found.items()}
+        )
+    FIGURES.write_text(json.dumps(known, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    README.write_text(filled(README.read_text(encoding="utf-8"), values()), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]) if sys.argv[1:] else ROOT / "results")

@@ -1,0 +1,93 @@
+"""What came of a study or a diagnosis, in one sentence, and the exit code that says the same."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+from pathlib import Path
+from typing import Any
+
+
+class Exit(IntEnum):
+    """Codes with which ``siq`` ends.
+
+    ``ANSWERED``: there is an answer; that a formula is not certified is one, too. ``FAULT``: a file cannot be
+    used, something is not installed, or a step stopped. ``USAGE``: the command line was not understood.
+    ``NO_ANSWER``: everything ran, and there is a page that says why, but it has no formula, or the
+    simulation cannot be compared. ``INTERRUPTED``: it was stopped, and goes on where it stopped.
+    """
+
+    ANSWERED = 0
+    FAULT = 1
+    USAGE = 2
+    NO_ANSWER = 3
+    INTERRUPTED = 130
+
+
+@dataclass(frozen=True)
+class Told:
+    """What the terminal says at the end.
+
+    Attributes
+    ----------
+    lines
+        The answer, and what has to be known of it.
+    page
+        The page to read.
+    code
+        How the command ends.
+    """
+
+    lines: tuple[str, ...]
+    page: Path
+    code: Exit
+
+
+CERTIFIED = {
+    "all": "Every formula passed its certificate.",
+    "some": "Some of the formulas passed their certificates; the page says which.",
+    "none": "No formula passed its certificate: read on the page why, before you rely on the numbers.",
+}
+
+
+def answer_of_page(page: Path) -> Told:
+    """What to say of a page, from the file ``answer.json`` beside it.
+
+    Parameters
+    ----------
+    page
+        ``results/NAME/report.html`` or ``results/mismatch/NAME/report.html``.
+    """
+    try:
+        answer = json.loads((page.parent / "answer.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):  # a page of an earlier version: it is there, and that is all we know
+        return Told((), page, Exit.ANSWERED)
+    return _of_diagnosis(answer, page) if "verdict" in answer else _of_study(answer, page)
+
+
+def _of_study(answer: Mapping[str, Any], page: Path) -> Told:
+    sentence = str(answer["sentence"])
+    if not answer["formulas"]:
+        why = "No formula was found; the page says at which step, and what to do."
+        return Told((sentence, why) if sentence else (why,), page, Exit.NO_ANSWER)
+    lines = [sentence] if sentence else []
+    if answer["runs"] == 1 and answer["certified"] == "all":
+        lines.append("The formula passed its certificate.")
+    else:
+        lines.append(CERTIFIED[answer["certified"]])
+    if answer["failed"]:
+        lines.append(f"{answer['failed']} of {answer['runs']} runs failed at some step.")
+    return Told(tuple(lines), page, Exit.ANSWERED)
+
+
+def _of_diagnosis(answer: Mapping[str, Any], page: Path) -> Told:
+    code = Exit.ANSWERED if answer.get("compared", True) else Exit.NO_ANSWER
+    lines = [str(answer["sentence"])]
+    before, after = answer.get("held_out_before"), answer.get("held_out_after")
+    if before is not None and after is not None and before != after:
+        lines.append(
+            f"On recordings held out its error is {before:.2g} of their spread, and {after:.2g} with that."
+        )
+    return Told(tuple(lines), page, code)

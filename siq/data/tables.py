@@ -1,0 +1,207 @@
+"""A table of recordings, from cells to checked numbers: what is read, what is put right, what is refused?"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from siq.data.cells import CellFault, agree_on_unit, parse_labels, parse_numbers
+from siq.data.checks import check_times
+from siq.data.clock_times import seconds_of_clock
+from siq.data.folders import files_of
+from siq.data.formats import ColumnFile, open_columns
+from siq.data.layout import layout_of
+from siq.data.repairs import Rows, put_in_order, trim
+from siq.errors import InputError
+
+
+class CheckedTable(NamedTuple):
+    """What `siq.data.recordings.Recordings` is made of, by the same names."""
+
+    names: tuple[str, ...]
+    units: tuple[str | None, ...]
+    labels: tuple[str, ...]
+    recording: np.ndarray
+    t: np.ndarray
+    values: np.ndarray
+    time_unit: str | None
+    headings: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+def read_tables(
+    path: str | Path, *, columns: Sequence[str] | None, units: Mapping[str, str] | None
+) -> CheckedTable:
+    """Read a file of recordings, or a folder that holds one file per recording.
+
+    See `siq.data.recordings.read_recordings`.
+    """
+    if not Path(path).is_dir():
+        return checked_table(str(path), open_columns(path), columns, units)
+    files = files_of(Path(path))
+    tables = [checked_table(str(file), open_columns(file), columns, units) for file in files]
+    return _joined(files, tables, str(path))
+
+
+def checked_table(
+    file: str, source: ColumnFile, columns: Sequence[str] | None, units: Mapping[str, str] | None
+) -> CheckedTable:
+    """Check a table that has been opened.
+
+    Parameters
+    ----------
+    file
+        What messages call it.
+    source
+        Its columns.
+    columns, units
+        See `siq.data.recordings.read_recordings`.
+
+    Raises
+    ------
+    InputError
+        For the first thing that cannot be used.
+    """
+    layout = layout_of(file, source, columns)
+    used = [layout.time, *layout.states]
+    cells = source.load([*([] if layout.recording is None else [layout.recording]), *used])
+    labels_of_rows = cells.pop(0) if layout.recording is not None else None
+    if len(cells[0]) == 0:
+        raise InputError(file, "", "the table has no rows", "write at least two samples of one recording")
+    called = [source.headings[place].strip() if place == layout.time else layout.titles[index - 1]
+              for index, place in enumerate(used)]  # fmt: skip
+    names = ["t", *layout.names]
+    numbers = np.empty((len(used), len(cells[0])))
+    found_units: list[str | None] = []
+    faults: list[CellFault] = []
+    notes = list(layout.notes)
+    for index, (name, place) in enumerate(zip(names, used, strict=True)):
+        clock = seconds_of_clock(file, called[index], cells[index]) if name == "t" else None
+        cell_unit: str | None = "s"
+        if clock is not None:
+            numbers[index] = clock[0]
+            notes.append(f"the times were turned into seconds since the first, {clock[1]}")
+        else:
+            shown = name if name == "t" else called[index]
+            numbers[index], cell_unit, fault = parse_numbers(file, shown, cells[index])
+            faults += [fault] if fault else []
+        stated = {**layout.units[place], "cells": cell_unit}
+        found_units.append(agree_on_unit(file, called[index], stated, (units or {}).get(name)))
+    rows, fault = _grouped(file, labels_of_rows, numbers)
+    faults += [fault] if fault else []
+    _refuse(file, faults)
+    rows = trim(rows, numbers)
+    _refuse_missing(file, numbers, rows, ["t", *called[1:]])
+    rows = put_in_order(rows, numbers, labelled=layout.recording is not None)
+    check_times(file, numbers[0][rows.order], rows.recording, rows.labels, rows.order)
+    return CheckedTable(
+        names=layout.names,
+        units=tuple(found_units[1:]),
+        labels=rows.labels,
+        recording=rows.recording,
+        t=numbers[0][rows.order],
+        values=np.ascontiguousarray(numbers[1:, rows.order].T),
+        time_unit=found_units[0],
+        headings=() if layout.titles == layout.names else layout.titles,
+        notes=(*notes, *rows.notes),
+    )
+
+
+def _grouped(file: str, labels: object, numbers: np.ndarray) -> tuple[Rows, CellFault | None]:
+    """The rows by recording; those without a label and without any number are padding and left out."""
+    blank = np.isnan(numbers).all(axis=0)
+    notes: tuple[str, ...] = ()
+    if labels is None:
+        order = np.flatnonzero(~blank)
+        rows = Rows(order, np.zeros(len(order), dtype=np.int64), ("0",))
+        fault = None
+    else:
+        recording, names, fault = parse_labels(file, labels, blank=blank)
+        order = np.flatnonzero(recording >= 0)
+        order = order[np.argsort(recording[order], kind="stable")]
+        rows = Rows(order, recording[order], names)
+    dropped = numbers.shape[1] - len(rows.order)
+    if dropped:
+        notes = (f"{dropped} empty row{'s were' if dropped > 1 else ' was'} left out",)
+    return Rows(rows.order, rows.recording, rows.labels, notes), fault
+
+
+def _refuse(file: str, faults: Sequence[CellFault]) -> None:
+    if faults:
+        first = min(faults, key=lambda each: each.row)
+        raise InputError(file, f"row {first.row}, column {first.column}", first.fault, first.remedy)
+
+
+def _refuse_missing(file: str, numbers: np.ndarray, rows: Rows, called: Sequence[str]) -> None:
+    missing = np.isnan(numbers[:, rows.order])
+    if not missing.any():
+        return
+    wrong = np.flatnonzero(missing.any(axis=0))
+    row = int(rows.order[wrong].min())
+    column = int(np.argmax(np.isnan(numbers[:, row])))
+    if len(wrong) == len(rows.order) and len(wrong) > 2:
+        raise InputError(
+            file, "", "no row has a value in every column",
+            "interpolate all columns to the same times, or name the states in the study",
+        )  # fmt: skip
+    others = f", as in {len(wrong) - 1} more row{'s' if len(wrong) > 2 else ''}" if len(wrong) > 1 else ""
+    remedy = (
+        "remove the row or write a finite number"
+        if not others
+        else "remove these rows or write finite numbers"
+    )
+    raise InputError(
+        file,
+        f"row {row + 1}, column {called[column]}",
+        f"the value is missing (empty or NaN){others}",
+        remedy,
+    )
+
+
+def _joined(files: Sequence[Path], tables: Sequence[CheckedTable], folder: str) -> CheckedTable:
+    """Tables of one folder as one; the name of a file is that of its recording."""
+    first = tables[0]
+    places = [[0] * 0 for _ in tables]
+    labels: list[str] = []
+    for file, table, order in zip(files, tables, places, strict=True):
+        if set(table.names) != set(first.names):
+            odd = sorted(set(table.names) ^ set(first.names))
+            raise InputError(
+                str(file), "", f"its columns are {', '.join(table.names)}, and those of {files[0].name} are"
+                f" {', '.join(first.names)}",
+                f"give {', '.join(odd)} to all files or to none, or name the states in the study",
+            )  # fmt: skip
+        order += [table.names.index(name) for name in first.names]
+        stem = file.stem
+        if [other.stem for other in files].count(stem) > 1:
+            stem = file.name
+        labels += [stem] if len(table.labels) == 1 else [f"{stem}/{label}" for label in table.labels]
+    names = [file.name for file in files]
+    units = []
+    for index, name in enumerate(first.names):
+        stated = [table.units[order[index]] for table, order in zip(tables, places, strict=True)]
+        units.append(agree_on_unit(folder, name, dict(zip(names, stated, strict=True)), None))
+    stated = [table.time_unit for table in tables]
+    time_unit = agree_on_unit(folder, "t", dict(zip(names, stated, strict=True)), None)
+    counts = np.cumsum([0, *(len(table.labels) for table in tables)])
+    notes = [f"the folder holds {len(files)} files, one recording each" if len(labels) == len(files)
+             else f"the folder holds {len(files)} files with {len(labels)} recordings"]  # fmt: skip
+    for note in dict.fromkeys(note for table in tables for note in table.notes):
+        having = sum(note in table.notes for table in tables)
+        notes.append(note if having == len(tables) else f"in {having} of {len(tables)} files {note}")
+    return CheckedTable(
+        names=first.names,
+        units=tuple(units),
+        labels=tuple(labels),
+        recording=np.concatenate(
+            [table.recording + start for table, start in zip(tables, counts, strict=False)]
+        ),
+        t=np.concatenate([table.t for table in tables]),
+        values=np.concatenate([table.values[:, order] for table, order in zip(tables, places, strict=True)]),
+        time_unit=time_unit,
+        headings=first.headings,
+        notes=tuple(notes),
+    )

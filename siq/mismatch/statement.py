@@ -1,0 +1,249 @@
+"""What a diagnosis states, as objects and as data: `Statement.as_data` is the content of ``verdict.json``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from siq.mismatch.candidates import PROCESS_NOISE
+from siq.mismatch.held_out import HeldOutErrors
+from siq.mismatch.investigation import MismatchVerdict
+from siq.mismatch.location import Location
+
+METRIC = "normalised rms, held-out recordings"
+UNKNOWN_ERRORS = HeldOutErrors(None, None, None, None)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A parameter's value with its standard error, None where it has none, and its unit."""
+
+    estimate: float
+    standard_error: float | None
+    unit: str
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Why a mechanism is believed; None where a test does not apply.
+
+    Attributes
+    ----------
+    delta_chi2, delta_bic
+        What it gains, see `siq.mismatch.trials.TriedMechanism`.
+    p_white, p_cluster
+        Probabilities of as much by chance: if all errors are independent, and whatever errors within a
+        recording have to do with each other.
+    """
+
+    delta_chi2: float | None
+    delta_bic: float | None
+    p_white: float | None
+    p_cluster: float | None
+
+
+Standing = Literal["same", "needless", "less"]
+
+
+@dataclass(frozen=True)
+class Rival:
+    """A mechanism that was fitted in the place of one that was found.
+
+    Attributes
+    ----------
+    name, label
+        As of `StatedMechanism`.
+    delta_chi2
+        What it gains, compared with the same simulation.
+    further_parameters
+        How many more it has than the one that was found.
+    standing
+        ``same``: it explains the recordings as well. ``needless``: it explains as much, with further
+        parameters that gain no more than they would by chance. ``less``: it explains less.
+    """
+
+    name: str
+    label: str
+    delta_chi2: float
+    further_parameters: int
+    standing: Standing
+
+
+@dataclass(frozen=True)
+class StatedMechanism:
+    """A mechanism that is named, or that describes what has no name.
+
+    Attributes
+    ----------
+    name, label
+        Of the dictionary, and told apart from its other forms and places.
+    terms
+        Formula that is added, by equation; see `siq.mismatch.candidates.MechanismCandidate.changes`.
+    parameters
+        Those that it brings.
+    evidence
+        Why it is believed.
+    share_of_excess
+        What all mechanisms together explain of the excess over noise.
+    indistinguishable_from
+        Names of mechanisms that explain the recordings as well; None where it is not named itself.
+    equations
+        States in whose equations it changes something; none for a fault of the sensor.
+    beside
+        Labels of the mechanisms that were in place when it was judged.
+    rivals
+        What else was fitted in its place, the one that gains most first.
+    """
+
+    name: str
+    label: str
+    terms: Mapping[str, str]
+    parameters: Mapping[str, Estimate]
+    evidence: Evidence
+    share_of_excess: float
+    indistinguishable_from: tuple[str, ...] | None = None
+    equations: tuple[str, ...] = ()
+    beside: tuple[str, ...] = ()
+    rivals: tuple[Rival, ...] = ()
+
+
+@dataclass(frozen=True)
+class Description:
+    """What is known of a mismatch that has no name.
+
+    Attributes
+    ----------
+    share_described
+        Share of the excess that the mechanisms in `by` describe.
+    by
+        Mechanisms that explain a part, and are not named.
+    p_residuals_random
+        p-value of the test that what is left is noise: how often noise alone would look as structured.
+    random_forces_admitted
+        Whether the fit needed random forces.
+    too_faint
+        Whether the mechanisms in `by` leave nothing, and are not named since they gain too little.
+    """
+
+    share_described: float
+    by: tuple[StatedMechanism, ...]
+    p_residuals_random: float
+    random_forces_admitted: bool
+    too_faint: bool = False
+
+
+@dataclass(frozen=True)
+class Recalibrated:
+    """A parameter of the simulation before and after the fit, with the standard error."""
+
+    before: float
+    after: float
+    standard_error: float
+
+
+@dataclass(frozen=True)
+class UpperBound:
+    """At most so large (95 %) is a parameter of a mechanism that was not found."""
+
+    upper_bound_95: float
+    unit: str
+    parameter: str
+    label: str
+
+
+@dataclass(frozen=True)
+class NotFitted:
+    """A mechanism of the dictionary that could not be judged, with the reason."""
+
+    mechanism: str
+    label: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Statement:
+    """All that a diagnosis states.
+
+    Attributes
+    ----------
+    verdict
+        One of four.
+    sentence
+        The same as a colleague would say it, with the numbers.
+    mechanisms
+        What is named.
+    description
+        Of a mismatch without a name.
+    location
+        Where the mismatch sits, if there is one.
+    recalibration
+        The simulation's own parameters.
+    errors
+        On held-out recordings.
+    excluded
+        Bounds of what was not found, where nothing is missing.
+    remarks
+        Reservations.
+    not_fitted
+        What could not be judged.
+    words
+        Further sentences by what they are about; see `siq.mismatch.sentences.words_of`.
+    """
+
+    verdict: MismatchVerdict
+    sentence: str
+    mechanisms: tuple[StatedMechanism, ...] = ()
+    description: Description | None = None
+    location: Location | None = None
+    recalibration: Mapping[str, Recalibrated] | None = None
+    errors: HeldOutErrors = UNKNOWN_ERRORS
+    excluded: Mapping[str, UpperBound] | None = None
+    remarks: tuple[str, ...] = ()
+    not_fitted: tuple[NotFitted, ...] = ()
+    words: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+    @property
+    def random_forces(self) -> bool:
+        """Whether random forces are all that is missing."""
+        return [each.name for each in self.mechanisms] == [PROCESS_NOISE]
+
+    def as_data(self) -> dict[str, Any]:
+        """The content of ``verdict.json``; a number that is not finite is null."""
+        data = {
+            "verdict": str(self.verdict),
+            "sentence": self.sentence,
+            "mechanisms": [_mechanism_data(each) for each in self.mechanisms],
+            "description": None
+            if self.description is None
+            else asdict(self.description) | {"by": [_mechanism_data(each) for each in self.description.by]},
+            "location": None if self.location is None else self.location.as_data(),
+            "recalibration": {name: asdict(each) for name, each in (self.recalibration or {}).items()},
+            "fit": {"metric": METRIC, **asdict(self.errors)},
+            "excluded": {label: asdict(each) for label, each in (self.excluded or {}).items()},
+            "remarks": list(self.remarks),
+            "not_fitted": [asdict(each) for each in self.not_fitted],
+            "words": {about: list(lines) for about, lines in self.words.items()},
+        }
+        plain: dict[str, Any] = _plain(data)
+        return plain
+
+
+def _mechanism_data(mechanism: StatedMechanism) -> dict[str, Any]:
+    data = asdict(mechanism)
+    if mechanism.indistinguishable_from is None:
+        del data["indistinguishable_from"]
+    return data
+
+
+def _plain(value: Any) -> Any:
+    """The same as JSON has it."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not np.isfinite(value) else value

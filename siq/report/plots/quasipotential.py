@@ -1,0 +1,345 @@
+"""What does U look like: as a curve of one state, a map of two, a plane of more?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import BoundaryNorm, LinearSegmentedColormap
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import MaxNLocator
+
+from siq.landscape.landscape import Landscape
+from siq.numerics.measured_text import unit_text
+from siq.report.drawn_landscape import DrawnLandscape, drawn
+from siq.report.plots.landscape_curves import power_of_ten, scaled_label
+from siq.report.plots.planes import Plane, View, plane_of
+from siq.report.plots.style import (
+    BLACK,
+    BLUE,
+    GREY,
+    ORANGE,
+    VERMILLION,
+    drawn_in_style,
+    name_label,
+)
+
+if TYPE_CHECKING:
+    from siq.data.recordings import Recordings
+
+WIDTH = 4.5  # inches: on a phone of 400 pixels its letters are 11 pixels high
+LEVELS = 9
+ROOM = 0.3  # of the height of the highest pass: shown above it
+MOST_POINTS = 2500  # recorded ones; more make a fog
+CURVE_POINTS = 801
+# Dark in the wells, light above them: also without colour, and black letters stand on the light part.
+COLOURS = LinearSegmentedColormap.from_list("wells", ["#1B4F8A", "#4F8FC4", "#A3CBE5", "#CFE2EE", "#DFECF4"])
+RIM: dict[str, Any] = {"path_effects": [withStroke(linewidth=2.5, foreground="white")]}
+UPHILL: dict[str, Any] = {
+    "color": VERMILLION, "linewidth": 1.8, "path_effects": [withStroke(linewidth=3.0, foreground="white")],
+}  # fmt: skip
+DOWNHILL: dict[str, Any] = {
+    "color": BLACK, "linewidth": 1.2, "linestyle": (0, (3, 2)),
+    "path_effects": [withStroke(linewidth=2.4, foreground="white")],
+}  # fmt: skip
+WELL: dict[str, Any] = {
+    "marker": "o", "markersize": 7, "markerfacecolor": ORANGE, "markeredgecolor": BLACK, "linestyle": "none",
+}  # fmt: skip
+SADDLE: dict[str, Any] = {
+    "marker": "X", "markersize": 8, "markerfacecolor": "white", "markeredgecolor": BLACK, "linestyle": "none",
+}  # fmt: skip
+RECORDED: dict[str, Any] = {
+    "marker": ".", "markersize": 2.5, "color": "#222222", "alpha": 0.35, "markeredgewidth": 0,
+    "linestyle": "none",
+}  # fmt: skip
+
+
+def plot_quasipotential(
+    landscape: Landscape | DrawnLandscape,
+    *,
+    recordings: Recordings | None = None,
+    states: Sequence[str] | None = None,
+    view: View = "projection",
+    legend: bool = True,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw U with its wells, passes and most probable paths, and the recorded states.
+
+    Main arguments
+    --------------
+    landscape
+        The landscape.
+    recordings
+        What it was found from: their states are drawn as faint points. By default those to which the formulas
+        were fitted.
+
+    Other arguments
+    ---------------
+    states
+        Names of the two states that make the plane, where there are more than two; by default those along
+        which the wells lie apart.
+    view
+        Of three states and more: ``projection`` draws the lowest U that the other states allow, on which
+        wells and passes keep their heights; ``section`` holds the others at the lowest pass.
+    legend
+        Whether to say below the axes what the signs mean.
+    ax
+        Where; by default new axes of pyplot.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        Of one state a curve, with a band of two standard errors where the error of f is known; of more a map.
+        Where U is not known nothing is drawn.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from siq.data.recordings import Recordings
+    >>> t, starts = np.linspace(0, 3, 61), np.random.default_rng(0).uniform(-1.5, 1.5, 60)
+    >>> x = starts / np.sqrt(starts**2 + (1 - starts**2) * np.exp(-2 * t[:, None]))  # dx/dt = x - x³
+    >>> recordings = Recordings.from_arrays(t, x.T[:, :, None], names=["x"])
+    >>> axes = plot_quasipotential(Landscape.from_recordings(recordings), ax=Figure().add_subplot())
+    >>> axes.get_xlabel(), axes.get_ylabel()
+    ('$x$', '$U$ (unit of ε)')
+    """
+    shown = as_drawn(landscape, recordings)
+    axes = new_axes() if ax is None else ax
+    handles = draw_quasipotential(axes, shown, states=states, view=view)
+    if legend:
+        add_legend(axes, handles)
+    return axes
+
+
+@drawn_in_style
+def quasipotential_figure(
+    landscape: DrawnLandscape, *, states: Sequence[str] | None = None, view: View = "projection"
+) -> Figure | None:
+    """The first picture of a page, None where U is known nowhere.
+
+    Parameters
+    ----------
+    landscape
+        What is drawn.
+    states, view
+        As for `plot_quasipotential`.
+    """
+    one = len(landscape.names) == 1
+    figure = Figure(figsize=(WIDTH, 3.6 if one else 4.5))
+    axes = figure.add_subplot()
+    handles = draw_quasipotential(axes, landscape, states=states, view=view)
+    if not any(np.isfinite(_values_in(landscape))):
+        return None
+    figure.legend(handles=handles, loc="outside lower center", ncols=2)
+    return figure
+
+
+def as_drawn(landscape: Landscape | DrawnLandscape, recordings: Recordings | None = None) -> DrawnLandscape:
+    """What is drawn of a landscape, with recorded states where recordings are given."""
+    if isinstance(landscape, DrawnLandscape):
+        return landscape
+    if recordings is None:
+        return drawn(landscape)
+    if recordings.names != landscape.dynamics.states:
+        raise ValueError(
+            f"the recordings have the states {', '.join(recordings.names)}, and the landscape has"
+            f" {', '.join(landscape.dynamics.states)}"
+        )
+    return drawn(landscape, points=recordings.values)
+
+
+def new_axes(**options: Any) -> Axes:
+    """New axes of pyplot, so that a notebook shows them."""
+    from matplotlib import pyplot  # whose state is left alone where axes are given
+
+    axes: Axes = pyplot.subplots(layout="constrained", **options)[1]
+    return axes
+
+
+def add_legend(axes: Axes, handles: Sequence[Any]) -> None:
+    """A legend below the axes, beside nothing that is drawn."""
+    axes.legend(
+        handles=list(handles), loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, frameon=False,
+        fontsize="small",
+    )  # fmt: skip
+
+
+def draw_quasipotential(
+    axes: Axes, landscape: DrawnLandscape, *, states: Sequence[str] | None = None, view: View = "projection"
+) -> list[Any]:
+    """Draw U on axes; what is returned belongs into their legend."""
+    if len(landscape.names) == 1:
+        return _draw_curve(axes, landscape)
+    plane = plane_of(landscape, states=states, view=view)
+    handles = _draw_map(axes, landscape, plane)
+    handles += draw_points(axes, landscape, plane.shown)
+    handles += draw_ways(axes, landscape, plane.shown)
+    handles += draw_equilibria(axes, landscape, plane.shown)
+    name_axes(axes, landscape, plane.shown)
+    if plane.sentence:
+        axes.set_title(plane.sentence[0].upper() + plane.sentence[1:], fontsize="medium", loc="left")
+    return handles
+
+
+def _values_in(landscape: DrawnLandscape) -> np.ndarray:
+    """U at places that are drawn, to see whether it is known at all."""
+    places = [one.position[None] for one in landscape.wells]
+    if landscape.points is not None:
+        places.append(landscape.points[:: max(len(landscape.points) // 500, 1)])
+    return landscape.potential(np.concatenate(places)) if places else np.zeros(0)
+
+
+def highest_shown(landscape: DrawnLandscape, values: np.ndarray) -> float:
+    """U up to which colours differ, or the axis reaches: somewhat above the highest pass."""
+    known = values[np.isfinite(values)]
+    lowest = float(known.min()) if len(known) else 0.0
+    top = landscape.top
+    if top is None or not top > lowest:
+        return float(known.max()) if len(known) else 1.0
+    return top + ROOM * (top - lowest)
+
+
+def energy_axis_label(axis: Any, landscape: DrawnLandscape, largest: float, what: str = "$U$") -> str:
+    """The label of an axis of U: its unit, and a power of ten where numbers are unhandy."""
+    return scaled_label(axis, what, landscape.energy_unit or "unit of ε", largest)
+
+
+def _draw_curve(axes: Axes, landscape: DrawnLandscape) -> list[Any]:
+    x = np.linspace(*landscape.box[0], CURVE_POINTS)
+    values = landscape.potential(x[:, None])
+    handles: list[Any] = []
+    error = landscape.standard_error(x)
+    top = highest_shown(landscape, values)
+    lowest = float(np.nanmin(values)) if np.isfinite(values).any() else 0.0
+    if error is not None and np.nanmax(np.where(values < top, error, 0.0)) > 1e-3 * (top - lowest):
+        axes.fill_between(x, values - 2 * error, values + 2 * error, color=BLUE, alpha=0.25, linewidth=0)
+        handles.append(Patch(color=BLUE, alpha=0.25, label="± 2 standard errors"))
+    axes.plot(x, values, color=BLUE, linewidth=1.8)
+    room = 0.06 * (top - lowest)
+    axes.set_ylim(lowest - (3 if len(handles) else 1) * room, top)
+    axes.set_xlim(*landscape.box[0])
+    if landscape.points is not None and len(landscape.points):
+        thinned = landscape.points[:: max(len(landscape.points) // MOST_POINTS, 1), 0]
+        axes.plot(
+            thinned, np.full(len(thinned), 0.012), transform=axes.get_xaxis_transform(), marker="|",
+            color=GREY,
+            markersize=6, alpha=0.25, linestyle="none", rasterized=True,
+        )  # fmt: skip
+        handles.append(Line2D([], [], linestyle="none", marker="|", color=GREY, label="recorded states"))
+    heights = {place: one.height for place, one in enumerate(landscape.wells)}
+    for way in landscape.ways:
+        if np.isfinite(way.barrier):
+            _draw_depth(
+                axes, landscape.wells[way.start].position[0], way.saddle[0], heights[way.start], way.barrier
+            )
+    marks = [(one, WELL) for one in landscape.wells] + [(one, SADDLE) for one in landscape.saddles]
+    for one, style in marks:
+        height = landscape.potential(one.position[None])[0]
+        height = one.height if np.isnan(height) else height
+        axes.plot(one.position, [height], zorder=4, **style)
+        if one.label:
+            axes.annotate(
+                one.label, (one.position[0], height), xytext=(0, -7), textcoords="offset points", ha="center",
+                va="top", fontweight="bold", zorder=5, **RIM,
+            )  # fmt: skip
+    axes.set_ylim(bottom=lowest - 0.2 * (top - lowest))  # room for the letters
+    handles += _names_of_marks(landscape)
+    name_axes(axes, landscape, (0,))
+    axes.set_ylabel(energy_axis_label(axes.yaxis, landscape, max(abs(top), abs(lowest))))
+    return handles
+
+
+def _draw_depth(axes: Axes, well: float, saddle: float, bottom: float, barrier: float) -> None:
+    axes.plot([well, saddle], [bottom + barrier] * 2, color=GREY, linewidth=0.9, linestyle=(0, (2, 2)))
+    axes.annotate(
+        "", (well, bottom + barrier), xytext=(well, bottom),
+        arrowprops={"arrowstyle": "<->", "color": GREY, "shrinkA": 0, "shrinkB": 0},
+    )  # fmt: skip
+
+
+def _draw_map(axes: Axes, landscape: DrawnLandscape, plane: Plane) -> list[Any]:
+    handles: list[Any] = []
+    values = plane.values.T
+    if np.isfinite(values).any():
+        top, lowest = highest_shown(landscape, values), float(np.nanmin(values))
+        lowest = 0.0 if abs(lowest) < 1e-3 * abs(top - lowest) else lowest
+        top = top if top > lowest else lowest + (abs(lowest) or 1.0)
+        levels = MaxNLocator(LEVELS, steps=[1, 2, 2.5, 5, 10]).tick_values(lowest, top)
+        norm = BoundaryNorm(levels, 256, extend="max")
+        heights = np.maximum(values, levels[0])
+        filled = axes.contourf(
+            plane.x1, plane.x2, heights, levels=levels, norm=norm, cmap=COLOURS, extend="max"
+        )  # fmt: skip
+        axes.contour(plane.x1, plane.x2, heights, levels=levels, colors=BLACK, linewidths=0.35, alpha=0.5)
+        power = power_of_ten(float(np.abs(levels).max()))
+        bar = axes.figure.colorbar(filled, ax=axes, pad=0.02, aspect=25, spacing="proportional")
+        bar.set_ticks(levels[:: 2 if len(levels) > 7 else 1].tolist())
+        bar.minorticks_off()
+        bar.ax.set_yticklabels([f"{one / 10.0**power:.4g}".replace("-", "−") for one in bar.get_ticks()])
+        unit = unit_text(landscape.energy_unit) or "unit of ε"
+        bar.set_label(f"$U$ ($10^{{{power}}}$ {unit})" if power else f"$U$ ({unit})")
+        if np.isnan(values).any():
+            handles.append(Patch(facecolor="white", edgecolor="#B0B0B0", label="white: $U$ not known"))
+    first, second = plane.shown
+    axes.set_xlim(*landscape.box[first])
+    axes.set_ylim(*landscape.box[second])
+    return handles
+
+
+def draw_points(axes: Axes, landscape: DrawnLandscape, shown: tuple[int, int]) -> list[Any]:
+    """Draw some of the recorded states, faintly."""
+    points = landscape.points
+    if points is None or not len(points):
+        return []
+    thinned = points[:: max(len(points) // MOST_POINTS, 1)]
+    # As an image: so many points would make megabytes of vector graphics.
+    axes.plot(*thinned[:, list(shown)].T, rasterized=True, zorder=2, **RECORDED)
+    return [Line2D([], [], label="recorded states", **(RECORDED | {"markersize": 5, "alpha": 0.8}))]
+
+
+def draw_ways(axes: Axes, landscape: DrawnLandscape, shown: tuple[int, int]) -> list[Any]:
+    """Draw the paths: uphill those of least action, downhill those of f without noise."""
+    handles = []
+    for part, style, text in (
+        ("uphill", UPHILL, "most probable way out"), ("downhill", DOWNHILL, "and on, without noise"),
+    ):  # fmt: skip
+        lines = [line for way in landscape.ways if len(line := getattr(way, part))]
+        for line in lines:
+            axes.plot(*line[:, list(shown)].T, zorder=3 if part == "uphill" else 3.1, **style)
+        handles += [Line2D([], [], label=text, **style)] if lines else []
+    return handles
+
+
+def draw_equilibria(axes: Axes, landscape: DrawnLandscape, shown: tuple[int, int]) -> list[Any]:
+    """Draw wells with their letters, and passes."""
+    low, high = landscape.box[list(shown)].T
+    marks = [(one, SADDLE) for one in landscape.saddles] + [(one, WELL) for one in landscape.wells]
+    for one, style in marks:
+        place = one.position[list(shown)]
+        axes.plot(*place, zorder=4, **style)
+        if one.label:
+            upward = 1 if (place[1] - low[1]) < 0.8 * (high[1] - low[1]) else -1
+            axes.annotate(
+                one.label, tuple(place), xytext=(0, 8 * upward), textcoords="offset points", ha="center",
+                va="bottom" if upward > 0 else "top", fontweight="bold", zorder=5, annotation_clip=True,
+                **RIM,
+            )  # fmt: skip
+    return _names_of_marks(landscape)
+
+
+def _names_of_marks(landscape: DrawnLandscape) -> list[Any]:
+    handles = [Line2D([], [], label="stable state", **WELL)] if landscape.wells else []
+    return handles + ([Line2D([], [], label="saddle", **SADDLE)] if landscape.saddles else [])
+
+
+def name_axes(axes: Axes, landscape: DrawnLandscape, shown: Sequence[int]) -> None:
+    """Names and units of states at the axes, with a power of ten where numbers are unhandy."""
+    for axis, place in zip((axes.xaxis, axes.yaxis), shown, strict=False):
+        largest = float(np.abs(landscape.box[place]).max())
+        label = scaled_label(axis, f"${name_label(landscape.names[place])}$", landscape.units[place], largest)
+        axis.set_label_text(label)

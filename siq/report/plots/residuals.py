@@ -1,0 +1,191 @@
+"""What does f leave of the recorded increments, and is that more than noise?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from siq.data.recordings import Recordings, snapshot_pairs
+from siq.dynamics.dynamics import Dynamics
+from siq.dynamics.simulation import runge_kutta_step
+from siq.identify.identified_field import NOISE_FREE
+from siq.landscape.landscape import Landscape
+from siq.report.plots.diagnosis import draw_errors
+from siq.report.plots.landscape_curves import scaled_label
+from siq.report.plots.quasipotential import add_legend, new_axes
+from siq.report.plots.style import BLUE, COLUMN_WIDTH, GREY, drawn_in_style, magnitude_label, name_label
+
+if TYPE_CHECKING:
+    from siq.mismatch.diagnosis import Diagnosis
+
+BINS = 24
+FEWEST = 8  # increments in a bin: a mean of fewer has no error worth the name
+PAIRS = 60_000  # drawn from; more would only take longer
+ACCURACY = 0.01  # of an integrator's step, times the norm of the Jacobian
+
+
+@dataclass(frozen=True)
+class BinnedResiduals:
+    """What f leaves of one state's increments, per time, in bins along that state.
+
+    Attributes
+    ----------
+    at, mean, standard_error
+        Of each bin: its middle, the mean of what is left, and the standard error of that mean.
+    share
+        Root mean square of what is left, as a share of that of the increments.
+    """
+
+    at: np.ndarray
+    mean: np.ndarray
+    standard_error: np.ndarray
+    share: float
+
+
+def plot_residuals(
+    found: Landscape | Diagnosis,
+    recordings: Recordings | None = None,
+    *,
+    state: str | None = None,
+    legend: bool = True,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw what a vector field leaves of the recordings: noise about zero, if nothing is missing.
+
+    Main arguments
+    --------------
+    found
+        A landscape; or a diagnosis, of which the errors on the held-out recordings are drawn.
+    recordings
+        Of a landscape: what its f is held against, mostly what it was identified from.
+
+    Other arguments
+    ---------------
+    state
+        Which state is shown, or which output of a diagnosis; by default the first.
+    legend
+        Whether to say below the axes what is drawn.
+    ax
+        Where; by default new axes of pyplot.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        Of a landscape: recorded increment minus the one that f predicts, per time, as means over bins of the
+        state, with the band in which noise alone leaves 95 % of them. Of a diagnosis: simulation minus
+        recording in the course of time.
+
+    Raises
+    ------
+    ValueError
+        When the recordings of a landscape are missing or have other states, or the state is unknown.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> t, starts = np.linspace(0, 3, 61), np.random.default_rng(0).uniform(-1.5, 1.5, 60)
+    >>> x = starts / np.sqrt(starts**2 + (1 - starts**2) * np.exp(-2 * t[:, None]))  # dx/dt = x - x³
+    >>> recordings = Recordings.from_arrays(t, x.T[:, :, None], names=["x"])
+    >>> axes = plot_residuals(Landscape.from_recordings(recordings), recordings, ax=Figure().add_subplot())
+    >>> axes.get_xlabel()
+    '$x$'
+    """
+    if not isinstance(found, Landscape):
+        axes = new_axes() if ax is None else ax
+        handles = draw_errors(axes, found, output=state)
+        if legend:
+            add_legend(axes, handles)
+        return axes
+    dynamics = found.dynamics
+    if recordings is None or recordings.names != dynamics.states:
+        have = "none are given" if recordings is None else f"these have {', '.join(recordings.names)}"
+        raise ValueError(f"give recordings of {', '.join(dynamics.states)}; {have}")
+    if state is not None and state not in dynamics.states:
+        raise ValueError(f"there is no state {state}; name one of {', '.join(dynamics.states)}")
+    place = 0 if state is None else dynamics.states.index(state)
+    axes = new_axes() if ax is None else ax
+    time_unit = recordings.time_unit or dynamics.time_unit
+    handles = _draw(axes, binned_residuals(dynamics, recordings, place), dynamics.states[place],
+                    (dynamics.units[place], time_unit))  # fmt: skip
+    if legend:
+        add_legend(axes, handles)
+    return axes
+
+
+@drawn_in_style
+def residuals_figure(
+    dynamics: Dynamics, recordings: Recordings, *, units: Sequence[str], time_unit: str = "1"
+) -> Figure:
+    """The figure of a page: what f leaves of the recorded increments, a panel for each state."""
+    figure = Figure(figsize=(COLUMN_WIDTH, 2.3 * len(dynamics.states) + 0.5))
+    for place, axes in enumerate(figure.subplots(len(dynamics.states), squeeze=False)[:, 0]):
+        binned = binned_residuals(dynamics, recordings, place)
+        handles = _draw(axes, binned, dynamics.states[place], (units[place], time_unit))
+    figure.legend(handles=handles, loc="outside lower center", ncols=1)
+    return figure
+
+
+def rate_unit(unit: str, time_unit: str) -> str:
+    """The unit of a state per time, empty where both are plain numbers."""
+    plain, timeless = unit in ("", "1"), time_unit in ("", "1")
+    if timeless:
+        return "" if plain else f"{unit} per time"
+    return f"1/{time_unit}" if plain else f"{unit}/{time_unit}"
+
+
+def binned_residuals(dynamics: Dynamics, recordings: Recordings, place: int) -> BinnedResiduals:
+    """What f leaves of the increments of one state, in bins along it."""
+    pairs = snapshot_pairs(recordings)
+    some = slice(None, None, max(len(pairs.h) // PAIRS, 1))
+    x0, xh, h = pairs.x0[some], pairs.xh[some], pairs.h[some]
+    width = np.where((span := np.ptp(x0, axis=0)) > 0, span, 1.0)
+    jacobian = dynamics.jacobian(x0) * width / width[:, None]
+    rate = float(np.quantile(np.linalg.norm(jacobian, axis=(1, 2)), 0.99))
+    steps = int(np.clip(np.ceil(h.max() * rate / ACCURACY), 1, 200))
+    x = np.ascontiguousarray(x0.T)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for _ in range(steps):
+            x = runge_kutta_step(dynamics.drift_of_components, x, h / steps)
+    left, along = (xh[:, place] - x[place]) / h, x0[:, place]
+    known = np.isfinite(left)
+    left, along = left[known], along[known]
+    low, high = float(along.min()), float(along.max())
+    which = np.minimum((BINS * (along - low) / ((high - low) or 1.0)).astype(int), BINS - 1)
+    rows = [which == one for one in np.unique(which) if (which == one).sum() >= FEWEST]
+    rows = rows or [np.ones(len(along), dtype=bool)]
+    return BinnedResiduals(
+        np.array([along[one].mean() for one in rows]),
+        np.array([left[one].mean() for one in rows]),
+        np.array([left[one].std(ddof=1) / np.sqrt(one.sum()) for one in rows]),
+        float(np.sqrt(np.mean(left**2) / np.mean((xh - x0)[:, place] ** 2 / h**2))),
+    )
+
+
+def _draw(axes: Axes, binned: BinnedResiduals, name: str, units: tuple[str, str]) -> list[Any]:
+    """Draw residuals of a state on axes, with the units of the state and of time."""
+    axes.fill_between(
+        binned.at, -2 * binned.standard_error, 2 * binned.standard_error, color=GREY, alpha=0.3, linewidth=0
+    )
+    axes.axhline(0.0, color=GREY, linewidth=0.8)
+    axes.plot(binned.at, binned.mean, marker="o", markersize=4, linestyle="none", color=BLUE)
+    largest = float(np.abs(binned.at).max())
+    axes.set_xlabel(scaled_label(axes.xaxis, f"${name_label(name)}$", units[0], largest))
+    largest = max(abs(limit) for limit in axes.get_ylim())
+    what = f"left of d${name_label(name)}$/d$t$"
+    axes.set_ylabel(scaled_label(axes.yaxis, what, rate_unit(*units), largest))
+    within = int((np.abs(binned.mean) <= 2 * binned.standard_error).sum())
+    title = f"{within} of {len(binned.at)} bins within the band"
+    if binned.share < NOISE_FREE:  # rounding and the integrator, of which no band is the measure
+        title = f"no noise: {magnitude_label(binned.share, digits=1)} of the increments is left"
+    axes.set_title(title, loc="left", fontsize="medium")
+    return [
+        Line2D([], [], color=BLUE, marker="o", linestyle="none", label="mean of a bin"),
+        Patch(color=GREY, alpha=0.3, label="noise alone: ± 2 standard errors"),
+    ]

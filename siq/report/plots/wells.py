@@ -1,0 +1,279 @@
+"""Which states belong to which well, and how high must the most probable way out climb?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+
+from siq.landscape.landscape import Landscape
+from siq.numerics.measured_text import unit_text
+from siq.potential.well import Well
+from siq.report.drawn_landscape import DrawnLandscape, DrawnWay
+from siq.report.plots.planes import POINTS, chosen_states, in_blocks
+from siq.report.plots.quasipotential import (
+    CURVE_POINTS,
+    MOST_POINTS,
+    SADDLE,
+    add_legend,
+    as_drawn,
+    draw_equilibria,
+    energy_axis_label,
+    highest_shown,
+    name_axes,
+    new_axes,
+)
+from siq.report.plots.style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY_BLUE, VERMILLION
+
+if TYPE_CHECKING:
+    from siq.data.recordings import Recordings
+
+COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY_BLUE)
+LINE_STYLES = ("-", "--", "-.", ":")
+MARKERS = ("o", "s", "^", "D", "v", "P")
+DARK = {"fontweight": "bold"}
+
+
+def plot_wells(
+    landscape: Landscape | DrawnLandscape,
+    *,
+    recordings: Recordings | None = None,
+    states: Sequence[str] | None = None,
+    legend: bool = True,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw which recorded states belong to which well, and how far each well reaches.
+
+    Main arguments
+    --------------
+    landscape
+        The landscape.
+    recordings
+        What it was found from; by default the states to which its formulas were fitted are drawn.
+
+    Other arguments
+    ---------------
+    states
+        Names of two states that make the plane, where there are more than two.
+    legend
+        Whether to say below the axes what the colours mean.
+    ax
+        Where; by default new axes of pyplot.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        A colour for each well. Of one state its curve of U; of two and more its states, and a line around
+        those that lie below its lowest pass. A state is the well's whose formula holds there and gives the
+        lowest U; one where no formula holds is grey.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from siq.data.recordings import Recordings
+    >>> t, starts = np.linspace(0, 3, 61), np.random.default_rng(0).uniform(-1.5, 1.5, 60)
+    >>> x = starts / np.sqrt(starts**2 + (1 - starts**2) * np.exp(-2 * t[:, None]))  # dx/dt = x - x³
+    >>> recordings = Recordings.from_arrays(t, x.T[:, :, None], names=["x"])
+    >>> axes = plot_wells(Landscape.from_recordings(recordings), ax=Figure().add_subplot())
+    >>> [text.get_text() for text in axes.get_legend().get_texts()]
+    ['well A', 'well B', 'saddle']
+    """
+    shown = as_drawn(landscape, recordings)
+    axes = new_axes() if ax is None else ax
+    known = [(place, well) for place, well in enumerate(shown.formulas) if well is not None]
+    handles = [
+        Line2D(
+            [],
+            [],
+            color=_colour(place),
+            marker=MARKERS[place % len(MARKERS)],
+            label=f"well {shown.wells[place].label}",
+        )
+        for place, _ in known
+    ]
+    if len(shown.names) == 1:
+        _draw_curves(axes, shown, known)
+        handles.append(Line2D([], [], label="saddle", **SADDLE))
+    else:
+        plane = chosen_states(shown, states)
+        handles += _draw_states(axes, shown, known, plane)
+        handles += [one for one in draw_equilibria(axes, shown, plane) if one.get_label() == "saddle"]
+        name_axes(axes, shown, plane)
+        axes.set_xlim(*shown.box[plane[0]])
+        axes.set_ylim(*shown.box[plane[1]])
+    if legend:
+        add_legend(axes, handles)
+    return axes
+
+
+def plot_paths(landscape: Landscape | DrawnLandscape, *, legend: bool = True, ax: Axes | None = None) -> Axes:
+    """Draw U along the most probable way out of each well, over its pass, and down into the next.
+
+    Parameters
+    ----------
+    landscape
+        The landscape, of any number of states.
+    legend
+        Whether to name the ways below the axes.
+    ax
+        Where; by default new axes of pyplot.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        U against the distance from the pass along the way. Of two wells the one that comes first in the
+        tables is on the left, so that a way and the way back lie on one another where they are the same.
+        Where the states have different units the distance is a share of the region that is shown.
+
+    Raises
+    ------
+    ValueError
+        When no way out of any well is known.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from siq.data.recordings import Recordings
+    >>> t, starts = np.linspace(0, 3, 61), np.random.default_rng(0).uniform(-1.5, 1.5, 60)
+    >>> x = starts / np.sqrt(starts**2 + (1 - starts**2) * np.exp(-2 * t[:, None]))  # dx/dt = x - x³
+    >>> recordings = Recordings.from_arrays(t, x.T[:, :, None], names=["x"])
+    >>> axes = plot_paths(Landscape.from_recordings(recordings), ax=Figure().add_subplot())
+    >>> [line.get_label() for line in axes.lines][:2]
+    ['A to B', 'B to A']
+    """
+    shown = as_drawn(landscape)
+    ways = [way for way in shown.ways if len(way.uphill)]
+    if not ways:
+        raise ValueError("no way out of any well is known: there is no path to draw")
+    axes = new_axes() if ax is None else ax
+    one_unit = len(set(shown.units)) == 1
+    scale = np.ones(len(shown.names)) if one_unit else np.ptp(shown.box, axis=1)
+    for place, way in enumerate(ways):
+        along, values = _profile(shown, way, scale)
+        end = "outside" if way.end is None else shown.wells[way.end].label
+        axes.plot(
+            along, values, color=_colour(place), linestyle=LINE_STYLES[place % len(LINE_STYLES)],
+            linewidth=2.2 - 0.6 * (place % 2), label=f"{shown.wells[way.start].label} to {end}",
+        )  # fmt: skip
+    seen: set[tuple[float, str]] = set()
+    for way in ways:
+        along, _ = _profile(shown, way, scale)
+        mirrored = way.end is not None and way.end < way.start
+        ends = [(along[-1 if mirrored else 0], shown.wells[way.start])]
+        ends += [] if way.end is None else [(along[0 if mirrored else -1], shown.wells[way.end])]
+        for where, well in ends:
+            key = (round(float(where) / max(float(np.ptp(along)), 1e-300), 2), well.label)
+            if key not in seen:
+                axes.annotate(
+                    well.label, (float(where), well.height), xytext=(0, -5), textcoords="offset points",
+                    ha="center", va="top", **DARK,
+                )  # fmt: skip
+            seen.add(key)
+    axes.axvline(0.0, color=GREY, linewidth=0.8, linestyle=(0, (2, 2)), zorder=0)
+    axes.margins(y=0.15)
+    largest = max(abs(limit) for limit in axes.get_ylim())
+    axes.set_ylabel(energy_axis_label(axes.yaxis, shown, largest, "$U$ along the way"))
+    unit = shown.units[0] if one_unit else ""
+    what = "distance from the saddle" if one_unit else "distance from the saddle / size of the region"
+    axes.set_xlabel(f"{what} ({unit_text(unit)})" if unit not in ("", "1") else what)
+    if legend:
+        add_legend(axes, axes.get_legend_handles_labels()[0])
+    return axes
+
+
+def _profile(landscape: DrawnLandscape, way: DrawnWay, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distance along a way, zero at the pass, and U there: by the action uphill, by the formulas downhill."""
+    up, down = way.uphill, way.downhill[1:]
+    points = np.concatenate([up, down])
+    steps = np.linalg.norm(np.diff(points / scale, axis=0), axis=1)
+    along = np.concatenate([[0.0], np.cumsum(steps)])
+    along = along - along[len(up) - 1]
+    values = landscape.potential(points)
+    bottom = landscape.wells[way.start].height
+    values[0] = bottom if np.isfinite(bottom) else values[0]
+    if np.isfinite(way.barrier) and np.isfinite(bottom):
+        values[len(up) - 1] = bottom + way.barrier
+    known = np.isfinite(values)
+    values = np.interp(along, along[known], values[known]) if known.any() else values
+    mirrored = way.end is not None and way.end < way.start
+    return (-along[::-1], values[::-1]) if mirrored else (along, values)
+
+
+def _colour(place: int) -> str:
+    return COLOURS[place % len(COLOURS)]
+
+
+def _draw_curves(axes: Axes, landscape: DrawnLandscape, known: Sequence[tuple[int, Well]]) -> None:
+    x = np.linspace(*landscape.box[0], CURVE_POINTS)
+    heights = [one.height if landscape.matched else 0.0 for one in landscape.wells]
+    every = [heights[place] + 2 * well.known_values(x[:, None]) for place, well in known]
+    top = highest_shown(landscape, np.concatenate(every) if every else np.zeros(0))
+    for (place, _), values in zip(known, every, strict=True):
+        shade = np.where(values < top, values, np.nan)
+        axes.plot(x, shade, color=_colour(place), linewidth=2.0)
+        axes.fill_between(x, shade, top, color=_colour(place), alpha=0.12, linewidth=0)
+        well = landscape.wells[place]
+        axes.plot(
+            well.position, [heights[place]], marker=MARKERS[place % len(MARKERS)], color=_colour(place),
+            markeredgecolor=BLACK, linestyle="none",
+        )  # fmt: skip
+        axes.annotate(
+            well.label, (well.position[0], heights[place]), xytext=(0, -8), textcoords="offset points",
+            ha="center", va="top", **DARK,
+        )  # fmt: skip
+    for one in landscape.saddles:
+        axes.plot(one.position, [one.height], **SADDLE)
+    axes.margins(y=0.15)
+    name_axes(axes, landscape, (0,))
+    axes.set_ylabel(energy_axis_label(axes.yaxis, landscape, abs(top)))
+
+
+def _draw_states(
+    axes: Axes, landscape: DrawnLandscape, known: Sequence[tuple[int, Well]], plane: tuple[int, int]
+) -> list[Any]:
+    points = landscape.points
+    points = np.zeros((0, len(landscape.names))) if points is None else points
+    points = points[:: max(len(points) // MOST_POINTS, 1)]
+    heights = [one.height if landscape.matched else 0.0 for one in landscape.wells]
+    values = np.full((len(landscape.wells), len(points)), np.inf)
+    for place, well in known:
+        values[place] = np.nan_to_num(heights[place] + 2 * well.known_values(points), nan=np.inf)
+    owner = np.where(np.isfinite(values).any(axis=0), values.argmin(axis=0), -1)
+    handles = []
+    for place in [-1, *(place for place, _ in known)]:
+        rows = owner == place
+        look: dict[str, Any] = (
+            {"color": GREY, "alpha": 0.25} if place < 0 else {"color": _colour(place), "alpha": 0.5}
+        )
+        axes.plot(
+            *points[rows][:, list(plane)].T, linestyle="none", markersize=2.5, markeredgewidth=0,
+            rasterized=True,
+            marker=MARKERS[place % len(MARKERS)] if place >= 0 else ".", **look,
+        )  # fmt: skip
+        if place < 0 and rows.any():
+            handles.append(Line2D([], [], linestyle="none", marker=".", color=GREY, label="no formula holds"))
+    if len(landscape.names) == 2:
+        _draw_rims(axes, landscape, known, heights)
+        handles.append(Line2D([], [], color=GREY, linewidth=1.6, label="rim: height of the lowest saddle"))
+    return handles
+
+
+def _draw_rims(
+    axes: Axes, landscape: DrawnLandscape, known: Sequence[tuple[int, Well]], heights: Sequence[float]
+) -> None:
+    """Around each well the line of U at the height of its lowest pass."""
+    x1, x2 = (np.linspace(*limits, POINTS) for limits in landscape.box)
+    grid = np.stack(np.meshgrid(x1, x2, indexing="ij"), axis=-1).reshape(-1, 2)
+    for place, well in known:
+        barriers = [way.barrier for way in landscape.ways if way.start == place and np.isfinite(way.barrier)]
+        level = min(barriers) if barriers else 2 * well.level
+        values = in_blocks(lambda x, well=well: 2 * well.known_values(x), grid)  # type: ignore[misc]
+        if np.nanmin(values, initial=np.inf) < level:
+            axes.contour(
+                x1, x2, values.reshape(POINTS, POINTS).T, levels=[level], colors=_colour(place),
+                linewidths=1.6,
+                linestyles=LINE_STYLES[place % len(LINE_STYLES)],
+            )  # fmt: skip

@@ -1,0 +1,413 @@
+"""Each file as somebody would bring it: it is read, and what was assumed is said; or one sentence helps."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from siq.data.headings import RESERVED, is_unit, read_heading, usable_name
+from siq.data.inspection import inspect_recordings
+from siq.data.learnable import checked_for_learning
+from siq.data.noise_floor import noise_floors
+from siq.data.quantum import decimals_of, quantum, rounding_error
+from siq.data.recordings import Recordings, read_pairs, read_recordings, write_recordings
+from siq.data.selection import STRETCHES, in_stretches
+from siq.dynamics.cards import check_name
+from siq.dynamics.formulas import CONSTANTS, FUNCTIONS
+from siq.errors import InputError
+
+
+def put(folder: Path, name: str, content: str | bytes) -> Path:
+    path = folder / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+GERMAN = "recording;t (s);bead x (µm)\na;0,0;1,5\na;0,5;1,25\n"
+# One line each, or two: a table to be read down.
+READ: dict[str, tuple[str, str | bytes, tuple[str, ...], list[list[float]], str]] = {
+    # what: (name, content, names, values, what is said of it)
+    "a German Excel": ("a.csv", GERMAN, ("bead_x",), [[1.5], [1.25]], "semicolons, and decimals by a comma"),
+    "latin-1": ("a.csv", GERMAN.encode("latin-1"), ("bead_x",), [[1.5], [1.25]], "Windows-1252"),
+    "a byte order mark": ("a.csv", b"\xef\xbb\xbft,x\r\n0,1\r\n1,2\r\n", ("x",), [[1], [2]], ""),
+    "UTF-16": ("a.csv", "t\tx\n0\t1,5\n1\t2\n".encode("utf-16"), ("x",), [[1.5], [2]], "UTF-16"),
+    "tabs": ("a.txt", "t\tx\n0\t1\n1\t2\n", ("x",), [[1], [2]], "separated by tabs"),
+    "spaces": ("a.dat", "  t (s)   x (mm)\n 0   1.5\n 1  2\n", ("x",), [[1.5], [2]], "separated by spaces"),
+    "a line sep=;": ("a.csv", "sep=;\nt;x\n0;1,5\n1;2\n", ("x",), [[1.5], [2]], "semicolons"),
+    "comments above": ("a.csv", "# a logger, 7\n" * 3000 + "t,x\n0,1\n1,2\n", ("x",), [[1], [2]], ""),
+    "numpy.savetxt": ("a.txt", "# t x y\n0 1 3\n1 2 4\n", ("x", "y"), [[1, 3], [2, 4]], "spaces"),
+    "a line of units": ("a.csv", "Time,X\n[s],[µm]\n0,1\n1,2\n", ("X",), [[1], [2]], "read as the units"),
+    "other words": ("a.csv", "run,Time,x\nA,0,1\nA,1,2\n", ("x",), [[1], [2]], "'run' says which recording"),
+    "a time in ms": ("a.csv", "time_ms,x\n0,1\n1,2\n", ("x",), [[1], [2]], "'time' is the time"),
+    "x(t), lambda, exp": (
+        "a.csv", "t,x(t),lambda,exp\n0,1,3,5\n1,2,4,6\n", ("x", "lambda_", "exp_"), [[1, 3, 5], [2, 4, 6]],
+        "'lambda' is called lambda_ in formulas",
+    ),
+    "a pandas index": (
+        "a.csv", ",t,x\n0,0,1\n1,1,2\n", ("x",), [[1], [2]], "counts the rows and was left out",
+    ),
+    "a second clock": (
+        "a.csv", "t,Time (ms),x\n0,0,1\n1,1000,2\n", ("x",), [[1], [2]], "looks like a second",
+    ),
+    "a temperature T": ("a.csv", "t,x,T\n0,1,3\n1,2,4\n", ("x", "T"), [[1, 3], [2, 4]], ""),
+    "missing ends": ("a.csv", "t,x\n0,\n1,1\n2,2\n3,nan\n", ("x",), [[1], [2]], "2 rows with missing values"),
+    "empty rows": ("a.csv", "recording,t,x\na,0,1\na,1,2\n,,\n,,\n", ("x",), [[1], [2]], "2 empty rows"),
+    "empty columns": ("a.csv", "t,x,\n0,1.5,\n1,2,\n", ("x",), [[1.5], [2]], ""),
+    "dates": (
+        "a.csv", "time,x\n2024-01-01 12:00:00,1\n2024-01-01 12:00:01,2\n", ("x",), [[1], [2]], "seconds",
+    ),
+    "German dates": (
+        "a.csv", "Zeit;x\n31.12.2024 12:00:00;1\n31.12.2024 12:00:01;2\n", ("x",), [[1], [2]], "sec",
+    ),
+    "times of day": (
+        "a.csv", "time,x\n12:00:00,1\n12:00:01,2\n", ("x",), [[1], [2]], "since the first, 12:00:00",
+    ),
+    "rows twice": ("a.csv", "t,x\n0,1\n0,1\n1,2\n", ("x",), [[1], [2]], "one row stood twice"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", READ)
+def test_what_is_meant_clearly_is_read_and_what_was_assumed_is_said(tmp_path: Path, what: str) -> None:
+    name, content, names, values, said = READ[what]
+    read = read_recordings(put(tmp_path, name, content))
+    assert (read.names, read.values.tolist(), read.t[1] - read.t[0]) == (names, values, read.t[1] - read.t[0])
+    assert said in "; ".join(read.notes)
+    assert bool(said) == bool(read.notes)
+
+
+REFUSED: dict[str, tuple[str, str | bytes, str, str]] = {
+    # what: (name, content, fault, remedy)
+    "two meanings of a comma": ("a.csv", "t,x\n0,5,1,25\n1,0,2,5\n", "rows have 4 cells", "decimal points"),
+    "points between thousands": (
+        "a.csv", "t;x\n0;1.234,5\n1;2,0\n", "both a point and a comma", "without marks",
+    ),
+    "two decimal marks": (
+        "a.csv", "t;x\n0;1,5\n1;1.2\n", "with commas ('1,5') and with points", "the same way",
+    ),
+    "no headings": ("a.csv", "0,1\n1,2\n", "where the headings should stand", "such as t,x"),
+    "a missing value": (
+        "a.csv", "t,x\n0,1\n1,\n2,3\n3,\n4,5\n", "missing (empty or NaN), as in 1 more", "remove",
+    ),
+    "no common row": ("a.csv", "t,x,y\n0,1,\n1,,2\n2,3,\n", "no row has a value in every", "interpolate"),
+    "no time": ("a.csv", "x,y\n1,2\n2,3\n", "the column 't' is missing", "the time of every sample"),
+    "two clocks": (
+        "a.csv", "time,Time (ms),x\n0,0,1\n1,9,2\n", "'time' and 'Time (ms)' all look", "call the right",
+    ),
+    "a date of two kinds": ("a.csv", "time,x\n1/2/2024,1\n2/2/2024,2\n", "read in two ways", "2024-12-31"),
+    "a step back": (
+        "a.csv", "t,x\n0,1\n1,2\n2,3\n1.5,2\n3,4\n", "unsorted (1.5 comes after 2.0)", "sort its rows",
+    ),
+    "text": ("a.csv", "t,x,who\n0,1,anna\n1,2,anna\n", "'anna' is no number", "name the states in the study"),
+    "true and false": ("a.csv", "t,x,ok\n0,1,True\n1,2,False\n", "'True' is no number", "remove the column"),
+    "Excel": ("a.xlsx", b"PK\x03\x04....", "it is a spreadsheet", "save the sheet as CSV"),
+    "Excel, renamed": ("a.csv", b"PK\x03\x04....", "it is a spreadsheet", "save the sheet as CSV"),
+    "a binary file": ("a.csv", b"t,x\n\0\0\0", "the file is no text", "as CSV in UTF-8"),
+    "JSON": ("a.json", "{}", "the suffix '.json' is unknown", "use one of .parquet, .csv"),
+    "an array without names": ("a.npy", b"", "the file is empty", "write the recordings again"),
+    "two of a name": ("a.csv", "t,x,x\n0,1,2\n1,2,3\n", "the column stands twice", "rename or remove"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_can_be_meant_in_two_ways_is_refused_in_one_sentence(tmp_path: Path, what: str) -> None:
+    name, content, fault, remedy = REFUSED[what]
+    path = put(tmp_path, name, content)
+    with pytest.raises(InputError) as caught:
+        read_recordings(path)
+    assert fault in caught.value.fault and remedy in caught.value.remedy
+    assert str(caught.value).startswith(str(path)) and str(caught.value).count("\n") == 0
+
+
+def swinging(seed: int = 0, *, count: int = 4, samples: int = 40) -> Recordings:
+    generator = np.random.default_rng(seed)
+    t = np.cumsum(generator.uniform(0.1, 0.2, (count, samples)), axis=1).round(6)
+    values = generator.normal(size=(count, samples, 2)).round(6)
+    made = Recordings.from_arrays(list(t), list(values), names=["x", "y"], units=["µm", None], time_unit="s")
+    return dataclasses.replace(made, labels=tuple(f"r{index}" for index in range(count)))
+
+
+def table(ours: Recordings) -> pd.DataFrame:
+    columns = {"recording": np.array(ours.labels)[ours.recording], "t (s)": ours.t}
+    return pd.DataFrame(columns | {"x (µm)": ours.values[:, 0], "y": ours.values[:, 1]})
+
+
+def padded(frame: pd.DataFrame) -> pd.DataFrame:
+    pieces = []
+    for label, own in frame.groupby("recording", sort=False):
+        lacking = {"recording": label, "t (s)": [-2.0, -1.0], "x (µm)": [np.nan] * 2, "y": [np.nan, 1.0]}
+        pieces += [pd.DataFrame(lacking), own]
+    return pd.concat(pieces)
+
+
+def csv(frame: pd.DataFrame, **options: object) -> bytes:
+    text = io.StringIO()
+    frame.to_csv(text, **({"index": False} | options))  # type: ignore[call-overload]
+    return text.getvalue().encode()
+
+
+SPELLINGS: dict[str, Callable[[pd.DataFrame], bytes]] = {
+    "plain": csv,
+    "decimal commas": lambda frame: csv(frame, sep=";", decimal=","),
+    "tabs": lambda frame: csv(frame, sep="\t"),
+    "tabs and commas": lambda frame: csv(frame, sep="\t", decimal=","),
+    "bars": lambda frame: csv(frame, sep="|"),
+    "BOM and CRLF": lambda frame: b"\xef\xbb\xbf" + csv(frame, lineterminator="\r\n"),
+    "latin-1": lambda frame: csv(frame).decode().encode("latin-1"),
+    "all quoted": lambda frame: csv(frame, quoting=1),
+    "an index": lambda frame: csv(frame, index=True),
+    "a shuffle": lambda frame: csv(frame.sample(frac=1, random_state=1)),
+    "a shuffled index": lambda frame: csv(frame.sample(frac=1, random_state=1), index=True),
+    "padding": lambda frame: csv(padded(frame)),
+    "other names": lambda frame: csv(frame.rename(columns={"recording": "Trial", "t (s)": "Time [s]"})),
+    "numbers with units": lambda frame: csv(
+        frame.assign(x=[f"{value:.6f} µm" for value in frame["x (µm)"]])[["recording", "t (s)", "x", "y"]]
+    ),
+}
+
+
+@pytest.mark.parametrize("spelling", SPELLINGS)
+@pytest.mark.parametrize("seed", range(3))
+def test_a_file_in_any_spelling_gives_the_same_recordings(tmp_path: Path, spelling: str, seed: int) -> None:
+    ours = swinging(seed)
+    read = read_recordings(put(tmp_path, "a.csv", SPELLINGS[spelling](table(ours))))
+    assert (read.names, read.units, read.time_unit) == (ours.names, ours.units, ours.time_unit)
+    order = [read.labels.index(label) for label in ours.labels]
+    for index, own in enumerate(order):
+        np.testing.assert_array_equal(read.t[read.recording == own], ours.t[ours.recording == index])
+        np.testing.assert_array_equal(
+            read.values[read.recording == own], ours.values[ours.recording == index]
+        )
+
+
+def test_names_units_titles_and_notes_survive_a_file_of_ours(tmp_path: Path) -> None:
+    read = read_recordings(put(tmp_path, "a.csv", GERMAN))
+    assert (read.headings, read.titles, read.units) == (("bead x",), ("bead x",), ("µm",))
+    write_recordings(tmp_path / "a.parquet", read)
+    again = read_recordings(tmp_path / "a.parquet")
+    for field in dataclasses.fields(Recordings):
+        np.testing.assert_array_equal(getattr(again, field.name), getattr(read, field.name))
+
+
+def test_states_are_found_by_title_by_name_and_in_other_case(tmp_path: Path) -> None:
+    path = put(tmp_path, "a.csv", "t,Bead X,other\n0,1,3\n1,2,4\n")
+    for name in ("Bead_X", "bead_x"):
+        assert read_recordings(path, columns=[name]).values.tolist() == [[1], [2]]
+    with pytest.raises(InputError, match="did you mean 'Bead X'"):
+        read_recordings(path, columns=["Beed_X"])
+
+
+def test_a_folder_holds_one_recording_in_each_file(tmp_path: Path) -> None:
+    for name, values in (
+        ("monday.csv", "0,1\n1,2\n"),
+        ("tuesday.csv", "0,3\n1,4\n2,5\n"),
+        (".hidden.csv", "x"),
+    ):
+        put(tmp_path, name, f"t [s],x [mm]\n{values}" if name[0] != "." else values)
+    put(tmp_path, "README.txt", "When this was measured")
+    read = read_recordings(tmp_path)
+    assert (read.labels, read.recording.tolist()) == (("monday", "tuesday"), [0, 0, 1, 1, 1])
+    assert (read.units, read.time_unit, read.values.ravel().tolist()) == (("mm",), "s", [1, 2, 3, 4, 5])
+    put(tmp_path, "wednesday.csv", "t [s],x [mm],y\n0,1,2\n1,2,3\n")
+    with pytest.raises(
+        InputError, match=r"wednesday\.csv: its columns are x, y, and those of monday\.csv are x"
+    ):
+        read_recordings(tmp_path)
+    assert read_recordings(tmp_path, columns=["x"]).labels == ("monday", "tuesday", "wednesday")
+    put(tmp_path, "wednesday.csv", "t [ms],x [mm]\n0,1\n1,2\n")
+    with pytest.raises(InputError, match=r"mixed units, s in the monday\.csv but ms"):
+        read_recordings(tmp_path)
+
+
+def test_a_wrong_path_says_where_it_was_looked_for_and_what_is_near(tmp_path: Path) -> None:
+    put(tmp_path, "recordings.csv", "t,x\n0,1\n1,2\n")
+    for wrong in ("recordigns.csv", "recordings.txt", "Recordings.csv"):
+        with pytest.raises(InputError) as caught:
+            read_recordings(tmp_path / wrong)
+        assert str(tmp_path / wrong) in caught.value.fault
+        assert f"did you mean '{tmp_path / 'recordings.csv'}'" in caught.value.remedy
+    with pytest.raises(InputError, match=f"there is no folder '{tmp_path / 'nowhere'}' either"):
+        read_recordings(tmp_path / "nowhere" / "a.csv")
+
+
+def test_where_the_time_starts_over_a_recording_begins_unless_labels_say_otherwise(tmp_path: Path) -> None:
+    rows = "0,1\n1,2\n2,3\n0,4\n1,5\n2,6\n"
+    read = read_recordings(put(tmp_path, "a.csv", f"t,x\n{rows}"))
+    assert read.labels == ("0", "1") and read.recording.tolist() == [0, 0, 0, 1, 1, 1]
+    labelled = "recording,t,x\n" + "".join(f"a,{row}\n" for row in rows.split())
+    with pytest.raises(InputError, match="unsorted"):
+        read_recordings(put(tmp_path, "a.csv", labelled))
+
+
+def test_numpy_files_are_columns_and_never_unpickled(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", t=[0.0, 1.0], x=[1.0, 2.0])
+    np.save(tmp_path / "a.npy", np.array([(0, 1), (1, 2)], dtype=[("t", float), ("x", float)]))
+    for name in ("a.npz", "a.npy"):
+        assert read_recordings(tmp_path / name).values.tolist() == [[1], [2]]
+    np.save(tmp_path / "b.npy", np.eye(2))
+    with pytest.raises(InputError, match="one array without names"):
+        read_recordings(tmp_path / "b.npy")
+    np.save(tmp_path / "c.npy", np.array([{"t": 0}], dtype=object), allow_pickle=True)
+    with pytest.raises(InputError, match="cannot be read as NumPy"):
+        read_recordings(tmp_path / "c.npy")
+
+
+def test_reserved_names_are_those_that_formulas_refuse() -> None:
+    assert {*FUNCTIONS, *CONSTANTS, "recording", "t", "delay"} == RESERVED
+    for title in (
+        "x",
+        "bead x",
+        "lambda",
+        "exp",
+        "2nd",
+        "dx/dt",
+        "ẋ",
+        "µ",
+        "",
+        "класс",
+        "x (raw)",
+        "a-b",
+        "%",
+    ):
+        check_name(usable_name(title))
+
+
+@pytest.mark.parametrize(
+    ("heading", "title", "unit"),
+    [
+        ("x [mm]", "x", "mm"), ("x (mm)", "x", "mm"), ("x / mm", "x", "mm"), ("x in mm", "x", "mm"),
+        ("x, mm", "x", "mm"), ("t_s", "t", "s"), ("Time (ms)", "Time", "ms"), ("x(t)", "x", None),
+        ("x(t) [nm]", "x", "nm"), ("x (raw)", "x (raw)", None), ("dx/dt", "dx/dt", None), ("v", "v", None),
+        ("P (kg m^-3)", "P", "kg m^-3"), ("F (pN/µm²)", "F", "pN/µm²"), ("n (1)", "n", "1"),
+    ],
+)  # fmt: skip
+def test_a_unit_in_brackets_is_one_and_a_word_is_not(heading: str, title: str, unit: str | None) -> None:
+    assert read_heading(heading) == (title, unit)
+
+
+def test_units_are_told_from_words() -> None:
+    assert all(map(is_unit, ["mm", "µm/s", "m/s²", "m s^-2", "kHz", "a.u.", "%", "°C", "1/s", "arb. units"]))
+    assert not any(map(is_unit, ["raw", "left", "x", "bead", "t1", "in phase", ""]))
+
+
+@pytest.mark.parametrize("decimals", [0, 1, 3, 6])
+def test_rounding_is_recognised_and_what_was_not_rounded_is_not(decimals: int) -> None:
+    values = np.random.default_rng(decimals).normal(size=3000) * 10.0 ** (1 - decimals) * 20
+    step = quantum(values.round(decimals))
+    assert step is not None and decimals_of(step) == decimals
+    assert np.std(values.round(decimals) - values) == pytest.approx(rounding_error(step), rel=0.05)
+    assert quantum(values) is None
+    assert quantum(np.zeros(100)) is None
+
+
+def test_the_step_of_a_digitiser_is_recognised() -> None:
+    counts = np.random.default_rng(0).integers(-500, 500, 20_000)
+    step = quantum(0.3 + counts * 0.0048828125 / 3)
+    assert step == pytest.approx(0.0048828125 / 3, rel=1e-6)
+
+
+def noisy(sensor: float, process: float, *, step: float = 0.01, samples: int = 20_000) -> Recordings:
+    generator = np.random.default_rng(7)
+    kicks = generator.normal(size=samples) * np.sqrt(process * step)
+    x = np.zeros(samples)
+    for k in range(1, samples):
+        x[k] = x[k - 1] + step * (x[k - 1] - x[k - 1] ** 3) + kicks[k]
+    x += sensor * generator.normal(size=samples)
+    return Recordings.from_arrays(np.arange(samples) * step, x[:, None] + 1e-3, names=["x"])
+
+
+@pytest.mark.parametrize(("sensor", "process"), [(0.0, 0.1), (0.02, 0.1), (0.02, 0.0), (0.005, 0.5)])
+def test_both_noises_are_estimated_at_a_glance(sensor: float, process: float) -> None:
+    floors = noise_floors(noisy(sensor, process))
+    assert floors is not None
+    found = floors[0]
+    for estimate, error, truth in (
+        (found.sensor, found.sensor_error, sensor), (found.process, found.process_error, process)
+    ):  # fmt: skip
+        assert abs(estimate - truth) <= 4 * max(error, 0.01 * truth)
+        assert (estimate > 0) == (truth > 0) or truth < 3 * error
+
+
+def test_a_motion_without_noise_is_not_taken_for_noise() -> None:
+    for rate in (0.3, 3.0, 20.0):
+        t = np.arange(400) * 0.01
+        x = np.exp(-rate * t)[:, None] * [1.0, 0.5] + np.stack([np.sin(2 * t), np.cos(3 * t)], axis=1)
+        floors = noise_floors(Recordings.from_arrays(t, x, names=["x", "y"]))
+        assert floors is not None
+        assert all(floor.process == floor.sensor == 0 for floor in floors)
+
+
+def test_one_relaxation_is_refused_before_anything_runs_and_one_hopping_record_is_not(tmp_path: Path) -> None:
+    t = np.arange(500) * 0.01
+    text = csv(pd.DataFrame({"recording": "a", "t": t, "x": np.exp(-t)}))
+    path = put(tmp_path, "settling.csv", text)
+    with pytest.raises(
+        InputError, match=r"there is one recording, and it shows no random forces.*many starting"
+    ):
+        read_pairs(path, states=None, units=None, pair_step=None)
+    hopping = noisy(0.0, 0.1)
+    write_recordings(tmp_path / "hopping.parquet", hopping)
+    read, _ = read_pairs(tmp_path / "hopping.parquet", states=None, units=None, pair_step=None)
+    cut = in_stretches(read)
+    assert len(cut.labels) == STRETCHES and "cut into 10 stretches" in cut.notes[-1]
+    np.testing.assert_array_equal(cut.values, read.values)
+    assert in_stretches(cut) is cut
+    settling = read_recordings(path)
+    assert in_stretches(settling) is settling
+
+
+def test_a_column_that_never_changes_is_left_out_or_refused(tmp_path: Path) -> None:
+    path = put(tmp_path, "a.csv", "recording,t,x,T (°C)\na,0,1,20\na,1,2,20\nb,0,3,20\nb,1,4,20\n")
+    read, _ = read_pairs(path, states=None, units=None, pair_step=None)
+    assert read.names == ("x",) and "'T' is 20 in every row and was left out" in read.notes[0]
+    with pytest.raises(InputError, match="column T: it is 20 in every row"):
+        read_pairs(path, states=["x", "T"], units=None, pair_step=None)
+
+
+def test_what_looks_odd_is_said() -> None:
+    t = np.arange(200) * 0.1
+    angle = np.mod(t * 2, 2 * np.pi)
+    turning = Recordings.from_arrays([t, t[:1]], [angle[:, None], angle[:1, None]], names=["phi"])
+    said = checked_for_learning(turning, file="a.csv", chosen=False).notes
+    assert any("'phi' jumps by 2π 6 times" in note for note in said)
+    assert any("a single sample" in note for note in said)
+    swinging_only = Recordings.from_arrays([t, t], np.stack([np.sin(t), np.cos(t)])[..., None], names=["phi"])
+    assert checked_for_learning(swinging_only, file="a.csv", chosen=False).notes == ()
+
+
+def test_recordings_with_longer_steps_that_give_no_pairs_are_named(tmp_path: Path) -> None:
+    fine, coarse = np.arange(50) * 0.1, np.arange(5) * 1.0
+    generator = np.random.default_rng(0)
+    values = [generator.normal(size=(len(t), 1)) for t in (fine, fine, coarse)]
+    write_recordings(
+        tmp_path / "a.parquet", Recordings.from_arrays([fine, fine, coarse], values, names=["x"])
+    )
+    read, _ = read_pairs(tmp_path / "a.parquet", states=None, units=None, pair_step=None)
+    assert "1 of 3 recordings have longer steps than the others" in read.notes[-1]
+
+
+def test_an_inspection_says_what_is_there(tmp_path: Path) -> None:
+    ours = swinging()
+    found = inspect_recordings(put(tmp_path, "a.csv", csv(table(ours).round(2), sep=";", decimal=",")))
+    assert (found.samples.usual, found.pairs > 0, [state.quantum for state in found.states]) == (
+        40,
+        True,
+        [0.01] * 2,
+    )
+    text = found.text()
+    for words in (
+        "4 recordings of 40 samples",
+        "written to 2 decimals, an error of 0.003 µm",
+        "Note: The columns",
+    ):
+        assert words in text
+    hopping = noisy(0.02, 0.1)
+    write_recordings(tmp_path / "b.parquet", hopping)
+    found = inspect_recordings(tmp_path / "b.parquet")
+    assert "Random forces are seen" in found.prospects[0] and "noise of the sensor" in found.prospects[1]
+    assert "unit the time is" in found.prospects[2]
