@@ -78,7 +78,7 @@ def term_text(term: str) -> str:
     >>> term_text("x**2*y"), term_text("1")
     ('x² y', '1')
     """
-    names = {name for name in re.findall(r"[^\W\d]\w*", term)} - {*FUNCTIONS, *CONSTANTS}
+    names = set(re.findall(r"[^\W\d]\w*", term)) - {*FUNCTIONS, *CONSTANTS}
     return formula_text(parse_formula(term, {name: sympy.Symbol(name, real=True) for name in names}))
 
 
