@@ -21,7 +21,7 @@ from siq.landscape.landscape import Landscape
 from siq.landscape.storage import landscape_data
 from siq.potential.symbolic import SymbolicDecomposition
 from siq.potential.well import Well
-from siq.report.landscape_answer import SaidLandscape, well_name
+from siq.report.said_landscape import SaidLandscape, well_name
 
 Potential = Callable[[np.ndarray], np.ndarray]
 """U at points ``(n, d)``, NaN where it is not known: shape ``(n,)``."""

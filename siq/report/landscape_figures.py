@@ -17,10 +17,10 @@ from siq.landscape.reference import ReferenceLandscape
 from siq.landscape.storage import StoredLandscape
 from siq.networks.trained import TrainedNetworks
 from siq.potential.symbolic import SymbolicDecomposition
-from siq.report.landscape_answer import SaidLandscape
 from siq.report.plots.landscape import plot_error_maps
 from siq.report.plots.landscape_curves import plot_degrees, plot_escape
 from siq.report.plots.one_state import plot_error_curves
+from siq.report.said_landscape import SaidLandscape
 from siq.report.settings import LandscapeFiguresSettings
 from siq.steps.outcomes import Method
 from siq.study.published import published_formula

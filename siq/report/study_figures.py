@@ -21,7 +21,6 @@ from siq.networks.trained import TrainedNetworks
 from siq.numerics.randomness import Purpose, generator
 from siq.potential.symbolic import SymbolicDecomposition
 from siq.report.drawn_landscape import DrawnLandscape, drawn_data
-from siq.report.landscape_answer import SaidLandscape
 from siq.report.plots import (
     ComponentFields,
     Dataset,
@@ -36,6 +35,7 @@ from siq.report.plots import (
 from siq.report.plots.quasipotential import quasipotential_figure
 from siq.report.plots.residuals import residuals_figure
 from siq.report.projection import project, project_landscape
+from siq.report.said_landscape import SaidLandscape
 from siq.report.settings import FiguresSettings
 from siq.steps.outcomes import METHODS, Method
 from siq.steps.shown import ModelFiles, Shown

@@ -16,7 +16,6 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
 from siq.numerics.measured_text import unit_text
-from siq.report.landscape_answer import well_name
 from siq.report.plots.style import (
     BLACK,
     BLUE,
@@ -30,6 +29,7 @@ from siq.report.plots.style import (
     drawn_in_style,
     unit_label,
 )
+from siq.report.said_landscape import well_name
 
 COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, BLACK)
 MARKERS = ("o", "s", "^", "D", "v", "P")
