@@ -129,6 +129,8 @@ def quasipotential_figure(
     states, view
         As for `plot_quasipotential`.
     """
+    if not landscape.wells:
+        return None
     one = len(landscape.names) == 1
     figure = Figure(figsize=(WIDTH, 3.6 if one else 4.5))
     axes = figure.add_subplot()
