@@ -210,7 +210,7 @@ def energy_axis_label(axis: Any, landscape: DrawnLandscape, largest: float, what
 
 
 def _draw_curve(axes: Axes, landscape: DrawnLandscape) -> list[Any]:
-    x = np.linspace(*landscape.box[0], CURVE_POINTS)
+    x = landscape.along(0, CURVE_POINTS)
     values = landscape.potential(x[:, None])
     handles: list[Any] = []
     error = landscape.standard_error(x)
@@ -269,7 +269,7 @@ def _draw_map(axes: Axes, landscape: DrawnLandscape, plane: Plane) -> list[Any]:
         top, lowest = highest_shown(landscape, values), float(np.nanmin(values))
         lowest = 0.0 if abs(lowest) < 1e-3 * abs(top - lowest) else lowest
         top = top if top > lowest else lowest + (abs(lowest) or 1.0)
-        levels = MaxNLocator(LEVELS, steps=[1, 2, 2.5, 5, 10]).tick_values(lowest, top)
+        levels = np.asarray(MaxNLocator(LEVELS, steps=[1, 2, 2.5, 5, 10]).tick_values(lowest, top))
         norm = BoundaryNorm(levels, 256, extend="max")
         heights = np.maximum(values, levels[0])
         filled = axes.contourf(

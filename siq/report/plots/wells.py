@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY_BLUE)
 LINE_STYLES = ("-", "--", "-.", ":")
 MARKERS = ("o", "s", "^", "D", "v", "P")
-DARK = {"fontweight": "bold"}
 
 
 def plot_wells(
@@ -169,7 +168,7 @@ def plot_paths(landscape: Landscape | DrawnLandscape, *, legend: bool = True, ax
             if key not in seen:
                 axes.annotate(
                     well.label, (float(where), well.height), xytext=(0, -5), textcoords="offset points",
-                    ha="center", va="top", **DARK,
+                    ha="center", va="top", fontweight="bold",
                 )  # fmt: skip
             seen.add(key)
     axes.axvline(0.0, color=GREY, linewidth=0.8, linestyle=(0, (2, 2)), zorder=0)
@@ -207,7 +206,7 @@ def _colour(place: int) -> str:
 
 
 def _draw_curves(axes: Axes, landscape: DrawnLandscape, known: Sequence[tuple[int, Well]]) -> None:
-    x = np.linspace(*landscape.box[0], CURVE_POINTS)
+    x = landscape.along(0, CURVE_POINTS)
     heights = [one.height if landscape.matched else 0.0 for one in landscape.wells]
     every = [heights[place] + 2 * well.known_values(x[:, None]) for place, well in known]
     top = highest_shown(landscape, np.concatenate(every) if every else np.zeros(0))
@@ -222,7 +221,7 @@ def _draw_curves(axes: Axes, landscape: DrawnLandscape, known: Sequence[tuple[in
         )  # fmt: skip
         axes.annotate(
             well.label, (well.position[0], heights[place]), xytext=(0, -8), textcoords="offset points",
-            ha="center", va="top", **DARK,
+            ha="center", va="top", fontweight="bold",
         )  # fmt: skip
     for one in landscape.saddles:
         axes.plot(one.position, [one.height], **SADDLE)
@@ -265,7 +264,7 @@ def _draw_rims(
     axes: Axes, landscape: DrawnLandscape, known: Sequence[tuple[int, Well]], heights: Sequence[float]
 ) -> None:
     """Around each well the line of U at the height of its lowest pass."""
-    x1, x2 = (np.linspace(*limits, POINTS) for limits in landscape.box)
+    x1, x2 = landscape.along(0, POINTS), landscape.along(1, POINTS)
     grid = np.stack(np.meshgrid(x1, x2, indexing="ij"), axis=-1).reshape(-1, 2)
     for place, well in known:
         barriers = [way.barrier for way in landscape.ways if way.start == place and np.isfinite(way.barrier)]
