@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from siq.data.recordings import Recordings
 
 WIDTH = 4.5  # inches: on a phone of 400 pixels its letters are 11 pixels high
-LEVELS = 9
+LEVELS = 12
 ROOM = 0.3  # of the height of the highest pass: shown above it
 MOST_POINTS = 2500  # recorded ones; more make a fog
 CURVE_POINTS = 801
