@@ -124,7 +124,7 @@ def joined(landscape: DrawnLandscape, heights: list[float]) -> list[Join]:
         for way in landscape.ways
         if way.end is not None and np.isfinite(way.barrier)
     )
-    groups = {well: (well,) for well in range(len(heights))}
+    groups: dict[int, tuple[int, ...]] = {well: (well,) for well in range(len(heights))}
     joins = []
     for height, start, end in passes:
         left, right = groups[start], groups[end]
