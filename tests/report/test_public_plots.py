@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import siq
+from siq.dynamics.simulation import runge_kutta_step
 from siq.landscape.landscape import Landscape, find_landscape
 from siq.landscape.storage import landscape_data
 from siq.landscape.transitions import barrier_standard_error
@@ -208,6 +209,24 @@ def test_residuals_of_the_right_field_lie_within_the_band_and_a_missing_term_bey
     wrong = residuals.binned_residuals(missing, noisy, 0)
     assert (np.abs(wrong.mean) > 2 * wrong.standard_error).mean() > 0.7
     assert np.average(wrong.mean, weights=wrong.standard_error**-2) == pytest.approx(-0.5, abs=0.05)
+
+
+def test_where_rounding_alone_is_left_there_is_no_figure_and_no_band() -> None:
+    known, t = double_well(1), 0.05 * np.arange(41)
+    x = np.random.default_rng(0).uniform(-1, 1, (1, 30))
+    path = [x]
+    for _ in range(40):
+        for _ in range(100):
+            x = runge_kutta_step(known.dynamics.drift_of_components, x, 5e-4)
+        path.append(x)
+    quiet = siq.Recordings.from_arrays(t, np.concatenate(path).T[:, :, None], names=["x"], units=["um"])
+    assert residuals.residuals_figure(known.dynamics, quiet, units=["um"]) is None
+    axes = siq.plot_residuals(landscape(1), quiet, ax=Figure().add_subplot())
+    assert len(axes.collections) == (0 if "no noise" in axes.get_title(loc="left") else 1)
+    shake = 1e-3 * np.random.default_rng(1).normal(size=quiet.values.shape)
+    shaken = replace(quiet, values=quiet.values + shake)
+    figure = residuals.residuals_figure(known.dynamics, shaken, units=["um"], time_unit="s")
+    assert figure is not None and "µm/s" in figure.axes[0].get_ylabel()
 
 
 def test_residuals_carry_the_rate_of_their_state() -> None:
