@@ -130,7 +130,7 @@ def place_text(said: SaidLandscape, well: SaidWell) -> str:
     ]
     if len(set(units)) == 1:
         unit = unit_text(units[0])
-        listed, named = ",\u00a0".join(values), ",\u00a0".join(names)
+        listed, named = ", ".join(values), ",\u00a0".join(names)  # a phone breaks the values, not the names
         return f"({named})\u00a0=\u00a0({listed})" + (f"\u00a0{unit}" if unit else "")
     pairs = zip(names, values, units, strict=True)
     return ", ".join(
@@ -142,6 +142,8 @@ def _rounded(value: float, error: float, *, size: float) -> str:
     """A value to the digits that its error leaves, without the error."""
     if not math.isfinite(error) or error < 1e-4 * size:
         error = 1e-3 * size if size else 1.0
+        if abs(value) < 0.5e-3 * error:  # what rounding left of zero
+            return "0"
     decimals = max(0, -math.floor(math.log10(error))) if error > 0 else 3
     if decimals > 6 or size >= 1e5:
         return value_text(value)

@@ -50,6 +50,7 @@ def test_silverbox_is_cut_at_its_gaps_and_freed_of_offsets(write):
         ("a,b\n1,2\n", "no columns"),
         ('"V1","V2",\n1.0,,\n', "missing"),
     ],
+    ids=["no gaps", "no columns", "missing"],  # the text is long
 )
 def test_other_files_are_refused_in_a_sentence(write, text, part):
     with pytest.raises(InputError, match=part):
