@@ -22,7 +22,11 @@ SHORT = 8  # terms that are read at a glance: so short a formula is shown as it 
 
 
 def formula_rows(
-    found: SymbolicDecomposition, exact: SymbolicDecomposition | None, *, places: Sequence[np.ndarray] = ()
+    found: SymbolicDecomposition,
+    exact: SymbolicDecomposition | None,
+    *,
+    places: Sequence[np.ndarray] = (),
+    depth: float = 0.0,
 ) -> list[FormulaRow]:
     """U, g and f of one method; U about each well where no single formula holds.
 
