@@ -27,6 +27,7 @@ Potential = Callable[[np.ndarray], np.ndarray]
 """U at points ``(n, d)``, NaN where it is not known: shape ``(n,)``."""
 
 MARGIN = 0.05  # of what is shown: left free around it
+BLOCK_OF_POINTS = 20_000  # evaluated at once: each has some hundred powers
 PARTS = ("uphill", "downhill")
 
 
@@ -152,6 +153,29 @@ class DrawnLandscape:
             return None
         deepest = min(self.wells, key=lambda one: np.nan_to_num(one.height, nan=np.inf))
         return _error_of_one_state(self.dynamics, x, float(deepest.position[0]))
+
+
+def chosen_states(landscape: DrawnLandscape, states: Sequence[str] | None) -> tuple[int, int]:
+    """Places of the two states that make the plane; by default those along which the wells lie apart.
+
+    Raises
+    ------
+    ValueError
+        When they are not two states of the landscape.
+    """
+    names = landscape.names
+    if states is not None:
+        if len(set(states)) != 2 or not set(states) <= set(names):
+            raise ValueError(f"states is {list(states)}; name two of {', '.join(names)}")
+        return names.index(states[0]), names.index(states[1])
+    if len(names) == 2:
+        return 0, 1
+    width = np.ptp(landscape.box, axis=1)
+    places = np.array([one.position for one in (*landscape.wells, *landscape.saddles)])
+    apart = np.ptp(places, axis=0) / width if len(places) else np.zeros(len(names))
+    # Where wells differ along one state only, the first of the others is as good as any.
+    first, second = np.sort(np.argsort(-np.round(apart, 2), kind="stable")[:2])
+    return int(first), int(second)
 
 
 def drawn(landscape: Landscape, *, points: np.ndarray | None = None) -> DrawnLandscape:

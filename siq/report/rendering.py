@@ -45,7 +45,7 @@ def _environment() -> Environment:
         "page_width": _page_width,
         "wide_for": _wide_for,
         "short": short_caption,
-        "unbroken": lambda text: text.replace(" × 10", "\u00a0×\u00a010").replace(" ± ", "\u00a0±\u00a0"),
+        "unbroken": lambda text: text.replace(" × 10", "\u00a0×\u00a010"),
         "records": lambda frame: list(frame.itertuples(index=False, name=None)),
     }
     return environment

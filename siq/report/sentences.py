@@ -95,7 +95,7 @@ def _several(
 
 
 def _against_exact(
-    errors: pd.DataFrame, mine: pd.DataFrame, summary: pd.DataFrame, *, method: str, runs: int
+    errors: pd.Series, mine: pd.DataFrame, summary: pd.DataFrame, *, method: str, runs: int
 ) -> list[str]:
     """How far the formulas are from the exact ones, where these are known, and from what was published."""
     if not len(errors):

@@ -141,7 +141,7 @@ def test_the_formula_of_a_well_can_be_taken_elsewhere() -> None:
 def test_the_report_has_verdict_attractors_and_barriers() -> None:
     certificate = Certificate({"characteristics": Verdict(0.0, 0.01, True)}, 0.01, "")
     text = replace(double(), certificate=certificate, notes=("a limit cycle <x>",)).report()
-    assert "certified, with a stated error of V of 0.01" in text
+    assert "The formulas are certified: U is right to within 1 % of its height." in text
     assert "a limit cycle <x>" in text and "barrier" in text and "attractor" in text
     page = replace(double(), notes=("a limit cycle <x>",))._repr_html_()
     assert "No test was made" in page and "&lt;x&gt;" in page and page.count("<table") == 2

@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from siq.report.sentences import answer_sentences, control_sentences
+from siq.report.sentences import control_sentences, run_sentences
 from siq.study.scoring import summary_table
 from siq.study.study import PublishedFigure
 from siq.study.tables import as_table
@@ -43,7 +43,7 @@ def answer(errors: list[float | None], *, published: bool = True, certified: boo
     summary = summary_table(
         as_table("coefficients", rows), rrmse, as_table("prediction", []), PUBLISHED if published else {}
     )
-    return " ".join(answer_sentences(rrmse, outcomes, summary, runs=len(errors), method="regression"))
+    return " ".join(run_sentences(rrmse, outcomes, summary, runs=len(errors), method="regression"))
 
 
 def test_it_says_how_many_runs_ended_with_formulas_and_how_many_failed() -> None:
@@ -55,7 +55,7 @@ def test_it_says_how_many_runs_ended_with_formulas_and_how_many_failed() -> None
 
 def test_failed_runs_count_in_no_mean() -> None:
     text = answer([1e-3, None, 3e-3])
-    assert "2.00e-03 ± 1.4e-03 (median 2.00e-03, worst run 3.00e-03)" in text
+    assert "0.0020 ± 0.0014 (median 2.00 × 10⁻³, worst run 3.00 × 10⁻³)" in text
     assert "2 of 2 runs found exactly the right terms" in text
 
 
@@ -64,14 +64,14 @@ def test_runs_with_false_terms_are_told_apart() -> None:
 
 
 def test_the_published_figure_stands_beside_ours() -> None:
-    assert "The published figure is 1.00e-03, so ours is 2 times that" in answer([1e-3, 3e-3])
+    assert "The published figure is 1.00 × 10⁻³; ours is 2.00 times that" in answer([1e-3, 3e-3])
     assert "published" not in answer([1e-3, 3e-3], published=False)
 
 
 def test_terms_of_most_runs_and_of_some_runs_are_told_apart() -> None:
     text = answer([1e-3, 2e-3, 3e-3])
-    assert "in most runs, the terms x**2 (1.002" in text
-    assert "not to be relied on: x*y" in text
+    assert "In most runs U has the terms x² (1.0020 ± 0.0010)." in text
+    assert "not to be relied on: x y" in text
 
 
 def test_uncertified_runs_are_never_passed_over() -> None:
@@ -91,9 +91,17 @@ def test_a_study_without_any_answer_known_claims_no_error() -> None:
     rrmse = as_table("rrmse", [{"run": 0, "method": "regression", "certified": False}])
     outcomes = as_table("outcomes", [{"run": 0, "step": "train", "status": "ok", "reason": ""}])
     summary = summary_table(as_table("coefficients", []), rrmse, as_table("prediction", []), {})
-    text = " ".join(answer_sentences(rrmse, outcomes, summary, runs=1, method="regression"))
-    assert "Against the exact U" not in text
-    assert isinstance(summary, pd.DataFrame)
+    text = " ".join(run_sentences(rrmse, outcomes, summary, runs=1, method="regression"))
+    assert text == ""
+
+
+def test_one_run_is_not_counted() -> None:
+    text = answer([1e-3])
+    assert "runs" not in text and "1 of 1" not in text
+    assert (
+        "Against the exact U the coefficients are off by 0.1 %" in text and "exactly the right terms" in text
+    )
+    assert "wrong terms" in answer([0.5])
 
 
 def test_the_control_is_counted_by_what_became_of_it() -> None:
@@ -109,9 +117,9 @@ def test_the_control_is_counted_by_what_became_of_it() -> None:
         ]
     )
     (said,) = control_sentences(table)
-    assert "was refused in 1 of 3 runs" in said
-    assert "in 1 refinement led from it to the same V" in said
-    assert "in 1 ANOTHER V than the refined one was certified" in said
+    assert "It was refused in 1 of 3 runs" in said
+    assert "in 1 refinement led from it to the same U" in said
+    assert "in 1 ANOTHER U than the refined one was certified" in said
     (harmless,) = control_sentences(table[table["run"] < 2])
     assert "ANOTHER" not in harmless
     assert control_sentences(table.assign(method="refined")) == []

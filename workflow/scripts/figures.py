@@ -10,6 +10,7 @@ from pathlib import Path
 from siq.dynamics.cards import load_system
 from siq.identify.storage import read_field
 from siq.landscape.storage import read_landscape
+from siq.report.interactive import interactive_view
 from siq.report.plots import save_figure
 from siq.report.settings import FiguresSettings
 from siq.report.study_figures import PicturedRun, StudyTables, leading_figures, study_figures, what_is_shown
@@ -51,15 +52,19 @@ if __name__ == "__main__":
             None if card is None else load_system(card),
             {} if published is None else load_published(published).figures,
         )
-        overview = read_json(source.overview)
+        overview, view = read_json(source.overview), None
         first = run if overview is None else overview["run"]
         record, recorded = read_field(source.every_field[first]), read_run(source.recordings[first])
         if record is not None and recorded is not None:
             dynamics, own = record.found.dynamics, models.formulas(first).get(Method.REFINED)
             stored = read_landscape(source.overview, dynamics=dynamics)
-            figures |= leading_figures(PicturedRun(overview, stored, own, dynamics, recorded))
+            picture = PicturedRun(overview, stored, own, dynamics, recorded)
+            figures |= leading_figures(picture)
+            view = interactive_view(picture.drawn()) if dynamics.dimension > 2 else None
         drawn = Path(now.params.folder)
         drawn.mkdir(parents=True, exist_ok=True)
+        if view is not None:
+            (drawn / "interactive.html").write_text(view, encoding="utf-8")
         for name, figure in figures.items():
             if figure is not None:
                 save_figure(figure, drawn / name)

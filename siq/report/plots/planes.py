@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from siq.report.drawn_landscape import DrawnLandscape, Potential
+from siq.report.drawn_landscape import BLOCK_OF_POINTS, DrawnLandscape, Potential, chosen_states
 
 View = Literal["projection", "section"]
 
@@ -16,7 +16,6 @@ POINTS = 141  # along each axis, of two states
 POINTS_OF_MORE = 61  # of a projection, which asks for many points behind each of these
 BEHIND = 40  # states in the other directions that a projection tries at each point
 SWEEPS = 3  # after which the lowest of them moves by less than a pixel
-BLOCK = 20_000  # points at once: each of some hundred powers
 
 
 @dataclass(frozen=True)
@@ -40,29 +39,6 @@ class Plane:
     x2: np.ndarray
     values: np.ndarray
     sentence: str
-
-
-def chosen_states(landscape: DrawnLandscape, states: Sequence[str] | None) -> tuple[int, int]:
-    """Places of the two states that make the plane; by default those along which the wells lie apart.
-
-    Raises
-    ------
-    ValueError
-        When they are not two states of the landscape.
-    """
-    names = landscape.names
-    if states is not None:
-        if len(set(states)) != 2 or not set(states) <= set(names):
-            raise ValueError(f"states is {list(states)}; name two of {', '.join(names)}")
-        return names.index(states[0]), names.index(states[1])
-    if len(names) == 2:
-        return 0, 1
-    width = np.ptp(landscape.box, axis=1)
-    places = np.array([one.position for one in (*landscape.wells, *landscape.saddles)])
-    apart = np.ptp(places, axis=0) / width if len(places) else np.zeros(len(names))
-    # Where wells differ along one state only, the first of the others is as good as any.
-    first, second = np.sort(np.argsort(-np.round(apart, 2), kind="stable")[:2])
-    return int(first), int(second)
 
 
 def plane_of(
@@ -103,7 +79,7 @@ def plane_of(
 
 def in_blocks(potential: Potential, x: np.ndarray) -> np.ndarray:
     """A potential at many points, some at a time."""
-    parts = [potential(x[start : start + BLOCK]) for start in range(0, len(x), BLOCK)]
+    parts = [potential(x[start : start + BLOCK_OF_POINTS]) for start in range(0, len(x), BLOCK_OF_POINTS)]
     return np.concatenate(parts) if parts else np.zeros(0)
 
 

@@ -12,8 +12,8 @@ from matplotlib.lines import Line2D
 from siq.landscape.landscape import Landscape
 from siq.numerics.measured_text import unit_text
 from siq.potential.well import Well
-from siq.report.drawn_landscape import DrawnLandscape, DrawnWay
-from siq.report.plots.planes import POINTS, chosen_states, in_blocks
+from siq.report.drawn_landscape import DrawnLandscape, DrawnWay, chosen_states
+from siq.report.plots.planes import POINTS, in_blocks
 from siq.report.plots.quasipotential import (
     CURVE_POINTS,
     MOST_POINTS,

@@ -1,0 +1,174 @@
+"""The sentence that page and text open with, for every kind of landscape."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from known_systems import double_well, exact_field, portrait_of
+
+from siq.landscape.dwell_times import NoiseStrength
+from siq.landscape.landscape import find_landscape
+from siq.landscape.storage import landscape_data
+from siq.potential.local_wells import WellOptions
+from siq.report.landscape_answer import headline, remarks, wells_table
+from siq.report.landscape_tables import landscape_tables
+from siq.report.said_landscape import SaidLandscape, well_name
+from siq.study.tables import as_table
+
+NOISE = {"intensity": 0.1, "standard_error": 0.001, "source": "estimated"}
+
+
+def landscape(
+    places: list[list[float]],
+    barriers: list[float | None],
+    *,
+    noise: dict[str, Any] | None = None,
+    units: str = "um",
+    time: str = "s",
+    prefactor: float | None = 4.0,
+) -> dict[str, Any]:
+    """Plain data of wells in a row, each left to the next over a saddle; None is a barrier nobody knows."""
+    d = len(places[0]) if places else 1
+    ways = [
+        {
+            "start": index, "end": (index + 1) % len(places) if len(places) > 1 else None,
+            "saddle": [0.0] * d, "barrier": barrier, "error": 0.01, "standard_error": 0.01,
+            "minimum_action": barrier, "prefactor": prefactor, "exponent": 0.0, "notes": [],
+        }
+        for index, barrier in enumerate(barriers)
+    ]  # fmt: skip
+    wells = [
+        {
+            "attractor": place,
+            "standard_errors": [0.004] * d,
+            "basin": 1 / len(places),
+            "height": 0.0,
+            "V": None,
+        }
+        for place in places
+    ]
+    equilibria = [
+        {"position": place, "kind": "attractor", "eigenvalues": [[-1.0, 0.0]] * d} for place in places
+    ]
+    return {
+        "states": ["x", "y", "z"][:d], "units": [units] * d, "time_unit": time, "noise": noise,
+        "equilibria": equilibria, "wells": wells, "transitions": ways, "notes": [],
+    }  # fmt: skip
+
+
+def test_two_wells_without_noise_have_depths_and_a_way_to_times() -> None:
+    data = landscape([[-0.5], [0.6]], [0.25, 0.35])
+    said = headline(data)
+    assert said == (
+        "The recordings show two stable states: A at x\u00a0=\u00a0−0.5000 ± 0.0040\u00a0µm is"
+        " 0.250 ± 0.010\u00a0µm²/s deep; and B at x\u00a0=\u00a00.6000 ± 0.0040\u00a0µm is"
+        " 0.350 ± 0.010\u00a0µm²/s deep."
+    )
+    (remark,) = remarks(data)
+    assert "noise_intensities" in remark and "follow" in remark
+    assert not any("lasts" in text for text in wells_table(data)[0]["stable state"])
+
+
+def test_like_wells_are_told_once() -> None:
+    said = headline(landscape([[-0.5], [0.5]], [0.25, 0.25], noise=NOISE))
+    assert "; each is 0.250 ± 0.010\u00a0µm²/s deep (2.50 ± 0.10 times the noise strength) and lasts " in said
+    assert said.count("deep") == 1
+
+
+def test_under_noise_every_well_lasts_as_the_law_says() -> None:
+    data = landscape([[-0.5], [0.5]], [0.8, 0.9], noise=NOISE)
+    mean = SaidLandscape(data).wells[0].time
+    assert mean is not None and mean.value == pytest.approx(4 * math.exp(8))
+    table, numbers = wells_table(data)
+    assert list(numbers["mean_time"]) == pytest.approx([4 * math.exp(8), 4 * math.exp(9)])
+    assert "lasts (s)" in list(table["stable state"]) and "ΔU/ε" in list(table["stable state"])
+    assert "± " in headline(data) and " s" in headline(data)
+    assert any("ε = 0.1000 ± 0.0010\u00a0µm²/s, as the recordings show it" in one for one in remarks(data))
+    assert not any("orders of magnitude" in one for one in remarks(data))
+
+
+def test_a_low_barrier_gives_a_range_and_a_warning() -> None:
+    data = landscape([[-0.5], [0.5]], [0.15, 0.9], noise=NOISE)
+    assert " to " in headline(data)
+    warning = next(one for one in remarks(data) if "orders of magnitude" in one)
+    assert "A is less than 3 times" in warning and "B" not in warning
+
+
+def test_a_well_below_the_noise_has_no_time() -> None:
+    said = headline(landscape([[-0.5], [0.5]], [0.05, 0.9], noise=NOISE))
+    assert "too shallow to hold the state against this noise" in said
+
+
+def test_where_the_law_fails_it_is_said_why() -> None:
+    data = landscape([[-0.5], [0.5]], [0.8, 0.9], noise=NOISE, prefactor=None)
+    for way in data["transitions"]:
+        way["notes"] = ["no escape time: V is not smooth at the saddle"]
+    assert "lasts" not in headline(data)
+    assert "No time can be given for A and B: V is not smooth at the saddle." in remarks(data)
+
+
+def test_one_stable_state_and_none() -> None:
+    alone = landscape([[0.5]], [])
+    alone["wells"][0]["V"] = {"depth": 0.6, "level": 0.6}
+    assert headline(alone).startswith("The recordings show one stable state, at x")
+    assert headline(alone).endswith("U is known up to 1.200\u00a0µm²/s above it.")
+    assert remarks(alone) == []
+    none = landscape([], []) | {"notes": ["they end on a limit cycle"]}
+    assert headline(none) == "No stable state was found in the recorded region: they end on a limit cycle."
+    assert headline(None, missing="f was not found").endswith(": f was not found.")
+
+
+def test_more_wells_than_a_sentence_can_list_are_told_by_their_ends() -> None:
+    data = landscape([[float(k)] for k in range(5)], [0.1, 0.5, 0.2, 0.3, 0.4])
+    said = headline(data)
+    assert "five stable states" in said and "the deepest, B at" in said and "the shallowest, A, " in said
+    assert list(wells_table(data)[0]["stable state"]) == ["A", "B", "C", "D", "E"]  # a row for each
+
+
+def test_states_of_one_unit_share_it_and_of_several_keep_theirs() -> None:
+    data = landscape([[-0.5, 0.0], [0.5, 0.0]], [0.25, 0.25])
+    assert "A at (x, y)\u00a0=\u00a0(−0.500,\u00a00.000)\u00a0µm" in headline(data)
+    data["units"] = ["um", "um/s"]
+    assert "A at x\u00a0=\u00a0−0.500\u00a0µm, y\u00a0=\u00a00.000\u00a0µm/s" in headline(data)
+    assert SaidLandscape(data).energy_unit == ""  # D then carries the units
+    assert SaidLandscape(landscape([[0.0]], [], units="1")).energy_unit == "s^-1"
+    assert SaidLandscape(landscape([[0.0]], [], units="1", time="1")).energy_unit == ""
+
+
+def test_what_rounding_left_of_zero_is_zero() -> None:
+    data = landscape([[-1.0, 4.94066e-324], [1.0, 1e-13]], [0.25, 0.25])
+    for well in data["wells"]:
+        well["standard_errors"] = [1e-12, 1e-12]
+    table, _ = wells_table(data)
+    assert list(table.set_index("stable state").loc["y (µm)"]) == ["0", "0"]
+    assert "e-3" not in headline(data)
+
+
+def test_ways_equilibria_and_times_for_given_noises_are_tables(tmp_path) -> None:
+    data = landscape([[-0.5], [0.5]], [0.25, 0.35])
+    tables = landscape_tables(data, as_table("landscape", []), noises=(0.05, 0.3), folder=tmp_path)
+    captions = [one.caption for one in tables]
+    assert [caption.split()[0] for caption in captions] == ["Every", "All", "How"]
+    times = tables[2].frame
+    assert list(times.columns)[1:] == ["A lasts (s)", "B lasts (s)"]
+    assert times.iloc[1, 1] == "too strong a noise" and times.iloc[0, 1] != ""
+    assert tables[0].data is not None and list(tables[0].data["barrier"]) == [0.25, 0.35]
+
+
+@pytest.mark.parametrize("noise", [None, NoiseStrength(0.05, 0.001, "estimated")])
+def test_text_and_page_say_the_same_sentence(noise: NoiseStrength | None) -> None:
+    known = double_well(2)
+    found = find_landscape(
+        exact_field(known, 3, relative_error=1e-3), portrait_of(known, 250, share=0.8),
+        options=WellOptions(degrees=(4,)), noise=noise,
+    )  # fmt: skip
+    data = landscape_data(found, dynamics=found.dynamics)
+    text = found.report()
+    assert text.splitlines()[0] == headline(data)
+    assert ("lasts" in headline(data)) == (noise is not None)
+    assert np.isfinite(SaidLandscape(data).wells[0].position_errors).all()
+
+
+def test_letters_go_on_after_the_last() -> None:
+    assert [well_name(index) for index in (0, 25, 26, 52)] == ["A", "Z", "A1", "A2"]
