@@ -87,4 +87,4 @@ def test_what_an_extra_is_for_names_it(statement: str, package: str, extra: str)
 
 def test_the_extras_are_those_of_the_distribution() -> None:
     assert PROJECT["name"] == DISTRIBUTION
-    assert {"networks", "plots", "workflow", "docs", "dev"} == set(PROJECT["optional-dependencies"])
+    assert {"networks", "plots", "workflow", "docs", "pages", "dev"} == set(PROJECT["optional-dependencies"])

@@ -24,6 +24,7 @@ from siq.dynamics.equilibria import hessian_at
 from siq.dynamics.phase_portrait import PhasePortrait
 from siq.errors import NumericalFailure
 from siq.identify.identified_field import IdentifiedField
+from siq.numerics.measured_text import place_text
 from siq.numerics.thinning import representative_subset
 from siq.reference.characteristics import End, Fan
 from siq.reference.sheets import adapted_fan, lowest_sheet
@@ -184,9 +185,9 @@ def check_characteristics(
         # An error that cannot be stated explains nothing: a false solution, whose ascending paths run away.
         limit = (error if error <= options.error else 0.0) + one.error
         place = x[int(np.argmax(np.abs(difference)))]
-        shown = np.array2string(place, precision=3, suppress_small=True)
+        shown = place_text(place)
         passed = bool(value <= limit)
-        reason = "" if passed else f"V is not that which characteristics carry, by most at {shown}"
+        reason = "" if passed else f"V is not what characteristics give, most of all at {shown}"
         worst = place if worst is None or not passed else worst
         verdicts.append(Verdict(value, limit, passed, reason))
     decisive = max(verdicts, key=lambda one: (not one.passed, one.value / (one.limit or 1.0)))

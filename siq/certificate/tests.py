@@ -33,6 +33,7 @@ from pydantic.dataclasses import dataclass
 from siq.certificate.error_bound import SAFETY, residual_integral
 from siq.dynamics.equilibria import Equilibrium, hessian_at
 from siq.identify.identified_field import IdentifiedField
+from siq.numerics.measured_text import place_text
 from siq.potential.well import Well
 
 Function = Callable[[np.ndarray], np.ndarray]
@@ -191,8 +192,7 @@ def check_branch(candidate: Candidate, found: IdentifiedField, *, limit: float, 
         if value / bound >= worst / allowed:
             worst, allowed, place = value, bound, one
     passed = worst <= allowed
-    shown = np.array2string(place.position, precision=4, suppress_small=True)
-    reason = f"the curvature of V at the attractor {shown} is not that which f demands"
+    reason = f"the curvature of V at the stable state {place_text(place.position)} is not what f asks for"
     return Verdict(worst, allowed, passed, "" if passed else reason)
 
 
@@ -267,7 +267,7 @@ def check_agreement(
         if value >= worst:
             worst, where = value, x[int(np.argmax(np.abs(one - two)))]
     passed = bool(worst <= limit)
-    shown = "" if where is None else np.array2string(where, precision=3, suppress_small=True)
+    shown = "" if where is None else place_text(where)
     return Verdict(worst, limit, passed, "" if passed else f"the two routes disagree most at {shown}")
 
 

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
+
+import numpy as np
 
 from siq.numerics.number_text import MINUS, SMALLEST, SUPERSCRIPTS, number_text
 
@@ -119,3 +122,18 @@ def squared(unit: str) -> str:
     if unit in ("1", "-", ""):
         return ""
     return f"{unit}^2" if re.fullmatch(r"[^\W\d_]+|[%°]", unit) else f"({unit})^2"
+
+
+def place_text(position: Sequence[float] | np.ndarray, *, digits: int = 3) -> str:
+    """A point as text, its coordinates to so many digits of the largest.
+
+    Examples
+    --------
+    >>> place_text([1.0, -3e-17, 0.52])
+    '(1, 0, 0.52)'
+    """
+    size = max((abs(float(value)) for value in position), default=0.0)
+    unit = 10.0 ** (_exponent(size, digits) - digits + 1) if size else 1.0
+    rounded = [round(float(value) / unit) * unit for value in position]
+    texts = [f"{value:.{digits}g}" for value in rounded]
+    return "(" + ", ".join("0" if float(text) == 0 else text.replace("-", MINUS) for text in texts) + ")"

@@ -18,6 +18,7 @@
 `study_page`         what does the page of a study say, in which order?
 `study_sections`     and in each of its parts?
 `study_formulas`     which formulas?
+`study_runs`         which tables of several runs?
 `study_captions`     what do its figures show, and where do they stand?
 `study_figures`      and which figures has it?
 `landscape_tables`   what does it say of the landscape?

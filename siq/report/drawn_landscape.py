@@ -137,6 +137,11 @@ class DrawnLandscape:
         known = [top for top in tops if np.isfinite(top)]
         return max(known) if known else None
 
+    def along(self, place: int, count: int) -> np.ndarray:
+        """So many values of a state, evenly over what is shown."""
+        low, high = self.box[place].tolist()
+        return np.linspace(low, high, count)
+
     @property
     def lowest_pass(self) -> np.ndarray:
         """Where the lowest pass lies; the deepest well where there is none."""

@@ -129,7 +129,13 @@ def vector_mathml(expressions: Sequence[sympy.Expr], *, decimals: int = 3) -> Ma
 def matrix_mathml(matrix: Sequence[Sequence[float]]) -> Markup:
     """Typeset a matrix of numbers in brackets; a number that stands alone without them."""
     printer = _MathMLPrinter(3)
-    texts = [[value_text(float(value)) for value in row] for row in matrix]
+    texts = [
+        [
+            str(int(value)).replace("-", MINUS) if float(value).is_integer() else value_text(value)
+            for value in row
+        ]
+        for row in matrix
+    ]
     spoken = "; ".join(", ".join(row) for row in texts)
     if texts == [[texts[0][0]]]:
         return _math(printer, printer.leaf("mn", texts[0][0]), spoken)
@@ -138,6 +144,10 @@ def matrix_mathml(matrix: Sequence[Sequence[float]]) -> Markup:
         for row in texts
     ]
     return _math(printer, printer.bracketed(printer.element("mtable", *rows)), spoken)
+
+
+def _entry_text(value: float) -> str:
+    return str(int(value)).replace("-", MINUS) if value.is_integer() else value_text(value)
 
 
 def _math(printer: _MathMLPrinter, content: Any, spoken: str) -> Markup:

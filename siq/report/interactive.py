@@ -100,7 +100,7 @@ def _shown(landscape: DrawnLandscape) -> list[int]:
 def _on_a_grid(landscape: DrawnLandscape, shown: Sequence[int]) -> np.ndarray:
     """U on a grid of the states that are shown."""
     count = min(int(NODES ** (1 / len(shown)) + 1e-9), MOST_NODES)
-    axes = [np.linspace(*landscape.box[place], count) for place in shown]
+    axes = [landscape.along(place, count) for place in shown]
     mesh = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(shown))
     values = []
     for start in range(0, len(mesh), BLOCK_OF_POINTS):

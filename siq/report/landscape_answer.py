@@ -130,8 +130,8 @@ def place_text(said: SaidLandscape, well: SaidWell) -> str:
     ]
     if len(set(units)) == 1:
         unit = unit_text(units[0])
-        listed = ",\u00a0".join(values)
-        return f"({', '.join(names)})\u00a0=\u00a0({listed})" + (f"\u00a0{unit}" if unit else "")
+        listed, named = ",\u00a0".join(values), ",\u00a0".join(names)
+        return f"({named})\u00a0=\u00a0({listed})" + (f"\u00a0{unit}" if unit else "")
     pairs = zip(names, values, units, strict=True)
     return ", ".join(
         f"{name}\u00a0=\u00a0{value}\u00a0{unit_text(unit)}".rstrip() for name, value, unit in pairs

@@ -26,28 +26,11 @@ from siq.report.said_landscape import SaidLandscape
 from siq.report.sentences import control_sentences, run_sentences
 from siq.report.study_captions import Part, figures_of
 from siq.report.study_formulas import coefficient_table, formula_rows
+from siq.report.study_runs import method_tables
 from siq.steps.outcomes import Method, Status, Step
 from siq.steps.shown import ModelFiles, Shown
 from siq.study.study import Study
 
-SUMMARY_COLUMNS = (
-    "method",
-    "quantity",
-    "exact",
-    "mean",
-    "standard_deviation",
-    "median",
-    "inclusion_frequency",
-    "published",
-    "published_standard_deviation",
-    "runs",
-)
-SUMMARY_HELP = {
-    "quantity": "component:term for coefficients; those of V = U/2 and of f are in the file",
-    "inclusion frequency": "share of runs in which the term was found",
-    "runs": "runs that have a value",
-    "published": "the published figure, with its source",
-}
 SOURCES = {
     DiffusionSource.GIVEN: "As given.",
     DiffusionSource.ESTIMATED: "Estimated from the noise in the recordings, since none was given, and"
@@ -198,6 +181,11 @@ class StudyParts:
         if self.results.overview is not None:
             said = SaidLandscape(self.results.overview)
             units = dict(zip(said.states, said.units, strict=True)) | {"t": said.time_unit}
+        largest = mine[mine["component"] == "U"]["estimate"].abs().max()
+        nothing = (
+            (mine["term"] == "1") & (mine["component"] == "U") & (mine["estimate"].abs() < 1e-12 * largest)
+        )
+        mine = mine[~nothing]
         table = coefficient_table(mine, units=units, components=SHOWN)
         if table is None:
             return []
@@ -289,32 +277,12 @@ class StudyParts:
         if self.study.runs == 1:
             return None
         tables, folder = self.results.tables, self.results.folder
-        counted = (
-            tables["certificates"]
-            .groupby(["method", "test"], sort=False)
-            .agg(
-                passed=("passed", "sum"),
-                runs=("passed", "size"),
-                median=("value", "median"),
-                worst=("value", "max"),
-            )
-            .reset_index()
+        found = method_tables(
+            tables, folder, (str(self._method), str(Method.CONTROL)), beside_paper=self.beside_paper
         )
-        found = [
-            ReportTable(
-                "Every figure over the runs" + (", beside the published one." if self.beside_paper else "."),
-                _summary_shown(tables["summary"]), SUMMARY_HELP, f"{folder}/summary.csv", 60,
-            ),
-            ReportTable(
-                "How many runs passed each test of the certificate.",
-                counted, {}, f"{folder}/certificates.csv", 40,
-            ),
-            ReportTable("Errors by run.", _words(tables["rrmse"]), {}, f"{folder}/rrmse.csv", 50),
-        ]  # fmt: skip
         return ReportSection(
             f"What {self.study.runs} runs say together", self._runs_said(),
-            tables=[one for one in found if len(one.frame)],
-            figures=self._figures(Part.RUNS),
+            tables=found, figures=self._figures(Part.RUNS),
         )  # fmt: skip
 
     def published(self) -> ReportSection | None:
@@ -336,8 +304,14 @@ class StudyParts:
             )
         if rows:
             text.append(self._regression_verdict())
+        tables = []
+        if self.study.runs > 1 and other:
+            tables = method_tables(
+                self.results.tables, self.results.folder, (str(Method.REGRESSION),),
+                beside_paper=self.beside_paper,
+            )  # fmt: skip
         return ReportSection(
-            "The published method", text, formulas=rows, figures=figures, folded=not self.beside_paper
+            "The published method", text, rows, tables, figures, folded=not self.beside_paper
         )
 
     def _regression_verdict(self) -> str:
@@ -385,6 +359,7 @@ class StudyParts:
         return ReportSection("The study and the versions", text, listing=printed, folded=True)
 
 
+ROUNDING = 1e-12  # of the largest coefficient of U: a constant so small is left of zero
 SHOWN = "U$|f_"
 """Components whose coefficients are shown; those of g follow from them, and can be downloaded."""
 
@@ -399,17 +374,6 @@ def _printed(study: Study) -> dict[str, Any]:
     """The study as plain data; of recordings nothing is simulated."""
     data = study.model_dump(mode="json")
     return data if study.recordings is None else data | {"simulation": None}
-
-
-def _summary_shown(summary: pd.DataFrame) -> pd.DataFrame:
-    """Errors, U and g; the headings in words, so that they wrap."""
-    shown = summary[~summary["quantity"].str.match("V:|f_")]
-    columns = [name for name in SUMMARY_COLUMNS if shown[name].notna().any()]
-    return _words(shown[columns])
-
-
-def _words(table: pd.DataFrame) -> pd.DataFrame:
-    return table.rename(columns=lambda name: name.replace("_", " "))
 
 
 def _refusals(rrmse: pd.DataFrame, certificates: pd.DataFrame) -> pd.DataFrame:

@@ -128,7 +128,7 @@ def test_more_wells_than_a_sentence_can_list_are_told_by_their_ends() -> None:
 
 def test_states_of_one_unit_share_it_and_of_several_keep_theirs() -> None:
     data = landscape([[-0.5, 0.0], [0.5, 0.0]], [0.25, 0.25])
-    assert "A at (x, y)\u00a0=\u00a0(−0.500,\u00a00.000)\u00a0µm" in headline(data)
+    assert "A at (x,\u00a0y)\u00a0=\u00a0(−0.500,\u00a00.000)\u00a0µm" in headline(data)
     data["units"] = ["um", "um/s"]
     assert "A at x\u00a0=\u00a0−0.500\u00a0µm, y\u00a0=\u00a00.000\u00a0µm/s" in headline(data)
     assert SaidLandscape(data).energy_unit == ""  # D then carries the units

@@ -107,7 +107,10 @@ def test_nothing_is_run_twice(finished):
 def test_snakemakes_own_report_is_written_with_captions(finished):
     done = finished.run("results/mini/report.html", "--report", "workflow-report.html")
     assert done.returncode == 0, done.stdout[-2000:]
-    assert "inclusion frequency" in finished.path("workflow-report.html").read_text(encoding="utf-8")
+    said = finished.path("workflow-report.html").read_text(encoding="utf-8")
+    parts = [said.index(f'"{part}"') for part in ("1 The answer", "2 Evidence", "4 The runs")]
+    assert parts == sorted(parts)  # in the order of the page
+    assert "How often each term was found" in said
 
 
 def test_the_page_beside_the_paper_takes_what_a_study_left(finished):

@@ -47,6 +47,7 @@ if __name__ == "__main__":
             names, space = settings.space.names or (), settings.space
             units = [space.unit(name) for name in names]
             figure = plot_invariant_distribution(found.densities, states=names, units=units)
-            save_figure(figure, drawn / "invariant")
+            if figure is not None:
+                save_figure(figure, drawn / "invariant")
         write_table(now.output.table, found.table)
         write_table(now.output.shares, found.shares)

@@ -8,6 +8,8 @@ from collections.abc import Iterable
 from importlib.metadata import version
 from pathlib import Path
 
+from markupsafe import Markup
+
 import siq
 from siq.files.whole import whole_file
 from siq.identify.storage import read_field
@@ -41,6 +43,7 @@ if __name__ == "__main__":
         shown = shown if shown.run is not None else models.first_wells()
         overview = read_json(source.overview)
         run = shown.run if shown.run is not None else (overview or {}).get("run", 0)
+        view = Path(source.drawn) / "interactive.html"
         folders = [source.drawn, *source.drawn_landscape, source.drawn_density]
         results = StudyResults(
             tables,
@@ -52,6 +55,7 @@ if __name__ == "__main__":
             vectors=files(folders, ".svg"),
             overview=overview,
             record=read_field(source.fields[run]),
+            interactive=Markup(view.read_text(encoding="utf-8")) if view.is_file() else None,
         )
         programs = PACKAGES if study.training is None else (*PACKAGES, *OF_NETWORKS)
         versions = {"siq": siq.__version__} | {name: version(name) for name in programs}

@@ -13,6 +13,7 @@ from siq.report.plots.quasipotential import as_drawn, energy_axis_label, new_axe
 from siq.report.plots.style import BLACK, BLUE, GREY, VERMILLION, magnitude_label, mean_and_spread
 
 NO_ERROR = 1e-4  # of a barrier: a smaller error is not written
+SIDE_BY_SIDE = 3  # wells whose barriers stand beside each other with their errors
 OPEN = 0.14  # of the height of the picture: how far a way out of the recorded region rises
 
 
@@ -79,7 +80,7 @@ def plot_barriers(landscape: Landscape | DrawnLandscape, *, ax: Axes | None = No
         [*tops.values(), *(heights[way.start] + way.barrier for way in lowest_ways if way is not None)]
     )
     span = (reach - min(heights)) or 1.0
-    labels = []
+    labels, many = [], len(heights) > SIDE_BY_SIDE
     for well, (height, way) in enumerate(zip(heights, lowest_ways, strict=True)):
         label = shown.wells[well].label
         if way is None:
@@ -97,7 +98,7 @@ def plot_barriers(landscape: Landscape | DrawnLandscape, *, ax: Axes | None = No
                 places[well], height + way.barrier, yerr=2 * way.standard_error, color=VERMILLION, marker="_",
                 markersize=9, capsize=4, elinewidth=1.4, zorder=4,
             )  # fmt: skip
-        labels.append(f"{label}\n$\\Delta U$ =\n{_with_error(way.barrier, way.standard_error)}")
+        labels.append(f"{label}\n$\\Delta U$ =\n{_with_error(way.barrier, way.standard_error, broken=many)}")
     axes.set_xticks([places[well] for well in range(len(heights))], labels)
     axes.tick_params(axis="x", length=0)
     axes.set_xlim(-0.6, len(heights) - 0.4)
@@ -111,10 +112,12 @@ def plot_barriers(landscape: Landscape | DrawnLandscape, *, ax: Axes | None = No
     return axes
 
 
-def _with_error(value: float, error: float) -> str:
-    """A barrier with its error, without the digits that nobody reads."""
-    known = np.isfinite(error) and error > NO_ERROR * abs(value)
-    return mean_and_spread(value, error) if known else magnitude_label(value, digits=4)
+def _with_error(value: float, error: float, *, broken: bool) -> str:
+    """A barrier with its error, without the digits that nobody reads; on two lines where there is no room."""
+    if not (np.isfinite(error) and error > NO_ERROR * abs(value)):
+        return magnitude_label(value, digits=4)
+    text = mean_and_spread(value, error)
+    return text.replace(r" \pm ", "$\n$\\pm$ $") if broken and "(" not in text else text
 
 
 def joined(landscape: DrawnLandscape, heights: list[float]) -> list[Join]:
@@ -124,7 +127,7 @@ def joined(landscape: DrawnLandscape, heights: list[float]) -> list[Join]:
         for way in landscape.ways
         if way.end is not None and np.isfinite(way.barrier)
     )
-    groups = {well: (well,) for well in range(len(heights))}
+    groups: dict[int, tuple[int, ...]] = {well: (well,) for well in range(len(heights))}
     joins = []
     for height, start, end in passes:
         left, right = groups[start], groups[end]

@@ -123,7 +123,8 @@ def _known(fields: ComponentFields, *, one_state: bool) -> list[str]:
     circulates = False
     if fields.circulatory is not None and not _is_missing(fields.circulatory):
         # What is left of g in a gradient system is rounding.
-        size = 0.0 if _is_missing(fields.minus_gradient) else np.nanmax(np.abs(fields.minus_gradient))
+        slope = fields.minus_gradient
+        size = 0.0 if slope is None or _is_missing(slope) else float(np.nanmax(np.abs(slope)))
         circulates = bool(np.nanmax(np.abs(fields.circulatory)) > ROUNDING * size)
     parts = {
         "trajectories": bool(len(fields.trajectories)),

@@ -184,7 +184,7 @@ def plot_escape(table: pd.DataFrame, *, time_unit: str = "1", energy_unit: str =
         )  # fmt: skip
         handles.append(
             Line2D([], [], color=colour, linestyle=style, marker=marker, markersize=4,
-                   markerfacecolor="white", label=by_letters(name))
+                   markerfacecolor="white", label=by_letters(str(name)))
         )  # fmt: skip
     _limit(axes, rows)
     largest = float((1 / rows["intensity"]).max())

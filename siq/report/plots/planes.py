@@ -61,7 +61,7 @@ def plane_of(
     shown = chosen_states(landscape, states)
     rest = [place for place in range(len(landscape.names)) if place not in shown]
     count = POINTS_OF_MORE if rest and view == "projection" else POINTS
-    x1, x2 = (np.linspace(*landscape.box[place], count) for place in shown)
+    x1, x2 = (landscape.along(place, count) for place in shown)
     at = landscape.lowest_pass
     grid = np.tile(at, (count * count, 1))
     grid[:, shown] = np.stack(np.meshgrid(x1, x2, indexing="ij"), axis=-1).reshape(-1, 2)

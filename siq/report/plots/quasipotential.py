@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from siq.data.recordings import Recordings
 
 WIDTH = 4.5  # inches: on a phone of 400 pixels its letters are 11 pixels high
-LEVELS = 9
+LEVELS = 12
 ROOM = 0.3  # of the height of the highest pass: shown above it
 MOST_POINTS = 2500  # recorded ones; more make a fog
 CURVE_POINTS = 801
@@ -129,6 +129,8 @@ def quasipotential_figure(
     states, view
         As for `plot_quasipotential`.
     """
+    if not landscape.wells:
+        return None
     one = len(landscape.names) == 1
     figure = Figure(figsize=(WIDTH, 3.6 if one else 4.5))
     axes = figure.add_subplot()
@@ -210,7 +212,7 @@ def energy_axis_label(axis: Any, landscape: DrawnLandscape, largest: float, what
 
 
 def _draw_curve(axes: Axes, landscape: DrawnLandscape) -> list[Any]:
-    x = np.linspace(*landscape.box[0], CURVE_POINTS)
+    x = landscape.along(0, CURVE_POINTS)
     values = landscape.potential(x[:, None])
     handles: list[Any] = []
     error = landscape.standard_error(x)
@@ -269,7 +271,7 @@ def _draw_map(axes: Axes, landscape: DrawnLandscape, plane: Plane) -> list[Any]:
         top, lowest = highest_shown(landscape, values), float(np.nanmin(values))
         lowest = 0.0 if abs(lowest) < 1e-3 * abs(top - lowest) else lowest
         top = top if top > lowest else lowest + (abs(lowest) or 1.0)
-        levels = MaxNLocator(LEVELS, steps=[1, 2, 2.5, 5, 10]).tick_values(lowest, top)
+        levels = np.asarray(MaxNLocator(LEVELS, steps=[1, 2, 2.5, 5, 10]).tick_values(lowest, top))
         norm = BoundaryNorm(levels, 256, extend="max")
         heights = np.maximum(values, levels[0])
         filled = axes.contourf(

@@ -122,13 +122,20 @@ def plot_residuals(
 @drawn_in_style
 def residuals_figure(
     dynamics: Dynamics, recordings: Recordings, *, units: Sequence[str], time_unit: str = "1"
-) -> Figure:
-    """The figure of a page: what f leaves of the recorded increments, a panel for each state."""
-    figure = Figure(figsize=(COLUMN_WIDTH, 2.3 * len(dynamics.states) + 0.5))
-    for place, axes in enumerate(figure.subplots(len(dynamics.states), squeeze=False)[:, 0]):
-        binned = binned_residuals(dynamics, recordings, place)
-        handles = _draw(axes, binned, dynamics.states[place], (units[place], time_unit))
-    figure.legend(handles=handles, loc="outside lower center", ncols=1)
+) -> Figure | None:
+    """The figure of a page: what f leaves of the recorded increments, a panel for each state.
+
+    None of recordings without noise, where nothing is left but rounding.
+    """
+    every = [binned_residuals(dynamics, recordings, place) for place in range(dynamics.dimension)]
+    if all(one.share < NOISE_FREE for one in every):
+        return None
+    figure = Figure(figsize=(COLUMN_WIDTH, 2.3 * len(every) + 0.5))
+    panels = figure.subplots(len(every), squeeze=False)[:, 0]
+    handles: dict[str, Any] = {}
+    for axes, binned, name, unit in zip(panels, every, dynamics.states, units, strict=True):
+        handles |= {one.get_label(): one for one in _draw(axes, binned, name, (unit, time_unit))}
+    figure.legend(handles=list(handles.values()), loc="outside lower center", ncols=1)
     return figure
 
 
@@ -170,9 +177,10 @@ def binned_residuals(dynamics: Dynamics, recordings: Recordings, place: int) -> 
 
 def _draw(axes: Axes, binned: BinnedResiduals, name: str, units: tuple[str, str]) -> list[Any]:
     """Draw residuals of a state on axes, with the units of the state and of time."""
-    axes.fill_between(
-        binned.at, -2 * binned.standard_error, 2 * binned.standard_error, color=GREY, alpha=0.3, linewidth=0
-    )
+    quiet = binned.share < NOISE_FREE  # rounding and the integrator are left, which no band is the measure of
+    if not quiet:
+        band = 2 * binned.standard_error
+        axes.fill_between(binned.at, -band, band, color=GREY, alpha=0.3, linewidth=0)
     axes.axhline(0.0, color=GREY, linewidth=0.8)
     axes.plot(binned.at, binned.mean, marker="o", markersize=4, linestyle="none", color=BLUE)
     largest = float(np.abs(binned.at).max())
@@ -182,10 +190,8 @@ def _draw(axes: Axes, binned: BinnedResiduals, name: str, units: tuple[str, str]
     axes.set_ylabel(scaled_label(axes.yaxis, what, rate_unit(*units), largest))
     within = int((np.abs(binned.mean) <= 2 * binned.standard_error).sum())
     title = f"{within} of {len(binned.at)} bins within the band"
-    if binned.share < NOISE_FREE:  # rounding and the integrator, of which no band is the measure
+    if quiet:
         title = f"no noise: {magnitude_label(binned.share, digits=1)} of the increments is left"
     axes.set_title(title, loc="left", fontsize="medium")
-    return [
-        Line2D([], [], color=BLUE, marker="o", linestyle="none", label="mean of a bin"),
-        Patch(color=GREY, alpha=0.3, label="noise alone: ± 2 standard errors"),
-    ]
+    mean = Line2D([], [], color=BLUE, marker="o", linestyle="none", label="mean of a bin")
+    return [mean] if quiet else [mean, Patch(color=GREY, alpha=0.3, label="noise alone: ± 2 standard errors")]

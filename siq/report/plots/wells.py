@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
+from scipy.interpolate import PchipInterpolator
 
 from siq.landscape.landscape import Landscape
 from siq.numerics.measured_text import unit_text
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
 COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY_BLUE)
 LINE_STYLES = ("-", "--", "-.", ":")
 MARKERS = ("o", "s", "^", "D", "v", "P")
-DARK = {"fontweight": "bold"}
 
 
 def plot_wells(
@@ -158,18 +158,18 @@ def plot_paths(landscape: Landscape | DrawnLandscape, *, legend: bool = True, ax
             along, values, color=_colour(place), linestyle=LINE_STYLES[place % len(LINE_STYLES)],
             linewidth=2.2 - 0.6 * (place % 2), label=f"{shown.wells[way.start].label} to {end}",
         )  # fmt: skip
-    seen: set[tuple[float, str]] = set()
+    seen: set[tuple[str, bool]] = set()
     for way in ways:
         along, _ = _profile(shown, way, scale)
         mirrored = way.end is not None and way.end < way.start
         ends = [(along[-1 if mirrored else 0], shown.wells[way.start])]
         ends += [] if way.end is None else [(along[0 if mirrored else -1], shown.wells[way.end])]
         for where, well in ends:
-            key = (round(float(where) / max(float(np.ptp(along)), 1e-300), 2), well.label)
+            key = (well.label, bool(where > 0))
             if key not in seen:
                 axes.annotate(
                     well.label, (float(where), well.height), xytext=(0, -5), textcoords="offset points",
-                    ha="center", va="top", **DARK,
+                    ha="center", va="top", fontweight="bold",
                 )  # fmt: skip
             seen.add(key)
     axes.axvline(0.0, color=GREY, linewidth=0.8, linestyle=(0, (2, 2)), zorder=0)
@@ -192,14 +192,34 @@ def _profile(landscape: DrawnLandscape, way: DrawnWay, scale: np.ndarray) -> tup
     along = np.concatenate([[0.0], np.cumsum(steps)])
     along = along - along[len(up) - 1]
     values = landscape.potential(points)
-    bottom = landscape.wells[way.start].height
-    values[0] = bottom if np.isfinite(bottom) else values[0]
-    if np.isfinite(way.barrier) and np.isfinite(bottom):
-        values[len(up) - 1] = bottom + way.barrier
-    known = np.isfinite(values)
-    values = np.interp(along, along[known], values[known]) if known.any() else values
+    bottom, beyond = landscape.wells[way.start].height, None if way.end is None else landscape.wells[way.end]
+    if np.isfinite(bottom) and np.isfinite(way.barrier):
+        share = _share_of_action(landscape, up)
+        values[: len(up)] = values[: len(up)] if share is None else bottom + way.barrier * share
+        values[0], values[len(up) - 1] = bottom, bottom + way.barrier
+    if beyond is not None and np.isfinite(beyond.height):
+        values[-1] = beyond.height
+    known = np.isfinite(values) & (np.diff(along, prepend=-np.inf) > 0)
+    if known.sum() > 1:
+        values = PchipInterpolator(along[known], values[known], extrapolate=False)(along)
     mirrored = way.end is not None and way.end < way.start
     return (-along[::-1], values[::-1]) if mirrored else (along, values)
+
+
+def _share_of_action(landscape: DrawnLandscape, path: np.ndarray) -> np.ndarray | None:
+    """Which share of the action is spent up to each point of a path; None where D has no inverse.
+
+    It is ∫ (|f| |dφ| - f·dφ) in the metric of the noise, see `siq.landscape.paths`.
+    """
+    dynamics = landscape.dynamics
+    if dynamics is None or not dynamics.diffusion.regular:
+        return None
+    middle, step, noise = (path[1:] + path[:-1]) / 2, np.diff(path, axis=0), dynamics.diffusion
+    flow = dynamics.drift(middle)
+    fast, far = noise.squared_speed(middle, flow), noise.squared_speed(middle, step)
+    with_it = (noise.squared_speed(middle, flow + step) - fast - far) / 2
+    spent = np.concatenate([[0.0], np.cumsum(np.maximum(np.sqrt(fast * far) - with_it, 0.0))])
+    return np.asarray(spent / spent[-1]) if spent[-1] > 0 else None
 
 
 def _colour(place: int) -> str:
@@ -207,7 +227,7 @@ def _colour(place: int) -> str:
 
 
 def _draw_curves(axes: Axes, landscape: DrawnLandscape, known: Sequence[tuple[int, Well]]) -> None:
-    x = np.linspace(*landscape.box[0], CURVE_POINTS)
+    x = landscape.along(0, CURVE_POINTS)
     heights = [one.height if landscape.matched else 0.0 for one in landscape.wells]
     every = [heights[place] + 2 * well.known_values(x[:, None]) for place, well in known]
     top = highest_shown(landscape, np.concatenate(every) if every else np.zeros(0))
@@ -222,7 +242,7 @@ def _draw_curves(axes: Axes, landscape: DrawnLandscape, known: Sequence[tuple[in
         )  # fmt: skip
         axes.annotate(
             well.label, (well.position[0], heights[place]), xytext=(0, -8), textcoords="offset points",
-            ha="center", va="top", **DARK,
+            ha="center", va="top", fontweight="bold",
         )  # fmt: skip
     for one in landscape.saddles:
         axes.plot(one.position, [one.height], **SADDLE)
@@ -265,7 +285,7 @@ def _draw_rims(
     axes: Axes, landscape: DrawnLandscape, known: Sequence[tuple[int, Well]], heights: Sequence[float]
 ) -> None:
     """Around each well the line of U at the height of its lowest pass."""
-    x1, x2 = (np.linspace(*limits, POINTS) for limits in landscape.box)
+    x1, x2 = landscape.along(0, POINTS), landscape.along(1, POINTS)
     grid = np.stack(np.meshgrid(x1, x2, indexing="ij"), axis=-1).reshape(-1, 2)
     for place, well in known:
         barriers = [way.barrier for way in landscape.ways if way.start == place and np.isfinite(way.barrier)]
