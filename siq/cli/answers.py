@@ -84,10 +84,4 @@ def _of_study(answer: Mapping[str, Any], page: Path) -> Told:
 
 def _of_diagnosis(answer: Mapping[str, Any], page: Path) -> Told:
     code = Exit.ANSWERED if answer.get("compared", True) else Exit.NO_ANSWER
-    lines = [str(answer["sentence"])]
-    before, after = answer.get("held_out_before"), answer.get("held_out_after")
-    if before is not None and after is not None and before != after:
-        lines.append(
-            f"On recordings held out its error is {before:.2g} of their spread, and {after:.2g} with that."
-        )
-    return Told(tuple(lines), page, code)
+    return Told((str(answer["sentence"]),), page, code)

@@ -24,7 +24,7 @@ from siq.mismatch.steadiness import unsteadiness
 from siq.mismatch.structure import Structure
 from siq.mismatch.study import MismatchStudy
 from siq.mismatch.trials import UntriedMechanism
-from siq.numerics.quantity_text import p_equation, percent
+from siq.numerics.share_text import p_equation, percent
 
 
 class MismatchVerdict(StrEnum):

@@ -15,7 +15,7 @@ from siq.estimation.measurements import Measurements
 from siq.mismatch.investigation import Investigation, MismatchVerdict
 from siq.mismatch.roles import Roles
 from siq.mismatch.structure import Curve, Structure
-from siq.numerics.quantity_text import measured_text, unit_text
+from siq.numerics.measured_text import unit_text, value_text
 
 VISIBLE = 0.1  # of the largest value of a curve
 TWO_ERRORS = 2.0
@@ -208,7 +208,7 @@ def where_it_sits(
         "unknown": "",
     }.get(coordinate, f", as a function of {coordinate}")
     if coordinate in region:
-        lower, upper = (measured_text(limit) for limit in region[coordinate])
+        lower, upper = (value_text(limit, digits=3) for limit in region[coordinate])
         unit = unit_text((units or {}).get(coordinate, "1"))
         after = f" {unit}" if unit else ""
         along += f" (near {lower}{after})" if lower == upper else f" (between {lower} and {upper}{after})"

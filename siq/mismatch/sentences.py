@@ -11,8 +11,9 @@ from siq.mismatch.candidates import GENERIC, PROCESS_NOISE
 from siq.mismatch.held_out import HeldOutErrors
 from siq.mismatch.investigation import MismatchVerdict
 from siq.mismatch.statement import Description, Recalibrated, Rival, StatedMechanism, Statement
+from siq.numerics.measured_text import value_text
 from siq.numerics.number_text import LARGEST_PLAIN_NUMBER, number_text
-from siq.numerics.quantity_text import SMALLEST_SHARE, measured_text, p_equation, p_text, percent
+from siq.numerics.share_text import SMALLEST_SHARE, p_equation, p_text, percent
 
 NOTICED = 1.96  # standard errors beyond which a parameter counts as changed
 LISTED = 2  # names in a sentence, before the rest is counted
@@ -79,7 +80,7 @@ def named(mechanism: StatedMechanism) -> str:
     Such as ``dry friction of 0.310 ± 0.015 m/s² in the equation of v``.
     """
     sizes = [
-        (name, measured_text(entry.estimate, entry.standard_error, entry.unit))
+        (name, value_text(entry.estimate, entry.standard_error, unit=entry.unit))
         for name, entry in mechanism.parameters.items()
     ]
     if len(sizes) == 1 and mechanism.name != GENERIC:
@@ -180,7 +181,7 @@ def shifted(recalibration: Mapping[str, Recalibrated], units: Mapping[str, str])
 
     def change(name: str) -> str:
         each, unit = recalibration[name], units.get(name, "1")
-        after = measured_text(each.after, each.standard_error, unit)
+        after = value_text(each.after, each.standard_error, unit=unit)
         return f"{name} is {after}, where the card has {_value(each.before)}"
 
     if not certain:
@@ -284,7 +285,7 @@ def _not_foreseen(errors: HeldOutErrors) -> str:
 
 def _random_forces(mechanism: StatedMechanism) -> str:
     sizes = [
-        f"{measured_text(entry.estimate, entry.standard_error, entry.unit)} on"
+        f"{value_text(entry.estimate, entry.standard_error, unit=entry.unit, digits=3)} on"
         f" {name.removeprefix('intensity_')}"
         for name, entry in mechanism.parameters.items()
     ]

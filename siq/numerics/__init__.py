@@ -2,13 +2,13 @@
 
 ====================  ==========================================================================
 `integration`         how do many trajectories take a step of order eight at once, each its own?
-`quantity_text`       how is a quantity written: a value, a share, a p-value?
 `machine_code`        how does a loop become machine code?
 `randomness`          where do the random numbers of a study come from?
 `thinning`            which points represent a region evenly?
 `density_comparison`  how far are samples from a density on a plane of two states?
 `number_text`         how is a number written for a reader?
 `measured_text`       and a measured value, with its error and its unit?
+`share_text`          and a share, or a p-value?
 ====================  ==========================================================================
 
 Imports `siq.errors`.

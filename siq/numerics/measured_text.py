@@ -17,15 +17,19 @@ SMALLEST_PLAIN, LARGEST_PLAIN = (
 )  # decimal exponents between which a number is written without a power of ten
 
 
-def value_text(value: float, error: float = math.nan, *, unit: str = "") -> str:
+def value_text(
+    value: float, error: float | None = None, *, unit: str = "", digits: int = EXACT_DIGITS
+) -> str:
     """Write a value with its standard error, both to the digits that the error leaves.
 
     Parameters
     ----------
     value, error
-        The value and its standard error; NaN where it is not known.
+        The value and its standard error; None or NaN where it is not known.
     unit
         As `unit_text` takes it.
+    digits
+        Significant digits of a value without an error.
 
     Returns
     -------
@@ -44,6 +48,7 @@ def value_text(value: float, error: float = math.nan, *, unit: str = "") -> str:
         return number_text(value)
     if abs(value) < SMALLEST:
         value = 0.0
+    error = math.nan if error is None else error
     known = math.isfinite(error) and error > 0
     largest = max(abs(value), error if known else 0.0)
     if largest == 0:
@@ -58,7 +63,7 @@ def value_text(value: float, error: float = math.nan, *, unit: str = "") -> str:
         value, error, decimals = round(value, decimals), round(error, decimals), max(decimals, 0)
         text = f"{_plain(value, decimals)} ± {error:.{decimals}f}"
     else:
-        text = _plain(value, max(EXACT_DIGITS - 1 - power_left, 0))
+        text = _plain(value, max(digits - 1 - power_left, 0))
     if scale != 1.0:
         text = f"({text})" if "±" in text else text
         text += f" × 10{str(power).translate(SUPERSCRIPTS)}"
@@ -101,7 +106,12 @@ def _two_digits(value: float) -> str:
 
 
 def unit_text(unit: str | None) -> str:
-    """A unit as it is printed: ``um^2/s`` as µm²/s; nothing for ``1``.
+    """A unit as it is printed: ``um^2/s`` as µm²/s, ``s**(-1)`` as 1/s; nothing for ``1``.
+
+    Parameters
+    ----------
+    unit
+        As cards and headings have it. What is no product of powers is kept as it is.
 
     Examples
     --------
@@ -111,9 +121,17 @@ def unit_text(unit: str | None) -> str:
     text = "" if unit is None else unit.strip()
     if text in ("1", "-", ""):
         return ""
-    text = re.sub(r"(?<![A-Za-z])u(?=(m|s|g|N|V|A|W|K|L|l|J|Pa|Hz|M|mol|rad)(?![A-Za-z]))", "µ", text)
-    text = re.sub(r"(?:\*\*|\^)\s*\(?(-?\d+)\)?", lambda found: found[1].translate(SUPERSCRIPTS), text)
-    return text.replace("*", "·")
+    text = re.sub(
+        r"(?:\*\*|\^)\s*(?:\(\s*(-?\d+)\s*\)|(-?\d+))",
+        lambda power: (power[1] or power[2]).translate(SUPERSCRIPTS),
+        text,
+    )
+    text = re.sub(r"(?<![A-Za-z])u(?=(?:m|s|g|N|V|A|W|K|L|l|J|Pa|Hz|M|mol|rad)(?![A-Za-z]))", "µ", text)
+    text = text.replace("**", "^").replace("*", "·")
+    if "/" not in text:
+        text = re.sub(r"\b([A-Za-zµΩ°]+)⁻¹(?!\d)", r"1/\1", text)
+    inverse = re.fullmatch(r"([A-Za-zµΩ°]+)⁻([²³⁴-⁹])", text)
+    return f"1/{inverse[1]}{inverse[2]}" if inverse else text
 
 
 def squared(unit: str) -> str:

@@ -6,7 +6,8 @@ from html import escape
 
 from siq.dynamics.dynamics import Dynamics
 from siq.mismatch.statement import METRIC, Estimate, StatedMechanism, Statement
-from siq.numerics.quantity_text import measured_text, p_text
+from siq.numerics.measured_text import value_text
+from siq.numerics.share_text import p_text
 
 DIGITS = 4
 Section = tuple[str, list[str]]
@@ -57,7 +58,7 @@ def _sections(statement: Statement, system: Dynamics) -> list[Section]:
 
 def with_error(entry: Estimate) -> str:
     """A value with its error and unit, and the error in per cent."""
-    text = measured_text(entry.estimate, entry.standard_error, entry.unit)
+    text = value_text(entry.estimate, entry.standard_error, unit=entry.unit)
     if not entry.standard_error or not entry.estimate:
         return text
     return f"{text} ({100 * entry.standard_error / abs(entry.estimate):.2g} %)"
@@ -113,6 +114,6 @@ def _errors(statement: Statement) -> list[str]:
 
 def _excluded(statement: Statement) -> list[str]:
     return [
-        f"{label}: {bound.parameter} = {measured_text(bound.upper_bound_95, unit=bound.unit, digits=2)}"
+        f"{label}: {bound.parameter} = {value_text(bound.upper_bound_95, unit=bound.unit, digits=2)}"
         for label, bound in (statement.excluded or {}).items()
     ]

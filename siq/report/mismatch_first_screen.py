@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from siq.numerics.quantity_text import measured_text, unit_text
+from siq.numerics.measured_text import unit_text, value_text
 from siq.report.mismatch_findings import SIMULATIONS, Findings, capital, mechanisms_said
 from siq.report.page import ReportFigure, ReportTable
 
@@ -114,7 +114,7 @@ def numbers(findings: Findings) -> ReportTable | None:
             words = "with what comes closest"
         row = {"simulation": words, **own.get(name, {})}
         row["of the spread"] = "ran away" if error is None else _percent(error)
-        row["times noise"] = "" if error is None or not floor > 0 else measured_text(error / floor, digits=2)
+        row["times noise"] = "" if error is None or not floor > 0 else value_text(error / floor, digits=2)
         rows.append(row)
     rows.append({"simulation": "noise alone", "of the spread": _percent(floor), "times noise": "1"})
     frame = pd.DataFrame(rows).fillna("")
@@ -142,11 +142,13 @@ def errors_in_units(findings: Findings) -> dict[str, dict[str, str]]:
         for name in SIMULATIONS:
             off = (rows[name] - rows["measured"])[rows["measured"].notna()].to_numpy(float)
             text = (
-                measured_text(float(np.sqrt(np.mean(off**2)))) if np.isfinite(off).all() and len(off) else ""
+                value_text(float(np.sqrt(np.mean(off**2))), digits=3)
+                if np.isfinite(off).all() and len(off)
+                else ""
             )
             found.setdefault(name, {})[f"{output} ({unit})" if unit else str(output)] = text or "ran away"
     return found
 
 
 def _percent(share: float) -> str:
-    return f"{measured_text(100 * share)} %"
+    return f"{value_text(100 * share, digits=3)} %"

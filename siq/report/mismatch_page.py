@@ -53,4 +53,4 @@ def mismatch_page(findings: Findings, *, title: str, commands: Sequence[str]) ->
         table=numbers(findings),
         sections=sections(findings, commands=commands),
     )
-    return render_template("mismatch.html.j2", content)
+    return render_template("report.html.j2", content)

@@ -10,7 +10,8 @@ import pandas as pd
 from markupsafe import Markup
 
 from siq.mismatch.dictionary import Mechanism
-from siq.numerics.quantity_text import measured_text, p_text, percent, unit_text
+from siq.numerics.measured_text import unit_text, value_text
+from siq.numerics.share_text import p_text, percent
 from siq.report.mismatch_findings import (
     SIMULATIONS,
     Findings,
@@ -155,7 +156,7 @@ def _of_what(name: str, entry: Mechanism | None, findings: Findings) -> str:
 
 
 def _value(entry: Mapping[str, Any]) -> str:
-    return measured_text(entry["estimate"], entry.get("standard_error"), entry.get("unit", "1"))
+    return value_text(entry["estimate"], entry.get("standard_error"), unit=entry.get("unit", "1"))
 
 
 def _how_sure(findings: Findings) -> MismatchSection:
@@ -232,7 +233,7 @@ def _where(findings: Findings) -> MismatchSection | None:
         return None
     text = [place["sentence"]]
     if place["time"] is not None:
-        begin, end = (measured_text(limit) for limit in place["time"])
+        begin, end = (value_text(limit, digits=3) for limit in place["time"])
         unit = unit_text(findings.before.time_unit)
         text.append(f"The recordings run from {begin} to {end}{f' {unit}' if unit else ''}.")
     total = place.get("recordings_total", 0)
@@ -300,7 +301,7 @@ def _excluded(findings: Findings) -> MismatchSection | None:
         {
             "mechanism": label,
             "parameter": entry.get("parameter", ""),
-            "at most (95 %)": measured_text(entry["upper_bound_95"], unit=entry["unit"], digits=2),
+            "at most (95 %)": value_text(entry["upper_bound_95"], unit=entry["unit"], digits=2),
         }
         for label, entry in bounds.items()
     ]
@@ -314,8 +315,8 @@ def _parameters(findings: Findings) -> MismatchSection | None:
     rows = [
         {
             "parameter": name,
-            "on the card": measured_text(entry["before"], unit=units.get(name, "1"), digits=4),
-            "fitted": measured_text(entry["after"], entry["standard_error"], units.get(name, "1")),
+            "on the card": value_text(entry["before"], unit=units.get(name, "1"), digits=4),
+            "fitted": value_text(entry["after"], entry["standard_error"], unit=units.get(name, "1")),
             "change, in standard errors": (entry["after"] - entry["before"]) / entry["standard_error"]
             if entry["standard_error"]
             else float("nan"),

@@ -19,7 +19,7 @@ from siq.mismatch import diagnosis as module
 from siq.mismatch.case import comparison_of
 from siq.mismatch.tables import tables_of, tables_of_failure
 from siq.mismatch.verdict import statement_of_failure
-from siq.numerics.quantity_text import measured_text
+from siq.numerics.measured_text import value_text
 from siq.report.diagnosis_report import diagnosis_html, diagnosis_text
 
 n, r = sympy.symbols("n r", real=True)
@@ -65,10 +65,10 @@ def test_the_report_says_all_of_it(diagnosis: siq.Diagnosis) -> None:
     text = diagnosis.report()
     (found,) = diagnosis.mechanisms
     size = found.parameters["c_1"]
-    assert f"c_1 = {measured_text(size.estimate, size.standard_error, size.unit)} (" in text
+    assert f"c_1 = {value_text(size.estimate, size.standard_error, unit=size.unit)} (" in text
     assert "1/(kg·d)" in text
     r = diagnosis.statement.recalibration["r"]
-    assert f"r = {measured_text(r.after, r.standard_error, '1/d')} (" in text and "(on the card: 1)" in text
+    assert f"r = {value_text(r.after, r.standard_error, unit='1/d')} (" in text and "(on the card: 1)" in text
     # It opens with the sentence that the page opens with.
     assert text.splitlines()[1].strip() == diagnosis.statement.sentence
     for heading in ("Verdict", "Mechanisms", "Location", "Error (normalised rms", "How sure it is"):

@@ -23,7 +23,7 @@ from siq.mismatch.statement import (
     Statement,
 )
 from siq.mismatch.verdict import statement_of_failure
-from siq.numerics.quantity_text import p_text, percent
+from siq.numerics.share_text import p_text, percent
 
 NAMES = ("dry friction", "Stribeck friction", "hysteresis", "quadratic drag", "cubic damping", "input delay")
 SAME = 10.0
@@ -200,7 +200,9 @@ def test_random_forces_are_a_verdict_of_their_own():
         PROCESS_NOISE, PROCESS_NOISE, {}, {"intensity_v": Estimate(0.02, None, "m**2/s**3")},
         Evidence(None, None, None, None), 1.0, indistinguishable_from=(),
     )  # fmt: skip
-    text = said(statement_from(1, MismatchVerdict.MISSING_PHYSICS, mechanisms=(forces,)))
+    text = said(statement_from(1, MismatchVerdict.MISSING_PHYSICS, mechanisms=(forces,))).replace(
+        "\u00a0", " "
+    )
     assert "driven by random forces" in text and "0.0200 m²/s³ on v" in text
     assert "lacks" not in text and "falls from" not in text and "explains" not in text
 

@@ -23,6 +23,8 @@ from siq.numerics.number_text import number_text
         (0.0, math.nan, "0"),
         (5e-324, math.nan, "0"),
         (math.nan, 1.0, "—"),
+        (2.5e-7, 1.2e-9, "(2.500 ± 0.012) × 10⁻⁷"),
+        (1.5, None, "1.500"),
     ],
 )
 def test_a_value_has_the_digits_that_its_error_leaves(value, error, text):
@@ -40,7 +42,12 @@ def test_a_unit_stands_behind_value_and_error_alike():
         ("um", "µm"),
         ("um^2/s", "µm²/s"),
         ("m/s**2", "m/s²"),
-        ("s^-1", "s⁻¹"),
+        ("s^-1", "1/s"),
+        ("s**(-2)", "1/s²"),
+        ("m**12", "m¹²"),
+        ("1/(m**2*s**2)", "1/(m²·s²)"),
+        ("um/ms", "µm/ms"),
+        ("°C", "°C"),
         ("1", ""),
         (None, ""),
         ("min", "min"),

@@ -47,6 +47,6 @@ def siq(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
     """Run the command as a reader of the README does. What it says of the science is not judged here."""
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     return subprocess.run(
-        [sys.executable, "-m", "siq.cli", *arguments],
+        [sys.executable, "-m", "siq", *arguments],
         cwd=folder, env=environment, capture_output=True, text=True, timeout=1500,
     )  # fmt: skip

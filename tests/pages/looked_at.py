@@ -25,8 +25,10 @@ STICKING_OUT = """
 () => {
   const width = document.documentElement.clientWidth, found = [];
   const contained = element => {
-    for (let one = element.parentElement; one && one !== document.body; one = one.parentElement)
-      if (getComputedStyle(one).overflowX !== 'visible') return true;
+    for (let one = element; one && one !== document.body; one = one.parentElement) {
+      const style = getComputedStyle(one);
+      if (style.position === 'fixed' || (one !== element && style.overflowX !== 'visible')) return true;
+    }
     return false;
   };
   for (const element of document.body.querySelectorAll('*')) {

@@ -145,7 +145,7 @@ def test_page_says_what_where_how_sure_and_what_else(models):
     for part in (
         "missing physics",
         "lacks cubic stiffness",
-        "0.250 ± 0.010 1/(mm²·s²)",
+        "0.250 ± 0.010\u00a01/(mm²·s²)",
         "Duffing",
         "cannot tell cubic stiffness from quintic stiffness",
         "ran away",
@@ -173,7 +173,7 @@ def test_page_without_a_mechanism_tells_what_is_excluded(models, verdict):
     page = page_of(
         models, verdict={"verdict": verdict, "mechanisms": [], "location": None, "excluded": excluded}
     )
-    assert "at most (95 %)" in page and "0.50 mm/s²" in page
+    assert "at most (95 %)" in page and "0.50\u00a0mm/s²" in page
     assert "against chance" in page
 
 

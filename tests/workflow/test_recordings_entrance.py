@@ -51,7 +51,7 @@ def test_recordings_without_a_card_are_enough(fresh_project, finished):
     project.make("results/measured/report.html")
     page = project.path("results/measured/report.html").read_text(encoding="utf-8")
     assert "The recordings show two stable states" in page
-    assert "<th scope=\"col\">exact" not in page.lower()  # nobody knows it
+    assert '<th scope="col">exact' not in page.lower()  # nobody knows it
     landscape = pd.read_parquet(project.path("results/measured/tables/landscape.parquet"))
     assert list(landscape["kind"]) == ["attractor", "saddle", "attractor", "transition", "transition"]
     ways = landscape[landscape["kind"] == "transition"]

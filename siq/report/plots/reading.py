@@ -10,7 +10,7 @@ from typing import ParamSpec
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
-from siq.numerics.quantity_text import unit_text
+from siq.numerics.measured_text import unit_text
 from siq.report.plots.style import drawing_style
 
 WIDTH = 5.0  # inches; on a phone of 400 pixels a point of text is then one pixel high

@@ -1,0 +1,7 @@
+"""`python -m siq`: the command, where its program is not on the path."""
+
+import sys
+
+from siq.cli.main import main
+
+sys.exit(main())
