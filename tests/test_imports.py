@@ -36,6 +36,7 @@ ORDER = (
     "steps",
     "report",
     "cli",
+    "__main__",
 )
 
 # Thin methods that call what stands above them, when they are called: (who, whom).

@@ -12,7 +12,7 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from siq.data.recordings import read_pairs
+from siq.data.learnable import read_pairs
 from siq.dynamics.cards import check_name, load_exact
 from siq.dynamics.dynamics import Dynamics
 from siq.errors import InputError

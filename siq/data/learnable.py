@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
 from siq.data.noise_floor import noise_floors
+from siq.data.recordings import Recordings, SnapshotPairs, read_recordings, snapshot_pairs
 from siq.errors import InputError
-
-if TYPE_CHECKING:
-    from siq.data.recordings import Recordings
 
 TURNS = {2 * np.pi: "2π", 360.0: "360"}  # of an angle, in radians and in degrees
 NEARLY = 0.9  # of a turn: a jump by so much, in a column that stays within one, is no motion
@@ -100,3 +99,42 @@ def remarks(recordings: Recordings) -> list[str]:
                     " or record its sine and cosine"
                 )
     return said
+
+
+def read_pairs(
+    path: str | Path,
+    *,
+    states: Sequence[str] | None,
+    units: Mapping[str, str] | None,
+    pair_step: float | None,
+) -> tuple[Recordings, SnapshotPairs]:
+    """Read recordings that something is to be learned from, and their pairs.
+
+    Parameters
+    ----------
+    path, states, units
+        See `read_recordings`.
+    pair_step
+        See `snapshot_pairs`.
+
+    Raises
+    ------
+    InputError
+        As `read_recordings` and `checked_for_learning` do, and when no two samples are
+        close enough to be a pair.
+    """
+    recordings = read_recordings(path, columns=states, units=units)
+    recordings = checked_for_learning(recordings, file=str(path), chosen=states is not None)
+    try:
+        pairs = snapshot_pairs(recordings, pair_step=pair_step)
+    except ValueError as error:
+        raise InputError(path, "", str(error), "raise recordings.pair_step in the study") from None
+    without = len(recordings.labels) - len(np.unique(pairs.recording))
+    single = int((np.bincount(recordings.recording) == 1).sum())
+    if without > single:
+        note = (
+            f"{without - single} of {len(recordings.labels)} recordings have longer steps than the others and"
+            " give no pairs; recordings.pair_step in the study says how long a step may be"
+        )
+        recordings = replace(recordings, notes=(*recordings.notes, note))
+    return recordings, pairs

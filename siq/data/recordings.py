@@ -17,8 +17,6 @@ import numpy as np
 
 from siq.data.checks import check_times
 from siq.data.labels import sources
-from siq.data.learnable import checked_for_learning
-from siq.errors import InputError
 from siq.files.whole import whole_file
 
 if TYPE_CHECKING:
@@ -324,42 +322,3 @@ def snapshot_pairs(recordings: Recordings, *, pair_step: float | None = None) ->
         h=gap[keep],
         recording=sources(recordings.labels)[recording[:-1][keep]],
     )
-
-
-def read_pairs(
-    path: str | Path,
-    *,
-    states: Sequence[str] | None,
-    units: Mapping[str, str] | None,
-    pair_step: float | None,
-) -> tuple[Recordings, SnapshotPairs]:
-    """Read recordings that something is to be learned from, and their pairs.
-
-    Parameters
-    ----------
-    path, states, units
-        See `read_recordings`.
-    pair_step
-        See `snapshot_pairs`.
-
-    Raises
-    ------
-    InputError
-        As `read_recordings` and `siq.data.learnable.checked_for_learning` do, and when no two samples are
-        close enough to be a pair.
-    """
-    recordings = read_recordings(path, columns=states, units=units)
-    recordings = checked_for_learning(recordings, file=str(path), chosen=states is not None)
-    try:
-        pairs = snapshot_pairs(recordings, pair_step=pair_step)
-    except ValueError as error:
-        raise InputError(path, "", str(error), "raise recordings.pair_step in the study") from None
-    without = len(recordings.labels) - len(np.unique(pairs.recording))
-    single = int((np.bincount(recordings.recording) == 1).sum())
-    if without > single:
-        note = (
-            f"{without - single} of {len(recordings.labels)} recordings have longer steps than the others and"
-            " give no pairs; recordings.pair_step in the study says how long a step may be"
-        )
-        recordings = replace(recordings, notes=(*recordings.notes, note))
-    return recordings, pairs

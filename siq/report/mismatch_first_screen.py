@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import pandas as pd
 
 from siq.numerics.measured_text import unit_text, value_text
 from siq.report.mismatch_findings import SIMULATIONS, Findings, capital, mechanisms_said
-from siq.report.page import ReportFigure, ReportTable
+from siq.report.page import Badge, ReportFigure, ReportTable
 
 BEFORE_AFTER = {
     "before": "A held-out recording, which had no part in the comparison, and the simulation as given.",
@@ -22,25 +20,6 @@ PANELS = (
     " Above: the course in time. Below: simulation minus recording; grey: two standard deviations of the"
     " sensor's noise. Each simulation is told how the recording begins, and runs freely from there."
 )
-
-
-@dataclass(frozen=True)
-class VerdictBadge:
-    """The verdict in two words.
-
-    Attributes
-    ----------
-    label
-        The words.
-    good
-        Whether the simulation needs no change.
-    promise
-        What it means, in plain words.
-    """
-
-    label: str
-    good: bool
-    promise: tuple[str, ...]
 
 
 PROMISES = {
@@ -71,10 +50,10 @@ PROMISES = {
 }
 
 
-def badge(findings: Findings) -> VerdictBadge:
+def badge(findings: Findings) -> Badge:
     """The verdict in two words, and what these mean."""
     kind = findings.kind
-    return VerdictBadge(kind, kind == "no mismatch", PROMISES[kind])
+    return Badge(kind, kind == "no mismatch", PROMISES[kind])
 
 
 def answer(findings: Findings) -> list[str]:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import pandas as pd
-from markupsafe import Markup
 
 from siq.mismatch.dictionary import Mechanism
 from siq.numerics.measured_text import unit_text, value_text
@@ -22,7 +20,7 @@ from siq.report.mismatch_findings import (
     rate_of,
     typeset,
 )
-from siq.report.page import ReportFigure, ReportTable
+from siq.report.page import FormulaRow, ReportSection, ReportTable
 
 CANDIDATES_SHOWN = 12
 RECORDINGS_LISTED = 12
@@ -50,48 +48,7 @@ STAGES = {
 }
 
 
-@dataclass(frozen=True)
-class FormulaLine:
-    """A formula with what it is of; the attributes are those that the pages' templates ask for."""
-
-    quantity: Markup | str
-    formula: Markup | str
-    note: str = ""
-    exact: None = None
-    whole: None = None
-
-
-@dataclass(frozen=True)
-class MismatchSection:
-    """A section of the page.
-
-    Attributes
-    ----------
-    heading
-        Its heading.
-    text
-        Paragraphs.
-    formulas, tables, figures
-        Below the text, in this order.
-    notes
-        Paragraphs in small print.
-    folded
-        Whether it is closed until a reader opens it.
-    listing
-        Lines of code, such as commands.
-    """
-
-    heading: str
-    text: Sequence[str] = ()
-    formulas: Sequence[FormulaLine] = ()
-    tables: Sequence[ReportTable] = ()
-    figures: Sequence[ReportFigure] = ()
-    notes: Sequence[str] = ()
-    folded: bool = False
-    listing: str = ""
-
-
-def sections(findings: Findings, *, commands: Sequence[str] = ()) -> list[MismatchSection]:
+def sections(findings: Findings, *, commands: Sequence[str] = ()) -> list[ReportSection]:
     """Every section that has something to say, in the order of the page."""
     found = [
         _formula(findings),
@@ -102,14 +59,12 @@ def sections(findings: Findings, *, commands: Sequence[str] = ()) -> list[Mismat
         _parameters(findings),
         _held_out(findings),
         _candidates(findings),
-        MismatchSection("How to run it again", listing="\n".join(commands), folded=True)
-        if commands
-        else None,
+        ReportSection("How to run it again", listing="\n".join(commands), folded=True) if commands else None,
     ]
     return [section for section in found if section is not None]
 
 
-def _formula(findings: Findings) -> MismatchSection | None:
+def _formula(findings: Findings) -> ReportSection | None:
     named = mechanisms_said(findings)
     if not named:
         return None
@@ -118,7 +73,7 @@ def _formula(findings: Findings) -> MismatchSection | None:
     for each in named:
         entry = known.get(each["name"])
         lines += [
-            FormulaLine(
+            FormulaRow(
                 each["label"],
                 typeset(formula, findings.after, each["parameters"]),
                 _of_what(name, entry, findings),
@@ -133,7 +88,7 @@ def _formula(findings: Findings) -> MismatchSection | None:
             notes.append(f"{capital(each['name'])}: {entry.reference}.")
     if findings.kind == "missing physics":
         lines += [
-            FormulaLine(rate_of(name), mathml(formula))
+            FormulaRow(rate_of(name), mathml(formula))
             for name, formula in zip(findings.after.states, findings.after.equations, strict=True)
         ]
         notes.append("The simulation with what was found is a system card like any other: system.yaml.")
@@ -141,7 +96,7 @@ def _formula(findings: Findings) -> MismatchSection | None:
     if findings.kind == "random forces":
         heading = "The random forces"
     tables = [ReportTable("Parameters of what is missing.", pd.DataFrame(rows))] if rows else []
-    return MismatchSection(heading, (), lines, tables, notes=list(dict.fromkeys(notes)))
+    return ReportSection(heading, (), lines, tables, notes=list(dict.fromkeys(notes)))
 
 
 def _of_what(name: str, entry: Mechanism | None, findings: Findings) -> str:
@@ -159,7 +114,7 @@ def _value(entry: Mapping[str, Any]) -> str:
     return value_text(entry["estimate"], entry.get("standard_error"), unit=entry.get("unit", "1"))
 
 
-def _how_sure(findings: Findings) -> MismatchSection:
+def _how_sure(findings: Findings) -> ReportSection:
     named = mechanisms_said(findings)
     rows = [
         {
@@ -197,7 +152,7 @@ def _how_sure(findings: Findings) -> MismatchSection:
         f"{capital(each['label'])} could not be judged: {each['reason']}."
         for each in findings.verdict.get("not_fitted", [])
     ]
-    return MismatchSection("How sure it is", text, tables=tables, notes=notes)
+    return ReportSection("How sure it is", text, tables=tables, notes=notes)
 
 
 NOTHING_FOUND = {
@@ -227,7 +182,7 @@ def _look_alikes(findings: Findings, named: Sequence[Mapping[str, Any]]) -> list
     return lines
 
 
-def _where(findings: Findings) -> MismatchSection | None:
+def _where(findings: Findings) -> ReportSection | None:
     place = findings.verdict["location"]
     if place is None:
         return None
@@ -246,10 +201,10 @@ def _where(findings: Findings) -> MismatchSection | None:
                 f" {percent(share)} of the difference."
             )
     figures = [*findings.figure("curves", CAPTIONS["curves"]), *findings.figure("map", CAPTIONS["map"])]
-    return MismatchSection("Where it sits", text, figures=figures)
+    return ReportSection("Where it sits", text, figures=figures)
 
 
-def _wells(findings: Findings) -> MismatchSection | None:
+def _wells(findings: Findings) -> ReportSection | None:
     if findings.kind in ("no mismatch", "unexplained"):
         return None
     text, tables, figures = list(findings.notes), [], []
@@ -290,10 +245,10 @@ def _wells(findings: Findings) -> MismatchSection | None:
     if not text and not tables:
         return None
     heading = "What it does to wells and escape times"
-    return MismatchSection(heading, text, tables=tables, figures=figures, folded=not tables)
+    return ReportSection(heading, text, tables=tables, figures=figures, folded=not tables)
 
 
-def _excluded(findings: Findings) -> MismatchSection | None:
+def _excluded(findings: Findings) -> ReportSection | None:
     bounds = findings.verdict["excluded"]
     if not bounds:
         return None
@@ -307,10 +262,10 @@ def _excluded(findings: Findings) -> MismatchSection | None:
     ]
     text = ["What was looked for and not found may still be there, but no larger than this."]
     table = ReportTable("Upper bounds for mechanisms that were not found.", pd.DataFrame(rows), {}, "", 60)
-    return MismatchSection("How large could something missing be?", text, tables=[table])
+    return ReportSection("How large could something missing be?", text, tables=[table])
 
 
-def _parameters(findings: Findings) -> MismatchSection | None:
+def _parameters(findings: Findings) -> ReportSection | None:
     units = {entry.name: entry.unit for entry in findings.before.parameters}
     rows = [
         {
@@ -329,10 +284,10 @@ def _parameters(findings: Findings) -> MismatchSection | None:
     table = ReportTable(
         f"The simulation's own parameters, on the card and fitted, {end}.", pd.DataFrame(rows)
     )
-    return MismatchSection("Its own parameters", tables=[table])
+    return ReportSection("Its own parameters", tables=[table])
 
 
-def _held_out(findings: Findings) -> MismatchSection | None:
+def _held_out(findings: Findings) -> ReportSection | None:
     tables = []
     if len(findings.scores):
         caption = "Scores of the public benchmark: root mean square errors on its held-out recordings."
@@ -340,10 +295,10 @@ def _held_out(findings: Findings) -> MismatchSection | None:
     figures = findings.figure("held_out", CAPTIONS["held_out"])
     if not tables and not figures:
         return None
-    return MismatchSection("More held-out recordings", tables=tables, figures=figures)
+    return ReportSection("More held-out recordings", tables=tables, figures=figures)
 
 
-def _candidates(findings: Findings) -> MismatchSection | None:
+def _candidates(findings: Findings) -> ReportSection | None:
     table = findings.candidates
     best = table[table["gain"] >= 1] if len(table) else table
     if not len(best):
@@ -372,4 +327,4 @@ def _candidates(findings: Findings) -> MismatchSection | None:
         CANDIDATES_SHOWN,
     )
     figures = findings.figure("candidates", CAPTIONS["candidates"])
-    return MismatchSection("All that was tried", tables=[whole], figures=figures)
+    return ReportSection("All that was tried", tables=[whole], figures=figures)

@@ -24,7 +24,7 @@ class FormulaRow:
     Attributes
     ----------
     quantity
-        What the formula gives: ``"U"``, ``"f"``.
+        What the formula gives: ``"U"``, ``"f"``, typeset or as text.
     formula
         Typeset by `siq.report.formatting`; plain text is shown as text.
     note
@@ -35,7 +35,7 @@ class FormulaRow:
         The formula in full, folded away, where `formula` leaves small terms out.
     """
 
-    quantity: str
+    quantity: Markup | str
     formula: Markup | str
     note: str = ""
     exact: Markup | str | None = None

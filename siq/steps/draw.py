@@ -7,7 +7,8 @@ from pathlib import Path
 
 from pydantic.dataclasses import dataclass
 
-from siq.data.recordings import Recordings, read_pairs, write_recordings
+from siq.data.learnable import read_pairs
+from siq.data.recordings import Recordings, write_recordings
 from siq.data.selection import in_stretches, resample_recordings
 from siq.dynamics.cards import load_system
 from siq.dynamics.dynamics import Dynamics

@@ -114,7 +114,8 @@ class Study(BaseModel):
         Noise intensities ε for which the invariant distribution is computed, and simulated.
     landscape
         How the landscape is found: equilibria, a formula for each well, barriers, paths and escape times;
-        by default with the options' own defaults. ``false`` finds none.
+        by default with the options' own defaults. ``false`` finds none, but for the run that
+        the page shows.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)

@@ -13,10 +13,10 @@ import pytest
 
 from siq.data.headings import RESERVED, is_unit, read_heading, usable_name
 from siq.data.inspection import inspect_recordings
-from siq.data.learnable import checked_for_learning
+from siq.data.learnable import checked_for_learning, read_pairs
 from siq.data.noise_floor import noise_floors
 from siq.data.quantum import decimals_of, quantum, rounding_error
-from siq.data.recordings import Recordings, read_pairs, read_recordings, write_recordings
+from siq.data.recordings import Recordings, read_recordings, write_recordings
 from siq.data.selection import STRETCHES, in_stretches
 from siq.dynamics.cards import check_name
 from siq.dynamics.formulas import CONSTANTS, FUNCTIONS

@@ -1,11 +1,11 @@
 """The sentence that page and text open with, for every kind of landscape."""
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
 from known_systems import double_well, exact_field, portrait_of
+from told_landscapes import NOISE, landscape
 
 from siq.landscape.dwell_times import NoiseStrength
 from siq.landscape.landscape import find_landscape
@@ -15,46 +15,6 @@ from siq.report.landscape_answer import headline, remarks, wells_table
 from siq.report.landscape_tables import landscape_tables
 from siq.report.said_landscape import SaidLandscape, well_name
 from siq.study.tables import as_table
-
-NOISE = {"intensity": 0.1, "standard_error": 0.001, "source": "estimated"}
-
-
-def landscape(
-    places: list[list[float]],
-    barriers: list[float | None],
-    *,
-    noise: dict[str, Any] | None = None,
-    units: str = "um",
-    time: str = "s",
-    prefactor: float | None = 4.0,
-) -> dict[str, Any]:
-    """Plain data of wells in a row, each left to the next over a saddle; None is a barrier nobody knows."""
-    d = len(places[0]) if places else 1
-    ways = [
-        {
-            "start": index, "end": (index + 1) % len(places) if len(places) > 1 else None,
-            "saddle": [0.0] * d, "barrier": barrier, "error": 0.01, "standard_error": 0.01,
-            "minimum_action": barrier, "prefactor": prefactor, "exponent": 0.0, "notes": [],
-        }
-        for index, barrier in enumerate(barriers)
-    ]  # fmt: skip
-    wells = [
-        {
-            "attractor": place,
-            "standard_errors": [0.004] * d,
-            "basin": 1 / len(places),
-            "height": 0.0,
-            "V": None,
-        }
-        for place in places
-    ]
-    equilibria = [
-        {"position": place, "kind": "attractor", "eigenvalues": [[-1.0, 0.0]] * d} for place in places
-    ]
-    return {
-        "states": ["x", "y", "z"][:d], "units": [units] * d, "time_unit": time, "noise": noise,
-        "equilibria": equilibria, "wells": wells, "transitions": ways, "notes": [],
-    }  # fmt: skip
 
 
 def test_two_wells_without_noise_have_depths_and_a_way_to_times() -> None:

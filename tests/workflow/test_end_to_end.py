@@ -113,6 +113,26 @@ def test_snakemakes_own_report_is_written_with_captions(finished):
     assert "How often each term was found" in said
 
 
+def test_every_figure_of_the_page_is_a_file_and_none_is_a_sentence(finished):
+    figures = finished.path("results/mini/figures")
+    names = {path.stem for path in figures.glob("*.png")}
+    assert names == {path.stem for path in figures.glob("*.svg")}
+    assert {"quasipotential", "coefficients_refined", "prediction"} <= names
+    # Nobody asked for the density, and nothing was published of this landscape.
+    assert not names & {"invariant", "escape", "landscape_published"}
+
+
+def test_the_page_and_the_terminal_have_the_same_answer(finished):
+    answer = json.loads(finished.path("results/mini/answer.json").read_text(encoding="utf-8"))
+    page = finished.path("results/mini/report.html").read_text(encoding="utf-8")
+    assert answer["runs"] == 2 and answer["formulas"] == 2 and answer["failed"] == 0
+    # The study finds no landscape of every run; that of the run that is shown tells the answer.
+    assert answer["sentence"].startswith("The recordings show two stable states, A at")
+    assert answer["sentence"].split(",")[0] in page
+    overview = json.loads(finished.path("results/mini/overview.json").read_text(encoding="utf-8"))
+    assert len(overview["wells"]) == 2
+
+
 def test_the_page_beside_the_paper_takes_what_a_study_left(finished):
     study = load_study(finished.path("study.yaml"))
     system = load_system(finished.path("config/systems/archetype3d.yaml"))

@@ -1,0 +1,204 @@
+"""The page of every kind of study: what stands where, and that only what exists is shown."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+import sympy
+from told_landscapes import NOISE, landscape
+
+from siq.dynamics.dynamics import Dynamics
+from siq.potential.storage import model_to_data, write_model
+from siq.potential.symbolic import SymbolicDecomposition, exact_decomposition
+from siq.report.page import ReportContent, render_report
+from siq.report.study_captions import CAPTIONS, LEADING, OF_NETWORKS, OF_RUNS
+from siq.report.study_page import study_page
+from siq.report.study_sections import StudyResults
+from siq.steps.outcomes import Method
+from siq.steps.shown import ModelFiles, shown_formula
+from siq.study.scoring import coefficient_table, summary_table
+from siq.study.study import Study
+from siq.study.tables import COLUMNS, as_table
+
+PNG = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR" + (1400).to_bytes(4, "big") + (940).to_bytes(4, "big")
+X = sympy.Symbol("x", real=True)
+SYSTEM = Dynamics.of((X,), (2.0 * X - 8.0 * X**3,))
+EXACT = exact_decomposition(SYSTEM, 4.0 * X**4 - 2.0 * X**2 + 0.25)
+
+
+def certificate(*, passed: bool) -> dict[str, Any]:
+    test = {
+        "value": 1e-6 if passed else 0.3,
+        "limit": 0.05,
+        "passed": passed,
+        "reason": "" if passed else "too far",
+    }
+    return {
+        "certified": passed, "scope": "region", "stated_error": 4.2e-6 if passed else None,
+        "reason": "" if passed else "too far", "tested_on": "points", "independent": ["characteristics"],
+        "tests": {"characteristics": test},
+    }  # fmt: skip
+
+
+def page_of(
+    folder: Path,
+    *,
+    certified: bool = True,
+    runs: int = 1,
+    regressed: bool = False,
+    exact: SymbolicDecomposition | None = None,
+    overview: dict[str, Any] | None = None,
+    images: tuple[str, ...] = (),
+    reason: str = "",
+    **study: Any,
+) -> ReportContent:
+    """The page of a study with these results; where there is a reason for it, without formulas."""
+    found: dict[str, SymbolicDecomposition] = {} if reason else {str(Method.REFINED): EXACT}
+    if regressed:
+        found[str(Method.REGRESSION)] = EXACT
+        study["training"] = {}
+    certificates = {name: certificate(passed=certified and name == Method.REFINED) for name in found}
+    paths, coefficients, rrmse, tests, outcomes = [], [], [], [], []
+    for run in range(runs):
+        path = folder / f"{run}.json"
+        write_model(path, model_to_data(found, certificates))
+        paths.append(str(path))
+        for name, one in found.items():
+            coefficients.append(
+                coefficient_table(run, name, one, exact, terms=("1", "x", "x**2", "x**3", "x**4"))
+            )
+            rrmse.append({"run": run, "method": name, "certified": certificates[name]["certified"]})
+            tests.append({"run": run, "method": name, "test": "characteristics", "reason": ""}
+                         | {key: certificates[name]["tests"]["characteristics"][key]
+                            for key in ("value", "limit", "passed")})  # fmt: skip
+        outcomes.append({"run": run, "step": "identify", "status": "ok", "reason": ""})
+        if reason:
+            outcomes.append({"run": run, "step": "refine", "status": "failed", "reason": reason})
+    tables = {name: as_table(name, []) for name in COLUMNS}
+    tables |= {
+        "rrmse": as_table("rrmse", rrmse), "certificates": as_table("certificates", tests),
+        "outcomes": as_table("outcomes", outcomes),
+    }  # fmt: skip
+    if coefficients:
+        tables["coefficients"] = as_table("coefficients", pd.concat(coefficients))
+    tables["summary"] = summary_table(tables["coefficients"], tables["rrmse"], tables["prediction"], {})
+    del tables["landscape_errors"], tables["escape"]
+    models = ModelFiles(tuple(paths))
+    asked = Study.model_validate({"name": "mine", "runs": runs, "recordings": {"file": "mine.csv"}} | study)
+    results = StudyResults(
+        tables, Path("results/mine/tables"), models, shown_formula(tables["rrmse"], models), exact,
+        images=dict.fromkeys(images, PNG), vectors={}, overview=overview,
+    )  # fmt: skip
+    return study_page(asked, results, command="siq run mine.yaml", versions={"siq": "1"})
+
+
+def headings(content: ReportContent) -> list[str]:
+    return [section.heading for section in content.sections]
+
+
+WELLS = {"run": 0} | landscape([[-0.5], [0.5]], [0.25, 0.25], noise=NOISE)
+EVERY = tuple(CAPTIONS)
+
+
+def test_the_answer_then_formulas_then_evidence_then_workings(tmp_path: Path) -> None:
+    content = page_of(tmp_path, overview=WELLS, images=("quasipotential", "residuals", "dataset"))
+    assert content.answer[0].startswith("The recordings show two stable states")
+    assert content.badge is not None and content.badge.good
+    assert content.figure is not None and content.figure.caption == CAPTIONS["quasipotential"].text
+    assert content.table is not None and "lasts (s)" in list(content.table.frame["stable state"])
+    assert headings(content) == [
+        "Formulas", "How far it can be trusted", "The landscape in full", "The recordings and the workings",
+        "How to run it again", "The study and the versions",
+    ]  # fmt: skip
+    folded = [section.heading for section in content.sections if section.folded]
+    assert folded == ["The recordings and the workings", "The study and the versions"]
+
+
+def test_of_one_run_without_networks_card_and_paper_nothing_speaks_of_them(tmp_path: Path) -> None:
+    page = render_report(page_of(tmp_path, overview=WELLS, images=EVERY))
+    text = re.sub(r'base64,[^"]*', "", page[page.index("<main>") : page.index("The study and the versions")])
+    for word in ("runs", "1 of 1", "Exact", "paper", "regression", "published", "network", "RRMSE", "run 0"):
+        assert word not in text, word
+
+
+@pytest.mark.parametrize("runs", [1, 3])
+@pytest.mark.parametrize("regressed", [False, True])
+def test_every_figure_that_makes_sense_is_shown_once(tmp_path: Path, runs: int, regressed: bool) -> None:
+    content = page_of(
+        tmp_path, overview=WELLS, images=(*EVERY, "of_tomorrow"), runs=runs, regressed=regressed
+    )
+    shown = [figure.alternative for section in content.sections for figure in section.figures]
+    assert content.figure is not None
+    shown.append(content.figure.alternative)
+    absent = {LEADING[1], "landscape_published"}
+    absent |= set(OF_RUNS) if runs == 1 else set()
+    absent |= set() if regressed else set(OF_NETWORKS)
+    expected = [caption.text for name, caption in CAPTIONS.items() if name not in absent]
+    assert sorted(shown) == sorted([*expected, "Of tomorrow."])
+
+
+def test_a_figure_that_was_not_drawn_leaves_no_trace(tmp_path: Path) -> None:
+    content = page_of(tmp_path, overview=WELLS)
+    page = render_report(content)
+    assert content.figure is None and "<img" not in page and "Figure" not in page
+
+
+def test_the_published_method_is_folded_away_unless_a_paper_is_named(tmp_path: Path) -> None:
+    for published, folded in ((None, True), ("archetype3d", False)):
+        content = page_of(tmp_path, overview=WELLS, regressed=True, published=published)
+        section = next(one for one in content.sections if one.heading == "The published method")
+        assert section.folded is folded and [row.quantity for row in section.formulas] == ["U", "g", "f"]
+        assert "not certified" in section.text[-1]
+    assert "The published method" not in headings(page_of(tmp_path, overview=WELLS))
+
+
+def test_figures_name_the_paper_only_beside_it(tmp_path: Path) -> None:
+    captions = [
+        "".join(figure.caption for section in page.sections for figure in section.figures)
+        for page in (
+            page_of(tmp_path, overview=WELLS, images=EVERY, published=name) for name in (None, "archetype3d")
+        )
+    ]
+    assert "paper" not in captions[0] and "In the paper: Fig. 1." in captions[1]
+
+
+def test_a_refusal_is_told_as_one(tmp_path: Path) -> None:
+    content = page_of(tmp_path, overview=WELLS, certified=False)
+    assert content.badge is not None and not content.badge.good and content.badge.label == "not certified"
+    assert content.badge.promise[0] == (
+        "An independent calculation, along characteristics of f, gives another U."
+    )
+    evidence = next(one for one in content.sections if one.heading == "How far it can be trusted")
+    assert any("not certified" in table.caption for table in evidence.tables)
+
+
+def test_a_study_without_a_formula_says_why_and_has_no_table_of_nothing(tmp_path: Path) -> None:
+    content = page_of(tmp_path, reason="the recordings are too short")
+    assert content.answer == ["No landscape was found: the recordings are too short."]
+    assert content.table is None and content.badge is not None and content.badge.label == "no formula"
+    page = render_report(content)
+    assert "the table has no rows" not in page.lower() and "nan" not in page[page.index("<main>") :]
+
+
+def test_several_runs_say_together_what_they_have_in_common(tmp_path: Path) -> None:
+    content = page_of(tmp_path, overview=WELLS, runs=3)
+    section = next(one for one in content.sections if one.heading == "What 3 runs say together")
+    assert any("3 of 3 runs are certified" in line for line in section.text)
+    assert list(section.tables[0].frame["quantity"])[-1] == "U: x⁴"
+    assert "3 of 3 runs are certified." in (content.badge.promise if content.badge else [])
+
+
+def test_an_exact_answer_stands_beside_ours(tmp_path: Path) -> None:
+    page = render_report(page_of(tmp_path, overview=WELLS, exact=EXACT))
+    assert ">Exact</th>" in page and "Against the exact U" not in page  # no error was scored here
+    assert ">Exact</th>" not in render_report(page_of(tmp_path, overview=WELLS))
+
+
+def test_what_the_command_prints_is_what_the_page_opens_with(tmp_path: Path) -> None:
+    page = render_report(page_of(tmp_path, overview=WELLS))
+    sentence = page_of(tmp_path, overview=WELLS).answer[0]
+    assert page.index(sentence.split(";")[0]) < page.index("Formulas</h2>")

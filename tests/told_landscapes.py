@@ -1,0 +1,45 @@
+"""Landscapes as plain data, to be told."""
+
+from __future__ import annotations
+
+from typing import Any
+
+NOISE = {"intensity": 0.1, "standard_error": 0.001, "source": "estimated"}
+
+
+def landscape(
+    places: list[list[float]],
+    barriers: list[float | None],
+    *,
+    noise: dict[str, Any] | None = None,
+    units: str = "um",
+    time: str = "s",
+    prefactor: float | None = 4.0,
+) -> dict[str, Any]:
+    """Plain data of wells in a row, each left to the next over a saddle; None is a barrier nobody knows."""
+    d = len(places[0]) if places else 1
+    ways = [
+        {
+            "start": index, "end": (index + 1) % len(places) if len(places) > 1 else None,
+            "saddle": [0.0] * d, "barrier": barrier, "error": 0.01, "standard_error": 0.01,
+            "minimum_action": barrier, "prefactor": prefactor, "exponent": 0.0, "notes": [],
+        }
+        for index, barrier in enumerate(barriers)
+    ]  # fmt: skip
+    wells = [
+        {
+            "attractor": place,
+            "standard_errors": [0.004] * d,
+            "basin": 1 / len(places),
+            "height": 0.0,
+            "V": None,
+        }
+        for place in places
+    ]
+    equilibria = [
+        {"position": place, "kind": "attractor", "eigenvalues": [[-1.0, 0.0]] * d} for place in places
+    ]
+    return {
+        "states": ["x", "y", "z"][:d], "units": [units] * d, "time_unit": time, "noise": noise,
+        "equilibria": equilibria, "wells": wells, "transitions": ways, "notes": [],
+    }  # fmt: skip
