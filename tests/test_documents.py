@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib.util
 import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -115,6 +117,12 @@ def test_figures_are_read_from_tables(tmp_path: Path) -> None:
     assert found["rrmse_mean"] == "3.2·10⁻¹¹" and found["regression_right_terms"] == "0 of 1"
 
 
+def test_every_figure_says_where_it_comes_from() -> None:
+    assert not [
+        one for of in FIGURES.values() for one in of.values() if set(one) != {"value", "command", "source"}
+    ]
+
+
 def test_the_readme_is_filled_in_by_the_script() -> None:
     figures = loaded(DOCS / "make" / "figures.py")
     assert figures.filled("so <!--=a.b-->old<!--/-->!", {"a.b": "new"}) == "so <!--=a.b-->new<!--/-->!"
@@ -137,6 +145,23 @@ def test_outputs_of_examples_belong_to_their_text(script: Path) -> None:
     assert made["seconds"] <= 60
     assert {"output.txt", "figure.png", "table.csv"} <= {file.name for file in outputs.iterdir()}
     assert (outputs / "output.txt").read_text(encoding="utf-8").strip()
+
+
+@pytest.mark.parametrize("script", EXAMPLES, ids=lambda script: script.stem)
+def test_figures_in_the_text_of_examples_are_those_of_their_outputs(script: Path) -> None:
+    outputs = DOCS / "gallery" / "outputs" / script.stem
+    shown = "".join((outputs / name).read_text(encoding="utf-8") for name in ("output.txt", "table.csv"))
+    shown += script.read_text(encoding="utf-8")
+    text = (script.with_suffix(".md")).read_text(encoding="utf-8")
+    said = re.sub(r"```.*?```|`[^`]*`", "", text, flags=re.DOTALL)
+    for number in re.findall(r"(?<![\w.⁻])\d+\.\d+|\d{3,}", said):
+        assert re.search(rf"(?<![\d.]){re.escape(number)}(?!\d)", shown), number
+
+
+def test_every_image_of_the_examples_is_there() -> None:
+    for page in (DOCS / "gallery").glob("*.md"):
+        for image in re.findall(r"(outputs/[\w/.-]+\.png)", page.read_text(encoding="utf-8")):
+            assert (DOCS / "gallery" / image).is_file(), image
 
 
 @pytest.mark.parametrize("script", NOTEBOOKS, ids=lambda script: script.stem)
@@ -239,6 +264,14 @@ def test_the_catalogue_of_workflows_finds_what_it_expects() -> None:
     assert catalogue["usage"]["software-stack-deployment"]
     assert (ROOT / "config" / "README.md").is_file()
     assert (ROOT / "workflow" / "report" / "workflow.rst").is_file()
+
+
+@pytest.mark.workflow
+def test_the_workflow_begins_where_the_catalogue_looks_too() -> None:
+    command = [sys.executable, "-m", "snakemake", "-n", "-s", "workflow/Snakefile", "statistics"]
+    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    assert "archetype3d" in run.stdout + run.stderr
 
 
 def test_every_caption_is_used_and_every_used_caption_exists() -> None:

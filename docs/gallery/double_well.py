@@ -37,6 +37,5 @@ print(table.round(1).to_string(index=False))
 print("\nExact: wells at x = -1 and 1 µm, barriers of U of 0.5 µm²/s")
 
 # %% The picture
-axes = landscape.plot()
-axes.plot(samples[:25, :, 0].T, samples[:25, :, 1].T, color="0.5", linewidth=0.3, zorder=0.5)
+siq.plot_quasipotential(landscape, recordings=recordings)
 plt.show()

@@ -38,6 +38,5 @@ print()
 print(table.round(0).to_string(index=False))
 
 # %% The picture
-axes = landscape.plot()
-axes.plot(samples[:25, :, 0].T, samples[:25, :, 1].T, color="0.5", linewidth=0.3, zorder=0.5)
+siq.plot_quasipotential(landscape, recordings=recordings)
 plt.show()

@@ -60,18 +60,7 @@ table = pd.DataFrame(
 print()
 print(table.to_string(index=False, float_format="{:.4f}".format))
 
-# %% The picture: a swing that had no part in finding it out
-held_out, end = diagnosis.case.kept, diagnosis.case.kept.first[1]
-t, measured = held_out.t[:end], held_out.outputs[:end, 0]
-figure, axes = plt.subplots(2, sharex=True, layout="constrained")
-runs = {
-    "with new parameters": diagnosis.held_out.recalibrated,
-    "with what was missing": diagnosis.held_out.augmented,
-}
-for ax, (label, run) in zip(axes, runs.items(), strict=True):
-    ax.axhline(0, color="0.8", linewidth=1)
-    ax.plot(t, 1000 * (measured - run.outputs[:end, 0]), ".", markersize=2)
-    ax.set_title(f"Recording less simulation, {label}")
-    ax.set_ylabel("angle [mrad]")
-axes[1].set_xlabel("t [s]")
+# %% The pictures: a swing that had no part in the fit, and what the simulations leave of it
+siq.plot_diagnosis(diagnosis)
+siq.plot_residuals(diagnosis)
 plt.show()

@@ -61,16 +61,7 @@ table = pd.DataFrame(
 print()
 print(table.to_string(index=False, float_format="{:.4f}".format))
 
-# %% The picture: a swing that had no part in the fit
-held_out, end = diagnosis.case.kept, diagnosis.case.kept.first[1]
-t, measured = held_out.t[:end], held_out.outputs[:end, 0]
-simulated = diagnosis.held_out.recalibrated.outputs[:end, 0]
-figure, axes = plt.subplots(2, sharex=True, layout="constrained")
-axes[0].plot(t, measured, ".", markersize=2, label="recorded")
-axes[0].plot(t, simulated, linewidth=1, label="simulated")
-axes[0].set_ylabel("angle [rad]")
-axes[0].legend(loc="upper right")
-axes[1].plot(t, 1000 * (measured - simulated), ".", markersize=2)
-axes[1].set_ylabel("difference [mrad]")
-axes[1].set_xlabel("t [s]")
+# %% The pictures: a swing that had no part in the fit, and what the simulations leave of it
+siq.plot_diagnosis(diagnosis)
+siq.plot_residuals(diagnosis)
 plt.show()

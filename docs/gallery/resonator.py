@@ -44,5 +44,5 @@ print(table.to_string(index=False))
 print("\nBy minimum action paths of the exact equations: 1.047e-08 and 8.16e-09")
 
 # %% The picture
-landscape.plot()
+siq.plot_quasipotential(landscape, recordings=recordings)
 plt.show()

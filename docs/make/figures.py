@@ -2,8 +2,10 @@
 
 `docs/figures.json` is the one place where a measured figure stands. Pages name it as
 `{{ figures.archetype3d.certified }}`; README.md, which no program fills in, has it between the marks
-`<!--=archetype3d.certified-->` and `<!--/-->`, and this script writes it there. Figures whose tables are not
-among the results stay as they were measured before, and the script says so.
+`<!--=archetype3d.certified-->` and `<!--/-->`, and this script writes it there. Beside each figure stand
+the command that measured it and its source: the folder of tables from which this script read it, or how
+else it came there. Figures whose tables are not among the results stay as they were measured before, and
+the script says so.
 """
 
 from __future__ import annotations
@@ -97,7 +99,10 @@ def main(results: Path) -> None:
             )
             continue
         known.setdefault(group, {}).update(
-            {name: {"value": value, "command": command} for name, value in found.items()}
+            {
+                name: {"value": value, "command": command, "source": f"results/{tables}"}
+                for name, value in found.items()
+            }
         )
     FIGURES.write_text(json.dumps(known, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     README.write_text(filled(README.read_text(encoding="utf-8"), values()), encoding="utf-8")

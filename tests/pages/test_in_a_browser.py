@@ -35,6 +35,7 @@ def test_the_documentation_is_sound(browser: Any, width: int) -> None:
         seen = look_at(browser, page, width=width)
         assert not seen.overflowing, f"{page.name}: {seen.overflowing}"
         assert not seen.requests, f"{page.name}: {seen.requests}"
+        assert not seen.faults, f"{page.name}: {seen.faults}"
 
 
 @pytest.mark.parametrize("kind", ["two-states", "three-states"])

@@ -30,7 +30,7 @@ from siq.steps.score import ScoreSettings
 from siq.steps.train import TrainSettings
 from siq.study.study import load_published
 from workflow.code_digest import code_digest
-from workflow.places import config_path, find_file
+from workflow.places import BASE, config_path, find_file
 from workflow.settings import Studies, prepare_environment
 from workflow.warm import start
 
@@ -88,7 +88,7 @@ def exact_answer(wildcards):
 
 def code(script):
     """Params function: fingerprint of the script and of every module of siq that it imports, by content."""
-    return lambda wildcards: code_digest(Path(workflow.basedir), script)
+    return lambda wildcards: code_digest(BASE, script)
 
 
 def block_of(wildcards):
