@@ -107,7 +107,9 @@ def needed_file(file: str, *, start: Path, where: tuple[str, str]) -> str:
         fault = f"there is no file '{file}', neither at " + " nor at ".join(map(str, places))
     near = [name for place in places for name in _like(place)]
     remedy = (
-        f"did you mean '{near[0]}'" if near else "correct the path; it starts from the folder of this file"
+        f"perhaps you meant '{near[0]}'"
+        if near
+        else "correct the path; it starts from the folder of this file"
     )
     raise InputError(*where, fault, remedy)
 

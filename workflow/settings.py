@@ -236,7 +236,9 @@ def _existing_card(system: str, document: Document) -> Path:
     near = difflib.get_close_matches(system, known, n=1)
     raise InputError(
         *where, f"there is no card of a system '{system}'",
-        f"did you mean '{near[0]}'" if near else f"give the path of one, or use one of {', '.join(known)}",
+        f"perhaps you meant '{near[0]}'"
+        if near
+        else f"give the path of one, or use one of {', '.join(known)}",
     )  # fmt: skip
 
 

@@ -137,7 +137,7 @@ def _not_there(given: str) -> InputError:
     near = difflib.get_close_matches(place.name, beside, n=1) or difflib.get_close_matches(
         given, known_studies(), n=1
     )
-    remedy = f"did you mean '{near[0]}'" if near else "correct the path"
+    remedy = f"perhaps you meant '{near[0]}'" if near else "correct the path"
     if not place.parent.is_dir():
         return InputError(given, "", f"there is no folder {place.parent}", remedy)
     return InputError(given, "", f"there is no file or folder of that name in {place.parent}", remedy)

@@ -34,7 +34,7 @@ def missing_file(file: str, looked_at: Sequence[Path]) -> InputError:
         near = difflib.get_close_matches(path.name.casefold(), names, n=1)
         near = near or [name for name in names if Path(name).stem == path.stem.casefold()]
         if near:
-            return InputError(file, "", fault, f"did you mean '{folder / names[near[0]]}'")
+            return InputError(file, "", fault, f"perhaps you meant '{folder / names[near[0]]}'")
     missing = next((path.parent for path in looked_at if not path.parent.is_dir()), None)
     remedy = (
         f"there is no folder '{missing}' either" if missing is not None else "check the name and the folder"

@@ -245,5 +245,5 @@ def _wanted(file: str, name: str, plain: list[str], known: list[int], notes: lis
             return matches[0]
     titles = [plain[place] for place in known if plain[place]]
     near = difflib.get_close_matches(name, titles, n=1)
-    remedy = f"did you mean '{near[0]}'" if near else f"the measured columns are {', '.join(titles)}"
+    remedy = f"perhaps you meant '{near[0]}'" if near else f"the measured columns are {', '.join(titles)}"
     raise InputError(file, "", f"the column '{name}' is missing", remedy if titles else "add it")

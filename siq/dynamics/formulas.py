@@ -156,7 +156,7 @@ def _look_up(name: str, names: Mapping[str, sympy.Expr]) -> sympy.Expr:
     if name in CONSTANTS:
         return CONSTANTS[name]
     near = difflib.get_close_matches(name, names, n=1)
-    remedy = f"did you mean '{near[0]}'" if near else "declare it, or correct the spelling"
+    remedy = f"perhaps you meant '{near[0]}'" if near else "declare it, or correct the spelling"
     raise FormulaError(f"the name '{name}' is not declared", remedy)
 
 
@@ -177,7 +177,7 @@ def _power(base: sympy.Expr, exponent: sympy.Expr) -> sympy.Expr:
 def _call(name: str, arguments: Sequence[sympy.Expr]) -> sympy.Expr:
     if name not in FUNCTIONS:
         near = difflib.get_close_matches(name, FUNCTIONS, n=1)
-        remedy = f"did you mean '{near[0]}'" if near else f"use one of {', '.join(FUNCTIONS)}"
+        remedy = f"perhaps you meant '{near[0]}'" if near else f"use one of {', '.join(FUNCTIONS)}"
         raise FormulaError(f"the function '{name}' is not allowed in a formula", remedy)
     wanted = "at least two arguments" if name in ("Max", "Min") else "one argument"
     if (len(arguments) < 2) if name in ("Max", "Min") else (len(arguments) != 1):

@@ -125,7 +125,9 @@ def _explain(error: Any, keys: Keys, model: type[BaseModel]) -> tuple[str, str]:
         known = _known_keys(model, keys[:-1])
         near = difflib.get_close_matches(str(name), known, n=1)
         remedy = (
-            f"did you mean '{near[0]}'" if near else f"remove it or use one of {', '.join(sorted(known))}"
+            f"perhaps you meant '{near[0]}'"
+            if near
+            else f"remove it or use one of {', '.join(sorted(known))}"
         )
         return f"the key '{name}' is unknown", remedy
     if kind in ("missing", "missing_argument"):

@@ -10,6 +10,7 @@ from siq.landscape.landscape import Landscape
 from siq.landscape.storage import landscape_data
 from siq.report.certificate_text import certificate_line
 from siq.report.landscape_answer import headline, remarks, wells_table
+from siq.report.said_landscape import well_name
 
 
 def landscape_text(landscape: Landscape) -> str:
@@ -41,5 +42,8 @@ def _tables(landscape: Landscape) -> list[tuple[str, pd.DataFrame]]:
     data = landscape_data(landscape, dynamics=landscape.dynamics)
     tables = [("Stable states:", wells_table(data)[0])] if data["wells"] else []
     if landscape.transitions:
-        tables.append(("Barriers of U, by the attractors that they part:", landscape.barriers()))
+        ways = landscape.barriers().rename(columns={"start": "from", "end": "to"})
+        for end in ("from", "to"):
+            ways[end] = [None if pd.isna(well) else well_name(int(well)) for well in ways[end]]
+        tables.append(("Ways out, and their barriers of U:", ways))
     return tables

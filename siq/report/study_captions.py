@@ -142,6 +142,12 @@ OF_RUNS = ("coefficients_refined", "inclusion_refined", "coefficients_regression
            "error_distribution")  # fmt: skip
 """Figures of a scatter over runs, of which there is none in one."""
 
+OF_ONE_STATE = (
+    "The quasipotential U where it is known, with a band of two standard errors; the stable states (letters),"
+    " the saddles between them (crosses), the depth of each (arrows), and recorded states (ticks)."
+)
+"""What the first picture shows where there is one state: a curve, and no ways beside it."""
+
 LEADING = ("quasipotential", "landscape")
 """Figures that a page can open with, the best first."""
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 from siq.report.landscape_answer import wells_table
 from siq.report.page import ReportContent, ReportSection, ReportTable
-from siq.report.study_captions import LEADING, figure_of, shown_figures
+from siq.report.study_captions import LEADING, OF_ONE_STATE, figure_of, shown_figures
 from siq.report.study_sections import StudyParts, StudyResults
 from siq.study.study import Study
 
@@ -44,6 +45,8 @@ def study_page(
     figure = None
     if lead is not None:
         figure = figure_of(lead, results.images, results.vectors, beside_paper=beside_paper)
+        if overview is not None and len(overview["states"]) == 1:
+            figure = replace(figure, caption=OF_ONE_STATE, alternative=OF_ONE_STATE)
     sections = [
         page.formulas(),
         page.evidence(),

@@ -40,8 +40,8 @@ def test_what_is_not_understood_ends_with_the_code_of_usage(arguments: list[str]
 @pytest.mark.parametrize(
     ("arguments", "files", "parts"),
     [
-        (["run", "measured.csv"], {"measurd.csv": ROWS}, ("measured.csv", "did you mean 'measurd.csv'")),
-        (["run", "archetype3"], {}, ("did you mean 'archetype3d",)),
+        (["run", "measured.csv"], {"measurd.csv": ROWS}, ("measured.csv", "perhaps you meant 'measurd.csv'")),
+        (["run", "archetype3"], {}, ("perhaps you meant 'archetype3d",)),
         (["run", "no/where.csv"], {}, ("there is no folder", "/no")),
         (["run", "card.yaml"], {"card.yaml": CARD}, ("the card of a system", "'system: card.yaml'")),
         (["run", "."], {"system.yaml": CARD}, ("siq diagnose .",)),

@@ -237,7 +237,7 @@ def test_tables_are_refused_by_row_and_column(
 def test_missing_columns_and_other_units_are_refused_by_name(tmp_path: Path) -> None:
     path = write_csv(tmp_path, "recording,t,position [cm],speed\na,0,1,1\na,1,2,2\n")
     error = refusal(path, columns=["positon"])
-    assert "'positon' is missing" in error.fault and error.remedy == "did you mean 'position'"
+    assert "'positon' is missing" in error.fault and error.remedy == "perhaps you meant 'position'"
     assert refusal(path, columns=["q"]).remedy == "the measured columns are position, speed"
     error = refusal(path, units={"position": "mm"})
     assert error.place == "column position" and "cm where the system card has mm" in error.fault

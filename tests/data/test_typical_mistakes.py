@@ -198,7 +198,7 @@ def test_states_are_found_by_title_by_name_and_in_other_case(tmp_path: Path) -> 
     path = put(tmp_path, "a.csv", "t,Bead X,other\n0,1,3\n1,2,4\n")
     for name in ("Bead_X", "bead_x"):
         assert read_recordings(path, columns=[name]).values.tolist() == [[1], [2]]
-    with pytest.raises(InputError, match="did you mean 'Bead X'"):
+    with pytest.raises(InputError, match="perhaps you meant 'Bead X'"):
         read_recordings(path, columns=["Beed_X"])
 
 
@@ -230,7 +230,7 @@ def test_a_wrong_path_says_where_it_was_looked_for_and_what_is_near(tmp_path: Pa
         with pytest.raises(InputError) as caught:
             read_recordings(tmp_path / wrong)
         assert str(tmp_path / wrong) in caught.value.fault
-        assert f"did you mean '{tmp_path / 'recordings.csv'}'" in caught.value.remedy
+        assert f"perhaps you meant '{tmp_path / 'recordings.csv'}'" in caught.value.remedy
     with pytest.raises(InputError, match=f"there is no folder '{tmp_path / 'nowhere'}' either"):
         read_recordings(tmp_path / "nowhere" / "a.csv")
 

@@ -137,15 +137,15 @@ def test_an_unknown_parameter_names_card_line_and_name(write: Write) -> None:
     assert error.file.endswith("spiral.yaml")
     assert error.place == "line 10 (equations.q)"
     assert "'zetta'" in error.fault
-    assert error.remedy == "did you mean 'zeta'"
+    assert error.remedy == "perhaps you meant 'zeta'"
 
 
 @pytest.mark.parametrize(
     ("old", "new", "place", "fault", "remedy"),
     [
-        ("equations:", "equation:", "line 8 (equation)", "'equation' is unknown", "did you mean 'equations'"),
-        ("unit: m,", "unti: m,", "line 3 (states.p.unti)", "'unti' is unknown", "did you mean 'unit'"),
-        ("value: 3", "valeu: 3", "line 7 (parameters.omega.valeu)", "'valeu' is", "did you mean 'value'"),
+        ("equations:", "equation:", "line 8 (equation)", "'equation' is unknown", "you meant 'equations'"),
+        ("unit: m,", "unti: m,", "line 3 (states.p.unti)", "'unti' is unknown", "you meant 'unit'"),
+        ("value: 3", "valeu: 3", "line 7 (parameters.omega.valeu)", "'valeu' is", "you meant 'value'"),
         ("[-1, 2]", "[2, -1]", "line 3 (states.p.domain)", "the domain is empty", "lower < upper"),
         ("[-1, 2]", "[.nan, 2]", "line 3 (states.p.domain.0)", "nan", "finite"),
         ('  p: "q"\n', "", "", "'p' has no equation", "add"),

@@ -133,9 +133,9 @@ def test_a_number_beyond_floating_point_is_refused_as_a_formula_error(text: str)
 @pytest.mark.parametrize(
     ("text", "remedy"),
     [
-        ("2*zetta", "did you mean 'zeta'"),
-        ("sine(x)", "did you mean 'sin'"),
-        ("abs(x)", "did you mean 'Abs'"),
+        ("2*zetta", "perhaps you meant 'zeta'"),
+        ("sine(x)", "perhaps you meant 'sin'"),
+        ("abs(x)", "perhaps you meant 'Abs'"),
         ("x^2", "write '**' for powers"),
     ],
 )

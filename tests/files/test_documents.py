@@ -68,14 +68,18 @@ def test_a_broken_document_is_refused_with_its_line(write: Write, text: str, pla
 @pytest.mark.parametrize(
     ("text", "place", "remedy"),
     [
-        ("nmae: a\nname: b\n", "line 1 (nmae)", "did you mean 'name'"),
-        ("name: a\ninner:\n  weight: 1\n  color: blue\n", "line 4 (inner.color)", "did you mean 'colour'"),
+        ("nmae: a\nname: b\n", "line 1 (nmae)", "perhaps you meant 'name'"),
+        (
+            "name: a\ninner:\n  weight: 1\n  color: blue\n",
+            "line 4 (inner.color)",
+            "perhaps you meant 'colour'",
+        ),
         (
             "name: a\nmany:\n  one:\n    weight: 1\n    color: b\n",
             "line 5 (many.one.color)",
-            "did you mean 'colour'",
+            "perhaps you meant 'colour'",
         ),
-        ("nmae: a\n", "line 1 (nmae)", "did you mean 'name'"),
+        ("nmae: a\n", "line 1 (nmae)", "perhaps you meant 'name'"),
         ("name: a\nzzz: 1\n", "line 2 (zzz)", "remove it or use one of inner, many, name, numbers"),
     ],
 )

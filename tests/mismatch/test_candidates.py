@@ -184,7 +184,7 @@ def test_entries_of_a_study_are_added_and_left_out() -> None:
          "changes nothing"),
         ("mechanisms: [{name: a, sentence: b, forms: [{roles: {v: speed}, terms: {v: '1'}, coordinate: v,"
          " parameters: {}}]}]", "speed"),
-        ("mechanisms: [{name: a, sentense: b, forms: []}]", "did you mean 'sentence'"),
+        ("mechanisms: [{name: a, sentense: b, forms: []}]", "perhaps you meant 'sentence'"),
     ],
 )  # fmt: skip
 def test_entries_that_cannot_be_used_are_refused(text: str, message: str, tmp_path) -> None:

@@ -299,7 +299,7 @@ def test_a_candidate_whose_fit_fails_unforeseen_is_recorded_with_the_reason(
         ({"held_out": [f"r{index}" for index in range(8)]}, "one side of the split is empty"),
         ({"without": ["friction"]}, "no mechanism is called 'friction'"),
         ({"noise": {"v": 0.1}}, "'v' is no output"),
-        ({"held_oud": 0.2}, "did you mean 'held_out'"),
+        ({"held_oud": 0.2}, "perhaps you meant 'held_out'"),
     ],
 )
 def test_a_study_that_cannot_be_used_is_refused_in_a_sentence(

@@ -15,7 +15,7 @@ from siq.dynamics.dynamics import Dynamics
 from siq.potential.storage import model_to_data, write_model
 from siq.potential.symbolic import SymbolicDecomposition, exact_decomposition
 from siq.report.page import ReportContent, render_report
-from siq.report.study_captions import CAPTIONS, LEADING, OF_NETWORKS, OF_RUNS
+from siq.report.study_captions import CAPTIONS, LEADING, OF_NETWORKS, OF_ONE_STATE, OF_RUNS
 from siq.report.study_page import study_page
 from siq.report.study_sections import StudyResults
 from siq.steps.outcomes import Method
@@ -108,7 +108,7 @@ def test_the_answer_then_formulas_then_evidence_then_workings(tmp_path: Path) ->
     content = page_of(tmp_path, overview=WELLS, images=("quasipotential", "residuals", "dataset"))
     assert content.answer[0].startswith("The recordings show two stable states")
     assert content.badge is not None and content.badge.good
-    assert content.figure is not None and content.figure.caption == CAPTIONS["quasipotential"].text
+    assert content.figure is not None and content.figure.caption == OF_ONE_STATE
     assert content.table is not None and "lasts (s)" in list(content.table.frame["stable state"])
     assert headings(content) == [
         "Formulas", "How far it can be trusted", "The landscape in full", "The recordings and the workings",
@@ -137,7 +137,8 @@ def test_every_figure_that_makes_sense_is_shown_once(tmp_path: Path, runs: int, 
     absent = {LEADING[1], "landscape_published"}
     absent |= set(OF_RUNS) if runs == 1 else set()
     absent |= set() if regressed else set(OF_NETWORKS)
-    expected = [caption.text for name, caption in CAPTIONS.items() if name not in absent]
+    texts = {name: caption.text for name, caption in CAPTIONS.items()} | {"quasipotential": OF_ONE_STATE}
+    expected = [text for name, text in texts.items() if name not in absent]
     assert sorted(shown) == sorted([*expected, "Of tomorrow."])
 
 

@@ -90,18 +90,23 @@ def test_a_study_without_data_is_refused(write: Write) -> None:
 @pytest.mark.parametrize(
     ("text", "place", "fault", "remedy"),
     [
-        ("sytem: a\nname: s\nsystem: a\n", "line 1 (sytem)", "'sytem' is unknown", "did you mean 'system'"),
+        (
+            "sytem: a\nname: s\nsystem: a\n",
+            "line 1 (sytem)",
+            "'sytem' is unknown",
+            "perhaps you meant 'system'",
+        ),
         (
             "name: s\nsystem: a\ntraining:\n  step: 5\n",
             "line 4 (training.step)",
             "'step' is unknown",
-            "did you mean 'steps'",
+            "perhaps you meant 'steps'",
         ),
         (
             "name: s\nsystem: a\nregression:\n  tresholds: 5\n",
             "line 4 (regression.tresholds)",
             "'tresholds' is unknown",
-            "did you mean 'threshold'",
+            "perhaps you meant 'threshold'",
         ),
         ("name: s\nsystem: a\nruns: 0\n", "line 3 (runs)", "0", "greater than or equal to 1"),
         ("name: s\nsystem: a\nruns: many\n", "line 3 (runs)", "'many'", "integer"),
@@ -119,7 +124,12 @@ def test_a_study_without_data_is_refused(write: Write) -> None:
             "change one of them",
         ),
         ("name: s\nrecordings:\n  pair_step: 1\n", "line 2 (recordings.file)", "'file' is missing", "add"),
-        ("name: s\nrecordings:\n  file: a.csv\n  stats: [x]\n", "line 4", "'stats'", "did you mean 'states'"),
+        (
+            "name: s\nrecordings:\n  file: a.csv\n  stats: [x]\n",
+            "line 4",
+            "'stats'",
+            "perhaps you meant 'states'",
+        ),
     ],
 )
 def test_a_faulty_study_is_refused_with_its_line_and_a_remedy(

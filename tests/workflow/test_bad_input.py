@@ -31,7 +31,7 @@ def refused(project, *, study=None, card=None, recordings=None):
     [
         (
             {"study": ("threshold: 0.1", "treshold: 0.1")},
-            ("study.yaml", "line", "treshold", "did you mean 'threshold'"),
+            ("study.yaml", "line", "treshold", "perhaps you meant 'threshold'"),
         ),
         (
             {"study": ("seed: 7", "seed: -7")},

@@ -51,7 +51,7 @@ def test_a_job_that_refuses_its_input_is_heard_and_nothing_else(tmp_path: Path) 
     (tmp_path / "study.yaml").write_text("name: s\nsystem: archetype4\n")
     done = siq(tmp_path, "run", "study.yaml")
     assert done.returncode == 1 and done.stdout == ""
-    assert "did you mean 'archetype4d'" in done.stderr and "Traceback" not in done.stderr
+    assert "perhaps you meant 'archetype4d'" in done.stderr and "Traceback" not in done.stderr
     assert not (tmp_path / "results").exists()
 
 

@@ -118,7 +118,7 @@ def test_a_benchmark_that_was_not_downloaded_is_told_and_the_rest_runs(fresh_pro
         ({"card": None}, None, ("it has no card of the simulation", "add system.yaml")),
         ({"recordings": ""}, None, ("it has no recordings", "recordings.csv")),
         ({"recordings": "recording,t,x\na,0,1\n"}, None, ("recordings.csv", "v")),
-        ({}, "helt_out: [r1]\n", ("study.yaml, line 1 (helt_out)", "did you mean 'held_out'")),
+        ({}, "helt_out: [r1]\n", ("study.yaml, line 1 (helt_out)", "perhaps you meant 'held_out'")),
         ({}, "held_out: [r77]\n", ("study.yaml", "held_out", "no recording is called 'r77'")),
         ({}, "without: [friction]\n", ("study.yaml", "without", "no mechanism is called 'friction'")),
     ],

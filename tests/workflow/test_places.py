@@ -41,7 +41,7 @@ def test_a_missing_file_is_told_with_every_place_and_the_nearest_name(folder: Pa
     said = str(refused.value)
     for place in (folder / "work" / "studies", folder / "work", folder / "lent"):
         assert str(place / "baed.csv") in said
-    assert said.startswith("studies/s.yaml, line 2: ") and "did you mean 'bead.csv'" in said
+    assert said.startswith("studies/s.yaml, line 2: ") and "perhaps you meant 'bead.csv'" in said
     assert needed_file("results/made.csv", start=Path("studies"), where=("s", "")) == "results/made.csv"
 
 
@@ -76,7 +76,7 @@ def test_everything_that_a_study_names_starts_from_its_folder(folder: Path) -> N
 
 @pytest.mark.parametrize(
     ("key", "value", "part"),
-    [("system", "archetyp3d", "did you mean 'archetype3d'"), ("system", "cards/x.yaml", "cards/x.yaml")],
+    [("system", "archetyp3d", "perhaps you meant 'archetype3d'"), ("system", "cards/x.yaml", "cards/x.yaml")],
 )
 def test_a_missing_card_is_told_with_the_line_of_the_study(
     folder: Path, key: str, value: str, part: str
