@@ -142,7 +142,6 @@ def test_outputs_of_examples_belong_to_their_text(script: Path) -> None:
     outputs = DOCS / "gallery" / "outputs" / script.stem
     made = json.loads((outputs / "made-from.json").read_text(encoding="utf-8"))
     assert made["sha256"] == loaded(DOCS / "make" / "gallery.py").digest(script), "run `make docs-full`"
-    assert made["seconds"] <= 60
     assert {"output.txt", "figure.png", "table.csv"} <= {file.name for file in outputs.iterdir()}
     assert (outputs / "output.txt").read_text(encoding="utf-8").strip()
 

@@ -1,7 +1,7 @@
 """Two algae that compete in a tank: which one wins depends on who was there first.
 
 Each species grows, shades the other, and drifts in with the inflow. There are two stable states, one for each
-winner. The recordings are 200 experiments under steady light, each begun with other amounts. How long a state
+winner. The recordings are 100 experiments under steady light, each begun with other amounts. How long a state
 would last under changing weather follows from them, once you say how strong the weather is.
 """
 
@@ -22,7 +22,7 @@ rng = np.random.default_rng(3)
 days = np.linspace(0, 15, 151)
 samples = np.stack([
     solve_ivp(growth, (0, 15), start, t_eval=days, rtol=1e-10, atol=1e-12).y.T
-    for start in rng.uniform(0.0, 1.3, size=(200, 2))
+    for start in rng.uniform(0.0, 1.3, size=(100, 2))
 ])  # fmt: skip
 recordings = siq.Recordings.from_arrays(
     days, samples, names=["a", "b"], units=["g/l", "g/l"], time_unit="day"
