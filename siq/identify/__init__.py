@@ -7,6 +7,7 @@
 `library`           which candidate functions are there, with which derivatives and constraints?
 `flow`              where does f lead within the step of a pair?
 `diffusion`         which D, where nobody gave it?
+`random_forces`     how strong are the random forces behind residuals of a whole step?
 `residuals`         what do its residuals say: no noise, process noise, noise of the measurement?
 `rounding`          were values rounded when they were written, and does it matter?
 `prediction`        where does f lead in the long run?

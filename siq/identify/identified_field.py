@@ -32,7 +32,8 @@ class IdentifiedField:
     covariance
         Shape ``(p, p)``: their covariance.
     noise_rate
-        Shape ``(d, d)``: covariance of the residual per unit of time. For process noise it is ε D.
+        Shape ``(d, d)``: covariance of the residual per unit of time. For process noise it is ε D, once
+        `siq.identify.random_forces` has put back what a step forgets.
     residual_ratio
         Rms of the residuals over rms of the increments.
     flow

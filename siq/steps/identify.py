@@ -24,6 +24,7 @@ from siq.identify.identification import (
 )
 from siq.identify.identified_field import IdentifiedField
 from siq.identify.prediction import prediction_errors
+from siq.identify.random_forces import with_random_forces
 from siq.identify.residuals import NoiseDiagnosis, mean_residual_probability, residual_noise
 from siq.identify.rounding import rounding_text
 from siq.identify.storage import FieldRecord, field_library, read_field, write_field
@@ -90,7 +91,7 @@ def _identified(settings: IdentifySettings, recordings: Recordings, number: int)
     if carries_noise(library, parts[0], options=options, integrator_step=maker):
         # Under noise every recording counts: all give the result, a part of them its test.
         everything = snapshot_pairs(recordings, pair_step=step)
-        found = identify_pairs(everything)
+        found = with_random_forces(identify_pairs(everything), everything)
         fitted = refit(found, parts[0])
     else:
         found = fitted = identify_pairs(parts[0])
