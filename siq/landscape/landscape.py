@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 SAME = 1e-6  # of the recorded box: one attractor, from different starts
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Landscape:
     """What is known of a landscape: wells, the ways out of them, and U = 2V over all of them.
 
@@ -252,6 +252,13 @@ class Landscape:
         from siq.report.landscape_text import landscape_text
 
         return landscape_text(self)
+
+    def __repr__(self) -> str:
+        """One line: a landscape holds thousands of numbers, which `report` makes readable."""
+        named = ", ".join(self.dynamics.states)
+        return (
+            f"<Landscape of ({named}): {len(self.attractors)} attractors, {len(self.transitions)} ways out>"
+        )
 
     def _repr_html_(self) -> str:
         from siq.report.landscape_text import landscape_html

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from siq.data.recordings import Recordings
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Diagnosis:
     """What a simulation lacks, as far as recordings tell.
 
@@ -75,6 +75,10 @@ class Diagnosis:
         from siq.report.diagnosis_report import diagnosis_text  # which stands above this module
 
         return diagnosis_text(self.statement, self.case.system)
+
+    def __repr__(self) -> str:
+        """One line; `report` says the rest."""
+        return f"<Diagnosis: {self.statement.sentence or self.verdict}>"
 
     def _repr_html_(self) -> str:
         """The report for a notebook."""

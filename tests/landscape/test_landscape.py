@@ -142,6 +142,7 @@ def test_the_report_has_verdict_attractors_and_barriers() -> None:
     certificate = Certificate({"characteristics": Verdict(0.0, 0.01, True)}, 0.01, "")
     text = replace(double(), certificate=certificate, notes=("a limit cycle <x>",)).report()
     assert "The formulas are certified: U is right to within 1 % of its height." in text
+    assert repr(double()) == "<Landscape of (x, y): 2 attractors, 2 ways out>"
     assert "a limit cycle <x>" in text and "Ways out, and their barriers of U:" in text and "A  B" in text
     page = replace(double(), notes=("a limit cycle <x>",))._repr_html_()
     assert "No test was made" in page and "&lt;x&gt;" in page and page.count("<table") == 2
