@@ -55,6 +55,7 @@ def test_a_job_that_refuses_its_input_is_heard_and_nothing_else(tmp_path: Path) 
     assert not (tmp_path / "results").exists()
 
 
+@pytest.mark.slow  # CI has the exit codes from tests/cli
 def test_a_run_without_a_formula_is_no_success(tmp_path: Path) -> None:
     """Growth without a stable state: there is a page, a sentence and a code, by the workflow itself, too."""
     rows = [f"r{k},{i / 20},{(k - 4.5) * 1.025**i!r}" for k in range(10) for i in range(60)]
