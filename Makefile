@@ -46,6 +46,7 @@ newcomer: wheel
 
 # docs/_build/html/index.html: the pages and the reference. A warning is an error.
 docs: environment
+	rm -rf docs/_build/html docs/api
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet -b html docs docs/_build/html
 
 # The documentation from its beginnings: examples, notebooks and pictures are made anew, figures read from results.
