@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import difflib
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -64,6 +65,27 @@ class MissingExtra(ImportError):
             name=package,
         )
         self.extra = extra
+
+
+def suggestion(name: str, known: Iterable[str], *, otherwise: str) -> str:
+    """The remedy for a name that nobody knows: the one that is most like it, or what to do instead.
+
+    Parameters
+    ----------
+    name
+        As the user wrote it.
+    known
+        What it could have been.
+    otherwise
+        The remedy where none of these is like it.
+
+    Examples
+    --------
+    >>> suggestion("zetta", ["zeta", "gamma"], otherwise="declare it")
+    "perhaps you meant 'zeta'"
+    """
+    near = difflib.get_close_matches(name, list(known), n=1)
+    return f"perhaps you meant '{near[0]}'" if near else otherwise
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from siq.data.folders import CARD, RECORDINGS, case_folders
 from siq.data.public_recordings import BENCHMARKS
 from siq.dynamics.cards import SystemCard
 from siq.errors import InputError
@@ -20,8 +21,7 @@ from siq.files.documents import Document, read_document, validate
 from workflow.places import config_path, find_file, needed_file, system_card
 
 MADE = "results/recordings"
-CARD, STUDY = "system.yaml", "study.yaml"
-RECORDINGS = ("recordings.parquet", "recordings.csv")
+STUDY = "study.yaml"
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
 
@@ -154,13 +154,7 @@ class Cases:
         base = Path(str(self._folder)).expanduser()
         if not base.is_dir():
             raise InputError(str(self._folder), "", "there is no such folder", "correct --config cases=DIR")
-        if (base / CARD).is_file():
-            return {base.resolve().name: base}
-        return {
-            path.name: path
-            for path in sorted(base.iterdir())
-            if path.is_dir() and any((path / name).exists() for name in (CARD, *RECORDINGS))
-        }
+        return case_folders(base)
 
     def _of_folder(self, name: str, folder: Path) -> CheckedCase:
         if not NAME.fullmatch(name):

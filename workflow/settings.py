@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib.util
 import os
 from collections.abc import Mapping, Sequence
@@ -15,7 +14,7 @@ from pydantic import TypeAdapter
 from siq.data.learnable import read_pairs
 from siq.dynamics.cards import check_name, load_exact
 from siq.dynamics.dynamics import Dynamics
-from siq.errors import InputError
+from siq.errors import InputError, suggestion
 from siq.files.documents import Document, read_document, validate
 from siq.steps.of_study import StudyParts, settings_of
 from siq.study.study import Study, check_states, completed, load_published, load_study_system
@@ -233,13 +232,9 @@ def _existing_card(system: str, document: Document) -> Path:
     if system.endswith((".yaml", ".yml")):
         return Path(needed_file(system, start=Path(document.file).parent, where=where))
     known = names_in("systems")
-    near = difflib.get_close_matches(system, known, n=1)
-    raise InputError(
-        *where, f"there is no card of a system '{system}'",
-        f"perhaps you meant '{near[0]}'"
-        if near
-        else f"give the path of one, or use one of {', '.join(known)}",
-    )  # fmt: skip
+    otherwise = f"give the path of one, or use one of {', '.join(known)}"
+    remedy = suggestion(system, known, otherwise=otherwise)
+    raise InputError(*where, f"there is no card of a system '{system}'", remedy)
 
 
 def _need_networks(document: Document) -> None:

@@ -6,10 +6,14 @@ import argparse
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from siq.cli.answers import Exit
 from siq.errors import InputError, MissingExtra, NumericalFailure
 from siq.version import version
+
+if TYPE_CHECKING:
+    from siq.cli.workflow import Request
 
 EPILOG = """\
 what to begin with:
@@ -168,25 +172,23 @@ def _add_example(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def _run(options: argparse.Namespace) -> Exit:
     from siq.cli.run import run_study
 
-    return run_study(
-        options.study,
-        cores=_cores(options.cores),
-        verbose=options.verbose,
-        dry_run=options.dry_run,
-        further=options.further,
-    )
+    return run_study(options.study, _request(options))
 
 
 def _diagnose(options: argparse.Namespace) -> Exit:
     from siq.cli.run import diagnose_cases
 
-    return diagnose_cases(
-        options.folder,
-        cores=_cores(options.cores),
-        verbose=options.verbose,
-        dry_run=options.dry_run,
-        further=options.further,
-    )
+    return diagnose_cases(options.folder, _request(options))
+
+
+def _request(options: argparse.Namespace) -> Request:
+    """How to run the workflow, as the options of `run` and `diagnose` have it."""
+    from siq.cli.workflow import Request
+
+    return Request(
+        cores=_cores(options.cores), verbose=options.verbose, dry_run=options.dry_run,
+        further=tuple(options.further),
+    )  # fmt: skip
 
 
 def _cores(text: str) -> str:

@@ -2,30 +2,23 @@
 
 from __future__ import annotations
 
-import difflib
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from siq.cli.answers import Exit, Told, answer_of_page
 from siq.cli.studies import is_study, name_for, own_path, write_generated
 from siq.cli.workflow import Ended, Request, known_studies, need_workflow, run_workflow
-from siq.errors import InputError
+from siq.data.folders import CARD, case_folders
+from siq.errors import InputError, suggestion
 from siq.files.documents import read_document
 from siq.study.study import load_study
 
 RESULTS = Path("results")
-CARD, RECORDINGS = "system.yaml", ("recordings.parquet", "recordings.csv")
 
 
-def run_study(
-    given: str,
-    *,
-    cores: str = "all",
-    verbose: bool = False,
-    dry_run: bool = False,
-    further: Sequence[str] = (),
-) -> Exit:
+def run_study(given: str, asked: Request) -> Exit:
     """Answer a study, recordings without a study, or a study that comes with the workflow.
 
     Parameters
@@ -33,14 +26,8 @@ def run_study(
     given
         Path of a study (YAML) or of recordings (a file, or a folder of files), or the name of a study in
         ``config/studies``.
-    cores
-        How many to use.
-    verbose
-        Show what Snakemake says in the place of one line of progress.
-    dry_run
-        Only say what would run.
-    further
-        Options for Snakemake.
+    asked
+        How to run it; what to make is added.
 
     Raises
     ------
@@ -69,26 +56,19 @@ def run_study(
         name = name_for(path)
         study, settings = write_generated(path, name), (f"origin={own_path(path)}",)
     page = RESULTS / name / "report.html"
-    request = Request((page.as_posix(),), study, settings, cores, verbose, dry_run, tuple(further))
+    request = replace(asked, targets=(page.as_posix(),), study=study, settings=settings)
     return _told(run_workflow(request), request, [page])
 
 
-def diagnose_cases(
-    folder: str,
-    *,
-    cores: str = "all",
-    verbose: bool = False,
-    dry_run: bool = False,
-    further: Sequence[str] = (),
-) -> Exit:
+def diagnose_cases(folder: str, asked: Request) -> Exit:
     """Compare simulations with recordings: every case of a folder, or the one that the folder is.
 
     Parameters
     ----------
     folder
         With ``system.yaml`` and recordings, or with folders that have them.
-    cores, verbose, dry_run, further
-        As `run_study` takes them.
+    asked
+        How to run it; what to make is added.
 
     Raises
     ------
@@ -103,21 +83,9 @@ def diagnose_cases(
         place = place.parent
     if not place.is_dir():
         raise _not_there(folder)
-    pages = [RESULTS / "mismatch" / name / "report.html" for name in case_names(place)]
-    settings = (f"cases={place.as_posix()}",)
-    request = Request(("diagnose",), None, settings, cores, verbose, dry_run, tuple(further))
+    pages = [RESULTS / "mismatch" / name / "report.html" for name in case_folders(place)]
+    request = replace(asked, targets=("diagnose",), settings=(f"cases={place.as_posix()}",))
     return _told(run_workflow(request), request, pages)
-
-
-def case_names(folder: Path) -> list[str]:
-    """The names of the cases in a folder, as the workflow has them."""
-    if (folder / CARD).is_file():
-        return [folder.resolve().name]
-    return sorted(
-        path.name
-        for path in folder.iterdir()
-        if path.is_dir() and any((path / name).exists() for name in (CARD, *RECORDINGS))
-    )
 
 
 def _refuse_card(path: Path) -> None:
@@ -134,10 +102,8 @@ def _not_there(given: str) -> InputError:
     """A wrong path, with where it was looked for and what is there of a similar name."""
     place = Path(given).expanduser().absolute()
     beside = [entry.name for entry in place.parent.iterdir()] if place.parent.is_dir() else []
-    near = difflib.get_close_matches(place.name, beside, n=1) or difflib.get_close_matches(
-        given, known_studies(), n=1
-    )
-    remedy = f"perhaps you meant '{near[0]}'" if near else "correct the path"
+    otherwise = suggestion(given, known_studies(), otherwise="correct the path")
+    remedy = suggestion(place.name, beside, otherwise=otherwise)
     if not place.parent.is_dir():
         return InputError(given, "", f"there is no folder {place.parent}", remedy)
     return InputError(given, "", f"there is no file or folder of that name in {place.parent}", remedy)

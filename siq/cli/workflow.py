@@ -65,7 +65,7 @@ class Request:
         Options that are passed on.
     """
 
-    targets: tuple[str, ...]
+    targets: tuple[str, ...] = ()
     study: Path | None = None
     settings: tuple[str, ...] = ()
     cores: str = "all"

@@ -1,4 +1,4 @@
-"""Which files are in a folder of recordings, and what may a path have meant that leads nowhere?"""
+"""Which files are in a folder of recordings or of cases, and what may a wrong path have meant?"""
 
 from __future__ import annotations
 
@@ -10,6 +10,27 @@ from siq.errors import InputError
 
 SUFFIXES = (".parquet", ".csv", ".tsv", ".txt", ".dat", ".h5", ".hdf5", ".mat", ".npz", ".npy")
 """Of files that can be read; `siq.data.formats.READERS` has a reader for each."""
+
+
+CARD, RECORDINGS = "system.yaml", ("recordings.parquet", "recordings.csv")
+"""The files of a case: the equations of a simulation, and what was recorded."""
+
+
+def case_folders(folder: Path) -> dict[str, Path]:
+    """The cases of a folder by name: itself where it has a card, or the folders in it that have one.
+
+    Parameters
+    ----------
+    folder
+        Has to be there.
+    """
+    if (folder / CARD).is_file():
+        return {folder.resolve().name: folder}
+    return {
+        path.name: path
+        for path in sorted(folder.iterdir())
+        if path.is_dir() and any((path / name).exists() for name in (CARD, *RECORDINGS))
+    }
 
 
 def missing_file(file: str, looked_at: Sequence[Path]) -> InputError:

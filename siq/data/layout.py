@@ -6,7 +6,6 @@ thing takes their place, and that is said; a table that names no recordings is o
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -23,7 +22,7 @@ from siq.data.headings import (
     read_heading,
     usable_name,
 )
-from siq.errors import InputError
+from siq.errors import InputError, suggestion
 
 
 @dataclass(frozen=True)
@@ -244,6 +243,5 @@ def _wanted(file: str, name: str, plain: list[str], known: list[int], notes: lis
                 notes.append(f"'{plain[matches[0]]}' is called {name} in formulas")
             return matches[0]
     titles = [plain[place] for place in known if plain[place]]
-    near = difflib.get_close_matches(name, titles, n=1)
-    remedy = f"perhaps you meant '{near[0]}'" if near else f"the measured columns are {', '.join(titles)}"
+    remedy = suggestion(name, titles, otherwise=f"the measured columns are {', '.join(titles)}")
     raise InputError(file, "", f"the column '{name}' is missing", remedy if titles else "add it")

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import ast
 import builtins
-import difflib
 from collections.abc import Callable, Collection, Mapping, Sequence
 
 import numpy as np
 import sympy
 from sympy.printing.numpy import NumPyPrinter
+
+from siq.errors import suggestion
 
 FUNCTIONS: Mapping[str, Callable[..., sympy.Expr]] = {
     "sin": sympy.sin,
@@ -155,8 +156,7 @@ def _look_up(name: str, names: Mapping[str, sympy.Expr]) -> sympy.Expr:
         return names[name]
     if name in CONSTANTS:
         return CONSTANTS[name]
-    near = difflib.get_close_matches(name, names, n=1)
-    remedy = f"perhaps you meant '{near[0]}'" if near else "declare it, or correct the spelling"
+    remedy = suggestion(name, names, otherwise="declare it, or correct the spelling")
     raise FormulaError(f"the name '{name}' is not declared", remedy)
 
 
@@ -176,8 +176,7 @@ def _power(base: sympy.Expr, exponent: sympy.Expr) -> sympy.Expr:
 
 def _call(name: str, arguments: Sequence[sympy.Expr]) -> sympy.Expr:
     if name not in FUNCTIONS:
-        near = difflib.get_close_matches(name, FUNCTIONS, n=1)
-        remedy = f"perhaps you meant '{near[0]}'" if near else f"use one of {', '.join(FUNCTIONS)}"
+        remedy = suggestion(name, FUNCTIONS, otherwise=f"use one of {', '.join(FUNCTIONS)}")
         raise FormulaError(f"the function '{name}' is not allowed in a formula", remedy)
     wanted = "at least two arguments" if name in ("Max", "Min") else "one argument"
     if (len(arguments) < 2) if name in ("Max", "Min") else (len(arguments) != 1):

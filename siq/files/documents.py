@@ -6,7 +6,6 @@ built, a key that stands twice is refused, and whatever the schema refuses is to
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -14,7 +13,7 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from siq.errors import InputError
+from siq.errors import InputError, suggestion
 
 UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")
 Keys = tuple[str | int, ...]
@@ -123,13 +122,8 @@ def _explain(error: Any, keys: Keys, model: type[BaseModel]) -> tuple[str, str]:
     kind = error["type"]
     if kind in UNKNOWN_KEY:
         known = _known_keys(model, keys[:-1])
-        near = difflib.get_close_matches(str(name), known, n=1)
-        remedy = (
-            f"perhaps you meant '{near[0]}'"
-            if near
-            else f"remove it or use one of {', '.join(sorted(known))}"
-        )
-        return f"the key '{name}' is unknown", remedy
+        otherwise = f"remove it or use one of {', '.join(sorted(known))}"
+        return f"the key '{name}' is unknown", suggestion(str(name), known, otherwise=otherwise)
     if kind in ("missing", "missing_argument"):
         return f"the key '{name}' is missing", f"add '{name}: ...'"
     message = error["msg"].removeprefix("Value error, ").removeprefix("Assertion failed, ")

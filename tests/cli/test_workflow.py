@@ -8,8 +8,8 @@ from types import ModuleType
 
 import pytest
 
-from siq.cli.run import case_names
 from siq.cli.workflow import PLUGINS, Request, known_studies, workflow_folder
+from siq.data.folders import case_folders
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -36,8 +36,8 @@ def test_a_folder_is_a_case_or_has_cases(tmp_path: Path) -> None:
         (tmp_path / name).mkdir()
     (tmp_path / "a" / "system.yaml").touch()
     (tmp_path / "b" / "recordings.csv").touch()
-    assert case_names(tmp_path) == ["a", "b"]
-    assert case_names(tmp_path / "a") == ["a"]
+    assert list(case_folders(tmp_path)) == ["a", "b"]
+    assert list(case_folders(tmp_path / "a")) == ["a"]
 
 
 @pytest.fixture(scope="module")
