@@ -7,9 +7,11 @@ Imports `siq.identify` and what it may import.
 `linearisation`     what do small changes of states and parameters do to what is measured?
 `kernels`           the same sample after sample, compiled
 `innovations`       what does a filter not foresee?
+`closure`           what does the spread of a state do to its mean?
 `noise`             how strong are the sensors' noise and random forces?
 `noise_kernel`      the likelihood of both, compiled
 `first_states`      with which states does a fit begin?
+`shooting`          where does one step of a fit lead?
 `estimation`        which parameters, states and noise fit best?
 `trajectories`      the same, where trajectories may not leave their equations
 `jumps`             how finely must a jump of f be followed?
