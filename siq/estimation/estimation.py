@@ -15,7 +15,7 @@ restricted likelihood, which allows for that.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -158,6 +158,7 @@ def fit_by_filter(
     x: np.ndarray,
     noise: Noise,
     estimate_process: bool = True,
+    estimate_sensor: bool = True,
     substeps: int | None = None,
     iterations: int = 25,
     closure: bool = True,
@@ -168,6 +169,8 @@ def fit_by_filter(
     ----------
     model, data, x, noise, estimate_process, substeps, iterations
         See there; random forces have to drive the states.
+    estimate_sensor
+        Whether the noise of the sensors is estimated; if not, the random forces are as given, too.
     closure
         Whether the spread of what the filter knows acts on the mean of f (`siq.estimation.closure`).
 
@@ -180,6 +183,8 @@ def fit_by_filter(
         if substeps is None:
             substeps = substeps_needed(model, data, model.values, x, tolerance=SUBSTEP_ERROR)
         closed = ClosedFunctions(model) if closure else None
+        if not estimate_sensor:
+            data = replace(data, sensor_noise=noise.measurement)
         shooting = Shooting(model, Grid(data, substeps), _sizes(model, x), filtered=True, closed=closed)
         begin = Iterate(model.values, x, shooting.linearised(model.values, x, None, noise), x)
         if not begin.along.finite:
