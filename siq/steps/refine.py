@@ -249,7 +249,17 @@ def _refined(
     certificate = ground.certify(
         formulas, wells=refined.wells, relative_error=error, compared=compared
     )  # fmt: skip
-    return refined, formulas, certificate
+    if certificate.certified or not refined.wells:
+        return refined, formulas, certificate
+    # One formula for all wells is an extra. What refuses it is no word against the wells.
+    alone = replace(
+        refined, potential=None, circulatory=None, potential_covariance=None, circulatory_errors=None,
+        joint=False, notes=(*refined.notes, f"no single formula holds over the wells: {certificate.reason}"),
+    )  # fmt: skip
+    of_wells = ground.certify_wells(alone, compared=compared)
+    if not of_wells.certified:
+        return refined, formulas, certificate
+    return alone, refined_decomposition(alone, ground.points), of_wells
 
 
 def control(
