@@ -203,9 +203,9 @@ def refine(
     elif wells:
         network_wells = wells
     if network_wells and not _good(best, limit):
-        # Refined one by one, the wells may turn out to share one formula. All of them together make the start:
-        # one alone does not tell an odd power from an even one, and goes on wrongly in the others.
-        groups = [network_wells] if len(network_wells) == 1 else [network_wells, *([w] for w in network_wells)]
+        # Refined one by one, the wells may turn out to share one formula. All of them together make the
+        # start: one alone does not tell an odd power from an even one, and goes on wrongly in the others.
+        groups = [network_wells, *([well] for well in network_wells if len(network_wells) > 1)]
         values = (fit_wells(library, group) for group in groups)
         best = _best_of(map(globally, values), limit, best)
     if best is not None and _good(best, limit):
@@ -284,7 +284,12 @@ def over_library(found: IdentifiedField, library: CandidateLibrary) -> Identifie
         place = position[found.library.terms[term]]
         support[row] = component, place
         coefficients[place, component] = found.coefficients[term, component]
-    return replace(found, library=library, coefficients=coefficients, support=support)
+    doubts = found.doubts
+    if doubts is not None:
+        places = [position[term] for term in found.library.terms]
+        doubts = np.zeros((len(doubts), library.size, library.dimension))
+        doubts[:, places] = found.doubts
+    return replace(found, library=library, coefficients=coefficients, support=support, doubts=doubts)
 
 
 def local_wells(
