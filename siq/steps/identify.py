@@ -21,7 +21,6 @@ from siq.identify.flow_regression import refit, residuals
 from siq.identify.identification import (
     IdentificationOptions,
     carries_noise,
-    critical_errors,
     identify_vector_field,
 )
 from siq.identify.identified_field import IdentifiedField
@@ -37,6 +36,7 @@ from siq.identify.residuals import (
     shared_errors,
 )
 from siq.identify.rounding import rounding_text
+from siq.identify.selection import critical_values
 from siq.identify.storage import FieldRecord, field_library, read_field, write_field
 from siq.numerics.randomness import Purpose, generator
 from siq.steps.outcomes import Outcome, Status, Step, read_outcomes, write_outcomes
@@ -150,7 +150,7 @@ def _beside_sensor_noise(
     try:
         filtered = identify_by_likelihood(
             found.library, recordings, found, start, pair_step=step,
-            critical=critical_errors(settings.identification, found.library),
+            critical=critical_values(found.library, false_terms=settings.identification.false_terms),
         )  # fmt: skip
     except (NumericalFailure, np.linalg.LinAlgError) as error:
         if (correlation < -MUCH).any():
