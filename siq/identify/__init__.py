@@ -3,6 +3,7 @@
 ==================  ===========================================================================
 `identification`    which terms has f?
 `selection`         which terms does noise allow for, and which others would do nearly as well?
+`stability`         in how many resampled recordings would each term be chosen?
 `flow_regression`   which coefficients of given terms make f lead from X0 to Xh?
 `identified_field`  what is known of the f that was found, errors included?
 `library`           which candidate functions are there, with which derivatives and constraints?

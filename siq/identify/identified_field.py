@@ -43,6 +43,9 @@ class IdentifiedField:
     doubts
         Shape ``(r, q, d)``: by how much f would change with other terms that fit nearly as well, each scaled
         by the square root of its probability (`siq.identify.selection`). None where nobody asked.
+    stability
+        Shape ``(p,)``: the share of resampled recordings in which each term would be chosen
+        (`siq.identify.stability`). None where nobody asked.
     """
 
     library: CandidateLibrary
@@ -54,6 +57,7 @@ class IdentifiedField:
     flow: FlowMap
     diffusion: Diffusion
     doubts: np.ndarray | None = None
+    stability: np.ndarray | None = None
 
     def variance(self, slopes: np.ndarray) -> np.ndarray:
         """Variance of what follows from f to first order, by its coefficients and by which terms there are.

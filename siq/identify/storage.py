@@ -83,8 +83,9 @@ def write_field(path: str | Path, record: FieldRecord, options: IdentificationOp
                 "term": found.library.names[k],
                 "coefficient": float(found.coefficients[k, i]),
                 "standard_error": float(found.standard_errors[k, i]),
+                "stability": None if found.stability is None else float(found.stability[place]),
             }
-            for i, k in found.support
+            for place, (i, k) in enumerate(found.support)
         ],
         "covariance": found.covariance.tolist(),
         "doubts": None if found.doubts is None else found.doubts.tolist(),
@@ -101,6 +102,11 @@ def write_field(path: str | Path, record: FieldRecord, options: IdentificationOp
 
 def _doubts(written: Any, library: CandidateLibrary) -> np.ndarray | None:
     return None if written is None else np.array(written).reshape(-1, library.size, library.dimension)
+
+
+def _stability(terms: Sequence[Mapping[str, Any]]) -> np.ndarray | None:
+    shares = [row.get("stability") for row in terms]
+    return None if None in shares else np.array(shares, dtype=float)
 
 
 def read_field(path: str | Path) -> FieldRecord | None:
@@ -127,7 +133,7 @@ def read_field(path: str | Path) -> FieldRecord | None:
         found = IdentifiedField(
             library, coefficients, support, np.array(data["covariance"]), np.array(data["noise_rate"]),
             float(data["residual_ratio"]), FlowMap(**data["flow"]), Diffusion(np.array(data["diffusion"])),
-            _doubts(data.get("doubts"), library),
+            _doubts(data.get("doubts"), library), _stability(data["terms"]),
         )  # fmt: skip
         p, d = len(support), library.dimension
         if found.covariance.shape != (p, p) or found.noise_rate.shape != (d, d):

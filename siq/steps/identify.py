@@ -22,6 +22,7 @@ from siq.identify.identification import (
     IdentificationOptions,
     carries_noise,
     identify_vector_field,
+    with_stability,
 )
 from siq.identify.identified_field import IdentifiedField
 from siq.identify.noisy_sensor import FilteredField, held_out_evidence, identify_by_likelihood
@@ -106,9 +107,11 @@ def _identified(settings: IdentifySettings, recordings: Recordings, number: int)
         # Under noise every recording counts: all give the result, a part of them its test.
         everything = snapshot_pairs(recordings, pair_step=step)
         found = with_random_forces(identify_pairs(everything), everything)
-        filtered = _beside_sensor_noise(found, recordings, settings)
+        draw = generator(settings.seed, number, Purpose.STABILITY)
+        filtered = _beside_sensor_noise(found, recordings, settings, draw)
         if filtered is not None:
             return _filtered_record(filtered, recordings, (training, held_out), settings)
+        found = with_stability(found, everything, options=options, generator=draw)
         fitted = refit(found, parts[0])
     else:
         found = fitted = identify_pairs(parts[0])
@@ -133,7 +136,7 @@ def _identified(settings: IdentifySettings, recordings: Recordings, number: int)
 
 
 def _beside_sensor_noise(
-    found: IdentifiedField, recordings: Recordings, settings: IdentifySettings
+    found: IdentifiedField, recordings: Recordings, settings: IdentifySettings, draw: np.random.Generator
 ) -> FilteredField | None:
     """F by the likelihood of whole recordings, where their sensors are noisy; None where they are not.
 
@@ -149,7 +152,7 @@ def _beside_sensor_noise(
     start = Noise(share * variance, np.diag(found.noise_rate) * (1 - 2 * share))
     try:
         filtered = identify_by_likelihood(
-            found.library, recordings, found, start, pair_step=step,
+            found.library, recordings, found, start, pair_step=step, generator=draw,
             critical=critical_values(found.library, false_terms=settings.identification.false_terms),
         )  # fmt: skip
     except (NumericalFailure, np.linalg.LinAlgError) as error:
