@@ -1,4 +1,4 @@
-"""Resampled recordings: terms that all of them ask for stay, and one that a single recording asks for goes."""
+"""Resampled recordings: terms that all ask for stay, and one that a single recording asks for goes."""
 
 from __future__ import annotations
 
