@@ -123,7 +123,7 @@ def _with_diffusion(
     f does not depend on D, and whether noise is white does not either: so D can come last.
     """
     step, space = settings.sampling.pair_step, settings.space
-    given = space.noise(len(recordings.names))
+    given = space.noise(recordings.names)
     if given is not None:
         found = replace(found, diffusion=given)
         return found, residual_noise(found, recordings, pair_step=step), DiffusionSource.GIVEN

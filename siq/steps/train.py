@@ -138,7 +138,7 @@ def _diffusion(
     Networks only lead to the right solution, which is then found with the D of its own run.
     """
     dimension = next(iter(data.values())).training.x0.shape[1]
-    given = settings.space.noise(dimension)
+    given = settings.space.constant_noise(dimension)
     if given is not None:
         return given
     records = [record for number in data if (record := runs[number].record) is not None]
