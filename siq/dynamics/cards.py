@@ -2,8 +2,8 @@
 
 A *system card* (``config/systems/NAME.yaml``) declares states, parameters, the vector field f, and the
 covariance D of the noise in ``dx = f dt + sqrt(ε) D^(1/2) dW``, in numbers or formulas. D belongs to
-the system because the orthogonality ``∇V·g = 0`` of the decomposition ``f = -D∇V + g`` depends on it: the same
-equations in other units are another problem unless D is carried along.
+the system because the orthogonality ``∇V·g = 0`` of the decomposition ``f = -D∇V + g`` depends on it: the
+same equations in other units are another problem unless D is carried along.
 """
 
 from __future__ import annotations

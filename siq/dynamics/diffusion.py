@@ -85,6 +85,11 @@ class NoiseInUnits(NoiseField):
         """D at points: ``(n, d)`` to ``(n, d, d)``."""
         return np.asarray(self.factor * self._inverse @ self.noise.at(self._points(y)) @ self._inverse.T)
 
+    def whitening_at(self, y: np.ndarray) -> np.ndarray:
+        """σ⁻¹ at points: ``(n, d)`` to ``(n, d, d)``; raises as that of the noise."""
+        own = self.noise.whitening_at(self._points(y)) @ self.units
+        return np.asarray(own / np.sqrt(self.factor))
+
     def derivatives(self, y: np.ndarray) -> np.ndarray:
         """∂D_ij/∂y_k at points: ``(n, d)`` to ``(n, d, d, d)``, k last."""
         inner = self.noise.derivatives(self._points(y))

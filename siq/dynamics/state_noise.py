@@ -13,7 +13,7 @@ import numpy as np
 import sympy
 
 from siq.dynamics.diffusion import Diffusion
-from siq.dynamics.formulas import compile_formulas
+from siq.dynamics.formulas import compile_formulas, parse_formula
 from siq.errors import NumericalFailure
 
 
@@ -236,6 +236,14 @@ def diffusion_rows_of(diffusion: Diffusion) -> list[list[str | float]]:
     if diffusion.constant:
         return [[float(entry) for entry in row] for row in diffusion.matrix]
     return [[str(entry) for entry in row] for row in diffusion.formulas]
+
+
+def diffusion_of_rows(symbols: Sequence[sympy.Symbol], rows: Sequence[Sequence[str | float]]) -> Diffusion:
+    """D from what `diffusion_rows_of` made; raises as `StateNoise` and `Diffusion`, or `FormulaError`."""
+    names = {each.name: each for each in symbols}
+    if all(not isinstance(entry, str) for row in rows for entry in row):
+        return Diffusion(np.array(rows, dtype=float))
+    return state_noise(symbols, [[parse_formula(entry, names) for entry in row] for row in rows])
 
 
 def _derivatives(expressions: Sequence[sympy.Expr], symbols: Sequence[sympy.Symbol]) -> list[sympy.Expr]:

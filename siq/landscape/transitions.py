@@ -136,7 +136,7 @@ def missing_diffusion(dynamics: Dynamics) -> str | None:
     """
     defined = defined_states(dynamics)
     noise = dynamics.diffusion
-    if not defined or not np.array_equal(noise.matrix, np.eye(dynamics.dimension)):
+    if not defined or not noise.constant or not np.array_equal(noise.matrix, np.eye(dynamics.dimension)):
         return None
     return (
         f"the equation of {', '.join(defined)} is of the form dx/dt = v, which no noise drives, and D is the"

@@ -35,6 +35,7 @@ Route = Literal["network", "local"]
 
 IMPLAUSIBLE = 1e-4  # a probability below which no orthogonal fit is believed
 NETWORK_DEGREE = 8  # highest power of a well by the network route, whose start knows no more
+ELSEWHERE = "where D depends on the state no single formula is sought: each well has its own"
 FIT_POINTS = 400  # where ∇V·g is asked to vanish in a joint fit
 
 
@@ -197,6 +198,9 @@ def refine(
             network_wells = _network_wells(found, portrait, wells, network, seed, notes)
     elif wells:
         network_wells = wells
+    if not found.diffusion.constant:  # g = f + D∇V would need functions that no library has
+        notes.append(ELSEWHERE)
+        return _without_formula(found, library, best, wells, network_wells, routes, notes)
     if network_wells and not _good(best, limit):
         # Refined one by one, the wells may turn out to share one formula.
         values = (fit_values(library, x, well.values(x)) for well in network_wells for x in [well.inside])
@@ -204,6 +208,18 @@ def refine(
     if best is not None and _good(best, limit):
         return _with_circulation(best, found, points, options, wells, notes)
     notes.append("no single formula in this library holds over the whole recorded region")
+    return _without_formula(found, library, best, wells, network_wells, routes, notes)
+
+
+def _without_formula(
+    found: IdentifiedField,
+    library: CandidateLibrary,
+    best: GlobalPotential | None,
+    wells: Sequence[Well],
+    network_wells: Sequence[Well],
+    routes: Sequence[Route],
+    notes: Sequence[str],
+) -> Refined:
     return Refined(
         found, library, None, None, None, None,
         np.inf if best is None else best.residual, False, tuple(wells),
