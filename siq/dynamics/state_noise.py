@@ -139,6 +139,8 @@ class StateNoise(Diffusion):
 
     def push(self, x: np.ndarray, momenta: np.ndarray) -> np.ndarray:
         """``D(x) p`` at points ``(n, d)`` and momenta ``(n, ..., d)``."""
+        if not len(x):
+            return np.zeros(momenta.shape)
         n, d = x.shape
         return np.asarray((momenta.reshape(n, -1, d) @ self.at(x)).reshape(momenta.shape))
 

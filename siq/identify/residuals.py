@@ -24,6 +24,7 @@ from siq.identify.rounding import (
     rounding_errors,
     rounding_text,
 )
+from siq.identify.weighted_regression import weighted_residual_probability, whitened
 
 NoiseKind = Literal["none", "process", "measurement", "rounding", "coloured"]
 
@@ -131,15 +132,14 @@ def residual_noise(
         sample = SnapshotPairs(
             sample.x0[:PAIRS], sample.xh[:PAIRS], sample.h[:PAIRS], sample.recording[:PAIRS]
         )
-    intensity = noise.intensity(found.noise_rate)
-    covariance = found.noise_rate / intensity if intensity > 0 else noise.matrix
-    whiten = noise.whitening
-    excess = np.abs(whiten @ covariance @ whiten.T - np.eye(d))
+    intensity, covariance, excess = _against_diffusion(found, pairs)
     deviation = float(excess.max())
     score = float((excess / np.sqrt((1 + np.eye(d)) / len(pairs.h))).max())
     if found.noise_free:
-        return NoiseDiagnosis("none", 0.0, noise.matrix, 0.0, 0.0, 0.0, 0.0, np.zeros(d))
+        return NoiseDiagnosis("none", 0.0, covariance, 0.0, 0.0, 0.0, 0.0, np.zeros(d))
     rest = residuals(found, sample)
+    if not noise.constant:
+        rest = whitened(found, sample, rest)
     joined = _joined(sample, rest)
     first, second = rest[:-1][joined], rest[1:][joined]
     product = first * second
@@ -156,7 +156,7 @@ def residual_noise(
             rounding = rounding_errors(recordings)
             if is_rounding(measurement, rounding, correlation=float(correlations[worst])):
                 return NoiseDiagnosis(
-                    "rounding", 0.0, noise.matrix, 0.0, 0.0,
+                    "rounding", 0.0, covariance, 0.0, 0.0,
                     float(correlations[worst]), float(scores[worst]), measurement,
                     rounding_text(recordings),
                     rounding_bias(found, pairs, rounding), decimals_needed(recordings, pairs),
@@ -165,6 +165,24 @@ def residual_noise(
         kind, intensity, covariance, deviation, score,
         float(correlations[worst]), float(scores[worst]), measurement,
     )  # fmt: skip
+
+
+def _against_diffusion(found: IdentifiedField, pairs: SnapshotPairs) -> tuple[float, np.ndarray, np.ndarray]:
+    """ε, the covariance of the residuals in its unit, and how far it is from D, where D is the unit."""
+    noise, unit = found.diffusion, np.eye(found.library.dimension)
+    if noise.constant:
+        intensity = noise.intensity(found.noise_rate)
+        covariance = found.noise_rate / intensity if intensity > 0 and not found.noise_free else noise.matrix
+        return intensity, covariance, np.abs(noise.whitening @ covariance @ noise.whitening.T - unit)
+    if found.noise_free:
+        return 0.0, unit, np.zeros_like(unit)
+    forces = whitened(found, pairs, residuals(found, pairs))
+    whole = forces.T @ forces / len(forces)
+    intensity = float(np.trace(whole)) / len(unit)
+    excess = np.abs(whole / intensity - unit)
+    if found.noise is not None:  # its own formula says ε without the chance of the residuals
+        intensity = found.intensity
+    return intensity, found.noise_rate / intensity, excess
 
 
 def _joined(sample: SnapshotPairs, rest: np.ndarray) -> np.ndarray:
@@ -201,6 +219,8 @@ def mean_residual_probability(found: IdentifiedField, pairs: SnapshotPairs) -> f
     # Copies of resampled recordings would count as evidence that there is not.
     _, single = np.unique(np.column_stack([pairs.x0, pairs.xh]), axis=0, return_index=True)
     pairs = pairs.take(single)
+    if not found.diffusion.constant:
+        return weighted_residual_probability(found, pairs)
     rest = residuals(found, pairs) / np.sqrt(pairs.h)[:, None]
     design = found.library.evaluate(pairs.x0) * np.sqrt(pairs.h)[:, None]
     design = design / np.where((size := np.linalg.norm(design, axis=0)) > 0, size, 1.0)

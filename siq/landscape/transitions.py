@@ -219,7 +219,11 @@ def barrier_standard_error(path: TransitionPath, found: IdentifiedField) -> floa
     spent = np.where(speed > 0, length / np.where(speed > 0, speed, 1.0), 0.0)
     terms = found.library.evaluate(middle)[:, found.support[:, 1]]
     slope = -2 * (spent[:, None] * force[:, found.support[:, 0]] * terms).sum(axis=0)
-    return float(np.sqrt(max(slope @ found.covariance @ slope, 0.0)))
+    variance = float(slope @ found.covariance @ slope)
+    if found.noise is not None:  # and by ∂U/∂D = -2 ∫ p·∂D p dt
+        slope = -2 * (spent[:, None] * found.noise.push_slopes(middle, force)).sum(axis=0) / found.intensity
+        variance += float(slope @ found.noise.covariance @ slope)
+    return float(np.sqrt(max(variance, 0.0)))
 
 
 def position_standard_errors(found: IdentifiedField, position: np.ndarray) -> np.ndarray:
