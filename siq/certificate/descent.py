@@ -69,7 +69,7 @@ def check_descent(
     if below > options.descent:
         return Verdict(float(below), options.descent, False, RISES)
     slope = candidate.gradients(x0)
-    if not found.noise_free:
+    if found.noise_rate.any() and not found.noise_free:
         return _in_the_mean(found, x0, xh, h, values, slope, options, error)
     counts = values - lowest > LOWEST * size
     if not counts.any():

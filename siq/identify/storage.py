@@ -49,7 +49,7 @@ class FieldRecord:
     def sensor_variance(self) -> np.ndarray | None:
         """Variance of each state's sensor noise, shape ``(d,)``; None where f was found without any."""
         deviations = np.array(self.noise.get("measurement", []), dtype=float)
-        if self.noise.get("kind") != "process" or not (deviations > 0).any():
+        if self.noise.get("kind") not in ("process", "sensor") or not (deviations > 0).any():
             return None
         return deviations**2
 
@@ -60,7 +60,7 @@ class FieldRecord:
         The variance of n residuals of d states has the relative standard error ``√(2/nd)``.
         """
         intensity = float(self.noise.get("intensity", 0.0))
-        if self.noise.get("kind") != "process" or not intensity > 0:
+        if self.noise.get("kind") not in ("process", "sensor") or not intensity > 0:
             return None
         samples = int(self.noise.get("pairs", 0)) * self.found.library.dimension
         return intensity, intensity * (2 / samples) ** 0.5 if samples else 0.0
