@@ -53,7 +53,7 @@ def test_the_barrier_of_one_state_is_the_quadrature() -> None:
         assert path.action == pytest.approx(expected, rel=1e-6)
 
 
-@pytest.mark.parametrize("dimension", [2, 3, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("dimension", [2, *(pytest.param(d, marks=pytest.mark.slow) for d in (3, 4))])
 def test_barriers_and_momenta_are_those_of_the_given_potential(dimension: int) -> None:
     known = multiplicative(dimension)
     saddle = saddle_of(known)
@@ -95,7 +95,7 @@ def _mirrored(known: KnownSystem):  # type: ignore[no-untyped-def]
     return Dynamics.of((x,), drift, diffusion=((known.dynamics.diffusion.formulas[0][0].subs(back),),))
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_the_prefactor_has_the_corrections_of_itô_in_several_states(dimension: int) -> None:
     """∇²V and the divergences are known: the law can be worked out by hand along the path."""
     known = multiplicative(dimension)
