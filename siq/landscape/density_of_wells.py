@@ -169,9 +169,11 @@ def sample_potential(
 
 
 def _prefactor(potential: GlobalQuasipotential, sampled: SampledPotential) -> np.ndarray | None:
+    if sampled.values.ndim > 1:
+        return None
     first = potential.wells[0]
     noise = first.dynamics.diffusion
-    if noise.constant or noise.dimension > 1:
+    if noise.constant:
         return None
     own = noise.at(np.stack([first.attractor, *sampled.axes[0][:, None]]))[:, 0, 0]
     # Where a formula of D is not positive no state can be, and none is known.
