@@ -24,6 +24,7 @@ from siq.identify.identification import (
     with_stability,
 )
 from siq.identify.identified_field import IdentifiedField
+from siq.identify.noise_regression import constant_noise_probability
 from siq.identify.prediction import prediction_errors
 from siq.identify.random_forces import with_random_forces
 from siq.identify.residuals import (
@@ -129,7 +130,10 @@ def _identified(settings: IdentifySettings, recordings: Recordings, number: int)
         "correlation_score": noise.correlation_score,
         "measurement": noise.measurement.tolist(),
         "diffusion": str(source),
-        "note": noise.note,
+        "note": "; ".join(
+            each for each in (noise.note, _unlike(found, noise, source, recordings, settings)) if each
+        )
+        or None,
         "pairs": sum(len(part.h) for part in parts),
     }
     return FieldRecord(found, verdict.as_data(), kept)
@@ -160,6 +164,26 @@ def _with_diffusion(
             return with_own, noise, DiffusionSource.ESTIMATED
     check_units(recordings.names, units_of_states(recordings, space))
     return found, residual_noise(found, recordings, pair_step=step), DiffusionSource.UNIT
+
+
+def _unlike(
+    found: IdentifiedField,
+    noise: NoiseDiagnosis,
+    source: DiffusionSource,
+    recordings: Recordings,
+    settings: IdentifySettings,
+) -> str | None:
+    """What has to be said of a constant D that was given, where the recordings speak for another."""
+    if source != DiffusionSource.GIVEN or noise.kind != "process" or not found.diffusion.constant:
+        return None
+    pairs = snapshot_pairs(recordings, pair_step=settings.sampling.pair_step)
+    probability = constant_noise_probability(found, pairs, residuals(found, pairs))
+    if probability >= settings.identification.false_terms:
+        return None
+    return (
+        "the noise is stronger at some states than at others, and the D that was given is the same"
+        " everywhere: leave it out, or give formulas of the states"
+    )
 
 
 def _held_out_verdict(
