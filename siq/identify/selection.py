@@ -131,6 +131,15 @@ class Equation:
             yield float(score), tuple(sorted((*support, int(place))))
 
 
+def best_support(equation: Equation, start: Sequence[int]) -> tuple[int, ...]:
+    """The support of the lowest score that exchanges reach, from a start and from no term at all.
+
+    Elimination may leave many terms that make up together what a few would do, none of which it still has: no
+    exchange of a single one leads back from there, but the way up from nothing does.
+    """
+    return min((improved_support(equation, one) for one in (start, ())), key=lambda one: equation.score(one))
+
+
 def improved_support(equation: Equation, start: Sequence[int]) -> tuple[int, ...]:
     """The support of the lowest score that exchanges of single terms reach from a start."""
     support = tuple(sorted(int(place) for place in start))
