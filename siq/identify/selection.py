@@ -11,16 +11,8 @@ Terms are added, dropped and exchanged as long as that lowers the score. Of two 
 the one of the lower degree is taken: the probability of a false term is shared among degrees in the ratio
 1 : ½ : ¼ …, and among the terms of a degree evenly.
 
-The supports next to the chosen one are *rivals*, and what they would change in f belongs to the error of f as
-the covariance does. A term was left out unless it was sure; a rival has to be weighed as it is likely:
-
-- one term more, at z standard errors with the probability p of so many by chance, by its prior odds times
-  ``1/(-e p ln p)``, the most that any prior of its size can make of the data (Sellke, Bayarri and Berger, The
-  American Statistician 55 (2001) 62); one less by the inverse of that;
-- another term instead, by ``exp(-Δχ²/2)`` times the ratio of their prior odds.
-
-The prior odds are those of as many terms again as there are, shared among the absent ones as the probability
-of a false term is.
+The supports next to the chosen one are *rivals*. Each would do with the probability ``exp(-Δscore/2)``
+relative to it, and what it would change in f belongs to the error of f as the covariance does.
 """
 
 from __future__ import annotations
@@ -115,18 +107,6 @@ class Equation:
         misfit = self.goal - self.columns @ self.fitted(support)
         return float(misfit @ misfit / self.variance)
 
-    def odds(self, own: Sequence[int], other: Sequence[int]) -> float:
-        """How likely a neighbour is, relative to a support: see the module."""
-        come, gone = sorted(set(other) - set(own)), sorted(set(own) - set(other))
-        shares = scipy.special.ndtr(-self.critical)
-        change = self.chi_square(own) - self.chi_square(other)
-        if come and gone:
-            return float(np.exp(min(change / 2, 0.0)) * shares[come[0]] / shares[gone[0]])
-        place = (come or gone)[0]
-        absent = shares.sum() - shares[list(own)].sum() + (shares[place] if gone else 0.0)
-        its = len(own) * shares[place] / absent * _evidence(abs(change))
-        return float(its if come else 1 / its)
-
     def neighbours(self, support: Sequence[int]) -> Iterator[tuple[float, tuple[int, ...]]]:
         """Scores of all supports that one term more, one less, or another one makes of this one."""
         yield from self._with_one_more(support)
@@ -183,15 +163,9 @@ def rival_changes(equation: Equation, support: Sequence[int]) -> np.ndarray:
     change; see the module.
     """
     own = tuple(sorted(int(place) for place in support))
-    coefficients = equation.fitted(own)
-    kept = [(equation.odds(own, other), other) for _, other in equation.neighbours(own)]
+    score, coefficients = equation.score(own), equation.fitted(own)
+    kept = [(np.exp(-(its - score) / 2), other) for its, other in equation.neighbours(own)]
     kept = [(weight, other) for weight, other in kept if weight > LEAST_WEIGHT]
     total = 1.0 + sum(weight for weight, _ in kept)
     changes = [np.sqrt(weight / total) * (equation.fitted(other) - coefficients) for weight, other in kept]
     return np.array(changes).reshape(-1, equation.columns.shape[1])
-
-
-def _evidence(squared: float) -> float:
-    """The most that z² standard errors squared can say for a term: 1 where chance has as much."""
-    p = max(2 * float(scipy.special.ndtr(-np.sqrt(max(squared, 0.0)))), np.finfo(float).tiny)
-    return float(1 / (-np.e * p * np.log(p))) if p < 1 / np.e else 1.0

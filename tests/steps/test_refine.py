@@ -7,9 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import sympy
 
 from siq.certificate.certify import Certificate
 from siq.certificate.tests import Verdict
+from siq.data.recordings import SnapshotPairs
+from siq.dynamics.dynamics import Dynamics
+from siq.dynamics.phase_portrait import phase_portrait
 from siq.potential.refinement import Refined, RefinementOptions
 from siq.steps import refine
 
@@ -51,3 +55,18 @@ def test_the_wells_carry_the_certificate_where_one_formula_is_refused(
     assert (formulas.potential is not None) == whole
     assert made.certified == (PASSED in (formula, wells))
     assert any("no single formula" in note for note in refined.notes) == (not whole)
+
+
+def test_recordings_of_every_well_are_held_out_where_they_stay_in_theirs() -> None:
+    x, y = sympy.symbols("x y", real=True)
+    draw = np.random.default_rng(0)
+    states = draw.uniform([-1.6, -0.8], [1.6, 0.8], (600, 2))
+    portrait = phase_portrait(Dynamics.of((x, y), (x - x**3, -y)), states)
+    places = np.repeat([-1.0, -1.0, 1.0, 1.0, 1.0], 200)
+    x0 = np.stack([places, np.zeros(1000)], axis=1) + 0.1 * draw.standard_normal((1000, 2))
+    recording = np.repeat(np.arange(5), 200)
+    pairs = SnapshotPairs(x0=x0, xh=x0, h=np.full(1000, 0.1), recording=recording)
+    mask = np.array([True, False, False, False, False])
+    found = refine.every_well_held_out(portrait, pairs, mask)
+    assert found.tolist()[:2] == [True, False] and found[2:].sum() == 1
+    assert refine.every_well_held_out(portrait, pairs, found).tolist() == found.tolist()
