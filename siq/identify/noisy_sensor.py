@@ -28,7 +28,7 @@ from siq.identify.flow import FlowMap
 from siq.identify.flow_regression import positive
 from siq.identify.identified_field import IdentifiedField, field_dynamics
 from siq.identify.library import CandidateLibrary
-from siq.identify.selection import Equation, improved_support, rival_changes, strong_terms
+from siq.identify.selection import Equation, best_support, rival_changes, strong_terms
 from siq.identify.stability import blocks_of, stability, triangles
 
 ROUNDS = 8  # of the fit of a whole library, which only chooses terms
@@ -119,7 +119,7 @@ def identify_by_likelihood(
     )[0][: len(values) + 1]
     # In units of the innovations' errors; all equations at once, since a filter couples them.
     equations = Equation(triangle[:, :-1], triangle[:, -1], 1.0, np.tile(critical, d))
-    chosen = list(improved_support(equations, strong_terms(equations)))
+    chosen = list(best_support(equations, strong_terms(equations)))
     support = everything[chosen]
     for component, name in enumerate(library.states):
         if component not in support[:, 0]:
