@@ -34,6 +34,7 @@ from siq.dynamics.phase_portrait import PhasePortrait
 from siq.identify.identified_field import IdentifiedField
 from siq.landscape.dwell_times import NoiseStrength
 from siq.landscape.predicted_visits import PredictedVisits, cores_about, predicted_visits
+from siq.reference.fokker_planck import CELLS
 
 NO_WONDER = 0.01  # probability of no hop at all, below which it contradicts the prediction
 NODES = 41  # of the integral over the prediction's own error
@@ -183,6 +184,8 @@ def record_test(
     states = len(portrait.attractors)
     whole = dwell_counts(recordings.t, visits, runs, states=states)
     held = dwell_counts(recordings.t, visits, apart, states=states)
+    if found.dynamics.dimension not in CELLS and not any(one.visits for one in whole):
+        return RecordTest(missing="the recordings do not hop")
     prediction = predicted_visits(found, portrait, noise, cores, seed=seed)
     tested = tuple(
         VisitTest(
