@@ -21,14 +21,21 @@ from siq.identify.identification import (
     IdentificationOptions,
     carries_noise,
     identify_vector_field,
+    with_stability,
 )
 from siq.identify.identified_field import IdentifiedField
 from siq.identify.prediction import prediction_errors
 from siq.identify.random_forces import with_random_forces
-from siq.identify.residuals import NoiseDiagnosis, mean_residual_probability, residual_noise
+from siq.identify.residuals import (
+    NoiseDiagnosis,
+    mean_residual_probability,
+    residual_noise,
+)
 from siq.identify.rounding import rounding_text
 from siq.identify.storage import FieldRecord, field_library, read_field, write_field
+from siq.identify.weighted_regression import fit_weighted, with_given_noise, with_noise_formula
 from siq.numerics.randomness import Purpose, generator
+from siq.steps.identify_beside_sensor import beside_sensor_noise, filtered_record, units_of_states
 from siq.steps.outcomes import Outcome, Status, Step, read_outcomes, write_outcomes
 from siq.steps.settings import STRICT, Sampling, StateSpace
 
@@ -92,12 +99,25 @@ def _identified(settings: IdentifySettings, recordings: Recordings, number: int)
         # Under noise every recording counts: all give the result, a part of them its test.
         everything = snapshot_pairs(recordings, pair_step=step)
         found = with_random_forces(identify_pairs(everything), everything)
-        fitted = refit(found, parts[0])
+        draw = generator(settings.seed, number, Purpose.STABILITY)
+        filtered = beside_sensor_noise(found, recordings, options=options, pair_step=step, generator=draw)
+        if filtered is not None:
+            return filtered_record(
+                filtered, recordings, (training, held_out), sampling=sampling, space=settings.space,
+                limits=settings.prediction,
+            )  # fmt: skip
     else:
-        found = fitted = identify_pairs(parts[0])
+        found = identify_pairs(parts[0])
     found, noise, source = _with_diffusion(
         found, recordings, settings, pairs=sum(len(part.h) for part in parts)
     )
+    fitted = found
+    if not found.noise_free:
+        if found.diffusion.constant:
+            draw = generator(settings.seed, number, Purpose.STABILITY)
+            pairs = snapshot_pairs(recordings, pair_step=step)
+            found = with_stability(found, pairs, options=options, generator=draw)
+        fitted = (refit if found.diffusion.constant else fit_weighted)(found, parts[0])
     verdict = _held_out_verdict(
         found, fitted, parts, held_out, fault=noise.fault(recordings.names), limits=settings.prediction
     )
@@ -123,21 +143,22 @@ def _with_diffusion(
     f does not depend on D, and whether noise is white does not either: so D can come last.
     """
     step, space = settings.sampling.pair_step, settings.space
-    given = space.noise(len(recordings.names))
+    given, false_terms = space.noise(recordings.names), settings.identification.false_terms
+    everything = snapshot_pairs(recordings, pair_step=step)
     if given is not None:
-        found = replace(found, diffusion=given)
+        found = with_given_noise(found, everything, given, false_terms=false_terms)
         return found, residual_noise(found, recordings, pair_step=step), DiffusionSource.GIVEN
     estimated = estimated_diffusion(found, pairs=pairs)
     if estimated is not None:
         with_own = replace(found, diffusion=estimated)
         noise = residual_noise(with_own, recordings, pair_step=step)
         if noise.kind == "process":
+            by_state = with_noise_formula(with_own, everything, false_terms=false_terms)
+            if by_state is not None:
+                by_formula = residual_noise(by_state, recordings, pair_step=step)
+                return by_state, by_formula, DiffusionSource.ESTIMATED
             return with_own, noise, DiffusionSource.ESTIMATED
-    units = [
-        unit or space.unit(name) or None
-        for name, unit in zip(recordings.names, recordings.units, strict=True)
-    ]
-    check_units(recordings.names, units)
+    check_units(recordings.names, units_of_states(recordings, space))
     return found, residual_noise(found, recordings, pair_step=step), DiffusionSource.UNIT
 
 
@@ -159,7 +180,14 @@ def _held_out_verdict(
         )
     training, unseen = parts
     squares = [
-        float((residuals(fitted, pairs) ** 2 / pairs.h[:, None]).mean()) for pairs in (unseen, training)
+        float(
+            fitted.diffusion.squared_speed(
+                pairs.x0, residuals(fitted, pairs) / np.sqrt(pairs.h)[:, None]
+            ).mean()
+        )
+        if not fitted.diffusion.constant
+        else float((residuals(fitted, pairs) ** 2 / pairs.h[:, None]).mean())
+        for pairs in (unseen, training)
     ]
     return check_prediction(
         noise_fault=fault,
