@@ -7,7 +7,7 @@ with the cores where they are.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
@@ -16,7 +16,7 @@ from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.equilibria import hessian_at
 from siq.dynamics.phase_portrait import PhasePortrait
 from siq.errors import NumericalFailure
-from siq.identify.identified_field import IdentifiedField
+from siq.identify.identified_field import IdentifiedField, field_dynamics
 from siq.landscape.dwell_times import NoiseStrength, dwell_time
 from siq.landscape.transitions import transitions, ways_out
 from siq.numerics.measured_text import place_text
@@ -186,15 +186,37 @@ def _processes(
     cells = CELLS[dynamics.dimension]
     main = _visits(dynamics, noise.intensity, box, cores, cells)
     generator = np.random.default_rng(seed)
-    draws = generator.multivariate_normal(
-        found.values, found.covariance, size=DRAWS[dynamics.dimension], method="eigh"
-    )
-    strengths = np.exp(noise.standard_error / noise.intensity * generator.standard_normal(len(draws)))
     others = []
-    for draw, strength in zip(draws, strengths, strict=True):
-        drawn = dynamics.with_values(draw)
+    for _ in range(DRAWS[dynamics.dimension]):
+        drawn = drawn_system(found, generator=generator)
+        strength = float(np.exp(noise.standard_error / noise.intensity * generator.standard_normal()))
         others.append(_visits(drawn, noise.intensity * strength, box, cores, round(COARSER * cells)))
     return (main, *others)
+
+
+def drawn_system(found: IdentifiedField, *, generator: np.random.Generator) -> Dynamics:
+    """F and D drawn from their distributions, further terms of f and the terms of D(x) included.
+
+    Parameters
+    ----------
+    found
+        What is known of both.
+    generator
+        Where the draw comes from.
+    """
+    coefficients = np.zeros_like(found.coefficients)
+    own = generator.multivariate_normal(found.values, found.covariance, method="eigh")
+    coefficients[found.support[:, 1], found.support[:, 0]] = own
+    if found.doubts is not None and len(found.doubts):
+        coefficients += np.tensordot(generator.standard_normal(len(found.doubts)), found.doubts, 1)
+    support = np.argwhere(coefficients.T != 0)
+    diffusion = found.diffusion
+    if found.noise is not None:
+        terms = found.noise
+        entries = generator.multivariate_normal(terms.values, terms.covariance, method="eigh")
+        diffusion = replace(terms, values=entries).diffusion(found.intensity)
+    values = coefficients[support[:, 1], support[:, 0]]
+    return field_dynamics(found.library, support, values, diffusion=diffusion)
 
 
 def _visits(dynamics: Dynamics, intensity: float, box: np.ndarray, cores: Cores, cells: int) -> CellVisits:

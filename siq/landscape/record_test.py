@@ -26,7 +26,6 @@ import numpy as np
 from scipy import stats
 
 from siq.certificate.tests import Verdict
-from siq.data.noise_floor import noise_floors
 from siq.data.recordings import Recordings
 from siq.data.stationarity import correlated_samples, runs_of
 from siq.data.transitions import DwellCount, continued_visits, dwell_counts
@@ -156,6 +155,7 @@ def record_test(
     recordings: Recordings,
     held_out: np.ndarray,
     *,
+    sensor: np.ndarray | None = None,
     seed: int = 0,
 ) -> RecordTest:
     """Hold what was identified against the record's own hops and histogram.
@@ -170,6 +170,8 @@ def record_test(
         All of them.
     held_out
         Mask over ``recordings.labels``: those that no fit saw.
+    sensor
+        Standard deviation of each state's sensor noise, shape ``(d,)``; None where there is none.
     seed
         Decides the draws of f.
     """
@@ -199,7 +201,7 @@ def record_test(
     chance = min(probability_of(one.whole, one.predicted, one.error) for one in tested)
     if not any(one.visits for one in whole) and chance > NO_WONDER:
         return RecordTest(missing="the recordings do not hop, nor should they have in their time")
-    densities = _densities(prediction, recordings, visits, apart)
+    densities = _densities(prediction, recordings, visits, apart, sensor)
     return RecordTest(tested, densities, notes=prediction.notes)
 
 
@@ -216,12 +218,15 @@ def probability_of(count: DwellCount, mean: float, error: float) -> float:
 
 
 def _densities(
-    prediction: PredictedVisits, recordings: Recordings, visits: np.ndarray, runs: list[slice]
+    prediction: PredictedVisits,
+    recordings: Recordings,
+    visits: np.ndarray,
+    runs: list[slice],
+    sensor: np.ndarray | None,
 ) -> tuple[DensityTest, ...]:
     """Each state's distribution during the visits to each well, on the runs given."""
     if not prediction.processes:
         return ()
-    floors = noise_floors(recordings)
     used = np.zeros(len(visits), dtype=bool)
     for run in runs:
         used[run] = True
@@ -233,7 +238,7 @@ def _densities(
         pieces = _pieces(rows)
         for state in range(len(recordings.names)):
             x = recordings.values[rows, state]
-            blur = 0.0 if floors is None else floors[state].sensor
+            blur = 0.0 if sensor is None else float(sensor[state])
             independent = len(x) / (2 * correlated_samples(x, pieces))
             if independent >= FEWEST and np.ptp(x) > 0:
                 tests.append(_density(prediction, one.well, state, x, independent, blur))

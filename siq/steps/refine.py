@@ -247,10 +247,12 @@ class Ground:
         """What f says of the record's own hops and histogram, beside what is counted on it."""
         shown = self.record.noise_strength
         noise = None if shown is None else NoiseStrength(*shown, source="estimated")
+        variance = self.record.sensor_variance
         try:
             return record_test(
-                self.found, self.portrait, noise, self.recordings, self.unseen, seed=self.number
-            )
+                self.found, self.portrait, noise, self.recordings, self.unseen,
+                sensor=None if variance is None else np.sqrt(variance), seed=self.number,
+            )  # fmt: skip
         except (NumericalFailure, np.linalg.LinAlgError) as error:
             return RecordTest(missing=str(error))
 
