@@ -30,6 +30,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
+from siq.data.noise_floor import noise_floors
 from siq.data.recordings import Recordings
 from siq.data.stationarity import (
     Background,
@@ -38,6 +39,7 @@ from siq.data.stationarity import (
     runs_of,
     stretches_of,
     usual_step,
+    without_background,
 )
 from siq.numerics.machine_code import machine_code
 
@@ -161,7 +163,8 @@ def switching(recordings: Recordings, *, generator: np.random.Generator | None =
 
     Examples
     --------
-    >>> from siq.data.recordings import Recordings
+    >>> from siq.data.noise_floor import noise_floors
+    from siq.data.recordings import Recordings
     >>> generator = np.random.default_rng(1)
     >>> x = np.empty((20_000, 1))
     >>> x[0] = 1.0
@@ -203,6 +206,26 @@ def switching(recordings: Recordings, *, generator: np.random.Generator | None =
         depth,
         min(2 * probability * len(tests), 1.0),
     )
+
+
+def without_slow_drift(recordings: Recordings) -> Recordings:
+    """A single long recording less what drifts slowly in it, which a note says for each state.
+
+    Of a record that supports two states the drift is what both levels have in common; of any other, what slow
+    cosines explain. Several recordings come back as they are: how they begin may be a part of what they show.
+    So does one without random forces, in which nothing but the system itself moves.
+    """
+    floors = noise_floors(recordings) if len(recordings.labels) == 1 else None
+    if floors is None or any(floor.process == 0 for floor in floors):
+        return recordings
+    found = switching(recordings)
+    flat = recordings
+    for state, values in enumerate(recordings.values.T):
+        if found is not None and found.supported and state == found.state:
+            flat = without_background(flat, state, found.background)
+        else:
+            flat = without_background(flat, state, background_of(recordings, values))
+    return flat
 
 
 def pushed_apart(values: np.ndarray, runs: list[slice], relaxation: float) -> tuple[float, float] | None:
