@@ -16,6 +16,8 @@ certified without it.
 `agreement`        both routes give the same V within their errors. Networks that do not agree with the local
                    route are trained again: a test of consistency, and no evidence from elsewhere
 `prediction`       f predicts held-out recordings, and its residuals are white
+`record`           held-out recordings hop, and are spread, as f and D say: `siq.landscape.record_test`. Only
+                   where they show random forces and two states, and where they hop or should
 =================  ===========================================================================================
 
 `siq.certificate.characteristics`, `siq.certificate.descent` and `siq.certificate.existence` have those three

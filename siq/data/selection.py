@@ -10,6 +10,7 @@ import numpy as np
 from siq.data.labels import distinct_labels, sources
 from siq.data.noise_floor import noise_floors
 from siq.data.recordings import Recordings
+from siq.data.stationarity import correlated_samples, runs_of
 
 
 def select_recordings(recordings: Recordings, indices: Sequence[int] | np.ndarray) -> Recordings:
@@ -63,12 +64,15 @@ def resample_recordings(recordings: Recordings, *, generator: np.random.Generato
     return select_recordings(recordings, generator.integers(count, size=count))
 
 
-STRETCHES = 10  # of a single recording, two of which are held out
+STRETCHES = 10  # of a single recording, at least, two of which are held out
+MOST_STRETCHES = 40  # more make no error better known
+LENGTH = 10  # correlation times in a stretch: what is left of its first sample at its end is then nothing
 
 
 def in_stretches(recordings: Recordings) -> Recordings:
     """Cut a recording that is the only one into stretches, of which some can be held out, or drawn again.
 
+    Stretches are ten correlation times long, hops included, where this makes between ten and forty of them.
     Several recordings come back as they are, and so does one of fewer than `STRETCHES` pairs, or without
     random forces: a system that settles once is not seen again in another stretch.
     """
@@ -78,11 +82,14 @@ def in_stretches(recordings: Recordings) -> Recordings:
     floors = noise_floors(recordings)
     if floors is not None and all(floor.process == 0 for floor in floors):
         return recordings
+    runs = runs_of(recordings)
+    longest = max(correlated_samples(column, runs) for column in recordings.values.T)
+    cut = int(np.clip(count / (LENGTH * longest), STRETCHES, min(MOST_STRETCHES, count // 2)))
     label = recordings.labels[0]
-    note = f"there is one recording; it was cut into {STRETCHES} stretches, so that some can be held out"
+    note = f"there is one recording; it was cut into {cut} stretches, so that some can be held out"
     return replace(
         recordings,
-        labels=tuple(f"{label} ({number} of {STRETCHES})" for number in range(1, STRETCHES + 1)),
-        recording=np.arange(count) * STRETCHES // count,
+        labels=tuple(f"{label} ({number} of {cut})" for number in range(1, cut + 1)),
+        recording=np.arange(count) * cut // count,
         notes=(*recordings.notes, note),
     )

@@ -23,6 +23,7 @@
 `study_figures`          and which figures has it?
 `landscape_tables`       what does it say of the landscape?
 `landscape_figures`      and which figures of it?
+`record_answer`          what does it say of the record's own hops?
 `invariant_tables`       what does it say of the invariant distribution?
 `reproduction_page`      what does the page say that lists a publication's results beside ours?
 `mismatch_page`          what does the page of a diagnosis say?

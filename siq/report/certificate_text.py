@@ -21,6 +21,7 @@ TESTS = {
     "characteristics": "an independent calculation, along characteristics of f, gives the same U",
     "agreement": "two routes to U lead to the same one",
     "prediction": "f predicts recordings that were held out",
+    "record": "the record hops, and is spread, as f and D say",
     "same_as_refined": "it is the same U as the one above",
 }
 """What each test asks, as a reader is told."""
@@ -35,6 +36,7 @@ FAILURES = {
     "characteristics": "an independent calculation, along characteristics of f, gives another U",
     "agreement": "two routes to U lead to different ones",
     "prediction": "f does not predict recordings that were held out",
+    "record": "the record hops, or is spread, otherwise than f and D say",
 }
 """The same where the answer is no."""
 

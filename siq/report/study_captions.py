@@ -14,6 +14,7 @@ class Part(StrEnum):
 
     LEAD = "lead"
     EVIDENCE = "evidence"
+    RECORD = "record"
     LANDSCAPE = "landscape"
     RUNS = "runs"
     PUBLISHED = "published"
@@ -61,6 +62,11 @@ CAPTIONS: Mapping[str, Caption] = {
         "Prediction of recordings that were held out: trajectories, recorded and computed from the same first"
         " states by f; and the relative errors at their ends, with the median.",
         "Fig. 4a",
+    ),
+    "record": Caption(
+        Part.RECORD,
+        "The record beside what f, D and ε say of it: (a) mean visits to each well, counted on all recordings"
+        " and predicted; below, how a state is spread during the visits to a well, on held-out recordings.",
     ),
     "escape": Caption(
         Part.EVIDENCE,

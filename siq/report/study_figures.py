@@ -33,6 +33,7 @@ from siq.report.plots import (
     plot_training,
 )
 from siq.report.plots.quasipotential import quasipotential_figure
+from siq.report.plots.record import plot_record
 from siq.report.plots.residuals import residuals_figure
 from siq.report.projection import project, project_landscape
 from siq.report.said_landscape import SaidLandscape
@@ -133,6 +134,8 @@ class StudyTables:
     rrmse: pd.DataFrame
     training: pd.DataFrame
     prediction: pd.DataFrame
+    record: pd.DataFrame
+    record_density: pd.DataFrame
 
 
 def what_is_shown(shown: Shown, models: ModelFiles, complete: tuple[int, StoredLandscape] | None) -> ShownRun:
@@ -181,8 +184,19 @@ def study_figures(
     figures["dataset"] = _dataset_figure(settings, shown, system)
     figures["components"] = _components_figure(shown, system)
     error = published.get("prediction_error")
+    figures["record"] = _record_figure(tables, shown, system)
     figures["prediction"] = _prediction_figure(settings, tables.prediction, shown, system, error)
     return figures
+
+
+def _record_figure(tables: StudyTables, shown: ShownRun, system: Dynamics | None) -> Figure | None:
+    """The test against the record, of the run that is shown."""
+    recordings = shown.recordings
+    if recordings is None:
+        return None
+    one, two = (table[table["run"] == shown.number] for table in (tables.record, tables.record_density))
+    units = dict(zip(recordings.names, _units(recordings, system), strict=True))
+    return plot_record(one, two, units=units, time_unit=recordings.time_unit or "1")
 
 
 def _some(recordings: Recordings) -> np.ndarray:

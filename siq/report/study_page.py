@@ -49,6 +49,7 @@ def study_page(
             figure = replace(figure, caption=OF_ONE_STATE, alternative=OF_ONE_STATE)
     sections = [
         page.formulas(),
+        page.record(),
         page.evidence(),
         page.landscape(),
         page.over_runs(),

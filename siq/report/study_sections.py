@@ -22,6 +22,7 @@ from siq.report.invariant_tables import invariant_tables
 from siq.report.landscape_answer import headline, remarks
 from siq.report.landscape_tables import errors_table, escape_table, landscape_sentences, landscape_tables
 from siq.report.page import Badge, FormulaRow, ReportSection, ReportTable
+from siq.report.record_answer import record_sentences, record_table
 from siq.report.said_landscape import SaidLandscape
 from siq.report.sentences import control_sentences, run_sentences
 from siq.report.study_captions import Part, figures_of
@@ -232,6 +233,25 @@ class StudyParts:
         return ReportSection(
             "How far it can be trusted", text, tables=found, figures=figures, notes=self._remarks()
         )
+
+    def record(self) -> ReportSection | None:
+        """The record's own hops and histogram, beside what was identified."""
+        shown, certificate = self.results.shown, self._certificate()
+        table = self.results.tables.get("record")
+        if table is None or shown.run is None:
+            return None
+        mine = table[table["run"] == shown.run]
+        missing = "" if certificate is None else str(certificate.get("no_record_test") or "")
+        text = record_sentences(mine, missing)
+        if not text:
+            return None
+        overview = self.results.overview
+        time = "1" if overview is None else SaidLandscape(overview).time_unit
+        found = record_table(mine, time, self.results.folder)
+        return ReportSection(
+            "Against the record itself", text, tables=[] if found is None else [found],
+            figures=self._figures(Part.RECORD),
+        )  # fmt: skip
 
     def _remarks(self) -> list[str]:
         """What steps that went well have to say, each once; where D is from stands beside D."""

@@ -32,6 +32,7 @@ settings, of_study      what are several steps told alike, and how does a study 
 shown                   which run stands for all of them?
 training_block          how do runs train side by side, and what does a killed job go on from?
 trained, landscapes     how do later steps read networks and landscapes?
+record_tables           which rows does the test against the record give?
 landscape_tables        which rows of tables does a landscape give?
 ======================  =================================================================================
 """

@@ -12,7 +12,10 @@ from siq.study.scoring import summary_table
 from siq.study.study import PublishedFigure
 from siq.study.tables import as_table, concatenate
 
-OF_RUNS = ("coefficients", "rrmse", "prediction", "certificates", "landscape", "degrees", "training")
+OF_RUNS = (
+    "coefficients", "rrmse", "prediction", "certificates", "record", "record_density", "landscape", "degrees",
+    "training",
+)  # fmt: skip
 """Tables that every run, or every block of runs, has a part of."""
 
 

@@ -10,6 +10,7 @@ from pydantic.dataclasses import dataclass
 from siq.data.learnable import read_pairs
 from siq.data.recordings import Recordings, write_recordings
 from siq.data.selection import in_stretches, resample_recordings
+from siq.data.transitions import without_slow_drift
 from siq.dynamics.cards import load_system
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.simulation import SimulationOptions, simulate_snapshots
@@ -50,7 +51,7 @@ def run(settings: DrawSettings, source: Dynamics | Recordings, *, number: int) -
         Of the run.
     """
     if isinstance(source, Recordings):
-        source = in_stretches(source)
+        source = in_stretches(without_slow_drift(source))
         if number > 0:
             draw = generator(settings.seed, number, Purpose.RESAMPLE)
             source = resample_recordings(source, generator=draw)

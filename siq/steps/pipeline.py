@@ -15,6 +15,7 @@ from pydantic.dataclasses import dataclass
 from siq.certificate.tests import CertificateOptions, PredictionLimits
 from siq.data.recordings import Recordings
 from siq.data.selection import in_stretches
+from siq.data.transitions import without_slow_drift
 from siq.identify.identification import IdentificationOptions
 from siq.landscape.options import LandscapeOptions
 from siq.networks.options import TrainingOptions
@@ -126,7 +127,7 @@ def analyse(
         Also where a step failed, which its outcome then says.
     """
     settings = settings or PipelineSettings()
-    recordings = in_stretches(recordings)
+    recordings = in_stretches(without_slow_drift(recordings))
     identified = identify.run(settings.of(identify.IdentifySettings), recordings, number=number)
     trained, regressed = not_trained(number), None
     refinement = settings.refinement.with_routes(networks=settings.training is not None)

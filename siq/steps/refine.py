@@ -36,6 +36,8 @@ from siq.errors import NumericalFailure
 from siq.identify.identified_field import IdentifiedField
 from siq.identify.noisy_sensor import filtered_recordings
 from siq.identify.storage import FieldRecord
+from siq.landscape.dwell_times import NoiseStrength
+from siq.landscape.record_test import RecordTest, record_test
 from siq.networks.trained import TrainedNetworks, shuffled
 from siq.numerics.randomness import Purpose, generator
 from siq.potential.refined_formulas import refined_decomposition, relative_error_of
@@ -45,8 +47,10 @@ from siq.potential.symbolic import SymbolicDecomposition, term_coefficients
 from siq.potential.well import Well
 from siq.steps.identify import Identified
 from siq.steps.outcomes import Method, Outcome, Status, Step, write_outcomes
+from siq.steps.record_tables import density_rows, visit_rows
 from siq.steps.settings import STRICT, Sampling
 from siq.steps.trained import TrainedRun
+from siq.study.tables import write_table
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -86,12 +90,16 @@ class RefinedRun:
     """Formulas of a run by method, with a certificate for each and for the control, and the outcome.
 
     Certificates are plain data, as they stand in `model.json`; `certificate` is that of the refined formulas.
+    `record` is the test of f against the hops and the histogram of the recordings, about the `attractors`.
     """
 
     formulas: Mapping[Method, SymbolicDecomposition]
     certificates: Mapping[Method, Mapping[str, Any]]
     outcome: Outcome
     certificate: Certificate | None = None
+    record: RecordTest | None = None
+    attractors: tuple[np.ndarray, ...] = ()
+    states: tuple[str, ...] = ()
 
     @property
     def wells(self) -> tuple[Well, ...]:
@@ -106,6 +114,7 @@ def run(settings: RefineSettings, given: RunToRefine) -> RefinedRun:
     certificates: dict[Method, Mapping[str, Any]] = {}
     certificate: Certificate | None = None
     ground: Ground | None = None
+    record: RecordTest | None = None
     lost = _lost_networks(settings, given)
     if (missing := _missing(settings, given)) is not None:
         outcome = Outcome(number, Step.REFINE, Status.SKIPPED, missing)
@@ -115,8 +124,11 @@ def run(settings: RefineSettings, given: RunToRefine) -> RefinedRun:
             if given.regressed is not None:
                 certificates[Method.REGRESSION] = ground.certify(given.regressed).as_data()
             refined, certificate, notes = refine_and_certify(ground, given.regressed)
+            record = ground.record_test()
+            certificate = with_record(certificate, record, settings.certificate)
             formulas[Method.REFINED] = refined
-            certificates[Method.REFINED] = certificate.as_data() | {"notes": [*lost, *notes]}
+            said = {"notes": [*lost, *notes], "no_record_test": record.missing or ""}
+            certificates[Method.REFINED] = certificate.as_data() | said
             status = Status.OK if certificate.certified else Status.WARNING
             reason = [] if certificate.certified else [*lost, f"not certified: {certificate.reason}"]
             outcome = Outcome(number, Step.REFINE, status, "; ".join(reason))
@@ -127,7 +139,20 @@ def run(settings: RefineSettings, given: RunToRefine) -> RefinedRun:
         certificates[Method.CONTROL] = control(ground, ground.networks, *theirs)
     for method in formulas.keys() - certificates.keys():
         certificates[method] = uncertified(f"no test was made: {outcome.reason}")
-    return RefinedRun(formulas, certificates, outcome, certificate)
+    places = () if ground is None else tuple(one.position for one in ground.portrait.attractors)
+    states = () if given.recordings is None else given.recordings.names
+    return RefinedRun(formulas, certificates, outcome, certificate, record, places, states)
+
+
+def with_record(certificate: Certificate, record: RecordTest, options: CertificateOptions) -> Certificate:
+    """The certificate with the test `record` among its tests, where there is one."""
+    verdict = record.verdict(false_alarms=options.false_alarms)
+    if verdict is None:
+        return certificate
+    reason = certificate.reason
+    if not verdict.passed:
+        reason = "; ".join(one for one in (reason, verdict.reason) if one)
+    return replace(certificate, tests={**certificate.tests, "record": verdict}, reason=reason)
 
 
 def _missing(settings: RefineSettings, given: RunToRefine) -> str | None:
@@ -183,6 +208,7 @@ class Ground:
         if not self.found.noise_free:
             mask = every_well_held_out(self.portrait, pairs, mask)
         self.held_out = HeldOut(unseen, pairs.take(mask[pairs.recording]))
+        self.recordings, self.unseen = recordings, mask
 
     @cached_property
     def references(self) -> tuple[Reference, ...]:
@@ -220,6 +246,19 @@ class Ground:
             compared=compared,
             seed=self.number,
         )
+
+    def record_test(self) -> RecordTest:
+        """What f says of the record's own hops and histogram, beside what is counted on it."""
+        shown = self.record.noise_strength
+        noise = None if shown is None else NoiseStrength(*shown, source="estimated")
+        variance = self.record.sensor_variance
+        try:
+            return record_test(
+                self.found, self.portrait, noise, self.recordings, self.unseen,
+                sensor=None if variance is None else np.sqrt(variance), seed=self.number,
+            )  # fmt: skip
+        except (NumericalFailure, np.linalg.LinAlgError) as error:
+            return RecordTest(missing=str(error))
 
     def prediction(self) -> Verdict:
         """The verdict on f, from its identification."""
@@ -368,8 +407,18 @@ def _about(formulas: SymbolicDecomposition, attractor: np.ndarray) -> Function |
     return next((one.values for one in formulas.wells if np.array_equal(one.attractor, attractor)), None)
 
 
-def write(refined: RefinedRun, *, model: str | Path, outcome: str | Path) -> None:
-    """Write `model.json`, and what became of the step."""
+def write(
+    refined: RefinedRun,
+    *,
+    model: str | Path,
+    outcome: str | Path,
+    record: str | Path,
+    record_density: str | Path,
+) -> None:
+    """Write `model.json`, what became of the step, and the tables of the test against the record."""
+    number = refined.outcome.run
+    write_table(record, visit_rows(number, refined.record, refined.attractors))
+    write_table(record_density, density_rows(number, refined.record, refined.attractors, refined.states))
     formulas = {str(method): one for method, one in refined.formulas.items()}
     certificates = {str(method): one for method, one in refined.certificates.items()}
     write_model(model, model_to_data(formulas, certificates))

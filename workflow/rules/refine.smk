@@ -12,6 +12,8 @@ rule refine:
     output:
         model="results/{study}/runs/{run}/model.json",
         outcome="results/{study}/runs/{run}/refine.json",
+        record="results/{study}/runs/{run}/record.parquet",
+        record_density="results/{study}/runs/{run}/record_density.parquet",
     log:
         "results/{study}/logs/{run}/refine.log",
     benchmark:

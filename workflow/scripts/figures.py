@@ -4,7 +4,7 @@ from workflow.warm import run_warm
 
 run_warm()
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 from siq.dynamics.cards import load_system
@@ -28,9 +28,7 @@ if __name__ == "__main__":
     with job() as now:
         source, settings = now.input, now.settings(FiguresSettings)
         card, published = now.given("card"), now.given("published")
-        tables = StudyTables(
-            *(read_table(source[name]) for name in ("coefficients", "rrmse", "training", "prediction"))
-        )
+        tables = StudyTables(*(read_table(source[field.name]) for field in fields(StudyTables)))
         models = ModelFiles(tuple(source.models))
         chosen = shown_formula(tables.rrmse, models)
         complete = None

@@ -21,4 +21,5 @@ if __name__ == "__main__":
             regressed=None if model is None else read_model(model)[0].get(Method.REGRESSION),
         )
         refined = refine.run(now.settings(refine.RefineSettings), given)
-        refine.write(refined, model=now.output.model, outcome=now.output.outcome)
+        names = ("model", "outcome", "record", "record_density")
+        refine.write(refined, **{name: now.output[name] for name in names})

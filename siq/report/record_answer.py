@@ -1,0 +1,100 @@
+"""What the page says of the record's own hops and histogram, beside what was identified."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from siq.numerics.measured_text import range_text, unit_text, value_text
+from siq.report.page import ReportTable
+
+METHODS = {"operator": "Fokker–Planck operator", "law": "law of Eyring and Kramers"}
+LARGE = 0.5  # relative error from which on a range says more than ±
+
+
+def record_sentences(record: pd.DataFrame, missing: str) -> list[str]:
+    """How many hops were seen, what that allows, and whether it agrees; or why there is no test.
+
+    Parameters
+    ----------
+    record
+        The rows of one run of the table of that name.
+    missing
+        Why there is no test; empty where there is one.
+    """
+    if record.empty:
+        return [f"There is no test against the record itself: {missing}."] if missing else []
+    hops, held = int(record["visits"].sum()), int(record["held_out_visits"].sum())
+    if not hops:
+        return ["No hop from well to well was seen."]
+    fewest = int(record["visits"].min())
+    worth = (
+        "tells nothing of its mean" if not fewest else f"is known to {100 / math.sqrt(fewest):.0f} % at best"
+    )
+    seen = f"{hops} hops from well to well were seen" if hops > 1 else "One hop from well to well was seen"
+    part = "none" if not held else str(held)
+    return [
+        f"{seen}, {part} of them on recordings that were held out. A mean time from n visits has a relative"
+        f" error of 1/√n: the one of the fewest visits, {fewest}, {worth}."
+    ]
+
+
+def record_table(record: pd.DataFrame, time_unit: str, folder: Path) -> ReportTable | None:
+    """Mean visits to each well, counted and predicted; None where there is no test.
+
+    Parameters
+    ----------
+    record
+        The rows of one run of the table of that name.
+    time_unit
+        Of the recordings.
+    folder
+        Where the whole tables are.
+    """
+    if record.empty:
+        return None
+    unit = f" ({unit_text(time_unit)})" if unit_text(time_unit) else ""
+    rows = [
+        {
+            "well about": one["attractor"],
+            "visits seen to end": int(one["visits"]),
+            f"mean visit, counted{unit}": _counted(one),
+            "held out: visits": int(one["held_out_visits"]),
+            f"held out: mean{unit}": value_text(one["held_out_counted"], digits=3)
+            if math.isfinite(one["held_out_counted"])
+            else "none ended",
+            f"predicted{unit}": _predicted(one),
+            "by": METHODS.get(str(one["method"]), str(one["method"])),
+            "probability": f"{one['probability']:.2g}",
+        }
+        for one in record.to_dict("records")
+    ]
+    explained = {
+        "visits seen to end": "a visit lasts from where the core of a well is entered until the core of"
+        " another one is; what the record cuts counts with its time, and not as a visit",
+        f"mean visit, counted{unit}": "on all recordings: time over visits, with its interval of 95 %",
+        f"predicted{unit}": "of the same visits, from f, D and ε, with the error that these leave",
+        "probability": "of a count on held-out recordings that is as far off, were the prediction true within"
+        " its error",
+    }
+    return ReportTable(
+        "How long visits to each well last: counted on the record, and predicted.",
+        pd.DataFrame(rows), explained, f"{folder}/record.csv", data=record, rows_named=True,
+    )  # fmt: skip
+
+
+def _counted(one: Mapping[Any, Any]) -> str:
+    if not one["visits"]:
+        return f"above {value_text(one['lowest'], digits=2)}"
+    return f"{value_text(one['counted'], digits=3)} ({range_text(one['lowest'], one['highest'])})"
+
+
+def _predicted(one: Mapping[Any, Any]) -> str:
+    share = one["predicted_error"] / one["predicted"]
+    if share > LARGE:
+        return range_text(one["predicted"] * math.exp(-share), one["predicted"] * math.exp(share))
+    return value_text(one["predicted"], one["predicted_error"])
