@@ -16,6 +16,9 @@
 `learnable`          can anything be learned from these recordings?
 `quantum`            how finely were the numbers of a column written?
 `noise_floor`        how strong are the two kinds of noise, at a first look?
+`lagged`             where are samples evenly spaced, and how do neighbours go together over lags?
+`noise_memory`       sensor noise, an exposure, or forces with a memory?
+`markov_lag`         from which lag on is a record Markovian?
 `inspection`         what is in a file, and what will it be good for?
 `labels`             which recording has which label, and which has a copy of it?
 `held_out`           which recordings does a fit not see?

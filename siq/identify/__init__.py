@@ -9,6 +9,8 @@
 `diffusion`         which D, where nobody gave it?
 `random_forces`     how strong are the random forces behind residuals of a whole step?
 `residuals`         what do its residuals say: no noise, process noise, noise of the measurement?
+`lagged_pairs`      which f, where recordings remember for some steps?
+`memory`            and what has to be said of that?
 `rounding`          were values rounded when they were written, and does it matter?
 `prediction`        where does f lead in the long run?
 `storage`           how is it kept in a file?

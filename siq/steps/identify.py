@@ -6,12 +6,14 @@ from dataclasses import dataclass as plain_dataclass
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydantic.dataclasses import dataclass
 
 from siq.certificate.tests import PredictionLimits, Verdict, check_prediction
 from siq.data.held_out import held_out_recordings
+from siq.data.markov_lag import MarkovLag, markov_lag
 from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
 from siq.data.selection import select_recordings
 from siq.errors import NumericalFailure
@@ -23,6 +25,17 @@ from siq.identify.identification import (
     identify_vector_field,
 )
 from siq.identify.identified_field import IdentifiedField
+from siq.identify.lagged_pairs import (
+    identify_from_earlier,
+    lagged_pairs,
+    lagged_parts,
+    lost_time,
+    mean_probability_from_earlier,
+    refit_from_earlier,
+    residuals_from_earlier,
+)
+from siq.identify.library import CandidateLibrary
+from siq.identify.memory import lagged_noise
 from siq.identify.prediction import prediction_errors
 from siq.identify.random_forces import with_random_forces
 from siq.identify.residuals import NoiseDiagnosis, mean_residual_probability, residual_noise
@@ -88,7 +101,10 @@ def _identified(settings: IdentifySettings, recordings: Recordings, number: int)
         options=options,
         integrator_step=maker,
     )
-    if carries_noise(library, parts[0], options=options, integrator_step=maker):
+    noisy = carries_noise(library, parts[0], options=options, integrator_step=maker)
+    if noisy and maker is None and (remembered := markov_lag(recordings)).remembers:
+        return _from_earlier(settings, recordings, held, remembered, library)
+    if noisy:
         # Under noise every recording counts: all give the result, a part of them its test.
         everything = snapshot_pairs(recordings, pair_step=step)
         found = with_random_forces(identify_pairs(everything), everything)
@@ -101,7 +117,12 @@ def _identified(settings: IdentifySettings, recordings: Recordings, number: int)
     verdict = _held_out_verdict(
         found, fitted, parts, held_out, fault=noise.fault(recordings.names), limits=settings.prediction
     )
-    kept = {
+    return FieldRecord(found, verdict.as_data(), _kept(noise, source, sum(len(part.h) for part in parts)))
+
+
+def _kept(noise: NoiseDiagnosis, source: DiffusionSource, pairs: int) -> dict[str, Any]:
+    """What is stored of the noise, with the number of independent pairs that it is known from."""
+    return {
         "kind": noise.kind,
         "intensity": noise.intensity,
         "covariance": noise.covariance.tolist(),
@@ -110,8 +131,47 @@ def _identified(settings: IdentifySettings, recordings: Recordings, number: int)
         "measurement": noise.measurement.tolist(),
         "diffusion": str(source),
         "note": noise.note,
-        "pairs": sum(len(part.h) for part in parts),
+        "pairs": pairs,
     }
+
+
+def _from_earlier(
+    settings: IdentifySettings,
+    recordings: Recordings,
+    held: np.ndarray,
+    remembered: MarkovLag,
+    library: CandidateLibrary,
+) -> FieldRecord:
+    """F of recordings that remember: each pair is seen from a sample that knows nothing of its noise."""
+    assert remembered.lag is not None  # they remember for so long
+    everything = lagged_pairs(recordings, remembered.lag)
+    parts = lagged_parts(recordings, remembered.lag, held)
+    found = identify_from_earlier(library, everything, options=settings.identification)
+    fitted = refit_from_earlier(found, parts[0])
+    found = with_random_forces(found, everything.pairs)
+    independent = int(everything.independent)
+    given = settings.space.noise(len(recordings.names))
+    diffusion, source = given, DiffusionSource.GIVEN
+    if diffusion is None:
+        diffusion, source = estimated_diffusion(found, pairs=independent), DiffusionSource.ESTIMATED
+    if diffusion is None:
+        _check_units(settings.space, recordings)
+        diffusion, source = found.diffusion, DiffusionSource.UNIT
+    found = replace(found, diffusion=diffusion)
+    noise = lagged_noise(found, remembered, independent=independent)
+    squares = [
+        float((residuals_from_earlier(fitted, part) ** 2 / part.pairs.h[:, None]).mean())
+        for part in reversed(parts)
+    ]
+    verdict = check_prediction(
+        noise_fault=noise.fault(recordings.names),
+        errors=None,
+        mean_probability=mean_probability_from_earlier(fitted, parts[1], seen=len(parts[0].pairs.h)),
+        held_out_ratio=squares[0] / squares[1],
+        limits=settings.prediction,
+    )
+    lost = lost_time(found, everything)
+    kept = _kept(noise, source, independent) | {"lag": remembered.lag, "lost_time": lost}
     return FieldRecord(found, verdict.as_data(), kept)
 
 
@@ -133,12 +193,16 @@ def _with_diffusion(
         noise = residual_noise(with_own, recordings, pair_step=step)
         if noise.kind == "process":
             return with_own, noise, DiffusionSource.ESTIMATED
+    _check_units(space, recordings)
+    return found, residual_noise(found, recordings, pair_step=step), DiffusionSource.UNIT
+
+
+def _check_units(space: StateSpace, recordings: Recordings) -> None:
     units = [
         unit or space.unit(name) or None
         for name, unit in zip(recordings.names, recordings.units, strict=True)
     ]
     check_units(recordings.names, units)
-    return found, residual_noise(found, recordings, pair_step=step), DiffusionSource.UNIT
 
 
 def _held_out_verdict(

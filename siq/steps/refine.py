@@ -32,6 +32,7 @@ from siq.data.recordings import Recordings, snapshot_pairs
 from siq.dynamics.phase_portrait import PhasePortrait, evenly_spread, phase_portrait
 from siq.errors import NumericalFailure
 from siq.identify.identified_field import IdentifiedField
+from siq.identify.lagged_pairs import coarse_pairs
 from siq.identify.storage import FieldRecord
 from siq.networks.trained import TrainedNetworks, shuffled
 from siq.numerics.randomness import Purpose, generator
@@ -171,6 +172,9 @@ class Ground:
         draw = generator(settings.seed, self.number, Purpose.REFINE)
         self.points = x[~held][evenly_spread(x[~held], generator=draw)]
         unseen = x[held][evenly_spread(x[held], generator=draw)]
+        if (memory := record.memory) is not None:
+            pairs = coarse_pairs(recordings, memory[0], lost=memory[1])
+            held = mask[pairs.recording]
         self.held_out = HeldOut(unseen, pairs.take(held))
         self.portrait: PhasePortrait = phase_portrait(self.found.dynamics, self.points, seed=self.number)
 
