@@ -7,10 +7,10 @@ L steps earlier knows nothing of what is remembered, once L is the lag from whic
 
     ``Σ_t θ(x(t-L)) ⊗ (x(t+h) - Φ_h(x(t); f)) = 0``
 
-holds in the mean for the true f and no other: the functions of the earlier state are instruments. Every sample
-begins such a pair, so that they overlap, and their residuals are correlated up to the lag L. Sums of them have
-the long-run covariance ``Ω = C_0 + Σ_{k≤L} (C_k + C_kᵀ)``, from which standard errors follow, and the strength
-of the forces: they act over longer times as white ones of the covariance Ω/h per time.
+holds in the mean for the true f and no other: the functions of the earlier state are instruments. Every
+sample begins such a pair, so that they overlap, and their residuals are correlated up to the lag L. Sums of
+them have the long-run covariance ``Ω = C_0 + Σ_{k≤L} (C_k + C_kᵀ)``, from which standard errors follow, and
+the strength of the forces: they act over longer times as white ones of the covariance Ω/h per time.
 """
 
 from __future__ import annotations
@@ -76,8 +76,8 @@ def lagged_pairs(recordings: Recordings, lag: int) -> LaggedPairs:
     at = stretches.within(lag)
     if not len(at):
         raise NumericalFailure(
-            f"the recordings remember for {lag} steps, and none has as many even steps in a row; record longer"
-            " without gaps"
+            f"the recordings remember for {lag} steps, and none has as many even steps in a row; record"
+            " longer without gaps"
         )
     now = at + lag
     x, t = recordings.values, recordings.t
@@ -214,6 +214,7 @@ def identify_from_earlier(
         moved = moments.increments(moments.all_terms, values)
         solution = np.linalg.lstsq(moments.functions, moments.directions.T @ moved, rcond=1e-12)[0]
         values = solution.T.ravel()
+    assert values is not None
     rest = moved - (moments.all_terms.matrix(values) @ (moments.all_terms.theta * given.pairs.h)).T
     spread = moments.long_run(rest) * moments.repeated
     support = [
