@@ -8,6 +8,8 @@
 `flow`              where does f lead within the step of a pair?
 `diffusion`         which D, where nobody gave it?
 `random_forces`     how strong are the random forces behind residuals of a whole step?
+`subset`            which terms does a least-squares problem ask for?
+`noisy_sensor`      which f do recordings show whose sensor is noisy?
 `residuals`         what do its residuals say: no noise, process noise, noise of the measurement?
 `lagged_pairs`      which f, where recordings remember for some steps?
 `memory`            and what has to be said of that?
@@ -16,5 +18,5 @@
 `storage`           how is it kept in a file?
 ==================  ===========================================================================
 
-Imports `siq.dynamics` and what it may import.
+Imports `siq.estimation` and what it may import.
 """

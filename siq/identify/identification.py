@@ -31,6 +31,7 @@ from siq.identify.flow_regression import (
 )
 from siq.identify.identified_field import NOISE_FREE, IdentifiedField
 from siq.identify.library import CandidateLibrary
+from siq.identify.subset import best_subset
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -138,7 +139,12 @@ def _identify(
         (i, k)
         for i in range(d)
         for k in _significant(
-            triangle, q, i, n / repeated, options=options, noise_free=noise_free, candidates=d * q
+            triangle,
+            q,
+            i,
+            n / repeated,
+            precision=options.precision if noise_free else None,
+            critical=critical_errors(options, library),
         )
     ]
     if len({i for i, _ in chosen}) < d:
@@ -171,7 +177,9 @@ def _check_count(library: CandidateLibrary, pairs: SnapshotPairs) -> None:
         )
 
 
-def _critical(options: IdentificationOptions, candidates: int) -> float:
+def critical_errors(options: IdentificationOptions, library: CandidateLibrary) -> float:
+    """Standard errors that a coefficient has to exceed, for all candidates of all equations together."""
+    candidates = library.size * library.dimension
     return float(-scipy.special.ndtri(options.false_terms / (2 * candidates)))
 
 
@@ -181,15 +189,17 @@ def _significant(
     component: int,
     n: float,
     *,
-    options: IdentificationOptions,
-    noise_free: bool,
-    candidates: int,
+    precision: float | None,
+    critical: float,
 ) -> np.ndarray:
-    """Backward elimination of one equation: the least significant term leaves, until all are significant."""
-    critical = _critical(options, candidates)
+    """Terms of one equation: those that contribute more than a precision, or where noise decides the best.
+
+    Backward elimination first: the least significant term leaves, until all are significant. Under noise that
+    is where a search begins, since of terms that look alike it may have dropped the wrong one.
+    """
     goal = triangle[:, q + component]
     size = np.linalg.norm(goal)
-    active = np.arange(q)
+    active, usual = np.arange(q), 0.0
     while len(active):
         orthogonal, upper = np.linalg.qr(triangle[:, active])
         coefficients = scipy.linalg.solve_triangular(upper, orthogonal.T @ goal)
@@ -199,13 +209,17 @@ def _significant(
         errors = np.sqrt(variance) * np.linalg.norm(inverse, axis=1)
         contribution = np.abs(coefficients) * np.linalg.norm(triangle[:, active], axis=0) / (size or 1.0)
         strength = np.minimum(np.abs(coefficients) / np.where(errors > 0, errors, 1e-300) / critical, 1e30)
-        if noise_free:
-            strength = contribution / options.precision
+        if precision is not None:
+            strength = contribution / precision
+        elif len(active) == q:
+            usual = np.sqrt(variance)
         weakest = int(np.argmin(strength))
-        if strength[weakest] >= 1 and contribution.min() >= options.precision:
+        if strength[weakest] >= 1:
             break
         active = np.delete(active, weakest)
-    return active
+    if precision is not None or not usual > 0:
+        return active
+    return best_subset(triangle[:, :q] / usual, goal / usual, penalty=critical**2, starts=(active,))
 
 
 def _weakest(found: IdentifiedField, problem: FlowRegression, options: IdentificationOptions) -> int | None:
@@ -215,7 +229,7 @@ def _weakest(found: IdentifiedField, problem: FlowRegression, options: Identific
         sizes = np.sqrt(problem.h @ problem.predicted(found.values) ** 2)
         strength = np.abs(found.values) * terms / positive(sizes)[found.support[:, 0]] / options.precision
     else:
-        critical = _critical(options, found.library.size * found.library.dimension)
+        critical = critical_errors(options, found.library)
         strength = np.abs(found.values) / np.sqrt(np.diag(found.covariance)) / critical
     for index in np.argsort(strength):
         if strength[index] >= 1:
