@@ -19,7 +19,10 @@
 `lagged`             where are samples evenly spaced, and how do neighbours go together over lags?
 `noise_memory`       sensor noise, an exposure, or forces with a memory?
 `markov_lag`         from which lag on is a record Markovian?
-`inspection`         what is in a file, and what will it be good for?
+`coverage`           which part of the space of states was visited?
+`inspected_states`   what is known of each measured column?
+`prospects`          what can be learned, in sentences?
+`inspection`         what is in recordings, and what will they be good for?
 `labels`             which recording has which label, and which has a copy of it?
 `held_out`           which recordings does a fit not see?
 `public_recordings`  what do the files of public benchmarks hold?
