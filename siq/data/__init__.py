@@ -15,6 +15,8 @@
 `checks`             is the table whole, and do its times increase?
 `learnable`          can anything be learned from these recordings?
 `quantum`            how finely were the numbers of a column written?
+`stationarity`       how fast does a record forget, and does its background drift slowly?
+`transitions`        how many states does it support by itself, and how often does it hop?
 `noise_floor`        how strong are the two kinds of noise, at a first look?
 `lagged`             where are samples evenly spaced, and how do neighbours go together over lags?
 `noise_memory`       sensor noise, an exposure, or forces with a memory?

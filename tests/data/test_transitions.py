@@ -1,0 +1,118 @@
+"""What a record itself says of its states: two wells are told from one state on a moving background."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from siq.data.recordings import Recordings
+from siq.data.stationarity import background_of, correlation_times, relaxation_samples, runs_of
+from siq.data.transitions import DwellCount, counted_visits, dwell_counts, switching
+
+STEP, COUNT = 0.05, 20_000
+TIME = STEP * np.arange(COUNT)
+
+
+def one_state(seed: int) -> np.ndarray:
+    """An Ornstein–Uhlenbeck process of relaxation time 1 and standard deviation 1."""
+    memory = np.exp(-STEP)
+    kicks = np.sqrt(1 - memory**2) * np.random.default_rng(seed).standard_normal(COUNT)
+    return np.asarray(lfilter([1.0], [1.0, -memory], kicks))
+
+
+def two_states(seed: int, intensity: float, count: int = COUNT) -> np.ndarray:
+    generator, x = np.random.default_rng(seed), np.empty(count)
+    x[0] = 1.0
+    kicks = np.sqrt(intensity * STEP) * generator.standard_normal(count)
+    for k in range(count - 1):
+        x[k + 1] = x[k] + STEP * (x[k] - x[k] ** 3) + kicks[k]
+    return x
+
+
+def recorded(*series: np.ndarray) -> Recordings:
+    return Recordings.from_arrays(TIME[: len(series[0])], np.array(series)[:, :, None], names=["x"])
+
+
+BACKGROUNDS = {
+    "none": 0 * TIME,
+    "linear": 8 * TIME / TIME[-1],
+    "one and a half periods": 4 * np.sin(3 * np.pi * TIME / TIME[-1]),
+    "five periods": 4 * np.sin(10 * np.pi * TIME / TIME[-1]),
+    "ten periods": 3 * np.sin(20 * np.pi * TIME / TIME[-1]),
+    "step by step": np.floor(4 * TIME / TIME[-1]),
+}
+
+
+@pytest.mark.parametrize("background", [name for name in BACKGROUNDS if name != "step by step"])
+@pytest.mark.parametrize("seed", [0])
+def test_one_state_on_a_slow_background_is_not_two(background: str, seed: int) -> None:
+    found = switching(recorded(one_state(seed) + BACKGROUNDS[background]))
+    assert found is not None and not found.supported
+
+
+@pytest.mark.parametrize("background", ["none", "linear", "one and a half periods"])
+@pytest.mark.parametrize("sensor", [0.0, 0.1])
+def test_two_wells_are_two(background: str, sensor: float) -> None:
+    noise = sensor * np.random.default_rng(9).standard_normal(COUNT)
+    found = switching(recorded(two_states(3, 0.25) + noise + BACKGROUNDS[background] / 20))
+    assert found is not None and found.supported and 10 < found.hops < 60
+
+
+def test_two_wells_of_which_each_recording_shows_one_are_not_seen_to_hop() -> None:
+    found = switching(recorded(two_states(0, 0.04), -two_states(1, 0.04)))
+    assert found is not None and found.hops == 0 and not found.supported
+
+
+def test_visits_go_from_level_to_level() -> None:
+    x = np.array([0.0, -1.0, 0.5, -0.5, 1.0, 0.0, 1.2, -1.0, 0.9])
+    recordings = Recordings.from_arrays(np.arange(9.0), x[:, None], names=["x"])
+    runs = runs_of(recordings)
+    visits = counted_visits(x, runs, (-1.0, 1.0))
+    assert visits.tolist() == [-1, 0, 0, 0, 1, 1, 1, 0, 0]
+    low, high = dwell_counts(recordings.t, visits, runs)
+    assert (low, high) == (DwellCount(1, 4.0), DwellCount(1, 3.0))
+
+
+def test_a_gap_in_time_ends_no_visit() -> None:
+    t = np.array([0.0, 1.0, 2.0, 10.0, 11.0, 12.0])
+    x = np.array([-1.0, -1.0, -1.0, 1.0, 1.0, -1.0])
+    recordings = Recordings.from_arrays(t, x[:, None], names=["x"])
+    runs = runs_of(recordings)
+    low, high = dwell_counts(t, counted_visits(x, runs, (-1.0, 1.0)), runs)
+    assert (low, high) == (DwellCount(0, 2.0), DwellCount(1, 2.0))
+
+
+def test_a_mean_dwell_time_is_as_sure_as_its_visits_are_many() -> None:
+    count = DwellCount(25, 100.0)
+    assert count.mean == 4.0 and count.relative_error == 0.2
+    low, high = count.limits
+    assert low < 2.8 and high > 6.0
+    assert DwellCount(0, 7.0).limits[1] == np.inf
+
+
+def test_interval_of_a_mean_dwell_time_covers() -> None:
+    generator = np.random.default_rng(0)
+    hops = generator.poisson(20.0, size=2000)
+    covered = [low <= 1.0 <= high for low, high in (DwellCount(int(n), 20.0).limits for n in hops)]
+    assert 0.94 < np.mean(covered) < 0.98
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-8, 1e6])
+def test_an_exponential_correlation_is_found(scale: float) -> None:
+    recordings = recorded(*(scale * one_state(seed) for seed in range(4)))
+    relaxation = relaxation_samples(recordings.values[:, 0], runs_of(recordings))
+    assert relaxation is not None and 0.6 < relaxation * STEP < 1.3
+    assert correlation_times(recordings)[0] == pytest.approx(1.0, rel=0.15)
+
+
+def test_only_a_background_that_is_there_is_found() -> None:
+    still = recorded(one_state(5))
+    assert background_of(still, still.values[:, 0]).half_periods == 0
+    moving = recorded(one_state(5) + BACKGROUNDS["linear"])
+    found = background_of(moving, moving.values[:, 0])
+    assert found.half_periods > 0 and found.range == pytest.approx(8, rel=0.2)
+
+
+def test_a_record_that_is_too_short_says_nothing() -> None:
+    assert switching(recorded(one_state(0)[:40])) is None
