@@ -25,8 +25,10 @@ from siq.data.prospects import (
     memory_prospects,
     memory_sentences,
     noise_prospects,
+    transition_sentences,
 )
 from siq.data.recordings import LONGEST_STEP, Recordings, read_recordings
+from siq.data.transitions import Switching, switching
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -59,8 +61,11 @@ class Inspection:
         From which lag on the recordings are Markovian, and what makes them remember until then.
     coverage
         Which part of the range of the states was visited.
+    switching
+        Two states with the hops between them and the background; None where nothing is known of them, as of
+        recordings without noise.
     findings
-        What the last three say, each a sentence.
+        What the last four say, each a sentence.
     notes
         What was assumed or repaired in reading.
     prospects
@@ -77,6 +82,7 @@ class Inspection:
     gaps: int
     memory: MarkovLag
     coverage: Coverage
+    switching: Switching | None
     findings: tuple[str, ...]
     notes: tuple[str, ...]
     prospects: tuple[str, ...]
@@ -153,6 +159,8 @@ def inspection_of(recordings: Recordings, *, file: str = "the recordings") -> In
     usual = _usual_step(recordings)
     near = int((gaps <= LONGEST_STEP * usual * (1 + 1e-6)).sum())
     memory, coverage = markov_lag(recordings), coverage_of(recordings)
+    # What relaxes without noise neither hops nor drifts.
+    hops = None if memory.kind in ("none", "unknown") else switching(recordings)
     return Inspection(
         file=file,
         recordings=recordings,
@@ -164,27 +172,31 @@ def inspection_of(recordings: Recordings, *, file: str = "the recordings") -> In
         gaps=len(gaps) - near,
         memory=memory,
         coverage=coverage,
-        findings=tuple(_findings(recordings, memory, coverage)),
+        switching=hops,
+        findings=tuple(_findings(recordings, memory, coverage, hops)),
         notes=(*recordings.notes, *remarks(recordings)),
         prospects=_prospects(recordings, states, memory),
     )
 
 
-def _findings(recordings: Recordings, memory: MarkovLag, coverage: Coverage) -> list[str]:
+def _findings(
+    recordings: Recordings, memory: MarkovLag, coverage: Coverage, hops: Switching | None
+) -> list[str]:
     said = memory_sentences(memory, titles=recordings.titles, time_unit=recordings.time_unit)
     if np.isfinite(memory.relaxation) and memory.kind not in ("unknown", "hidden"):
         unit = f" {recordings.time_unit}" if recordings.time_unit else ""
         said.append(
-            f"The fastest relaxation takes about {memory.relaxation:.2g}{unit},"
+            f"A fluctuation is forgotten within about {memory.relaxation:.2g}{unit},"
             f" {memory.relaxation / memory.step:.2g} steps."
         )
+    said += transition_sentences(hops, titles=recordings.titles, time_unit=recordings.time_unit)
     return [*said, coverage_sentence(coverage, titles=recordings.titles)]
 
 
 def _prospects(recordings: Recordings, states: tuple[StateFacts, ...], memory: MarkovLag) -> tuple[str, ...]:
     noises = [state.noise for state in states if state.noise is not None]
     step = _usual_step(recordings)
-    remembers = memory.kind in ("blur", "coloured", "either")
+    remembers = memory.remembers
     # Correlated forces fill the windows of the first look as a smooth motion does.
     said = noise_prospects(
         recordings,
@@ -219,7 +231,7 @@ def _lines(found: Inspection) -> list[str]:
             + (f", {found.gaps:,} gaps" if found.gaps else "")
         )
     # Where increments are correlated the two noises of a first look are neither.
-    told = found.memory.kind not in ("blur", "coloured", "either", "hidden")
+    told = not found.memory.remembers and found.memory.kind != "hidden"
     lines += [state_text(state, recordings.time_unit, noise=told) for state in found.states]
     lines += found.findings
     lines += [f"Note: {note[0].upper()}{note[1:]}." for note in found.notes]

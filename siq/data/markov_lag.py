@@ -24,8 +24,9 @@ import scipy.special
 from siq.data.lagged import Stretches, even_stretches, lagged_covariances, long_run_covariance
 from siq.data.noise_memory import FittedShape, fitted_shape
 from siq.data.recordings import Recordings
+from siq.data.stationarity import relaxation_samples, runs_of, usual_step
 
-Kind = Literal["none", "white", "sensor", "blur", "coloured", "either", "hidden", "unknown"]
+Kind = Literal["none", "white", "sensor", "blur", "coloured", "either", "memory", "hidden", "unknown"]
 
 FALSE_ALARMS = 1e-3  # a choice: one record in a thousand of white noise is taken for one with a memory
 HARMLESS = 0.005  # a correlation; twice that, one per cent, is what it adds to the strength of the noise
@@ -34,13 +35,14 @@ SEEN = 2.0  # standard errors: the usual ones of 95 %
 SEEN_LATER = 3.0  # at each of a few longer lags, so that all are kept about as often
 LATER = (1.25, 1.5, 2.0)  # times the lag: correlations that swing pass through zero, but do not stay there
 TOLD = 0.1  # a correlation: the mean is off by no larger share where less than that could remain unseen
+DEPARTURE = 0.05  # of a correlation: a fifth of what an exposure of a whole step makes
+TELLING = 0.1  # a correlation: what the earlier state tells no more of than that is left out of the mean
 LONGEST = 2.0  # relaxation times: a state so much earlier tells e^-2 of the present one, and errors grow
 LARGEST_DEGREE, MOST_FUNCTIONS = 5, 36  # numerical: a polynomial that a second suffices for
 FEWEST = 50  # steps for each function: fewer tell nothing of correlations
 MOST_SAMPLES = 400_000  # looked at: a correlation is then known to 0.002, a tenth of HARMLESS
 GROWTH = 1.2  # of the lags that are tried, about as exactly as they are known
 QUIET = 1e-3  # of the rms step: what is left is less than that where nothing but the integrator erred
-SAMPLE = 400  # states at which rates are looked at, for their median
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,8 @@ class MarkovLag:
     kind
         ``none``: no noise. ``white``: random forces without a memory. ``sensor``: errors of the sensor, new
         in each sample. ``blur``: each sample is a mean over an exposure. ``coloured``: the random forces
-        have a memory, or the sensor is slow. ``either`` of these two. ``hidden``: it remembers longer than
+        have a memory, or the sensor is slow. ``either`` of these two. ``memory``: it remembers in another
+        way, such as by an oscillation of its own. ``hidden``: it remembers longer than
         it takes to relax, as where a state is not recorded. ``unknown``: too few samples, or uneven ones.
     lag
         From so many steps on it is Markovian: 0 of white noise, None where no such lag was found.
@@ -82,7 +85,7 @@ class MarkovLag:
     @property
     def remembers(self) -> bool:
         """Whether pairs of neighbouring samples are misleading, and pairs seen from earlier are not."""
-        return self.kind in ("blur", "coloured", "either") and self.lag is not None
+        return self.kind in ("blur", "coloured", "either", "memory") and self.lag is not None
 
     @property
     def time(self) -> float:
@@ -117,7 +120,7 @@ def markov_lag(recordings: Recordings) -> MarkovLag:
         return _told("white", 0, first, FIRST_LAGS, problem)
     lag = 1
     while (seen := problem.seen_from(lag)) is not None:
-        if lag * problem.step > LONGEST * seen.relaxation:
+        if lag * problem.step > LONGEST * problem.relaxation:
             break
         if problem.forgotten(seen, lag):
             return _with_kind(seen, lag, problem)
@@ -132,7 +135,6 @@ class _Seen:
 
     rest: np.ndarray
     number: np.ndarray
-    relaxation: float
     inverse: np.ndarray  # (q, q): of the mean of φ(x(t-L)) φ(x(t))ᵀ
 
     @property
@@ -172,10 +174,10 @@ class _Problem:
     """Increments, polynomials of the states where they begin, and their stretches."""
 
     functions: np.ndarray  # (n, q), orthonormal in the mean
-    slopes: np.ndarray  # (d, s, q): derivatives of the functions at some states
     increments: np.ndarray  # (n, d)
     stretches: Stretches
     size: np.ndarray
+    relaxation: float
 
     @property
     def step(self) -> float:
@@ -201,14 +203,10 @@ class _Problem:
         values_of, vectors = np.linalg.eigh(gram)
         kept = values_of > 1e-10 * values_of[-1]
         orthonormal = vectors[:, kept] / np.sqrt(values_of[kept])
-        some = scaled[np.flatnonzero(known)[:: max(int(known.sum()) // SAMPLE, 1)]]
-        slopes = np.stack(
-            [_slopes(some, powers, place) @ orthonormal / scale[place] for place in range(len(scale))]
-        )
         increments = np.where(known[:, None], np.diff(values, axis=0), 0.0)
         return cls(
-            functions @ orthonormal, slopes, increments, Stretches(number, stretches.step),
-            np.sqrt((increments[known] ** 2).mean(axis=0)),
+            functions @ orthonormal, increments, Stretches(number, stretches.step),
+            np.sqrt((increments[known] ** 2).mean(axis=0)), _relaxation(recordings),
         )  # fmt: skip
 
     def seen_from(self, lag: int) -> _Seen | None:
@@ -223,16 +221,13 @@ class _Problem:
             return None
         earlier, now = self.functions[:count] * both[:, None], self.functions[lag:]
         moved = self.increments[lag:]
-        inverse = np.linalg.pinv(earlier.T @ now / both.sum(), rcond=1e-12)
+        inverse = np.linalg.pinv(earlier.T @ now / both.sum(), rcond=TELLING)
         coefficients = inverse @ (earlier.T @ moved) / both.sum()
         number = np.full(len(self.increments), -1)
         number[lag:][both] = numbers[lag:][both]
         rest = np.zeros_like(self.increments)
         rest[lag:] = (moved - now @ coefficients) * both[:, None]
-        jacobian = np.einsum("jsq,qi->sij", self.slopes, coefficients) / self.step
-        fastest = np.abs(np.linalg.eigvals(jacobian).real).max(axis=1)
-        rate = float(np.median(fastest))
-        return _Seen(rest, number, 1 / rate if rate > 0 else np.inf, inverse)
+        return _Seen(rest, number, inverse)
 
     def forgotten(self, seen: _Seen, lag: int) -> bool:
         """Whether residuals so many steps apart, and farther, are not told from uncorrelated.
@@ -277,10 +272,13 @@ def _monomials(x: np.ndarray, powers: list[tuple[int, ...]]) -> np.ndarray:
     return values
 
 
-def _slopes(x: np.ndarray, powers: list[tuple[int, ...]], place: int) -> np.ndarray:
-    """Derivatives of the monomials by one state."""
-    lower = [tuple(max(e - (k == place), 0) for k, e in enumerate(row)) for row in powers]
-    return _monomials(x, lower) * np.array([row[place] for row in powers])
+def _relaxation(recordings: Recordings) -> float:
+    """The shortest time in which a state relaxes, NaN where nothing is known of it."""
+    runs, step = runs_of(recordings), usual_step(recordings)
+    known = [
+        samples for column in recordings.values.T if (samples := relaxation_samples(column, runs)) is not None
+    ]
+    return min(known) * step if known else float("nan")
 
 
 def _significant(found: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
@@ -308,6 +306,9 @@ def _with_kind(seen: _Seen, lag: int, problem: _Problem) -> MarkovLag:
     longest = max(fits, key=lambda fit: fit.memory, default=None)
     if longest is None or longest.shape == "white":
         return _told("white", 0, seen, most, problem)
+    errors = seen.correlations(most)[1]
+    if longest.departure > max(DEPARTURE, 4 * float(errors[0].max())):
+        return _told("memory", lag, seen, most, problem)
     if longest.memory == 0:
         lag = 1
     sensor = np.zeros(len(marked))
@@ -322,6 +323,6 @@ def _told(
     values, errors = seen.correlations(most)
     d = values.shape[1]
     return MarkovLag(
-        kind, lag, problem.step, memory, seen.relaxation, np.arange(1, len(values) + 1), values, errors,
+        kind, lag, problem.step, memory, problem.relaxation, np.arange(1, len(values) + 1), values, errors,
         np.zeros(d) if sensor is None else sensor,
     )  # fmt: skip

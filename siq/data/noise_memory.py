@@ -45,6 +45,8 @@ class FittedShape:
         χ² of what is left, and ...
     freedom
         ... the number that it has in the mean where the kind is right.
+    departure
+        The largest difference of a correlation from that of the kind: large where it is of none of these.
     """
 
     shape: Shape
@@ -52,6 +54,7 @@ class FittedShape:
     sensor: float
     misfit: float
     freedom: int
+    departure: float = 0.0
 
 
 def exposure_displacement(lags: np.ndarray, exposure: float) -> np.ndarray:
@@ -97,9 +100,12 @@ def fitted_shape(covariances: np.ndarray, count: float, *, seen: int) -> FittedS
     error = root @ increment_covariances(np.where(lags > 0, 2.0, 0.0))
     size = len(covariances)
 
-    def misfit(memory: float, kind: Shape, *, sensor: bool) -> tuple[float, np.ndarray]:
+    def own(memory: float, kind: Shape) -> np.ndarray:
         move = exposure_displacement if kind == "blur" else coloured_displacement
-        design = np.stack([root @ increment_covariances(move(lags, memory)), error], axis=1)
+        return increment_covariances(move(lags, memory))
+
+    def misfit(memory: float, kind: Shape, *, sensor: bool) -> tuple[float, np.ndarray]:
+        design = np.stack([root @ own(memory, kind), error], axis=1)
         design = design if sensor else design[:, :1]
         scale = np.linalg.norm(design, axis=0)
         values, left = scipy.optimize.nnls(design / scale, goal)
@@ -124,9 +130,14 @@ def fitted_shape(covariances: np.ndarray, count: float, *, seen: int) -> FittedS
         simple.append(FittedShape(shape, 0.0, float(values[1]), left, size - 1 - (shape == "sensor")))
     with_memory = [min((best(kind, False), best(kind, True)), key=_cost) for kind in kinds]
     first, second = sorted(with_memory, key=_cost)
-    if second.misfit - first.misfit < CLEARLY:
-        first = replace(first, shape="either")
-    return min((*simple, first), key=_cost)
+    either = second.misfit - first.misfit < CLEARLY
+    chosen = min((*simple, first), key=_cost)
+    _, values = misfit(chosen.memory, chosen.shape, sensor=chosen.sensor > 0)
+    left = covariances - values[0] * own(chosen.memory, chosen.shape)
+    left -= values[1] * increment_covariances(np.where(lags > 0, 2.0, 0.0))
+    departure = float(np.abs(left).max() / covariances[0])
+    shape = "either" if either and chosen is first else chosen.shape
+    return replace(chosen, shape=shape, departure=departure)
 
 
 def _cost(fit: FittedShape) -> float:

@@ -10,6 +10,7 @@ from siq.data.coverage import Coverage
 from siq.data.learnable import SINGLE, SINGLE_REMEDY
 from siq.data.markov_lag import MarkovLag
 from siq.data.recordings import Recordings
+from siq.data.transitions import DwellCount, Switching
 
 COARSE = 0.5  # relaxation times: over a longer step most of what f does is forgotten
 SPARSE = 0.3  # of the cells of the range; less is a thin line, on which a formula knows nothing beside it
@@ -22,8 +23,8 @@ def memory_sentences(memory: MarkovLag, *, titles: Sequence[str], time_unit: str
     lag = f"{memory.lag} {steps} ({memory.time:.2g}{unit})" if memory.lag else ""
     strongest = ""
     if len(memory.correlations):
-        place = int(np.argmax(np.abs(memory.correlations[0])))
-        strongest = f" ({memory.correlations[0, place]:+.2f} in {titles[place]})"
+        row, place = np.unravel_index(np.argmax(np.abs(memory.correlations)), memory.correlations.shape)
+        strongest = f" ({memory.correlations[row, place]:+.2f} in {titles[int(place)]})"
     said = {
         "none": "No noise: what neighbouring samples leave of a smooth motion is that of rounding.",
         "white": "Markovian from the first step on: increments know nothing of each other, as under random"
@@ -36,11 +37,54 @@ def memory_sentences(memory: MarkovLag, *, titles: Sequence[str], time_unit: str
         f" the random forces have a memory, or the sensor is slow. Markovian from {lag} on.",
         "either": f"Neighbouring increments are correlated{strongest}: samples are means over an exposure, or"
         f" the random forces have a memory. Markovian from {lag} on.",
+        "memory": f"Increments are correlated over several steps{strongest}, neither as by an exposure nor as"
+        " by forces that simply forget: something oscillates, or a state is not recorded. Markovian from"
+        f" {lag} on.",
         "hidden": f"Increments are correlated{strongest}, for longer than the state takes to relax: a state"
         " is not recorded, such as a velocity, or the forces have a long memory.",
         "unknown": "Whether the recordings remember is not known: too few samples are evenly spaced.",
     }
     return [said[memory.kind]]
+
+
+def transition_sentences(
+    found: Switching | None, *, titles: Sequence[str], time_unit: str | None
+) -> list[str]:
+    """How many states the recordings themselves support, how often they hop, and what that allows."""
+    if found is None:
+        return []
+    title, unit = titles[found.state], f" {time_unit}" if time_unit else ""
+    said = []
+    if found.supported:
+        low, high = found.levels
+        means = " and ".join(_dwell(count, unit) for count in found.counts)
+        said.append(
+            f"Two states are supported, at {low:.3g} and {high:.3g} of {title}, with {found.hops} transitions"
+            f" seen: they last {means} in the mean."
+        )
+        fewest = min(count.visits for count in found.counts)
+        if fewest:
+            said.append(
+                f"From {fewest} transitions a mean dwell time is known to {100 / np.sqrt(fewest):.0f} % at"
+                " best; more needs longer recordings."
+            )
+    else:
+        said.append("The recordings by themselves support one state; transitions between two are not seen.")
+    if found.background.half_periods:
+        said.append(
+            f"The background of {title} drifts slowly, over a range of {found.background.range:.2g}: a part"
+            " of its histogram is due to that."
+        )
+    else:
+        said.append("Stationary: no slow drift of the background is seen.")
+    return said
+
+
+def _dwell(count: DwellCount, unit: str) -> str:
+    low, high = count.limits
+    if not count.visits:
+        return f"more than {low:.2g}{unit}"
+    return f"{count.mean:.2g}{unit} ({low:.2g} to {high:.2g})"
 
 
 def noise_prospects(recordings: Recordings, *, forced: bool, known: bool, noisy: Sequence[str]) -> list[str]:

@@ -11,6 +11,7 @@ from siq.identify.residuals import NoiseDiagnosis
 CAUSES = {
     "blur": "each sample is the mean over an exposure of {memory}",
     "coloured": "the random forces, or a slow sensor, have a memory of {memory}",
+    "memory": "what is recorded remembers for some steps, as with an oscillation or a state not recorded",
     "either": "samples are means over an exposure, or the random forces have a memory",
 }
 
