@@ -2,13 +2,14 @@
 
 ==================  ===========================================================================
 `identification`    which terms has f?
+`selection`         which terms does noise allow for, and which others would do nearly as well?
+`stability`         in how many resampled recordings would each term be chosen?
 `flow_regression`   which coefficients of given terms make f lead from X0 to Xh?
 `identified_field`  what is known of the f that was found, errors included?
 `library`           which candidate functions are there, with which derivatives and constraints?
 `flow`              where does f lead within the step of a pair?
 `diffusion`         which D, where nobody gave it?
 `random_forces`     how strong are the random forces behind residuals of a whole step?
-`subset`            which terms does a least-squares problem ask for?
 `noisy_sensor`      which f do recordings show whose sensor is noisy?
 `residuals`         what do its residuals say: no noise, process noise, noise of the measurement?
 `lagged_pairs`      which f, where recordings remember for some steps?

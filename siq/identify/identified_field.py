@@ -40,6 +40,12 @@ class IdentifiedField:
         The map over a pair's step that was fitted.
     diffusion
         D, which recordings do not tell apart from ε: of these only the product, `noise_rate`, is identified.
+    doubts
+        Shape ``(r, q, d)``: by how much f would change with other terms that fit nearly as well, each scaled
+        by the square root of its probability (`siq.identify.selection`). None where nobody asked.
+    stability
+        Shape ``(p,)``: the share of resampled recordings in which each term would be chosen
+        (`siq.identify.stability`). None where nobody asked.
     """
 
     library: CandidateLibrary
@@ -50,6 +56,29 @@ class IdentifiedField:
     residual_ratio: float
     flow: FlowMap
     diffusion: Diffusion
+    doubts: np.ndarray | None = None
+    stability: np.ndarray | None = None
+
+    def variance(self, slopes: np.ndarray) -> np.ndarray:
+        """Variance of what follows from f to first order, by its coefficients and by which terms there are.
+
+        Parameters
+        ----------
+        slopes
+            Derivatives by all coefficients, shape ``(..., q, d)``.
+
+        Returns
+        -------
+        numpy.ndarray
+            Shape ``(...)``.
+        """
+        components, terms = self.support.T
+        own = slopes[..., terms, components]
+        total = np.einsum("...p,pr,...r->...", own, self.covariance, own)
+        if self.doubts is not None and len(self.doubts):
+            changes = np.tensordot(slopes, self.doubts, axes=([-2, -1], [-2, -1]))
+            total = total + (changes**2).sum(axis=-1)
+        return np.asarray(np.maximum(total, 0.0))
 
     @property
     def noise_free(self) -> bool:

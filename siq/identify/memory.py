@@ -51,6 +51,6 @@ def lagged_noise(
     correlation = float(memory.correlations[0, state])
     return NoiseDiagnosis(
         "process", intensity, covariance, float(excess.max()), score,
-        correlation, correlation / float(memory.errors[0, state]), memory.sensor,
+        correlation, correlation / float(memory.errors[0, state]), np.zeros(d),
         memory=memory_text(memory, time_unit=time_unit),
     )  # fmt: skip

@@ -27,7 +27,8 @@ from siq.identify.flow import FlowMap
 from siq.identify.flow_regression import positive
 from siq.identify.identified_field import IdentifiedField, field_dynamics
 from siq.identify.library import CandidateLibrary
-from siq.identify.subset import best_subset, strong_terms
+from siq.identify.selection import Equation, improved_support, rival_changes, strong_terms
+from siq.identify.stability import blocks_of, stability, triangles
 
 ROUNDS = 8  # of the fit of a whole library, which only chooses terms
 WITHOUT = 1e-6  # of a sensor's variance: as good as none
@@ -67,7 +68,8 @@ def identify_by_likelihood(
     begin: IdentifiedField,
     noise: Noise,
     *,
-    critical: float,
+    critical: np.ndarray,
+    generator: np.random.Generator,
     pair_step: float | None = None,
 ) -> FilteredField:
     """Find f, the random forces and the noise of the sensor together.
@@ -79,12 +81,13 @@ def identify_by_likelihood(
     recordings
         Whole trajectories.
     begin
-        f as the regression of pairs has it; its diffusion is kept, and its terms are one of the beginnings of
-        the search.
+        f as the regression of pairs has it, of which the diffusion is kept.
     noise
         To begin with.
     critical
-        Standard errors that a coefficient has to exceed.
+        Standard errors that the coefficient of each function has to exceed, shape ``(q,)``.
+    generator
+        Draws recordings again, see `siq.identify.stability`.
     pair_step
         Longest time between samples that still belong together.
 
@@ -113,13 +116,9 @@ def identify_by_likelihood(
     triangle = scipy.linalg.qr(
         np.column_stack([white.columns, goal]), mode="r", overwrite_a=True, check_finite=False
     )[0][: len(values) + 1]
-    known = np.flatnonzero((everything[:, None] == begin.support[None]).all(axis=2).any(axis=1))
-    chosen = best_subset(
-        triangle[:, :-1],
-        triangle[:, -1],
-        penalty=critical**2,
-        starts=(known, strong_terms(triangle[:, :-1], triangle[:, -1], penalty=critical**2)),
-    )
+    # In units of the innovations' errors; all equations at once, since a filter couples them.
+    equations = Equation(triangle[:, :-1], triangle[:, -1], 1.0, np.tile(critical, d))
+    chosen = list(improved_support(equations, strong_terms(equations)))
     support = everything[chosen]
     for component, name in enumerate(library.states):
         if component not in support[:, 0]:
@@ -129,7 +128,19 @@ def identify_by_likelihood(
         support = np.delete(support, weak, axis=0)
         kept = np.delete(fit.model.values, weak)
         fit = _settled(library, support, data, fit.noise, values=kept, x=fit.linearised_at)
-    return _as_field(begin, library, support, fit, data, noise_uncertainty(fit, data))
+    one = _as_field(begin, library, support, fit, data, noise_uncertainty(fit, data))
+    own = (support[:, 0] * q + support[:, 1]).tolist()
+    doubts = rival_changes(equations, own)
+    # Whitened values stand one behind the other, all states of a sample together.
+    parts = triangles(np.column_stack([white.columns, goal]), np.repeat(blocks_of(recordings.recording), d))
+    (shares,) = stability(
+        parts,
+        lambda drawn: [Equation(drawn[:, :-1], drawn[:, -1], 1.0, equations.critical)],
+        [own],
+        generator=generator,
+    )
+    field = replace(one.found, doubts=doubts.reshape(-1, d, q).transpose(0, 2, 1), stability=shares)
+    return replace(one, found=field)
 
 
 def unbroken(recordings: Recordings, *, pair_step: float | None = None) -> Measurements:
@@ -271,11 +282,11 @@ def _last_change(fit: Fit, white: Whitened) -> np.ndarray:
     return change if fit.converged else 0 * change
 
 
-def _weakest(fit: Fit, support: np.ndarray, critical: float) -> int | None:
+def _weakest(fit: Fit, support: np.ndarray, critical: np.ndarray) -> int | None:
     """The least significant term, if it is not significant, and not the last of its equation."""
-    strength = np.abs(fit.model.values) / fit.standard_errors
+    strength = np.abs(fit.model.values) / fit.standard_errors / critical[support[:, 1]]
     for place in np.argsort(strength):
-        if strength[place] >= critical:
+        if strength[place] >= 1:
             return None
         if np.sum(support[:, 0] == support[place, 0]) > 1:
             return int(place)

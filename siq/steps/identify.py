@@ -23,8 +23,8 @@ from siq.identify.flow_regression import refit, residuals
 from siq.identify.identification import (
     IdentificationOptions,
     carries_noise,
-    critical_errors,
     identify_vector_field,
+    with_stability,
 )
 from siq.identify.identified_field import IdentifiedField
 from siq.identify.lagged_pairs import (
@@ -50,6 +50,7 @@ from siq.identify.residuals import (
     shared_errors,
 )
 from siq.identify.rounding import rounding_text
+from siq.identify.selection import critical_values
 from siq.identify.storage import FieldRecord, field_library, read_field, write_field
 from siq.numerics.randomness import Purpose, generator
 from siq.steps.outcomes import Outcome, Status, Step, read_outcomes, write_outcomes
@@ -122,9 +123,11 @@ def _identified(settings: IdentifySettings, recordings: Recordings, number: int)
         # Under noise every recording counts: all give the result, a part of them its test.
         everything = snapshot_pairs(recordings, pair_step=step)
         found = with_random_forces(identify_pairs(everything), everything)
-        filtered = _beside_sensor_noise(found, recordings, settings)
+        draw = generator(settings.seed, number, Purpose.STABILITY)
+        filtered = _beside_sensor_noise(found, recordings, settings, draw)
         if filtered is not None:
             return _filtered_record(filtered, recordings, (training, held_out), settings)
+        found = with_stability(found, everything, options=options, generator=draw)
         fitted = refit(found, parts[0])
     else:
         found = fitted = identify_pairs(parts[0])
@@ -193,7 +196,7 @@ def _from_earlier(
 
 
 def _beside_sensor_noise(
-    found: IdentifiedField, recordings: Recordings, settings: IdentifySettings
+    found: IdentifiedField, recordings: Recordings, settings: IdentifySettings, draw: np.random.Generator
 ) -> FilteredField | None:
     """F by the likelihood of whole recordings, where their sensors are noisy; None where they are not.
 
@@ -209,8 +212,8 @@ def _beside_sensor_noise(
     start = Noise(share * variance, np.diag(found.noise_rate) * (1 - 2 * share))
     try:
         filtered = identify_by_likelihood(
-            found.library, recordings, found, start, pair_step=step,
-            critical=critical_errors(settings.identification, found.library),
+            found.library, recordings, found, start, pair_step=step, generator=draw,
+            critical=critical_values(found.library, false_terms=settings.identification.false_terms),
         )  # fmt: skip
     except (NumericalFailure, np.linalg.LinAlgError) as error:
         if (correlation < -MUCH).any():
