@@ -14,6 +14,8 @@
 `invariant_distribution`  which density follows from one formula of U?
 `density_of_wells`        and which from several wells, where U is known in part?
 `ensembles`               where are walkers after a long time?
+`predicted_visits`        how long do visits to wells last, core to core, and where are states meanwhile?
+`record_test`             does the record hop, and spread, as what was identified foresees?
 `reference`               what do methods say of it that share no code with ours?
 `comparison`              how far is it from them?
 ========================  ====================================================================================

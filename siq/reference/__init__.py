@@ -6,6 +6,7 @@
 `sheets`           where do they start, and which of their points may be believed?
 `power_series`     what is V near an attractor, order by order?
 `mesh`             what is V on a mesh of two states, found without any ansatz?
+`fokker_planck`    how long do visits last, and where are states, whatever the barriers?
 `escapes`          how long does an escape take in a simulation?
 =================  ===============================================================
 
