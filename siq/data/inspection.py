@@ -228,7 +228,7 @@ def _lines(found: Inspection) -> list[str]:
     if found.steps is not None:
         lines.append(
             f"time step {range_text(found.steps)}{unit}; {found.pairs:,} pairs of neighbouring samples"
-            + (f", {found.gaps:,} gaps" if found.gaps else "")
+            + (f", {found.gaps:,} gap{'s' if found.gaps > 1 else ''}" if found.gaps else "")
         )
     # Where increments are correlated the two noises of a first look are neither.
     told = not found.memory.remembers and found.memory.kind != "hidden"

@@ -51,5 +51,10 @@ def inspection_section(
         for name, caption in CAPTIONS.items()
         if name in images
     ]
-    capital = [f"{line[0].upper()}{line[1:]}" if line[:2].islower() else line for line in sentences]
+    # The name of a state stays as it is: X is not x.
+    named = [line.partition(" ")[0].endswith(":") for line in sentences]
+    capital = [
+        line if is_state else f"{line[0].upper()}{line[1:]}"
+        for line, is_state in zip(sentences, named, strict=True)
+    ]
     return ReportSection(HEADING, capital, figures=figures)

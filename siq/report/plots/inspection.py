@@ -24,6 +24,7 @@ from siq.report.plots.style import (
 POINTS = 1500  # across a panel: more than it has dots
 TOGETHER = 12  # short recordings drawn in one panel
 SHORT = 20  # recordings; where there are more, each is a relaxation, and several are drawn
+LONG = 0.9  # of the longest recording
 BINS = 60
 LAGS = 60  # shown at most
 STATES = 4  # drawn below each other; the text has all
@@ -102,7 +103,10 @@ def _draw_record(axes: Axes, found: Inspection, state: int) -> None:
     if len(counts) > SHORT:
         chosen = np.unique(np.linspace(0, len(counts) - 1, TOGETHER).astype(int))
     else:
-        chosen = np.array([int(np.argmax(counts))])
+        # Of the longest the one that moves most: it shows transitions, where there are any.
+        long = np.flatnonzero(counts >= LONG * counts.max())
+        spans = [np.ptp(recordings.values[begins[one] : begins[one] + counts[one], state]) for one in long]
+        chosen = long[[int(np.argmax(spans))]]
     for one in chosen:
         rows = slice(begins[one], begins[one] + counts[one])
         t, x = recordings.t[rows] - recordings.t[begins[one]], recordings.values[rows, state]
