@@ -341,8 +341,12 @@ def _relative_error_of_drift(found: IdentifiedField, points: np.ndarray) -> floa
         return 0.0
     components, functions = found.support.T
     terms = found.library.evaluate(points)[:, functions]
-    weighted = found.diffusion.precision[np.ix_(components, components)] * found.covariance
-    total = np.einsum("np,pr,nr->n", terms, weighted, terms).mean()
+    if found.diffusion.constant:
+        weighted = found.diffusion.precision[np.ix_(components, components)] * found.covariance
+        total = np.einsum("np,pr,nr->n", terms, weighted, terms).mean()
+    else:
+        precision = found.diffusion.precision_at(points)[:, components[:, None], components]
+        total = np.einsum("np,npr,pr,nr->n", terms, precision, found.covariance, terms, optimize=True).mean()
     return float(np.sqrt(total / found.diffusion.squared_speed(points, found.dynamics.drift(points)).mean()))
 
 
