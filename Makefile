@@ -54,6 +54,7 @@ docs-full: environment
 	$(BIN)/python docs/make/gallery.py
 	$(BIN)/python docs/make/notebooks.py
 	$(BIN)/python docs/make/concepts.py
+	$(BIN)/python docs/make/inspection.py
 	$(BIN)/python docs/make/figures.py
 	$(MAKE) docs
 

@@ -33,7 +33,8 @@ class FieldRecord:
         The certificate's test of it, see `siq.certificate.tests.Verdict.as_data`.
     noise
         Kind, intensity and correlations of the residuals, see `siq.identify.residuals.NoiseDiagnosis`; and
-        where D is from.
+        where D is from. Of recordings that remember also `lag`, in steps, and `lost_time`, see
+        `siq.identify.lagged_pairs`.
     """
 
     found: IdentifiedField
@@ -44,6 +45,12 @@ class FieldRecord:
     def diffusion_source(self) -> DiffusionSource:
         """Where D is from."""
         return DiffusionSource(self.noise.get("diffusion", DiffusionSource.GIVEN))
+
+    @property
+    def memory(self) -> tuple[int, float] | None:
+        """The lag from which on the recordings are Markovian, and the time lost; None of those that are."""
+        lag = self.noise.get("lag")
+        return None if lag is None else (int(lag), float(self.noise.get("lost_time", 0.0)))
 
     @property
     def sensor_variance(self) -> np.ndarray | None:

@@ -12,6 +12,7 @@ from pydantic.dataclasses import dataclass
 
 from siq.certificate.tests import PredictionLimits, Verdict, check_prediction
 from siq.data.held_out import held_out_recordings
+from siq.data.markov_lag import markov_lag
 from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
 from siq.data.selection import select_recordings
 from siq.errors import NumericalFailure
@@ -37,6 +38,7 @@ from siq.identify.storage import FieldRecord, field_library, read_field, write_f
 from siq.identify.weighted_regression import fit_weighted, with_given_noise, with_noise_formula
 from siq.numerics.randomness import Purpose, generator
 from siq.steps.identify_beside_sensor import beside_sensor_noise, filtered_record, units_of_states
+from siq.steps.identify_from_earlier import record_from_earlier
 from siq.steps.outcomes import Outcome, Status, Step, read_outcomes, write_outcomes
 from siq.steps.settings import STRICT, Sampling, StateSpace
 
@@ -96,7 +98,13 @@ def _identified(settings: IdentifySettings, recordings: Recordings, number: int)
         options=options,
         integrator_step=maker,
     )
-    if carries_noise(library, parts[0], options=options, integrator_step=maker):
+    noisy = carries_noise(library, parts[0], options=options, integrator_step=maker)
+    if noisy and maker is None and (memory := markov_lag(recordings)).remembers:
+        return record_from_earlier(
+            recordings, memory, held=held, library=library, options=options, space=settings.space,
+            limits=settings.prediction,
+        )  # fmt: skip
+    if noisy:
         # Under noise every recording counts: all give the result, a part of them its test.
         everything = snapshot_pairs(recordings, pair_step=step)
         found = with_random_forces(identify_pairs(everything), everything)

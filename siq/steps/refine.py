@@ -34,6 +34,7 @@ from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
 from siq.dynamics.phase_portrait import PhasePortrait, evenly_spread, phase_portrait
 from siq.errors import NumericalFailure
 from siq.identify.identified_field import IdentifiedField
+from siq.identify.lagged_pairs import coarse_pairs
 from siq.identify.noisy_sensor import filtered_recordings
 from siq.identify.storage import FieldRecord
 from siq.landscape.dwell_times import NoiseStrength
@@ -204,6 +205,8 @@ class Ground:
         draw = generator(settings.seed, self.number, Purpose.REFINE)
         self.points = x[~held][evenly_spread(x[~held], generator=draw)]
         unseen = x[held][evenly_spread(x[held], generator=draw)]
+        if (memory := record.memory) is not None:
+            pairs = coarse_pairs(recordings, memory[0], lost=memory[1])
         self.portrait: PhasePortrait = phase_portrait(self.found.dynamics, self.points, seed=self.number)
         if not self.found.noise_free:
             mask = every_well_held_out(self.portrait, pairs, mask)
