@@ -22,7 +22,7 @@ TRUE_BRANCH = 3.0  # a curvature of V that is wrong by this factor is that of an
 
 @dataclass
 class Answer:
-    """What was said of one record; barriers stand in the order of the true attractors, NaN where there is none.
+    """What was said of one record; barriers are in the order of the true attractors, NaN where there is none.
 
     Attributes
     ----------

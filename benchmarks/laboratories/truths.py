@@ -1,7 +1,7 @@
 """Which wells and barriers does a laboratory have, and how do barriers follow the parameters?
 
-In one state both follow from an integral, ``U/ε = -∫ 2f/q dx``. In more states q is constant, and U for D = 1 is
-the action of the path of least action, which changes with the coefficients of f by
+In one state both follow from an integral, ``U/ε = -∫ 2f/q dx``. In more states q is constant, and U for D = 1
+is the action of the path of least action, which changes with the coefficients of f by
 
     ∂U/∂θ = -2 ∫ p·∂f/∂θ dt    (p = 0 at both ends, so that their motion does not matter).
 """
@@ -94,6 +94,11 @@ def truth(laboratory: Laboratory) -> Truth:
         attractors, saddles[nearest], np.array(curvatures),
         np.array([barrier for barrier, _ in found]), np.array([slope for _, slope in found]),
     )  # fmt: skip
+
+
+def barrier(laboratory: Laboratory, attractor: np.ndarray, saddle: np.ndarray) -> float:
+    """Of U, or of U/ε where D is not given, between two rests."""
+    return _way_out(laboratory, attractor, saddle)[0]
 
 
 def _way_out(laboratory: Laboratory, attractor: np.ndarray, saddle: np.ndarray) -> tuple[float, np.ndarray]:
