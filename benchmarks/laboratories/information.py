@@ -6,11 +6,12 @@ variances, is
 
     G = Σ ∂eᵀ C⁻¹ ∂e + ½ tr(C⁻¹ ∂C C⁻¹ ∂C),
 
-every derivative complete, that of the gain included. Without sensor noise it is ``Σ h Θᵀ (εD)⁻¹ Θ`` for f.
-The mean moves with the mean of f, ``f + ½ f″:P``: without the second part, which is that of a truncated
-second-order filter, the score of the archetype has 2.3 times the variance that it should have, and with it the
-right one. What is averaged over a step is a further state, the running integral of the states, which every
-sample sets to zero. The filter takes the steps of the simulation: both have one map from sample to sample.
+every derivative complete, that of the gain included. The mean moves with the mean of f, ``f + ½ f″:P``.
+Without the second part, which is that of a truncated second-order filter, the score of the archetype has 2.3 times the
+variance that it should have; with it the right one. What is averaged over a step is a further state, the
+running integral of the states, which every sample sets to zero. Without sensor noise and blur G is
+
+    G = Σ h Θᵀ (εD)⁻¹ Θ    for f, and    Σ ½ d ∂(log q)²    for q.
 
 References
 ----------
@@ -23,6 +24,7 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
+import scipy.linalg
 
 from benchmarks.laboratories.models import Laboratory
 from benchmarks.laboratories.polynomials import (
@@ -53,17 +55,42 @@ class Information:
     score: np.ndarray
 
 
-def information(laboratory: Laboratory, seen: np.ndarray) -> Information:
-    """Of records ``(records, samples, d)``, at the laboratory's own parameters."""
+def information(laboratory: Laboratory, seen: np.ndarray, *, substeps: int | None = None) -> Information:
+    """Of records ``(records, samples, d)``, at the laboratory's own parameters.
+
+    Parameters
+    ----------
+    laboratory
+        That made them.
+    seen
+        What it recorded.
+    substeps
+        Of the filter between two samples; by default those of the simulation.
+    """
     system, noisy = polynomials(laboratory), bool((laboratory.sensor > 0).any())
     count = len(system.component) + len(system.noise_coefficients) + noisy * laboratory.dimension
     matrix, score = np.zeros((count, count)), np.zeros(count)
     for one in seen:
         _filtered(
-            system, one, laboratory.step, laboratory.within, laboratory.sensor**2, laboratory.averaged, noisy,
-            matrix, score,
+            system, one, laboratory.step, substeps or laboratory.within, laboratory.sensor**2,
+            laboratory.averaged, noisy, matrix, score,
         )  # fmt: skip
     return Information(matrix, score)
+
+
+def information_of_states(laboratory: Laboratory, seen: np.ndarray) -> np.ndarray:
+    """G where the instrument shows the states themselves, shape ``(p, p)``."""
+    system = polynomials(laboratory)
+    x = seen[:, :-1].reshape(-1, laboratory.dimension)
+    theta, chi = (
+        np.stack([np.prod(x**each, axis=1) for each in powers], axis=1)
+        for powers in (system.powers, system.noise_powers)
+    )
+    noise = chi @ system.noise_coefficients
+    same = system.component[:, None] == system.component
+    drift_part = same * laboratory.step * (theta.T @ (theta / noise[:, None]))
+    noise_part = laboratory.dimension / 2 * (chi.T @ (chi / noise[:, None] ** 2))
+    return np.asarray(scipy.linalg.block_diag(drift_part, noise_part))
 
 
 @numba.njit(cache=True)
@@ -75,7 +102,7 @@ def _changes(
     spread: np.ndarray,
     term: int,
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """What a unit of a parameter changes of the mean of f, of its Jacobian, and of q, where the mean has moved."""
+    """What a unit of a parameter changes of the mean of f, of its Jacobian, and of q; the mean has moved."""
     d, terms = len(x), len(system.component)
     own, turned, noise = np.zeros(d), np.zeros((d, d)), 0.0
     for i in range(d):

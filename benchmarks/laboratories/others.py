@@ -1,7 +1,7 @@
 """What do other methods say of a record?
 
-Each gives polynomials f and q; wells and barriers follow from these as the true ones do, with no formula of V.
-None of them certifies anything, and their intervals are not asked for.
+Each gives polynomials f and q; wells and barriers follow from these as the true ones do, without a formula of
+V. None of them certifies anything, and their intervals are not asked for.
 """
 
 from __future__ import annotations

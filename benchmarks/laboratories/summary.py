@@ -1,8 +1,8 @@
 """Errors, coverage and false certificates as a table.
 
 A certificate is false where it stands on a wrong branch, where a well is missing or invented, or where a
-barrier's error is above three times the stated one. Of normal errors of the right size a share of 0.0027 is above
-three: what that alone would bring stands beside the count.
+barrier's error is above three times the stated one. Of normal errors of the right size a share of 0.0027 is
+above three: what that alone would bring stands beside the count.
 """
 
 from __future__ import annotations
