@@ -17,6 +17,8 @@ from siq.certificate.descent import check_descent
 from siq.certificate.held_out import HeldOut, part_of
 from siq.certificate.regions import basin_region
 from siq.certificate.tests import (
+    ERROR_POINTS,
+    STATED,
     Candidate,
     CertificateOptions,
     Verdict,
@@ -32,6 +34,7 @@ from siq.dynamics.phase_portrait import PhasePortrait
 from siq.identify.identified_field import IdentifiedField
 from siq.potential.refinement import Refined
 from siq.potential.symbolic import SymbolicDecomposition
+from siq.potential.uncertainty import relative_error
 from siq.potential.well import Well
 from siq.reference.sheets import adapted_fan, first_caustic
 
@@ -206,7 +209,9 @@ def certify_wells(
             continue
         candidate = _of_well(well, portrait, part.points)
         its, place = stated_error(candidate, found, seed=seed)
+        # Characteristics follow the same f: what f's uncertainty adds explains no difference from them.
         made, its, there = _common(candidate, found, part, mine, options, its, well.level, seed)
+        its += STATED * _error_from_field(well, found, part.points, seed)
         for name, verdict in made.items():
             tests[name] = _worse(tests.get(name), verdict)
         if its >= error:
@@ -340,6 +345,13 @@ def _error_of(
     well: Well, found: IdentifiedField, portrait: PhasePortrait, seed: int
 ) -> tuple[float, np.ndarray | None]:
     return stated_error(_of_well(well, portrait, _sublevel_points([well])[0]), found, seed=seed)
+
+
+def _error_from_field(well: Well, found: IdentifiedField, points: np.ndarray, seed: int) -> float:
+    """Relative standard error of V over points, from what is not known of f."""
+    generator = np.random.default_rng(seed)
+    x = points[generator.choice(len(points), min(ERROR_POINTS, len(points)), replace=False)]
+    return relative_error(found, well.gradients, well.attractor, x, well.values(x))
 
 
 def _explained(options: CertificateOptions, *errors: float) -> float:

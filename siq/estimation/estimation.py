@@ -1,30 +1,35 @@
 """Estimation: parameters, states and the two kinds of noise, by maximum likelihood.
 
 The model is fitted with noise in what is measured (variance R) and, where asked, noise that drives the states
-(intensity Q per time). With Q = 0 this is the least-squares fit of whole trajectories; with Q > 0 it is the
-extended Kalman smoother, iterated to convergence, whose likelihood is that of its innovations. A model that
-lacks physics is fitted with Q > 0 too: the states then follow the data, whatever the model says, and a later
-addition is judged along the right trajectories. Initial states are unknown and enter as fixed effects; the
-variances are those of highest restricted likelihood, which allows for that.
+(intensity Q per time). With Q = 0 this is the least-squares fit of whole trajectories. With Q > 0 it is the
+extended Kalman filter, linearised at what it knows at the begin of each interval, whose likelihood is that
+of its innovations. Linearising along *smoothed* states, which know the future, would be another thing: what
+random forces did later is then in the states at which f is taken, and the coefficients of f come out too
+small, by a half where sensor and random forces do alike. Smoothed states are where the filter begins, since
+they follow the data whatever the model says, and they are what is shown of the motion.
+
+A model that lacks physics is fitted with Q > 0 too, so that a later addition is judged along the right
+trajectories. Initial states are unknown and enter as fixed effects; the variances are those of highest
+restricted likelihood, which allows for that.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from siq.dynamics.dynamics import Dynamics
-from siq.estimation.innovations import Noise, process_covariance, solve, whiten, with_parameters_changed
-from siq.estimation.kernels import smoothed_states, whitened_innovations
+from siq.estimation.closure import ClosedFunctions
+from siq.estimation.innovations import Noise, solve, whiten
 from siq.estimation.linearisation import Grid, Linearisation, linearise, substeps_needed
 from siq.estimation.measurements import Measurements
 from siq.estimation.noise import noise_along
+from siq.estimation.shooting import Iterate, Shooting, changed
 
-SMALLEST_STEP = 1 / 64
-NONLINEAR = 0.5  # share of a step's effect that may be unforeseen before the step is shortened
+SUBSTEP_ERROR = 3e-6  # of the spread of a state: far below what any sensor resolves
 SETTLED = 1e-4  # change of the innovations, squared and per sample, at which a fit has converged
+FINE = 1e-3  # the same of all innovations together, by the parameters: a thirtieth of a standard error
 STANDSTILL = 0.005  # change of the sum of squares over four steps, below which a fit moves to no avail
 PATIENCE = 6  # steps before that is asked
 RESTING = 1e-12  # of a state's domain, the least that its spread is taken for
@@ -43,10 +48,15 @@ class Fit:
         Of the free parameters, shape ``(p, p)``, from white innovations.
     x
         Smoothed states at all samples, shape ``(n, d)``.
+    linearised_at
+        Where f was taken for `linearisation`, shape ``(n, d)``: `x` without process noise, otherwise what the
+        filter knows at each sample.
+    spread
+        Covariance of what the filter knows at each sample, shape ``(n, d, d)``; None without process noise.
     noise
         Estimates, or what was given.
     linearisation
-        At `x` and the estimates.
+        At `linearised_at` and the estimates.
     log_likelihood
         Not the restricted one, which depends on the units in which a model has its states.
     sum_of_squares
@@ -64,6 +74,8 @@ class Fit:
     model: Dynamics
     covariance: np.ndarray
     x: np.ndarray
+    linearised_at: np.ndarray
+    spread: np.ndarray | None
     noise: Noise
     linearisation: Linearisation
     log_likelihood: float
@@ -121,75 +133,70 @@ def fit_by_multiple_shooting(
     """
     with np.errstate(all="ignore"):  # what runs away is told as a fault
         if substeps is None:
-            substeps = substeps_needed(model, data, model.values, x, tolerance=3e-6)
+            substeps = substeps_needed(model, data, model.values, x, tolerance=SUBSTEP_ERROR)
         grid = Grid(data, substeps)
-        begin = _Iterate(model.values, x, linearise(model, grid, model.values, x))
+        begin = Iterate(model.values, x, linearise(model, grid, model.values, x), x)
         if not begin.along.finite:
             return _failed(model, begin, noise, substeps, RUNS_AWAY)
-        shooting = _Shooting(model, grid, _sizes(model, x))
+        shooting = Shooting(model, grid, _sizes(model, x))
+        try:
+            fit = _gauss_newton(shooting, begin, noise, estimate_process=estimate_process, most=iterations)
+        except (ArithmeticError, np.linalg.LinAlgError) as error:
+            return _failed(model, begin, noise, substeps, str(error))
+    if not (fit.converged and fit.has_process_noise):
+        return fit
+    return fit_by_filter(
+        fit.model, data, x=fit.x, noise=fit.noise, estimate_process=estimate_process, substeps=substeps,
+        iterations=iterations, closure=False,
+    )  # fmt: skip
+
+
+def fit_by_filter(
+    model: Dynamics,
+    data: Measurements,
+    *,
+    x: np.ndarray,
+    noise: Noise,
+    estimate_process: bool = True,
+    estimate_sensor: bool = True,
+    substeps: int | None = None,
+    iterations: int = 25,
+    closure: bool = True,
+) -> Fit:
+    """The second half of `fit_by_multiple_shooting` alone, for a model that follows the data from the start.
+
+    Parameters
+    ----------
+    model, data, x, noise, estimate_process, substeps, iterations
+        See there; random forces have to drive the states.
+    estimate_sensor
+        Whether the noise of the sensors is estimated; if not, the random forces are as given, too.
+    closure
+        Whether the spread of what the filter knows acts on the mean of f (`siq.estimation.closure`).
+
+    Returns
+    -------
+    Fit
+        See there.
+    """
+    with np.errstate(all="ignore"):  # what runs away is told as a fault
+        if substeps is None:
+            substeps = substeps_needed(model, data, model.values, x, tolerance=SUBSTEP_ERROR)
+        closed = ClosedFunctions(model) if closure else None
+        if not estimate_sensor:
+            data = replace(data, sensor_noise=noise.measurement)
+        shooting = Shooting(model, Grid(data, substeps), _sizes(model, x), filtered=True, closed=closed)
+        begin = Iterate(model.values, x, shooting.linearised(model.values, x, None, noise), x)
+        if not begin.along.finite:
+            return _failed(model, begin, noise, substeps, RUNS_AWAY)
         try:
             return _gauss_newton(shooting, begin, noise, estimate_process=estimate_process, most=iterations)
         except (ArithmeticError, np.linalg.LinAlgError) as error:
             return _failed(model, begin, noise, substeps, str(error))
 
 
-@dataclass(frozen=True)
-class _Iterate:
-    """Where a fit stands: all parameters ``(p,)``, the states ``(n, d)``, and the linearisation there."""
-
-    values: np.ndarray
-    x: np.ndarray
-    along: Linearisation
-
-
-@dataclass(frozen=True)
-class _Shooting:
-    """What is fitted: the model on the grid of the measurements, with the size of each state ``(d,)``."""
-
-    model: Dynamics
-    grid: Grid
-    scale: np.ndarray
-
-    def stepped(self, now: _Iterate, change: np.ndarray, noise: Noise) -> tuple[_Iterate, float] | None:
-        """The step that the linearisation suggests, shortened until it does about what was foreseen.
-
-        Parameters
-        ----------
-        now
-            Where the fit stands.
-        change
-            Of the free parameters, shape ``(p,)``.
-        noise
-            Decides how the states follow.
-
-        Returns
-        -------
-        _Iterate, float
-            Where it leads, and the share of it that was taken; None where not even a short one does as
-            foreseen.
-        """
-        deviation = state_changes(now.along, self.grid.data, noise, change)
-        rows, scale = self.grid.rows, self.scale
-        moved = np.einsum("kij,kj->ki", now.along.transition[rows], deviation[rows])
-        moved += now.along.response[rows] @ change
-        foreseen = now.along.gap[rows] + moved - deviation[rows + 1]
-        effect = np.sqrt(np.mean(((np.abs(moved) + np.abs(deviation[rows + 1])) / scale) ** 2))
-        length = 1.0
-        while length >= SMALLEST_STEP:
-            values = _changed(now.values, self.model.free, length * change)
-            x = now.x + length * deviation
-            along = linearise(self.model, self.grid, values, x)
-            if along.finite:
-                expected = (1 - length) * now.along.gap[rows] + length * foreseen
-                unforeseen = np.sqrt(np.mean(((along.gap[rows] - expected) / scale) ** 2))
-                if unforeseen <= NONLINEAR * length * effect + 1e-9:
-                    return _Iterate(values, x, along), length
-            length /= 2
-        return None
-
-
 def _gauss_newton(
-    shooting: _Shooting, now: _Iterate, noise: Noise, *, estimate_process: bool, most: int
+    shooting: Shooting, now: Iterate, noise: Noise, *, estimate_process: bool, most: int
 ) -> Fit:
     data = shooting.grid.data
     before: np.ndarray | None = None
@@ -200,12 +207,14 @@ def _gauss_newton(
             noise = noise_along(now.along, data, noise, estimate_process)
         white = whiten(now.along, data, noise)
         change, _ = solve(white.columns, white.innovations)
-        left = white.innovations - white.columns @ change
+        explained = white.columns @ change
+        left = white.innovations - explained
         # A shortened step leaves much of what is foreseen undone, and the forecast unchanged.
         if (
             before is not None
             and whole
             and ((left - before) ** 2).sum() < SETTLED * len(left) * max(1.0, (left**2).sum() / len(left))
+            and (not shooting.filtered or explained @ explained < FINE)
         ):
             if settled_noise:
                 converged = True
@@ -244,7 +253,7 @@ def fit_of_states(
     noise
         To begin with; the measurement noise is estimated.
     """
-    at = _Iterate(model.values, x, linearise(model, Grid(data, substeps), model.values, x))
+    at = Iterate(model.values, x, linearise(model, Grid(data, substeps), model.values, x), x)
     if not at.along.finite:
         return _failed(model, at, noise, substeps, RUNS_AWAY)
     try:
@@ -255,16 +264,18 @@ def fit_of_states(
 
 
 def _fit_at(
-    model: Dynamics, data: Measurements, at: _Iterate, *, noise: Noise, substeps: int, converged: bool
+    model: Dynamics, data: Measurements, at: Iterate, *, noise: Noise, substeps: int, converged: bool
 ) -> Fit:
     white = whiten(at.along, data, noise)
     change, covariance = solve(white.columns, white.innovations)
     # The last change is below the errors. The likelihood is that of the states in hand, not of a forecast.
     total = float(white.innovations @ white.innovations)
     return Fit(
-        model=model.with_values(_changed(at.values, model.free, change if converged else 0 * change)),
+        model=model.with_values(changed(at.values, model.free, change if converged else 0 * change)),
         covariance=covariance,
-        x=at.x,
+        x=at.smoothed,
+        linearised_at=at.x,
+        spread=at.spread,
         noise=noise,
         linearisation=at.along,
         log_likelihood=white.log_likelihood(total),
@@ -272,41 +283,6 @@ def _fit_at(
         degrees_of_freedom=white.degrees_of_freedom - len(model.free),
         substeps=substeps,
         converged=converged,
-    )
-
-
-def state_changes(
-    linearisation: Linearisation, data: Measurements, noise: Noise, change: np.ndarray
-) -> np.ndarray:
-    """Most probable changes of all states, shape ``(n, d)``, given those of the parameters, ``(p,)``."""
-    step = np.append(np.diff(data.t), 0.0)
-    process = process_covariance(linearisation.transition, step, noise.process)
-    still = with_parameters_changed(linearisation, change)
-    gap, residual = still.gap, still.residual
-    innovations, _, initial, _ = whitened_innovations(
-        data.first,
-        still.transition,
-        still.response,
-        gap,
-        process,
-        still.measured,
-        still.measured_response,
-        residual,
-        noise.measurement,
-    )
-    begin = np.empty((len(data.labels), gap.shape[1]))
-    for place, (start, end) in enumerate(zip(data.first[:-1], data.first[1:], strict=True)):
-        columns = initial[start:end].reshape(-1, gap.shape[1])
-        begin[place] = solve(columns, innovations[start:end].ravel())[0]
-    return smoothed_states(
-        data.first,
-        linearisation.transition,
-        gap,
-        process,
-        linearisation.measured,
-        residual,
-        noise.measurement,
-        begin,
     )
 
 
@@ -323,18 +299,14 @@ def _sizes(model: Dynamics, x: np.ndarray) -> np.ndarray:
     return np.maximum(x.std(axis=0), RESTING * np.where(np.isfinite(wide), wide, about_zero))
 
 
-def _changed(values: np.ndarray, free: Sequence[int], change: np.ndarray) -> np.ndarray:
-    result = values.copy()
-    result[np.array(free, dtype=int)] += change
-    return result
-
-
-def _failed(model: Dynamics, at: _Iterate, noise: Noise, substeps: int, fault: str) -> Fit:
+def _failed(model: Dynamics, at: Iterate, noise: Noise, substeps: int, fault: str) -> Fit:
     free = len(model.free)
     return Fit(
         model=model,
         covariance=np.full((free, free), np.nan),
-        x=at.x,
+        x=at.smoothed,
+        linearised_at=at.x,
+        spread=at.spread,
         noise=noise,
         linearisation=at.along,
         log_likelihood=-np.inf,

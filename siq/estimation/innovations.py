@@ -29,18 +29,29 @@ class Noise:
         R, per sample, shape ``(m,)``.
     process
         Q, per time, shape ``(d,)``; zero where nothing drives the state.
+    shape
+        Of the random forces, where they are no independent ones of constant strength: ``(1, d, d)``, or
+        ``(n, d, d)`` for one at each sample. The intensity is then ``√Q_i shape_ij √Q_j``.
     """
 
     measurement: np.ndarray
     process: np.ndarray
+    shape: np.ndarray | None = None
 
     def without_process(self) -> Noise:
         """The same measurement noise, and states that follow their equations exactly."""
-        return Noise(self.measurement, np.zeros_like(self.process))
+        return replace(self, process=np.zeros_like(self.process))
 
     def scaled(self, factor: float) -> Noise:
         """The same measurement noise, with the process noise multiplied."""
-        return Noise(self.measurement, self.process * factor)
+        return replace(self, process=self.process * factor)
+
+    @property
+    def intensity(self) -> np.ndarray:
+        """Intensity of the random forces, per time: shape ``(1, d, d)``, or ``(n, d, d)``."""
+        if self.shape is None:
+            return np.diag(self.process)[None]
+        return self.shape * np.sqrt(np.outer(self.process, self.process))
 
 
 def profile_likelihood(total: float, freedom: int, log_determinant: float) -> float:
@@ -91,7 +102,7 @@ def whiten(linearisation: Linearisation, data: Measurements, noise: Noise) -> Wh
     """
     transition = linearisation.transition
     step = np.append(np.diff(data.t), 0.0)
-    process = process_covariance(transition, step, noise.process)
+    process = process_covariance(transition, step, noise.intensity)
     innovations, columns, initial, log_determinant = whitened_innovations(
         data.first,
         transition,
@@ -136,17 +147,20 @@ def process_covariance(transition: np.ndarray, step: np.ndarray, intensity: np.n
     step
         Their lengths, shape ``(n,)``.
     intensity
-        Q per time, shape ``(d,)``.
+        Per time, shape ``(1, d, d)`` or ``(n, d, d)``.
     """
     total = np.zeros_like(transition)
-    for place in np.flatnonzero(intensity):
-        after = transition[:, :, place]
-        unit = np.zeros(len(intensity))
-        unit[place] = 1.0
-        middle = (after + unit) / 2
-        total += intensity[place] * (after[:, :, None] * after[:, None, :])
-        total += 4 * intensity[place] * (middle[:, :, None] * middle[:, None, :])
-        total[:, place, place] += intensity[place]
+    dimension = transition.shape[1]
+    unit = np.eye(dimension)
+    for i in range(dimension):
+        for j in range(dimension):
+            strength = intensity[:, i, j]
+            if not strength.any():
+                continue
+            one, other = transition[:, :, i], transition[:, :, j]
+            ends = one[:, :, None] * other[:, None, :] + unit[:, i, None] * unit[None, :, j]
+            middle = (one + unit[i])[:, :, None] * (other + unit[j])[:, None, :]
+            total += strength[:, None, None] * (ends + middle)
     return total * (step / 6)[:, None, None]
 
 

@@ -203,11 +203,12 @@ def smoothed_states(
     residual: np.ndarray,
     variance: np.ndarray,
     begin: np.ndarray,
-) -> np.ndarray:
-    """The most probable deviation of every state, given all measurements and the initial states.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The most probable deviation of every state, given all measurements, or only those until then.
 
-    Modified Bryson–Frazier smoother: it inverts no covariance of states, which is singular where a state
-    carries no process noise.
+    The second is what a filter knows: it is told the initial states and parameters, and nothing else of the
+    future. Modified Bryson–Frazier smoother: it inverts no covariance of states, which is singular where a
+    state carries no process noise.
 
     Parameters
     ----------
@@ -218,12 +219,18 @@ def smoothed_states(
 
     Returns
     -------
-    numpy.ndarray
-        Shape ``(n, d)``.
+    smoothed
+        Given all measurements, shape ``(n, d)``.
+    filtered
+        Given those of its own sample and before, shape ``(n, d)``.
+    spread
+        Covariance of what is filtered, shape ``(n, d, d)``.
     """
     rows, dimension = gap.shape
     outputs = residual.shape[1]
     smoothed = np.empty((rows, dimension))
+    filtered = np.empty((rows, dimension))
+    spread_after = np.empty((rows, dimension, dimension))
     covariances = np.empty((rows, dimension, dimension))
     gains = np.zeros((rows, outputs, dimension))
     spreads = np.ones((rows, outputs))
@@ -259,6 +266,8 @@ def smoothed_states(
                     state[i] += share * innovation
                     for j in range(dimension):
                         covariance[i, j] -= share * gains[k, o, j]
+            filtered[k] = state
+            spread_after[k] = covariance
             if k + 1 == first[recording + 1]:
                 break
             for i in range(dimension):
@@ -302,4 +311,4 @@ def smoothed_states(
                 for j in range(dimension):
                     value += covariances[k, i, j] * adjoint[j]
                 smoothed[k, i] -= value
-    return smoothed
+    return smoothed, filtered, spread_after

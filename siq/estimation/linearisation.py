@@ -30,6 +30,16 @@ class Columns(Protocol):
         """In the outputs, at states ``(d, n)`` of all samples: shape ``(m, q, n)``."""
 
 
+class Drift(Protocol):
+    """F and its derivatives, as `siq.dynamics.parametric.ParametricFunctions` has them."""
+
+    def rates(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> np.ndarray:
+        """F at states ``(d, n)``: shape ``(d, n)``."""
+
+    def slopes(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """By states and by free parameters: ``(d, d, n)`` and ``(d, p, n)``."""
+
+
 MOST_SUBSTEPS = 16
 INSIDE = 1e-9  # share of a substep by which its ends lie inside, where an input jumps between samples
 
@@ -124,12 +134,18 @@ def integrate_intervals(model: Dynamics, grid: Grid, values: np.ndarray, x: np.n
     step = grid.step
     for part in range(grid.substeps):
         with np.errstate(all="ignore"):  # what runs away is seen by its end
-            x = _runge_kutta(model, grid, values, x, part, step, delays)[0]
+            x = _runge_kutta(model.functions, grid, values, x, part, step, delays)[0]
     return x
 
 
 def linearise(
-    model: Dynamics, grid: Grid, values: np.ndarray, x: np.ndarray, *, columns: Columns | None = None
+    model: Dynamics,
+    grid: Grid,
+    values: np.ndarray,
+    x: np.ndarray,
+    *,
+    columns: Columns | None = None,
+    drift: Drift | None = None,
 ) -> Linearisation:
     """Integrate every interval from the state in hand, with the derivatives.
 
@@ -145,8 +161,11 @@ def linearise(
         The states in hand, shape ``(n, d)``.
     columns
         Further right-hand sides whose response is wanted behind those of the parameters.
+    drift
+        F where it is another than the model's, such as the mean of f over a spread of states.
     """
     data, compiled, delays = grid.data, model.functions, model.lags(values)
+    drift = compiled if drift is None else drift
     rows, step = grid.rows, grid.step
     state = np.ascontiguousarray(x[rows].T)
     dimension, count = state.shape
@@ -155,14 +174,14 @@ def linearise(
 
     def slopes(at: np.ndarray, node: int) -> tuple[np.ndarray, np.ndarray]:
         signals = grid.signals(node, delays)
-        by_state, by_parameter = compiled.slopes(at, signals, values)
+        by_state, by_parameter = drift.slopes(at, signals, values)
         if columns is not None:
             by_parameter = np.concatenate([by_parameter, columns.rates(at, values, node)], axis=1)
         return np.moveaxis(by_state, 2, 0), np.moveaxis(by_parameter, 2, 0)
 
     for part in range(grid.substeps):
         with np.errstate(all="ignore"):  # what runs away is seen by `Linearisation.finite`
-            after, begin_rate, end_rate = _runge_kutta(model, grid, values, state, part, step, delays)
+            after, begin_rate, end_rate = _runge_kutta(drift, grid, values, state, part, step, delays)
             middle = (state + after) / 2 + step / 8 * (begin_rate - end_rate)
         at = [slopes(place, 3 * part + node) for node, place in enumerate((state, middle, after))]
         if response is None:
@@ -225,7 +244,7 @@ def substeps_needed(
 
 
 def _runge_kutta(
-    model: Dynamics,
+    drift: Drift,
     grid: Grid,
     values: np.ndarray,
     x: np.ndarray,
@@ -234,7 +253,7 @@ def _runge_kutta(
     delays: tuple[tuple[int, float], ...],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """State after a substep, and f at its begin and its end; the inputs differ from stage to stage."""
-    rates = model.functions.rates
+    rates = drift.rates
     begin, middle, end = (grid.signals(3 * part + node, delays) for node in range(3))
     k1 = rates(x, begin, values)
     k2 = rates(x + step / 2 * k1, middle, values)

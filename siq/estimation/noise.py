@@ -6,7 +6,7 @@ that are fitted beside them.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.optimize
@@ -42,6 +42,66 @@ def _rates(model: Dynamics, data: Measurements, x: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(rates), rates, 0.0)
 
 
+@dataclass(frozen=True)
+class NoiseCoordinates:
+    """The parameters of a noise as one vector: logarithms of variances, then how random forces correlate.
+
+    Attributes
+    ----------
+    origin
+        The noise at zero. A process noise that is zero there stays so.
+    known
+        Which variances of the measurement are known, and stay as they are; shape ``(m,)``.
+    """
+
+    origin: Noise
+    known: np.ndarray
+
+    @property
+    def driven(self) -> np.ndarray:
+        """Places of the states that random forces drive."""
+        return np.flatnonzero(self.origin.process > 0)
+
+    @property
+    def correlates(self) -> bool:
+        """Whether a correlation of the random forces is among the parameters."""
+        return self.origin.shape is not None and len(self.origin.shape) == 1
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        count = len(self.driven)
+        pairs = count * (count - 1) // 2 if self.correlates else 0
+        return len(self.known) + count + pairs
+
+    def noise_at(self, vector: np.ndarray) -> Noise:
+        """The noise for a vector, shape ``(size,)``."""
+        outputs, driven = len(self.known), self.driven
+        process = np.zeros_like(self.origin.process)
+        process[driven] = self.origin.process[driven] * np.exp(vector[outputs : outputs + len(driven)])
+        logarithms = np.where(self.known, 0.0, vector[:outputs])
+        result = replace(
+            self.origin, measurement=self.origin.measurement * np.exp(logarithms), process=process
+        )
+        if not self.correlates or len(driven) < 2:
+            return result
+        assert self.origin.shape is not None
+        root = np.linalg.cholesky(self.origin.shape[0][np.ix_(driven, driven)])
+        change = np.eye(len(driven))
+        change[np.tril_indices(len(driven), -1)] = vector[outputs + len(driven) :]
+        root = root @ change
+        root /= np.linalg.norm(root, axis=1)[:, None]
+        shape = self.origin.shape.copy()
+        shape[0][np.ix_(driven, driven)] = root @ root.T
+        return replace(result, shape=shape)
+
+
+def noise_coordinates(data: Measurements, origin: Noise) -> NoiseCoordinates:
+    """The parameters of a noise of recordings, of whose sensors something may be known."""
+    known = np.zeros(len(origin.measurement), dtype=bool)
+    return NoiseCoordinates(origin, known if data.sensor_noise is None else np.isfinite(data.sensor_noise))
+
+
 def estimate_noise(linearisation: Linearisation, data: Measurements, start: Noise) -> Noise:
     """The noise of highest restricted likelihood along the trajectories in hand.
 
@@ -57,39 +117,33 @@ def estimate_noise(linearisation: Linearisation, data: Measurements, start: Nois
     start
         Where the search begins. A process noise that is zero stays so.
     """
-    driven = np.flatnonzero(start.process > 0)
-    outputs = len(start.measurement)
+    coordinates = noise_coordinates(data, start)
+    driven, outputs = coordinates.driven, len(start.measurement)
     white = whiten(linearisation, data, start)
     linearisation = with_parameters_changed(linearisation, solve(white.columns, white.innovations)[0])
 
-    def noise_at(logarithms: np.ndarray) -> Noise:
-        process = np.zeros_like(start.process)
-        process[driven] = start.process[driven] * np.exp(logarithms[outputs:])
-        return Noise(start.measurement * np.exp(logarithms[:outputs]), process)
-
-    def cost(logarithms: np.ndarray) -> float:
-        value = -log_likelihood(linearisation, data, noise_at(logarithms))
+    def cost(vector: np.ndarray) -> float:
+        value = -log_likelihood(linearisation, data, coordinates.noise_at(vector))
         return value if np.isfinite(value) else 1e300
 
-    begins = [np.zeros(outputs + len(driven))]
+    begins = [np.zeros(coordinates.size)]
     for factor in (1e-2, 1e-4, 1e-6) if len(driven) else ():
-        begins.append(np.concatenate([np.zeros(outputs), np.full(len(driven), np.log(factor))]))
+        begins.append(np.zeros(coordinates.size))
+        begins[-1][outputs : outputs + len(driven)] = np.log(factor)
     best = min(begins, key=cost)
     # States that random forces drive could follow every sample; the noise of a sensor never vanishes.
     least = np.log(SMOOTHEST * data.roughness / start.measurement)
-    bounds = [(min(least[k], 0.0), best[k] + 12.0) for k in range(outputs)]
-    if data.sensor_noise is not None:
-        bounds = [
-            (0.0, 0.0) if known else bound
-            for known, bound in zip(np.isfinite(data.sensor_noise), bounds, strict=True)
-        ]
+    bounds = [
+        (0.0, 0.0) if coordinates.known[k] else (min(least[k], 0.0), best[k] + 12.0) for k in range(outputs)
+    ]
     bounds += [(np.log(LOWEST), 12.0)] * len(driven)
+    bounds += [(-10.0, 10.0)] * (coordinates.size - len(bounds))
     found = scipy.optimize.minimize(
         cost, best, method="L-BFGS-B", bounds=bounds, options={"maxiter": 12, "ftol": 1e-7, "eps": 1e-3}
     )
-    logarithms = found.x if found.fun <= cost(best) else best
-    noise = noise_at(logarithms)
-    gone = logarithms[outputs:] <= np.log(LOWEST) + 1
+    vector = found.x if found.fun <= cost(best) else best
+    noise = coordinates.noise_at(vector)
+    gone = vector[outputs : outputs + len(driven)] <= np.log(LOWEST) + 1
     noise.process[driven[gone]] = 0.0
     return noise
 
@@ -122,7 +176,7 @@ def likelihood_sums(
         linearisation.residual,
         weight * np.append(np.diff(data.t), 0.0),
         noise.measurement,
-        noise.process,
+        noise.intensity,
     )
     return total, freedom, log_determinant
 
@@ -145,5 +199,5 @@ def noise_along(
     factor = (left**2).sum(axis=0) / np.maximum(known.sum(axis=0) * share, 1.0)
     if driven:  # one scale for both, since only their ratio is given
         factor = np.full_like(factor, (left**2).sum() / (known.sum() * share))
-        return Noise(noise.measurement * factor, noise.process * factor[0])
+        return replace(noise, measurement=noise.measurement * factor, process=noise.process * factor[0])
     return replace(noise, measurement=data.with_known_noise(noise.measurement * np.maximum(factor, 1e-12)))

@@ -36,7 +36,7 @@ def noise_likelihood(
     step
         Lengths of the intervals, shape ``(n,)``.
     intensity
-        Process noise per time, shape ``(d,)``.
+        Of the random forces, per time: shape ``(1, d, d)``, or ``(n, d, d)``.
 
     Returns
     -------
@@ -51,6 +51,7 @@ def noise_likelihood(
     outputs = residual.shape[1]
     kept = 1 + columns
     width = kept + dimension
+    constant = len(intensity) == 1
     sums = np.zeros((kept, kept))
     log_determinant = 0.0
     freedom = 0
@@ -101,6 +102,7 @@ def noise_likelihood(
                         covariance[i, j] -= share * gain[j]
             if k + 1 == first[recording + 1]:
                 break
+            row = 0 if constant else k
             for i in range(dimension):
                 for c in range(width):
                     value = 0.0
@@ -122,12 +124,16 @@ def noise_likelihood(
                     value = 0.0
                     for m in range(dimension):
                         value += half[i, m] * transition[k, j, m]
-                        # Simpson's rule, as in siq.estimation.innovations.process_covariance.
-                        a, b = transition[k, i, m], transition[k, j, m]
-                        same_i = 1.0 if i == m else 0.0
-                        same_j = 1.0 if j == m else 0.0
-                        added = a * b + (a + same_i) * (b + same_j) + same_i * same_j
-                        value += intensity[m] * added * step[k] / 6.0
+                        for other in range(dimension):
+                            strength = intensity[row, m, other]
+                            if strength == 0.0:
+                                continue
+                            # Simpson's rule, as in siq.estimation.innovations.process_covariance.
+                            a, b = transition[k, i, m], transition[k, j, other]
+                            same_i = 1.0 if i == m else 0.0
+                            same_j = 1.0 if j == other else 0.0
+                            added = a * b + (a + same_i) * (b + same_j) + same_i * same_j
+                            value += strength * added * step[k] / 6.0
                     covariance[i, j] = value
                     covariance[j, i] = value
         removed, logarithm = _eliminate(own, kept)

@@ -1,8 +1,9 @@
 """The vector field, identified first: sparse regression of the flow over the step of the pairs.
 
 All functions of a library are fitted first (`siq.identify.flow_regression`). Terms are dropped by their own
-uncertainty, and what remains is fitted by generalised least squares with the covariance that the residuals
-show, which attains the Cramér–Rao bound.
+uncertainty, and under noise exchanged as long as that helps (`siq.identify.selection`). What remains is
+fitted by generalised least squares with the covariance that the residuals show, which attains the Cramér–Rao
+bound.
 
 Not to be confused with the f of `siq.networks.regression`, which is that of the networks: here no network
 takes part, and V and g are not known yet. That makes it the yardstick of the certificate.
@@ -10,12 +11,12 @@ takes part, and V and g are not known yet. That makes it the yardstick of the ce
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
 import scipy.linalg
-import scipy.special
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
@@ -31,6 +32,7 @@ from siq.identify.flow_regression import (
 )
 from siq.identify.identified_field import NOISE_FREE, IdentifiedField
 from siq.identify.library import CandidateLibrary
+from siq.identify.selection import Equation, critical_values, improved_support, rival_changes
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -45,7 +47,7 @@ class IdentificationOptions:
         Further functions of the states, as formulas: roots, fractions and whatever else.
     false_terms
         Probability that noise alone brings any false term into f. Each candidate is judged by its own
-        standard error, at this probability divided by the number of candidates.
+        standard error, at its share of this probability, of which high degrees have less than low ones.
     precision
         A term that contributes less than this share of f is dropped also from data without noise, whose
         residuals are the integrator's error and not random.
@@ -55,7 +57,7 @@ class IdentificationOptions:
 
     degree: Annotated[int, Field(ge=1, le=12)] = 5
     functions: tuple[str, ...] = ()
-    false_terms: Annotated[float, Field(gt=0, lt=0.5)] = 0.01
+    false_terms: Annotated[float, Field(gt=0, lt=0.5)] = 0.05
     precision: Annotated[float, Field(gt=0, lt=0.1)] = 1e-7
     pairs: Annotated[int, Field(ge=100)] = 8_000
 
@@ -134,13 +136,14 @@ def _identify(
     dense = fit_everything(library, pairs, integrator_step=integrator_step)
     triangle, values, noise_free = dense.triangle, dense.values, dense.ratio < NOISE_FREE
     repeated = 1.0 if noise_free else copies(pairs)
-    chosen = [
-        (i, k)
-        for i in range(d)
-        for k in _significant(
-            triangle, q, i, n / repeated, options=options, noise_free=noise_free, candidates=d * q
-        )
-    ]
+    critical = critical_values(library, false_terms=options.false_terms)
+    equations = [Equation.of_triangle(triangle, i, samples=n / repeated, critical=critical) for i in range(d)]
+    chosen = []
+    for i, equation in enumerate(equations):
+        kept: Sequence[int] = _significant(
+            triangle, q, i, n / repeated, options=options, noise_free=noise_free, critical=critical
+        ).tolist()
+        chosen += [(i, k) for k in (kept if noise_free else improved_support(equation, kept))]
     if len({i for i, _ in chosen}) < d:
         missing = next(i for i in range(d) if i not in {j for j, _ in chosen})
         raise NumericalFailure(f"no term of the equation of {library.states[missing]} is significant")
@@ -154,13 +157,23 @@ def _identify(
     problem = FlowRegression(library, pairs, support)
     found = fit_support(found, problem)
     # With the final support and flow a term may turn out to be superfluous after all.
-    while (weak := _weakest(found, problem, options)) is not None:
+    while (weak := _weakest(found, problem, options, critical)) is not None:
         support = np.delete(found.support, weak, axis=0)
         coefficients = np.zeros_like(found.coefficients)
         coefficients[support[:, 1], support[:, 0]] = found.coefficients[support[:, 1], support[:, 0]]
         problem = FlowRegression(library, pairs, support)
         found = fit_support(replace(found, coefficients=coefficients, support=support), problem)
-    return found
+    return found if noise_free else replace(found, doubts=_doubts(equations, found.support))
+
+
+def _doubts(equations: Sequence[Equation], support: np.ndarray) -> np.ndarray:
+    """What rivals of the support would change in f, shape ``(r, q, d)``."""
+    doubts = []
+    for i, equation in enumerate(equations):
+        changes = rival_changes(equation, support[support[:, 0] == i, 1].tolist())
+        doubts.append(np.zeros((*changes.shape, len(equations))))
+        doubts[-1][:, :, i] = changes
+    return np.concatenate(doubts)
 
 
 def _check_count(library: CandidateLibrary, pairs: SnapshotPairs) -> None:
@@ -171,10 +184,6 @@ def _check_count(library: CandidateLibrary, pairs: SnapshotPairs) -> None:
         )
 
 
-def _critical(options: IdentificationOptions, candidates: int) -> float:
-    return float(-scipy.special.ndtri(options.false_terms / (2 * candidates)))
-
-
 def _significant(
     triangle: np.ndarray,
     q: int,
@@ -183,10 +192,9 @@ def _significant(
     *,
     options: IdentificationOptions,
     noise_free: bool,
-    candidates: int,
+    critical: np.ndarray,
 ) -> np.ndarray:
     """Backward elimination of one equation: the least significant term leaves, until all are significant."""
-    critical = _critical(options, candidates)
     goal = triangle[:, q + component]
     size = np.linalg.norm(goal)
     active = np.arange(q)
@@ -198,7 +206,8 @@ def _significant(
         inverse = scipy.linalg.solve_triangular(upper, np.eye(len(active)))
         errors = np.sqrt(variance) * np.linalg.norm(inverse, axis=1)
         contribution = np.abs(coefficients) * np.linalg.norm(triangle[:, active], axis=0) / (size or 1.0)
-        strength = np.minimum(np.abs(coefficients) / np.where(errors > 0, errors, 1e-300) / critical, 1e30)
+        standing = np.abs(coefficients) / np.where(errors > 0, errors, 1e-300)
+        strength = np.minimum(standing / critical[active], 1e30)
         if noise_free:
             strength = contribution / options.precision
         weakest = int(np.argmin(strength))
@@ -208,15 +217,17 @@ def _significant(
     return active
 
 
-def _weakest(found: IdentifiedField, problem: FlowRegression, options: IdentificationOptions) -> int | None:
+def _weakest(
+    found: IdentifiedField, problem: FlowRegression, options: IdentificationOptions, critical: np.ndarray
+) -> int | None:
     """The least significant term, if it is not significant, and not the last of its equation."""
     if found.noise_free:
         terms = np.sqrt(problem.theta**2 @ problem.h)[problem.position]
         sizes = np.sqrt(problem.h @ problem.predicted(found.values) ** 2)
         strength = np.abs(found.values) * terms / positive(sizes)[found.support[:, 0]] / options.precision
     else:
-        critical = _critical(options, found.library.size * found.library.dimension)
-        strength = np.abs(found.values) / np.sqrt(np.diag(found.covariance)) / critical
+        standing = np.abs(found.values) / np.sqrt(np.diag(found.covariance))
+        strength = standing / critical[found.support[:, 1]]
     for index in np.argsort(strength):
         if strength[index] >= 1:
             return None

@@ -40,6 +40,9 @@ class IdentifiedField:
         The map over a pair's step that was fitted.
     diffusion
         D, which recordings do not tell apart from ε: of these only the product, `noise_rate`, is identified.
+    doubts
+        Shape ``(r, q, d)``: by how much f would change with other terms that fit nearly as well, each scaled
+        by the square root of its probability (`siq.identify.selection`). None where nobody asked.
     """
 
     library: CandidateLibrary
@@ -50,6 +53,28 @@ class IdentifiedField:
     residual_ratio: float
     flow: FlowMap
     diffusion: Diffusion
+    doubts: np.ndarray | None = None
+
+    def variance(self, slopes: np.ndarray) -> np.ndarray:
+        """Variance of what follows from f to first order, by its coefficients and by which terms there are.
+
+        Parameters
+        ----------
+        slopes
+            Derivatives by all coefficients, shape ``(..., q, d)``.
+
+        Returns
+        -------
+        numpy.ndarray
+            Shape ``(...)``.
+        """
+        components, terms = self.support.T
+        own = slopes[..., terms, components]
+        total = np.einsum("...p,pr,...r->...", own, self.covariance, own)
+        if self.doubts is not None and len(self.doubts):
+            changes = np.tensordot(slopes, self.doubts, axes=([-2, -1], [-2, -1]))
+            total = total + (changes**2).sum(axis=-1)
+        return np.asarray(np.maximum(total, 0.0))
 
     @property
     def noise_free(self) -> bool:
@@ -59,21 +84,8 @@ class IdentifiedField:
     @cached_property
     def dynamics(self) -> Dynamics:
         """F and D, with the p coefficients that are not zero as parameters, and their covariance."""
-        prefix = "c"
-        while any(f"{prefix}{place}" in self.library.states for place in range(len(self.support))):
-            prefix += "_"
-        names = [f"{prefix}{place}" for place in range(len(self.support))]
-        equations = [sympy.S.Zero] * self.library.dimension
-        for (component, term), name in zip(self.support, names, strict=True):
-            equations[component] += symbol(name) * self.library.terms[term]
-        return Dynamics(
-            states=self.library.states,
-            equations=tuple(equations),
-            diffusion=self.diffusion,
-            parameters=tuple(
-                Parameter(name, float(value)) for name, value in zip(names, self.values, strict=True)
-            ),
-            covariance=self.covariance,
+        return field_dynamics(
+            self.library, self.support, self.values, diffusion=self.diffusion, covariance=self.covariance
         )
 
     @property
@@ -87,3 +99,42 @@ class IdentifiedField:
         errors = np.zeros_like(self.coefficients)
         errors[self.support[:, 1], self.support[:, 0]] = np.sqrt(np.diag(self.covariance))
         return errors
+
+
+def field_dynamics(
+    library: CandidateLibrary,
+    support: np.ndarray,
+    values: np.ndarray,
+    *,
+    diffusion: Diffusion,
+    covariance: np.ndarray | None = None,
+) -> Dynamics:
+    """Dynamics whose parameters are the coefficients of f over some terms of a library.
+
+    Parameters
+    ----------
+    library
+        The q functions of the d states.
+    support
+        Shape ``(p, 2)``: component and term of each coefficient.
+    values
+        The coefficients, shape ``(p,)``.
+    diffusion
+        D.
+    covariance
+        Of the coefficients, shape ``(p, p)``.
+    """
+    prefix = "c"
+    while any(f"{prefix}{place}" in library.states for place in range(len(support))):
+        prefix += "_"
+    names = [f"{prefix}{place}" for place in range(len(support))]
+    equations = [sympy.S.Zero] * library.dimension
+    for (component, term), name in zip(support, names, strict=True):
+        equations[component] += symbol(name) * library.terms[term]
+    return Dynamics(
+        states=library.states,
+        equations=tuple(equations),
+        diffusion=diffusion,
+        parameters=tuple(Parameter(name, float(value)) for name, value in zip(names, values, strict=True)),
+        covariance=covariance,
+    )

@@ -139,13 +139,7 @@ def residual_noise(
     score = float((excess / np.sqrt((1 + np.eye(d)) / len(pairs.h))).max())
     if found.noise_free:
         return NoiseDiagnosis("none", 0.0, noise.matrix, 0.0, 0.0, 0.0, 0.0, np.zeros(d))
-    rest = residuals(found, sample)
-    joined = _joined(sample, rest)
-    first, second = rest[:-1][joined], rest[1:][joined]
-    product = first * second
-    size = np.sqrt((first**2).mean(axis=0) * (second**2).mean(axis=0))
-    correlations = product.mean(axis=0) / size
-    scores = product.sum(axis=0) / np.sqrt((product**2).sum(axis=0))
+    correlations, scores = _neighbours(found, sample)
     worst = int(np.argmax(np.abs(scores)))
     kind: NoiseKind = "process"
     measurement = np.zeros(d)
@@ -165,6 +159,27 @@ def residual_noise(
         kind, intensity, covariance, deviation, score,
         float(correlations[worst]), float(scores[worst]), measurement,
     )  # fmt: skip
+
+
+def shared_errors(
+    found: IdentifiedField, recordings: Recordings, *, pair_step: float | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """What neighbouring residuals share: their correlation state by state, and in standard errors.
+
+    Negative where the sensor is noisy, since the sample in the middle is the later one of the first pair and
+    the earlier one of the second.
+    """
+    return _neighbours(found, snapshot_pairs(recordings, pair_step=pair_step))
+
+
+def _neighbours(found: IdentifiedField, sample: SnapshotPairs) -> tuple[np.ndarray, np.ndarray]:
+    rest = residuals(found, sample)
+    joined = _joined(sample, rest)
+    first, second = rest[:-1][joined], rest[1:][joined]
+    product = first * second
+    size = np.sqrt((first**2).mean(axis=0) * (second**2).mean(axis=0))
+    scores = product.sum(axis=0) / np.sqrt((product**2).sum(axis=0))
+    return product.mean(axis=0) / size, scores
 
 
 def _joined(sample: SnapshotPairs, rest: np.ndarray) -> np.ndarray:

@@ -45,6 +45,14 @@ class FieldRecord:
         return DiffusionSource(self.noise.get("diffusion", DiffusionSource.GIVEN))
 
     @property
+    def sensor_variance(self) -> np.ndarray | None:
+        """Variance of each state's sensor noise, shape ``(d,)``; None where f was found without any."""
+        deviations = np.array(self.noise.get("measurement", []), dtype=float)
+        if self.noise.get("kind") != "process" or not (deviations > 0).any():
+            return None
+        return deviations**2
+
+    @property
     def noise_strength(self) -> tuple[float, float] | None:
         """ε and its standard error, None where the recordings show no white noise.
 
@@ -79,6 +87,7 @@ def write_field(path: str | Path, record: FieldRecord, options: IdentificationOp
             for i, k in found.support
         ],
         "covariance": found.covariance.tolist(),
+        "doubts": None if found.doubts is None else found.doubts.tolist(),
         "noise_rate": found.noise_rate.tolist(),
         "residual_ratio": found.residual_ratio,
         "diffusion": found.diffusion.matrix.tolist(),
@@ -88,6 +97,10 @@ def write_field(path: str | Path, record: FieldRecord, options: IdentificationOp
     }
     with whole_file(path) as partial:
         partial.write_text(json.dumps(data, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _doubts(written: Any, library: CandidateLibrary) -> np.ndarray | None:
+    return None if written is None else np.array(written).reshape(-1, library.size, library.dimension)
 
 
 def read_field(path: str | Path) -> FieldRecord | None:
@@ -114,6 +127,7 @@ def read_field(path: str | Path) -> FieldRecord | None:
         found = IdentifiedField(
             library, coefficients, support, np.array(data["covariance"]), np.array(data["noise_rate"]),
             float(data["residual_ratio"]), FlowMap(**data["flow"]), Diffusion(np.array(data["diffusion"])),
+            _doubts(data.get("doubts"), library),
         )  # fmt: skip
         p, d = len(support), library.dimension
         if found.covariance.shape != (p, p) or found.noise_rate.shape != (d, d):

@@ -217,19 +217,16 @@ def barrier_standard_error(path: TransitionPath, found: IdentifiedField) -> floa
     noise = found.diffusion
     speed, length = (np.sqrt(noise.squared_speed(middle, one)) for one in (flow, move))
     spent = np.where(speed > 0, length / np.where(speed > 0, speed, 1.0), 0.0)
-    terms = found.library.evaluate(middle)[:, found.support[:, 1]]
-    slope = -2 * (spent[:, None] * force[:, found.support[:, 0]] * terms).sum(axis=0)
-    return float(np.sqrt(max(slope @ found.covariance @ slope, 0.0)))
+    terms = found.library.evaluate(middle)
+    slope = -2 * np.einsum("n,nq,nd->qd", spent, terms, force)
+    return float(np.sqrt(found.variance(slope)))
 
 
 def position_standard_errors(found: IdentifiedField, position: np.ndarray) -> np.ndarray:
     """Standard errors of an equilibrium's position, shape ``(d,)``: of f = 0 follows δx = -J⁻¹ δf."""
     terms = found.library.evaluate(position[None])[0]
-    components, which = found.support.T
-    change = np.zeros((found.library.dimension, len(found.support)))
-    change[components, np.arange(len(found.support))] = terms[which]
     try:
-        moved = np.linalg.solve(found.dynamics.jacobian(position[None])[0], change)
+        moved = np.linalg.inv(found.dynamics.jacobian(position[None])[0])
     except np.linalg.LinAlgError:
         return np.full(found.library.dimension, np.nan)
-    return np.sqrt(np.maximum(np.einsum("ik,kl,il->i", moved, found.covariance, moved), 0.0))
+    return np.sqrt(found.variance(np.einsum("k,ij->ikj", terms, moved)))

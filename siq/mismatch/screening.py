@@ -60,7 +60,7 @@ def probe_response(model: Dynamics, grid: Grid, fit: Fit, columns: Columns) -> L
         The probes.
     """
     with np.errstate(all="ignore"):  # what overflows is left out of the screening
-        coarse = linearise(model, grid, fit.model.values, fit.x, columns=columns)
+        coarse = linearise(model, grid, fit.model.values, fit.linearised_at, columns=columns)
     known, parameters = fit.linearisation, len(fit.model.free)
     return replace(
         known,

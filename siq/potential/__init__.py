@@ -10,6 +10,7 @@
 `orthogonal_fit`    which V and g together fit f best under noise?
 `refinement`        how do these become the formulas of a run?
 `refined_formulas`  how do their coefficients and errors read as formulas?
+`uncertainty`       how far does what is not known of f carry V off?
 `training_check`    would refinement succeed from these networks?
 `symbolic`          what do formulas of V, g and f evaluate to?
 `storage`           how are they kept in a file?

@@ -7,7 +7,7 @@ else that the local route uses takes part.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +18,7 @@ from siq.identify.identified_field import IdentifiedField
 from siq.identify.library import CandidateLibrary
 from siq.potential.bases import LibraryBasis, potential_basis
 from siq.potential.hamilton_jacobi import HamiltonJacobi, Solution, equation_at, gauss_newton, sensitivity
+from siq.potential.well import Well
 
 LOWER_PARTS = (0.7, 0.5, 0.3)  # of the points, by V
 
@@ -58,6 +59,28 @@ def fit_values(library: CandidateLibrary, x: np.ndarray, potential: np.ndarray) 
     solution = np.linalg.lstsq(values / scale, potential, rcond=1e-10)[0] / scale
     coefficients = np.zeros(library.size)
     coefficients[basis.chosen] = solution[:-1]
+    return coefficients
+
+
+def fit_wells(library: CandidateLibrary, wells: Sequence[Well]) -> np.ndarray:
+    """Coefficients of V, shape ``(q,)``, by least squares of the V of several wells within each of them.
+
+    How deep the wells are among each other is left open: each has a constant of its own.
+    """
+    basis = potential_basis(library)
+    inside = [well.inside for well in wells]
+    counts = [len(x) for x in inside]
+    # Every well counts as much as any other, however many points it has.
+    weight = np.repeat([1 / np.sqrt(max(count, 1)) for count in counts], counts)
+    constants = np.repeat(np.eye(len(wells)), counts, axis=0)
+    functions = np.column_stack([basis.values(np.concatenate(inside)), constants])
+    scale = np.sqrt((functions**2).mean(axis=0))
+    scale = np.where(scale > 0, scale, 1.0)
+    goal = np.concatenate([well.values(x) for well, x in zip(wells, inside, strict=True)])
+    matrix = weight[:, None] * functions / scale
+    solution = np.linalg.lstsq(matrix, weight * goal, rcond=1e-10)[0] / scale
+    coefficients = np.zeros(library.size)
+    coefficients[basis.chosen] = solution[: basis.size]
     return coefficients
 
 

@@ -25,7 +25,12 @@ from siq.errors import NumericalFailure
 from siq.identify.identified_field import IdentifiedField
 from siq.identify.library import CandidateLibrary, joint_library, total_degree
 from siq.potential.bases import affordable_degree
-from siq.potential.global_route import GlobalPotential, fit_values, network_starts, refine_globally
+from siq.potential.global_route import (
+    GlobalPotential,
+    fit_wells,
+    network_starts,
+    refine_globally,
+)
 from siq.potential.local_route import fit_well
 from siq.potential.local_wells import WellOptions, local_well
 from siq.potential.orthogonal_fit import OrthogonalFit, fit_orthogonal
@@ -198,11 +203,15 @@ def refine(
     elif wells:
         network_wells = wells
     if network_wells and not _good(best, limit):
-        # Refined one by one, the wells may turn out to share one formula.
-        values = (fit_values(library, x, well.values(x)) for well in network_wells for x in [well.inside])
+        # Refined one by one, the wells may turn out to share one formula. All of them together make the
+        # start: one alone does not tell an odd power from an even one, and goes on wrongly in the others.
+        groups = [network_wells, *([well] for well in network_wells if len(network_wells) > 1)]
+        values = (fit_wells(library, group) for group in groups)
         best = _best_of(map(globally, values), limit, best)
     if best is not None and _good(best, limit):
-        return _with_circulation(best, found, points, options, wells, notes)
+        whole = _with_circulation(best, found, points, options, wells, notes)
+        if whole is not None:
+            return whole
     notes.append("no single formula in this library holds over the whole recorded region")
     return Refined(
         found, library, None, None, None, None,
@@ -275,7 +284,12 @@ def over_library(found: IdentifiedField, library: CandidateLibrary) -> Identifie
         place = position[found.library.terms[term]]
         support[row] = component, place
         coefficients[place, component] = found.coefficients[term, component]
-    return replace(found, library=library, coefficients=coefficients, support=support)
+    doubts = found.doubts
+    if doubts is not None:
+        places = [position[term] for term in found.library.terms]
+        doubts = np.zeros((len(doubts), library.size, library.dimension))
+        doubts[:, places] = found.doubts
+    return replace(found, library=library, coefficients=coefficients, support=support, doubts=doubts)
 
 
 def local_wells(
@@ -302,8 +316,13 @@ def _with_circulation(
     options: RefinementOptions,
     wells: Sequence[Well],
     notes: list[str],
-) -> Refined:
-    """G = f + D∇V with its uncertainty, on the terms that differ from zero; jointly with V under noise."""
+) -> Refined | None:
+    """G = f + D∇V with its uncertainty, on the terms that differ from zero; jointly with V under noise.
+
+    Under noise V may fail the Hamilton–Jacobi equation of the identified f by as much as f errs. What tells
+    whether that is all is the joint fit: an f that V and g make up exactly, and that the data allow. Where
+    there is none V has to solve the equation as without noise; None where it does not.
+    """
     library = best.library
     q, d = library.size, library.dimension
     downhill = library.downhill(found.diffusion)
@@ -327,6 +346,8 @@ def _with_circulation(
         fit = fit_orthogonal(found, best.coefficients, circulatory, points[rows])
         if fit is None or fit.probability < IMPLAUSIBLE:
             fit = None
+            if best.residual >= options.single_formula:
+                return None
             notes.append("V and g have no exactly orthogonal form on their terms: they are fitted one by one")
     if fit is not None:
         return Refined(

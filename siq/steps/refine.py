@@ -32,6 +32,7 @@ from siq.data.recordings import Recordings, snapshot_pairs
 from siq.dynamics.phase_portrait import PhasePortrait, evenly_spread, phase_portrait
 from siq.errors import NumericalFailure
 from siq.identify.identified_field import IdentifiedField
+from siq.identify.noisy_sensor import filtered_recordings
 from siq.identify.storage import FieldRecord
 from siq.networks.trained import TrainedNetworks, shuffled
 from siq.numerics.randomness import Purpose, generator
@@ -166,6 +167,11 @@ class Ground:
         self.options = settings.refinement.with_routes(networks=self.networks is not None)
         draw = generator(settings.seed, self.number, Purpose.HOLD_OUT)
         mask = held_out_recordings(recordings, generator=draw)
+        if (sensor := record.sensor_variance) is not None:
+            # Of measured values the increments do not have the mean of f.
+            recordings = filtered_recordings(
+                self.found, sensor, recordings, pair_step=settings.sampling.pair_step
+            )
         pairs = snapshot_pairs(recordings, pair_step=settings.sampling.pair_step)
         held, x = mask[pairs.recording], pairs.x0
         draw = generator(settings.seed, self.number, Purpose.REFINE)
@@ -249,7 +255,17 @@ def _refined(
     certificate = ground.certify(
         formulas, wells=refined.wells, relative_error=error, compared=compared
     )  # fmt: skip
-    return refined, formulas, certificate
+    if certificate.certified or not refined.wells:
+        return refined, formulas, certificate
+    # One formula for all wells is an extra. What refuses it is no word against the wells.
+    alone = replace(
+        refined, potential=None, circulatory=None, potential_covariance=None, circulatory_errors=None,
+        joint=False, notes=(*refined.notes, f"no single formula holds over the wells: {certificate.reason}"),
+    )  # fmt: skip
+    of_wells = ground.certify_wells(alone, compared=compared)
+    if not of_wells.certified:
+        return refined, formulas, certificate
+    return alone, refined_decomposition(alone, ground.points), of_wells
 
 
 def control(

@@ -98,7 +98,7 @@ def dense(data: Measurements, line: object, noise: Noise) -> tuple[np.ndarray, n
     rows, dimension = line.gap.shape
     parameters = line.response.shape[2]
     step = np.append(np.diff(data.t), 0.0)
-    process = process_covariance(line.transition, step, noise.process)
+    process = process_covariance(line.transition, step, noise.intensity)
     mean = np.zeros((rows, dimension))
     columns = np.zeros((rows, dimension, parameters + len(data.labels) * dimension))
     spread = np.zeros((rows, dimension, rows, dimension))
@@ -156,8 +156,8 @@ def test_smoothed_states_are_the_conditional_means(linearised) -> None:
     data, line, noise = linearised
     begin = np.array([[0.1, -0.2], [0.0, 0.3]])
     step = np.append(np.diff(data.t), 0.0)
-    process = process_covariance(line.transition, step, noise.process)
-    found = smoothed_states(
+    process = process_covariance(line.transition, step, noise.intensity)
+    found, _, _ = smoothed_states(
         data.first, line.transition, line.gap, process, line.measured, line.residual, noise.measurement, begin
     )
     # The same minimum, written as least squares over all random forces.
@@ -253,7 +253,7 @@ def test_the_products_of_columns_are_eliminated_as_by_projection(linearised) -> 
     data, line, noise = linearised
     total, _, freedom = noise_likelihood(
         data.first, line.transition, line.response, line.gap, line.measured, line.measured_response,
-        line.residual, np.append(np.diff(data.t), 0.0), noise.measurement, noise.process,
+        line.residual, np.append(np.diff(data.t), 0.0), noise.measurement, noise.intensity,
     )  # fmt: skip
     white = whiten(line, data, noise)
     change = np.linalg.lstsq(white.columns, white.innovations, rcond=None)[0]

@@ -1,0 +1,176 @@
+"""Which terms of one equation do noisy pairs ask for, and which others would do nearly as well?
+
+Backward elimination (`siq.identify.identification`) ends where no single term is superfluous. Where two terms
+are nearly the same function on the recorded states, as x²y and x⁴y are about x² = 1, it may have dropped the
+wrong one on its way and never looks back. Here supports are compared as wholes, by
+
+    score = χ² + Σ c_k²,
+
+χ² being that of the residuals and c_k the number of standard errors that the term k has to be from zero.
+Terms are added, dropped and exchanged as long as that lowers the score. Of two terms that fit equally well
+the one of the lower degree is taken: the probability of a false term is shared among degrees in the ratio
+1 : ½ : ¼ …, and among the terms of a degree evenly.
+
+The supports next to the chosen one are *rivals*. Each would do with the probability ``exp(-Δscore/2)``
+relative to it, and what it would change in f belongs to the error of f as the covariance does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+import scipy.special
+
+from siq.identify.library import CandidateLibrary, total_degree
+
+MOST_MOVES = 200  # numerical, a guard: each lowers the score
+SAME = 1e-10  # of a term's square: what is left of it beside the others is rounding
+LEAST_WEIGHT = 1e-3  # of a rival: what weighs less changes an error by less than its third digit
+FURTHER_DEGREE = 1  # of a function that the user named: it is no less likely than a state itself
+
+
+def critical_values(library: CandidateLibrary, *, false_terms: float) -> np.ndarray:
+    """How many standard errors each function has to be from zero, in any equation: shape ``(q,)``.
+
+    Parameters
+    ----------
+    library
+        The q functions of d states.
+    false_terms
+        Probability that noise alone brings any false term into f.
+    """
+    symbols = library.symbols
+    degrees = np.array(
+        [
+            total_degree(library, place) if term.is_polynomial(*symbols) else FURTHER_DEGREE
+            for place, term in enumerate(library.terms)
+        ]
+    )
+    present, counts = np.unique(degrees, return_counts=True)
+    shares = 0.5 ** present.astype(float)
+    budget = false_terms * shares / shares.sum() / (counts * library.dimension)
+    each = budget[np.searchsorted(present, degrees)]
+    return np.asarray(-scipy.special.ndtri(each / 2))
+
+
+@dataclass(frozen=True)
+class Equation:
+    """The regression of one component of f, through the triangle on which everything depends.
+
+    Attributes
+    ----------
+    columns
+        Of the q functions, shape ``(m, q)``.
+    goal
+        Of the velocities, shape ``(m,)``.
+    variance
+        Of a residual, as the fit of all functions leaves it.
+    critical
+        Shape ``(q,)``.
+    """
+
+    columns: np.ndarray
+    goal: np.ndarray
+    variance: float
+    critical: np.ndarray
+
+    @classmethod
+    def of_triangle(
+        cls, triangle: np.ndarray, component: int, *, samples: float, critical: np.ndarray
+    ) -> Equation:
+        """From the triangle ``(q + d, q + d)`` of the fit of all functions, of so many independent pairs."""
+        q = len(critical)
+        columns, goal = triangle[:, :q], triangle[:, q + component]
+        left = triangle[q:, q + component]
+        return cls(columns, goal, float(left @ left) / max(samples - q, 1.0), critical)
+
+    def fitted(self, support: Sequence[int]) -> np.ndarray:
+        """Coefficients on a support, shape ``(q,)``."""
+        coefficients = np.zeros(self.columns.shape[1])
+        if not len(support):
+            return coefficients
+        places = list(support)
+        chosen = self.columns[:, places]
+        scale = np.linalg.norm(chosen, axis=0)
+        scale = np.where(scale > 0, scale, 1.0)
+        coefficients[places] = np.linalg.lstsq(chosen / scale, self.goal, rcond=None)[0] / scale
+        return coefficients
+
+    def score(self, support: Sequence[int]) -> float:
+        """χ² and the price of the terms."""
+        misfit = self.goal - self.columns @ self.fitted(support)
+        return float(misfit @ misfit / self.variance + (self.critical[list(support)] ** 2).sum())
+
+    def neighbours(self, support: Sequence[int]) -> Iterator[tuple[float, tuple[int, ...]]]:
+        """Scores of all supports that one term more, one less, or another one makes of this one."""
+        yield from self._with_one_more(support)
+        for left_out in support:
+            others = tuple(one for one in support if one != left_out)
+            yield self.score(others), others
+            yield from self._with_one_more(others, but=left_out)
+
+    def _with_one_more(
+        self, support: Sequence[int], *, but: int | None = None
+    ) -> Iterator[tuple[float, tuple[int, ...]]]:
+        columns, goal = self.columns, self.goal
+        if len(support):
+            orthogonal = np.linalg.qr(columns[:, list(support)])[0]
+            columns = columns - orthogonal @ (orthogonal.T @ columns)
+            goal = goal - orthogonal @ (orthogonal.T @ goal)
+        squares = (columns**2).sum(axis=0)
+        usable = squares > SAME * (self.columns**2).sum(axis=0)
+        usable[list(support)] = False
+        if but is not None:
+            usable[but] = False
+        gains = (columns[:, usable].T @ goal) ** 2 / squares[usable]
+        scores = (goal @ goal - gains) / self.variance + self.critical[usable] ** 2
+        price = float((self.critical[list(support)] ** 2).sum())
+        for score, place in zip(scores + price, np.flatnonzero(usable), strict=True):
+            yield float(score), tuple(sorted((*support, int(place))))
+
+
+def strong_terms(equation: Equation) -> tuple[int, ...]:
+    """What is left when the weakest term leaves again and again, until all are significant."""
+    active = np.flatnonzero(np.linalg.norm(equation.columns, axis=0) > 0)
+    while len(active):
+        chosen = equation.columns[:, active]
+        size = np.linalg.norm(chosen, axis=0)
+        orthogonal, upper = np.linalg.qr(chosen / size)
+        coefficients = scipy.linalg.solve_triangular(upper, orthogonal.T @ equation.goal)
+        errors = np.linalg.norm(scipy.linalg.solve_triangular(upper, np.eye(len(active))), axis=1)
+        strength = np.abs(coefficients) / errors / np.sqrt(equation.variance) / equation.critical[active]
+        weakest = int(np.argmin(strength))
+        if strength[weakest] >= 1:
+            break
+        active = np.delete(active, weakest)
+    return tuple(int(place) for place in active)
+
+
+def improved_support(equation: Equation, start: Sequence[int]) -> tuple[int, ...]:
+    """The support of the lowest score that exchanges of single terms reach from a start."""
+    support = tuple(sorted(int(place) for place in start))
+    score = equation.score(support)
+    for _ in range(MOST_MOVES):
+        best, following = min(equation.neighbours(support), default=(np.inf, support))
+        if not best < score:
+            break
+        score, support = best, following
+    return support
+
+
+def rival_changes(equation: Equation, support: Sequence[int]) -> np.ndarray:
+    """What rivals of a support would change in its coefficients, shape ``(r, q)``.
+
+    Each is scaled by the square root of its probability, so that the sum of their squares is the mean square
+    change; see the module.
+    """
+    own = tuple(sorted(int(place) for place in support))
+    score, coefficients = equation.score(own), equation.fitted(own)
+    kept = [(np.exp(-(its - score) / 2), other) for its, other in equation.neighbours(own)]
+    kept = [(weight, other) for weight, other in kept if weight > LEAST_WEIGHT]
+    total = 1.0 + sum(weight for weight, _ in kept)
+    changes = [np.sqrt(weight / total) * (equation.fitted(other) - coefficients) for weight, other in kept]
+    return np.array(changes).reshape(-1, equation.columns.shape[1])

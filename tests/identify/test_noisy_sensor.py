@@ -1,0 +1,111 @@
+"""f beside the noise of a sensor: the right terms, unbiased, and held-out recordings that can refuse it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from siq.data.recordings import Recordings, snapshot_pairs
+from siq.data.selection import select_recordings
+from siq.estimation.innovations import Noise
+from siq.identify.identification import IdentificationOptions, identify_vector_field
+from siq.identify.library import candidate_library
+from siq.identify.noisy_sensor import (
+    FilteredField,
+    filtered_recordings,
+    held_out_evidence,
+    identify_by_likelihood,
+    unbroken,
+)
+from siq.identify.selection import critical_values
+from siq.steps import identify
+from siq.steps.outcomes import Status
+from siq.steps.pipeline import PipelineSettings
+
+STEP, FORCES, SENSOR = 0.02, 0.3, 0.1
+
+
+def double_well(seed: int, *, samples: int = 3000, records: int = 6) -> tuple[Recordings, np.ndarray]:
+    """Records of dx = (x - x³) dt + √0.3 dW with sensor noise 0.1, and the states without it."""
+    generator = np.random.default_rng(seed)
+    x, now = np.empty((samples, records)), np.sign(generator.standard_normal(records))
+    for row in range(samples):
+        x[row] = now
+        for _ in range(10):
+            push = np.sqrt(FORCES * STEP / 10) * generator.standard_normal(records)
+            now = now + STEP / 10 * (now - now**3) + push
+    measured = x + SENSOR * generator.standard_normal(x.shape)
+    recordings = Recordings.from_arrays(STEP * np.arange(samples), measured.T[:, :, None], names=["x"])
+    return recordings, x.T.reshape(-1, 1)
+
+
+def identified(recordings: Recordings, *, degree: int) -> FilteredField:
+    library = candidate_library(["x"], degree=degree)
+    begin = identify_vector_field(
+        library, snapshot_pairs(recordings), options=IdentificationOptions(degree=degree)
+    )
+    return identify_by_likelihood(
+        library, recordings, begin, Noise(np.array([0.003]), np.array([0.5])),
+        critical=critical_values(library, false_terms=0.05),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def found() -> tuple[FilteredField, Recordings, np.ndarray]:
+    recordings, x = double_well(1)
+    return identified(recordings, degree=5), recordings, x
+
+
+def test_terms_and_noises_are_found(found: tuple[FilteredField, Recordings, np.ndarray]) -> None:
+    field = found[0].found
+    assert [field.library.names[k] for _, k in field.support] == ["x", "x**3"]
+    errors = np.sqrt(np.diag(field.covariance))
+    assert (np.abs(field.values - [1, -1]) < 3 * errors).all()
+    assert np.sqrt(found[0].sensor[0]) == pytest.approx(SENSOR, rel=0.03)
+    assert field.noise_rate[0, 0] == pytest.approx(FORCES, rel=0.1)
+    assert found[0].gain > 100 and abs(found[0].score) < 4
+
+
+def test_filtered_states_are_nearer_and_keep_the_mean_of_f(
+    found: tuple[FilteredField, Recordings, np.ndarray],
+) -> None:
+    one, recordings, x = found
+    filtered = filtered_recordings(one.found, one.sensor, recordings)
+    assert np.std(filtered.values - x) < 0.75 * SENSOR
+    for values, unbiased in ((filtered, True), (recordings, False)):
+        pairs = snapshot_pairs(values)
+        terms = np.column_stack([pairs.x0, pairs.x0**3])
+        slopes = np.linalg.lstsq(terms, (pairs.xh - pairs.x0)[:, 0] / STEP, rcond=None)[0]
+        assert (np.abs(slopes - [1, -1]).max() < 0.3) == unbiased
+
+
+def test_held_out_recordings_refuse_an_f_that_lacks_a_term(
+    found: tuple[FilteredField, Recordings, np.ndarray],
+) -> None:
+    one, recordings, _ = found
+    parts = select_recordings(recordings, [0, 1, 2, 3]), select_recordings(recordings, [4, 5])
+    probability, ratio = held_out_evidence(one, *parts)
+    assert probability > 1e-3 and ratio == pytest.approx(1.0, abs=0.05)
+    field = one.found
+    linear = replace(field, support=field.support[:1], covariance=field.covariance[:1, :1])
+    probability, _ = held_out_evidence(replace(one, found=linear), *parts)
+    assert probability < 1e-6
+
+
+def test_a_gap_begins_another_recording() -> None:
+    t = np.concatenate([np.arange(5), np.arange(20, 26)]).astype(float)
+    data = unbroken(Recordings.from_arrays(t, np.zeros((11, 1)), names=["x"]))
+    np.testing.assert_array_equal(data.first, [0, 5, 11])
+    assert data.labels == ("0", "0")
+
+
+def test_the_step_asks_the_likelihood_where_sensors_are_noisy() -> None:
+    recordings, _ = double_well(2, samples=2000)
+    settings = PipelineSettings().of(identify.IdentifySettings)
+    done = identify.run(settings, recordings, number=0)
+    assert done.record is not None and done.outcome.status == Status.OK
+    assert done.record.sensor_variance is not None
+    assert np.sqrt(done.record.sensor_variance[0]) == pytest.approx(SENSOR, rel=0.1)
+    assert "the noise of the sensor" in done.outcome.reason
