@@ -8,7 +8,7 @@ variances, is
 
 every derivative complete, that of the gain included. The mean moves with the mean of f, ``f + ½ f″:P``.
 Without the second part, which is that of a truncated second-order filter, the score of the archetype has 2.3
-times the variance that it should have; with it the right one. What is averaged over a step is a further state,
+times the variance that it should have; with it the right one. What is averaged over a step is one more state,
 the running integral of the states, which every sample sets to zero. Without sensor noise and blur G is
 
     G = Σ h Θᵀ (εD)⁻¹ Θ    for f, and    Σ ½ d ∂(log q)²    for q.
