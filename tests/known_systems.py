@@ -195,7 +195,13 @@ def uniform_points(known: KnownSystem, count: int, *, seed: int = 0, share: floa
 
 def portrait_of(known: KnownSystem, count: int = 400, *, share: float = 1.0) -> PhasePortrait:
     """The phase portrait that recordings from all over the domain would give, made once."""
-    text = (str(known.dynamics.formulas), known.diffusion.tobytes(), known.domain.tobytes(), count, share)
+    text = (
+        str(known.dynamics.formulas),
+        str(known.dynamics.diffusion.formulas),
+        known.domain.tobytes(),
+        count,
+        share,
+    )
     if text not in _PORTRAITS:
         points = uniform_points(known, count, share=share)
         _PORTRAITS[text] = phase_portrait(known.dynamics, points)

@@ -4,6 +4,7 @@
 `tests`            which tests are there, and which false solution does each refuse?
 `characteristics`  is V that which characteristics carry, with nothing else of its fit?
 `descent`          does V fall along recordings that no fit saw, as fast as it has to?
+`existence`        do stable states and saddles stay, whatever of its uncertainty f takes?
 `error_bound`      how far may V be from the true one, from its own residual?
 `regions`          which points lie among the recorded states that lead to an attractor?
 `held_out`         which held-out states and pairs does a formula have to answer?

@@ -14,6 +14,7 @@ import numpy as np
 
 from siq.certificate.characteristics import SHARE, Reference, check_characteristics
 from siq.certificate.descent import check_descent
+from siq.certificate.existence import check_existence
 from siq.certificate.held_out import HeldOut, part_of
 from siq.certificate.regions import basin_region
 from siq.certificate.tests import (
@@ -158,7 +159,10 @@ def _certify(
     tests, error, place = _common(candidate, found, held_out, references, options, error, np.inf, seed)
     worst = worst if place is None else place
     tests["identity"] = check_identity(candidate, found, limit=options.identity)
-    tests["error"] = check_error(error, limit=options.error)
+    from_field = STATED * candidate.relative_error
+    tests["error"] = check_error(error - from_field, limit=options.error, from_field=from_field)
+    if portrait.attractors:
+        tests["existence"] = check_existence(found, portrait, seed=seed)
     if wells:
         # The local route shares the error of f, and has the rest of its own.
         own = [_error_of(well, found, portrait, seed)[0] for well in wells]
@@ -193,6 +197,7 @@ def certify_wells(
     wells = refined.wells or refined.network_wells
     tests: dict[str, Verdict] = {}
     error, worst = (0.0, None) if wells else (np.inf, None)
+    own_error, from_field = error, 0.0
     tested = []
     for well in wells:
         own = [place for place, one in enumerate(portrait.attractors) if _same(one.position, well.attractor)]
@@ -205,13 +210,15 @@ def certify_wells(
                 f" {_place(well.attractor)}: record more there, or raise refinement.degrees"
             )
             tests["hamilton_jacobi"] = Verdict(np.inf, options.hamilton_jacobi, False, reason)
-            error = np.inf
+            error = own_error = np.inf
             continue
         candidate = _of_well(well, portrait, part.points)
         its, place = stated_error(candidate, found, seed=seed)
         # Characteristics follow the same f: what f's uncertainty adds explains no difference from them.
         made, its, there = _common(candidate, found, part, mine, options, its, well.level, seed)
-        its += STATED * _error_from_field(well, found, part.points, seed)
+        uncertain = STATED * _error_from_field(well, found, part.points, seed)
+        own_error, from_field = max(own_error, its), max(from_field, uncertain)
+        its += uncertain
         for name, verdict in made.items():
             tests[name] = _worse(tests.get(name), verdict)
         if its >= error:
@@ -220,7 +227,9 @@ def certify_wells(
     if missing or not wells:
         reason = f"{missing} of {len(portrait.attractors)} attractors have no formula"
         tests["branch"] = Verdict(np.inf, options.branch, False, reason)
-    tests["error"] = check_error(error, limit=options.error)
+    tests["error"] = check_error(own_error, limit=options.error, from_field=from_field)
+    if portrait.attractors:
+        tests["existence"] = check_existence(found, portrait, seed=seed)
     if refined.wells and refined.network_wells:
         pairs = [
             (one, two)

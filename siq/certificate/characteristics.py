@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from siq.certificate.regions import BasinRegion, basin_region
-from siq.certificate.tests import Candidate, CertificateOptions, Verdict, stated_error
+from siq.certificate.tests import STATED, Candidate, CertificateOptions, Verdict, stated_error
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.equilibria import hessian_at
 from siq.dynamics.phase_portrait import PhasePortrait
@@ -183,7 +183,11 @@ def check_characteristics(
         if not value <= error + one.error:  # a mean over a region says little of its deepest part
             error = max(error, stated_error(replace(candidate, points=x), found, seed=seed)[0])
         # An error that cannot be stated explains nothing: a false solution, whose ascending paths run away.
-        limit = (error if error <= options.error else 0.0) + one.error
+        from_field = STATED * candidate.relative_error  # of a formula that was fitted together with f
+        own = error - from_field
+        limit = (
+            (own if own <= options.error else 0.0) + (from_field if np.isfinite(error) else 0.0) + one.error
+        )
         place = x[int(np.argmax(np.abs(difference)))]
         shown = place_text(place)
         passed = bool(value <= limit)

@@ -10,14 +10,16 @@ certified without it.
 `hamilton_jacobi`  ∇V·(f + D∇V) vanishes on held-out points, and ∇V does not
 `branch`           the Hessian at every attractor is M = W⁻¹, within the error that f leaves open; J is stable
 `descent`          V falls along held-out recordings, from sample to sample or in the mean over their noise
-`error`            the error that V's own residual and the uncertainty of f leave is small enough to be stated
+`error`            the error that V's own residual leaves is small, and that from f small enough to be known
+`existence`        stable states and saddles stay where f is changed within its uncertainty
 `characteristics`  V is that which characteristics carry, within that error
 `agreement`        both routes give the same V within their errors. Networks that do not agree with the local
                    route are trained again: a test of consistency, and no evidence from elsewhere
 `prediction`       f predicts held-out recordings, and its residuals are white
 =================  ===========================================================================================
 
-`siq.certificate.characteristics` and `siq.certificate.descent` have those two tests, this module all others.
+`siq.certificate.characteristics`, `siq.certificate.descent` and `siq.certificate.existence` have those three
+tests, this module all others.
 """
 
 from __future__ import annotations
@@ -40,6 +42,7 @@ Function = Callable[[np.ndarray], np.ndarray]
 
 ERROR_POINTS = 300
 FINEST_ERROR = 1e-9  # relative, of V
+LARGEST_FROM_FIELD = 0.5  # of V: half of it, with 95 % confidence, is more than a first order can tell
 STATED = 2.0  # standard errors of V from f: kept in 95 of 100 times
 DRAWS = 40  # of f from its distribution, for the error of M
 STANDARD_ERRORS = 4.0  # exceeded by chance once in 16 000 times
@@ -236,12 +239,24 @@ def stated_error(
     return max(error + STATED * candidate.relative_error, FINEST_ERROR), worst
 
 
-def check_error(error: float, *, limit: float) -> Verdict:
-    """Whether the error that has to be stated is small enough to state."""
-    passed = bool(error <= limit)
-    return Verdict(
-        error, limit, passed, "" if passed else "the error of V that its residual leaves open is too large"
-    )
+def check_error(error: float, *, limit: float, from_field: float = 0.0) -> Verdict:
+    """Whether the error that has to be stated is small enough to state.
+
+    Parameters
+    ----------
+    error
+        Relative, that V's own residual leaves open.
+    limit
+        Of that: a formula that is off by more is no solution.
+    from_field
+        What the uncertainty of f adds. It is no fault of the formula and is stated, whatever its size, as
+        long as it is known; from `LARGEST_FROM_FIELD` on its first order says nothing any more.
+    """
+    passed = bool(error <= limit and from_field <= LARGEST_FROM_FIELD)
+    reason = "" if passed else "the error of V that its residual leaves open is too large"
+    if error <= limit and not passed:
+        reason = "f is not known well enough to tell V: record more"
+    return Verdict(error if from_field <= LARGEST_FROM_FIELD else from_field, limit, passed, reason)
 
 
 def check_agreement(
@@ -326,8 +341,12 @@ def _relative_error_of_drift(found: IdentifiedField, points: np.ndarray) -> floa
         return 0.0
     components, functions = found.support.T
     terms = found.library.evaluate(points)[:, functions]
-    weighted = found.diffusion.precision[np.ix_(components, components)] * found.covariance
-    total = np.einsum("np,pr,nr->n", terms, weighted, terms).mean()
+    if found.diffusion.constant:
+        weighted = found.diffusion.precision[np.ix_(components, components)] * found.covariance
+        total = np.einsum("np,pr,nr->n", terms, weighted, terms).mean()
+    else:
+        precision = found.diffusion.precision_at(points)[:, components[:, None], components]
+        total = np.einsum("np,npr,pr,nr->n", terms, precision, found.covariance, terms, optimize=True).mean()
     return float(np.sqrt(total / found.diffusion.squared_speed(points, found.dynamics.drift(points)).mean()))
 
 

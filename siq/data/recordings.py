@@ -213,7 +213,11 @@ class SnapshotPairs:
 
 
 def read_recordings(
-    path: str | Path, *, columns: Sequence[str] | None = None, units: Mapping[str, str] | None = None
+    path: str | Path,
+    *,
+    columns: Sequence[str] | None = None,
+    units: Mapping[str, str] | None = None,
+    gaps: bool = True,
 ) -> Recordings:
     """Read a long table of trajectories and check it.
 
@@ -232,6 +236,9 @@ def read_recordings(
     units
         The units that are expected, by column, ``t`` included. Nothing is converted: another unit in the
         file is refused. A column without a unit in the file is taken as it is.
+    gaps
+        Whether rows in which a measured value is missing are left out, and said. Otherwise they are refused,
+        as they have to be where an input of the system could be among them.
 
     Raises
     ------
@@ -240,7 +247,7 @@ def read_recordings(
     """
     from siq.data.tables import read_tables  # which imports pyarrow
 
-    return Recordings(**read_tables(path, columns=columns, units=units)._asdict())
+    return Recordings(**read_tables(path, columns=columns, units=units, gaps=gaps)._asdict())
 
 
 def write_recordings(path: str | Path, recordings: Recordings) -> None:

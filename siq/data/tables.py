@@ -33,21 +33,30 @@ class CheckedTable(NamedTuple):
 
 
 def read_tables(
-    path: str | Path, *, columns: Sequence[str] | None, units: Mapping[str, str] | None
+    path: str | Path,
+    *,
+    columns: Sequence[str] | None,
+    units: Mapping[str, str] | None,
+    gaps: bool = True,
 ) -> CheckedTable:
     """Read a file of recordings, or a folder that holds one file per recording.
 
     See `siq.data.recordings.read_recordings`.
     """
     if not Path(path).is_dir():
-        return checked_table(str(path), open_columns(path), columns, units)
+        return checked_table(str(path), open_columns(path), columns, units, gaps=gaps)
     files = files_of(Path(path))
-    tables = [checked_table(str(file), open_columns(file), columns, units) for file in files]
+    tables = [checked_table(str(file), open_columns(file), columns, units, gaps=gaps) for file in files]
     return _joined(files, tables, str(path))
 
 
 def checked_table(
-    file: str, source: ColumnFile, columns: Sequence[str] | None, units: Mapping[str, str] | None
+    file: str,
+    source: ColumnFile,
+    columns: Sequence[str] | None,
+    units: Mapping[str, str] | None,
+    *,
+    gaps: bool = True,
 ) -> CheckedTable:
     """Check a table that has been opened.
 
@@ -57,7 +66,7 @@ def checked_table(
         What messages call it.
     source
         Its columns.
-    columns, units
+    columns, units, gaps
         See `siq.data.recordings.read_recordings`.
 
     Raises
@@ -94,6 +103,8 @@ def checked_table(
     faults += [fault] if fault else []
     _refuse(file, faults)
     rows = trim(rows, numbers)
+    if gaps:
+        rows = _without_gaps(rows, numbers)
     _refuse_missing(file, numbers, rows, ["t", *called[1:]])
     rows = put_in_order(rows, numbers, labelled=layout.recording is not None)
     check_times(file, numbers[0][rows.order], rows.recording, rows.labels, rows.order)
@@ -133,6 +144,28 @@ def _refuse(file: str, faults: Sequence[CellFault]) -> None:
     if faults:
         first = min(faults, key=lambda each: each.row)
         raise InputError(file, f"row {first.row}, column {first.column}", first.fault, first.remedy)
+
+
+def _without_gaps(rows: Rows, numbers: np.ndarray) -> Rows:
+    """Leave out rows in which a measured value is missing, where they are the few.
+
+    Their times tell the gap, across which nothing is learned. Where most are missing, the columns were hardly
+    meant to be one state, and they are refused.
+    """
+    missing = np.isnan(numbers[1:, rows.order]).any(axis=0) & ~np.isnan(numbers[0, rows.order])
+    count = int(missing.sum())
+    if not count or 2 * count > len(missing):
+        return rows
+    said = (
+        "1 row in which a value is missing was"
+        if count == 1
+        else f"{count} rows in which a value is missing were"
+    )
+    note = f"{said} left out; nothing is learned across the gap{'' if count == 1 else 's'}"
+    kept = ~missing
+    present, recording = np.unique(rows.recording[kept], return_inverse=True)
+    labels = tuple(rows.labels[place] for place in present)
+    return Rows(rows.order[kept], recording, labels, (*rows.notes, note))
 
 
 def _refuse_missing(file: str, numbers: np.ndarray, rows: Rows, called: Sequence[str]) -> None:

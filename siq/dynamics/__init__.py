@@ -3,6 +3,7 @@
 ================  =====================================================================
 `dynamics`        which drift, noise, inputs and outputs has a system?
 `diffusion`       what does its noise do to momenta and velocities?
+`state_noise`     and if it is stronger here than there, by a formula of the states?
 `cards`           what does a system card describe?
 `card_writing`    how is a dynamics written as a card?
 `formulas`        how does the text of a formula become a function, without being code?

@@ -8,6 +8,7 @@ import numpy as np
 import yaml
 
 from siq.dynamics.diffusion import Diffusion
+from siq.dynamics.state_noise import diffusion_rows_of
 
 if TYPE_CHECKING:
     from siq.dynamics.dynamics import Dynamics
@@ -62,11 +63,11 @@ def _domain(limits: np.ndarray) -> dict[str, list[float]]:
     return {"domain": [float(limit) for limit in limits]} if limits[0] < limits[1] else {}
 
 
-def _diffusion(diffusion: Diffusion) -> str | list[float] | list[list[float]]:
+def _diffusion(diffusion: Diffusion) -> str | list[str | float] | list[list[str | float]]:
     """``identity``, the diagonal, or the whole matrix."""
-    matrix = diffusion.matrix
-    if np.array_equal(matrix, np.eye(len(matrix))):
-        return "identity"
-    diagonal: list[float] = np.diag(matrix).tolist()
-    whole: list[list[float]] = matrix.tolist()
-    return diagonal if np.array_equal(matrix, np.diag(np.diag(matrix))) else whole
+    rows = diffusion_rows_of(diffusion)
+    places = range(len(rows))
+    if any(rows[i][j] not in (0.0, "0") for i in places for j in places if i != j):
+        return rows
+    diagonal = [rows[i][i] for i in places]
+    return "identity" if all(entry == 1.0 for entry in diagonal) else diagonal

@@ -1,15 +1,15 @@
 """System cards: the equations of a simulation as a file, and the dynamics that they describe.
 
 A *system card* (``config/systems/NAME.yaml``) declares states, parameters, the vector field f, and the
-covariance D of the noise in ``dx = f dt + sqrt(ε) D^(1/2) dW``. D belongs to the system because the
-orthogonality ``∇V·g = 0`` of the decomposition ``f = -D∇V + g`` depends on it: the same equations in other
-units are another problem unless D is carried along.
+covariance D of the noise in ``dx = f dt + sqrt(ε) D^(1/2) dW``, in numbers or formulas. D belongs to
+the system because the orthogonality ``∇V·g = 0`` of the decomposition ``f = -D∇V + g`` depends on it: the
+same equations in other units are another problem unless D is carried along.
 """
 
 from __future__ import annotations
 
 import keyword
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -21,6 +21,7 @@ from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.dynamics import Dynamics, Input, Parameter
 from siq.dynamics.formulas import CONSTANTS, FUNCTIONS, FormulaError, exact_number, parse_formula
 from siq.dynamics.parametric import TIME, symbol
+from siq.dynamics.state_noise import state_noise
 from siq.errors import InputError
 from siq.files.documents import Document, read_document, validate
 
@@ -37,7 +38,7 @@ def check_name(text: str) -> str:
 Name = Annotated[str, AfterValidator(check_name)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Formula = str | Number
-DiffusionEntry = Literal["identity"] | list[Number] | list[list[Number]]
+DiffusionEntry = Literal["identity"] | list[Formula] | list[list[Formula]]
 
 
 class _CardPart(BaseModel):
@@ -139,8 +140,10 @@ class SystemCard(_CardPart):
         What a recording measures, as formulas by name; by default the states. Only a diagnosis reads them.
     diffusion
         D of ``dx = f dt + √ε D^(1/2) dW``: ``identity``, the diagonal as a list, or the whole matrix as a
-        list of rows, in squared units of the states per unit of time. A zero says that no noise reaches a
-        state; where a landscape is asked for, it has to reach every state.
+        list of rows, in squared units of the states per unit of time. An entry is a number, or a formula of
+        the states and parameters in the sense of Itô, such as ``[1 + 0.8*x, 1]``; parameters count with the
+        values of the card. A zero says that no noise reaches a state; where a landscape is asked for, it has
+        to reach every state.
     exact
         Exact answers, where they are known.
     """
@@ -170,7 +173,7 @@ class SystemCard(_CardPart):
         for name in self.equations:
             if name not in self.states:
                 raise ValueError(f"the equation of '{name}' belongs to no state; declare it under states")
-        diffusion_matrix(self.diffusion, len(self.states))
+        diffusion_rows(self.diffusion, len(self.states))
         return self
 
 
@@ -179,8 +182,8 @@ def domain_of(card: SystemCard) -> np.ndarray:
     return np.array([entry.domain or (np.nan, np.nan) for entry in card.states.values()], dtype=float)
 
 
-def diffusion_matrix(diffusion: DiffusionEntry, dimension: int) -> np.ndarray:
-    """Noise covariance D as a matrix.
+def diffusion_rows(diffusion: DiffusionEntry, dimension: int) -> list[list[Formula]]:
+    """D as rows of numbers and formulas.
 
     Parameters
     ----------
@@ -189,25 +192,60 @@ def diffusion_matrix(diffusion: DiffusionEntry, dimension: int) -> np.ndarray:
     dimension
         Number of states, d.
 
+    Raises
+    ------
+    ValueError
+        When the shape is wrong, or numbers are not symmetric and positive semi-definite.
+    """
+    if diffusion == "identity":
+        return [[float(i == j) for j in range(dimension)] for i in range(dimension)]
+    lengths = {len(row) for row in diffusion if isinstance(row, list)}
+    if len(diffusion) != dimension or (lengths and lengths != {dimension}):
+        raise ValueError(f"the diffusion does not fit {dimension} states; give a diagonal or a square matrix")
+    rows = [
+        row if isinstance(row, list) else [row if i == j else 0.0 for j in range(dimension)]
+        for i, row in enumerate(diffusion)
+    ]
+    if not _has_formulas(rows):
+        Diffusion(np.array(rows, dtype=float))
+    return rows
+
+
+def read_diffusion(
+    diffusion: DiffusionEntry, symbols: Sequence[sympy.Symbol], parse: Callable[[Formula], sympy.Expr] | None
+) -> Diffusion:
+    """D as a card or a study gives it.
+
+    Parameters
+    ----------
+    diffusion
+        The entry.
+    symbols
+        The d states as they stand in formulas.
+    parse
+        What reads a formula; by default it may have the states in it, and nothing else.
+
     Returns
     -------
-    numpy.ndarray
-        D, shape ``(d, d)``, symmetric and positive semi-definite: a zero says that no noise reaches a state.
+    Diffusion
+        Symmetric and, where it is constant, positive semi-definite: a zero says that no noise reaches a
+        state.
 
     Raises
     ------
     ValueError
-        When the shape is wrong or D is not symmetric and positive semi-definite.
+        When the shape is wrong, or D is not symmetric and positive semi-definite.
     """
-    if diffusion == "identity":
-        return np.eye(dimension)
-    lengths = {len(row) for row in diffusion if isinstance(row, list)}
-    if len(diffusion) != dimension or (lengths and lengths != {dimension}):
-        raise ValueError(f"the diffusion does not fit {dimension} states; give a diagonal or a square matrix")
-    matrix = np.array(diffusion, dtype=float)
-    if matrix.ndim == 1:
-        matrix = np.diag(matrix)
-    return Diffusion(matrix).matrix
+    names = {each.name: each for each in symbols}
+    rows = diffusion_rows(diffusion, len(symbols))
+    if not _has_formulas(rows):
+        return Diffusion(np.array(rows, dtype=float))
+    read = parse if parse is not None else (lambda text: parse_formula(text, names))
+    return state_noise(symbols, [[read(entry) for entry in row] for row in rows])
+
+
+def _has_formulas(rows: list[list[Formula]]) -> bool:
+    return any(isinstance(entry, str) for row in rows for entry in row)
 
 
 def load_system(path: str | Path) -> Dynamics:
@@ -235,13 +273,23 @@ def build_system(document: Document, card: SystemCard) -> Dynamics:
     """
     outputs = card.outputs if card.outputs is not None else {name: name for name in card.states}
     parse = _parser(document, card)
+    numbers = {symbol(name): exact_number(entry.value) for name, entry in card.parameters.items()}
+    try:
+        diffusion = read_diffusion(
+            card.diffusion,
+            [symbol(name) for name in card.states],
+            lambda text: parse(("diffusion",), text).xreplace(numbers),
+        )
+    except ValueError as error:
+        fault, remedy = str(error).split("; ", 1)
+        raise InputError(document.file, document.place(("diffusion",)), fault, remedy) from None
     return Dynamics(
         name=card.name,
         title=card.title or card.name,
         time_unit=card.time_unit,
         states=tuple(card.states),
         units=tuple(entry.unit for entry in card.states.values()),
-        diffusion=Diffusion(diffusion_matrix(card.diffusion, len(card.states))),
+        diffusion=diffusion,
         domain=domain_of(card),
         inputs=tuple(Input(name, entry.unit, entry.interpolation) for name, entry in card.inputs.items()),
         parameters=tuple(

@@ -1,7 +1,13 @@
 """D, the noise of a system: what it does to momenta and velocities, and its inverse where it has one.
 
-``dx = f(x) dt + √ε σ(x) dW`` with ``D = σσᵀ``. Every product with D, its root or its inverse is taken here,
-so that a D which depends on the state, or does not reach every state, changes this module and no other.
+``dx = f(x) dt + √ε σ(x) dW`` with ``D = σσᵀ``, in the sense of Itô. Every product with D, its root or its
+inverse is taken at points, so that a constant D, `Diffusion`, and one that is a formula of the states,
+`siq.dynamics.state_noise.StateNoise`, are used alike. Who can do with a constant D only asks for its
+`matrix`, and another one refuses.
+
+Along characteristics, paths and in the prefactor of escape times stand derivatives of D with a momentum p:
+``pull`` is ``pᵀ(∂_k D)p``, ``turn`` is ``(∂_k D)p``, ``bend`` is ``pᵀ(∂_k ∂_l D)p``, and ``divergence`` is
+``Σ_i ∂_i D_ij``. Of a constant D they vanish.
 """
 
 from __future__ import annotations
@@ -10,13 +16,98 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import sympy
 from scipy.linalg import solve_triangular
 
+from siq.dynamics.formulas import exact_number
 from siq.errors import NumericalFailure
 
 
+class NoiseField:
+    """What follows from D and its derivatives at points, whatever D is."""
+
+    def at(self, x: np.ndarray) -> np.ndarray:
+        """D at points: ``(n, d)`` to ``(n, d, d)``."""
+        raise NotImplementedError
+
+    def derivatives(self, x: np.ndarray) -> np.ndarray:
+        """∂D_ij/∂x_k at points: ``(n, d)`` to ``(n, d, d, d)``, k last."""
+        raise NotImplementedError
+
+    def second_derivatives(self, x: np.ndarray) -> np.ndarray:
+        """∂²D_ij/∂x_k∂x_l at points: ``(n, d)`` to ``(n, d, d, d, d)``, k and l last."""
+        raise NotImplementedError
+
+    def pull(self, x: np.ndarray, momenta: np.ndarray) -> np.ndarray:
+        """``pᵀ(∂_k D)p`` at points and momenta ``(n, d)``: shape ``(n, d)``."""
+        return np.asarray(np.einsum("ni,nijk,nj->nk", momenta, self.derivatives(x), momenta))
+
+    def turn(self, x: np.ndarray, momenta: np.ndarray) -> np.ndarray:
+        """``((∂_k D)p)_i`` at points and momenta ``(n, d)``: shape ``(n, d, d)``, i before k."""
+        return np.asarray(np.einsum("nijk,nj->nik", self.derivatives(x), momenta))
+
+    def bend(self, x: np.ndarray, momenta: np.ndarray) -> np.ndarray:
+        """``pᵀ(∂_k ∂_l D)p`` at points and momenta ``(n, d)``: shape ``(n, d, d)``."""
+        return np.asarray(np.einsum("ni,nijkl,nj->nkl", momenta, self.second_derivatives(x), momenta))
+
+    def divergence(self, x: np.ndarray) -> np.ndarray:
+        """``Σ_i ∂_i D_ij`` at points: ``(n, d)`` to ``(n, d)``."""
+        return np.asarray(np.einsum("nijj->ni", self.derivatives(x)))
+
+
+@dataclass(frozen=True)
+class NoiseInUnits(NoiseField):
+    """D of the states ``x = center + units y`` as a D of y, times a factor for the unit of time.
+
+    Attributes
+    ----------
+    noise
+        D of x.
+    center, units
+        Shape ``(d,)`` and ``(d, d)``.
+    factor
+        By which ``units⁻¹ D units⁻ᵀ`` is multiplied.
+    """
+
+    noise: Diffusion
+    center: np.ndarray
+    units: np.ndarray
+    factor: float
+
+    @cached_property
+    def _inverse(self) -> np.ndarray:
+        return np.linalg.inv(self.units)
+
+    def _points(self, y: np.ndarray) -> np.ndarray:
+        return np.asarray(self.center + y @ self.units.T)
+
+    def at(self, y: np.ndarray) -> np.ndarray:
+        """D at points: ``(n, d)`` to ``(n, d, d)``."""
+        return np.asarray(self.factor * self._inverse @ self.noise.at(self._points(y)) @ self._inverse.T)
+
+    def whitening_at(self, y: np.ndarray) -> np.ndarray:
+        """σ⁻¹ at points: ``(n, d)`` to ``(n, d, d)``; raises as that of the noise."""
+        own = self.noise.whitening_at(self._points(y)) @ self.units
+        return np.asarray(own / np.sqrt(self.factor))
+
+    def derivatives(self, y: np.ndarray) -> np.ndarray:
+        """∂D_ij/∂y_k at points: ``(n, d)`` to ``(n, d, d, d)``, k last."""
+        inner = self.noise.derivatives(self._points(y))
+        left, units = self._inverse, self.units
+        return np.asarray(
+            self.factor * np.einsum("ai,bj,nijk,kl->nabl", left, left, inner, units, optimize=True)
+        )
+
+    def second_derivatives(self, y: np.ndarray) -> np.ndarray:
+        """∂²D_ij/∂y_k∂y_l at points: ``(n, d)`` to ``(n, d, d, d, d)``, k and l last."""
+        inner = self.noise.second_derivatives(self._points(y))
+        left, units = self._inverse, self.units
+        turned = np.einsum("ai,bj,nijkl,kc,ld->nabcd", left, left, inner, units, units, optimize=True)
+        return np.asarray(self.factor * turned)
+
+
 @dataclass(frozen=True, eq=False)
-class Diffusion:
+class Diffusion(NoiseField):
     """A constant D.
 
     Attributes
@@ -63,6 +154,16 @@ class Diffusion:
     def dimension(self) -> int:
         """Number of states, d."""
         return len(self.matrix)
+
+    @property
+    def constant(self) -> bool:
+        """Whether D is the same everywhere, so that `matrix`, `root` and their kin may be asked for."""
+        return True
+
+    @property
+    def formulas(self) -> tuple[tuple[sympy.Expr, ...], ...]:
+        """D row by row as formulas."""
+        return tuple(tuple(exact_number(float(entry)) for entry in row) for row in self.matrix)
 
     @property
     def scale(self) -> np.ndarray:
@@ -141,6 +242,40 @@ class Diffusion:
         """
         del x  # D is constant
         return np.asarray(np.einsum("ni,ij,nj->n", velocity, self.precision, velocity))
+
+    def root_at(self, x: np.ndarray) -> np.ndarray:
+        """σ at points: ``(n, d)`` to ``(n, d, d)``."""
+        return np.broadcast_to(self.root, (len(x), *self.matrix.shape))
+
+    def whitening_at(self, x: np.ndarray) -> np.ndarray:
+        """σ⁻¹ at points: ``(n, d)`` to ``(n, d, d)``; raises as `whitening`."""
+        return np.broadcast_to(self.whitening, (len(x), *self.matrix.shape))
+
+    def precision_at(self, x: np.ndarray) -> np.ndarray:
+        """D⁻¹ at points: ``(n, d)`` to ``(n, d, d)``; raises as `precision`."""
+        return np.broadcast_to(self.precision, (len(x), *self.matrix.shape))
+
+    def frozen(self, point: np.ndarray) -> Diffusion:
+        """The constant D that is the one at a point, shape ``(d,)``."""
+        del point  # D is constant
+        return self
+
+    def derivatives(self, x: np.ndarray) -> np.ndarray:
+        """∂D_ij/∂x_k at points: ``(n, d)`` to ``(n, d, d, d)``, k last."""
+        return np.zeros((len(x), *(self.dimension,) * 3))
+
+    def second_derivatives(self, x: np.ndarray) -> np.ndarray:
+        """∂²D_ij/∂x_k∂x_l at points: ``(n, d)`` to ``(n, d, d, d, d)``, k and l last."""
+        return np.zeros((len(x), *(self.dimension,) * 4))
+
+    def in_units(self, center: np.ndarray, units: np.ndarray, factor: float) -> NoiseInUnits:
+        """The same noise as one of y, ``x = center + units y``; see `NoiseInUnits`."""
+        return NoiseInUnits(self, center, units, factor)
+
+    def kicks(self, x: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+        """``σ(x) ξ`` of components: states and numbers ``(d, ...)`` to ``(d, ...)``, for simulations."""
+        del x  # D is constant
+        return np.asarray(self.root @ numbers)
 
     def intensity(self, rate: np.ndarray) -> float:
         """ε of a noise whose covariance per unit of time, shape ``(d, d)``, is about ε D."""

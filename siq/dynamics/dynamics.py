@@ -21,6 +21,7 @@ import sympy
 from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.formulas import compile_formulas, compile_values, exact_number
 from siq.dynamics.parametric import TIME, ParametricFunctions, delays_of, symbol
+from siq.dynamics.state_noise import StateNoise, state_noise
 
 
 @dataclass(frozen=True)
@@ -118,6 +119,8 @@ class Dynamics:
                             ("rows of D", self.diffusion.dimension)):  # fmt: skip
             if count != d:
                 raise ValueError(f"there are {count} {what} for {d} states; give one for each")
+        if isinstance(self.diffusion, StateNoise) and self.diffusion.symbols != self.symbols:
+            raise ValueError("D is one of other states; give it with these in their order")
         if self.domain is not None and np.shape(self.domain) != (d, 2):
             raise ValueError(f"the domain has the shape {np.shape(self.domain)}; give two limits a state")
 
@@ -127,7 +130,7 @@ class Dynamics:
         symbols: Sequence[sympy.Symbol],
         equations: Sequence[sympy.Expr],
         *,
-        diffusion: Diffusion | np.ndarray | None = None,
+        diffusion: Diffusion | np.ndarray | Sequence[Sequence[sympy.Expr | float]] | None = None,
     ) -> Dynamics:
         """Dynamics of formulas alone, with D = 1 unless another is given.
 
@@ -138,12 +141,14 @@ class Dynamics:
         equations
             The components of f.
         diffusion
-            D, as `Diffusion` or as a matrix ``(d, d)``.
+            D, as `Diffusion`, as a matrix ``(d, d)``, or as rows of formulas.
         """
         if diffusion is None:
             diffusion = Diffusion.identity(len(symbols))
-        elif not isinstance(diffusion, Diffusion):
+        elif isinstance(diffusion, np.ndarray):
             diffusion = Diffusion(np.asarray(diffusion, dtype=float))
+        elif not isinstance(diffusion, Diffusion):
+            diffusion = state_noise(symbols, diffusion)
         return cls(tuple(each.name for each in symbols), tuple(map(sympy.sympify, equations)), diffusion)
 
     @property

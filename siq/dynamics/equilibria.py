@@ -159,9 +159,10 @@ def hessian_at(dynamics: Dynamics, equilibrium: np.ndarray) -> np.ndarray:
     solutions of the Hamilton–Jacobi equation.
     """
     # In units of the noise: where the states' units differ much, rounding would swallow the smaller ones.
-    scale = dynamics.diffusion.scale
+    diffusion = dynamics.diffusion.frozen(equilibrium)  # p vanishes here, and with it what D's change does
+    scale = diffusion.scale
     jacobian = dynamics.jacobian(equilibrium[None])[0] * scale / scale[:, None]
-    noise = dynamics.diffusion.at(equilibrium[None])[0] / np.outer(scale, scale)
+    noise = diffusion.matrix / np.outer(scale, scale)
     covariance = scipy.linalg.solve_continuous_lyapunov(jacobian, -2 * noise)
     hessian = np.linalg.inv(covariance) / np.outer(scale, scale)
     return (hessian + hessian.T) / 2

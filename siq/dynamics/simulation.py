@@ -112,12 +112,13 @@ def euler_maruyama_step(drift: Drift, x: np.ndarray, step: float, increments: np
     step
         Time step Δt.
     increments
-        ``sqrt(ε) D^(1/2) ΔW``, shape ``(d, n)``: the noise over the step, see `noise_factor`.
+        ``sqrt(ε) D^(1/2) ΔW``, shape ``(d, n)``: the noise over the step, see `noise_source`.
 
     Returns
     -------
     numpy.ndarray
-        States one step later, shape ``(d, n)``. As the noise is additive, the rule is of strong order 1.
+        States one step later, shape ``(d, n)``. The rule is of strong order 1 where the noise is additive,
+        and of ½ where D depends on the state; its weak order is 1.
     """
     result = step * drift(x)
     result += x
@@ -125,8 +126,10 @@ def euler_maruyama_step(drift: Drift, x: np.ndarray, step: float, increments: np
     return result
 
 
-def noise_factor(diffusion: Diffusion, *, intensity: float, step: float) -> np.ndarray:
-    """L with ``L Lᵀ = ε D Δt``: L times standard normal numbers is the noise over one step.
+def noise_source(
+    diffusion: Diffusion, *, intensity: float, step: float, generator: np.random.Generator
+) -> Callable[[np.ndarray], np.ndarray]:
+    """What draws the noise over one step of states: ``sqrt(ε) σ(x) ΔW``, in the sense of Itô.
 
     Parameters
     ----------
@@ -136,20 +139,32 @@ def noise_factor(diffusion: Diffusion, *, intensity: float, step: float) -> np.n
         ε of ``dx = f dt + sqrt(ε) D^(1/2) dW``.
     step
         Time step Δt.
+    generator
+        Source of the noise.
 
     Returns
     -------
-    numpy.ndarray
-        Shape ``(d, d)``. Every root of D gives the same process in law.
+    callable
+        Maps the components of states ``(d, n)`` to increments ``(d, n)``, new ones with every call. Every
+        root of D gives the same process in law.
 
     Raises
     ------
     ValueError
         When ε or Δt is negative.
     """
+    factor = noise_factor(intensity=intensity, step=step)
+    if diffusion.constant:
+        whole = factor * diffusion.root
+        return lambda x: np.asarray(whole @ generator.standard_normal(x.shape))
+    return lambda x: factor * diffusion.kicks(x, generator.standard_normal(x.shape))
+
+
+def noise_factor(*, intensity: float, step: float) -> float:
+    """``sqrt(ε Δt)``: the size of the noise over one step where D = 1; raises as `noise_source`."""
     if intensity < 0 or step < 0:
         raise ValueError(f"the noise intensity ({intensity}) and the step ({step}) must not be negative")
-    return np.asarray(np.sqrt(intensity * step) * diffusion.root)
+    return float(np.sqrt(intensity * step))
 
 
 def simulate_snapshots(
@@ -186,15 +201,15 @@ def simulate_snapshots(
     count = options.trajectories
     x = generator.uniform(lower[:, None], upper[:, None], size=(dynamics.dimension, count))
     samples = np.empty((count, 2 * options.pairs, dynamics.dimension))
-    factor = noise_factor(dynamics.diffusion, intensity=options.noise_intensity, step=step)
-
+    noise = noise_source(
+        dynamics.diffusion, intensity=options.noise_intensity, step=step, generator=generator
+    )
     drift = dynamics.drift_of_components
 
     def advance(x: np.ndarray) -> np.ndarray:
         if options.noise_intensity == 0:
             return runge_kutta_step(drift, x, step)
-        increments = factor @ generator.standard_normal(x.shape)
-        return euler_maruyama_step(drift, x, step, increments)
+        return euler_maruyama_step(drift, x, step, noise(x))
 
     with np.errstate(over="ignore", invalid="ignore"):  # a runaway trajectory is told below, by name
         for pair in range(options.pairs):
@@ -273,13 +288,12 @@ def simulate_stationary(
     """
     if not 1 <= thin <= steps or burn_in < 0:
         raise ValueError(f"of {steps} steps after {burn_in}, every {thin}th leaves no sample")
-    factor = noise_factor(dynamics.diffusion, intensity=intensity, step=step)
+    noise = noise_source(dynamics.diffusion, intensity=intensity, step=step, generator=generator)
     x = np.array(start, dtype=float)
     samples = np.empty((len(x), steps // thin, x.shape[1]))
     with np.errstate(over="ignore", invalid="ignore"):  # told below
         for index in range(1 - burn_in, samples.shape[1] * thin + 1):
-            increments = factor @ generator.standard_normal(x.shape)
-            x = euler_maruyama_step(dynamics.drift_of_components, x, step, increments)
+            x = euler_maruyama_step(dynamics.drift_of_components, x, step, noise(x))
             if index > 0 and index % thin == 0:
                 samples[:, index // thin - 1] = x
     lost = int((~np.isfinite(x).all(axis=0)).sum())  # what once is not finite stays so

@@ -1,20 +1,24 @@
 """Which drift and which noise do recordings show?
 
-==================  ===========================================================================
-`identification`    which terms has f?
-`selection`         which terms does noise allow for, and which others would do nearly as well?
-`flow_regression`   which coefficients of given terms make f lead from X0 to Xh?
-`identified_field`  what is known of the f that was found, errors included?
-`library`           which candidate functions are there, with which derivatives and constraints?
-`flow`              where does f lead within the step of a pair?
-`diffusion`         which D, where nobody gave it?
-`random_forces`     how strong are the random forces behind residuals of a whole step?
-`noisy_sensor`      which f do recordings show whose sensor is noisy?
-`residuals`         what do its residuals say: no noise, process noise, noise of the measurement?
-`rounding`          were values rounded when they were written, and does it matter?
-`prediction`        where does f lead in the long run?
-`storage`           how is it kept in a file?
-==================  ===========================================================================
+======================  ===========================================================================
+`identification`        which terms has f?
+`selection`             which terms does noise allow for, and which others would do nearly as well?
+`stability`             in how many resampled recordings would each term be chosen?
+`flow_regression`       which coefficients of given terms make f lead from X0 to Xh?
+`identified_field`      what is known of the f that was found, errors included?
+`library`               which candidate functions are there, with which derivatives and constraints?
+`flow`                  where does f lead within the step of a pair?
+`diffusion`             which D, where nobody gave it?
+`random_forces`         how strong are the random forces behind residuals of a whole step?
+`noisy_sensor`          which f do recordings show whose sensor is noisy?
+`residuals`             what do its residuals say: no noise, process noise, noise of the measurement?
+`rounding`              were values rounded when they were written, and does it matter?
+`prediction`            where does f lead in the long run?
+`noise_formula`         what is known of a D that is a formula of the states, errors included?
+`noise_regression`      does the noise depend on the state, and by which formula?
+`weighted_regression`   which f, where the noise is stronger here than there?
+`storage`               how is it kept in a file?
+======================  ===========================================================================
 
 Imports `siq.estimation` and what it may import.
 """

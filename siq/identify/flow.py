@@ -78,9 +78,11 @@ def flow_map(
     coarse = FlowMap(steps)(field, x0, h)
     while steps < LARGEST_REFINEMENT:
         fine = FlowMap(2 * steps)(field, x0, h)
-        size = np.sqrt(((fine - x0) ** 2).mean(axis=1))
+        with np.errstate(over="ignore", invalid="ignore"):  # as above
+            size = np.sqrt(((fine - x0) ** 2).mean(axis=1))
+            error = np.sqrt(((fine - coarse) ** 2).mean(axis=1))
         # The error of the coarse result; that of the fine one is sixteen times smaller.
-        if not (np.sqrt(((fine - coarse) ** 2).mean(axis=1)) > tolerance * size).any():
+        if not (error > tolerance * size).any():
             break
         steps, coarse = 2 * steps, fine
     return FlowMap(steps)

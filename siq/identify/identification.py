@@ -33,6 +33,7 @@ from siq.identify.flow_regression import (
 from siq.identify.identified_field import NOISE_FREE, IdentifiedField
 from siq.identify.library import CandidateLibrary
 from siq.identify.selection import Equation, critical_values, improved_support, rival_changes
+from siq.identify.stability import blocks_of, stability, triangles
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -164,6 +165,48 @@ def _identify(
         problem = FlowRegression(library, pairs, support)
         found = fit_support(replace(found, coefficients=coefficients, support=support), problem)
     return found if noise_free else replace(found, doubts=_doubts(equations, found.support))
+
+
+def with_stability(
+    found: IdentifiedField,
+    pairs: SnapshotPairs,
+    *,
+    options: IdentificationOptions,
+    generator: np.random.Generator,
+) -> IdentifiedField:
+    """The same field, with the share of resampled recordings in which each of its terms is chosen.
+
+    Parameters
+    ----------
+    found
+        f from noisy pairs.
+    pairs
+        Those that it was fitted to.
+    options
+        What makes a term significant.
+    generator
+        Draws the recordings.
+    """
+    library = found.library
+    q, d = library.size, library.dimension
+    everything = np.array([(i, k) for i in range(d) for k in range(q)])
+    problem = FlowRegression(library, pairs, everything)
+    velocity = problem.corrected(found.coefficients.T.ravel(), found.flow, found.noise_rate)
+    rows = np.column_stack([problem.theta.T, velocity]) * np.sqrt(pairs.h)[:, None]
+    order = np.argsort(pairs.recording, kind="stable")
+    parts = triangles(rows[order], blocks_of(pairs.recording[order]))
+    critical = critical_values(library, false_terms=options.false_terms)
+    samples = len(pairs.h) / copies(pairs)
+
+    def equations(triangle: np.ndarray) -> list[Equation]:
+        return [Equation.of_triangle(triangle, i, samples=samples, critical=critical) for i in range(d)]
+
+    chosen = [found.support[found.support[:, 0] == i, 1].tolist() for i in range(d)]
+    shares = stability(parts, equations, chosen, generator=generator)
+    result = np.empty(len(found.support))
+    for i, share in enumerate(shares):
+        result[found.support[:, 0] == i] = share
+    return replace(found, stability=result)
 
 
 def _doubts(equations: Sequence[Equation], support: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ from siq.dynamics.dynamics import Dynamics, Parameter
 from siq.dynamics.parametric import symbol
 from siq.identify.flow import FlowMap
 from siq.identify.library import CandidateLibrary
+from siq.identify.noise_formula import NoiseFormula
 
 NOISE_FREE = 1e-6  # residuals below this share of the increments are the integrator's and the rounding's
 
@@ -43,6 +44,12 @@ class IdentifiedField:
     doubts
         Shape ``(r, q, d)``: by how much f would change with other terms that fit nearly as well, each scaled
         by the square root of its probability (`siq.identify.selection`). None where nobody asked.
+    stability
+        Shape ``(p,)``: the share of resampled recordings in which each term would be chosen
+        (`siq.identify.stability`). None where nobody asked.
+    noise
+        εD as a formula of the states, where the recordings show that it depends on them; `noise_rate` is its
+        mean over the recorded states then.
     """
 
     library: CandidateLibrary
@@ -54,6 +61,8 @@ class IdentifiedField:
     flow: FlowMap
     diffusion: Diffusion
     doubts: np.ndarray | None = None
+    stability: np.ndarray | None = None
+    noise: NoiseFormula | None = None
 
     def variance(self, slopes: np.ndarray) -> np.ndarray:
         """Variance of what follows from f to first order, by its coefficients and by which terms there are.
@@ -80,6 +89,16 @@ class IdentifiedField:
     def noise_free(self) -> bool:
         """Whether the residuals are those of the integrator and of rounding."""
         return self.residual_ratio < NOISE_FREE
+
+    @property
+    def intensity(self) -> float:
+        """ε of the formula of εD, where there is one: ``εD = ε D``."""
+        if self.noise is None:
+            raise ValueError("D does not depend on the state; ε is that of the residuals")
+        place = int(np.flatnonzero(self.noise.places[:, 0] == self.noise.places[:, 1])[0])
+        (i, _), term = self.noise.places[place], self.noise.terms[place]
+        own = sympy.Poly(self.diffusion.formulas[i][i], *self.library.symbols).coeff_monomial(term)
+        return float(self.noise.values[place]) / float(own)
 
     @cached_property
     def dynamics(self) -> Dynamics:

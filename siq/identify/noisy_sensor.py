@@ -28,6 +28,7 @@ from siq.identify.flow_regression import positive
 from siq.identify.identified_field import IdentifiedField, field_dynamics
 from siq.identify.library import CandidateLibrary
 from siq.identify.selection import Equation, improved_support, rival_changes, strong_terms
+from siq.identify.stability import blocks_of, stability, triangles
 
 ROUNDS = 8  # of the fit of a whole library, which only chooses terms
 WITHOUT = 1e-6  # of a sensor's variance: as good as none
@@ -68,6 +69,7 @@ def identify_by_likelihood(
     noise: Noise,
     *,
     critical: np.ndarray,
+    generator: np.random.Generator,
     pair_step: float | None = None,
 ) -> FilteredField:
     """Find f, the random forces and the noise of the sensor together.
@@ -84,6 +86,8 @@ def identify_by_likelihood(
         To begin with.
     critical
         Standard errors that the coefficient of each function has to exceed, shape ``(q,)``.
+    generator
+        Draws recordings again, see `siq.identify.stability`.
     pair_step
         Longest time between samples that still belong together.
 
@@ -125,8 +129,18 @@ def identify_by_likelihood(
         kept = np.delete(fit.model.values, weak)
         fit = _settled(library, support, data, fit.noise, values=kept, x=fit.linearised_at)
     one = _as_field(begin, library, support, fit, data, noise_uncertainty(fit, data))
-    doubts = rival_changes(equations, list(support[:, 0] * q + support[:, 1]))
-    return replace(one, found=replace(one.found, doubts=doubts.reshape(-1, d, q).transpose(0, 2, 1)))
+    own = (support[:, 0] * q + support[:, 1]).tolist()
+    doubts = rival_changes(equations, own)
+    # Whitened values stand one behind the other, all states of a sample together.
+    parts = triangles(np.column_stack([white.columns, goal]), np.repeat(blocks_of(recordings.recording), d))
+    (shares,) = stability(
+        parts,
+        lambda drawn: [Equation(drawn[:, :-1], drawn[:, -1], 1.0, equations.critical)],
+        [own],
+        generator=generator,
+    )
+    field = replace(one.found, doubts=doubts.reshape(-1, d, q).transpose(0, 2, 1), stability=shares)
+    return replace(one, found=field)
 
 
 def unbroken(recordings: Recordings, *, pair_step: float | None = None) -> Measurements:

@@ -24,6 +24,7 @@ from siq.identify.rounding import (
     rounding_errors,
     rounding_text,
 )
+from siq.identify.weighted_regression import weighted_residual_probability, whitened
 
 NoiseKind = Literal["none", "process", "measurement", "rounding", "coloured"]
 
@@ -124,21 +125,18 @@ def residual_noise(
     pair_step
         Longest step of a pair.
     """
-    noise, d = found.diffusion, found.library.dimension
+    d = found.library.dimension
     pairs = snapshot_pairs(recordings, pair_step=pair_step)
     sample = snapshot_pairs(recordings, pair_step=LONGEST_GAP * float(pairs.h.max()))
     if len(sample.h) > PAIRS:  # whole stretches, so that neighbours stay neighbours
         sample = SnapshotPairs(
             sample.x0[:PAIRS], sample.xh[:PAIRS], sample.h[:PAIRS], sample.recording[:PAIRS]
         )
-    intensity = noise.intensity(found.noise_rate)
-    covariance = found.noise_rate / intensity if intensity > 0 else noise.matrix
-    whiten = noise.whitening
-    excess = np.abs(whiten @ covariance @ whiten.T - np.eye(d))
+    intensity, covariance, excess = _against_diffusion(found, pairs)
     deviation = float(excess.max())
     score = float((excess / np.sqrt((1 + np.eye(d)) / len(pairs.h))).max())
     if found.noise_free:
-        return NoiseDiagnosis("none", 0.0, noise.matrix, 0.0, 0.0, 0.0, 0.0, np.zeros(d))
+        return NoiseDiagnosis("none", 0.0, covariance, 0.0, 0.0, 0.0, 0.0, np.zeros(d))
     correlations, scores = _neighbours(found, sample)
     worst = int(np.argmax(np.abs(scores)))
     kind: NoiseKind = "process"
@@ -150,7 +148,7 @@ def residual_noise(
             rounding = rounding_errors(recordings)
             if is_rounding(measurement, rounding, correlation=float(correlations[worst])):
                 return NoiseDiagnosis(
-                    "rounding", 0.0, noise.matrix, 0.0, 0.0,
+                    "rounding", 0.0, covariance, 0.0, 0.0,
                     float(correlations[worst]), float(scores[worst]), measurement,
                     rounding_text(recordings),
                     rounding_bias(found, pairs, rounding), decimals_needed(recordings, pairs),
@@ -174,12 +172,34 @@ def shared_errors(
 
 def _neighbours(found: IdentifiedField, sample: SnapshotPairs) -> tuple[np.ndarray, np.ndarray]:
     rest = residuals(found, sample)
+    if not found.diffusion.constant:
+        rest = whitened(found, sample, rest)
     joined = _joined(sample, rest)
+    if not joined.any():  # every recording has two samples
+        return np.zeros(rest.shape[1]), np.zeros(rest.shape[1])
     first, second = rest[:-1][joined], rest[1:][joined]
     product = first * second
     size = np.sqrt((first**2).mean(axis=0) * (second**2).mean(axis=0))
     scores = product.sum(axis=0) / np.sqrt((product**2).sum(axis=0))
     return product.mean(axis=0) / size, scores
+
+
+def _against_diffusion(found: IdentifiedField, pairs: SnapshotPairs) -> tuple[float, np.ndarray, np.ndarray]:
+    """ε, the covariance of the residuals in its unit, and how far it is from D, where D is the unit."""
+    noise, unit = found.diffusion, np.eye(found.library.dimension)
+    if noise.constant:
+        intensity = noise.intensity(found.noise_rate)
+        covariance = found.noise_rate / intensity if intensity > 0 and not found.noise_free else noise.matrix
+        return intensity, covariance, np.abs(noise.whitening @ covariance @ noise.whitening.T - unit)
+    if found.noise_free:
+        return 0.0, unit, np.zeros_like(unit)
+    forces = whitened(found, pairs, residuals(found, pairs))
+    whole = forces.T @ forces / len(forces)
+    intensity = float(np.trace(whole)) / len(unit)
+    excess = np.abs(whole / intensity - unit)
+    if found.noise is not None:  # its own formula says ε without the chance of the residuals
+        intensity = found.intensity
+    return intensity, found.noise_rate / intensity, excess
 
 
 def _joined(sample: SnapshotPairs, rest: np.ndarray) -> np.ndarray:
@@ -216,6 +236,8 @@ def mean_residual_probability(found: IdentifiedField, pairs: SnapshotPairs) -> f
     # Copies of resampled recordings would count as evidence that there is not.
     _, single = np.unique(np.column_stack([pairs.x0, pairs.xh]), axis=0, return_index=True)
     pairs = pairs.take(single)
+    if not found.diffusion.constant:
+        return weighted_residual_probability(found, pairs)
     rest = residuals(found, pairs) / np.sqrt(pairs.h)[:, None]
     design = found.library.evaluate(pairs.x0) * np.sqrt(pairs.h)[:, None]
     design = design / np.where((size := np.linalg.norm(design, axis=0)) > 0, size, 1.0)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from siq.dynamics.diffusion import Diffusion
+from siq.dynamics.state_noise import diffusion_of_rows, diffusion_rows_of
 from siq.errors import InputError
 from siq.files.whole import whole_file
 from siq.identify.diffusion import DiffusionSource
@@ -18,6 +18,7 @@ from siq.identify.flow import FlowMap
 from siq.identify.identification import IdentificationOptions
 from siq.identify.identified_field import IdentifiedField
 from siq.identify.library import CandidateLibrary, candidate_library
+from siq.identify.noise_formula import NoiseFormula
 
 
 @dataclass(frozen=True)
@@ -83,14 +84,16 @@ def write_field(path: str | Path, record: FieldRecord, options: IdentificationOp
                 "term": found.library.names[k],
                 "coefficient": float(found.coefficients[k, i]),
                 "standard_error": float(found.standard_errors[k, i]),
+                "stability": None if found.stability is None else float(found.stability[place]),
             }
-            for i, k in found.support
+            for place, (i, k) in enumerate(found.support)
         ],
         "covariance": found.covariance.tolist(),
         "doubts": None if found.doubts is None else found.doubts.tolist(),
         "noise_rate": found.noise_rate.tolist(),
         "residual_ratio": found.residual_ratio,
-        "diffusion": found.diffusion.matrix.tolist(),
+        "diffusion": diffusion_rows_of(found.diffusion),
+        "noise_formula": None if found.noise is None else found.noise.as_data(),
         "flow": {"steps": found.flow.steps, "euler": found.flow.euler},
         "noise": dict(record.noise),
         "prediction": dict(record.prediction),
@@ -101,6 +104,11 @@ def write_field(path: str | Path, record: FieldRecord, options: IdentificationOp
 
 def _doubts(written: Any, library: CandidateLibrary) -> np.ndarray | None:
     return None if written is None else np.array(written).reshape(-1, library.size, library.dimension)
+
+
+def _stability(terms: Sequence[Mapping[str, Any]]) -> np.ndarray | None:
+    shares = [row.get("stability") for row in terms]
+    return None if None in shares else np.array(shares, dtype=float)
 
 
 def read_field(path: str | Path) -> FieldRecord | None:
@@ -124,10 +132,13 @@ def read_field(path: str | Path) -> FieldRecord | None:
         coefficients = np.zeros((library.size, library.dimension))
         for (i, k), row in zip(support, data["terms"], strict=True):
             coefficients[k, i] = row["coefficient"]
+        noise = data.get("noise_formula")  # older files have none
         found = IdentifiedField(
             library, coefficients, support, np.array(data["covariance"]), np.array(data["noise_rate"]),
-            float(data["residual_ratio"]), FlowMap(**data["flow"]), Diffusion(np.array(data["diffusion"])),
-            _doubts(data.get("doubts"), library),
+            float(data["residual_ratio"]), FlowMap(**data["flow"]),
+            diffusion_of_rows(library.symbols, data["diffusion"]),
+            doubts=_doubts(data.get("doubts"), library), stability=_stability(data["terms"]),
+            noise=None if noise is None else NoiseFormula.from_data(noise, library.symbols),
         )  # fmt: skip
         p, d = len(support), library.dimension
         if found.covariance.shape != (p, p) or found.noise_rate.shape != (d, d):

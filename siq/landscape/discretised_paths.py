@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.equilibria import classify, hessian_at
+from siq.errors import NumericalFailure
 
 START_SHARE = 1e-6  # of the action: U on the ellipsoid where a chain begins
 CENTRAL = 0.005  # of the distance to the end: nearer to the attractor points lie no closer together
@@ -44,35 +45,46 @@ class DiscretisedPath:
 
 @dataclass(frozen=True)
 class Segments:
-    """f of the middles, the differences, their lengths and directions: ``(n - 1, d)`` and ``(n - 1,)``."""
+    """f of the middles, the differences and the sizes of both: ``(n - 1, d)`` and ``(n - 1,)``.
+
+    `whitening` is that of the middles, ``(n - 1, d, d)``, and `turn` is the difference of both directions.
+    """
 
     middles: np.ndarray
     force: np.ndarray
     forward: np.ndarray
+    whitening: np.ndarray
     speed: np.ndarray
     length: np.ndarray
+    turn: np.ndarray
 
     @property
     def actions(self) -> np.ndarray:
         """``|f||Δ| - f·Δ``, written so that nothing cancels where f and Δ are parallel."""
-        turn = self.forward / self.length[:, None] - self.force / self.speed[:, None]
-        return 0.5 * self.speed * self.length * np.sum(turn**2, axis=1)
+        return 0.5 * self.speed * self.length * np.sum(self.turn**2, axis=1)
+
+    @property
+    def metric(self) -> np.ndarray:
+        """D⁻¹ of the middles, ``(n - 1, d, d)``."""
+        return self.whitening.transpose(0, 2, 1) @ self.whitening
 
 
 class PathProblem:
-    """Chains between two states, in units in which D, their distance and ∂f/∂x are of size one.
+    """Chains between two states, in units in which D at the start, their distance and ∂f/∂x are of size one.
 
     ``x = start + units y``. M is the Hessian of V at the start, None where that is no attractor; then the
     first point of a chain is as fixed as the last.
     """
 
     def __init__(self, dynamics: Dynamics, start: np.ndarray, end: np.ndarray) -> None:
-        noise = dynamics.diffusion
+        noise = dynamics.diffusion.frozen(start)
         distance = float(np.linalg.norm(noise.whitening @ (end - start)))
         if not distance > 0:
             raise ValueError(f"the path is to end where it starts, at {start.tolist()}")
         self.dynamics, self.start, self.units = dynamics, start, distance * noise.root
         self.inverse = noise.whitening / distance
+        self.constant = dynamics.diffusion.constant
+        self.noise = dynamics.diffusion.in_units(start, self.units, distance**2)
         jacobians = self.inverse @ dynamics.jacobian(np.stack([start, end])) @ self.units
         self.rate = float(np.linalg.norm(jacobians, axis=(1, 2)).max())
         self.unit = distance**2 * self.rate  # of the action
@@ -111,17 +123,29 @@ class PathProblem:
         """What the action of a chain is made of."""
         middles, forward = (y[1:] + y[:-1]) / 2, np.diff(y, axis=0)
         force = self.force(middles)
-        speed, length = (np.linalg.norm(part, axis=1) + np.finfo(float).tiny for part in (force, forward))
-        return Segments(middles, force, forward, speed, length)
+        own_force, own_forward = force, forward
+        if self.constant:
+            whitening = np.broadcast_to(np.eye(y.shape[1]), (len(middles), y.shape[1], y.shape[1]))
+        else:
+            whitening = self.noise.whitening_at(middles)
+            own_force, own_forward = _of(whitening, force), _of(whitening, forward)
+        speed, length = (
+            np.linalg.norm(part, axis=1) + np.finfo(float).tiny for part in (own_force, own_forward)
+        )
+        turn = own_forward / length[:, None] - own_force / speed[:, None]
+        return Segments(middles, force, forward, whitening, speed, length, turn)
 
     def level(self, y: np.ndarray) -> np.ndarray:
         """The action from the start to points close to it, ``y·My``; zero without M."""
         return np.zeros(len(y)) if self.hessian is None else np.einsum("ni,ij,nj->n", y, self.hessian, y)
 
     def action(self, y: np.ndarray) -> float:
-        """S of a chain."""
+        """S of a chain; infinite where it leads through states at which D is not positive."""
         with np.errstate(all="ignore"):  # a trial may run away
-            return float(self.level(y[:1])[0] + self.segments(y).actions.sum())
+            try:
+                return float(self.level(y[:1])[0] + self.segments(y).actions.sum())
+            except NumericalFailure:
+                return np.inf
 
     def effort(self, y: np.ndarray) -> float:
         """The integral ``∫ |f| |φ'| ds``, with which an action is compared that may be zero."""
@@ -248,10 +272,14 @@ class PathProblem:
     def nodes(self, chain: DiscretisedPath) -> np.ndarray:
         """Points, momenta, and actions up to there, shape ``(n, 2d + 1)``."""
         y, parts = chain.points, self.segments(chain.points)
-        # Momenta of the middles, carried over half a segment with ṗ = -Jᵀp; both sides agree at a minimum.
+        # Momenta of the middles, carried over half a segment with ṗ = -Jᵀp - p·(∂D)p; both sides agree at a
+        # minimum.
         times = (parts.length / parts.speed)[:, None]
-        middle = (parts.forward / times - parts.force) / 2
-        turn = times / 2 * np.einsum("nij,ni->nj", self.jacobian(parts.middles), middle)
+        middle = _of(parts.metric, (parts.forward / times - parts.force) / 2)
+        change = np.einsum("nij,ni->nj", self.jacobian(parts.middles), middle)
+        if not self.constant:
+            change += self.noise.pull(parts.middles, middle)
+        turn = times / 2 * change
         p = np.empty_like(y)
         p[1:-1] = (middle[1:] + turn[1:] + middle[:-1] - turn[:-1]) / 2
         p[0] = middle[0] + turn[0] if self.hessian is None else self.hessian @ y[0]
@@ -263,7 +291,8 @@ class PathProblem:
         """The largest Hamiltonian, in proportion to its parts."""
         y, p = np.split(nodes[:, :-1], 2, axis=1)
         force = self.force(y)
-        drift, push = np.sum(p * force, axis=1), np.sum(p**2, axis=1)
+        drift = np.sum(p * force, axis=1)
+        push = np.sum((p if self.constant else _of(self.noise.at(y), p)) * p, axis=1)
         scale = max((np.abs(drift) + push).max(), NO_ACTION * np.sum(force**2, axis=1).max())
         return float(np.abs(drift + push).max() / scale)
 
@@ -288,30 +317,40 @@ class _Across:
 
     A chain may slide along itself without any change of S but that of its error, which must not matter. The
     matrix for frozen times is that of ``Σ |Δ - τf|²/2τ``, ``τ = |Δ|/|f|`` being held fast, without the second
-    derivatives of f: of an upper bound of S that touches it.
+    derivatives of f and D: of an upper bound of S that touches it. With ``q = D⁻¹(Δ/τ - f)``, twice the
+    momentum, and ``G_ik = ∂_k f_i + ((∂_k D)q)_i``, its blocks are ``τ GᵀD⁻¹G``, ``-D⁻¹G`` and ``D⁻¹/τ``.
     """
 
     def __init__(self, problem: PathProblem, y: np.ndarray) -> None:
         parts, dimension = problem.segments(y), y.shape[1]
         self.y, self.effort = y, float(np.sum(parts.speed * parts.length))
         self.range = slice(1 if problem.hessian is None else 0, -1)
-        speed, length = parts.speed[:, None, None], parts.length[:, None, None]
-        along, down = parts.forward / parts.length[:, None], parts.force / parts.speed[:, None]
-        by_forward = parts.speed[:, None] * along - parts.force
-        by_force = parts.length[:, None] * down - parts.forward
-        jacobian = problem.jacobian(parts.middles)
-        transposed, unit = jacobian.transpose(0, 2, 1), np.eye(dimension)
-        by_middle = np.einsum("nij,ni->nj", jacobian, by_force)
+        times = (parts.length / parts.speed)[:, None, None]
+        metric, middles, jacobian = parts.metric, parts.middles, problem.jacobian(parts.middles)
+        force, forward = (_of(metric, part) for part in (parts.force, parts.forward))
+        twice = forward / times[:, 0] - force
+        turned, by_middle = jacobian, np.einsum("nij,ni->nj", jacobian, twice)
+        bent = problem.bend(middles, -times[:, 0] * twice)
+        # The times change, too: by so much, up to a factor, with the middles and the differences.
+        slower = 2 * times[:, 0] * np.einsum("nij,ni->nj", jacobian, force)
+        if not problem.constant:
+            noise = problem.noise
+            turned = jacobian + noise.turn(middles, twice)
+            by_middle = by_middle + noise.pull(middles, twice) / 2
+            bent = bent - times / 2 * noise.bend(middles, twice)
+            slower -= times[:, 0] * noise.pull(middles, force) - noise.pull(middles, forward) / times[:, 0]
+        by_middle *= -times[:, 0]
         slope = np.zeros_like(y)
-        slope[1:] += by_middle / 2 + by_forward
-        slope[:-1] += by_middle / 2 - by_forward
+        slope[1:] += by_middle / 2 + twice
+        slope[:-1] += by_middle / 2 - twice
+        longer, share = -2 * forward / times[:, 0], (0.25 / (parts.speed * parts.length))[:, None, None]
+        pushed = metric @ turned
+        frozen = _Blocks(times * turned.transpose(0, 2, 1) @ pushed, -pushed, metric / times)
         exact = _Blocks(
-            transposed @ (length / speed * (unit - _outer(down, down))) @ jacobian
-            + problem.bend(parts.middles, by_force),
-            (_outer(along, down) - unit) @ jacobian,
-            speed / length * (unit - _outer(along, along)),
+            frozen.middle + bent - share * _outer(slower, slower),
+            frozen.mixed - share * _outer(longer, slower),
+            frozen.forward - share * _outer(longer, longer),
         )
-        frozen = _Blocks(length / speed * transposed @ jacobian, -jacobian, speed / length * unit)
         first = np.zeros((dimension, dimension))
         if problem.hessian is not None:
             slope[0] += 2 * problem.hessian @ y[0]
@@ -376,6 +415,10 @@ class _Blocks:
             for row in range(m):
                 matrix[m + row - column, column::m][: count - 1] = below[:, row, column]
         return matrix
+
+
+def _of(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    return np.asarray((matrices @ vectors[:, :, None])[:, :, 0])
 
 
 def _outer(left: np.ndarray, right: np.ndarray) -> np.ndarray:

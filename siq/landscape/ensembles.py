@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.simulation import noise_factor
+from siq.dynamics.simulation import noise_source
 from siq.errors import NumericalFailure
 from siq.landscape.density_of_wells import KnownDensity, SampledPotential
 from siq.numerics.density_comparison import GROUPS
@@ -55,7 +55,7 @@ def walk(
     thin: int,
     generator: np.random.Generator,
 ) -> np.ndarray:
-    """Walkers in ``dx = f dt + sqrt(ε) D^(1/2) dW`` by Heun's rule, of weak order two.
+    """Walkers in ``dx = f dt + sqrt(ε) D^(1/2) dW`` by Heun's rule, of weak order two where D is constant.
 
     f turns many times while it descends, and the rule of Euler and Maruyama would take part of the damping
     away.
@@ -86,12 +86,12 @@ def walk(
     rate = np.linalg.norm(dynamics.jacobian(start.T), axis=(1, 2))
     step = STEP / float(np.median(rate))
     function = dynamics.drift_of_components
-    factor = noise_factor(dynamics.diffusion, intensity=intensity, step=step)
+    noise = noise_source(dynamics.diffusion, intensity=intensity, step=step, generator=generator)
     x = np.array(start, dtype=float)
     samples = np.empty((len(x), steps // thin, x.shape[1]))
     with np.errstate(over="ignore", invalid="ignore"):  # told below
         for index in range(1 - burn_in, samples.shape[1] * thin + 1):
-            x = heun_step(function, x, step, factor @ generator.standard_normal(x.shape))
+            x = heun_step(function, x, step, noise(x))
             if index > 0 and index % thin == 0:
                 samples[:, index // thin - 1] = x
     lost = int((~np.isfinite(x).all(axis=0)).sum())  # what once is not finite stays so

@@ -150,7 +150,10 @@ def minimum_action_path(
     count = min(max(nodes, int(turning / TURN)), MOST_NODES // 4)
     chains: list[DiscretisedPath] = []
     for guess in guesses:
-        chain = problem.descend(guess, count, problem.action(problem.spaced(guess, count, 0.0)), first=True)
+        action = problem.action(problem.spaced(guess, count, 0.0))
+        if not np.isfinite(action):
+            continue
+        chain = problem.descend(guess, count, action, first=True)
         if np.isfinite(chain.action):
             chains.append(chain)
     if not chains:

@@ -2,11 +2,17 @@
 
 For ``dx = f dt + sqrt(ε) D^(1/2) dW`` and an attractor A whose lowest way out leads over the saddle S,
 
-    E[τ] = (2π/λ) (|det M_S| / det M_A)^(1/2) exp(∫ ∇·g dt) exp(ΔU/ε) (1 + O(ε)),
+    E[τ] = (2π/λ) (|det M_S| / det M_A)^(1/2) exp(∫ c dt) exp(ΔU/ε) (1 + O(ε)),    c = ∇·g + (∇·D)·p,
 
 where λ is the positive eigenvalue of the Jacobian at S, M are the Hessians of V (not of U = 2V), and the
-integral runs along the path ``ẋ = f + 2Dp`` from A to S; ``∇·g = ∇·f + tr D∇²V`` vanishes at both ends. It is
-Bouchet and Reygner's formula (their ε is ε/2 here), and for g = 0 that of Eyring and Kramers.
+integral runs along the path ``ẋ = f + 2Dp`` from A to S, where ``∇·g = ∇·f + ∇·(D∇V)``; c vanishes at both
+ends. For a constant D it is Bouchet and Reygner's formula (their ε is ε/2 here), and for g = 0 that of Eyring
+and Kramers.
+
+Where D depends on the state, the noise being Itô's, the stationary density ``C exp(-U/ε)`` obeys at the next
+order of ``½ε ∂_i∂_j(D_ij ρ) = ∂_i(f_i ρ)`` along the path ``d ln C/dt = -(∇·f + 2(∇·D)·p + tr D∇²V)``, with
+``(∇·D)_j = Σ_i ∂_i D_ij``. The escapes are the flux over S, ``C_S λ/2π (πε)^(d/2) |det M_S|^(-1/2)``, of what
+is about A, ``C_A (πε)^(d/2) (det M_A)^(-1/2)``. In one dimension C = 1/D.
 
 *Escape* means to have reached the neighbourhood of the attractor beyond S. A trajectory at S itself comes
 back half of the time, so that S, or the separatrix, is reached in half of E[τ].
@@ -19,10 +25,11 @@ of ``∇V·(f + D∇V) = 0`` remains ``JᵀM + MJ + 2MDM = 0``, or for ``W = M�
 By the inertia theorem W has as many negative eigenvalues as J has unstable ones: at A it is positive
 definite, at S one eigenvalue is negative, as it must be for a pass of V. Along the path M follows
 
-    Ṁ = -JᵀM - MJ - 2MDM - Σ_k p_k ∇²f_k,    M ẋ = ṗ,
+    Ṁ = -GᵀM - MG - 2MDM - Σ_k p_k ∇²f_k - p·∇²D p,    M ẋ = ṗ,
 
-where the second equation, which the first one conserves, has to be imposed: errors along the path grow. Where
-S attracts as fast as it repels, ``J W + W Jᵀ`` leaves M_S open, and it is taken from the end of the path.
+with ``G_ik = J_ik + 2 ((∂_k D)p)_i``, where the second equation, which the first one conserves, has to be
+imposed: errors along the path grow. Where S attracts as fast as it repels, ``J W + W Jᵀ`` leaves M_S open,
+and it is taken from the end of the path.
 
 References
 ----------
@@ -67,7 +74,7 @@ class EscapeRate:
     prefactor
         In time units; what stands before ``exp(ΔU/ε)``, the exponential of the integral included.
     exponent
-        ``∫ ∇·g dt`` along the path; zero if g has no divergence there.
+        ``∫ (∇·g + (∇·D)·p) dt`` along the path; zero if D is constant and g has no divergence there.
     notes
         What speaks against the law here without refuting it.
     """
@@ -156,7 +163,7 @@ def escape_rate(
 
 
 class _Frame:
-    """A path in units in which D, the distance from A to S, and the largest rate are one.
+    """A path in units in which D at A, the distance from A to S, and the largest rate are one.
 
     ``x = A + units y``, and V is in units of `unit`. The points, with momenta and velocities, are those from
     close to A to the neighbourhood of S; `at_attractor` and `at_saddle` are the Hessians of V.
@@ -165,7 +172,8 @@ class _Frame:
     def __init__(self, dynamics: Dynamics, path: MinimumActionPath) -> None:
         start, end = path.points[0], path.points[-1]
         ends = np.stack([start, end])
-        root, whitening = dynamics.diffusion.root, dynamics.diffusion.whitening
+        at_start = dynamics.diffusion.frozen(start)
+        root, whitening = at_start.root, at_start.whitening
         distance = float(np.linalg.norm(whitening @ (end - start)))
         jacobians = whitening @ dynamics.jacobian(ends) @ root
         self.rate = float(np.linalg.norm(jacobians, axis=(1, 2)).max())
@@ -181,6 +189,8 @@ class _Frame:
         self.resonant = bool(sums.min(initial=np.inf) < RESONANT * self.unstable)
         self.stable = float(-saddle.eigenvalues[1:].real.max(initial=-np.inf)) / self.rate
         self.dynamics, self.start, self.units = dynamics, start, distance * root
+        self.constant = dynamics.diffusion.constant
+        self.noise = dynamics.diffusion.in_units(start, self.units, distance**2)
         self.series = quasipotential_series(dynamics, start, degree=4)
         self.inverse, self.unit = whitening / distance, distance**2 * self.rate
         self.at_attractor = self.curvature(hessian_at(dynamics, start))
@@ -206,7 +216,9 @@ class _Frame:
             return y, p, v, np.linalg.norm(curve(share, 1)[:, :dimension], axis=1) / speed
 
         y, _, _, pace = along(np.arange(count))
-        largest = np.linalg.norm(self.jacobian(y), axis=(1, 2)) + 2 * np.linalg.norm(self.at_attractor)
+        largest = np.linalg.norm(self.jacobian(y), axis=(1, 2)) + 2 * np.linalg.norm(
+            self.diffusion(y) @ self.at_attractor, axis=(1, 2)
+        )
         # As many steps from one point of the path to the next as its two ends call for.
         parts = np.ceil(np.maximum(pace[1:], pace[:-1]) * largest.max() / LONGEST_STEP)
         if not parts.sum() < MOST_STEPS:
@@ -222,16 +234,29 @@ class _Frame:
 
     def velocity(self, y: np.ndarray, p: np.ndarray) -> np.ndarray:
         """``ẋ = f + 2Dp``."""
-        return self.dynamics.drift(self.start + y @ self.units.T) @ self.inverse.T / self.rate + 2 * p
+        push = p if self.constant else np.einsum("nij,nj->ni", self.diffusion(y), p)
+        return self.dynamics.drift(self.start + y @ self.units.T) @ self.inverse.T / self.rate + 2 * push
+
+    def diffusion(self, y: np.ndarray) -> np.ndarray:
+        """D, ``(n, d, d)``."""
+        if self.constant:
+            return np.broadcast_to(np.eye(y.shape[1]), (len(y), y.shape[1], y.shape[1]))
+        return self.noise.at(y)
 
     def jacobian(self, y: np.ndarray) -> np.ndarray:
         """J, ``(n, d, d)``."""
         return self.inverse @ self.dynamics.jacobian(self.start + y @ self.units.T) @ self.units / self.rate
 
     def bend(self, y: np.ndarray, p: np.ndarray) -> np.ndarray:
-        """``Σ_k p_k ∇²f_k``, ``(n, d, d)``."""
+        """``Σ_k p_k ∇²f_k + p·∇²D p``, ``(n, d, d)``."""
         second = self.dynamics.hessian(self.start + y @ self.units.T)
-        return self.units.T @ np.einsum("nk,nkij->nij", p @ self.inverse / self.rate, second) @ self.units
+        bent = self.units.T @ np.einsum("nk,nkij->nij", p @ self.inverse / self.rate, second) @ self.units
+        return bent if self.constant else bent + self.noise.bend(y, p)
+
+    def rise(self, y: np.ndarray, p: np.ndarray, curvatures: np.ndarray) -> np.ndarray:
+        """c, by which the logarithm of the density's prefactor falls along the path: shape ``(n,)``."""
+        rise = np.trace(self.jacobian(y) + self.diffusion(y) @ curvatures, axis1=1, axis2=2)
+        return rise if self.constant else rise + 2 * (self.noise.divergence(y) * p).sum(axis=1)
 
     def skew(self) -> float:
         """``|p - M_S (x - S)|`` at the end of the path to its parts, zero if V has this Hessian at S.
@@ -259,17 +284,18 @@ class _Frame:
         return along[-1] + (along[-1] - along[before]) * rest / (far - rest)
 
     def exponent(self, curvatures: np.ndarray) -> float:
-        """∫ ∇·g dt over the whole path; near S the integrand per length is continued as a straight line."""
-        divergence = np.trace(self.jacobian(self.points[::2]) + curvatures, axis1=1, axis2=2)
-        density = divergence / np.linalg.norm(self.velocities[::2], axis=1)
+        """∫ c dt over the whole path; near S the integrand per length is continued as a straight line."""
+        rise = self.rise(self.points[::2], self.momenta[::2], curvatures)
+        density = rise / np.linalg.norm(self.velocities[::2], axis=1)
         outer = self._rest()[0] * (density[-1] + self.continued(density)) / 2
-        return float(self.inner_exponent() + simpson(divergence * self.pace[::2], x=self.grid[::2]) + outer)
+        return float(self.inner_exponent() + simpson(rise * self.pace[::2], x=self.grid[::2]) + outer)
 
     def inner_exponent(self) -> float:
-        """∫ ∇·g dt from A to the first point y: with ``ẏ = By`` and ``∇·g = c·y`` it is ``c·B⁻¹y``."""
+        """∫ c dt from A to the first point y: with ``ẏ = By`` and ``c = b·y`` it is ``b·B⁻¹y``."""
         flow = self.jacobian(np.zeros((1, len(self.end))))[0] + 2 * self.at_attractor
         y = np.linalg.solve(flow, self.points[0]) * np.array([[1.0], [-1.0]])
-        odd = np.trace(self.jacobian(y) + self.given(self.series.hessian, y), axis1=1, axis2=2)
+        p = self.series.gradient(self.start + y @ self.units.T) @ self.units / self.unit
+        odd = self.rise(y, p, self.given(self.series.hessian, y))
         return float(odd[0] - odd[1]) / 2
 
     def given(self, hessian: Callable[[np.ndarray], np.ndarray], y: np.ndarray) -> np.ndarray:
@@ -286,11 +312,15 @@ class _Frame:
         """
         jacobians, bends = self.jacobian(self.points), self.bend(self.points, self.momenta)
         forces = -np.einsum("nji,nj->ni", jacobians, self.momenta)
+        noise = self.diffusion(self.points)
+        if not self.constant:
+            forces -= self.noise.pull(self.points, self.momenta)
+            jacobians = jacobians + 2 * self.noise.turn(self.points, self.momenta)
         largest = LARGEST * np.abs(self.at_attractor).max()
 
         def rate(m: np.ndarray, index: int) -> np.ndarray:
             product = m @ jacobians[index]
-            return -self.pace[index] * (product + product.T + 2 * m @ m + bends[index])
+            return -self.pace[index] * (product + product.T + 2 * m @ noise[index] @ m + bends[index])
 
         m = _imposed(self.given(self.series.hessian, self.points[:1])[0], self.velocities[0], forces[0])
         kept = [m]

@@ -137,7 +137,7 @@ def reference_landscape(
         ]
     )
     on_mesh, mesh_barriers = np.full(values.shape, np.nan), np.full(len(attractors), np.nan)
-    if dynamics.dimension == 2:
+    if dynamics.dimension == 2 and dynamics.diffusion.constant:  # the mesh knows no other
         for index, one in enumerate(attractors):
             mesh = mesh_quasipotential(
                 dynamics.drift, one, hessian=hessian_at(dynamics, one), box=box,

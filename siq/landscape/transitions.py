@@ -136,7 +136,7 @@ def missing_diffusion(dynamics: Dynamics) -> str | None:
     """
     defined = defined_states(dynamics)
     noise = dynamics.diffusion
-    if not defined or not np.array_equal(noise.matrix, np.eye(dynamics.dimension)):
+    if not defined or not noise.constant or not np.array_equal(noise.matrix, np.eye(dynamics.dimension)):
         return None
     return (
         f"the equation of {', '.join(defined)} is of the form dx/dt = v, which no noise drives, and D is the"
@@ -219,7 +219,11 @@ def barrier_standard_error(path: TransitionPath, found: IdentifiedField) -> floa
     spent = np.where(speed > 0, length / np.where(speed > 0, speed, 1.0), 0.0)
     terms = found.library.evaluate(middle)
     slope = -2 * np.einsum("n,nq,nd->qd", spent, terms, force)
-    return float(np.sqrt(found.variance(slope)))
+    variance = float(found.variance(slope))
+    if found.noise is not None:  # and by ∂U/∂D = -2 ∫ p·∂D p dt
+        slope = -2 * (spent[:, None] * found.noise.push_slopes(middle, force)).sum(axis=0) / found.intensity
+        variance += float(slope @ found.noise.covariance @ slope)
+    return float(np.sqrt(max(variance, 0.0)))
 
 
 def position_standard_errors(found: IdentifiedField, position: np.ndarray) -> np.ndarray:

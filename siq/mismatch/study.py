@@ -99,7 +99,7 @@ def measurements_of(recordings: Recordings | pd.DataFrame | str | Path, system: 
     if isinstance(recordings, Recordings):
         chosen = _chosen(recordings, columns, units, file=file)
     elif isinstance(recordings, str | Path):
-        chosen = read_recordings(recordings, columns=columns, units=units)
+        chosen = read_recordings(recordings, columns=columns, units=units, gaps=False)
     else:
         chosen = Recordings.from_frame(recordings, columns=columns, units=units)
     try:

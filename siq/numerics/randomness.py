@@ -13,6 +13,7 @@ class Purpose(StrEnum):
 
     SIMULATE = "simulate"
     RESAMPLE = "resample"
+    STABILITY = "stability"
     HOLD_OUT = "hold out"
     DIVIDE = "divide"
     TRAINING = "training"

@@ -40,6 +40,7 @@ Route = Literal["network", "local"]
 
 IMPLAUSIBLE = 1e-4  # a probability below which no orthogonal fit is believed
 NETWORK_DEGREE = 8  # highest power of a well by the network route, whose start knows no more
+ELSEWHERE = "where D depends on the state no single formula is sought: each well has its own"
 FIT_POINTS = 400  # where ∇V·g is asked to vanish in a joint fit
 
 
@@ -202,6 +203,9 @@ def refine(
             network_wells = _network_wells(found, portrait, wells, network, seed, notes)
     elif wells:
         network_wells = wells
+    if not found.diffusion.constant:  # g = f + D∇V would need functions that no library has
+        notes.append(ELSEWHERE)
+        return _without_formula(found, library, best, wells, network_wells, routes, notes)
     if network_wells and not _good(best, limit):
         # Refined one by one, the wells may turn out to share one formula. All of them together make the
         # start: one alone does not tell an odd power from an even one, and goes on wrongly in the others.
@@ -213,6 +217,18 @@ def refine(
         if whole is not None:
             return whole
     notes.append("no single formula in this library holds over the whole recorded region")
+    return _without_formula(found, library, best, wells, network_wells, routes, notes)
+
+
+def _without_formula(
+    found: IdentifiedField,
+    library: CandidateLibrary,
+    best: GlobalPotential | None,
+    wells: Sequence[Well],
+    network_wells: Sequence[Well],
+    routes: Sequence[Route],
+    notes: Sequence[str],
+) -> Refined:
     return Refined(
         found, library, None, None, None, None,
         np.inf if best is None else best.residual, False, tuple(wells),

@@ -17,6 +17,7 @@ import sympy
 
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.formulas import FormulaError, parse_formula
+from siq.dynamics.state_noise import diffusion_of_rows, diffusion_rows_of
 from siq.errors import InputError
 from siq.files.whole import whole_file
 from siq.potential.bases import PowerBasis
@@ -95,7 +96,7 @@ def _decomposition_to_data(one: SymbolicDecomposition) -> dict[str, Any]:
             }
             for well in one.wells
         ]
-        data["D"] = one.wells[0].dynamics.diffusion.matrix.tolist()
+        data["D"] = diffusion_rows_of(one.wells[0].dynamics.diffusion)
     if one.standard_errors:
         data["standard_errors"] = {name: dict(errors) for name, errors in one.standard_errors.items()}
     return data
@@ -124,7 +125,8 @@ def _wells_from_data(method: Mapping[str, Any], symbols: tuple[sympy.Symbol, ...
         return ()
     d = len(symbols)
     equations = [expression_from_data(part, symbols) for part in method["f"]]
-    dynamics = Dynamics.of(symbols, equations, diffusion=np.array(method.get("D", np.eye(d))))
+    diffusion = diffusion_of_rows(symbols, method.get("D", np.eye(d).tolist()))
+    dynamics = Dynamics.of(symbols, equations, diffusion=diffusion)
     return tuple(
         Well(
             dynamics, np.array(one["attractor"]), basis_from_data(one["V"], symbols),

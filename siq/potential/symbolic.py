@@ -15,7 +15,7 @@ import sympy
 
 from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.formulas import compile_formulas, exact_number
+from siq.dynamics.formulas import compile_formulas
 from siq.errors import NumericalFailure
 from siq.identify.library import CandidateLibrary, linear_combination
 from siq.potential.well import Well
@@ -98,8 +98,8 @@ def exact_decomposition(dynamics: Dynamics, quasipotential: sympy.Expr) -> Symbo
 def downhill_formulas(diffusion: Diffusion, gradient: Sequence[sympy.Expr]) -> tuple[sympy.Expr, ...]:
     """D∇V as formulas, from those of ∇V."""
     return tuple(
-        sum((exact_number(entry) * slope for entry, slope in zip(row, gradient, strict=True)), sympy.S.Zero)
-        for row in diffusion.matrix
+        sum((entry * slope for entry, slope in zip(row, gradient, strict=True)), sympy.S.Zero)
+        for row in diffusion.formulas
     )
 
 

@@ -2,7 +2,7 @@
 
 From the Hamiltonian ``H = p·f + p·Dp`` with ``p = ∇V``:
 
-    ẋ = f + 2Dp,    ṗ = -Jᵀp,    V̇ = p·Dp,
+    ẋ = f + 2Dp,    ṗ_k = -(Jᵀp)_k - p·(∂_k D)p,    V̇ = p·Dp,
 
 started on a small ellipsoid around the attractor A, where ``p = M (x - A)`` and ``V = ½ (x - A)·M (x - A)``
 with the first few corrections. No ansatz enters: within its limits this is a reference against which formulas
@@ -10,11 +10,12 @@ are judged.
 
 Neighbouring curves may meet. With the curves go their tangents ``X = ∂x, P = ∂p`` with respect to the start,
 
-    Ẋ = J X + 2D P,    Ṗ = -Jᵀ P - (Σ_k p_k ∇²f_k) X,    ∇²V = P X⁻¹,
+    Ẋ = G X + 2D P,    Ṗ = -Gᵀ P - (Σ_k p_k ∇²f_k + p·∇²D p) X,    ∇²V = P X⁻¹,
 
-and where ``det X`` vanishes lies a *caustic*: V has no derivative there, and what the curve carries beyond is
-not the quasipotential. Every curve ends at its first caustic. A curve can lose its meaning before that, where
-another sheet arrives with less action: see `siq.reference.sheets.lowest_sheet`.
+with ``G_ik = J_ik + 2 ((∂_k D)p)_i``, which is J where D is constant; and where ``det X`` vanishes
+lies a *caustic*: V has no derivative there, and what the curve carries beyond is not the quasipotential.
+Every curve ends at its first caustic. A curve can lose its meaning before that, where another sheet arrives
+with less action: see `siq.reference.sheets.lowest_sheet`.
 """
 
 from __future__ import annotations

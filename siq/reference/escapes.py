@@ -17,7 +17,7 @@ import numpy as np
 
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.equilibria import hessian_at
-from siq.dynamics.simulation import noise_factor, runge_kutta_step
+from siq.dynamics.simulation import noise_source, runge_kutta_step
 from siq.errors import NumericalFailure
 
 Field = Callable[[np.ndarray], np.ndarray]
@@ -149,15 +149,14 @@ def simulate_escapes(
     if step is None:
         step = STEP / float(np.abs(np.linalg.eigvals(dynamics.jacobian(centers))).max())
     function = dynamics.drift_of_components
-    factor = noise_factor(dynamics.diffusion, intensity=intensity, step=step)
+    draw = noise_source(dynamics.diffusion, intensity=intensity, step=step, generator=generator)
     settling = [_settling_steps(dynamics, one, step) if confirm else 0 for one in targets]
     x = starts.T.copy()
     steps = int(np.ceil(longest / step))
     times, reached = [np.zeros(0)], [np.zeros(0, dtype=int)]
     with np.errstate(over="ignore", invalid="ignore"):  # told below
         for index in range(1, steps + 1):
-            noise = factor @ generator.standard_normal(x.shape)
-            x = heun_step(function, x, step, noise)
+            x = heun_step(function, x, step, draw(x))
             staying = np.ones(x.shape[1], dtype=bool)
             for number, target in enumerate(targets):
                 inside = np.flatnonzero(target.height(x) <= 1)
@@ -177,7 +176,10 @@ def simulate_escapes(
 
 
 def heun_step(function: Field, x: np.ndarray, step: float, noise: np.ndarray) -> np.ndarray:
-    """One step of Heun's rule; `noise` is ``sqrt(ε) D^(1/2) ΔW``, shape ``(d, walkers)``."""
+    """One step of Heun's rule; `noise` is ``sqrt(ε) D^(1/2) ΔW``, shape ``(d, walkers)``.
+
+    The noise is the same in both of its stages, so that it is one of Itô.
+    """
     first = function(x)
     predicted = x + step * first
     predicted += noise

@@ -37,7 +37,9 @@ class HamiltonianFlow:
         upper = np.linalg.cholesky(self.hessian).T
         self.units = np.sqrt(2 * level) * np.linalg.inv(upper)
         self.inverse = upper / np.sqrt(2 * level)
-        self.diffusion = upper @ dynamics.diffusion.matrix @ upper.T
+        self.noise = dynamics.diffusion.in_units(center, self.units, 2 * level)
+        self.constant = dynamics.diffusion.constant
+        self.diffusion = self.noise.at(np.zeros((1, self.dimension)))
         self.jacobian = self.inverse @ dynamics.jacobian(center[None])[0] @ self.units
 
     def parts(self, state: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -52,17 +54,22 @@ class HamiltonianFlow:
         x, p = self.points(y), 2 * self.level * q @ self.inverse
         force = self.dynamics.drift(x) @ self.inverse.T
         jacobian = self.inverse @ self.dynamics.jacobian(x) @ self.units
-        transposed = jacobian.transpose(0, 2, 1)
         bend = np.einsum("nk,nkij->nij", p, self.dynamics.hessian(x))
         bend = self.units.T @ bend @ self.units / (2 * self.level)
-        push = q @ self.diffusion
+        diffusion, turned = self.diffusion, jacobian
+        if not self.constant:
+            diffusion, turned = self.noise.at(y), jacobian + 2 * self.noise.turn(y, q)
+            bend = bend + self.noise.bend(y, q)
+        push = (diffusion @ q[:, :, None])[:, :, 0]
         new = np.empty_like(state)
         y_rate, q_rate, v_rate, x_rate, p_rate = self.parts(new)
         y_rate[...] = force + 2 * push
-        q_rate[...] = -(transposed @ q[:, :, None])[:, :, 0]
+        q_rate[...] = -(jacobian.transpose(0, 2, 1) @ q[:, :, None])[:, :, 0]
+        if not self.constant:
+            q_rate -= self.noise.pull(y, q)
         v_rate[...] = 2 * np.sum(q * push, axis=1)
-        x_rate[...] = jacobian @ x_tangents + 2 * self.diffusion @ p_tangents
-        p_rate[...] = -transposed @ p_tangents - bend @ x_tangents
+        x_rate[...] = turned @ x_tangents + 2 * diffusion @ p_tangents
+        p_rate[...] = -turned.transpose(0, 2, 1) @ p_tangents - bend @ x_tangents
         return new
 
     def points(self, y: np.ndarray) -> np.ndarray:

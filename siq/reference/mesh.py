@@ -243,6 +243,8 @@ def _check(
     reach: int | None,
     level: float | None,
 ) -> None:
+    if not diffusion.constant:
+        raise ValueError("the mesh knows only a D that is the same everywhere; use characteristics instead")
     for name, array, wanted in (
         ("attractor", attractor, (2,)),
         ("hessian", hessian, (2, 2)),

@@ -4,16 +4,18 @@ Around a stable equilibrium A of a smooth f the quasipotential is smooth, and th
 ``∇V·(f + D∇V) = 0`` fixes its Taylor coefficients one degree after another. With ``y = x - A``, ``J`` the
 Jacobian at A and ``M`` the Hessian of V there, the part of degree k obeys the linear system
 
-    ((J + 2 D M) y) · ∇V_k = - Σ ∇V_a · f_b - Σ ∇V_a · D ∇V_c,
+    ((J + 2 D M) y) · ∇V_k = - Σ ∇V_a · f_b - Σ ∇V_a · D_e ∇V_c,
 
-with ``2 ≤ a < k, a + b = k + 1`` in the first sum and ``3 ≤ a, c < k, a + c = k + 2`` in the second. The
-eigenvalues of the left side are sums of k eigenvalues of -J, never zero at an attractor: the series exists
+with ``2 ≤ a < k, a + b = k + 1`` in the first sum and ``2 ≤ a, c < k, a + c + e = k + 2`` in the second,
+where D_e is the part of degree e of D; on the left D is its value at A. The eigenvalues of the left
+side are sums of k eigenvalues of -J, never zero at an attractor: the series exists
 and is unique once M is chosen as the solution of full rank.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -127,9 +129,11 @@ def quasipotential_series(dynamics: Dynamics, attractor: np.ndarray, *, degree: 
     scale = np.sqrt(np.diag(np.linalg.inv(hessian)))
     _check_equilibrium(force[0][:, 0], jacobian, center, scale)
     force = [part * basis.scales(k, scale) / scale[:, None] for k, part in enumerate(force)]
-    noise = dynamics.diffusion.matrix / np.outer(scale, scale)
+    noise = _taylor_of_noise(dynamics, center, basis, degree - 2)
+    own = np.outer(scale, scale)[:, :, None]
+    noise = [part * basis.scales(k, scale) / own for k, part in enumerate(noise)]
     hessian = hessian * np.outer(scale, scale)
-    flow = jacobian * scale / scale[:, None] + 2 * noise @ hessian
+    flow = jacobian * scale / scale[:, None] + 2 * noise[0][:, :, 0] @ hessian
 
     parts = {2: basis.quadratic(hessian)}
     gradients = {2: basis.gradient(parts[2], 2)}
@@ -138,7 +142,11 @@ def quasipotential_series(dynamics: Dynamics, attractor: np.ndarray, *, degree: 
         for a in range(2, k):
             known += basis.dot(gradients[a], a - 1, force[k + 1 - a], k + 1 - a)
         for a in range(3, k):
-            known += basis.dot(gradients[a], a - 1, noise @ gradients[k + 2 - a], k + 1 - a)
+            known += basis.dot(gradients[a], a - 1, noise[0][:, :, 0] @ gradients[k + 2 - a], k + 1 - a)
+        for e in range(1, len(noise)):
+            for a in range(2, k - e + 1):  # and c = k + 2 - a - e is at least 2
+                pushed = basis.push(noise[e], e, gradients[k + 2 - a - e], k + 1 - a - e)
+                known += basis.dot(gradients[a], a - 1, pushed, k + 1 - a)
         parts[k] = np.linalg.solve(basis.advection(flow, k), -known)
         gradients[k] = basis.gradient(parts[k], k)
     return PowerSeries(
@@ -204,6 +212,10 @@ class _Homogeneous:
             minlength=len(self.exponents[degree]),
         )
 
+    def push(self, noise: np.ndarray, degree: int, gradient: np.ndarray, gradient_degree: int) -> np.ndarray:
+        """Σ_j D_ij p_j of polynomials, ``(d, d, n)`` and ``(d, m)``, to ``(d, l)``."""
+        return np.stack([self.dot(row, degree, gradient, gradient_degree) for row in noise])
+
     def advection(self, flow: np.ndarray, degree: int) -> np.ndarray:
         """Matrix of ``P ↦ (flow y)·∇P`` on polynomials P of a degree."""
         exponents, units = self.exponents[degree], np.eye(self.dimension, dtype=int)
@@ -218,20 +230,50 @@ class _Homogeneous:
 
 def _taylor(dynamics: Dynamics, center: np.ndarray, basis: _Homogeneous, degree: int) -> list[np.ndarray]:
     """Taylor coefficients of f at the center: for each degree the components, ``(d, n)``."""
-    if all(equation.is_polynomial(*dynamics.symbols) for equation in dynamics.formulas):
-        parts = _shifted(dynamics, center, basis, degree)
+    return _expanded("f", dynamics.formulas, dynamics.symbols, center, basis, degree)
+
+
+def _taylor_of_noise(
+    dynamics: Dynamics, center: np.ndarray, basis: _Homogeneous, degree: int
+) -> list[np.ndarray]:
+    """Taylor coefficients of D at the center, ``(d, d, n)`` for each degree, or for the first."""
+    diffusion, d = dynamics.diffusion, dynamics.dimension
+    if diffusion.constant:
+        return [diffusion.matrix[:, :, None]]
+    flat = [entry for row in diffusion.formulas for entry in row]
+    parts = _expanded("D", flat, dynamics.symbols, center, basis, degree)
+    return [part.reshape(d, d, -1) for part in parts]
+
+
+def _expanded(
+    what: str,
+    formulas: Sequence[sympy.Expr],
+    symbols: Sequence[sympy.Symbol],
+    center: np.ndarray,
+    basis: _Homogeneous,
+    degree: int,
+) -> list[np.ndarray]:
+    """Taylor coefficients of formulas at the center: for each degree of each formula, ``(m, n)``."""
+    if all(formula.is_polynomial(*symbols) for formula in formulas):
+        parts = _shifted(formulas, symbols, center, basis, degree)
     else:
-        parts = _differentiated(dynamics, center, basis, degree)
+        parts = _differentiated(formulas, symbols, center, basis, degree)
     if not all(np.isfinite(part).all() for part in parts):
-        raise ValueError(f"f has no finite derivatives up to order {degree} at {center.tolist()}")
+        raise ValueError(f"{what} has no finite derivatives up to order {degree} at {center.tolist()}")
     return parts
 
 
-def _shifted(dynamics: Dynamics, center: np.ndarray, basis: _Homogeneous, degree: int) -> list[np.ndarray]:
+def _shifted(
+    formulas: Sequence[sympy.Expr],
+    symbols: Sequence[sympy.Symbol],
+    center: np.ndarray,
+    basis: _Homogeneous,
+    degree: int,
+) -> list[np.ndarray]:
     # x^β = Σ_α binomial(β, α) center^(β - α) y^α: nothing is differentiated, nothing truncated.
-    parts = [np.zeros((dynamics.dimension, len(basis.exponents[k]))) for k in range(degree + 1)]
-    for component, equation in enumerate(dynamics.formulas):
-        terms = sympy.Poly(equation, *dynamics.symbols).terms()
+    parts = [np.zeros((len(formulas), len(basis.exponents[k]))) for k in range(degree + 1)]
+    for component, formula in enumerate(formulas):
+        terms = sympy.Poly(formula, *symbols).terms()
         powers = np.array([monomial for monomial, _ in terms])
         coefficients = np.array([float(coefficient) for _, coefficient in terms])
         highest = max(int(powers.max()), degree)
@@ -245,18 +287,22 @@ def _shifted(dynamics: Dynamics, center: np.ndarray, basis: _Homogeneous, degree
 
 
 def _differentiated(
-    dynamics: Dynamics, center: np.ndarray, basis: _Homogeneous, degree: int
+    formulas: Sequence[sympy.Expr],
+    symbols: Sequence[sympy.Symbol],
+    center: np.ndarray,
+    basis: _Homogeneous,
+    degree: int,
 ) -> list[np.ndarray]:
-    derivatives = {(0,) * dynamics.dimension: list(dynamics.formulas)}
+    derivatives = {(0,) * len(symbols): list(formulas)}
     for block in basis.exponents[1 : degree + 1]:
         for row in block:
             state = int(np.flatnonzero(row)[-1])
             lower = tuple(int(power) - (index == state) for index, power in enumerate(row))
-            derivatives[tuple(map(int, row))] = [d.diff(dynamics.symbols[state]) for d in derivatives[lower]]
-    formulas = [expression for row in derivatives.values() for expression in row]
+            derivatives[tuple(map(int, row))] = [d.diff(symbols[state]) for d in derivatives[lower]]
+    every = [expression for row in derivatives.values() for expression in row]
     with np.errstate(all="ignore"):
-        values = compile_formulas(formulas, dynamics.symbols)(center[:, None])[:, 0]
-    table = values.reshape(len(derivatives), dynamics.dimension).T
+        values = compile_formulas(every, tuple(symbols))(center[:, None])[:, 0]
+    table = values.reshape(len(derivatives), len(formulas)).T
     factorials = np.array([math.prod(math.factorial(power) for power in row) for row in derivatives])
     blocks = np.cumsum([len(block) for block in basis.exponents[:degree]])
     return np.split(table / factorials, blocks, axis=1)

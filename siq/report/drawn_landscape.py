@@ -325,7 +325,7 @@ def _error_of_one_state(dynamics: Dynamics, x: np.ndarray, start: float) -> np.n
     slopes = [dynamics.equations[0].diff(symbol(each.name)).xreplace(values) for each in dynamics.parameters]
     if not slopes or not np.isfinite(covariance).all() or not covariance.any():
         return None
-    rates = compile_formulas(slopes, dynamics.symbols)(x[None]) / noise.matrix[0, 0]
+    rates = compile_formulas(slopes, dynamics.symbols)(x[None]) / noise.at(x[:, None])[:, 0, 0]
     change = -2 * cumulative_trapezoid(rates, x, axis=1, initial=0.0)
     change -= np.array([np.interp(start, x, row) for row in change])[:, None]
     return np.sqrt(np.maximum(np.einsum("pn,pq,qn->n", change, covariance, change), 0.0))

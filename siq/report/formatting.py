@@ -146,6 +146,22 @@ def matrix_mathml(matrix: Sequence[Sequence[float]]) -> Markup:
     return _math(printer, printer.bracketed(printer.element("mtable", *rows)), spoken)
 
 
+def formula_matrix_mathml(rows: Sequence[Sequence[sympy.Expr]], *, decimals: int = 3) -> Markup:
+    """Typeset a matrix of formulas in brackets; a formula that stands alone without them."""
+    if len(rows) == 1:
+        return formula_mathml(rows[0][0], decimals=decimals)
+    printer = _MathMLPrinter(decimals)
+    table = [
+        printer.element(
+            "mtr",
+            *(printer.element("mtd", printer.lines(_with_integer_exponents(entry))) for entry in row),
+        )
+        for row in rows
+    ]
+    spoken = "; ".join(", ".join(formula_text(entry, decimals=decimals) for entry in row) for row in rows)
+    return _math(printer, printer.bracketed(printer.element("mtable", *table)), spoken)
+
+
 def _entry_text(value: float) -> str:
     return str(int(value)).replace("-", MINUS) if value.is_integer() else value_text(value)
 

@@ -17,7 +17,7 @@ from siq.identify.diffusion import DiffusionSource
 from siq.identify.storage import FieldRecord
 from siq.potential.symbolic import SymbolicDecomposition
 from siq.report.certificate_text import certificate_badge, tests_table
-from siq.report.formatting import matrix_mathml, vector_mathml
+from siq.report.formatting import formula_matrix_mathml, matrix_mathml, vector_mathml
 from siq.report.invariant_tables import invariant_tables
 from siq.report.landscape_answer import headline, remarks
 from siq.report.landscape_tables import errors_table, escape_table, landscape_sentences, landscape_tables
@@ -38,6 +38,8 @@ SOURCES = {
     DiffusionSource.UNIT: "Taken as the unit matrix: none was given, and the recordings show no noise that"
     " would tell. U and the barriers follow from it.",
 }
+
+BY_STATE = "It depends on the state, in the sense of Itô: the noise is not the same everywhere."
 
 
 @dataclass(frozen=True)
@@ -144,7 +146,11 @@ class StudyParts:
             rows.append(FormulaRow("f", field, "The vector field dx/dt without noise, as identified."))
         if record is not None:
             note = SOURCES[record.diffusion_source]
-            rows.append(FormulaRow("D", matrix_mathml(record.found.diffusion.matrix.tolist()), note))
+            noise = record.found.diffusion
+            if noise.constant:
+                rows.append(FormulaRow("D", matrix_mathml(noise.matrix.tolist()), note))
+            else:
+                rows.append(FormulaRow("D", formula_matrix_mathml(noise.formulas), f"{note} {BY_STATE}"))
         if not rows:
             return None
         text = []

@@ -9,28 +9,29 @@ Import the step that you mean, ``from siq.steps import identify``: this package 
 a change of one step makes nothing again that does not use it. It may import everything below it, and nothing
 of `siq.report` or `siq.cli`.
 
-====================  =================================================================================
-module                question
-====================  =================================================================================
-draw                  which trajectories has a run?
-identify              which f do its pairs show, and does it predict recordings that were held out?
-train                 which V and g do two networks find?
-regress               which sparse formulas are these (the published method)?
-refine                which V solves the Hamilton–Jacobi equation of f, and may it be believed?
-landscape             which wells, barriers and ways are there?
-score                 how far is all this from exact answers, where these are known?
-overview              which landscape does the page open with?
-collect               what do all runs say together?
-reference             what do methods say of a card that share nothing with ours?
-landscape_errors      how far are the landscapes from these references?
-escapes               does a direct simulation leave the wells as the law says?
-invariant             which invariant distribution follows, and is it that of a long simulation?
-pipeline              all of a run, in memory
-outcomes              what became of a step?
-settings, of_study    what are several steps told alike, and how does a study say it?
-shown                 which run stands for all of them?
-training_block        how do runs train side by side, and what does a killed job go on from?
-trained, landscapes   how do later steps read networks and landscapes?
-landscape_tables      which rows of tables does a landscape give?
-====================  =================================================================================
+======================  =================================================================================
+module                  question
+======================  =================================================================================
+draw                    which trajectories has a run?
+identify                which f do its pairs show, and does it predict recordings that were held out?
+identify_beside_sensor  the same, where the sensor is noisy: when, and what is kept of it?
+train                   which V and g do two networks find?
+regress                 which sparse formulas are these (the published method)?
+refine                  which V solves the Hamilton–Jacobi equation of f, and may it be believed?
+landscape               which wells, barriers and ways are there?
+score                   how far is all this from exact answers, where these are known?
+overview                which landscape does the page open with?
+collect                 what do all runs say together?
+reference               what do methods say of a card that share nothing with ours?
+landscape_errors        how far are the landscapes from these references?
+escapes                 does a direct simulation leave the wells as the law says?
+invariant               which invariant distribution follows, and is it that of a long simulation?
+pipeline                all of a run, in memory
+outcomes                what became of a step?
+settings, of_study      what are several steps told alike, and how does a study say it?
+shown                   which run stands for all of them?
+training_block          how do runs train side by side, and what does a killed job go on from?
+trained, landscapes     how do later steps read networks and landscapes?
+landscape_tables        which rows of tables does a landscape give?
+======================  =================================================================================
 """

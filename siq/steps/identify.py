@@ -15,37 +15,30 @@ from siq.data.held_out import held_out_recordings
 from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
 from siq.data.selection import select_recordings
 from siq.errors import NumericalFailure
-from siq.estimation.innovations import Noise
 from siq.identify.diffusion import DiffusionSource, check_units, estimated_diffusion
 from siq.identify.flow_regression import refit, residuals
 from siq.identify.identification import (
     IdentificationOptions,
     carries_noise,
     identify_vector_field,
+    with_stability,
 )
 from siq.identify.identified_field import IdentifiedField
-from siq.identify.noisy_sensor import FilteredField, held_out_evidence, identify_by_likelihood
 from siq.identify.prediction import prediction_errors
 from siq.identify.random_forces import with_random_forces
 from siq.identify.residuals import (
-    LARGE,
-    SIGNIFICANT,
     NoiseDiagnosis,
     mean_residual_probability,
     residual_noise,
-    shared_errors,
 )
 from siq.identify.rounding import rounding_text
-from siq.identify.selection import critical_values
 from siq.identify.storage import FieldRecord, field_library, read_field, write_field
+from siq.identify.weighted_regression import fit_weighted, with_given_noise, with_noise_formula
 from siq.numerics.randomness import Purpose, generator
+from siq.steps.identify_beside_sensor import beside_sensor_noise, filtered_record, units_of_states
 from siq.steps.outcomes import Outcome, Status, Step, read_outcomes, write_outcomes
 from siq.steps.settings import STRICT, Sampling, StateSpace
 
-SUSPECT = -1.0  # standard errors of the correlation of neighbouring residuals
-UNDRIVEN = 0.05  # share of random forces in the residuals, below which nothing but sensors is noisy
-LEAST, MOST = 1e-3, 0.45  # of the residuals' variance: a sensor's share of it that a fit begins with
-MUCH = 0.02  # the same share, beyond which a regression of pairs is no answer
 PREDICTED = 200  # held-out recordings that are predicted: enough for a median
 
 
@@ -106,15 +99,25 @@ def _identified(settings: IdentifySettings, recordings: Recordings, number: int)
         # Under noise every recording counts: all give the result, a part of them its test.
         everything = snapshot_pairs(recordings, pair_step=step)
         found = with_random_forces(identify_pairs(everything), everything)
-        filtered = _beside_sensor_noise(found, recordings, settings)
+        draw = generator(settings.seed, number, Purpose.STABILITY)
+        filtered = beside_sensor_noise(found, recordings, options=options, pair_step=step, generator=draw)
         if filtered is not None:
-            return _filtered_record(filtered, recordings, (training, held_out), settings)
-        fitted = refit(found, parts[0])
+            return filtered_record(
+                filtered, recordings, (training, held_out), sampling=sampling, space=settings.space,
+                limits=settings.prediction,
+            )  # fmt: skip
     else:
-        found = fitted = identify_pairs(parts[0])
+        found = identify_pairs(parts[0])
     found, noise, source = _with_diffusion(
         found, recordings, settings, pairs=sum(len(part.h) for part in parts)
     )
+    fitted = found
+    if not found.noise_free:
+        if found.diffusion.constant:
+            draw = generator(settings.seed, number, Purpose.STABILITY)
+            pairs = snapshot_pairs(recordings, pair_step=step)
+            found = with_stability(found, pairs, options=options, generator=draw)
+        fitted = (refit if found.diffusion.constant else fit_weighted)(found, parts[0])
     verdict = _held_out_verdict(
         found, fitted, parts, held_out, fault=noise.fault(recordings.names), limits=settings.prediction
     )
@@ -132,81 +135,6 @@ def _identified(settings: IdentifySettings, recordings: Recordings, number: int)
     return FieldRecord(found, verdict.as_data(), kept)
 
 
-def _beside_sensor_noise(
-    found: IdentifiedField, recordings: Recordings, settings: IdentifySettings
-) -> FilteredField | None:
-    """F by the likelihood of whole recordings, where their sensors are noisy; None where they are not.
-
-    What could be sensor noise is asked of the likelihood from one standard error on: it would bias f long
-    before it is significant.
-    """
-    step = settings.sampling.pair_step
-    correlation, score = shared_errors(found, recordings, pair_step=step)
-    if not (score < SUSPECT).any() or not (1 + 2 * correlation > UNDRIVEN).any():
-        return None
-    share = np.clip(-correlation, LEAST, MOST)
-    variance = np.diag(found.noise_rate) * float(np.median(snapshot_pairs(recordings, pair_step=step).h))
-    start = Noise(share * variance, np.diag(found.noise_rate) * (1 - 2 * share))
-    try:
-        filtered = identify_by_likelihood(
-            found.library, recordings, found, start, pair_step=step,
-            critical=critical_values(found.library, false_terms=settings.identification.false_terms),
-        )  # fmt: skip
-    except (NumericalFailure, np.linalg.LinAlgError) as error:
-        if (correlation < -MUCH).any():
-            raise NumericalFailure(f"the sensor is noisy, and f beside it is not found: {error}") from None
-        return None
-    return filtered if filtered.gain > 1 else None
-
-
-def _filtered_record(
-    filtered: FilteredField,
-    recordings: Recordings,
-    parts: tuple[Recordings, Recordings],
-    settings: IdentifySettings,
-) -> FieldRecord:
-    """What is kept of an f that was identified beside sensor noise."""
-    step = settings.sampling.pair_step
-    pairs = len(snapshot_pairs(recordings, pair_step=step).h)
-    given = settings.space.noise(len(recordings.names))
-    estimated = None if given is not None else estimated_diffusion(filtered.found, pairs=pairs)
-    source = DiffusionSource.GIVEN if given is not None else DiffusionSource.ESTIMATED
-    if given is None and estimated is None:
-        source = DiffusionSource.UNIT
-        check_units(recordings.names, _units(recordings, settings.space))
-    diffusion = given or estimated or filtered.found.diffusion
-    found = replace(filtered.found, diffusion=diffusion)
-    intensity = diffusion.intensity(found.noise_rate)
-    probability, ratio = held_out_evidence(filtered, *parts, pair_step=step)
-    coloured = abs(filtered.score) > SIGNIFICANT and abs(filtered.correlation) > LARGE
-    verdict = check_prediction(
-        noise_fault=(
-            f"the innovations of neighbouring samples are correlated ({filtered.correlation:.2f}) though"
-            " noise of the sensor is allowed for: the random forces have a memory, or a state is missing"
-        )
-        if coloured else None,
-        errors=None, mean_probability=probability, held_out_ratio=ratio, limits=settings.prediction,
-    )  # fmt: skip
-    sizes = np.sqrt(filtered.sensor)
-    said = ", ".join(f"{size:.2g} in {name}" for size, name in zip(sizes, recordings.titles, strict=True))
-    return FieldRecord(
-        found,
-        verdict.as_data(),
-        {
-            "kind": "coloured" if coloured else "process",
-            "intensity": intensity,
-            "covariance": (found.noise_rate / intensity).tolist(),
-            "correlation": filtered.correlation,
-            "correlation_score": filtered.score,
-            "measurement": sizes.tolist(),
-            "measurement_error": (sizes * filtered.sensor_error / 2).tolist(),
-            "diffusion": str(source),
-            "note": f"the noise of the sensor, {said}, was estimated beside f, which it does not bias",
-            "pairs": pairs,
-        },
-    )
-
-
 def _with_diffusion(
     found: IdentifiedField, recordings: Recordings, settings: IdentifySettings, *, pairs: int
 ) -> tuple[IdentifiedField, NoiseDiagnosis, DiffusionSource]:
@@ -215,24 +143,23 @@ def _with_diffusion(
     f does not depend on D, and whether noise is white does not either: so D can come last.
     """
     step, space = settings.sampling.pair_step, settings.space
-    given = space.noise(len(recordings.names))
+    given, false_terms = space.noise(recordings.names), settings.identification.false_terms
+    everything = snapshot_pairs(recordings, pair_step=step)
     if given is not None:
-        found = replace(found, diffusion=given)
+        found = with_given_noise(found, everything, given, false_terms=false_terms)
         return found, residual_noise(found, recordings, pair_step=step), DiffusionSource.GIVEN
     estimated = estimated_diffusion(found, pairs=pairs)
     if estimated is not None:
         with_own = replace(found, diffusion=estimated)
         noise = residual_noise(with_own, recordings, pair_step=step)
         if noise.kind == "process":
+            by_state = with_noise_formula(with_own, everything, false_terms=false_terms)
+            if by_state is not None:
+                by_formula = residual_noise(by_state, recordings, pair_step=step)
+                return by_state, by_formula, DiffusionSource.ESTIMATED
             return with_own, noise, DiffusionSource.ESTIMATED
-    check_units(recordings.names, _units(recordings, space))
+    check_units(recordings.names, units_of_states(recordings, space))
     return found, residual_noise(found, recordings, pair_step=step), DiffusionSource.UNIT
-
-
-def _units(recordings: Recordings, space: StateSpace) -> list[str | None]:
-    """The unit of each state, None where nobody said."""
-    named = zip(recordings.names, recordings.units, strict=True)
-    return [unit or space.unit(name) or None for name, unit in named]
 
 
 def _held_out_verdict(
@@ -253,7 +180,14 @@ def _held_out_verdict(
         )
     training, unseen = parts
     squares = [
-        float((residuals(fitted, pairs) ** 2 / pairs.h[:, None]).mean()) for pairs in (unseen, training)
+        float(
+            fitted.diffusion.squared_speed(
+                pairs.x0, residuals(fitted, pairs) / np.sqrt(pairs.h)[:, None]
+            ).mean()
+        )
+        if not fitted.diffusion.constant
+        else float((residuals(fitted, pairs) ** 2 / pairs.h[:, None]).mean())
+        for pairs in (unseen, training)
     ]
     return check_prediction(
         noise_fault=fault,

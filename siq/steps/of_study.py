@@ -10,6 +10,7 @@ from siq.certificate.tests import PredictionLimits
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.sampling import complete
 from siq.dynamics.simulation import SimulationOptions
+from siq.dynamics.state_noise import diffusion_rows_of
 from siq.potential.refinement import RefinementOptions
 from siq.steps.outcomes import METHODS, Method
 from siq.steps.settings import Sampling, StateSpace
@@ -58,7 +59,7 @@ class StudyParts:
         if self.system is not None:
             units = dict(zip(self.system.states, self.system.units, strict=True))
             units["t"] = self.system.time_unit
-            return StateSpace(self.system.states, units, self.system.diffusion.matrix.tolist())
+            return StateSpace(self.system.states, units, diffusion_rows_of(self.system.diffusion))
         recordings = self.study.recordings
         assert recordings is not None  # the schema asks for one of the two
         return StateSpace(recordings.states, None, recordings.diffusion)
@@ -114,4 +115,4 @@ def card_content(system: Dynamics | None) -> list[Any] | None:
         return None
     formulas = [str(equation) for equation in system.formulas]
     domain = None if system.domain is None else system.domain.tolist()
-    return [list(system.states), domain, formulas, system.diffusion.matrix.tolist()]
+    return [list(system.states), domain, formulas, diffusion_rows_of(system.diffusion)]

@@ -80,7 +80,7 @@ def _regressed(
         values.circulatory[below],
         values.vector_field[below],
         # D that nobody gave is that of the networks, in their precision.
-        diffusion=settings.space.noise(points.shape[1]) or Diffusion(networks.diffusion),
+        diffusion=settings.space.constant_noise(points.shape[1]) or Diffusion(networks.diffusion),
         options=options,
     )
     formulas = decomposition_from_coefficients(

@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from siq.networks.data import TrainingData
     from siq.potential.training_check import TrainingCheck
 
+MOST_POINTS = 10_000  # over which a D that depends on the state is averaged
+
 
 @dataclass(frozen=True, config=STRICT)
 class TrainSettings:
@@ -138,12 +140,18 @@ def _diffusion(
     Networks only lead to the right solution, which is then found with the D of its own run.
     """
     dimension = next(iter(data.values())).training.x0.shape[1]
-    given = settings.space.noise(dimension)
+    given = settings.space.constant_noise(dimension)
     if given is not None:
         return given
     records = [record for number in data if (record := runs[number].record) is not None]
     if not records:
         return Diffusion.identity(dimension)
+    if not all(record.found.diffusion.constant for record in records):
+        # Networks only lead to the right solution, which is then found with D as it is.
+        points = np.concatenate([data[number].training.x0 for number in data])
+        every = max(len(points) // MOST_POINTS, 1)
+        noises = [record.found.diffusion.at(points[::every]).mean(axis=0) for record in records]
+        return Diffusion(np.mean(noises, axis=0))
     return Diffusion(np.mean([record.found.diffusion.matrix for record in records], axis=0))
 
 
@@ -197,7 +205,8 @@ def _fingerprint(
         record = runs[number].record
         arrays = [part.training.x0, part.training.xh, part.training.h]
         if record is not None:
-            arrays += [record.found.coefficients, record.found.covariance, record.found.diffusion.matrix]
+            noise = record.found.diffusion.at(part.training.x0[:1])
+            arrays += [record.found.coefficients, record.found.covariance, noise]
         for values in arrays:
             digest.update(np.ascontiguousarray(values).tobytes())
     return digest.hexdigest()

@@ -16,10 +16,10 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from siq.certificate.tests import CertificateOptions
 from siq.data.headings import read_heading, usable_name
-from siq.dynamics.cards import DiffusionEntry, Name, SystemCard, build_system, diffusion_matrix
-from siq.dynamics.diffusion import Diffusion
+from siq.dynamics.cards import DiffusionEntry, Name, SystemCard, build_system, read_diffusion
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.formulas import FormulaError
+from siq.dynamics.parametric import symbol
 from siq.dynamics.sampling import SimulationEntry, complete, fault_over_domain
 from siq.errors import InputError
 from siq.files.documents import read_document, validate
@@ -50,8 +50,9 @@ class RecordingsOptions(BaseModel):
         Consecutive samples no further apart than this are pairs; by default those no further apart than
         one and a half of their median distance, since what is longer is a gap.
     diffusion
-        D, in the recordings' units, where no system gives it; by default as the noise of the recordings shows
-        it, or else the identity, which states of different units refuse. See `siq.identify.diffusion`.
+        D, in the recordings' units, where no system gives it, in numbers or formulas of the states; by
+        default as the noise of the recordings shows it, or else the identity, which states of different units
+        refuse. See `siq.identify.diffusion`.
     integrator_step
         Step of the Euler–Maruyama simulation that made the recordings, where one did: its increments are
         those of a map, from which the continuous process is then found. Leave it out for measurements.
@@ -318,7 +319,7 @@ def check_states(study: Study, states: Sequence[str], *, file: str) -> None:
     """
     try:
         if study.recordings is not None and study.recordings.diffusion is not None:
-            noise = Diffusion(diffusion_matrix(study.recordings.diffusion, len(states)))
+            noise = read_diffusion(study.recordings.diffusion, [symbol(name) for name in states], None)
             if not noise.regular:
                 raise ValueError("the noise does not reach every state; give a positive definite matrix")
     except ValueError as error:

@@ -210,7 +210,6 @@ def test_units_come_from_names_metadata_and_cells(tmp_path: Path) -> None:
         ("recording,t,x,x [m]\na,0,1,2\n", "column x", "stands twice", "rename"),
         ("recording,t,x\n", "", "has no rows", "at least two samples"),
         ("recording,t,x\na,0,1\na,1\n", "row 2", "2 cells while the header has 3", "one cell per column"),
-        ("recording,t,x\na,0,1\na,1,\n", "row 2, column x", "missing", "remove the row"),
         ("recording,t,x\na,0,1\na,NaN,2\n", "row 2, column t", "missing", "remove the row"),
         ("recording,t,x\na,inf,1\na,1,2\n", "row 1, column t", "infinite", "finite"),
         ("recording,t,x\na,0,1\na,1,-1e999\n", "row 2, column x", "infinite", "finite"),
@@ -381,8 +380,8 @@ def test_a_table_in_memory_is_read_as_the_same_file_is(tmp_path: Path) -> None:
 def test_a_table_in_memory_is_refused_for_what_a_file_is() -> None:
     table = frame(recordings()).drop(columns="recording").iloc[:3]
     assert Recordings.from_frame(table).labels == ("0",)
-    with pytest.raises(InputError, match="the table, row 2, column x: the value is missing"):
-        Recordings.from_frame(table.assign(x=[1.0, np.nan, 2.0]))
+    with pytest.raises(InputError, match="the table: no row has a value in every column"):
+        Recordings.from_frame(table.assign(x=[1.0, np.nan, np.nan], y=[np.nan, 1.0, 1.0]))
     with pytest.raises(InputError, match="the table: the column 't' is missing"):
         Recordings.from_frame(table.drop(columns="t"))
     with pytest.raises(InputError, match="the unit is mm"):

@@ -56,6 +56,10 @@ READ: dict[str, tuple[str, str | bytes, tuple[str, ...], list[list[float]], str]
         "a.csv", "t,Time (ms),x\n0,0,1\n1,1000,2\n", ("x",), [[1], [2]], "looks like a second",
     ),
     "a temperature T": ("a.csv", "t,x,T\n0,1,3\n1,2,4\n", ("x", "T"), [[1, 3], [2, 4]], ""),
+    "missing values": (
+        "a.csv", "t,x\n0,1\n1,\n2,3\n3,4\n4,\n5,5\n", ("x",), [[1], [3], [4], [5]],
+        "2 rows in which a value is missing were left out",
+    ),
     "missing ends": ("a.csv", "t,x\n0,\n1,1\n2,2\n3,nan\n", ("x",), [[1], [2]], "2 rows with missing values"),
     "empty rows": ("a.csv", "recording,t,x\na,0,1\na,1,2\n,,\n,,\n", ("x",), [[1], [2]], "2 empty rows"),
     "empty columns": ("a.csv", "t,x,\n0,1.5,\n1,2,\n", ("x",), [[1.5], [2]], ""),
@@ -91,8 +95,8 @@ REFUSED: dict[str, tuple[str, str | bytes, str, str]] = {
         "a.csv", "t;x\n0;1,5\n1;1.2\n", "with commas ('1,5') and with points", "the same way",
     ),
     "no headings": ("a.csv", "0,1\n1,2\n", "where the headings should stand", "such as t,x"),
-    "a missing value": (
-        "a.csv", "t,x\n0,1\n1,\n2,3\n3,\n4,5\n", "missing (empty or NaN), as in 1 more", "remove",
+    "mostly missing values": (
+        "a.csv", "t,x\n0,1\n1,\n2,\n3,\n4,5\n", "missing (empty or NaN), as in 2 more", "remove",
     ),
     "no common row": ("a.csv", "t,x,y\n0,1,\n1,,2\n2,3,\n", "no row has a value in every", "interpolate"),
     "no time": ("a.csv", "x,y\n1,2\n2,3\n", "the column 't' is missing", "the time of every sample"),

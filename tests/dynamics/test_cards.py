@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import sympy
 
-from siq.dynamics.cards import diffusion_matrix, load_exact, load_system
+from siq.dynamics.cards import diffusion_rows, load_exact, load_system
 from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.dynamics import Dynamics
 from siq.errors import InputError
@@ -181,7 +181,7 @@ def test_a_name_that_no_formula_could_use_is_refused(write: Write, name: str) ->
     ],
 )
 def test_diffusion_is_the_identity_a_diagonal_or_a_matrix(diffusion: object, expected: np.ndarray) -> None:
-    np.testing.assert_array_equal(diffusion_matrix(diffusion, 2), expected)
+    np.testing.assert_array_equal(diffusion_rows(diffusion, 2), expected)
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,10 @@ def polynomial(values: np.ndarray) -> Dynamics:
     formula = sum(sympy.Symbol(name, real=True) * x**power for power, name in enumerate(names))
     parameters = tuple(Parameter(name, float(value)) for name, value in zip(names, values, strict=True))
     return Dynamics(
-        states=("x",), equations=(formula,), diffusion=Dynamics.of((x,), (x,)).diffusion, parameters=parameters
+        states=("x",),
+        equations=(formula,),
+        diffusion=Dynamics.of((x,), (x,)).diffusion,
+        parameters=parameters,
     )
 
 

@@ -48,7 +48,7 @@ def identified(recordings: Recordings, *, degree: int) -> FilteredField:
     )
     return identify_by_likelihood(
         library, recordings, begin, Noise(np.array([0.003]), np.array([0.5])),
-        critical=critical_values(library, false_terms=0.05),
+        critical=critical_values(library, false_terms=0.05), generator=np.random.default_rng(0),
     )  # fmt: skip
 
 
@@ -65,6 +65,7 @@ def test_terms_and_noises_are_found(found: tuple[FilteredField, Recordings, np.n
     assert (np.abs(field.values - [1, -1]) < 3 * errors).all()
     assert np.sqrt(found[0].sensor[0]) == pytest.approx(SENSOR, rel=0.03)
     assert field.noise_rate[0, 0] == pytest.approx(FORCES, rel=0.1)
+    assert field.stability is not None and (field.stability > 0.5).all()
     assert found[0].gain > 100 and abs(found[0].score) < 4
 
 

@@ -69,8 +69,8 @@ def test_sampling_is_that_of_the_simulation_or_of_the_recordings(write: Write, a
 def test_the_states_are_those_of_the_card_or_of_the_study(write: Write, archetype: Dynamics) -> None:
     space = StudyParts(load_study(write(SIMULATED)), archetype).space
     assert space.names == ("x", "y", "z") and space.unit("t") == archetype.time_unit
-    assert space.noise(3).matrix.tolist() == archetype.diffusion.matrix.tolist()
-    assert StudyParts(load_study(write(RECORDED)), None).space.noise(2).matrix.tolist() == [[1, 0], [0, 4]]
+    assert space.noise("xyz").matrix.tolist() == archetype.diffusion.matrix.tolist()
+    assert StudyParts(load_study(write(RECORDED)), None).space.noise("xy").matrix.tolist() == [[1, 0], [0, 4]]
 
 
 def test_what_a_card_says_does_not_change_with_its_title(archetype: Dynamics) -> None:

@@ -1,0 +1,155 @@
+"""What is kept of an f that was identified beside the noise of a sensor."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from siq.certificate.tests import PredictionLimits, check_prediction
+from siq.data.recordings import Recordings, snapshot_pairs
+from siq.errors import NumericalFailure
+from siq.estimation.innovations import Noise
+from siq.identify.diffusion import DiffusionSource, check_units, estimated_diffusion
+from siq.identify.flow_regression import residuals
+from siq.identify.identification import IdentificationOptions
+from siq.identify.identified_field import IdentifiedField
+from siq.identify.noise_regression import constant_noise_probability
+from siq.identify.noisy_sensor import FilteredField, held_out_evidence, identify_by_likelihood
+from siq.identify.residuals import LARGE, SIGNIFICANT, shared_errors
+from siq.identify.selection import critical_values
+from siq.identify.storage import FieldRecord
+from siq.steps.settings import Sampling, StateSpace
+
+SUSPECT = -1.0  # standard errors of the correlation of neighbouring residuals
+UNDRIVEN = 0.05  # share of random forces in the residuals, below which nothing but sensors is noisy
+LEAST, MOST = 1e-3, 0.45  # of the residuals' variance: a sensor's share of it that a fit begins with
+
+
+def beside_sensor_noise(
+    found: IdentifiedField,
+    recordings: Recordings,
+    *,
+    options: IdentificationOptions,
+    pair_step: float | None,
+    generator: np.random.Generator,
+) -> FilteredField | None:
+    """F by the likelihood of whole recordings, where their sensors are noisy; None where they are not.
+
+    What could be sensor noise is asked of the likelihood from one standard error on: it would bias f long
+    before it is significant. Where random forces depend on the state it has to be significant, since the
+    likelihood takes them as constant.
+
+    Parameters
+    ----------
+    found
+        f of the regression of pairs.
+    recordings
+        Whole trajectories.
+    options
+        What makes a term significant.
+    pair_step
+        Longest time between samples that still belong together.
+    generator
+        Draws recordings again, for the stability of the terms.
+
+    Raises
+    ------
+    NumericalFailure
+        Where much sensor noise is seen and the likelihood leads to no f.
+    """
+    correlation, score = shared_errors(found, recordings, pair_step=pair_step)
+    if not (score < SUSPECT).any() or not (1 + 2 * correlation > UNDRIVEN).any():
+        return None
+    pairs = snapshot_pairs(recordings, pair_step=pair_step)
+    much = bool(((score < -SIGNIFICANT) & (correlation < -LARGE)).any())
+    if not much and _uneven(found, recordings, options.false_terms, pair_step=pair_step):
+        return None
+    share = np.clip(-correlation, LEAST, MOST)
+    variance = np.diag(found.noise_rate) * float(np.median(pairs.h))
+    start = Noise(share * variance, np.diag(found.noise_rate) * (1 - 2 * share))
+    try:
+        filtered = identify_by_likelihood(
+            found.library, recordings, found, start, pair_step=pair_step, generator=generator,
+            critical=critical_values(found.library, false_terms=options.false_terms),
+        )  # fmt: skip
+    except (NumericalFailure, np.linalg.LinAlgError) as error:
+        if much:
+            raise NumericalFailure(f"the sensor is noisy, and f beside it is not found: {error}") from None
+        return None
+    return filtered if filtered.gain > 1 else None
+
+
+def filtered_record(
+    filtered: FilteredField,
+    recordings: Recordings,
+    parts: tuple[Recordings, Recordings],
+    *,
+    sampling: Sampling,
+    space: StateSpace,
+    limits: PredictionLimits,
+) -> FieldRecord:
+    """What is kept of an f that was identified beside sensor noise.
+
+    Parameters
+    ----------
+    filtered, recordings
+        What was found, of which recordings.
+    parts
+        Those that train, and those that are held out.
+    sampling, space, limits
+        Of the step `identify`.
+    """
+    step = sampling.pair_step
+    pairs = len(snapshot_pairs(recordings, pair_step=step).h)
+    given = space.noise(recordings.names)
+    estimated = None if given is not None else estimated_diffusion(filtered.found, pairs=pairs)
+    source = DiffusionSource.GIVEN if given is not None else DiffusionSource.ESTIMATED
+    if given is None and estimated is None:
+        source = DiffusionSource.UNIT
+        check_units(recordings.names, units_of_states(recordings, space))
+    diffusion = given or estimated or filtered.found.diffusion
+    found = replace(filtered.found, diffusion=diffusion)
+    intensity = diffusion.intensity(found.noise_rate)
+    probability, ratio = held_out_evidence(filtered, *parts, pair_step=step)
+    coloured = abs(filtered.score) > SIGNIFICANT and abs(filtered.correlation) > LARGE
+    verdict = check_prediction(
+        noise_fault=(
+            f"the innovations of neighbouring samples are correlated ({filtered.correlation:.2f}) though"
+            " noise of the sensor is allowed for: the random forces have a memory, or a state is missing"
+        )
+        if coloured else None,
+        errors=None, mean_probability=probability, held_out_ratio=ratio, limits=limits,
+    )  # fmt: skip
+    sizes = np.sqrt(filtered.sensor)
+    said = ", ".join(f"{size:.2g} in {name}" for size, name in zip(sizes, recordings.titles, strict=True))
+    return FieldRecord(
+        found,
+        verdict.as_data(),
+        {
+            "kind": "coloured" if coloured else "process",
+            "intensity": intensity,
+            "covariance": (found.noise_rate / intensity).tolist(),
+            "correlation": filtered.correlation,
+            "correlation_score": filtered.score,
+            "measurement": sizes.tolist(),
+            "measurement_error": (sizes * filtered.sensor_error / 2).tolist(),
+            "diffusion": str(source),
+            "note": f"the noise of the sensor, {said}, was estimated beside f, which it does not bias",
+            "pairs": pairs,
+        },
+    )
+
+
+def units_of_states(recordings: Recordings, space: StateSpace) -> list[str | None]:
+    """The unit of each state, None where nobody said."""
+    named = zip(recordings.names, recordings.units, strict=True)
+    return [unit or space.unit(name) or None for name, unit in named]
+
+
+def _uneven(
+    found: IdentifiedField, recordings: Recordings, false_terms: float, *, pair_step: float | None
+) -> bool:
+    """Whether random forces are stronger at some states than at others."""
+    pairs = snapshot_pairs(recordings, pair_step=pair_step)
+    return constant_noise_probability(found, pairs, residuals(found, pairs)) < false_terms
