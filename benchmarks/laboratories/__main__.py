@@ -3,7 +3,8 @@
     python -m benchmarks.laboratories [--seeds 100] [--only NAME ...] [--others 10] [--cores 2]
 
 Each record is a file of its own below ``results/laboratories``: an interrupted run goes on where it was, and
-more seeds add to those that are there. A record that takes longer than it may is said to have no answer.
+more seeds add to those that are there. Remove the folder when the method has changed. A record that takes longer
+than it may is said to have no answer.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from pathlib import Path
 
 from benchmarks.laboratories import figure, summary
 from benchmarks.laboratories.models import LABORATORIES
-from benchmarks.laboratories.one import file_of, read, write
+from benchmarks.laboratories.one import MADE_BY, answers_of, file_of, write
 from benchmarks.laboratories.others import OTHERS, SFI_PYTHON
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")  # one each: records run side by side
@@ -50,7 +51,8 @@ def tasks(names: Sequence[str], seeds: int, others: int) -> list[Task]:
 def run(task: Task, folder: Path) -> str:
     """Ask in a process of its own, which takes no other along when it fails; what went wrong, if anything."""
     file = file_of(folder, task.laboratory, task.seed)
-    if task.method in read(file):
+    laboratory = LABORATORIES[task.laboratory]
+    if task.method in answers_of(file, laboratory):
         return ""
     command = [
         sys.executable,
@@ -71,7 +73,8 @@ def run(task: Task, folder: Path) -> str:
     except subprocess.TimeoutExpired:
         fault = f"no answer within {LONGEST:.0f} s"
     if fault:
-        write(file, {**read(file), task.method: {"certified": False, "barriers": [], "fault": fault}})
+        none = {"certified": False, "barriers": [], "fault": fault}
+        write(file, {MADE_BY: repr(laboratory), **answers_of(file, laboratory), task.method: none})
     return fault
 
 

@@ -147,7 +147,7 @@ ARCHETYPE = Laboratory(
     attractors=((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0)),
     saddles=((0.0, 0.0, 0.0),),
     records=4,
-    samples=15_000,
+    samples=7_500,
     step=0.02,
     sensor_noise=(0.09, 0.035, 0.035),
 )

@@ -14,11 +14,13 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.laboratories.answers import answered
-from benchmarks.laboratories.models import LABORATORIES
+from benchmarks.laboratories.models import LABORATORIES, Laboratory
 from benchmarks.laboratories.others import OTHERS
 from benchmarks.laboratories.records import crossings, generator, recorded
 from benchmarks.laboratories.truths import truth
 from siq.files.whole import whole_file
+
+MADE_BY, CROSSINGS = "laboratory", "crossings"  # what else stands in a file
 
 
 def file_of(folder: Path, name: str, seed: int) -> Path:
@@ -29,6 +31,17 @@ def file_of(folder: Path, name: str, seed: int) -> Path:
 def read(file: Path) -> dict[str, Any]:
     """Answers by method; none where there is no file."""
     return json.loads(file.read_text("utf-8")) if file.exists() else {}
+
+
+def answers_of(file: Path, laboratory: Laboratory) -> dict[str, Any]:
+    """The same, and none where another laboratory of this name made the record."""
+    found = read(file)
+    return found if found.get(MADE_BY) == repr(laboratory) else {}
+
+
+def methods_of(answers: dict[str, Any]) -> list[str]:
+    """Who was asked."""
+    return [name for name in answers if name not in (MADE_BY, CROSSINGS)]
 
 
 def write(file: Path, data: Any) -> None:
@@ -50,7 +63,7 @@ def main() -> None:
     """Make what is missing."""
     name, seed, folder, *methods = sys.argv[1:]
     laboratory, file = LABORATORIES[name], file_of(Path(folder), name, int(seed))
-    answers = read(file)
+    answers = answers_of(file, laboratory)
     seen = recorded(laboratory, generator(laboratory, int(seed)))
     known = truth(laboratory)
     for method in methods:
@@ -59,7 +72,11 @@ def main() -> None:
         found = (
             answered(laboratory, seen, known) if method == "siq" else OTHERS[method](laboratory, seen, known)
         )
-        answers |= {"crossings": crossings(laboratory, seen), method: found.as_data()}
+        answers |= {
+            MADE_BY: repr(laboratory),
+            CROSSINGS: crossings(laboratory, seen),
+            method: found.as_data(),
+        }
         write(file, answers)
 
 

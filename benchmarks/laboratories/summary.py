@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.laboratories.bounds import bound
 from benchmarks.laboratories.models import LABORATORIES, Laboratory
-from benchmarks.laboratories.one import read, write
+from benchmarks.laboratories.one import CROSSINGS, MADE_BY, answers_of, methods_of, read, write
 from benchmarks.laboratories.truths import truth
 
 INTERVAL = 1.96  # standard errors on either side of a 95 % interval
@@ -78,10 +78,10 @@ def known_of(laboratory: Laboratory, folder: Path) -> dict[str, Any]:
     file = folder / laboratory.name / "truth.json"
     key = repr(laboratory)
     found = read(file)
-    if found.get("laboratory") != key:
+    if found.get(MADE_BY) != key:
         known = truth(laboratory)
         best = bound(laboratory, known)
-        found = {"laboratory": key, "barriers": known.barriers.tolist(), "bounds": best.barriers.tolist()}
+        found = {MADE_BY: key, "barriers": known.barriers.tolist(), "bounds": best.barriers.tolist()}
         write(file, found)
     return found
 
@@ -93,9 +93,9 @@ def summarised(folder: Path, names: list[str]) -> list[Row]:
         files = sorted((folder / name).glob("[0-9]*.json"))
         if not files:
             continue
-        answers = [read(file) for file in files]
+        answers = [answers_of(file, LABORATORIES[name]) for file in files]
         known = known_of(LABORATORIES[name], folder)
-        methods = dict.fromkeys(key for each in answers for key in each if key != "crossings")
+        methods = dict.fromkeys(method for each in answers for method in methods_of(each))
         rows += [row(name, method, answers, known) for method in methods]
     return rows
 
@@ -112,7 +112,7 @@ def row(name: str, method: str, answers: list[dict[str, Any]], known: dict[str, 
     times = [each["seconds"] for each in said if each.get("seconds")]
     return Row(
         name, method, len(said),
-        float(np.mean([each.get("crossings", np.nan) for each in answers if method in each])),
+        float(np.mean([each.get(CROSSINGS, np.nan) for each in answers if method in each])),
         float(np.isfinite(barriers).all(axis=1).mean()), float(certified.mean()),
         _rms(errors), _mean(errors), float(np.nanmedian(stated)) if np.isfinite(stated).any() else np.nan,
         _covered(errors, stated), _rms(errors[certified]), _covered(errors[certified], stated[certified]),

@@ -169,7 +169,9 @@ def test_a_run_is_resumed_seed_by_seed(tmp_path: Path, monkeypatch: pytest.Monke
         ("hop", 1, "siq"), ("trap", 1, "siq"),
     ]  # fmt: skip
     (tmp_path / "hop").mkdir()
-    (tmp_path / "hop" / "000.json").write_text(json.dumps(answer(barrier=0.5)), encoding="utf-8")
+    (tmp_path / "hop" / "000.json").write_text(
+        json.dumps({"laboratory": repr(LABORATORIES["hop"])} | answer(barrier=0.5)), encoding="utf-8"
+    )
     known = Truth(np.zeros((2, 1)), np.zeros((2, 1)), np.zeros((2, 1, 1)), np.ones(2), np.ones((2, 1)))
     file = tmp_path / "hop" / "truth.json"
     key = {"laboratory": repr(LABORATORIES["hop"]), "barriers": known.barriers.tolist(), "bounds": [0.1, 0.1]}
