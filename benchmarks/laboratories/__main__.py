@@ -3,8 +3,8 @@
     python -m benchmarks.laboratories [--seeds 100] [--only NAME ...] [--others 10] [--cores 2]
 
 Each record is a file of its own below ``results/laboratories``: an interrupted run goes on where it was, and
-more seeds add to those that are there. Remove the folder when the method has changed. A record that takes longer
-than it may is said to have no answer.
+more seeds add to those that are there. Remove the folder when the method has changed. A record that takes
+longer than it may is said to have no answer.
 """
 
 from __future__ import annotations
