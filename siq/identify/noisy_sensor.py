@@ -28,7 +28,7 @@ from siq.identify.flow import FlowMap
 from siq.identify.flow_regression import positive
 from siq.identify.identified_field import IdentifiedField, field_dynamics
 from siq.identify.library import CandidateLibrary
-from siq.identify.selection import Equation, best_support, rival_changes, strong_terms
+from siq.identify.selection import Equation, best_support, doubts_of_all, strong_terms
 from siq.identify.stability import blocks_of, stability, triangles
 
 ROUNDS = 8  # of the fit of a whole library, which only chooses terms
@@ -132,7 +132,6 @@ def identify_by_likelihood(
     fit = _without_forces(fit, data)
     one = _as_field(begin, library, support, fit, data, noise_uncertainty(fit, data))
     own = (support[:, 0] * q + support[:, 1]).tolist()
-    doubts = rival_changes(equations, own)
     # Whitened values stand one behind the other, all states of a sample together.
     parts = triangles(np.column_stack([white.columns, goal]), np.repeat(blocks_of(recordings.recording), d))
     (shares,) = stability(
@@ -141,7 +140,7 @@ def identify_by_likelihood(
         [own],
         generator=generator,
     )
-    field = replace(one.found, doubts=doubts.reshape(-1, d, q).transpose(0, 2, 1), stability=shares)
+    field = replace(one.found, doubts=doubts_of_all(equations, support, dimension=d), stability=shares)
     return replace(one, found=field)
 
 
