@@ -7,8 +7,8 @@ CORES ?= 2
 # takes that one.
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 
-.PHONY: statistics examples test full untuned noise wheel test-pages newcomer docs docs-full lint format \
-        environment clean
+.PHONY: statistics examples test full untuned noise wheel test-pages newcomer laboratories coverage docs \
+        docs-full lint format environment clean
 
 statistics: environment
 	$(BIN)/snakemake --cores $(CORES) statistics
@@ -44,6 +44,17 @@ test-pages: environment docs
 newcomer: wheel
 	$(BIN)/python benchmarks/newcomer.py
 
+# Noisy, hopping records of simulated laboratories, a hundred of each, against the Cramér–Rao bounds of their
+# barriers and other methods: hours, and it goes on where it was stopped. `make laboratories SEEDS=5` for a look;
+# SFI_PYTHON=... names a Python that has StochasticForceInference.
+SEEDS ?= 100
+laboratories: environment
+	$(BIN)/python -m benchmarks.laboratories --seeds $(SEEDS) --cores $(CORES)
+
+# Whether standard errors cover at every ratio of sensor noise to random forces.
+coverage: environment
+	$(BIN)/python -m benchmarks.laboratories.coverage --seeds 200 --cores $(CORES)
+
 # docs/_build/html/index.html: the pages and the reference. A warning is an error.
 docs: environment
 	rm -rf docs/_build/html docs/api
@@ -54,6 +65,7 @@ docs-full: environment
 	$(BIN)/python docs/make/gallery.py
 	$(BIN)/python docs/make/notebooks.py
 	$(BIN)/python docs/make/concepts.py
+	$(BIN)/python docs/make/inspection.py
 	$(BIN)/python docs/make/figures.py
 	$(MAKE) docs
 

@@ -15,6 +15,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from siq.data.inspection import inspect
     from siq.data.recordings import Recordings, read_recordings, snapshot_pairs, write_recordings
     from siq.dynamics.cards import load_system
     from siq.dynamics.diffusion import Diffusion
@@ -62,6 +63,7 @@ __all__ = [
     "TrainingOptions",
     "candidate_library",
     "diagnose",
+    "inspect",
     "load_study",
     "load_system",
     "parse_formula",
@@ -101,6 +103,7 @@ _MODULES = {
     "TrainingOptions": "siq.networks.options",
     "candidate_library": "siq.identify.library",
     "diagnose": "siq.mismatch.diagnosis",
+    "inspect": "siq.data.inspection",
     "load_study": "siq.study.study",
     "load_system": "siq.dynamics.cards",
     "parse_formula": "siq.dynamics.formulas",

@@ -42,6 +42,7 @@ ORDER = (
 # Thin methods that call what stands above them, when they are called: (who, whom).
 UPWARDS: frozenset[tuple[str, str]] = frozenset(
     {
+        ("siq.data.inspection", "siq.report.plots.inspection"),
         ("siq.landscape.landscape", "siq.report.landscape_text"),
         ("siq.landscape.landscape", "siq.report.plots.quasipotential"),
         ("siq.landscape.landscape", "siq.steps.pipeline"),

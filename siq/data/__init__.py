@@ -18,7 +18,13 @@
 `stationarity`       how fast does a record forget, and does its background drift slowly?
 `transitions`        how many states does it support by itself, and how often does it hop?
 `noise_floor`        how strong are the two kinds of noise, at a first look?
-`inspection`         what is in a file, and what will it be good for?
+`lagged`             where are samples evenly spaced, and how do neighbours go together over lags?
+`noise_memory`       sensor noise, an exposure, or forces with a memory?
+`markov_lag`         from which lag on is a record Markovian?
+`coverage`           which part of the space of states was visited?
+`inspected_states`   what is known of each measured column?
+`prospects`          what can be learned, in sentences?
+`inspection`         what is in recordings, and what will they be good for?
 `labels`             which recording has which label, and which has a copy of it?
 `held_out`           which recordings does a fit not see?
 `public_recordings`  what do the files of public benchmarks hold?

@@ -1,55 +1,38 @@
-"""What is in a file of recordings, and what will it be good for? Told in seconds, before anything runs."""
+"""What is in recordings, and what will they be good for? Told in seconds, before anything runs."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from siq.data.learnable import SINGLE, SINGLE_REMEDY, remarks
-from siq.data.noise_floor import NoiseFloor, noise_floors
-from siq.data.quantum import decimals_of, quantum, rounding_error
+from siq.data.coverage import Coverage, coverage_of
+from siq.data.inspected_states import (
+    Span,
+    StateFacts,
+    range_text,
+    sensor_dominates,
+    span_of,
+    state_text,
+    states_of,
+)
+from siq.data.learnable import remarks
+from siq.data.markov_lag import MarkovLag, markov_lag
+from siq.data.prospects import (
+    coverage_sentence,
+    memory_prospects,
+    memory_sentences,
+    noise_prospects,
+    transition_sentences,
+)
 from siq.data.recordings import LONGEST_STEP, Recordings, read_recordings
+from siq.data.transitions import Switching, switching
 
-HARMFUL = 0.02  # of the variance of a step, shared by neighbours: `siq.identify.residuals` takes no more
-SEEN = 1e-6  # of the range of a state: rounding to less than that is not worth a word
-
-
-@dataclass(frozen=True)
-class Span:
-    """The shortest, the usual and the longest of something."""
-
-    shortest: float
-    usual: float
-    longest: float
-
-
-@dataclass(frozen=True)
-class StateFacts:
-    """What is known of one measured column.
-
-    Attributes
-    ----------
-    name, title
-        Its name in formulas, and what the file calls it.
-    unit
-        None where the file does not say.
-    lowest, highest
-        The interval of its values.
-    quantum
-        The step to which it was rounded when it was written, None where none is recognised.
-    noise
-        A first look at its noise; None where neighbouring samples are too few or uneven.
-    """
-
-    name: str
-    title: str
-    unit: str | None
-    lowest: float
-    highest: float
-    quantum: float | None
-    noise: NoiseFloor | None
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -72,6 +55,17 @@ class Inspection:
         Between neighbouring samples, in the unit of time; None where no recording has two.
     pairs
         Number of neighbouring samples that are close enough to learn from.
+    gaps
+        Number of neighbouring samples that are further apart than that.
+    memory
+        From which lag on the recordings are Markovian, and what makes them remember until then.
+    coverage
+        Which part of the range of the states was visited.
+    switching
+        Two states with the hops between them and the background; None where nothing is known of them, as of
+        recordings without noise.
+    findings
+        What the last four say, each a sentence.
     notes
         What was assumed or repaired in reading.
     prospects
@@ -85,12 +79,63 @@ class Inspection:
     durations: Span
     steps: Span | None
     pairs: int
+    gaps: int
+    memory: MarkovLag
+    coverage: Coverage
+    switching: Switching | None
+    findings: tuple[str, ...]
     notes: tuple[str, ...]
     prospects: tuple[str, ...]
 
     def text(self) -> str:
         """As lines of plain text, for a terminal."""
-        return _text(self)
+        return "\n".join([self.file, *(f"  {line}" for line in self.lines())])
+
+    def lines(self) -> list[str]:
+        """The same without the name of the file: what was read, what it shows, what can be learned."""
+        return _lines(self)
+
+    def plot(self) -> Figure:
+        """Three panels: the states in time, how often each is visited, and what neighbours remember."""
+        from siq.report.plots.inspection import plot_inspection
+
+        return plot_inspection(self)
+
+
+def inspect(source: str | Path | Recordings | pd.DataFrame) -> Inspection:
+    """Look at recordings, and say what is in them and what can be learned: seconds, before anything runs.
+
+    Parameters
+    ----------
+    source
+        A file, a folder of files, recordings, or a table with the columns ``t``, the measured ones and, of
+        several recordings, ``recording``.
+
+    Returns
+    -------
+    Inspection
+        With `text()` and `plot()`.
+
+    Raises
+    ------
+    InputError
+        For the first thing that cannot be read; see `siq.data.recordings.read_recordings`.
+
+    Examples
+    --------
+    >>> generator = np.random.default_rng(0)
+    >>> walk = np.zeros((2000, 1))
+    >>> for k in range(1999):
+    ...     walk[k + 1] = 0.95 * walk[k] + 0.1 * generator.standard_normal()
+    >>> found = inspect(Recordings.from_arrays(0.1 * np.arange(2000), walk, names=["x"]))
+    >>> found.memory.kind, found.memory.lag
+    ('white', 0)
+    """
+    if isinstance(source, str | Path):
+        return inspect_recordings(source)
+    if isinstance(source, Recordings):
+        return inspection_of(source)
+    return inspection_of(Recordings.from_frame(source), file="the table")
 
 
 def inspect_recordings(path: str | Path) -> Inspection:
@@ -110,66 +155,56 @@ def inspection_of(recordings: Recordings, *, file: str = "the recordings") -> In
     first = np.cumsum(counts) - counts
     durations = recordings.t[first + counts - 1] - recordings.t[first]
     gaps = np.diff(recordings.t)[np.diff(recordings.recording) == 0]
-    floors = noise_floors(recordings)
-    states = tuple(
-        StateFacts(
-            name, title, unit, float(values.min()), float(values.max()), quantum(values),
-            None if floors is None else floors[place],
-        )
-        for place, (name, title, unit, values) in enumerate(
-            zip(recordings.names, recordings.titles, recordings.units, recordings.values.T, strict=True)
-        )
-    )  # fmt: skip
+    states = states_of(recordings)
     usual = _usual_step(recordings)
+    near = int((gaps <= LONGEST_STEP * usual * (1 + 1e-6)).sum())
+    memory, coverage = markov_lag(recordings), coverage_of(recordings)
+    # What relaxes without noise neither hops nor drifts.
+    hops = None if memory.kind in ("none", "unknown") else switching(recordings)
     return Inspection(
         file=file,
         recordings=recordings,
         states=states,
-        samples=_span(counts),
-        durations=_span(durations),
-        steps=_span(gaps) if len(gaps) else None,
-        pairs=int((gaps <= LONGEST_STEP * usual * (1 + 1e-6)).sum()),
+        samples=span_of(counts),
+        durations=span_of(durations),
+        steps=span_of(gaps) if len(gaps) else None,
+        pairs=near,
+        gaps=len(gaps) - near,
+        memory=memory,
+        coverage=coverage,
+        switching=hops,
+        findings=tuple(_findings(recordings, memory, coverage, hops)),
         notes=(*recordings.notes, *remarks(recordings)),
-        prospects=_prospects(recordings, states),
+        prospects=_prospects(recordings, states, memory),
     )
 
 
-def _span(values: np.ndarray) -> Span:
-    return Span(float(values.min()), float(np.median(values)), float(values.max()))
+def _findings(
+    recordings: Recordings, memory: MarkovLag, coverage: Coverage, hops: Switching | None
+) -> list[str]:
+    said = memory_sentences(memory, titles=recordings.titles, time_unit=recordings.time_unit)
+    if np.isfinite(memory.relaxation) and memory.kind not in ("unknown", "hidden"):
+        unit = f" {recordings.time_unit}" if recordings.time_unit else ""
+        said.append(
+            f"A fluctuation is forgotten within about {memory.relaxation:.2g}{unit},"
+            f" {memory.relaxation / memory.step:.2g} steps."
+        )
+    said += transition_sentences(hops, titles=recordings.titles, time_unit=recordings.time_unit)
+    return [*said, coverage_sentence(coverage, titles=recordings.titles)]
 
 
-def _prospects(recordings: Recordings, states: tuple[StateFacts, ...]) -> tuple[str, ...]:
-    said = []
+def _prospects(recordings: Recordings, states: tuple[StateFacts, ...], memory: MarkovLag) -> tuple[str, ...]:
     noises = [state.noise for state in states if state.noise is not None]
-    forced = any(noise.process > 0 for noise in noises)
-    if forced:
-        said.append(
-            "Random forces are seen: their strength is estimated, and how long each stable state lasts."
-        )
-    elif noises and len(recordings.labels) == 1:
-        said.append(f"{SINGLE[0].upper()}{SINGLE[1:]}: {SINGLE_REMEDY}.")
-    elif noises:
-        said.append(
-            "No random forces are seen: you get the wells and the barriers between them, but not how long"
-            " each stable state lasts, since that depends on the noise."
-        )
-    else:
-        said.append(
-            "Whether there is noise is not known beforehand: too few neighbouring samples are evenly spaced."
-        )
-    known = {state.unit for state in states if state.unit}
-    if not forced and len(known) > 1:
-        said.append(
-            f"The states have different units ({', '.join(sorted(known))}): say in the study how strong the"
-            " noise is in each, recordings.diffusion."
-        )
     step = _usual_step(recordings)
-    noisy = [state.title for state in states if _sensor_dominates(state, step)]
-    if noisy:
-        said.append(
-            f"The noise of the sensor is a large part of what happens to {' and '.join(noisy)} from sample to"
-            " sample: formulas will be shown, but not certified. Average before you sample."
-        )
+    remembers = memory.remembers
+    # Correlated forces fill the windows of the first look as a smooth motion does.
+    said = noise_prospects(
+        recordings,
+        forced=remembers or any(noise.process > 0 for noise in noises),
+        known=remembers or bool(noises),
+        noisy=[state.title for state in states if sensor_dominates(state, step) and not remembers],
+    )
+    said += memory_prospects(memory, time_unit=recordings.time_unit)
     if recordings.time_unit is None:
         said.append(
             "The file does not say in which unit the time is: write it into the heading, such as t [s]."
@@ -177,59 +212,27 @@ def _prospects(recordings: Recordings, states: tuple[StateFacts, ...]) -> tuple[
     return tuple(said)
 
 
-def _sensor_dominates(state: StateFacts, step: float) -> bool:
-    """Whether noise of the sensor, other than rounding, is more than an identification takes."""
-    if state.noise is None:
-        return False
-    variance = state.noise.sensor**2
-    rounded = state.quantum is not None and state.noise.sensor <= 1.5 * rounding_error(state.quantum)
-    return not rounded and variance > HARMFUL * (state.noise.process * step + 2 * variance)
-
-
 def _usual_step(recordings: Recordings) -> float:
     gaps = np.diff(recordings.t)[np.diff(recordings.recording) == 0]
     return float(np.median(gaps)) if len(gaps) else 0.0
 
 
-def _text(found: Inspection) -> str:
+def _lines(found: Inspection) -> list[str]:
     recordings = found.recordings
     unit = f" {recordings.time_unit}" if recordings.time_unit else ""
     count = len(recordings.labels)
     lines = [
-        found.file,
-        f"  {count:,} recording{'s' if count > 1 else ''} of {_range(found.samples)} samples,"
-        f" {_range(found.durations)}{unit} long",
+        f"{count:,} recording{'s' if count > 1 else ''} of {range_text(found.samples)} samples,"
+        f" {range_text(found.durations)}{unit} long",
     ]
     if found.steps is not None:
         lines.append(
-            f"  time step {_range(found.steps)}{unit}; {found.pairs:,} pairs of neighbouring samples"
+            f"time step {range_text(found.steps)}{unit}; {found.pairs:,} pairs of neighbouring samples"
+            + (f", {found.gaps:,} gap{'s' if found.gaps > 1 else ''}" if found.gaps else "")
         )
-    lines += [f"  {_state_text(state, recordings.time_unit)}" for state in found.states]
-    lines += [f"  Note: {note[0].upper()}{note[1:]}." for note in found.notes]
-    lines += [f"  {sentence}" for sentence in found.prospects]
-    return "\n".join(lines)
-
-
-def _range(span: Span) -> str:
-    low, usual, high = (_plain(value) for value in (span.shortest, span.usual, span.longest))
-    return low if low == high else f"{low} to {high} (usually {usual})"
-
-
-def _plain(value: float) -> str:
-    return f"{value:,.0f}" if value >= 1000 else f"{value:.4g}"
-
-
-def _state_text(state: StateFacts, time_unit: str | None) -> str:
-    unit = f" {state.unit}" if state.unit else ""
-    named = state.name if state.name == state.title else f"{state.title} (in formulas: {state.name})"
-    said = [f"{named}: {state.lowest:.4g} to {state.highest:.4g}{unit}"]
-    if state.quantum is not None and rounding_error(state.quantum) > SEEN * (state.highest - state.lowest):
-        decimals = decimals_of(state.quantum)
-        how = f"to {decimals} decimals" if decimals else f"in steps of {state.quantum:.3g}{unit}"
-        said.append(f"written {how}, an error of {rounding_error(state.quantum):.1g}{unit}")
-    if state.noise is not None and state.noise.process > 0:
-        per = f" ({state.unit})²/{time_unit}" if state.unit and time_unit else ""
-        said.append(f"random forces of about {state.noise.process:.2g}{per}")
-    if state.noise is not None and state.noise.sensor > 0:
-        said.append(f"sensor noise of about {state.noise.sensor:.2g}{unit}")
-    return "; ".join(said)
+    # Where increments are correlated the two noises of a first look are neither.
+    told = not found.memory.remembers and found.memory.kind != "hidden"
+    lines += [state_text(state, recordings.time_unit, noise=told) for state in found.states]
+    lines += found.findings
+    lines += [f"Note: {note[0].upper()}{note[1:]}." for note in found.notes]
+    return [*lines, *found.prospects]

@@ -32,7 +32,7 @@ from siq.identify.flow_regression import (
 )
 from siq.identify.identified_field import NOISE_FREE, IdentifiedField
 from siq.identify.library import CandidateLibrary
-from siq.identify.selection import Equation, critical_values, improved_support, rival_changes
+from siq.identify.selection import Equation, best_support, critical_values, rival_changes
 from siq.identify.stability import blocks_of, stability, triangles
 
 
@@ -144,7 +144,7 @@ def _identify(
         kept: Sequence[int] = _significant(
             triangle, q, i, n / repeated, options=options, noise_free=noise_free, critical=critical
         ).tolist()
-        chosen += [(i, k) for k in (kept if noise_free else improved_support(equation, kept))]
+        chosen += [(i, k) for k in (kept if noise_free else best_support(equation, kept))]
     if len({i for i, _ in chosen}) < d:
         missing = next(i for i in range(d) if i not in {j for j, _ in chosen})
         raise NumericalFailure(f"no term of the equation of {library.states[missing]} is significant")

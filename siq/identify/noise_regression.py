@@ -34,6 +34,8 @@ from siq.identify.noise_formula import NoiseFormula
 
 DEGREE = 2  # of the formulas: the least that can bend, and keep positive where a straight line does not
 LARGE = 0.02  # relative change of D over the states below which a constant one does no harm, see `residuals`
+FEW_STATES = 3  # of which correlations may depend on the state: sixty coefficients
+MOST_NUMBERS = 2e7  # numerical: of an array in memory, 160 MB
 FEWEST = 20  # residuals for each coefficient of D: fewer do not show its sum of squares
 STEPS, HALVINGS = 60, 30  # numerical: most steps of Fisher's scoring, each halved until it gains
 SETTLED = 1e-9  # numerical: gain of the log-likelihood, per residual, with which scoring ends
@@ -57,7 +59,7 @@ def constant_noise_probability(found: IdentifiedField, pairs: SnapshotPairs, res
     float
         1 where the residuals are too few to tell, or the change that they speak for is harmless.
     """
-    data = _Residuals(found, pairs, rest)
+    data = _Residuals(found, *_affordable(pairs, rest))
     n, d = data.rest.shape
     entries = d * (d + 1) // 2
     if n < FEWEST * entries * data.functions.shape[1]:
@@ -97,10 +99,13 @@ def fitted_noise(
     NumericalFailure
         When no formula of this kind is positive at all recorded states.
     """
-    data = _Residuals(found, pairs, rest)
-    d = data.rest.shape[1]
-    pairs_of_states = [(i, j) for i in range(d) for j in range(i, d)]
-    chosen = np.array([(i, j, k) for i, j in pairs_of_states for k in range(data.functions.shape[1])])
+    data = _Residuals(found, *_affordable(pairs, rest))
+    d, m = data.rest.shape[1], data.functions.shape[1]
+    # Of many states the correlations are constant: their formulas would be most of all coefficients.
+    whole = d <= FEW_STATES
+    chosen = np.array(
+        [(i, j, k) for i in range(d) for j in range(i, d) for k in range(m if i == j or whole else 1)]
+    )
     start = data.rest.T @ data.rest / len(data.rest)
     values = np.array([start[i, j] if k == 0 else 0.0 for i, j, k in chosen])
     critical = float(-scipy.special.ndtri(false_terms / (2 * len(chosen))))
@@ -165,6 +170,15 @@ def random_forces_of(found: IdentifiedField, pairs: SnapshotPairs, rest: np.ndar
         step = np.zeros_like(step)
     back = np.eye(d) - step + step @ step / 2
     return np.asarray((back @ rest[:, :, None])[:, :, 0] / np.sqrt(pairs.h)[:, None])
+
+
+def _affordable(pairs: SnapshotPairs, rest: np.ndarray) -> tuple[SnapshotPairs, np.ndarray]:
+    """Pairs and residuals, evenly thinned where there are more than memory has room for."""
+    n, d = rest.shape
+    functions = len(monomial_exponents(d, DEGREE))
+    most = int(MOST_NUMBERS / (functions * d * (d + 1)))
+    rows = np.unique(np.linspace(0, n - 1, min(n, most)).astype(int))
+    return (pairs, rest) if len(rows) == n else (pairs.take(rows), rest[rows])
 
 
 class _Residuals:

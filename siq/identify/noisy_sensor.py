@@ -23,11 +23,12 @@ from siq.estimation.linearisation import Grid, linearise
 from siq.estimation.measurements import Measurements
 from siq.estimation.noise import log_likelihood
 from siq.estimation.noise_uncertainty import NoiseUncertainty, noise_uncertainty
+from siq.estimation.process_noise import process_noise_needed
 from siq.identify.flow import FlowMap
 from siq.identify.flow_regression import positive
 from siq.identify.identified_field import IdentifiedField, field_dynamics
 from siq.identify.library import CandidateLibrary
-from siq.identify.selection import Equation, improved_support, rival_changes, strong_terms
+from siq.identify.selection import Equation, best_support, rival_changes, strong_terms
 from siq.identify.stability import blocks_of, stability, triangles
 
 ROUNDS = 8  # of the fit of a whole library, which only chooses terms
@@ -118,7 +119,7 @@ def identify_by_likelihood(
     )[0][: len(values) + 1]
     # In units of the innovations' errors; all equations at once, since a filter couples them.
     equations = Equation(triangle[:, :-1], triangle[:, -1], 1.0, np.tile(critical, d))
-    chosen = list(improved_support(equations, strong_terms(equations)))
+    chosen = list(best_support(equations, strong_terms(equations)))
     support = everything[chosen]
     for component, name in enumerate(library.states):
         if component not in support[:, 0]:
@@ -128,6 +129,7 @@ def identify_by_likelihood(
         support = np.delete(support, weak, axis=0)
         kept = np.delete(fit.model.values, weak)
         fit = _settled(library, support, data, fit.noise, values=kept, x=fit.linearised_at)
+    fit = _without_forces(fit, data)
     one = _as_field(begin, library, support, fit, data, noise_uncertainty(fit, data))
     own = (support[:, 0] * q + support[:, 1]).tolist()
     doubts = rival_changes(equations, own)
@@ -245,6 +247,8 @@ def filtered_recordings(
 
 def _noise_of(found: IdentifiedField, sensor: np.ndarray) -> Noise:
     rate = found.noise_rate
+    if not rate.any():
+        return Noise(sensor, np.zeros(len(rate)))
     size = np.sqrt(np.diag(rate))
     return Noise(sensor, np.diag(rate).copy(), (rate / np.outer(size, size))[None])
 
@@ -274,6 +278,15 @@ def _settled(
             + "; record more, or sample more often"
         )
     return fit
+
+
+def _without_forces(fit: Fit, data: Measurements) -> Fit:
+    """The fit of trajectories that no random force drives, unless the recordings speak against it."""
+    strict = fit_by_filter(
+        fit.model, data, x=fit.x, noise=fit.noise.without_process(), estimate_process=False,
+        substeps=fit.substeps,
+    )  # fmt: skip
+    return fit if process_noise_needed(fit, strict) else strict
 
 
 def _last_change(fit: Fit, white: Whitened) -> np.ndarray:
@@ -324,7 +337,7 @@ def _as_field(
     best = log_likelihood(fit.linearisation, alone, fit.noise)
     base = max(
         log_likelihood(fit.linearisation, alone, without.scaled(factor))
-        for factor in 1 + np.linspace(0, 2, 21) * fit.noise.measurement.max() / (rate.max() * step)
+        for factor in 1 + np.linspace(0, 2, 21) * fit.noise.measurement.max() / max(rate.max() * step, 1e-300)
     )
     return FilteredField(
         found, fit.noise.measurement, certain.measurement, correlation, score, 2 * (best - base)

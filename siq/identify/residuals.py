@@ -62,6 +62,8 @@ class NoiseDiagnosis:
         The largest bias that rounding brings into a coefficient of f, in its standard errors.
     decimals
         How many would leave no trace of rounding.
+    memory
+        How long the recordings remember, and why, in words; None where they do not.
     """
 
     kind: NoiseKind
@@ -75,10 +77,13 @@ class NoiseDiagnosis:
     rounding: str | None = None
     rounding_bias: float = 0.0
     decimals: int = 0
+    memory: str | None = None
 
     @property
     def note(self) -> str | None:
         """What a reader has to know of recordings that can be used all the same."""
+        if self.memory is not None:
+            return self.memory
         if self.kind == "rounding" and self.rounding_bias <= HARMLESS:
             return f"{self.rounding}: the standard errors of the formulas contain it"
         return None

@@ -101,8 +101,12 @@ class Equation:
 
     def score(self, support: Sequence[int]) -> float:
         """χ² and the price of the terms."""
+        return self.chi_square(support) + float((self.critical[list(support)] ** 2).sum())
+
+    def chi_square(self, support: Sequence[int]) -> float:
+        """Of the residuals."""
         misfit = self.goal - self.columns @ self.fitted(support)
-        return float(misfit @ misfit / self.variance + (self.critical[list(support)] ** 2).sum())
+        return float(misfit @ misfit / self.variance)
 
     def neighbours(self, support: Sequence[int]) -> Iterator[tuple[float, tuple[int, ...]]]:
         """Scores of all supports that one term more, one less, or another one makes of this one."""
@@ -147,6 +151,17 @@ def strong_terms(equation: Equation) -> tuple[int, ...]:
             break
         active = np.delete(active, weakest)
     return tuple(int(place) for place in active)
+
+
+def best_support(equation: Equation, start: Sequence[int]) -> tuple[int, ...]:
+    """The support of the lowest score that exchanges reach, from a start and from no term at all.
+
+    Elimination may leave many terms that make up together what a few would do, none of which it still has: no
+    exchange of a single one leads back from there, but the way up from nothing does. It may also stay at
+    nothing, where two terms are strong together and weak alone, as x and x³ within two wells: no answer then.
+    """
+    found = [improved_support(equation, one) for one in (start, ())]
+    return min((one for one in found if one), key=lambda one: equation.score(one), default=())
 
 
 def improved_support(equation: Equation, start: Sequence[int]) -> tuple[int, ...]:

@@ -33,7 +33,8 @@ class FieldRecord:
         The certificate's test of it, see `siq.certificate.tests.Verdict.as_data`.
     noise
         Kind, intensity and correlations of the residuals, see `siq.identify.residuals.NoiseDiagnosis`; and
-        where D is from.
+        where D is from. Of recordings that remember also `lag`, in steps, and `lost_time`, see
+        `siq.identify.lagged_pairs`.
     """
 
     found: IdentifiedField
@@ -46,10 +47,16 @@ class FieldRecord:
         return DiffusionSource(self.noise.get("diffusion", DiffusionSource.GIVEN))
 
     @property
+    def memory(self) -> tuple[int, float] | None:
+        """The lag from which on the recordings are Markovian, and the time lost; None of those that are."""
+        lag = self.noise.get("lag")
+        return None if lag is None else (int(lag), float(self.noise.get("lost_time", 0.0)))
+
+    @property
     def sensor_variance(self) -> np.ndarray | None:
         """Variance of each state's sensor noise, shape ``(d,)``; None where f was found without any."""
         deviations = np.array(self.noise.get("measurement", []), dtype=float)
-        if self.noise.get("kind") != "process" or not (deviations > 0).any():
+        if self.noise.get("kind") not in ("process", "sensor") or not (deviations > 0).any():
             return None
         return deviations**2
 
@@ -60,7 +67,7 @@ class FieldRecord:
         The variance of n residuals of d states has the relative standard error ``√(2/nd)``.
         """
         intensity = float(self.noise.get("intensity", 0.0))
-        if self.noise.get("kind") != "process" or not intensity > 0:
+        if self.noise.get("kind") not in ("process", "sensor") or not intensity > 0:
             return None
         samples = int(self.noise.get("pairs", 0)) * self.found.library.dimension
         return intensity, intensity * (2 / samples) ** 0.5 if samples else 0.0

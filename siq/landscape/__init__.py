@@ -5,6 +5,7 @@
 `paths`                   which path leads from an attractor to a saddle at least action?
 `discretised_paths`       what is the action of a chain of points, and how is it made minimal?
 `rates`                   how often is a well left, prefactor included?
+`prefactor_errors`        how sure is that prefactor?
 `dwell_times`             how long does a well last, and how sure is that?
 `transitions`             which barriers part the wells, how sure are they, and what does a way out look like?
 `global_quasipotential`   what is U over all wells?

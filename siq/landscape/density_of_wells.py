@@ -10,7 +10,8 @@ below either of two levels in them:
 - U where f, followed from the state, enters the known region, since U does not rise along f.
 
 Both are told to within the width of a cell. Like the density, they are the leading order as ε → 0: the
-prefactor of exp(-U/ε), which varies with the state where div g ≠ 0, counts as 1.
+prefactor of exp(-U/ε), which varies with the state where div g ≠ 0 or D is not the same everywhere, counts
+as 1. Of one state it is known, 1/D(x), and the density is exact.
 """
 
 from __future__ import annotations
@@ -49,12 +50,16 @@ class SampledPotential:
         Index of the well whose formula gives U, of the same shape; -1 where none does.
     wells
         Their number, k.
+    prefactor
+        Of exp(-U/ε), where it is known and not one: of one state, D at the first attractor over D, of the
+        shape of `values`.
     """
 
     box: np.ndarray
     values: np.ndarray
     well: np.ndarray
     wells: int
+    prefactor: np.ndarray | None = None
 
     @property
     def widths(self) -> np.ndarray:
@@ -159,7 +164,20 @@ def sample_potential(
         np.where(known, least, np.nan),
         np.where(known, values.argmin(axis=0), -1),
         len(potential.wells),
+        _prefactor(potential, empty),
     )
+
+
+def _prefactor(potential: GlobalQuasipotential, sampled: SampledPotential) -> np.ndarray | None:
+    if sampled.values.ndim > 1:
+        return None
+    first = potential.wells[0]
+    noise = first.dynamics.diffusion
+    if noise.constant:
+        return None
+    own = noise.at(np.stack([first.attractor, *sampled.axes[0][:, None]]))[:, 0, 0]
+    # Where a formula of D is not positive no state can be, and none is known.
+    return np.asarray(own[0] / np.where(own[1:] > 0, own[1:], np.inf))
 
 
 def lowest_possible(sampled: SampledPotential, dynamics: Dynamics) -> np.ndarray:
@@ -246,8 +264,11 @@ def known_density(
     if not fine.known.any():
         raise NumericalFailure("U is known nowhere in the box")
     bottom = float(np.nanmin(fine.values))  # taken out of the exponents, which would run out of range
-    weights, wide = (np.exp(-(np.nan_to_num(one.values, nan=np.inf) - bottom) / intensity)
-                     for one in (fine, coarse))  # fmt: skip
+    weights, wide = (
+        np.exp(-(np.nan_to_num(one.values, nan=np.inf) - bottom) / intensity)
+        * (1.0 if one.prefactor is None else one.prefactor)
+        for one in (fine, coarse)
+    )
     total, rough = (weights.sum() * fine.widths.prod(), wide.sum() * coarse.widths.prod())
     change = float(abs(rough / total - 1))
     if not change <= TOLERANCE:
@@ -255,7 +276,8 @@ def known_density(
             f"the integral of exp(-U/ε) changes by {change:.1%} if cells are twice as wide; the wells are too"
             " narrow for the box"
         )
-    elsewhere = float(np.exp(-(lowest - bottom) / intensity).sum() * coarse.widths.prod())
+    above = np.exp(-(lowest - bottom) / intensity) * (1.0 if coarse.prefactor is None else coarse.prefactor)
+    elsewhere = float(above.sum() * coarse.widths.prod())
     shares = np.bincount(fine.well[fine.known], weights[fine.known], minlength=fine.wells)
     return KnownDensity(
         intensity=intensity,

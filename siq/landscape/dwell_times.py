@@ -7,9 +7,11 @@ A well is left over every one of its saddles, and the rates add. Over one saddle
 (`siq.landscape.rates`), from the well to the neighbourhood of the next attractor; the saddle itself is
 reached in half of it. The relative error of E[τ] has three parts:
 
-- from f: the standard error of ΔU/ε, and that of K, which is taken to be relatively as uncertain as ΔU, since
-  both follow from f to the first order;
-- from the noise: ΔU/ε times the relative error of ε;
+- from f: the standard errors of ΔU/ε and of ln K, which follow from the same f and err together
+  (`siq.landscape.prefactor_errors`). Where that of K is not known it is taken to be relatively as uncertain
+  as ΔU, since both follow from f to the first order;
+- from the noise: ΔU/ε times the relative error of ε. Where D itself is estimated, the error of its parts is
+  larger than that of their mean, and a path that runs along one of them has the larger one: `leverage`;
 - from the law itself, the leading order for small ε: about ε/ΔU.
 """
 
@@ -51,11 +53,18 @@ class Exit:
         ΔU and its standard error.
     prefactor
         K, None where the law does not hold.
+    prefactor_error, covariance
+        Standard error of ln K, None where not known, and its covariance with ΔU.
+    leverage
+        Relative standard error of ΔU/ε from an estimated D over that of ε.
     """
 
     barrier: float
     standard_error: float
     prefactor: float | None
+    prefactor_error: float | None = None
+    covariance: float = 0.0
+    leverage: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -108,8 +117,12 @@ def exit_time(way: Exit, noise: NoiseStrength) -> MeanTime | None:
         value = float(way.prefactor * np.exp(height))
     if not np.isfinite(value):
         return None
-    parts = (height * relative, relative, height * noise.standard_error / noise.intensity)
-    return MeanTime(value, float(np.sqrt(np.nansum(np.square(parts)))), 1 / height)
+    of_prefactor = relative if way.prefactor_error is None else way.prefactor_error
+    of_noise = height * way.leverage * noise.standard_error / noise.intensity
+    squares = float(np.nansum(np.square((height * relative, of_prefactor, of_noise))))
+    together = 2 * way.covariance / noise.intensity
+    # By rounding, or by what is in one error alone, the two could cancel by more than there is.
+    return MeanTime(value, float(np.sqrt(max(squares + together, np.nan_to_num(of_noise) ** 2))), 1 / height)
 
 
 def dwell_time(ways: Sequence[Exit], noise: NoiseStrength | None) -> MeanTime | None:

@@ -20,7 +20,8 @@ from siq.errors import NumericalFailure
 from siq.identify.diffusion import defined_states
 from siq.identify.identified_field import IdentifiedField
 from siq.landscape.dwell_times import Exit
-from siq.landscape.paths import TransitionPath, transition_path
+from siq.landscape.paths import MinimumActionPath, TransitionPath, transition_path
+from siq.landscape.prefactor_errors import PrefactorError, prefactor_error
 from siq.landscape.rates import EscapeRate, escape_rate
 from siq.potential.well import Well
 
@@ -52,6 +53,10 @@ class Transition:
         Law of the mean escape time, None where it fails.
     notes
         What is not known, in words.
+    prefactor_error
+        Of that law, from the uncertainty of f; None where not known.
+    leverage
+        Relative standard error of ΔU/ε from an estimated D over that of ε.
     """
 
     start: int
@@ -63,6 +68,8 @@ class Transition:
     standard_error: float
     rate: EscapeRate | None
     notes: tuple[str, ...] = ()
+    prefactor_error: PrefactorError | None = None
+    leverage: float = 1.0
 
     @property
     def error(self) -> float:
@@ -74,7 +81,12 @@ class Transition:
     @property
     def exit(self) -> Exit:
         """What the time of this way out follows from."""
-        return Exit(self.barrier, self.error, None if self.rate is None else self.rate.prefactor)
+        known, prefactor = self.prefactor_error, None if self.rate is None else self.rate.prefactor
+        if known is None:
+            return Exit(self.barrier, self.error, prefactor, leverage=self.leverage)
+        return Exit(
+            self.barrier, self.error, prefactor, known.standard_error, known.covariance, self.leverage
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -171,11 +183,13 @@ def _transition(found: IdentifiedField, way: WayOut, well: Well | None) -> Trans
     if not path.uphill.converged:
         notes.append("the minimum action path is not converged")
     rate, missing = None, missing_diffusion(found.dynamics)
+    of_prefactor: PrefactorError | None = None
     try:
         if missing is not None:
             raise NumericalFailure(missing)
         rate = escape_rate(found.dynamics, path.uphill)
         notes += rate.notes
+        of_prefactor = prefactor_error(found, path.uphill)
     except (NumericalFailure, np.linalg.LinAlgError) as error:
         notes.append(f"no escape time: {error}")
     barrier, share = path.uphill.action, 0.0
@@ -187,8 +201,9 @@ def _transition(found: IdentifiedField, way: WayOut, well: Well | None) -> Trans
                 path.uphill.action)  # fmt: skip
     spread = barrier_standard_error(path, found)
     return Transition(
-        way.start, way.end, way.saddle, path, barrier, share, spread, rate, tuple(dict.fromkeys(notes))
-    )
+        way.start, way.end, way.saddle, path, barrier, share, spread, rate, tuple(dict.fromkeys(notes)),
+        of_prefactor, noise_leverage(path.uphill, found.dynamics),
+    )  # fmt: skip
 
 
 def barrier_by_formula(path: TransitionPath, well: Well) -> tuple[float, float]:
@@ -210,13 +225,7 @@ def barrier_standard_error(path: TransitionPath, found: IdentifiedField) -> floa
 
         ∂U/∂c = -2 ∫ p·∂f/∂c dt.
     """
-    points, momenta = path.uphill.points, path.uphill.momenta
-    middle = (points[1:] + points[:-1]) / 2
-    force = (momenta[1:] + momenta[:-1]) / 2
-    flow, move = found.dynamics.drift(middle), np.diff(points, axis=0)
-    noise = found.diffusion
-    speed, length = (np.sqrt(noise.squared_speed(middle, one)) for one in (flow, move))
-    spent = np.where(speed > 0, length / np.where(speed > 0, speed, 1.0), 0.0)
+    middle, force, spent = _along(path.uphill, found.dynamics)
     terms = found.library.evaluate(middle)
     slope = -2 * np.einsum("n,nq,nd->qd", spent, terms, force)
     variance = float(found.variance(slope))
@@ -224,6 +233,31 @@ def barrier_standard_error(path: TransitionPath, found: IdentifiedField) -> floa
         slope = -2 * (spent[:, None] * found.noise.push_slopes(middle, force)).sum(axis=0) / found.intensity
         variance += float(slope @ found.noise.covariance @ slope)
     return float(np.sqrt(max(variance, 0.0)))
+
+
+def noise_leverage(path: MinimumActionPath, dynamics: Dynamics) -> float:
+    """Relative standard error of ΔU/ε from an estimated εD, over that of ε, the mean of its parts.
+
+    A change of εD changes ``ΔU/ε = 2∫p·dx/ε`` by ``-2∫ p·δ(εD)p dt/ε²``. With the covariance of a matrix that
+    is estimated from n residuals of d states, and A = ∫ p pᵀ dt, that makes ``2 √(d tr (AD)²)/ΔU``: 1 where
+    the path spends its action on all states alike, and √d where on one of them.
+    """
+    middle, force, spent = _along(path, dynamics)
+    pushed = np.einsum("n,ni,nj->ij", spent, dynamics.diffusion.push(middle, force), force)
+    total = float(np.trace(pushed))
+    if not total > 0:
+        return 1.0
+    return float(np.sqrt(dynamics.dimension * max(np.trace(pushed @ pushed), 0.0)) / total)
+
+
+def _along(path: MinimumActionPath, dynamics: Dynamics) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """States, momenta and times of the pieces of a path."""
+    middle = (path.points[1:] + path.points[:-1]) / 2
+    force = (path.momenta[1:] + path.momenta[:-1]) / 2
+    flow, move = dynamics.drift(middle), np.diff(path.points, axis=0)
+    speed, length = (np.sqrt(dynamics.diffusion.squared_speed(middle, one)) for one in (flow, move))
+    spent = np.where(speed > 0, length / np.where(speed > 0, speed, 1.0), 0.0)
+    return middle, force, spent
 
 
 def position_standard_errors(found: IdentifiedField, position: np.ndarray) -> np.ndarray:

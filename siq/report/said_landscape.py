@@ -36,6 +36,8 @@ class SaidWell:
         U up to which the formula holds, NaN where there is none.
     time
         How long the well lasts, None where not known.
+    leverage
+        Relative standard error of ΔU/ε from an estimated D over that of ε.
     """
 
     name: str
@@ -47,6 +49,7 @@ class SaidWell:
     beyond: str | None
     known_up_to: float
     time: MeanTime | None
+    leverage: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -114,7 +117,14 @@ class SaidLandscape:
     def exits(self, well: int) -> list[Exit]:
         """What the times out of a well follow from; of a barrier that nobody knows, NaN."""
         return [
-            Exit(_float(way["barrier"]), _float(way.get("error", way["standard_error"])), way["prefactor"])
+            Exit(
+                _float(way["barrier"]),
+                _float(way.get("error", way["standard_error"])),
+                way["prefactor"],
+                way.get("prefactor_error"),
+                way.get("prefactor_covariance", 0.0),
+                way.get("noise_leverage", 1.0),
+            )
             for way in self.data["transitions"]
             if way["start"] == well
         ]
@@ -143,6 +153,7 @@ class SaidLandscape:
             None if lowest is None or lowest["end"] is None else well_name(lowest["end"]),
             math.nan if formula is None else 2 * float(formula.get("depth") or formula["level"]),
             self.dwell_time(index, self.noise),
+            1.0 if lowest is None else lowest.get("noise_leverage", 1.0),
         )
 
     def relative_depth(self, well: SaidWell) -> tuple[float, float]:
@@ -150,7 +161,8 @@ class SaidLandscape:
         if self.noise is None or not math.isfinite(well.depth):
             return math.nan, math.nan
         ratio = well.depth / self.noise.intensity
-        parts = (well.depth_error / well.depth, self.noise.standard_error / self.noise.intensity)
+        of_noise = well.leverage * self.noise.standard_error / self.noise.intensity
+        parts = (well.depth_error / well.depth, of_noise)
         return ratio, abs(ratio) * float(np.sqrt(np.nansum(np.square(parts))))
 
 

@@ -141,6 +141,9 @@ CAPTIONS: Mapping[str, Caption] = {
     ),
 }
 
+OF_INSPECTION = ("record", "visited", "memory")
+"""Figures of the first section, see `siq.report.inspection_section`."""
+
 OF_NETWORKS = ("coefficients_regression", "inclusion_regression", "training")
 """Figures that say nothing where no networks were asked for."""
 
@@ -172,6 +175,7 @@ def shown_figures(names: set[str], *, runs: int, networks: bool, published: bool
     published
         Whether the study names published figures.
     """
+    names = names - set(OF_INSPECTION)
     if not published:
         names = names - {"landscape_published"}
     if not networks:

@@ -48,6 +48,7 @@ def study_page(
         if overview is not None and len(overview["states"]) == 1:
             figure = replace(figure, caption=OF_ONE_STATE, alternative=OF_ONE_STATE)
     sections = [
+        page.inspected(),
         page.formulas(),
         page.record(),
         page.evidence(),

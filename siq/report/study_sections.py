@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from siq.identify.storage import FieldRecord
 from siq.potential.symbolic import SymbolicDecomposition
 from siq.report.certificate_text import certificate_badge, tests_table
 from siq.report.formatting import formula_matrix_mathml, matrix_mathml, vector_mathml
+from siq.report.inspection_section import inspection_section
 from siq.report.invariant_tables import invariant_tables
 from siq.report.landscape_answer import headline, remarks
 from siq.report.landscape_tables import errors_table, escape_table, landscape_sentences, landscape_tables
@@ -68,6 +69,8 @@ class StudyResults:
         f and D of the run that is shown, None where there is none.
     interactive
         A view of U that can be turned, None where there is none.
+    inspection
+        What is in the recordings, line by line; None where they were simulated.
     """
 
     tables: Mapping[str, pd.DataFrame]
@@ -80,6 +83,7 @@ class StudyResults:
     overview: Mapping[str, Any] | None = None
     record: FieldRecord | None = None
     interactive: Markup | None = None
+    inspection: Sequence[str] | None = None
 
 
 @dataclass(frozen=True)
@@ -137,6 +141,12 @@ class StudyParts:
             runs=self.study.runs,
             refusals=dict(zip(refused["test"], refused["reason"], strict=True)),
         )
+
+    def inspected(self) -> ReportSection | None:
+        """What is in the recordings, before anything is learned from them."""
+        if self.results.inspection is None:
+            return None
+        return inspection_section(self.results.inspection, self.results.images, self.results.vectors)
 
     def formulas(self) -> ReportSection | None:
         """What was found, typeset, with coefficients and their errors."""

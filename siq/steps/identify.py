@@ -12,6 +12,7 @@ from pydantic.dataclasses import dataclass
 
 from siq.certificate.tests import PredictionLimits, Verdict, check_prediction
 from siq.data.held_out import held_out_recordings
+from siq.data.markov_lag import markov_lag
 from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
 from siq.data.selection import select_recordings
 from siq.errors import NumericalFailure
@@ -24,6 +25,7 @@ from siq.identify.identification import (
     with_stability,
 )
 from siq.identify.identified_field import IdentifiedField
+from siq.identify.noise_regression import constant_noise_probability
 from siq.identify.prediction import prediction_errors
 from siq.identify.random_forces import with_random_forces
 from siq.identify.residuals import (
@@ -36,6 +38,7 @@ from siq.identify.storage import FieldRecord, field_library, read_field, write_f
 from siq.identify.weighted_regression import fit_weighted, with_given_noise, with_noise_formula
 from siq.numerics.randomness import Purpose, generator
 from siq.steps.identify_beside_sensor import beside_sensor_noise, filtered_record, units_of_states
+from siq.steps.identify_from_earlier import record_from_earlier
 from siq.steps.outcomes import Outcome, Status, Step, read_outcomes, write_outcomes
 from siq.steps.settings import STRICT, Sampling, StateSpace
 
@@ -95,7 +98,13 @@ def _identified(settings: IdentifySettings, recordings: Recordings, number: int)
         options=options,
         integrator_step=maker,
     )
-    if carries_noise(library, parts[0], options=options, integrator_step=maker):
+    noisy = carries_noise(library, parts[0], options=options, integrator_step=maker)
+    if noisy and maker is None and (memory := markov_lag(recordings)).remembers:
+        return record_from_earlier(
+            recordings, memory, held=held, library=library, options=options, space=settings.space,
+            limits=settings.prediction,
+        )  # fmt: skip
+    if noisy:
         # Under noise every recording counts: all give the result, a part of them its test.
         everything = snapshot_pairs(recordings, pair_step=step)
         found = with_random_forces(identify_pairs(everything), everything)
@@ -129,7 +138,10 @@ def _identified(settings: IdentifySettings, recordings: Recordings, number: int)
         "correlation_score": noise.correlation_score,
         "measurement": noise.measurement.tolist(),
         "diffusion": str(source),
-        "note": noise.note,
+        "note": "; ".join(
+            each for each in (noise.note, _unlike(found, noise, source, recordings, settings)) if each
+        )
+        or None,
         "pairs": sum(len(part.h) for part in parts),
     }
     return FieldRecord(found, verdict.as_data(), kept)
@@ -160,6 +172,26 @@ def _with_diffusion(
             return with_own, noise, DiffusionSource.ESTIMATED
     check_units(recordings.names, units_of_states(recordings, space))
     return found, residual_noise(found, recordings, pair_step=step), DiffusionSource.UNIT
+
+
+def _unlike(
+    found: IdentifiedField,
+    noise: NoiseDiagnosis,
+    source: DiffusionSource,
+    recordings: Recordings,
+    settings: IdentifySettings,
+) -> str | None:
+    """What has to be said of a constant D that was given, where the recordings speak for another."""
+    if source != DiffusionSource.GIVEN or noise.kind != "process" or not found.diffusion.constant:
+        return None
+    pairs = snapshot_pairs(recordings, pair_step=settings.sampling.pair_step)
+    probability = constant_noise_probability(found, pairs, residuals(found, pairs))
+    if probability >= settings.identification.false_terms:
+        return None
+    return (
+        "the noise is stronger at some states than at others, and the D that was given is the same"
+        " everywhere: leave it out, or give formulas of the states"
+    )
 
 
 def _held_out_verdict(

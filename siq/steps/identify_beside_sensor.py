@@ -17,12 +17,12 @@ from siq.identify.identified_field import IdentifiedField
 from siq.identify.noise_regression import constant_noise_probability
 from siq.identify.noisy_sensor import FilteredField, held_out_evidence, identify_by_likelihood
 from siq.identify.residuals import LARGE, SIGNIFICANT, shared_errors
+from siq.identify.rounding import HARMLESS, is_rounding, rounding_bias, rounding_errors
 from siq.identify.selection import critical_values
 from siq.identify.storage import FieldRecord
 from siq.steps.settings import Sampling, StateSpace
 
 SUSPECT = -1.0  # standard errors of the correlation of neighbouring residuals
-UNDRIVEN = 0.05  # share of random forces in the residuals, below which nothing but sensors is noisy
 LEAST, MOST = 1e-3, 0.45  # of the residuals' variance: a sensor's share of it that a fit begins with
 
 
@@ -59,9 +59,11 @@ def beside_sensor_noise(
         Where much sensor noise is seen and the likelihood leads to no f.
     """
     correlation, score = shared_errors(found, recordings, pair_step=pair_step)
-    if not (score < SUSPECT).any() or not (1 + 2 * correlation > UNDRIVEN).any():
+    if not (score < SUSPECT).any():
         return None
     pairs = snapshot_pairs(recordings, pair_step=pair_step)
+    if _harmless_rounding(found, recordings, correlation, pair_step=pair_step):
+        return None
     much = bool(((score < -SIGNIFICANT) & (correlation < -LARGE)).any())
     if not much and _uneven(found, recordings, options.false_terms, pair_step=pair_step):
         return None
@@ -103,7 +105,9 @@ def filtered_record(
     step = sampling.pair_step
     pairs = len(snapshot_pairs(recordings, pair_step=step).h)
     given = space.noise(recordings.names)
-    estimated = None if given is not None else estimated_diffusion(filtered.found, pairs=pairs)
+    estimated = None
+    if given is None and filtered.found.noise_rate.any():
+        estimated = estimated_diffusion(filtered.found, pairs=pairs)
     source = DiffusionSource.GIVEN if given is not None else DiffusionSource.ESTIMATED
     if given is None and estimated is None:
         source = DiffusionSource.UNIT
@@ -112,6 +116,7 @@ def filtered_record(
     found = replace(filtered.found, diffusion=diffusion)
     intensity = diffusion.intensity(found.noise_rate)
     probability, ratio = held_out_evidence(filtered, *parts, pair_step=step)
+    forced = bool(found.noise_rate.any())
     coloured = abs(filtered.score) > SIGNIFICANT and abs(filtered.correlation) > LARGE
     verdict = check_prediction(
         noise_fault=(
@@ -127,9 +132,9 @@ def filtered_record(
         found,
         verdict.as_data(),
         {
-            "kind": "coloured" if coloured else "process",
+            "kind": "coloured" if coloured else "process" if forced else "sensor",
             "intensity": intensity,
-            "covariance": (found.noise_rate / intensity).tolist(),
+            "covariance": (found.noise_rate / intensity if forced else np.eye(len(sizes))).tolist(),
             "correlation": filtered.correlation,
             "correlation_score": filtered.score,
             "measurement": sizes.tolist(),
@@ -145,6 +150,19 @@ def units_of_states(recordings: Recordings, space: StateSpace) -> list[str | Non
     """The unit of each state, None where nobody said."""
     named = zip(recordings.names, recordings.units, strict=True)
     return [unit or space.unit(name) or None for name, unit in named]
+
+
+def _harmless_rounding(
+    found: IdentifiedField, recordings: Recordings, correlation: np.ndarray, *, pair_step: float | None
+) -> bool:
+    """Whether the noise of the sensor is that of rounding, and too little to bias f."""
+    rounding = rounding_errors(recordings)
+    pairs = snapshot_pairs(recordings, pair_step=pair_step)
+    size = np.diag(found.noise_rate) * float(np.median(pairs.h))
+    measured = np.sqrt(np.maximum(-correlation, 0.0) * size)
+    if not is_rounding(measured, rounding, correlation=float(correlation.min())):
+        return False
+    return rounding_bias(found, pairs, rounding) <= HARMLESS
 
 
 def _uneven(

@@ -25,13 +25,16 @@ from siq.certificate.certify import (
     uncertified,
 )
 from siq.certificate.characteristics import Reference, references_about
+from siq.certificate.descent import FEWEST, MOST_PAIRS
 from siq.certificate.held_out import HeldOut
+from siq.certificate.regions import basin_region
 from siq.certificate.tests import CertificateOptions, Function, Verdict
 from siq.data.held_out import held_out_recordings
-from siq.data.recordings import Recordings, snapshot_pairs
+from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
 from siq.dynamics.phase_portrait import PhasePortrait, evenly_spread, phase_portrait
 from siq.errors import NumericalFailure
 from siq.identify.identified_field import IdentifiedField
+from siq.identify.lagged_pairs import coarse_pairs
 from siq.identify.noisy_sensor import filtered_recordings
 from siq.identify.storage import FieldRecord
 from siq.landscape.dwell_times import NoiseStrength
@@ -202,9 +205,13 @@ class Ground:
         draw = generator(settings.seed, self.number, Purpose.REFINE)
         self.points = x[~held][evenly_spread(x[~held], generator=draw)]
         unseen = x[held][evenly_spread(x[held], generator=draw)]
-        self.held_out = HeldOut(unseen, pairs.take(held))
-        self.recordings, self.unseen = recordings, mask
+        if (memory := record.memory) is not None:
+            pairs = coarse_pairs(recordings, memory[0], lost=memory[1])
         self.portrait: PhasePortrait = phase_portrait(self.found.dynamics, self.points, seed=self.number)
+        if not self.found.noise_free:
+            mask = every_well_held_out(self.portrait, pairs, mask)
+        self.held_out = HeldOut(unseen, pairs.take(mask[pairs.recording]))
+        self.recordings, self.unseen = recordings, mask
 
     @cached_property
     def references(self) -> tuple[Reference, ...]:
@@ -261,6 +268,31 @@ class Ground:
         kept = dict(self.record.prediction)
         kept["value"] = np.inf if kept["value"] is None else kept["value"]
         return Verdict(**kept)
+
+
+def every_well_held_out(portrait: PhasePortrait, pairs: SnapshotPairs, mask: np.ndarray) -> np.ndarray:
+    """Held-out recordings, more of them where those that there are never come into some well.
+
+    Recordings under noise may stay in one well for good, and the test of motion in another would have nothing
+    to go by. They are chosen by where they are, not by where they go: the fit of V knows no increments.
+
+    Parameters
+    ----------
+    portrait
+        Attractors with their basins.
+    pairs
+        Of all recordings.
+    mask
+        Which recordings are held out, shape ``(r,)``.
+    """
+    mask = mask.copy()
+    some = pairs.take(np.arange(0, len(pairs.h), max(len(pairs.h) // MOST_PAIRS, 1)))
+    for index in range(len(portrait.attractors)):
+        there = some.recording[basin_region(portrait, index).recorded(some.x0)]
+        counts = np.bincount(there, minlength=len(mask))
+        while counts[mask].sum() < FEWEST and counts[~mask].any():
+            mask[int(np.argmax(np.where(mask, -1, counts)))] = True
+    return mask
 
 
 def refine_and_certify(

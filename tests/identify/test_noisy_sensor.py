@@ -95,6 +95,25 @@ def test_held_out_recordings_refuse_an_f_that_lacks_a_term(
     assert probability < 1e-6
 
 
+def test_relaxations_without_random_forces_are_whole_trajectories() -> None:
+    """Errors do not add up along a trajectory that nothing drives: f is known far better than by pairs."""
+    generator = np.random.default_rng(3)
+    t = 0.05 * np.arange(80)
+    start = generator.uniform(-1.5, 1.5, 30)
+    # x' = x - x³ from x(0): x² = 1/(1 + (1/x(0)² - 1) exp(-2t))
+    x = np.sign(start)[:, None] / np.sqrt(1 + (1 / start[:, None] ** 2 - 1) * np.exp(-2 * t))
+    measured = x + 0.02 * generator.standard_normal(x.shape)
+    recordings = Recordings.from_arrays(t, measured[:, :, None], names=["x"])
+    one = identified(recordings, degree=5)
+    assert [one.found.library.names[k] for _, k in one.found.support] == ["x", "x**3"]
+    errors = np.sqrt(np.diag(one.found.covariance))
+    assert (np.abs(one.found.values - [1, -1]) < 3 * errors).all() and errors.max() < 0.02
+    assert not one.found.noise_rate.any()
+    assert np.sqrt(one.sensor[0]) == pytest.approx(0.02, rel=0.05)
+    filtered = filtered_recordings(one.found, one.sensor, recordings)
+    assert np.std(filtered.values - x.reshape(-1, 1)) < 0.2 * 0.02
+
+
 def test_a_gap_begins_another_recording() -> None:
     t = np.concatenate([np.arange(5), np.arange(20, 26)]).astype(float)
     data = unbroken(Recordings.from_arrays(t, np.zeros((11, 1)), names=["x"]))

@@ -5,7 +5,7 @@ import pytest
 from scipy.special import ndtr
 
 from siq.identify.library import CandidateLibrary, candidate_library
-from siq.identify.selection import Equation, critical_values, improved_support, rival_changes
+from siq.identify.selection import Equation, best_support, critical_values, improved_support, rival_changes
 
 LIBRARY = candidate_library(["x", "y"], degree=5)
 NAMES = list(LIBRARY.names)
@@ -47,6 +47,12 @@ def test_a_term_that_elimination_mistook_is_exchanged(seed: int) -> None:
     made = equation(seed, {"y": -2.0, "x**2*y": -2.0})
     start = [NAMES.index("y"), NAMES.index("x**4*y")]
     assert named(improved_support(made, start)) == {"y", "x**2*y"}
+
+
+def test_many_terms_that_make_up_a_few_are_left_for_these() -> None:
+    made = equation(1, {"x": 2.0, "x**2": -2.0, "x*y": -3.0})
+    start = [NAMES.index(one) for one in ("x**3", "x**4", "x**5", "x**3*y", "x*y**3", "x**4*y")]
+    assert named(best_support(made, start)) == {"x", "x**2", "x*y"}
 
 
 def test_noise_alone_brings_few_terms() -> None:

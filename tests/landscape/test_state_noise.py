@@ -5,12 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from known_noise import exit_time, multiplicative, one_state, potential_of_one_state
-from known_systems import KnownSystem, potential_gradient, potential_values
+from known_systems import KnownSystem, portrait_of, potential_gradient, potential_values
 
 from siq.dynamics.equilibria import find_equilibria
+from siq.landscape.density_of_wells import known_density, lowest_possible, sample_potential
 from siq.landscape.discretised_paths import PathProblem, _Across
+from siq.landscape.global_quasipotential import GlobalQuasipotential
 from siq.landscape.paths import minimum_action_path
 from siq.landscape.rates import escape_rate
+from siq.potential.local_wells import WellOptions, local_well
 
 
 def saddle_of(known: KnownSystem) -> np.ndarray:
@@ -50,7 +53,7 @@ def test_the_barrier_of_one_state_is_the_quadrature() -> None:
         assert path.action == pytest.approx(expected, rel=1e-6)
 
 
-@pytest.mark.parametrize("dimension", [2, 3, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("dimension", [2, *(pytest.param(d, marks=pytest.mark.slow) for d in (3, 4))])
 def test_barriers_and_momenta_are_those_of_the_given_potential(dimension: int) -> None:
     known = multiplicative(dimension)
     saddle = saddle_of(known)
@@ -92,7 +95,7 @@ def _mirrored(known: KnownSystem):  # type: ignore[no-untyped-def]
     return Dynamics.of((x,), drift, diffusion=((known.dynamics.diffusion.formulas[0][0].subs(back),),))
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_the_prefactor_has_the_corrections_of_itô_in_several_states(dimension: int) -> None:
     """∇²V and the divergences are known: the law can be worked out by hand along the path."""
     known = multiplicative(dimension)
@@ -111,3 +114,24 @@ def test_the_prefactor_has_the_corrections_of_itô_in_several_states(dimension: 
     assert integrated.exponent == pytest.approx(given.exponent, abs=2e-3)
     assert integrated.prefactor == pytest.approx(given.prefactor, rel=2e-3)
     assert abs(integrated.exponent) > 0.05
+
+
+def test_the_density_of_one_state_is_exact() -> None:
+    """``p ~ exp(∫ 2f/(εD) dx)/D`` for Itô's noise, at any ε."""
+    known, intensity = one_state(), 0.1
+    portrait = portrait_of(known, 300)
+    wells = tuple(
+        local_well(known.dynamics, portrait, index, options=WellOptions(degrees=(10,))) for index in (0, 1)
+    )
+    to_top = [2 * potential_of_one_state(known, float(one.attractor[0]), 0.0) for one in wells]
+    heights = max(to_top) - np.array(to_top)
+    potential = GlobalQuasipotential(wells, heights)
+    box = np.array([[-1.4, 1.4]])
+    fine, coarse = (sample_potential(potential, box, cells=cells) for cells in (2000, 1000))
+    lowest = lowest_possible(coarse, known.dynamics)
+    density = known_density(fine, coarse, lowest, intensity=intensity)
+    seen, x = fine.known, fine.axes[0]
+    heights_at = np.array([2 * potential_of_one_state(known, 0.0, float(one)) for one in x[seen]])
+    exact = np.exp(-heights_at / intensity) / known.dynamics.diffusion.at(x[seen][:, None])[:, 0, 0]
+    np.testing.assert_allclose(density.probabilities[seen], exact / exact.sum(), rtol=2e-3)
+    assert seen.mean() > 0.7

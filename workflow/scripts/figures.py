@@ -10,6 +10,7 @@ from pathlib import Path
 from siq.dynamics.cards import load_system
 from siq.identify.storage import read_field
 from siq.landscape.storage import read_landscape
+from siq.report.inspection_section import inspection_drawn
 from siq.report.interactive import interactive_view
 from siq.report.plots import save_figure
 from siq.report.settings import FiguresSettings
@@ -61,6 +62,8 @@ if __name__ == "__main__":
             view = interactive_view(picture.drawn()) if dynamics.dimension > 2 else None
         drawn = Path(now.params.folder)
         drawn.mkdir(parents=True, exist_ok=True)
+        if settings.simulation is None and recorded is not None:
+            figures |= inspection_drawn(recorded, folder=drawn)
         if view is not None:
             (drawn / "interactive.html").write_text(view, encoding="utf-8")
         for name, figure in figures.items():

@@ -14,6 +14,7 @@ import siq
 from siq.files.whole import whole_file
 from siq.identify.storage import read_field
 from siq.report.answer import answer_of, write_answer
+from siq.report.inspection_section import read_inspection
 from siq.report.page import render_report
 from siq.report.settings import PageSettings
 from siq.report.study_page import study_page
@@ -55,6 +56,7 @@ if __name__ == "__main__":
             vectors=files(folders, ".svg"),
             overview=overview,
             record=read_field(source.fields[run]),
+            inspection=read_inspection(source.drawn),
             interactive=Markup(view.read_text(encoding="utf-8")) if view.is_file() else None,
         )
         programs = PACKAGES if study.training is None else (*PACKAGES, *OF_NETWORKS)

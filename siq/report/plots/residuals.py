@@ -12,10 +12,13 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from siq.data.lagged import lagged_covariances, long_run_covariance
+from siq.data.markov_lag import markov_lag
 from siq.data.recordings import Recordings, snapshot_pairs
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.simulation import runge_kutta_step
 from siq.identify.identified_field import NOISE_FREE
+from siq.identify.lagged_pairs import lagged_pairs
 from siq.landscape.landscape import Landscape
 from siq.report.plots.diagnosis import draw_errors
 from siq.report.plots.landscape_curves import scaled_label
@@ -148,9 +151,21 @@ def rate_unit(unit: str, time_unit: str) -> str:
 
 
 def binned_residuals(dynamics: Dynamics, recordings: Recordings, place: int) -> BinnedResiduals:
-    """What f leaves of the increments of one state, in bins along it."""
-    pairs = snapshot_pairs(recordings)
-    some = slice(None, None, max(len(pairs.h) // PAIRS, 1))
+    """What f leaves of the increments of one state, in bins along it.
+
+    Where recordings remember, the present state tells which way their noise pushes: bins are then along the
+    state so much earlier, which does not.
+    """
+    memory = markov_lag(recordings)
+    lag = memory.lag if memory.remembers else None
+    if lag is None:
+        pairs = snapshot_pairs(recordings)
+        some = slice(None, None, max(len(pairs.h) // PAIRS, 1))
+        along = pairs.x0[some, place]
+    else:
+        given = lagged_pairs(recordings, lag)
+        pairs, some = given.pairs, slice(0, PAIRS)  # one after the other, as their noise is correlated
+        along = given.earlier[some, place]
     x0, xh, h = pairs.x0[some], pairs.xh[some], pairs.h[some]
     width = np.where((span := np.ptp(x0, axis=0)) > 0, span, 1.0)
     jacobian = dynamics.jacobian(x0) * width / width[:, None]
@@ -160,7 +175,8 @@ def binned_residuals(dynamics: Dynamics, recordings: Recordings, place: int) -> 
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(steps):
             x = runge_kutta_step(dynamics.drift_of_components, x, h / steps)
-    left, along = (xh[:, place] - x[place]) / h, x0[:, place]
+    left = (xh[:, place] - x[place]) / h
+    together = 1.0 if lag is None else _together(left, given.number[some], lag)
     known = np.isfinite(left)
     left, along = left[known], along[known]
     low, high = float(along.min()), float(along.max())
@@ -170,9 +186,17 @@ def binned_residuals(dynamics: Dynamics, recordings: Recordings, place: int) -> 
     return BinnedResiduals(
         np.array([along[one].mean() for one in rows]),
         np.array([left[one].mean() for one in rows]),
-        np.array([left[one].std(ddof=1) / np.sqrt(one.sum()) for one in rows]),
+        np.array([together * left[one].std(ddof=1) / np.sqrt(one.sum()) for one in rows]),
         float(np.sqrt(np.mean(left**2) / np.mean((xh - x0)[:, place] ** 2 / h**2))),
     )
+
+
+def _together(left: np.ndarray, number: np.ndarray, lag: int) -> float:
+    """By how much the error of a mean is larger, since neighbours go together."""
+    rest = np.where(np.isfinite(left), left - left[np.isfinite(left)].mean(), 0.0)[:, None]
+    covariances = lagged_covariances(rest, number, lag)
+    share = float(long_run_covariance(covariances, lag)[0, 0] / covariances[0, 0, 0])
+    return float(np.sqrt(max(share, 1.0)))
 
 
 def _draw(axes: Axes, binned: BinnedResiduals, name: str, units: tuple[str, str]) -> list[Any]:

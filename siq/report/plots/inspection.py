@@ -1,0 +1,168 @@
+"""What is in the recordings: the states in time, which of them were visited, and what neighbours remember."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from siq.data.inspection import Inspection
+from siq.report.plots.style import (
+    BLACK,
+    BLUE,
+    COLUMN_WIDTH,
+    GREY,
+    VERMILLION,
+    axis_label,
+    counted,
+    drawn_in_style,
+    name_label,
+    say,
+    unit_label,
+)
+
+POINTS = 1500  # across a panel: more than it has dots
+TOGETHER = 12  # short recordings drawn in one panel
+SHORT = 20  # recordings; where there are more, each is a relaxation, and several are drawn
+LONG = 0.9  # of the longest recording
+BINS = 60
+LAGS = 60  # shown at most
+STATES = 4  # drawn below each other; the text has all
+
+
+@drawn_in_style
+def plot_inspection(found: Inspection) -> Figure:
+    """Three panels below each other, of the first state and, where there is one, the second.
+
+    Parameters
+    ----------
+    found
+        See `siq.data.inspection.inspect`.
+    """
+    figure = Figure(figsize=(COLUMN_WIDTH, 7.2))
+    first, second, third = figure.subplots(3, 1)
+    _draw_record(first, found, 0)
+    _draw_visits(second, found)
+    _draw_memory(third, found)
+    for axes, letter in zip((first, second, third), "abc", strict=True):
+        axes.set_title(f"({letter}) {axes.get_title(loc='left')}", loc="left")
+    return figure
+
+
+def inspection_figures(found: Inspection) -> dict[str, Figure]:
+    """The figures of a page by name: ``record``, ``visited``, ``memory``."""
+    return {
+        "record": record_figure(found),
+        "visited": visited_figure(found),
+        "memory": memory_figure(found),
+    }
+
+
+@drawn_in_style
+def record_figure(found: Inspection) -> Figure:
+    """The states in the course of time, a panel for each."""
+    count = min(len(found.states), STATES)
+    figure = Figure(figsize=(COLUMN_WIDTH, 1.7 * count + 0.5))
+    for state, axes in enumerate(figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]):
+        _draw_record(axes, found, state)
+        if state < count - 1:
+            axes.set_xlabel("")
+        if state > 0:
+            axes.set_title("", loc="left")
+    return figure
+
+
+@drawn_in_style
+def visited_figure(found: Inspection) -> Figure:
+    """How often each state was visited, on the plane of the first two."""
+    figure = Figure(figsize=(COLUMN_WIDTH, 2.9))
+    _draw_visits(figure.add_subplot(), found)
+    return figure
+
+
+@drawn_in_style
+def memory_figure(found: Inspection) -> Figure:
+    """How residuals of increments go together over lags."""
+    figure = Figure(figsize=(COLUMN_WIDTH, 2.7))
+    _draw_memory(figure.add_subplot(), found)
+    return figure
+
+
+def _labels(found: Inspection) -> list[str]:
+    recordings = found.recordings
+    return [
+        axis_label(name, unit or "1") for name, unit in zip(recordings.names, recordings.units, strict=True)
+    ]
+
+
+def _draw_record(axes: Axes, found: Inspection, state: int) -> None:
+    """One state in time: the longest recording, or several where there are many short ones."""
+    recordings = found.recordings
+    counts = np.bincount(recordings.recording)
+    begins = np.cumsum(counts) - counts
+    if len(counts) > SHORT:
+        chosen = np.unique(np.linspace(0, len(counts) - 1, TOGETHER).astype(int))
+    else:
+        # Of the longest the one that moves most: it shows transitions, where there are any.
+        long = np.flatnonzero(counts >= LONG * counts.max())
+        spans = [np.ptp(recordings.values[begins[one] : begins[one] + counts[one], state]) for one in long]
+        chosen = long[[int(np.argmax(spans))]]
+    for one in chosen:
+        rows = slice(begins[one], begins[one] + counts[one])
+        t, x = recordings.t[rows] - recordings.t[begins[one]], recordings.values[rows, state]
+        every = -(-len(t) // POINTS)
+        if every < 4:
+            axes.plot(t, x, linewidth=0.6, color=BLUE, rasterized=True)
+            continue
+        # From the lowest to the highest value of each dot: no excursion is lost.
+        edges = np.arange(0, len(t), every)
+        low, high = np.minimum.reduceat(x, edges), np.maximum.reduceat(x, edges)
+        axes.fill_between(t[edges], low, high, color=BLUE, linewidth=0.3, rasterized=True)
+    hops = found.switching
+    if hops is not None and hops.supported and hops.state == state:
+        for level in hops.levels:
+            axes.axhline(level, color=BLACK, linestyle="--", linewidth=0.8)
+    time_unit = recordings.time_unit
+    axes.set_xlabel(f"time {unit_label(time_unit or '')}".strip())
+    axes.set_ylabel(_labels(found)[state])
+    shown = f"{len(chosen)} of {counted(len(counts), 'recording')}" if len(counts) > 1 else "the recording"
+    axes.set_title(shown, loc="left")
+
+
+def _draw_visits(axes: Axes, found: Inspection) -> None:
+    values, labels = found.recordings.values, _labels(found)
+    if values.shape[1] == 1:
+        axes.hist(values[:, 0], bins=BINS, color=GREY)
+        axes.set_xlabel(labels[0])
+        axes.set_ylabel("number of samples")
+    else:
+        counts, *edges = np.histogram2d(values[:, 0], values[:, 1], bins=BINS)
+        seen = np.where(counts > 0, np.log10(np.maximum(counts, 1.0)), np.nan)
+        mesh = axes.pcolormesh(*edges, seen.T, cmap="cividis_r", rasterized=True)
+        axes.figure.colorbar(mesh, ax=axes, label=r"$\log_{10}$ of the samples")
+        axes.set_xlabel(labels[0])
+        axes.set_ylabel(labels[1])
+    axes.set_title(f"visited: {100 * found.coverage.share:.0f} % of the range", loc="left")
+
+
+def _draw_memory(axes: Axes, found: Inspection) -> None:
+    memory = found.memory
+    if not len(memory.lags):
+        say(axes, "too few evenly spaced samples to tell what neighbours remember")
+        return
+    shown = slice(0, LAGS)
+    lags = memory.lags[shown]
+    band = 2 * memory.errors[shown].max(axis=1)
+    axes.fill_between(lags, -band, band, color=GREY, alpha=0.3, linewidth=0, label="± 2 standard errors")
+    axes.axhline(0.0, color=GREY, linewidth=0.8)
+    if memory.remembers and memory.lag is not None:
+        axes.axvline(memory.lag, color=BLACK, linestyle="--", linewidth=0.9, label="Markovian from here on")
+    for state, name in enumerate(found.recordings.names[:STATES]):
+        axes.plot(
+            lags, memory.correlations[shown, state], marker="o", markersize=3, linewidth=0.8,
+            color=(BLUE, VERMILLION, "#009E73", "#E69F00")[state], label=f"${name_label(name)}$",
+        )  # fmt: skip
+    axes.set_xlabel("steps between two increments")
+    axes.set_ylabel("correlation")
+    axes.set_title("what one increment knows of another", loc="left")
+    axes.legend(loc="best")

@@ -1,0 +1,70 @@
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+from remembering import STEP, double_wells
+
+import siq
+from siq.data.inspection import Inspection
+from siq.data.recordings import Recordings
+
+
+def recorded(values: np.ndarray, **options: str) -> Recordings:
+    names = ["x", "y"][: values.shape[2]]
+    t = np.arange(values.shape[1]) * STEP
+    return Recordings.from_arrays(t, values, names=names, time_unit=options.get("time_unit"))
+
+
+@pytest.fixture(scope="module")
+def blurred() -> Inspection:
+    return siq.inspect(recorded(double_wells(1, exposure=3.0, samples=10_000), time_unit="s"))
+
+
+def test_a_file_a_table_and_recordings_are_told_alike(tmp_path: object, blurred: Inspection) -> None:
+    recordings = blurred.recordings
+    table = pd.DataFrame(
+        {"recording": recordings.recording, "t [s]": recordings.t, "x": recordings.values[:, 0]}
+    )
+    assert siq.inspect(table).lines() == blurred.lines()
+
+
+def test_memory_transitions_coverage_and_prospects_are_said(blurred: Inspection) -> None:
+    text = blurred.text()
+    for words in (
+        "beyond an exposure of 0.03 s",
+        "Markovian from 4 steps (0.04 s) on",
+        "Two states are supported",
+        "transitions seen",
+        "of the range of x was visited",
+        "Random forces are seen",
+        "seen from a sample 4 steps earlier",
+    ):
+        assert words in text
+    assert "sensor noise of about" not in text  # a first look would take the exposure for something else
+
+
+def test_gaps_and_labels_are_said() -> None:
+    values = double_wells(1, samples=1_000, traces=1)[0]
+    t = np.arange(len(values)) * STEP
+    t[500:] += 5.0
+    both = np.column_stack([values, values[:, 0] > 0])
+    found = siq.inspect(Recordings.from_arrays(t, both, names=["x", "side"]))
+    assert found.gaps == 1
+    assert "neighbouring samples, 1 gap\n" in found.text()
+    assert "only 2 different values" in found.text()
+
+
+def test_relaxations_without_noise_are_not_asked_for_transitions() -> None:
+    t = np.linspace(0, 3, 101)
+    starts = np.random.default_rng(0).uniform(-1.5, 1.5, (40, 1))
+    found = siq.inspect(Recordings.from_arrays(t, (starts * np.exp(-t))[:, :, None], names=["x"]))
+    assert found.memory.kind == "none"
+    assert found.switching is None
+    assert "No random forces are seen" in found.text()
+
+
+def test_three_panels_show_it(blurred: Inspection) -> None:
+    figure = blurred.plot()
+    assert len(figure.axes) == 3
+    assert figure.axes[2].get_xlabel() == "steps between two increments"
