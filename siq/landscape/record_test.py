@@ -175,8 +175,10 @@ def record_test(
     seed
         Decides the draws of f.
     """
-    if noise is None or found.noise_free:
+    if found.noise_free:
         return RecordTest(missing="the recordings show no random forces, so that nothing hops")
+    if noise is None:
+        return RecordTest(missing="the strength of the random forces is not known")
     if len(portrait.attractors) < 2:
         return RecordTest(missing="there is one stable state, so that nothing hops")
     cores = cores_about(found.dynamics, portrait, noise.intensity)
