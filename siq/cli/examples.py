@@ -13,8 +13,8 @@ from siq.files.whole import whole_file
 
 DOUBLE_WELL = """\
 # A bead hops between two optical traps at -0.5 um and 0.5 um, and the camera adds an error of 0.01 um to each
-# value. The recordings were simulated, so that the answer is known: dx = (8 x - 32 x**3) dt + noise of strength
-# 0.3 um**2/s, and a barrier of 1 um**2/s in U, which is 3.3 times the noise.
+# value. The recordings were simulated, so that the answer is known: dx = (8 x - 32 x**3) dt + noise of
+# strength 0.3 um**2/s, and a barrier of 1 um**2/s in U, which is 3.3 times the noise.
 name: double-well
 title: A bead in two optical traps
 recordings:
