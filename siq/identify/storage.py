@@ -61,6 +61,12 @@ class FieldRecord:
         return deviations**2
 
     @property
+    def exposure(self) -> float | None:
+        """The step over which each sample was taken as a mean; None where as the state itself."""
+        given = self.noise.get("exposure")
+        return None if given is None else float(given)
+
+    @property
     def noise_strength(self) -> tuple[float, float] | None:
         """ε and its standard error, None where the recordings show no white noise.
 
