@@ -27,6 +27,7 @@ from scipy import stats
 
 from siq.certificate.tests import Verdict
 from siq.data.recordings import Recordings
+from siq.data.selection import joined
 from siq.data.stationarity import correlated_samples, runs_of
 from siq.data.transitions import DwellCount, continued_visits, dwell_counts
 from siq.dynamics.phase_portrait import PhasePortrait
@@ -181,10 +182,10 @@ def record_test(
         return RecordTest(missing="there is one stable state, so that nothing hops")
     cores = cores_about(found.dynamics, portrait, noise.intensity)
     runs = runs_of(recordings)
-    visits = continued_visits(cores.of(recordings.values), runs)
+    visits = continued_visits(cores.of(recordings.values), runs_of(joined(recordings)))
     apart = [run for run in runs if held_out[recordings.recording[run.start]]]
     states = len(portrait.attractors)
-    whole = dwell_counts(recordings.t, visits, runs, states=states)
+    whole = dwell_counts(recordings.t, visits, runs_of(joined(recordings)), states=states)
     held = dwell_counts(recordings.t, visits, apart, states=states)
     if found.dynamics.dimension not in CELLS and not any(one.visits for one in whole):
         return RecordTest(missing="the recordings do not hop")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from siq.data.inspection import inspection_of
 from siq.data.recordings import Recordings
+from siq.data.selection import joined
 from siq.report.page import ReportFigure, ReportSection
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ def inspection_drawn(recordings: Recordings, *, folder: Path) -> dict[str, Figur
     """The figures of an inspection by name; what it says is written into the folder."""
     from siq.report.plots.inspection import inspection_figures  # matplotlib
 
-    found = inspection_of(recordings)
+    found = inspection_of(joined(recordings))
     (folder / FILE).write_text(json.dumps(found.lines(), ensure_ascii=False) + "\n", encoding="utf-8")
     return inspection_figures(found)
 
