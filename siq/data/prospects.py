@@ -69,7 +69,7 @@ def transition_sentences(
                 " best; more needs longer recordings."
             )
     else:
-        said.append("The recordings by themselves support one state; transitions between two are not seen.")
+        said.append("By themselves the recordings do not support more than one state.")
     if found.background.half_periods:
         said.append(
             f"The background of {title} drifts slowly, over a range of {found.background.range:.2g}: a part"

@@ -108,7 +108,8 @@ def joined(recordings: Recordings) -> Recordings:
     follows = [False] + [
         one is not None
         and other is not None
-        and (one["label"], one["of"], int(one["number"]) + 1) == (other["label"], other["of"], int(other["number"]))
+        and (one["label"], one["of"], int(one["number"]) + 1)
+        == (other["label"], other["of"], int(other["number"]))
         for one, other in pairwise(numbers)
     ]
     if not any(follows):

@@ -29,7 +29,7 @@ from siq.certificate.tests import Verdict
 from siq.data.recordings import Recordings
 from siq.data.selection import joined
 from siq.data.stationarity import correlated_samples, runs_of
-from siq.data.transitions import DwellCount, continued_visits, dwell_counts
+from siq.data.transitions import LEVEL, DwellCount, Switching, continued_visits, dwell_counts, switching
 from siq.dynamics.phase_portrait import PhasePortrait
 from siq.identify.identified_field import IdentifiedField
 from siq.landscape.dwell_times import NoiseStrength
@@ -106,12 +106,25 @@ class DensityTest:
 
 @dataclass(frozen=True)
 class RecordTest:
-    """All of it. `missing` says in words why there is no test, or is None."""
+    """All of it.
+
+    Attributes
+    ----------
+    visits, densities
+        As counted, and as predicted.
+    missing
+        Why neither is compared, in words; None where they are.
+    notes
+        What is not known, in words.
+    unseen
+        Two states between which the record hops, where a single one was identified; None elsewhere.
+    """
 
     visits: tuple[VisitTest, ...] = ()
     densities: tuple[DensityTest, ...] = ()
     missing: str | None = None
     notes: tuple[str, ...] = ()
+    unseen: Switching | None = None
 
     @property
     def hops(self) -> int:
@@ -129,6 +142,9 @@ class RecordTest:
         false_alarms
             Probability with which chance alone refuses what is right.
         """
+        if self.unseen is not None:
+            rarity, limit = -float(np.log10(self.unseen.probability)), -float(np.log10(LEVEL))
+            return Verdict(rarity, limit, False, self._unseen())
         found = [one.probability for one in self.visits] + [one.probability for one in self.densities]
         if self.missing is not None or not found:
             return None
@@ -136,6 +152,14 @@ class RecordTest:
         rarity = -float(np.log10(min(max(least * len(found), 1e-300), 1.0)))
         limit = -float(np.log10(false_alarms))
         return Verdict(rarity, limit, rarity <= limit, "" if rarity <= limit else self._reason(least))
+
+    def _unseen(self) -> str:
+        assert self.unseen is not None
+        low, high = self.unseen.levels
+        return (
+            f"the record hops between two states, at {low:.3g} and {high:.3g}, with {self.unseen.hops}"
+            " transitions seen, and what was identified has one stable state"
+        )
 
     def _reason(self, least: float) -> str:
         for one in self.visits:
@@ -179,7 +203,11 @@ def record_test(
     if noise is None or found.noise_free:
         return RecordTest(missing="the recordings show no random forces, so that nothing hops")
     if len(portrait.attractors) < 2:
-        return RecordTest(missing="there is one stable state, so that nothing hops")
+        seen = switching(joined(recordings)) if found.dynamics.dimension == 1 else None
+        return RecordTest(
+            missing="there is one stable state, so that nothing hops",
+            unseen=seen if seen is not None and seen.supported else None,
+        )
     cores = cores_about(found.dynamics, portrait, noise.intensity)
     runs = runs_of(recordings)
     visits = continued_visits(cores.of(recordings.values), runs_of(joined(recordings)))
