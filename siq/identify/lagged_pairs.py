@@ -237,8 +237,8 @@ def identify_from_earlier(
     if missing:
         raise NumericalFailure(
             f"no term of the equation of {library.states[missing[0]]} is significant: what is recorded"
-            f" remembers for {given.lag} steps, and states so much earlier tell too little of its motion; record"
-            " longer, or a quantity that fluctuates less"
+            f" remembers for {given.lag} steps, and states so much earlier tell too little of its motion;"
+            " record longer, or a quantity that fluctuates less"
         )
     noise = Diffusion.identity(d) if diffusion is None else diffusion
     while True:

@@ -64,7 +64,8 @@ def run(
     """The landscape of the identified f within the recorded region.
 
     The wells are those of the refinement, with their certificate, and `visits` those that its test against
-    the record compared; where it found none, the local route is asked once more, within the whole recorded region, unless `seek_wells` says that it shall not.
+    the record compared; where it found none, the local route is asked once more, within the whole
+    recorded region, unless `seek_wells` says that it shall not.
     """
     if recordings is None or record is None:
         reason = "no vector field was identified"
