@@ -11,6 +11,9 @@ the next saddle if that is less. What is predicted is this same time: in one and
 Fokker–Planck operator (`siq.reference.fokker_planck`), whatever the barrier, and beyond that by the law of
 Eyring and Kramers, whose mean time is that to the neighbourhood of the next attractor.
 
+A record knows only what it saw at its samples, and so the cores of the prediction are smaller than those of
+the count by what a walk oversteps (`siq.landscape.predicted_visits.Cores.as_sampled`).
+
 *Which error.* n visits that ended in a time T were as likely as Poisson's law with the mean T/τ says, where τ
 is uncertain by what draws of f from its distribution, and of ε, make of it. The distribution of each state
 during the visits to a well is compared as Kolmogorov and Smirnov do, with as many samples as the correlation
@@ -28,7 +31,7 @@ from scipy import stats
 from siq.certificate.tests import Verdict
 from siq.data.recordings import Recordings
 from siq.data.selection import joined
-from siq.data.stationarity import correlated_samples, runs_of
+from siq.data.stationarity import correlated_samples, runs_of, usual_step
 from siq.data.transitions import LEVEL, DwellCount, Switching, continued_visits, dwell_counts, switching
 from siq.dynamics.phase_portrait import PhasePortrait
 from siq.identify.identified_field import IdentifiedField
@@ -217,7 +220,8 @@ def record_test(
     held = dwell_counts(recordings.t, visits, apart, states=states)
     if found.dynamics.dimension not in CELLS and not any(one.visits for one in whole):
         return RecordTest(missing="the recordings do not hop")
-    prediction = predicted_visits(found, portrait, noise, cores, seed=seed)
+    sampled = cores.as_sampled(found.dynamics, noise.intensity, usual_step(recordings))
+    prediction = predicted_visits(found, portrait, noise, sampled, seed=seed)
     tested = tuple(
         VisitTest(
             one.well, held[one.well], whole[one.well], one.mean, one.error, prediction.method,

@@ -124,6 +124,9 @@ class StudyParts:
             # What is seen without any formula comes first where the formula misses it.
             alone = f"What was identified misses them: {told[0][0].lower()}{told[0][1:]}"
             return [seen, alone, *told[1:]]
+        certificate = self._certificate()
+        if seen and (certificate is None or not certificate["certified"]):
+            told.append(f"Without any formula: {seen[0].lower()}{seen[1:]}")
         return told
 
     def _why(self) -> str:
@@ -386,6 +389,8 @@ class StudyParts:
 
     def _method_said(self) -> str:
         routes = self.study.refinement.with_routes(networks=self.study.training is not None).routes or ()
+        if self.results.record is None:
+            return "No f was identified, so that there is no formula."
         return (
             f"f was identified {self._identified_by()}. The formulas solve the Hamilton–Jacobi"
             " equation of this"
