@@ -119,6 +119,9 @@ def follow_well(dynamics: Dynamics, portrait: PhasePortrait, index: int, *, seed
         return Reference(attractor, empty, np.zeros(0), np.nan, np.inf, fault)
     lowest = lowest_sheet(fan)
     kept = np.flatnonzero(lowest & region.recorded(fan.points))
+    if not len(kept):
+        fault = f"no characteristic from the attractor {shown} stays where states were recorded"
+        return Reference(attractor, empty, np.zeros(0), np.nan, np.inf, fault)
     scaled = (fan.points[kept] - attractor) @ fan.metric.T
     distance = _spacing(len(attractor))
     kept = kept[representative_subset(scaled, distance=distance, generator=np.random.default_rng(seed))]

@@ -29,6 +29,7 @@ from siq.data.prospects import (
 )
 from siq.data.recordings import LONGEST_STEP, Recordings, read_recordings
 from siq.data.transitions import Switching, switching
+from siq.numerics.measured_text import value_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -186,8 +187,8 @@ def _findings(
     if np.isfinite(memory.relaxation) and memory.kind not in ("unknown", "hidden"):
         unit = f" {recordings.time_unit}" if recordings.time_unit else ""
         said.append(
-            f"A fluctuation is forgotten within about {memory.relaxation:.2g}{unit},"
-            f" {memory.relaxation / memory.step:.2g} steps."
+            f"A fluctuation is forgotten within about {value_text(memory.relaxation, digits=2)}{unit},"
+            f" {value_text(memory.relaxation / memory.step, digits=2)} steps."
         )
     said += transition_sentences(hops, titles=recordings.titles, time_unit=recordings.time_unit)
     return [*said, coverage_sentence(coverage, titles=recordings.titles)]

@@ -11,6 +11,7 @@ from siq.data.learnable import SINGLE, SINGLE_REMEDY
 from siq.data.markov_lag import MarkovLag
 from siq.data.recordings import Recordings
 from siq.data.transitions import DwellCount, Switching
+from siq.numerics.measured_text import range_text, value_text
 
 COARSE = 0.5  # relaxation times: over a longer step most of what f does is forgotten
 SPARSE = 0.3  # of the cells of the range; less is a thin line, on which a formula knows nothing beside it
@@ -69,7 +70,7 @@ def transition_sentences(
                 " best; more needs longer recordings."
             )
     else:
-        said.append("The recordings by themselves support one state; transitions between two are not seen.")
+        said.append("By themselves the recordings do not support more than one state.")
     if found.background.half_periods:
         said.append(
             f"The background of {title} drifts slowly, over a range of {found.background.range:.2g}: a part"
@@ -83,8 +84,8 @@ def transition_sentences(
 def _dwell(count: DwellCount, unit: str) -> str:
     low, high = count.limits
     if not count.visits:
-        return f"more than {low:.2g}{unit}"
-    return f"{count.mean:.2g}{unit} ({low:.2g} to {high:.2g})"
+        return f"more than {value_text(low, digits=2)}{unit}"
+    return f"{value_text(count.mean, digits=3)}{unit} ({range_text(low, high)})"
 
 
 def noise_prospects(recordings: Recordings, *, forced: bool, known: bool, noisy: Sequence[str]) -> list[str]:
@@ -137,7 +138,7 @@ def memory_prospects(memory: MarkovLag, *, time_unit: str | None) -> list[str]:
     said = []
     if memory.remembers:
         said.append(
-            f"Formulas are found all the same: each increment is seen from a sample {memory.lag} steps"
+            f"Formulas are sought all the same: each increment is seen from a sample {memory.lag} steps"
             " earlier, which knows nothing of what is remembered."
         )
     if memory.kind == "hidden":

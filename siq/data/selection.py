@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -66,6 +68,7 @@ def resample_recordings(recordings: Recordings, *, generator: np.random.Generato
 
 STRETCHES = 10  # of a single recording, at least, two of which are held out
 MOST_STRETCHES = 40  # more make no error better known
+STRETCH_LABEL = re.compile(r"(?P<label>.*) \((?P<number>\d+) of (?P<of>\d+)\)")
 LENGTH = 10  # correlation times in a stretch: what is left of its first sample at its end is then nothing
 
 
@@ -93,3 +96,30 @@ def in_stretches(recordings: Recordings) -> Recordings:
         recording=np.arange(count) * cut // count,
         notes=(*recordings.notes, note),
     )
+
+
+def joined(recordings: Recordings) -> Recordings:
+    """Put together again what `in_stretches` has cut, where one stretch follows the other.
+
+    What takes long, such as a hop or a memory, is not seen in a stretch: how long a record remembers, and how
+    it hops, is asked of the record as a whole. Rows stay as they are.
+    """
+    numbers = [STRETCH_LABEL.fullmatch(label) for label in recordings.labels]
+    follows = [False] + [
+        one is not None
+        and other is not None
+        and (one["label"], one["of"], int(one["number"]) + 1)
+        == (other["label"], other["of"], int(other["number"]))
+        for one, other in pairwise(numbers)
+    ]
+    if not any(follows):
+        return recordings
+    labels = tuple(
+        label if number is None else number["label"]
+        for label, number, later in zip(recordings.labels, numbers, follows, strict=True)
+        if not later
+    )
+    if len(set(labels)) < len(labels):  # of recordings drawn again, some may follow, and others not
+        labels = tuple(label for label, later in zip(recordings.labels, follows, strict=True) if not later)
+    whole = np.cumsum(~np.array(follows)) - 1
+    return replace(recordings, labels=labels, recording=whole[recordings.recording])

@@ -41,6 +41,8 @@ from siq.identify.selection import (
 )
 
 ROUNDS = 6  # of deferred correction, each of which gains a factor of about h times the Jacobian
+TELLING = 0.1  # a correlation, as in `siq.data.markov_lag`: of a function that is told less well nothing is
+FEW, MANY = 3, 60  # numerical: terms left of so many functions, of which all exchanges are tried in passing
 SAMPLE = 500  # pairs by which the accuracy of the flow is judged
 
 
@@ -154,6 +156,16 @@ class _Moments:
         # Residuals of copies of resampled recordings are no further evidence.
         self.repeated = copies(given.pairs)
 
+    def told(self) -> np.ndarray:
+        """From increments along the instruments to coefficients of those functions that these tell of.
+
+        Of some function nothing may be known from an earlier state. Its coefficient would be chance, as large
+        as the error of its own instrument is small, and so would be all that is said of what is left.
+        """
+        orthogonal, upper = np.linalg.qr(self.all_terms.theta.T * self.given.pairs.h[:, None])
+        known = np.linalg.pinv(self.directions.T @ orthogonal, rcond=TELLING)
+        return np.asarray(np.linalg.lstsq(upper, known, rcond=1e-12)[0])
+
     def increments(self, problem: FlowRegression, values: np.ndarray | None) -> np.ndarray:
         """``h f(X0)`` as the pairs have it, once their flow is taken into account: shape ``(n, d)``."""
         h = self.given.pairs.h
@@ -219,8 +231,7 @@ def identify_from_earlier(
     values: np.ndarray | None = None
     for _ in range(2):
         moved = moments.increments(moments.all_terms, values)
-        solution = np.linalg.lstsq(moments.functions, moments.directions.T @ moved, rcond=1e-12)[0]
-        values = solution.T.ravel()
+        values = (moments.told() @ (moments.directions.T @ moved)).T.ravel()
     assert values is not None
     rest = moved - (moments.all_terms.matrix(values) @ (moments.all_terms.theta * given.pairs.h)).T
     spread = moments.long_run(rest) * moments.repeated
@@ -231,7 +242,11 @@ def identify_from_earlier(
     support = [(i, k) for i, one in enumerate(equations) for k in best_support(one, strong_terms(one))]
     missing = sorted(set(range(d)) - {i for i, _ in support})
     if missing:
-        raise NumericalFailure(f"no term of the equation of {library.states[missing[0]]} is significant")
+        raise NumericalFailure(
+            f"no term of the equation of {library.states[missing[0]]} is significant: what is recorded"
+            f" remembers for {given.lag} steps, and states so much earlier tell too little of its motion;"
+            " record longer, or a quantity that fluctuates less"
+        )
     noise = Diffusion.identity(d) if diffusion is None else diffusion
     while True:
         found = _fitted(moments, np.array(support), noise)

@@ -19,6 +19,7 @@ from siq.errors import NumericalFailure
 from siq.identify.identified_field import IdentifiedField
 from siq.landscape.dwell_times import Exit, NoiseStrength, dwell_time
 from siq.landscape.global_quasipotential import GlobalQuasipotential, heights_of_attractors, matched
+from siq.landscape.record_test import VisitTest
 from siq.landscape.transitions import (
     Transition,
     missing_diffusion,
@@ -73,6 +74,9 @@ class Landscape:
         Strength of the noise that drives the system, None where nobody knows it.
     found
         The identified f with its uncertainty, None where f is given.
+    visits
+        How long visits to the wells last, as counted on the recordings and as f and D say; empty where this
+        was not compared.
     """
 
     dynamics: Dynamics
@@ -87,6 +91,7 @@ class Landscape:
     position_errors: np.ndarray | None = None
     noise: NoiseStrength | None = None
     found: IdentifiedField | None = None
+    visits: tuple[VisitTest, ...] = ()
 
     @classmethod
     def from_recordings(cls, recordings: Recordings, settings: PipelineSettings | None = None) -> Landscape:

@@ -22,6 +22,8 @@ from siq.landscape.transitions import transitions, ways_out
 from siq.numerics.measured_text import place_text
 from siq.reference.fokker_planck import CELLS, CellProcess, cell_process, cores_of
 
+OVERSHOOT = 0.5826  # derived: -ζ(1/2)/√(2π)
+SMALLEST = 0.2  # of a core's radius: of steps as long as the core no such correction is known
 SHARE = 0.5  # of U at the next saddle: a core lies well within its well
 MARGINS = (
     0.15,
@@ -50,6 +52,21 @@ class Cores:
     attractors: np.ndarray
     hessians: np.ndarray
     levels: np.ndarray
+
+    def as_sampled(self, dynamics: Dynamics, intensity: float, step: float) -> Cores:
+        """Cores that a state meets all the time as often as it is seen in these at samples a step apart.
+
+        Between two samples a state may come into a core and leave it unseen. A random walk meets a boundary
+        as Brownian motion meets one that lies `OVERSHOOT` standard deviations of a step farther on (Chernoff;
+        Siegmund, Sequential Analysis, 1985): the cores are smaller by so much. The step is that along the
+        metric of the core, ``√(ε h tr(MD)/d)``.
+        """
+        levels = []
+        for place, hessian, level in zip(self.attractors, self.hessians, self.levels, strict=True):
+            spread = np.trace(hessian @ dynamics.diffusion.at(place[None])[0]) / len(place)
+            radius = np.sqrt(level) - OVERSHOOT * np.sqrt(intensity * step * max(float(spread), 0.0))
+            levels.append(max(radius, SMALLEST * np.sqrt(level)) ** 2)
+        return replace(self, levels=np.array(levels))
 
     def of(self, points: np.ndarray) -> np.ndarray:
         """The core of each point ``(n, d)``, -1 between them: shape ``(n,)``."""

@@ -11,6 +11,9 @@ the next saddle if that is less. What is predicted is this same time: in one and
 Fokker–Planck operator (`siq.reference.fokker_planck`), whatever the barrier, and beyond that by the law of
 Eyring and Kramers, whose mean time is that to the neighbourhood of the next attractor.
 
+A record knows only what it saw at its samples, and so the cores of the prediction are smaller than those of
+the count by what a walk oversteps (`siq.landscape.predicted_visits.Cores.as_sampled`).
+
 *Which error.* n visits that ended in a time T were as likely as Poisson's law with the mean T/τ says, where τ
 is uncertain by what draws of f from its distribution, and of ε, make of it. The distribution of each state
 during the visits to a well is compared as Kolmogorov and Smirnov do, with as many samples as the correlation
@@ -27,8 +30,9 @@ from scipy import stats
 
 from siq.certificate.tests import Verdict
 from siq.data.recordings import Recordings
-from siq.data.stationarity import correlated_samples, runs_of
-from siq.data.transitions import DwellCount, continued_visits, dwell_counts
+from siq.data.selection import joined
+from siq.data.stationarity import correlated_samples, runs_of, usual_step
+from siq.data.transitions import LEVEL, DwellCount, Switching, continued_visits, dwell_counts, switching
 from siq.dynamics.phase_portrait import PhasePortrait
 from siq.identify.identified_field import IdentifiedField
 from siq.landscape.dwell_times import NoiseStrength
@@ -105,12 +109,25 @@ class DensityTest:
 
 @dataclass(frozen=True)
 class RecordTest:
-    """All of it. `missing` says in words why there is no test, or is None."""
+    """All of it.
+
+    Attributes
+    ----------
+    visits, densities
+        As counted, and as predicted.
+    missing
+        Why neither is compared, in words; None where they are.
+    notes
+        What is not known, in words.
+    unseen
+        Two states between which the record hops, where a single one was identified; None elsewhere.
+    """
 
     visits: tuple[VisitTest, ...] = ()
     densities: tuple[DensityTest, ...] = ()
     missing: str | None = None
     notes: tuple[str, ...] = ()
+    unseen: Switching | None = None
 
     @property
     def hops(self) -> int:
@@ -128,6 +145,9 @@ class RecordTest:
         false_alarms
             Probability with which chance alone refuses what is right.
         """
+        if self.unseen is not None:
+            rarity, limit = -float(np.log10(self.unseen.probability)), -float(np.log10(LEVEL))
+            return Verdict(rarity, limit, False, self._unseen())
         found = [one.probability for one in self.visits] + [one.probability for one in self.densities]
         if self.missing is not None or not found:
             return None
@@ -135,6 +155,14 @@ class RecordTest:
         rarity = -float(np.log10(min(max(least * len(found), 1e-300), 1.0)))
         limit = -float(np.log10(false_alarms))
         return Verdict(rarity, limit, rarity <= limit, "" if rarity <= limit else self._reason(least))
+
+    def _unseen(self) -> str:
+        assert self.unseen is not None
+        low, high = self.unseen.levels
+        return (
+            f"the record hops between two states, at {low:.3g} and {high:.3g}, with {self.unseen.hops}"
+            " transitions seen, and what was identified has one stable state"
+        )
 
     def _reason(self, least: float) -> str:
         for one in self.visits:
@@ -180,17 +208,22 @@ def record_test(
     if noise is None:
         return RecordTest(missing="the strength of the random forces is not known")
     if len(portrait.attractors) < 2:
-        return RecordTest(missing="there is one stable state, so that nothing hops")
+        seen = switching(joined(recordings)) if found.dynamics.dimension == 1 else None
+        return RecordTest(
+            missing="there is one stable state, so that nothing hops",
+            unseen=seen if seen is not None and seen.supported else None,
+        )
     cores = cores_about(found.dynamics, portrait, noise.intensity)
     runs = runs_of(recordings)
-    visits = continued_visits(cores.of(recordings.values), runs)
+    visits = continued_visits(cores.of(recordings.values), runs_of(joined(recordings)))
     apart = [run for run in runs if held_out[recordings.recording[run.start]]]
     states = len(portrait.attractors)
-    whole = dwell_counts(recordings.t, visits, runs, states=states)
+    whole = dwell_counts(recordings.t, visits, runs_of(joined(recordings)), states=states)
     held = dwell_counts(recordings.t, visits, apart, states=states)
     if found.dynamics.dimension not in CELLS and not any(one.visits for one in whole):
         return RecordTest(missing="the recordings do not hop")
-    prediction = predicted_visits(found, portrait, noise, cores, seed=seed)
+    sampled = cores.as_sampled(found.dynamics, noise.intensity, usual_step(recordings))
+    prediction = predicted_visits(found, portrait, noise, sampled, seed=seed)
     tested = tuple(
         VisitTest(
             one.well, held[one.well], whole[one.well], one.mean, one.error, prediction.method,

@@ -20,6 +20,7 @@ from siq.errors import InputError
 from siq.files.whole import whole_file
 from siq.landscape.global_quasipotential import GlobalQuasipotential, matched
 from siq.landscape.landscape import Landscape
+from siq.landscape.record_test import VisitTest
 from siq.landscape.transitions import Transition
 from siq.potential.storage import basis_from_data, powers_to_data
 from siq.potential.well import Well
@@ -83,7 +84,22 @@ def landscape_data(landscape: Landscape, *, dynamics: Dynamics) -> dict[str, Any
             )
         ],
         "transitions": [_transition(one) for one in landscape.transitions],
+        "visits": [_visits(one) for one in landscape.visits],
         "notes": list(landscape.notes),
+    }
+
+
+def _visits(one: VisitTest) -> dict[str, Any]:
+    lowest, highest = one.whole.limits
+    return {
+        "well": one.well,
+        "visits": one.whole.visits,
+        "counted": _number(one.whole.mean),
+        "lowest": lowest,
+        "highest": _number(highest),
+        "predicted": one.predicted,
+        "error": one.predicted * one.error,
+        "method": one.method,
     }
 
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from siq.data.inspection import inspection_of
+from siq.data.inspection import Inspection, inspection_of
 from siq.data.recordings import Recordings
+from siq.data.selection import joined
 from siq.report.page import ReportFigure, ReportSection
 
 if TYPE_CHECKING:
@@ -23,16 +24,50 @@ CAPTIONS: Mapping[str, str] = {
 }
 
 
-FILE = "inspection.json"
+FILE, SEEN = "inspection.json", "seen.json"
 
 
 def inspection_drawn(recordings: Recordings, *, folder: Path) -> dict[str, Figure]:
     """The figures of an inspection by name; what it says is written into the folder."""
     from siq.report.plots.inspection import inspection_figures  # matplotlib
 
-    found = inspection_of(recordings)
+    found = inspection_of(joined(recordings))
     (folder / FILE).write_text(json.dumps(found.lines(), ensure_ascii=False) + "\n", encoding="utf-8")
+    (folder / SEEN).write_text(
+        json.dumps(seen_data(found), ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8"
+    )
     return inspection_figures(found)
+
+
+def seen_data(found: Inspection) -> dict[str, Any] | None:
+    """The two states that recordings show by themselves, as plain data; None where nothing is known."""
+    seen = found.switching
+    if seen is None:
+        return None
+    return {
+        "state": found.recordings.titles[seen.state],
+        "unit": found.recordings.units[seen.state],
+        "time_unit": found.recordings.time_unit,
+        "supported": seen.supported,
+        "probability": seen.probability,
+        "levels": list(seen.levels),
+        "hops": seen.hops,
+        "counts": [
+            {
+                "visits": one.visits,
+                "mean": one.mean if one.visits else None,
+                "lowest": one.limits[0],
+                "highest": one.limits[1] if one.visits else None,
+            }
+            for one in seen.counts
+        ],
+    }
+
+
+def read_seen(folder: str | Path) -> dict[str, Any] | None:
+    """What `inspection_drawn` wrote of two states; None where recordings were simulated."""
+    file = Path(folder) / SEEN
+    return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else None
 
 
 def read_inspection(folder: str | Path) -> list[str] | None:

@@ -15,12 +15,13 @@ import pandas as pd
 
 from siq.landscape.dwell_times import FEWEST, MeanTime
 from siq.numerics.measured_text import range_text, unit_text, value_text
-from siq.report.said_landscape import SaidLandscape, SaidWell
+from siq.report.said_landscape import SaidLandscape, SaidVisits, SaidWell
 
 COUNTS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine")
 LISTED = 3  # stable states that one sentence can list
 LONGEST_PLACE = 4  # states of which a sentence writes out a position
 LARGE = 0.5  # relative error from which a range says more than ±
+RESOLVED = 2.0  # standard errors, the usual ones of 95 %: a barrier below may be none
 
 
 def headline(data: Mapping[str, Any] | None, *, missing: str = "") -> str:
@@ -84,6 +85,9 @@ def _facts(said: SaidLandscape, well: SaidWell) -> str:
     if not math.isfinite(well.depth):
         return ""
     ratio, error = said.relative_depth(well)
+    if well.visits is not None and _below_law(said, well):
+        barrier = f"behind a barrier of {value_text(ratio, error)} times the noise strength"
+        return f"lasts {_visits_text(well.visits, said.time_unit)}, {barrier}"
     text = f"is {value_text(well.depth, well.depth_error, unit=said.energy_unit)} deep"
     if math.isfinite(ratio):
         text += f" ({value_text(ratio, error)} times the noise strength)"
@@ -92,6 +96,35 @@ def _facts(said: SaidLandscape, well: SaidWell) -> str:
     elif said.noise is not None and ratio <= 1:
         text += ", too shallow to hold the state against this noise"
     return text
+
+
+def _below_law(said: SaidLandscape, well: SaidWell) -> bool:
+    """Whether the barrier is too low for the law of escape, and is known to be."""
+    return said.relative_depth(well)[0] < FEWEST
+
+
+def _visits_text(visits: SaidVisits, unit: str) -> str:
+    """How long visits last: ``890 (580 to 1400) s as counted and 600 ± 140 s by f and D``."""
+    named = unit if unit_text(unit) else "time units"
+    return f"{counted_text(visits, named)} as counted and {foreseen_text(visits, named)} by f and D"
+
+
+def counted_text(visits: SaidVisits, unit: str = "") -> str:
+    """The mean of visits on the record, with its interval of 95 %; of none that ended a lower bound."""
+    if not visits.count:
+        return f"more than {value_text(visits.lowest, unit=unit, digits=2)}"
+    ends = range_text(visits.lowest, visits.highest)
+    text = f"{value_text(visits.counted, digits=3)} ({ends})"
+    return f"{text}\u00a0{unit_text(unit)}" if unit_text(unit) else text
+
+
+def foreseen_text(visits: SaidVisits, unit: str = "") -> str:
+    """The same mean as f and D say, with its error; a range where that is large."""
+    share = visits.error / visits.predicted
+    if share > LARGE:
+        factor = math.exp(share)
+        return range_text(visits.predicted / factor, visits.predicted * factor, unit=unit)
+    return value_text(visits.predicted, visits.error, unit=unit)
 
 
 def time_text(mean: MeanTime, unit: str, *, decorated: bool = True) -> str:
@@ -167,8 +200,9 @@ def remarks(data: Mapping[str, Any] | None) -> list[str]:
             " times"
             " follow."
         ]
-    lines = []
-    if any(well.time is not None for well in deep):
+    lines = _visits_remarks(said, deep)
+    by_law = [well for well in deep if well.visits is None or not _below_law(said, well)]
+    if any(well.time is not None for well in by_law):
         strength = value_text(noise.intensity, noise.standard_error, unit=said.energy_unit)
         whence = "as the recordings show it" if noise.source == "estimated" else "as given"
         lines.append(
@@ -177,20 +211,49 @@ def remarks(data: Mapping[str, Any] | None) -> list[str]:
             f" to about"
             " ε/ΔU."
         )
-    low = [well.name for well in deep if said.relative_depth(well)[0] < FEWEST]
+    low = [well for well in by_law if _below_law(said, well)]
     if low:
+        times = any(well.time is not None for well in low)
         lines.append(
-            f"The law of escape holds for barriers far above the noise. Here {_listed(low)}"
-            f" {'is' if len(low) == 1 else 'are'} less than {FEWEST:.0f} times the noise strength deep:"
-            f" take the"
-            " times as orders of magnitude."
+            "The law of escape holds for barriers far above the noise. Here"
+            f" {_listed([well.name for well in low])} {'is' if len(low) == 1 else 'are'} less than"
+            f" {FEWEST:.0f} times the noise strength deep:"
+            + (" take the times as orders of magnitude." if times else " it gives no time.")
         )
-    without = [well.name for well in deep if well.time is None and said.relative_depth(well)[0] > 1]
+    without = [well.name for well in by_law if well.time is None and said.relative_depth(well)[0] > 1]
     if without:
         notes = [note for way in data["transitions"] for note in way["notes"] if "no escape time" in note]
         lines.append(
             f"No time can be given for {_listed(without)}"
             + (f": {notes[0].split(': ', 1)[-1]}." if notes else ".")
+        )
+    return lines
+
+
+def _visits_remarks(said: SaidLandscape, deep: Sequence[SaidWell]) -> list[str]:
+    """What the times of wells mean whose barriers are too low for a law, and whether there are any."""
+    low = [well for well in deep if well.visits is not None and _below_law(said, well)]
+    if not low:
+        return []
+    names = _listed([well.name for well in low])
+    are = "is" if len(low) == 1 else "are"
+    methods = {well.visits.method for well in low if well.visits is not None}
+    whence = "the Fokker–Planck operator of f and D" if methods == {"operator"} else "f and D"
+    lines = [
+        f"{names} {are} less than {FEWEST:.0f} times the noise strength deep, so that no law of escape holds."
+        " The times are means of visits, from the core of a well to that of another: as counted on the"
+        f" recordings, with the interval of 95 %, and as {whence} give{'s' if 'operator' in methods else ''}"
+        " them. So low, where a core ends changes the time."
+    ]
+    unresolved = [
+        well.name for well in low if said.relative_depth(well)[0] < RESOLVED * said.relative_depth(well)[1]
+    ]
+    if unresolved:
+        subject = "barrier out of {} is" if len(unresolved) == 1 else "barriers out of {} are"
+        lines.append(
+            f"The {subject.format(_listed(unresolved))} not resolved:"
+            " within the error there may be none. f says where states stay longer, not that they are"
+            " held there."
         )
     return lines
 
@@ -230,6 +293,14 @@ def wells_table(data: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.DataFrame]:
         rows.setdefault(_headed("lasts", said.time_unit), []).append(
             "" if mean is None else time_text(mean, "1", decorated=False)
         )
+        if any(each.visits is not None for each in said.wells):
+            seen = well.visits
+            rows.setdefault(_headed("mean visit, counted", said.time_unit), []).append(
+                "" if seen is None else counted_text(seen)
+            )
+            rows.setdefault(_headed("mean visit, by f and D", said.time_unit), []).append(
+                "" if seen is None else foreseen_text(seen)
+            )
         rows.setdefault("next well", []).append(well.beyond or "")
         rows.setdefault("recorded states", []).append(f"{100 * well.basin:.0f} %")
     kept = {name: cells for name, cells in rows.items() if any(cells)}

@@ -9,11 +9,67 @@ from typing import Any
 
 import pandas as pd
 
-from siq.numerics.measured_text import range_text, unit_text, value_text
+from siq.numerics.measured_text import place_text, range_text, unit_text, value_text
 from siq.report.page import ReportTable
 
 METHODS = {"operator": "Fokker–Planck operator", "law": "law of Eyring and Kramers"}
 LARGE = 0.5  # relative error from which on a range says more than ±
+
+
+def with_visits(overview: Mapping[str, Any] | None, record: pd.DataFrame) -> dict[str, Any] | None:
+    """A landscape as plain data, with how long visits to its wells last.
+
+    Parameters
+    ----------
+    overview
+        The landscape of a run; None where there is none.
+    record
+        The table of that name, of all runs.
+    """
+    if overview is None:
+        return None
+    rows = {str(one["attractor"]): one for one in record[record["run"] == overview["run"]].to_dict("records")}
+    visits = [
+        {
+            "well": index,
+            "visits": int(one["visits"]),
+            "counted": one["counted"],
+            "lowest": one["lowest"],
+            "highest": one["highest"],
+            "predicted": one["predicted"],
+            "error": one["predicted_error"],
+            "method": one["method"],
+        }
+        for index, well in enumerate(overview["wells"])
+        if (one := rows.get(place_text(well["attractor"]))) is not None
+    ]
+    return {**overview, "visits": visits}
+
+
+def seen_sentence(seen: Mapping[str, Any] | None) -> str:
+    """The two states between which the recordings hop by themselves, in a sentence; empty where they do not.
+
+    Parameters
+    ----------
+    seen
+        What `siq.data.inspection` found, see `siq.report.inspection_section`.
+    """
+    if seen is None or not seen["supported"]:
+        return ""
+    low, high = (value_text(level, unit=seen["unit"] or "", digits=3) for level in seen["levels"])
+    time = unit_text(seen["time_unit"]) or "time units"
+    means = " and ".join(_seen_mean(one) for one in seen["counts"])
+    return (
+        f"The recordings hop between two states of {seen['state']}, at {low} and {high}: {seen['hops']}"
+        f" transition{'s were' if seen['hops'] > 1 else ' was'} seen, from level to level, and the states"
+        f" last {means} {time} in the mean."
+    )
+
+
+def _seen_mean(one: Mapping[str, Any]) -> str:
+    if not one["visits"]:
+        return f"more than {value_text(one['lowest'], digits=2)}"
+    return f"{value_text(one['mean'], digits=3)} ({range_text(one['lowest'], one['highest'])})"
 
 
 def record_sentences(record: pd.DataFrame, missing: str) -> list[str]:

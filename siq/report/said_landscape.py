@@ -17,6 +17,31 @@ NOTHING = 1e-6  # of the size of a state
 
 
 @dataclass(frozen=True)
+class SaidVisits:
+    """How long visits to a well last, in the unit of time.
+
+    Attributes
+    ----------
+    count
+        How many were seen to end on the recordings.
+    counted, lowest, highest
+        Their mean with its interval of 95 %; NaN where it is not known.
+    predicted, error
+        The same mean as f and D say, with its standard error.
+    method
+        ``operator`` of Fokker and Planck, or ``law`` of Eyring and Kramers.
+    """
+
+    count: int
+    counted: float
+    lowest: float
+    highest: float
+    predicted: float
+    error: float
+    method: str
+
+
+@dataclass(frozen=True)
 class SaidWell:
     """A stable state as it is told.
 
@@ -38,6 +63,8 @@ class SaidWell:
         How long the well lasts, None where not known.
     leverage
         Relative standard error of ΔU/ε from an estimated D over that of ε.
+    visits
+        How long visits to it last, None where this was not compared.
     """
 
     name: str
@@ -50,6 +77,7 @@ class SaidWell:
     known_up_to: float
     time: MeanTime | None
     leverage: float = 1.0
+    visits: SaidVisits | None = None
 
 
 @dataclass(frozen=True)
@@ -154,7 +182,17 @@ class SaidLandscape:
             math.nan if formula is None else 2 * float(formula.get("depth") or formula["level"]),
             self.dwell_time(index, self.noise),
             1.0 if lowest is None else lowest.get("noise_leverage", 1.0),
+            self._visits(index),
         )
+
+    def _visits(self, well: int) -> SaidVisits | None:
+        one = next((each for each in self.data.get("visits") or [] if each["well"] == well), None)
+        if one is None:
+            return None
+        return SaidVisits(
+            int(one["visits"]), _float(one["counted"]), _float(one["lowest"]), _float(one["highest"]),
+            _float(one["predicted"]), _float(one["error"]), str(one["method"]),
+        )  # fmt: skip
 
     def relative_depth(self, well: SaidWell) -> tuple[float, float]:
         """ΔU/ε with its standard error, NaN where no noise is known."""

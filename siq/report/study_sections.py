@@ -23,7 +23,7 @@ from siq.report.invariant_tables import invariant_tables
 from siq.report.landscape_answer import headline, remarks
 from siq.report.landscape_tables import errors_table, escape_table, landscape_sentences, landscape_tables
 from siq.report.page import Badge, FormulaRow, ReportSection, ReportTable
-from siq.report.record_answer import record_sentences, record_table
+from siq.report.record_answer import record_sentences, record_table, seen_sentence
 from siq.report.said_landscape import SaidLandscape
 from siq.report.sentences import control_sentences, run_sentences
 from siq.report.study_captions import Part, figures_of
@@ -71,6 +71,8 @@ class StudyResults:
         A view of U that can be turned, None where there is none.
     inspection
         What is in the recordings, line by line; None where they were simulated.
+    seen
+        The two states that they show by themselves, as plain data; None where nothing is known of that.
     """
 
     tables: Mapping[str, pd.DataFrame]
@@ -84,6 +86,7 @@ class StudyResults:
     record: FieldRecord | None = None
     interactive: Markup | None = None
     inspection: Sequence[str] | None = None
+    seen: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -113,10 +116,19 @@ class StudyParts:
 
     def answer(self) -> list[str]:
         """The sentence, and what has to be known of it."""
-        overview = self.results.overview
+        overview, seen = self.results.overview, seen_sentence(self.results.seen)
         if overview is None or not overview["wells"]:
-            return [f"No landscape was found: {self._why()}."]
-        return [headline(overview), *remarks(overview)]
+            missing = f"{'But no' if seen else 'No'} landscape was found: {self._why()}."
+            return [seen, missing] if seen else [missing]
+        told = [headline(overview), *remarks(overview)]
+        if seen and len(overview["wells"]) == 1:
+            # What is seen without any formula comes first where the formula misses it.
+            alone = f"What was identified misses them: {told[0][0].lower()}{told[0][1:]}"
+            return [seen, alone, *told[1:]]
+        certificate = self._certificate()
+        if seen and (certificate is None or not certificate["certified"]):
+            told.append(f"Without any formula: {seen[0].lower()}{seen[1:]}")
+        return told
 
     def _why(self) -> str:
         """Why there is none: what the step said that came as far as any."""
@@ -375,11 +387,21 @@ class StudyParts:
 
     def _method_said(self) -> str:
         routes = self.study.refinement.with_routes(networks=self.study.training is not None).routes or ()
+        if self.results.record is None:
+            return "No f was identified, so that there is no formula."
         return (
-            "f was identified from neighbouring samples alone. The formulas solve the Hamilton–Jacobi"
+            f"f was identified {self._identified_by()}. The formulas solve the Hamilton–Jacobi"
             " equation of this"
             f" f, by the {' and the '.join(routes)} route, and have to pass the tests of the certificate."
         )
+
+    def _identified_by(self) -> str:
+        record = self.results.record
+        if record is not None and record.memory is not None:
+            return f"from pairs of samples, as seen from {record.memory[0]} steps earlier"
+        if record is not None and record.sensor_variance is not None:
+            return "by the likelihood of whole recordings, with the noise of the sensor beside it"
+        return "from neighbouring samples alone"
 
     def provenance(self, versions: Mapping[str, str]) -> ReportSection:
         """The study as it was asked, with what, and how long."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass as plain_dataclass
+from dataclasses import replace
 from pathlib import Path
 
 from pydantic.dataclasses import dataclass
@@ -78,7 +79,14 @@ def read(path: str | Path, settings: DrawSettings) -> Dynamics | Recordings:
     recordings, _ = read_pairs(
         path, states=settings.space.names, units=settings.space.units, pair_step=settings.sampling.pair_step
     )
-    return recordings
+    space = settings.space
+    units = tuple(
+        unit or space.unit(name, unknown="") or None
+        for name, unit in zip(recordings.names, recordings.units, strict=True)
+    )
+    return replace(
+        recordings, units=units, time_unit=recordings.time_unit or space.unit("t", unknown="") or None
+    )
 
 
 def write(drawn: Drawn, *, recordings: str | Path, outcome: str | Path) -> None:

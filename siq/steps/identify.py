@@ -14,7 +14,7 @@ from siq.certificate.tests import PredictionLimits, Verdict, check_prediction
 from siq.data.held_out import held_out_recordings
 from siq.data.markov_lag import markov_lag
 from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
-from siq.data.selection import select_recordings
+from siq.data.selection import joined, select_recordings
 from siq.errors import NumericalFailure
 from siq.identify.diffusion import DiffusionSource, check_units, estimated_diffusion
 from siq.identify.flow_regression import refit, residuals
@@ -104,7 +104,7 @@ def _identified(settings: IdentifySettings, recordings: Recordings, number: int)
         integrator_step=maker,
     )
     noisy = carries_noise(library, parts[0], options=options, integrator_step=maker)
-    if noisy and maker is None and (memory := markov_lag(recordings)).remembers:
+    if noisy and maker is None and (memory := markov_lag(joined(recordings))).remembers:
         if memory.kind in ("blur", "either"):
             draw = generator(settings.seed, number, Purpose.STABILITY)
             means = means_over_exposures(

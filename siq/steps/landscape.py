@@ -18,6 +18,7 @@ from siq.identify.storage import FieldRecord
 from siq.landscape.dwell_times import NoiseStrength
 from siq.landscape.landscape import Landscape, find_landscape
 from siq.landscape.options import LandscapeOptions
+from siq.landscape.record_test import VisitTest
 from siq.landscape.storage import write_landscape
 from siq.numerics.randomness import Purpose, generator
 from siq.potential.refinement import RefinementOptions
@@ -58,11 +59,13 @@ def run(
     wells: Sequence[Well] = (),
     seek_wells: bool = True,
     certificate: Certificate | None = None,
+    visits: tuple[VisitTest, ...] = (),
 ) -> FoundLandscape:
     """The landscape of the identified f within the recorded region.
 
-    The wells are those of the refinement, with their certificate; where it found none, the local route is
-    asked once more, within the whole recorded region, unless `seek_wells` says that it shall not.
+    The wells are those of the refinement, with their certificate, and `visits` those that its test against
+    the record compared; where it found none, the local route is asked once more, within the whole
+    recorded region, unless `seek_wells` says that it shall not.
     """
     if recordings is None or record is None:
         reason = "no vector field was identified"
@@ -84,6 +87,9 @@ def run(
     note = record.diffusion_source.note
     if note is not None:
         found = replace(found, notes=(*found.notes, note))
+    # The attractors of both steps are those of one f: where they differ in number, indices mean nothing.
+    if visits and max(one.well for one in visits) < len(found.attractors):
+        found = replace(found, visits=visits)
     units, time = units_of(recordings, settings.space)
     found = found.in_units(units, time=time)
     return FoundLandscape(found, record, outcome)

@@ -62,7 +62,7 @@ class StudyParts:
             return StateSpace(self.system.states, units, diffusion_rows_of(self.system.diffusion))
         recordings = self.study.recordings
         assert recordings is not None  # the schema asks for one of the two
-        return StateSpace(recordings.states, None, recordings.diffusion)
+        return StateSpace(recordings.states, recordings.units, recordings.diffusion)
 
     @property
     def refinement(self) -> RefinementOptions:

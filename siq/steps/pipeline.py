@@ -145,5 +145,6 @@ def analyse(
         found = landscape.run(
             settings.of(landscape.LandscapeSettings), recordings, identified.record, number=number,
             wells=refined.wells, certificate=refined.certificate,
+            visits=() if refined.record is None else refined.record.visits,
         )  # fmt: skip
     return Analysis(identified, trained, regressed, refined, found)

@@ -46,6 +46,9 @@ class RecordingsOptions(BaseModel):
     states
         The columns that are states, in order, by their headings or by their names in formulas; by default the
         system's, or all of the file's.
+    units
+        The unit of each state, and of the time as ``t``, where the file does not say; nothing is converted,
+        and another unit in the file is refused.
     pair_step
         Consecutive samples no further apart than this are pairs; by default those no further apart than
         one and a half of their median distance, since what is longer is a gap.
@@ -62,6 +65,7 @@ class RecordingsOptions(BaseModel):
 
     file: str
     states: Annotated[tuple[Name, ...], Field(min_length=1)] | None = None
+    units: dict[str, str] | None = None
     pair_step: Annotated[float, Field(gt=0)] | None = None
     diffusion: DiffusionEntry | None = None
     integrator_step: Annotated[float, Field(gt=0)] | None = None

@@ -14,8 +14,9 @@ import siq
 from siq.files.whole import whole_file
 from siq.identify.storage import read_field
 from siq.report.answer import answer_of, write_answer
-from siq.report.inspection_section import read_inspection
+from siq.report.inspection_section import read_inspection, read_seen
 from siq.report.page import render_report
+from siq.report.record_answer import with_visits
 from siq.report.settings import PageSettings
 from siq.report.study_page import study_page
 from siq.report.study_sections import StudyResults
@@ -42,7 +43,7 @@ if __name__ == "__main__":
         models = ModelFiles(tuple(source.models))
         shown, card = shown_formula(tables["rrmse"], models), now.given("card")
         shown = shown if shown.run is not None else models.first_wells()
-        overview = read_json(source.overview)
+        overview = with_visits(read_json(source.overview), tables["record"])
         run = shown.run if shown.run is not None else (overview or {}).get("run", 0)
         view = Path(source.drawn) / "interactive.html"
         folders = [source.drawn, *source.drawn_landscape, source.drawn_density]
@@ -57,6 +58,7 @@ if __name__ == "__main__":
             overview=overview,
             record=read_field(source.fields[run]),
             inspection=read_inspection(source.drawn),
+            seen=read_seen(source.drawn),
             interactive=Markup(view.read_text(encoding="utf-8")) if view.is_file() else None,
         )
         programs = PACKAGES if study.training is None else (*PACKAGES, *OF_NETWORKS)
