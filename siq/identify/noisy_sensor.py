@@ -51,6 +51,8 @@ class FilteredField:
         Variance of each state's sensor noise, shape ``(d,)``.
     sensor_error
         Standard error of its logarithm, shape ``(d,)``.
+    forces_error
+        The same of the random forces' intensity.
     correlation, score
         Of neighbouring innovations, the strongest over the states, and in standard errors: white where the
         model holds.
@@ -63,6 +65,7 @@ class FilteredField:
     found: IdentifiedField
     sensor: np.ndarray
     sensor_error: np.ndarray
+    forces_error: np.ndarray
     correlation: float
     score: float
     gain: float
@@ -383,6 +386,7 @@ def _as_field(
         found,
         fit.noise.measurement,
         certain.measurement,
+        certain.process[:d],
         correlation,
         score,
         2 * (best - base),

@@ -70,11 +70,15 @@ class FieldRecord:
     def noise_strength(self) -> tuple[float, float] | None:
         """ε and its standard error, None where the recordings show no white noise.
 
-        The variance of n residuals of d states has the relative standard error ``√(2/nd)``.
+        The variance of n residuals of d states has the relative standard error ``√(2/nd)``. Beside sensor
+        noise it is larger, and stands in the record.
         """
         intensity = float(self.noise.get("intensity", 0.0))
         if self.noise.get("kind") not in ("process", "sensor") or not intensity > 0:
             return None
+        known = self.noise.get("intensity_error")
+        if known is not None:
+            return intensity, float(known)
         samples = int(self.noise.get("pairs", 0)) * self.found.library.dimension
         return intensity, intensity * (2 / samples) ** 0.5 if samples else 0.0
 

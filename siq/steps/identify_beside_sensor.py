@@ -148,6 +148,7 @@ def filtered_record(
     intensity = diffusion.intensity(found.noise_rate)
     probability, ratio = held_out_evidence(filtered, *parts, pair_step=step)
     forced = bool(found.noise_rate.any())
+    error = intensity * float(np.sqrt((filtered.forces_error**2).sum())) / len(filtered.sensor)
     coloured = abs(filtered.score) > SIGNIFICANT and abs(filtered.correlation) > LARGE
     verdict = check_prediction(
         noise_fault=(
@@ -165,6 +166,7 @@ def filtered_record(
         {
             "kind": "coloured" if coloured else "process" if forced else "sensor",
             "intensity": intensity,
+            "intensity_error": error if np.isfinite(error) else None,
             "covariance": (found.noise_rate / intensity if forced else np.eye(len(sizes))).tolist(),
             "correlation": filtered.correlation,
             "correlation_score": filtered.score,
