@@ -87,7 +87,7 @@ environment: $(VENV)/installed
 $(VENV)/installed: pyproject.toml requirements/pinned.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 	  || { echo "siq needs Python 3.11 or newer; name one with 'make PYTHON=python3.12 ...'." >&2; exit 1; }
-	@echo "Installing siq with all of its tools below $(VENV): about 2.2 GB, 1 GB of it for networks (CPU only)."
+	@echo "Installing siq with all of its tools below $(VENV): about 2.4 GB, 1 GB of it for networks (CPU only)."
 	$(PYTHON) -m venv $(VENV)
 	@test -z "$(TORCH_INDEX)" || test "$$(uname)" != Linux || $(BIN)/python -m pip install --quiet --no-deps \
 	  --retries 0 --timeout 15 --index-url $(TORCH_INDEX) --constraint requirements/pinned.txt torch 2> /dev/null \
