@@ -47,6 +47,7 @@ rule statistics:
 
 rule examples:
     input:
+        "results/double-well/report.html",
         "results/archetype3d-recordings/report.html",
 
 

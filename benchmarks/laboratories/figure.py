@@ -41,7 +41,7 @@ def draw(rows: list[Row], path: Path) -> None:
     axes.invert_yaxis()
     handles, labels = axes.get_legend_handles_labels()
     unique = dict(zip(labels, handles, strict=True))
-    axes.legend(unique.values(), unique.keys(), loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3)
+    figure.legend(unique.values(), unique.keys(), loc="outside lower center", ncols=len(unique))
     with whole_file(path) as partial:
         figure.savefig(partial, dpi=150)
     plt.close(figure)

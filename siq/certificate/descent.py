@@ -94,10 +94,13 @@ def _in_the_mean(
     """Whether ∇V·ΔX/h has the mean -∇V·D∇V, in bins of V."""
     claimed = found.diffusion.steepness(x0, slope)
     excess = (slope * (xh - x0)).sum(axis=1) / h + claimed
-    variance = np.einsum("ni,ij,nj->n", slope, found.noise_rate, slope) / h
+    forces = np.broadcast_to(found.noise_rate, (len(h), *found.noise_rate.shape))
+    if found.noise is not None:  # each increment has the noise of the state where it starts
+        forces = found.intensity * found.diffusion.at(x0)
+    variance = np.einsum("ni,nij,nj->n", slope, forces, slope) / h
     dynamics = found.dynamics
     change = np.einsum("nij,nj->ni", dynamics.jacobian(x0), dynamics.drift(x0))
-    change += 0.5 * np.einsum("nkij,ij->nk", dynamics.hessian(x0), found.noise_rate)
+    change += 0.5 * np.einsum("nkij,nij->nk", dynamics.hessian(x0), forces)
     curved = (slope * change).sum(axis=1) * h / 2
     bins = np.array_split(np.argsort(values), max(min(BINS, len(h) // FEWEST), 1))
     limit = float(-scipy.special.ndtri(options.false_alarms / (2 * len(bins))))

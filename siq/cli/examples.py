@@ -12,9 +12,9 @@ from siq.errors import InputError
 from siq.files.whole import whole_file
 
 DOUBLE_WELL = """\
-# A bead hops between two optical traps at -0.5 um and 0.5 um. The recordings were simulated, so that the
-# answer is known: dx = (8 x - 32 x**3) dt + noise of strength 0.3 um**2/s, and a barrier of 1 um**2/s in U,
-# which is 3.3 times the noise.
+# A bead hops between two optical traps at -0.5 um and 0.5 um, and the camera adds an error of 0.01 um to each
+# value. The recordings were simulated, so that the answer is known: dx = (8 x - 32 x**3) dt + noise of
+# strength 0.3 um**2/s, and a barrier of 1 um**2/s in U, which is 3.3 times the noise.
 name: double-well
 title: A bead in two optical traps
 recordings:
@@ -83,8 +83,11 @@ def write_example(name: str, folder: Path, *, replace: bool = False) -> tuple[li
 
 
 def double_well_recordings(recordings: int = 4, samples: int = 20_000, *, seed: int = 1) -> str:
-    """Recordings of a bead in two traps as a CSV file; ten steps of the simulation to each sample."""
-    generator, step, within, strength = np.random.default_rng(seed), 0.0025, 10, 0.3
+    """Recordings of a bead in two traps as a CSV file, with the noise of a camera.
+
+    Ten steps of the simulation lead to each sample.
+    """
+    generator, step, within, strength, camera = np.random.default_rng(seed), 0.0025, 10, 0.3, 0.01
     inner = step / within
     x = generator.choice([-0.5, 0.5], recordings)
     recorded = np.empty((samples, recordings))
@@ -92,6 +95,7 @@ def double_well_recordings(recordings: int = 4, samples: int = 20_000, *, seed: 
         recorded[sample] = x
         for push in generator.normal(scale=np.sqrt(strength * inner), size=(within, recordings)):
             x = x + inner * (8 * x - 32 * x**3) + push
+    recorded += generator.normal(scale=camera, size=recorded.shape)
     t = np.arange(samples) * step
     return _csv(
         "recording,t [s],x [um]", [(f"trace-{k + 1}", t, recorded[:, k : k + 1]) for k in range(recordings)]

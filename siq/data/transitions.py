@@ -163,8 +163,8 @@ def switching(recordings: Recordings, *, generator: np.random.Generator | None =
 
     Examples
     --------
-    >>> from siq.data.noise_floor import noise_floors
-    from siq.data.recordings import Recordings
+    >>> import numpy as np
+    >>> from siq.data.recordings import Recordings
     >>> generator = np.random.default_rng(1)
     >>> x = np.empty((20_000, 1))
     >>> x[0] = 1.0
@@ -173,7 +173,7 @@ def switching(recordings: Recordings, *, generator: np.random.Generator | None =
     ...     x[before + 1] = x[before] + 0.05 * (x[before] - x[before] ** 3) + kick
     >>> found = switching(Recordings.from_arrays(0.05 * np.arange(len(x)), x, names=["x"]))
     >>> found.supported, [round(level, 1) for level in found.levels]
-    (True, [-0.9, 0.9])
+    (True, [-0.9, 0.8])
     """
     runs, step = runs_of(recordings), usual_step(recordings)
     generator = np.random.default_rng(0) if generator is None else generator

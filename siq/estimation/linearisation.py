@@ -167,9 +167,12 @@ def linearise(
     data, compiled, delays = grid.data, model.functions, model.lags(values)
     drift = compiled if drift is None else drift
     rows, step = grid.rows, grid.step
-    state = np.ascontiguousarray(x[rows].T)
+    state = np.array(x[rows].T)
     dimension, count = state.shape
     transition = np.broadcast_to(np.eye(dimension), (count, dimension, dimension)).copy()
+    for place in data.restarting:
+        state[place] = 0.0
+        transition[:, place, place] = 0.0
     response: np.ndarray | None = None
 
     def slopes(at: np.ndarray, node: int) -> tuple[np.ndarray, np.ndarray]:

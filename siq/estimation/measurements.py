@@ -36,6 +36,8 @@ class Measurements:
     sensor_noise
         Variance of each output's noise where it is known, NaN where it is to be estimated; shape ``(m,)``.
         None where none is known.
+    restarting
+        Places of the states that begin at zero with every interval, such as a mean over an exposure.
     """
 
     labels: tuple[str, ...]
@@ -44,6 +46,7 @@ class Measurements:
     outputs: np.ndarray
     courses: tuple[tuple[scipy.interpolate.PPoly, ...], ...]
     sensor_noise: np.ndarray | None = None
+    restarting: tuple[int, ...] = ()
 
     @property
     def begins(self) -> np.ndarray:

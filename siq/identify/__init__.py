@@ -29,6 +29,7 @@
 `diffusion`             which D, where nobody gave it?
 `random_forces`         how strong are the random forces behind residuals of a whole step?
 `noisy_sensor`          which f do recordings show whose sensor is noisy?
+`exposure`              what does a sample tell that is a mean over its step?
 `residuals`             what do its residuals say: no noise, process noise, noise of the measurement?
 `lagged_pairs`          which f, where recordings remember for some steps?
 `memory`                and what has to be said of that?

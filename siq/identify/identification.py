@@ -32,7 +32,7 @@ from siq.identify.flow_regression import (
 )
 from siq.identify.identified_field import NOISE_FREE, IdentifiedField
 from siq.identify.library import CandidateLibrary
-from siq.identify.selection import Equation, best_support, critical_values, rival_changes
+from siq.identify.selection import Equation, best_support, critical_values, doubts_by_equation
 from siq.identify.stability import blocks_of, stability, triangles
 
 
@@ -164,7 +164,7 @@ def _identify(
         coefficients[support[:, 1], support[:, 0]] = found.coefficients[support[:, 1], support[:, 0]]
         problem = FlowRegression(library, pairs, support)
         found = fit_support(replace(found, coefficients=coefficients, support=support), problem)
-    return found if noise_free else replace(found, doubts=_doubts(equations, found.support))
+    return found if noise_free else replace(found, doubts=doubts_by_equation(equations, found.support))
 
 
 def with_stability(
@@ -207,16 +207,6 @@ def with_stability(
     for i, share in enumerate(shares):
         result[found.support[:, 0] == i] = share
     return replace(found, stability=result)
-
-
-def _doubts(equations: Sequence[Equation], support: np.ndarray) -> np.ndarray:
-    """What rivals of the support would change in f, shape ``(r, q, d)``."""
-    doubts = []
-    for i, equation in enumerate(equations):
-        changes = rival_changes(equation, support[support[:, 0] == i, 1].tolist())
-        doubts.append(np.zeros((*changes.shape, len(equations))))
-        doubts[-1][:, :, i] = changes
-    return np.concatenate(doubts)
 
 
 def _check_count(library: CandidateLibrary, pairs: SnapshotPairs) -> None:

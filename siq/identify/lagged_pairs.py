@@ -15,7 +15,7 @@ the strength of the forces: they act over longer times as white ones of the cova
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
@@ -32,6 +32,13 @@ from siq.identify.flow_regression import FlowRegression, copies, positive
 from siq.identify.identification import IdentificationOptions
 from siq.identify.identified_field import IdentifiedField
 from siq.identify.library import CandidateLibrary
+from siq.identify.selection import (
+    Equation,
+    best_support,
+    critical_values,
+    doubts_by_equation,
+    strong_terms,
+)
 
 ROUNDS = 6  # of deferred correction, each of which gains a factor of about h times the Jacobian
 TELLING = 0.1  # a correlation, as in `siq.data.markov_lag`: of a function that is told less well nothing is
@@ -211,7 +218,7 @@ def identify_from_earlier(
     Notes
     -----
     Two-stage least squares: functions and increments are projected on the instruments, and fitted there. The
-    least significant term of an equation leaves, by its own standard error, until all are significant.
+    terms of each equation are chosen there (`siq.identify.selection`).
     """
     q, d = library.size, library.dimension
     if given.independent < 2 * q:
@@ -220,7 +227,7 @@ def identify_from_earlier(
             " lower identification.degree or record more"
         )
     moments = _Moments(library, given)
-    critical = float(-scipy.special.ndtri(options.false_terms / (2 * d * q)))
+    critical = critical_values(library, false_terms=options.false_terms)
     values: np.ndarray | None = None
     for _ in range(2):
         moved = moments.increments(moments.all_terms, values)
@@ -228,11 +235,11 @@ def identify_from_earlier(
     assert values is not None
     rest = moved - (moments.all_terms.matrix(values) @ (moments.all_terms.theta * given.pairs.h)).T
     spread = moments.long_run(rest) * moments.repeated
-    support = [
-        (i, k)
+    equations = [
+        Equation(moments.functions, moments.directions.T @ moved[:, i], float(spread[i, i]), critical)
         for i in range(d)
-        for k in _significant(moments.functions, moments.directions.T @ moved[:, i], spread[i, i], critical)
     ]
+    support = [(i, k) for i, one in enumerate(equations) for k in best_support(one, strong_terms(one))]
     missing = sorted(set(range(d)) - {i for i, _ in support})
     if missing:
         raise NumericalFailure(
@@ -243,14 +250,14 @@ def identify_from_earlier(
     noise = Diffusion.identity(d) if diffusion is None else diffusion
     while True:
         found = _fitted(moments, np.array(support), noise)
-        strength = np.abs(found.values) / np.sqrt(np.diag(found.covariance))
+        strength = np.abs(found.values) / np.sqrt(np.diag(found.covariance)) / critical[found.support[:, 1]]
         weak = [
             place
             for place in np.argsort(strength)
-            if strength[place] < critical and sum(i == support[place][0] for i, _ in support) > 1
+            if strength[place] < 1 and sum(i == support[place][0] for i, _ in support) > 1
         ]
         if not weak:
-            return found
+            return replace(found, doubts=doubts_by_equation(equations, found.support))
         del support[weak[0]]
 
 
@@ -289,49 +296,6 @@ def mean_probability_from_earlier(fitted: IdentifiedField, unseen: LaggedPairs, 
     squares = ((moments.directions.T @ rest) ** 2).sum(axis=0) / spread / (1 + len(rest) / seen)
     q = fitted.library.size
     return float(min(scipy.special.chdtrc(q, squares).min() * rest.shape[1], 1.0))
-
-
-def _significant(functions: np.ndarray, goal: np.ndarray, variance: float, critical: float) -> list[int]:
-    """Backward elimination of one equation; residuals of the projected problem have a known variance."""
-    active = list(range(functions.shape[1]))
-    while active:
-        orthogonal, upper = np.linalg.qr(functions[:, active])
-        inverse = np.linalg.pinv(upper, rcond=1e-12)
-        coefficients = inverse @ (orthogonal.T @ goal)
-        strength = np.abs(coefficients) / positive(np.sqrt(variance) * np.linalg.norm(inverse, axis=1))
-        weakest = int(np.argmin(strength))
-        if strength[weakest] >= critical:
-            break
-        del active[weakest]
-        # Before the last ones go it is asked whether others of the same number say more.
-        if len(active) <= FEW and functions.shape[1] <= MANY:
-            active = _exchanged(functions, goal, active)
-    return _exchanged(functions, goal, active)
-
-
-def _exchanged(functions: np.ndarray, goal: np.ndarray, active: list[int]) -> list[int]:
-    """The same number of terms, one exchanged for another as long as less is left.
-
-    Terms that are nearly alike where the recordings are, such as x³ and x⁵, are left out one by one, and the
-    wrong one may go first.
-    """
-
-    def left(terms: list[int]) -> float:
-        orthogonal = np.linalg.qr(functions[:, terms])[0]
-        return float(((goal - orthogonal @ (orthogonal.T @ goal)) ** 2).sum())
-
-    best = left(active) if active else 0.0
-    while active:
-        tried = [
-            [*active[:place], other, *active[place + 1 :]]
-            for place in range(len(active))
-            for other in set(range(functions.shape[1])) - set(active)
-        ]
-        chosen = min(tried, key=left, default=active)
-        if left(chosen) >= best * (1 - 1e-9):
-            break
-        active, best = chosen, left(chosen)
-    return sorted(active)
 
 
 def _fitted(moments: _Moments, support: np.ndarray, diffusion: Diffusion) -> IdentifiedField:

@@ -16,6 +16,7 @@ import scipy.special
 
 from siq.data.recordings import LONGEST_STEP, Recordings
 from siq.dynamics.diffusion import Diffusion
+from siq.dynamics.dynamics import Dynamics
 from siq.errors import NumericalFailure
 from siq.estimation.estimation import Fit, fit_by_filter
 from siq.estimation.innovations import Noise, Whitened, solve, whiten
@@ -24,14 +25,16 @@ from siq.estimation.measurements import Measurements
 from siq.estimation.noise import log_likelihood
 from siq.estimation.noise_uncertainty import NoiseUncertainty, noise_uncertainty
 from siq.estimation.process_noise import process_noise_needed
+from siq.identify.exposure import exposed, exposed_measurements, exposed_noise
 from siq.identify.flow import FlowMap
 from siq.identify.flow_regression import positive
 from siq.identify.identified_field import IdentifiedField, field_dynamics
 from siq.identify.library import CandidateLibrary
-from siq.identify.selection import Equation, best_support, rival_changes, strong_terms
+from siq.identify.selection import Equation, best_support, doubts_of_all, strong_terms
 from siq.identify.stability import blocks_of, stability, triangles
 
 ROUNDS = 8  # of the fit of a whole library, which only chooses terms
+LAGS = (1, 2, 3)  # steps over which innovations are compared: what remembers at all remembers so long
 WITHOUT = 1e-6  # of a sensor's variance: as good as none
 NUMBERS = 4e8  # of the derivatives by all coefficients at all samples: 3 GB
 
@@ -48,30 +51,37 @@ class FilteredField:
         Variance of each state's sensor noise, shape ``(d,)``.
     sensor_error
         Standard error of its logarithm, shape ``(d,)``.
+    forces_error
+        The same of the random forces' intensity.
     correlation, score
         Of neighbouring innovations, the strongest over the states, and in standard errors: white where the
         model holds.
     gain
         Twice the log-likelihood ratio to the same terms without sensor noise.
+    exposure
+        The step over which samples are means, None where they are not.
     """
 
     found: IdentifiedField
     sensor: np.ndarray
     sensor_error: np.ndarray
+    forces_error: np.ndarray
     correlation: float
     score: float
     gain: float
+    exposure: float | None = None
 
 
 def identify_by_likelihood(
     library: CandidateLibrary,
     recordings: Recordings,
-    begin: IdentifiedField,
+    diffusion: Diffusion,
     noise: Noise,
     *,
     critical: np.ndarray,
     generator: np.random.Generator,
     pair_step: float | None = None,
+    exposure: float | None = None,
 ) -> FilteredField:
     """Find f, the random forces and the noise of the sensor together.
 
@@ -81,8 +91,8 @@ def identify_by_likelihood(
         The candidate functions.
     recordings
         Whole trajectories.
-    begin
-        f as the regression of pairs has it, of which the diffusion is kept.
+    diffusion
+        D, on which f does not depend.
     noise
         To begin with.
     critical
@@ -91,13 +101,16 @@ def identify_by_likelihood(
         Draws recordings again, see `siq.identify.stability`.
     pair_step
         Longest time between samples that still belong together.
+    exposure
+        The step over which each sample is a mean (`siq.identify.exposure`), None where it is none.
 
     Raises
     ------
     NumericalFailure
         When the fit does not settle, or a library is too large for the recordings.
     """
-    data = unbroken(recordings, pair_step=pair_step)
+    view = _View(library, diffusion, exposure)
+    data = view.measured(recordings, pair_step)
     q, d = library.size, library.dimension
     everything = np.array([(i, k) for i in range(d) for k in range(q)])
     if data.outputs.size * len(everything) > NUMBERS:
@@ -105,10 +118,10 @@ def identify_by_likelihood(
             f"{len(everything)} coefficients and {len(data.t)} samples with a noisy sensor are too much for"
             " the memory; lower identification.degree, or name the functions of f"
         )
-    noise = replace(noise, shape=np.eye(d)[None])
-    zero = np.zeros(len(everything))
-    model = field_dynamics(library, everything, zero, diffusion=begin.diffusion)
-    whole = fit_by_filter(model, data, x=recordings.values, noise=noise, iterations=ROUNDS, closure=False)
+    noise = view.noise(replace(noise, shape=np.eye(d)[None]))
+    model = view.model(everything, np.zeros(len(everything)))
+    x = view.states(recordings.values)
+    whole = fit_by_filter(model, data, x=x, noise=noise, iterations=ROUNDS, closure=False)
     if whole.fault:
         raise NumericalFailure(f"the likelihood beside sensor noise cannot be worked out: {whole.fault}")
     white = whiten(whole.linearisation, data, whole.noise)
@@ -124,15 +137,14 @@ def identify_by_likelihood(
     for component, name in enumerate(library.states):
         if component not in support[:, 0]:
             raise NumericalFailure(f"no term of the equation of {name} is significant")
-    fit = _settled(library, support, data, whole.noise, values=values[chosen], x=whole.linearised_at)
+    fit = _settled(view, support, data, whole.noise, values=values[chosen], x=whole.linearised_at)
     while (weak := _weakest(fit, support, critical)) is not None:
         support = np.delete(support, weak, axis=0)
         kept = np.delete(fit.model.values, weak)
-        fit = _settled(library, support, data, fit.noise, values=kept, x=fit.linearised_at)
+        fit = _settled(view, support, data, fit.noise, values=kept, x=fit.linearised_at)
     fit = _without_forces(fit, data)
-    one = _as_field(begin, library, support, fit, data, noise_uncertainty(fit, data))
+    one = _as_field(view, support, fit, data, noise_uncertainty(fit, data))
     own = (support[:, 0] * q + support[:, 1]).tolist()
-    doubts = rival_changes(equations, own)
     # Whitened values stand one behind the other, all states of a sample together.
     parts = triangles(np.column_stack([white.columns, goal]), np.repeat(blocks_of(recordings.recording), d))
     (shares,) = stability(
@@ -141,7 +153,7 @@ def identify_by_likelihood(
         [own],
         generator=generator,
     )
-    field = replace(one.found, doubts=doubts.reshape(-1, d, q).transpose(0, 2, 1), stability=shares)
+    field = replace(one.found, doubts=doubts_of_all(equations, support, dimension=d), stability=shares)
     return replace(one, found=field)
 
 
@@ -191,20 +203,22 @@ def held_out_evidence(
         and of their mean square to that of the training recordings.
     """
     library, support = one.found.library, one.found.support
-    noise = _noise_of(one.found, one.sensor)
-    own = unbroken(training, pair_step=pair_step)
-    fit = _settled(library, support, own, noise, values=one.found.values, x=training.values)
-    other = unbroken(unseen, pair_step=pair_step)
+    view = _View(library, one.found.diffusion, one.exposure)
+    noise = view.noise(_noise_of(one.found, one.sensor))
+    own = view.measured(training, pair_step)
+    x = view.states(training.values)
+    fit = _settled(view, support, own, noise, values=one.found.values, x=x)
+    other = view.measured(unseen, pair_step)
     still = tuple(replace(each, fixed=True) for each in fit.model.parameters)
     follow = fit_by_filter(
-        replace(fit.model, parameters=still), other, x=unseen.values, noise=fit.noise,
+        replace(fit.model, parameters=still), other, x=view.states(unseen.values), noise=fit.noise,
         estimate_process=False, estimate_sensor=False, substeps=fit.substeps,
     )  # fmt: skip
     q, d = library.size, library.dimension
     everything = np.array([(i, k) for i in range(d) for k in range(q)])
     values = np.zeros(len(everything))
     values[support[:, 0] * q + support[:, 1]] = fit.model.values
-    whole = field_dynamics(library, everything, values, diffusion=one.found.diffusion)
+    whole = view.model(everything, values)
     along = linearise(whole, Grid(other, fit.substeps), values, follow.linearised_at)
     # The innovations are those of the filter itself; the library's columns are along the same states.
     white = whiten(replace(along, gap=follow.linearisation.gap), other, follow.noise)
@@ -220,7 +234,12 @@ def held_out_evidence(
 
 
 def filtered_recordings(
-    found: IdentifiedField, sensor: np.ndarray, recordings: Recordings, *, pair_step: float | None = None
+    found: IdentifiedField,
+    sensor: np.ndarray,
+    recordings: Recordings,
+    *,
+    pair_step: float | None = None,
+    exposure: float | None = None,
 ) -> Recordings:
     """The states as a filter knows them at each sample, from that and the earlier ones.
 
@@ -232,17 +251,42 @@ def filtered_recordings(
         f and the random forces.
     sensor
         Variance of each state's sensor noise, shape ``(d,)``.
-    recordings, pair_step
+    recordings, pair_step, exposure
         As for `identify_by_likelihood`.
     """
-    data = unbroken(recordings, pair_step=pair_step)
-    model = found.dynamics
+    view = _View(found.library, found.diffusion, exposure)
+    data = view.measured(recordings, pair_step)
+    model = view.model(found.support, found.values)
     still = replace(model, parameters=tuple(replace(each, fixed=True) for each in model.parameters))
     follow = fit_by_filter(
-        still, data, x=recordings.values, noise=_noise_of(found, sensor), estimate_process=False,
-        estimate_sensor=False, substeps=found.flow.steps,
+        still, data, x=view.states(recordings.values), noise=view.noise(_noise_of(found, sensor)),
+        estimate_process=False, estimate_sensor=False, substeps=found.flow.steps,
     )  # fmt: skip
-    return replace(recordings, values=follow.linearised_at)
+    return replace(recordings, values=follow.linearised_at[:, : len(sensor)].copy())
+
+
+@dataclass(frozen=True)
+class _View:
+    """How samples show the states: as they are, or as means over the step before them."""
+
+    library: CandidateLibrary
+    diffusion: Diffusion
+    exposure: float | None
+
+    def model(self, support: np.ndarray, values: np.ndarray) -> Dynamics:
+        """Dynamics with the coefficients of a support as parameters, as they are measured."""
+        plain = field_dynamics(self.library, support, values, diffusion=self.diffusion)
+        return plain if self.exposure is None else exposed(plain, self.exposure)
+
+    def measured(self, recordings: Recordings, pair_step: float | None) -> Measurements:
+        data = unbroken(recordings, pair_step=pair_step)
+        return data if self.exposure is None else exposed_measurements(data, self.library.dimension)
+
+    def noise(self, noise: Noise) -> Noise:
+        return noise if self.exposure is None else exposed_noise(noise, self.library.dimension)
+
+    def states(self, values: np.ndarray) -> np.ndarray:
+        return values if self.exposure is None else np.column_stack([values, values])
 
 
 def _noise_of(found: IdentifiedField, sensor: np.ndarray) -> Noise:
@@ -254,7 +298,7 @@ def _noise_of(found: IdentifiedField, sensor: np.ndarray) -> Noise:
 
 
 def _settled(
-    library: CandidateLibrary,
+    view: _View,
     support: np.ndarray,
     data: Measurements,
     noise: Noise,
@@ -269,8 +313,7 @@ def _settled(
     NumericalFailure
         When it does not settle.
     """
-    model = field_dynamics(library, support, values, diffusion=Diffusion.identity(library.dimension))
-    fit = fit_by_filter(model, data, x=x, noise=noise)
+    fit = fit_by_filter(view.model(support, values), data, x=x, noise=noise)
     if not fit.converged:
         raise NumericalFailure(
             "the fit of f beside sensor noise does not settle"
@@ -307,16 +350,16 @@ def _weakest(fit: Fit, support: np.ndarray, critical: np.ndarray) -> int | None:
 
 
 def _as_field(
-    begin: IdentifiedField,
-    library: CandidateLibrary,
+    view: _View,
     support: np.ndarray,
     fit: Fit,
     data: Measurements,
     certain: NoiseUncertainty,
 ) -> FilteredField:
-    coefficients = np.zeros((library.size, library.dimension))
+    library, d = view.library, view.library.dimension
+    coefficients = np.zeros((library.size, d))
     coefficients[support[:, 1], support[:, 0]] = fit.model.values
-    rate = fit.noise.intensity[0]
+    rate = fit.noise.intensity[0][:d, :d]
     rows = data.begins
     moved = ((data.outputs[rows + 1] - data.outputs[rows]) ** 2).mean(axis=0)
     step = float(np.mean(data.t[rows + 1] - data.t[rows]))
@@ -329,7 +372,7 @@ def _as_field(
         rate,
         ratio,
         FlowMap(fit.substeps),
-        begin.diffusion,
+        view.diffusion,
     )
     correlation, score = _neighbours(whiten(fit.linearisation, data, fit.noise), data)
     without = replace(fit.noise, measurement=fit.noise.measurement * WITHOUT)
@@ -340,16 +383,27 @@ def _as_field(
         for factor in 1 + np.linspace(0, 2, 21) * fit.noise.measurement.max() / max(rate.max() * step, 1e-300)
     )
     return FilteredField(
-        found, fit.noise.measurement, certain.measurement, correlation, score, 2 * (best - base)
+        found,
+        fit.noise.measurement,
+        certain.measurement,
+        certain.process[:d],
+        correlation,
+        score,
+        2 * (best - base),
+        view.exposure,
     )
 
 
 def _neighbours(white: Whitened, data: Measurements) -> tuple[float, float]:
-    """Strongest correlation of neighbouring innovations over the outputs, and in standard errors."""
+    """Strongest correlation of near innovations over outputs and lags, and in standard errors."""
     innovations = white.innovations.reshape(len(data.t), -1)
-    first, second = innovations[data.begins], innovations[data.begins + 1]
-    product = first * second
-    correlations = product.mean(axis=0) / np.sqrt((first**2).mean(axis=0) * (second**2).mean(axis=0))
-    scores = product.sum(axis=0) / np.sqrt((product**2).sum(axis=0))
-    worst = int(np.argmax(np.abs(scores)))
-    return float(correlations[worst]), float(scores[worst])
+    found: list[tuple[float, float, float]] = []
+    for lag in LAGS:
+        rows = np.flatnonzero(data.recording[lag:] == data.recording[:-lag])
+        first, second = innovations[rows], innovations[rows + lag]
+        product = first * second
+        size = np.sqrt((first**2).mean(axis=0) * (second**2).mean(axis=0))
+        scores = product.sum(axis=0) / np.sqrt((product**2).sum(axis=0))
+        found += zip(np.abs(scores), product.mean(axis=0) / size, scores, strict=True)
+    _, correlation, score = max(found)
+    return float(correlation), float(score)

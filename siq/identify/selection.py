@@ -189,3 +189,28 @@ def rival_changes(equation: Equation, support: Sequence[int]) -> np.ndarray:
     total = 1.0 + sum(weight for weight, _ in kept)
     changes = [np.sqrt(weight / total) * (equation.fitted(other) - coefficients) for weight, other in kept]
     return np.array(changes).reshape(-1, equation.columns.shape[1])
+
+
+def doubts_by_equation(equations: Sequence[Equation], support: np.ndarray) -> np.ndarray:
+    """What rivals would change in f, equation by equation: shape ``(r, q, d)``.
+
+    Parameters
+    ----------
+    equations
+        One for each component of f.
+    support
+        Component and term of each coefficient, shape ``(p, 2)``.
+    """
+    doubts = []
+    for i, equation in enumerate(equations):
+        changes = rival_changes(equation, support[support[:, 0] == i, 1].tolist())
+        doubts.append(np.zeros((*changes.shape, len(equations))))
+        doubts[-1][:, :, i] = changes
+    return np.concatenate(doubts)
+
+
+def doubts_of_all(together: Equation, support: np.ndarray, *, dimension: int) -> np.ndarray:
+    """The same where all components are one problem, its columns one component after the other."""
+    functions = together.columns.shape[1] // dimension
+    changes = rival_changes(together, (support[:, 0] * functions + support[:, 1]).tolist())
+    return changes.reshape(-1, dimension, functions).transpose(0, 2, 1)

@@ -61,14 +61,24 @@ class FieldRecord:
         return deviations**2
 
     @property
+    def exposure(self) -> float | None:
+        """The step over which each sample was taken as a mean; None where as the state itself."""
+        given = self.noise.get("exposure")
+        return None if given is None else float(given)
+
+    @property
     def noise_strength(self) -> tuple[float, float] | None:
         """ε and its standard error, None where the recordings show no white noise.
 
-        The variance of n residuals of d states has the relative standard error ``√(2/nd)``.
+        The variance of n residuals of d states has the relative standard error ``√(2/nd)``. Beside sensor
+        noise it is larger, and stands in the record.
         """
         intensity = float(self.noise.get("intensity", 0.0))
         if self.noise.get("kind") not in ("process", "sensor") or not intensity > 0:
             return None
+        known = self.noise.get("intensity_error")
+        if known is not None:
+            return intensity, float(known)
         samples = int(self.noise.get("pairs", 0)) * self.found.library.dimension
         return intensity, intensity * (2 / samples) ** 0.5 if samples else 0.0
 

@@ -18,6 +18,7 @@ from siq.identify.flow_regression import FlowRegression, copies, residuals
 from siq.identify.identified_field import IdentifiedField
 from siq.identify.noise_formula import NoiseFormula
 from siq.identify.noise_regression import constant_noise_probability, fitted_noise, random_forces_of
+from siq.identify.selection import Equation, best_support, critical_values, doubts_of_all, strong_terms
 
 ROUNDS = 2  # of D by the residuals of f, and f by the weights of D: each changes the other by little
 CHUNK = 20_000  # residuals worked on together
@@ -95,8 +96,9 @@ def identify_weighted(found: IdentifiedField, pairs: SnapshotPairs, *, false_ter
     q, d = found.library.size, found.library.dimension
     everything = np.array([(i, k) for i in range(d) for k in range(q)])
     triangle, intensity = _triangle(found, pairs, everything)
-    critical = float(-scipy.special.ndtri(false_terms / (2 * q * d)))
-    kept = _significant(triangle, everything, critical * np.sqrt(intensity * copies(pairs)))
+    critical = np.tile(critical_values(found.library, false_terms=false_terms), d)
+    together = Equation(triangle[:, :-1], triangle[:, -1], intensity * copies(pairs), critical)
+    kept = list(best_support(together, strong_terms(together)))
     support = everything[kept]
     for i, name in enumerate(found.library.states):
         if not (support[:, 0] == i).any():
@@ -105,7 +107,7 @@ def identify_weighted(found: IdentifiedField, pairs: SnapshotPairs, *, false_ter
     start = np.linalg.lstsq(triangle[:, kept], triangle[:, -1], rcond=None)[0]
     coefficients[support[:, 1], support[:, 0]] = start
     found = replace(found, coefficients=coefficients, support=support, covariance=np.eye(len(support)))
-    return fit_weighted(found, pairs)
+    return replace(fit_weighted(found, pairs), doubts=doubts_of_all(together, support, dimension=d))
 
 
 def fit_weighted(found: IdentifiedField, pairs: SnapshotPairs) -> IdentifiedField:
@@ -182,46 +184,3 @@ def _triangle(
         stacked = np.concatenate([triangle, block.reshape(-1, p + 1)])
         triangle = np.asarray(np.linalg.qr(stacked, mode="r"))
     return triangle, squares / (len(pairs.h) * d)
-
-
-def _significant(triangle: np.ndarray, places: np.ndarray, critical: float) -> np.ndarray:
-    """The terms of the least ``χ² + critical²·terms`` that single changes lead to; every equation keeps one.
-
-    Terms of a library are nearly the same function on a few wells. To drop the weakest one after another may
-    then end with several that share the work of a single one; so terms are added, dropped and exchanged until
-    no change gains anything, from all terms and from the best one of each equation. `critical` is in units in
-    which a residual has the variance one.
-    """
-    scale = np.linalg.norm(triangle[:, :-1], axis=0)
-    scale = np.where(scale > 0, scale, 1.0)
-    design, goal = triangle[:, :-1] / scale, triangle[:, -1]
-    equations = np.unique(places[:, 0])
-
-    def cost(chosen: tuple[int, ...]) -> float:
-        if len(np.unique(places[list(chosen), 0])) < len(equations):
-            return np.inf
-        columns = design[:, list(chosen)]
-        left = goal - columns @ np.linalg.lstsq(columns, goal, rcond=1e-12)[0]
-        return float(left @ left) + critical**2 * len(chosen)
-
-    def settled(chosen: tuple[int, ...]) -> tuple[float, tuple[int, ...]]:
-        reached = cost(chosen)
-        while True:
-            others = [k for k in range(len(places)) if k not in chosen]
-            dropped = [tuple(k for k in chosen if k != one) for one in chosen]
-            moves = [one for one in dropped if one]
-            if len(chosen) <= MOST_TERMS * len(equations):
-                moves += [(*chosen, other) for other in others]
-                moves += [(*rest, other) for rest in dropped for other in others]
-            costs = [cost(move) for move in moves]
-            best = int(np.argmin(costs))
-            if not costs[best] < reached:
-                return reached, chosen
-            reached, chosen = costs[best], moves[best]
-
-    first = []
-    for i in equations:
-        mine = np.flatnonzero(places[:, 0] == i)
-        first.append(int(mine[np.argmax(np.abs(design[:, mine].T @ goal))]))
-    starts = (tuple(first), tuple(range(len(places))))
-    return np.array(sorted(min(settled(start) for start in starts)[1]))

@@ -28,6 +28,7 @@ from siq.landscape.transitions import (
     ways_out,
 )
 from siq.potential.local_wells import WellOptions, local_well, surveyed
+from siq.potential.uncertainty import potential_errors
 from siq.potential.well import Well
 
 if TYPE_CHECKING:
@@ -71,6 +72,8 @@ class Landscape:
         Standard error of each attractor's position, shape ``(k, d)``; None where not known.
     noise
         Strength of the noise that drives the system, None where nobody knows it.
+    found
+        The identified f with its uncertainty, None where f is given.
     visits
         How long visits to the wells last, as counted on the recordings and as f and D say; empty where this
         was not compared.
@@ -87,6 +90,7 @@ class Landscape:
     certificate: Certificate | None = None
     position_errors: np.ndarray | None = None
     noise: NoiseStrength | None = None
+    found: IdentifiedField | None = None
     visits: tuple[VisitTest, ...] = ()
 
     @classmethod
@@ -157,6 +161,28 @@ class Landscape:
         if x.ndim != 2 or x.shape[1] != self.dynamics.dimension:
             raise ValueError(f"the points have the shape {x.shape}; give (n, {self.dynamics.dimension})")
         return np.full(len(x), np.nan) if self.over_wells is None else self.over_wells(x)
+
+    def quasipotential_errors(self, points: np.ndarray) -> np.ndarray:
+        """Standard errors of U at points ``(n, d)``, above the attractor of the well that each lies in.
+
+        Returns
+        -------
+        numpy.ndarray
+            Shape ``(n,)``, from the uncertainty of f (`siq.potential.uncertainty`); zero where recordings
+            carry no noise, NaN where U is not known, or f was not identified.
+        """
+        x = np.asarray(points, dtype=float)
+        errors = np.full(len(x), np.nan)
+        if self.found is None or self.over_wells is None:
+            return errors
+        whole = self.over_wells(x)
+        for well, height in zip(self.wells, self.heights, strict=True):
+            if well is None:
+                continue
+            mine = np.isfinite(whole) & (2 * well.known_values(x) + height <= whole + SAME * well.level)
+            if mine.any():
+                errors[mine] = 2 * potential_errors(self.found, well.gradients, well.attractor, x[mine])
+        return errors
 
     def potential(self, well: int = 0) -> Well:
         """V about an attractor, zero there, as a formula with where it holds; U is 2V.
@@ -340,6 +366,7 @@ def find_landscape(
         certificate,
         np.array([position_standard_errors(found, one.position) for one in portrait.attractors]),
         noise,
+        found,
     )
 
 

@@ -25,7 +25,11 @@ from siq.reference.fokker_planck import CELLS, CellProcess, cell_process, cores_
 OVERSHOOT = 0.5826  # derived: -ζ(1/2)/√(2π)
 SMALLEST = 0.2  # of a core's radius: of steps as long as the core no such correction is known
 SHARE = 0.5  # of U at the next saddle: a core lies well within its well
-MARGIN = 0.15  # of the recorded box on each side: beyond it the operator lets nothing go
+MARGINS = (
+    0.15,
+    0.0,
+)  # of the recorded box on each side: beyond it the operator lets nothing go. None where a
+# formula of D(x), continued beyond what was recorded, is no longer positive
 DRAWS = {1: 24, 2: 8}  # of f, by the number of states: an error is then known to a sixth, or a quarter
 COARSER = 0.5  # as many cells along each state: enough for how much a time changes
 MOST_PLACES = 400  # cells of a sheared grid all have places of their own, and are put together
@@ -167,11 +171,12 @@ def predicted_visits(
     """
     notes: list[str] = []
     if found.dynamics.dimension in CELLS:
-        try:
-            processes = _processes(found, portrait, noise, cores, seed)
-        except (NumericalFailure, np.linalg.LinAlgError, RuntimeError) as error:
-            notes.append(str(error))
-        else:
+        for margin in MARGINS:
+            try:
+                processes = _processes(found, portrait, noise, cores, margin, seed)
+            except (NumericalFailure, np.linalg.LinAlgError, RuntimeError, ValueError) as error:
+                notes.append(str(error))
+                continue
             means = processes[0].means
             errors = np.log([one.means for one in processes[1:]]).std(axis=0, ddof=1)
             times = [
@@ -195,11 +200,16 @@ def predicted_visits(
 
 
 def _processes(
-    found: IdentifiedField, portrait: PhasePortrait, noise: NoiseStrength, cores: Cores, seed: int
+    found: IdentifiedField,
+    portrait: PhasePortrait,
+    noise: NoiseStrength,
+    cores: Cores,
+    margin: float,
+    seed: int,
 ) -> tuple[CellVisits, ...]:
     dynamics = found.dynamics
     width = portrait.box[:, 1] - portrait.box[:, 0]
-    box = portrait.box + MARGIN * np.stack([-width, width], axis=1)
+    box = portrait.box + margin * np.stack([-width, width], axis=1)
     cells = CELLS[dynamics.dimension]
     main = _visits(dynamics, noise.intensity, box, cores, cells)
     generator = np.random.default_rng(seed)

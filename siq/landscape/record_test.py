@@ -195,8 +195,10 @@ def record_test(
     seed
         Decides the draws of f.
     """
-    if noise is None or found.noise_free:
+    if found.noise_free:
         return RecordTest(missing="the recordings show no random forces, so that nothing hops")
+    if noise is None:
+        return RecordTest(missing="the strength of the random forces is not known")
     if len(portrait.attractors) < 2:
         seen = switching(joined(recordings)) if found.dynamics.dimension == 1 else None
         if seen is None or not seen.supported:

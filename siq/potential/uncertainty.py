@@ -15,6 +15,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from siq.dynamics.equilibria import hessian_at
 from siq.identify.identified_field import IdentifiedField
 
 RELAXATIONS = 12.0  # times 1/slowest rate: e^-12 of V is left at the beginning of a path
@@ -71,6 +72,10 @@ def potential_slopes(
     rates = -np.linalg.eigvals(dynamics.jacobian(attractor[None])[0]).real
     places = np.concatenate([x, attractor[None]])
     middle, width = (places.max(axis=0) + places.min(axis=0)) / 2, np.ptp(places, axis=0)
+    # Of a few points some state may hardly differ: paths to them use what V allows them in each.
+    hessian, offset = hessian_at(dynamics, attractor), x - attractor
+    highest = float(np.einsum("ni,ij,nj->n", offset, hessian, offset).max())
+    width = np.maximum(width, np.sqrt(highest * np.diag(np.linalg.inv(hessian))))
     width = np.where(width > 0, width, 1.0)
     scaled = dynamics.jacobian(x) * width / width[:, None]
     fastest = float(np.quantile(np.linalg.norm(scaled, axis=(1, 2)), 0.99))

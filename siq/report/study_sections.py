@@ -32,6 +32,7 @@ from siq.report.study_runs import method_tables
 from siq.steps.outcomes import Method, Status, Step
 from siq.steps.shown import ModelFiles, Shown
 from siq.study.study import Study
+from siq.study.tables import as_table
 
 SOURCES = {
     DiffusionSource.GIVEN: "As given.",
@@ -259,21 +260,18 @@ class StudyParts:
     def record(self) -> ReportSection | None:
         """The record's own hops and histogram, beside what was identified."""
         shown, certificate = self.results.shown, self._certificate()
-        table = self.results.tables.get("record")
-        if table is None or shown.run is None:
-            return None
+        table = self.results.tables.get("record", as_table("record", []))
         mine = table[table["run"] == shown.run]
         missing = "" if certificate is None else str(certificate.get("no_record_test") or "")
-        text = record_sentences(mine, missing)
-        if not text:
+        text, figures = record_sentences(mine, missing), self._figures(Part.RECORD)
+        if not text and not figures:
             return None
         overview = self.results.overview
         time = "1" if overview is None else SaidLandscape(overview).time_unit
         found = record_table(mine, time, self.results.folder)
         return ReportSection(
-            "Against the record itself", text, tables=[] if found is None else [found],
-            figures=self._figures(Part.RECORD),
-        )  # fmt: skip
+            "Against the record itself", text, tables=[] if found is None else [found], figures=figures
+        )
 
     def _remarks(self) -> list[str]:
         """What steps that went well have to say, each once; where D is from stands beside D."""

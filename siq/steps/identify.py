@@ -37,7 +37,12 @@ from siq.identify.rounding import rounding_text
 from siq.identify.storage import FieldRecord, field_library, read_field, write_field
 from siq.identify.weighted_regression import fit_weighted, with_given_noise, with_noise_formula
 from siq.numerics.randomness import Purpose, generator
-from siq.steps.identify_beside_sensor import beside_sensor_noise, filtered_record, units_of_states
+from siq.steps.identify_beside_sensor import (
+    beside_sensor_noise,
+    filtered_record,
+    means_over_exposures,
+    units_of_states,
+)
 from siq.steps.identify_from_earlier import record_from_earlier
 from siq.steps.outcomes import Outcome, Status, Step, read_outcomes, write_outcomes
 from siq.steps.settings import STRICT, Sampling, StateSpace
@@ -100,6 +105,16 @@ def _identified(settings: IdentifySettings, recordings: Recordings, number: int)
     )
     noisy = carries_noise(library, parts[0], options=options, integrator_step=maker)
     if noisy and maker is None and (memory := markov_lag(joined(recordings))).remembers:
+        if memory.kind in ("blur", "either"):
+            draw = generator(settings.seed, number, Purpose.STABILITY)
+            means = means_over_exposures(
+                recordings, library=library, options=options, pair_step=step, generator=draw
+            )
+            if means is not None:
+                return filtered_record(
+                    means, recordings, (training, held_out), sampling=sampling, space=settings.space,
+                    limits=settings.prediction,
+                )  # fmt: skip
         return record_from_earlier(
             recordings, memory, held=held, library=library, options=options, space=settings.space,
             limits=settings.prediction,

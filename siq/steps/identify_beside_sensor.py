@@ -8,12 +8,14 @@ import numpy as np
 
 from siq.certificate.tests import PredictionLimits, check_prediction
 from siq.data.recordings import Recordings, snapshot_pairs
+from siq.dynamics.diffusion import Diffusion
 from siq.errors import NumericalFailure
 from siq.estimation.innovations import Noise
 from siq.identify.diffusion import DiffusionSource, check_units, estimated_diffusion
 from siq.identify.flow_regression import residuals
 from siq.identify.identification import IdentificationOptions
 from siq.identify.identified_field import IdentifiedField
+from siq.identify.library import CandidateLibrary
 from siq.identify.noise_regression import constant_noise_probability
 from siq.identify.noisy_sensor import FilteredField, held_out_evidence, identify_by_likelihood
 from siq.identify.residuals import LARGE, SIGNIFICANT, shared_errors
@@ -72,7 +74,7 @@ def beside_sensor_noise(
     start = Noise(share * variance, np.diag(found.noise_rate) * (1 - 2 * share))
     try:
         filtered = identify_by_likelihood(
-            found.library, recordings, found, start, pair_step=pair_step, generator=generator,
+            found.library, recordings, found.diffusion, start, pair_step=pair_step, generator=generator,
             critical=critical_values(found.library, false_terms=options.false_terms),
         )  # fmt: skip
     except (NumericalFailure, np.linalg.LinAlgError) as error:
@@ -80,6 +82,35 @@ def beside_sensor_noise(
             raise NumericalFailure(f"the sensor is noisy, and f beside it is not found: {error}") from None
         return None
     return filtered if filtered.gain > 1 else None
+
+
+def means_over_exposures(
+    recordings: Recordings,
+    *,
+    library: CandidateLibrary,
+    options: IdentificationOptions,
+    pair_step: float | None,
+    generator: np.random.Generator,
+) -> FilteredField | None:
+    """F by the likelihood of samples that are means over their whole step; None where they are no such means.
+
+    They are such means if nothing is left in the innovations that neighbours share. The arguments are those
+    of `beside_sensor_noise`, with the candidate functions.
+    """
+    pairs = snapshot_pairs(recordings, pair_step=pair_step)
+    step = float(np.median(pairs.h))
+    moved = ((pairs.xh - pairs.x0) ** 2).mean(axis=0)
+    start = Noise(LEAST * moved, moved / step)
+    try:
+        filtered = identify_by_likelihood(
+            library, recordings, Diffusion.identity(library.dimension), start, pair_step=pair_step,
+            critical=critical_values(library, false_terms=options.false_terms), generator=generator,
+            exposure=step,
+        )  # fmt: skip
+    except (NumericalFailure, np.linalg.LinAlgError):
+        return None
+    remembers = abs(filtered.score) > SIGNIFICANT and abs(filtered.correlation) > LARGE
+    return None if remembers or not filtered.found.noise_rate.any() else filtered
 
 
 def filtered_record(
@@ -117,6 +148,7 @@ def filtered_record(
     intensity = diffusion.intensity(found.noise_rate)
     probability, ratio = held_out_evidence(filtered, *parts, pair_step=step)
     forced = bool(found.noise_rate.any())
+    error = intensity * float(np.sqrt((filtered.forces_error**2).sum())) / len(filtered.sensor)
     coloured = abs(filtered.score) > SIGNIFICANT and abs(filtered.correlation) > LARGE
     verdict = check_prediction(
         noise_fault=(
@@ -134,13 +166,20 @@ def filtered_record(
         {
             "kind": "coloured" if coloured else "process" if forced else "sensor",
             "intensity": intensity,
+            "intensity_error": error if np.isfinite(error) else None,
             "covariance": (found.noise_rate / intensity if forced else np.eye(len(sizes))).tolist(),
             "correlation": filtered.correlation,
             "correlation_score": filtered.score,
             "measurement": sizes.tolist(),
             "measurement_error": (sizes * filtered.sensor_error / 2).tolist(),
             "diffusion": str(source),
-            "note": f"the noise of the sensor, {said}, was estimated beside f, which it does not bias",
+            "exposure": filtered.exposure,
+            "note": f"the noise of the sensor, {said}, was estimated beside f, which it does not bias"
+            + (
+                ""
+                if filtered.exposure is None
+                else "; each sample was taken as the mean over the step before"
+            ),
             "pairs": pairs,
         },
     )

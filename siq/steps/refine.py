@@ -198,7 +198,11 @@ class Ground:
         if (sensor := record.sensor_variance) is not None:
             # Of measured values the increments do not have the mean of f.
             recordings = filtered_recordings(
-                self.found, sensor, recordings, pair_step=settings.sampling.pair_step
+                self.found,
+                sensor,
+                recordings,
+                pair_step=settings.sampling.pair_step,
+                exposure=record.exposure,
             )
         pairs = snapshot_pairs(recordings, pair_step=settings.sampling.pair_step)
         held, x = mask[pairs.recording], pairs.x0

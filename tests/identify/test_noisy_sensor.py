@@ -47,7 +47,7 @@ def identified(recordings: Recordings, *, degree: int) -> FilteredField:
         library, snapshot_pairs(recordings), options=IdentificationOptions(degree=degree)
     )
     return identify_by_likelihood(
-        library, recordings, begin, Noise(np.array([0.003]), np.array([0.5])),
+        library, recordings, begin.diffusion, Noise(np.array([0.003]), np.array([0.5])),
         critical=critical_values(library, false_terms=0.05), generator=np.random.default_rng(0),
     )  # fmt: skip
 
@@ -112,6 +112,32 @@ def test_relaxations_without_random_forces_are_whole_trajectories() -> None:
     assert np.sqrt(one.sensor[0]) == pytest.approx(0.02, rel=0.05)
     filtered = filtered_recordings(one.found, one.sensor, recordings)
     assert np.std(filtered.values - x.reshape(-1, 1)) < 0.2 * 0.02
+
+
+def test_means_over_an_exposure_are_treated_as_such() -> None:
+    """f from means is off by the path that two of them share; with the running mean as a state it is not."""
+    generator, within = np.random.default_rng(11), 10
+    samples, step = 12_000, 0.04
+    x, means = np.sign(generator.standard_normal(3)), np.empty((samples, 3))
+    for row in range(samples):
+        total = np.zeros(3)
+        for _ in range(within):
+            push = np.sqrt(FORCES * step / within) * generator.standard_normal(3)
+            before, x = x, x + step / within * (x - x**3) + push
+            total += (before + x) / 2
+        means[row] = total / within
+    means += 0.03 * generator.standard_normal(means.shape)
+    recordings = Recordings.from_arrays(step * np.arange(samples), means.T[:, :, None], names=["x"])
+    settings = PipelineSettings().of(identify.IdentifySettings)
+    done = identify.run(settings, recordings, number=0)
+    assert done.record is not None and done.record.exposure == pytest.approx(step)
+    field = done.record.found
+    assert [field.library.names[k] for _, k in field.support] == ["x", "x**3"]
+    assert (np.abs(field.values - [1, -1]) < 3.5 * np.sqrt(np.diag(field.covariance))).all()
+    assert field.noise_rate[0, 0] == pytest.approx(FORCES, rel=0.05)
+    assert done.record.sensor_variance is not None
+    assert np.sqrt(done.record.sensor_variance[0]) == pytest.approx(0.03, rel=0.1)
+    assert "mean over the step" in done.outcome.reason
 
 
 def test_a_gap_begins_another_recording() -> None:

@@ -1,105 +1,117 @@
-"""Visits of a record are foreseen as they are counted at its samples; a state that was missed is noticed."""
+"""What was identified is held against the record's own hops and histogram."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from siq.certificate.tests import Verdict
+from siq.data.held_out import held_out_recordings
 from siq.data.recordings import Recordings
-from siq.data.selection import in_stretches
-from siq.data.transitions import LEVEL, continued_visits, dwell_counts
-from siq.dynamics.diffusion import Diffusion
-from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.phase_portrait import phase_portrait
-from siq.identify.flow import FlowMap
-from siq.identify.identification import IdentificationOptions
-from siq.identify.identified_field import IdentifiedField
-from siq.identify.storage import field_library
+from siq.data.transitions import DwellCount
+from siq.dynamics.phase_portrait import PhasePortrait, phase_portrait
+from siq.identify.storage import FieldRecord
 from siq.landscape.dwell_times import NoiseStrength
-from siq.landscape.predicted_visits import cores_about
-from siq.landscape.record_test import record_test
-from siq.reference.fokker_planck import cell_process
+from siq.landscape.predicted_visits import cores_about, predicted_visits
+from siq.landscape.record_test import RecordTest, probability_of, record_test
+from siq.steps import identify
+from siq.steps.pipeline import PipelineSettings
 
-LIBRARY = field_library(["x"], IdentificationOptions(degree=3))
-
-
-def field(values: dict[str, float], intensity: float) -> IdentifiedField:
-    """An f of one state, as if it had been identified."""
-    support = np.array([[0, LIBRARY.names.index(name)] for name in values])
-    coefficients = np.zeros((LIBRARY.size, 1))
-    coefficients[support[:, 1], 0] = list(values.values())
-    return IdentifiedField(
-        LIBRARY, coefficients, support, 1e-4 * np.eye(len(support)), np.array([[intensity]]), 0.1,
-        FlowMap(1), Diffusion.identity(1),
-    )  # fmt: skip
+STEP, WITHIN, SAMPLES, RECORDS, INTENSITY = 0.05, 5, 4000, 10, 0.25
+RECORDED = tuple[Recordings, FieldRecord, PhasePortrait, np.ndarray]
 
 
-def wells() -> Dynamics:
-    """``dx = (x - x³) dt + √ε dW``."""
-    return field({"x": 1.0, "x**3": -1.0}, 0.5).dynamics
+@pytest.fixture(scope="module")
+def recorded() -> RECORDED:
+    """Ten recordings of ``dx = (x - x³) dt + √0.25 dW``, f as identified, its portrait, what is held out."""
+    generator, step = np.random.default_rng(11), STEP / WITHIN
+    state, values = np.sign(generator.standard_normal(RECORDS)), np.empty((RECORDS, SAMPLES, 1))
+    for sample in range(SAMPLES):
+        values[:, sample, 0] = state
+        for _ in range(WITHIN):
+            kick = np.sqrt(INTENSITY * step) * generator.standard_normal(RECORDS)
+            state = state + step * (state - state**3) + kick
+    recordings = Recordings.from_arrays(STEP * np.arange(SAMPLES), values, names=["x"])
+    found = identify.run(PipelineSettings().of(identify.IdentifySettings), recordings, number=0)
+    assert found.record is not None
+    portrait = phase_portrait(found.record.found.dynamics, recordings.values[::40], seed=0)
+    return recordings, found.record, portrait, held_out_recordings(recordings, generator=generator)
 
 
-def record(
-    intensity: float, step: float, samples: int, recordings: int = 1, substeps: int = 20
-) -> np.ndarray:
-    """It, simulated: shape ``(recordings, samples, 1)``."""
-    generator, h = np.random.default_rng(1), step / substeps
-    x, seen = np.ones(recordings), np.empty((recordings, samples, 1))
-    for k in range(samples):
-        kicks = np.sqrt(intensity * h) * generator.standard_normal((substeps, recordings))
-        for kick in kicks:
-            x = x + h * (x - x**3) + kick
-        seen[:, k, 0] = x
-    return seen
+def compared(recorded: RECORDED, intensity: float = INTENSITY) -> RecordTest:
+    recordings, record, portrait, held_out = recorded
+    return record_test(record.found, portrait, NoiseStrength(intensity), recordings, held_out)
 
 
-@pytest.mark.parametrize(("intensity", "step"), [(0.5, 0.2), (2.0, 0.1)])
-def test_visits_are_foreseen_as_samples_show_them(intensity: float, step: float) -> None:
-    dynamics = wells()
-    portrait = phase_portrait(dynamics, np.linspace(-1.6, 1.6, 100)[:, None], seed=0)
-    cores = cores_about(dynamics, portrait, intensity)
-    values = record(intensity, step, 800, recordings=400, substeps=10)
-    runs = [slice(start, start + 800) for start in range(0, values.size, 800)]
-    visits = continued_visits(cores.of(values.reshape(-1, 1)), runs)
-    counts = dwell_counts(np.tile(step * np.arange(800), 400), visits, runs)
-    counted = sum(one.time for one in counts) / sum(one.visits for one in counts)
-    process = cell_process(dynamics, intensity, np.array([[-3.5, 3.5]]))
-    always, sampled = (
-        process.mean_visit(one.of(process.points), 0)
-        for one in (cores, cores.as_sampled(dynamics, intensity, step))
-    )
-    assert sampled == pytest.approx(counted, rel=0.04)
-    assert counted > 1.1 * always  # samples miss visits
-
-
-def test_a_state_that_the_record_shows_and_f_does_not_is_noticed() -> None:
-    values = record(0.3, 0.1, 12_000, substeps=4)[0]
-    whole = Recordings.from_arrays(0.1 * np.arange(len(values)), values, names=["x"])
-    recordings = in_stretches(whole)
-    alone = field({"1": 0.3, "x": -0.5}, 0.3)
-    portrait = phase_portrait(alone.dynamics, values[::20], seed=0)
-    held = np.arange(len(recordings.labels)) < 2
-    found = record_test(alone, portrait, NoiseStrength(0.3), recordings, held)
+def verdict_of(found: RecordTest) -> Verdict:
     verdict = found.verdict(false_alarms=1e-4)
-    assert verdict is not None and not verdict.passed and verdict.value > -np.log10(LEVEL)
-    assert "hops between two states" in verdict.reason and found.missing == verdict.reason
-    both = field({"x": 1.0, "x**3": -1.0}, 0.3)
-    portrait = phase_portrait(both.dynamics, values[::20], seed=0)
-    agreed = record_test(both, portrait, NoiseStrength(0.3, 0.003), recordings, held)
-    verdict = agreed.verdict(false_alarms=1e-4)
-    assert verdict is not None and verdict.passed and agreed.hops > 30
+    assert verdict is not None
+    return verdict
 
 
-def test_a_single_state_is_no_contradiction() -> None:
-    generator = np.random.default_rng(0)
-    x = np.zeros((6000, 1))
-    for k in range(len(x) - 1):
-        x[k + 1] = 0.95 * x[k] + 0.1 * generator.standard_normal()
-    recordings = in_stretches(Recordings.from_arrays(0.1 * np.arange(len(x)), x, names=["x"]))
-    alone = field({"x": -0.5}, 0.1)
-    portrait = phase_portrait(alone.dynamics, x[::10], seed=0)
-    found = record_test(
-        alone, portrait, NoiseStrength(0.1), recordings, np.zeros(len(recordings.labels), dtype=bool)
-    )
-    assert found.unseen is None and found.verdict(false_alarms=1e-4) is None
-    assert found.hops == 0
+def test_what_is_right_passes(recorded: RECORDED) -> None:
+    found = compared(recorded)
+    assert found.hops > 30 and len(found.visits) == 2 and found.densities
+    assert verdict_of(found).passed
+    for one in found.visits:
+        assert one.method == "operator"
+        error = np.hypot(one.error, one.whole.relative_error)
+        assert abs(np.log(one.whole.mean / one.predicted)) < 3 * error
+
+
+@pytest.mark.parametrize("intensity", [0.1, 0.8])
+def test_a_wrong_strength_of_the_noise_is_refused(recorded: RECORDED, intensity: float) -> None:
+    verdict = verdict_of(compared(recorded, intensity))
+    assert not verdict.passed and verdict.reason
+
+
+def test_a_wrong_depth_is_refused(recorded: RECORDED) -> None:
+    recordings, record, portrait, held_out = recorded
+    deeper = replace(record.found, coefficients=2.5 * record.found.coefficients)
+    found = record_test(deeper, portrait, NoiseStrength(INTENSITY), recordings, held_out)
+    assert not verdict_of(found).passed
+
+
+def test_without_noise_there_is_no_test(recorded: RECORDED) -> None:
+    recordings, record, portrait, held_out = recorded
+    found = record_test(record.found, portrait, None, recordings, held_out)
+    assert found.verdict(false_alarms=1e-4) is None and "strength of the random forces" in str(found.missing)
+
+
+def test_a_record_too_short_to_hop_is_no_test(recorded: RECORDED) -> None:
+    recordings, record, portrait, _ = recorded
+    rows = np.arange(40)
+    short = replace(
+        recordings, labels=("0",), recording=recordings.recording[rows], t=recordings.t[rows],
+        values=recordings.values[rows],
+    )  # fmt: skip
+    found = record_test(record.found, portrait, NoiseStrength(INTENSITY), short, np.array([True]))
+    assert found.missing is not None and "nor should they" in found.missing
+
+
+def test_cores_keep_clear_of_the_saddle(recorded: RECORDED) -> None:
+    _, record, portrait, _ = recorded
+    cores = cores_about(record.found.dynamics, portrait, 10.0)
+    places = np.array([[0.0], [-1.0], [1.0], [-0.7]])
+    assert cores.of(places).tolist()[0] == -1 and set(cores.of(places[1:3]).tolist()) == {0, 1}
+
+
+def test_a_distribution_function_rises_from_nothing_to_all(recorded: RECORDED) -> None:
+    _, record, portrait, _ = recorded
+    noise = NoiseStrength(INTENSITY)
+    cores = cores_about(record.found.dynamics, portrait, INTENSITY)
+    found = predicted_visits(record.found, portrait, noise, cores)
+    along = found.distribution(0, 0, np.linspace(-3, 3, 50), blur=0.1)
+    assert along[0] < 1e-6 and along[-1] > 1 - 1e-6 and (np.diff(along) >= -1e-12).all()
+
+
+def test_probabilities_of_counts_are_those_of_chance() -> None:
+    generator = np.random.default_rng(1)
+    true = np.exp(0.2 * generator.standard_normal(1000))
+    counts = generator.poisson(15 / true)
+    found = [probability_of(DwellCount(int(n), 15.0), 1.0, 0.2) for n in counts]
+    assert np.mean(np.array(found) < 0.05) < 0.06
+    assert probability_of(DwellCount(0, 15.0), 1.0, 0.0) < 1e-5
+    assert probability_of(DwellCount(0, 0.0), 1.0, 0.1) == 1.0

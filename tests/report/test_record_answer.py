@@ -1,38 +1,71 @@
-"""What the record shows by itself is said with its intervals, and beside the wells that it belongs to."""
+"""What the page says of the record's own hops."""
 
 from __future__ import annotations
 
-from told_landscapes import NOISE, landscape
+import itertools
+from pathlib import Path
+from typing import Any
 
-from siq.report.record_answer import seen_sentence, with_visits
-from siq.report.said_landscape import SaidLandscape
+import numpy as np
+import pytest
+
+from siq.report.plots.record import plot_record
+from siq.report.record_answer import record_sentences, record_table
 from siq.study.tables import as_table
 
-SEEN = {
-    "state": "rate", "unit": "Hz", "time_unit": "s", "supported": True, "levels": [0.825, 35.29], "hops": 96,
-    "counts": [
-        {"visits": 48, "mean": 1.74, "lowest": 1.31, "highest": 2.36},
-        {"visits": 0, "mean": None, "lowest": 0.3, "highest": None},
+
+def well(**change: Any) -> dict[str, object]:
+    row: dict[str, object] = {
+        "run": 0, "attractor": "(1)", "visits": 16, "time": 800.0, "counted": 50.0, "lowest": 31.0,
+        "highest": 87.0, "held_out_visits": 4, "held_out_time": 180.0, "held_out_counted": 45.0,
+        "predicted": 51.0, "predicted_error": 3.0, "method": "operator", "probability": 0.8,
+    }  # fmt: skip
+    return row | change
+
+
+def never(**change: Any) -> dict[str, object]:
+    return well(
+        visits=0, counted=np.nan, highest=np.nan, held_out_visits=0, held_out_counted=np.nan, **change
+    )
+
+
+def test_hops_are_counted_and_what_they_allow_is_said() -> None:
+    said = " ".join(record_sentences(as_table("record", [well(), well(attractor="(-1)", visits=25)]), ""))
+    assert said.startswith("41 hops") and "8 of them" in said and "25 %" in said
+
+
+@pytest.mark.parametrize(
+    ("rows", "missing", "said"),
+    [
+        ([], "nothing hops", ["There is no test against the record itself: nothing hops."]),
+        ([], "", []),
+        ([never()], "", ["No hop from well to well was seen."]),
     ],
-}  # fmt: skip
+)
+def test_what_is_not_there_is_said(rows: list[dict[str, object]], missing: str, said: list[str]) -> None:
+    assert record_sentences(as_table("record", rows), missing) == said
 
 
-def test_two_states_of_a_record_are_told_without_any_formula() -> None:
-    said = seen_sentence(SEEN)
-    assert "two states of rate, at 0.825\u00a0Hz and 35.3\u00a0Hz: 96 transitions were seen" in said
-    assert "last 1.74 (1.3 to 2.4) and more than 0.30 s in the mean" in said
-    assert seen_sentence(SEEN | {"supported": False}) == "" == seen_sentence(None)
+def test_a_table_says_counts_with_intervals() -> None:
+    table = record_table(as_table("record", [well(), never()]), "s", Path("tables"))
+    assert table is not None
+    counted = table.frame["mean visit, counted (s)"].tolist()
+    assert counted[0].startswith("50") and "31 to 87" in counted[0] and counted[1].startswith("above")
+    assert table.frame["predicted (s)"].tolist()[0] == "51.0 ± 3.0"
+    assert record_table(as_table("record", []), "s", Path("tables")) is None
 
 
-def test_visits_belong_to_the_well_at_their_place() -> None:
-    rows = [
-        {"run": 0, "attractor": place, "visits": 5, "time": 50.0, "counted": mean, "lowest": 4.0,
-         "highest": 20.0, "held_out_visits": 1, "held_out_time": 9.0, "held_out_counted": 9.0,
-         "predicted": mean + 1, "predicted_error": 1.0, "method": "operator", "probability": 0.5}
-        for place, mean in (("(0.6)", 12.0), ("(−0.5)", 10.0))
+def test_the_figure_has_a_panel_for_each_histogram() -> None:
+    edges = np.linspace(-1, 1, 11)
+    rows: list[dict[str, object]] = [
+        {
+            "run": 0, "attractor": "(1)", "state": state, "lower": low, "upper": high, "counted": 0.5,
+            "predicted": 0.4, "distance": 0.1, "independent": 30.0, "probability": 0.5,
+        }
+        for state in ("x", "y")
+        for low, high in itertools.pairwise(edges)
     ]  # fmt: skip
-    data = landscape([[-0.5], [0.6]], [0.25, 0.35], noise=NOISE) | {"run": 0}
-    wells = SaidLandscape(with_visits(data, as_table("record", rows)) or {}).wells
-    assert [one.visits.counted for one in wells if one.visits] == [10.0, 12.0]
-    assert with_visits(None, as_table("record", [])) is None
-    assert with_visits(data | {"run": 1}, as_table("record", rows))["visits"] == []  # type: ignore[index]
+    record = as_table("record", [well(), never(attractor="(-1)")])
+    figure = plot_record(record, as_table("record_density", rows), units={"x": "nm", "y": "1"}, time_unit="s")
+    assert figure is not None and len(figure.axes) == 3
+    assert plot_record(as_table("record", []), as_table("record_density", []), units={}) is None

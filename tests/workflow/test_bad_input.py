@@ -52,12 +52,12 @@ def refused(project, *, study=None, card=None, recordings=None):
         (
             {
                 "study": ("system: archetype3d", RECORDINGS),
-                "recordings": ROWS.replace("b,0,1,2", "b,0,1,nan"),
+                "recordings": ROWS.replace("b,0,1,2", "b,nan,1,2"),
             },
-            ("measured.csv", "row 3, column y", "remove the row"),
+            ("measured.csv", "row 3, column t", "remove the row"),
         ),
     ],
-    ids=["misspelt key", "bad value", "unknown parameter", "hostile formula", "missing column", "NaN"],
+    ids=["misspelt key", "bad value", "unknown parameter", "hostile formula", "missing column", "no time"],
 )
 def test_bad_input_is_told_in_one_sentence_and_nothing_is_written(fresh_project, fault, parts):
     sentence = refused(fresh_project, **fault)

@@ -22,3 +22,21 @@ rule example_recordings:
         "simulating the example recordings"
     script:
         "../scripts/example_recordings.py"
+
+
+rule example_hopping:
+    output:
+        recordings="results/examples/double-well.csv",
+    log:
+        "results/examples/logs/double-well.log",
+    benchmark:
+        "results/examples/benchmarks/double-well.tsv"
+    conda:
+        "../envs/siq.yaml"
+    threads: 1
+    params:
+        code=code("example_hopping.py"),
+    message:
+        "simulating hopping recordings of a noisy camera"
+    script:
+        "../scripts/example_hopping.py"

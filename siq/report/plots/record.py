@@ -11,6 +11,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
+from matplotlib.ticker import FuncFormatter, LogLocator
 
 from siq.numerics.measured_text import unit_text
 from siq.report.plots.style import (
@@ -79,6 +80,9 @@ def _visits(axes: Axes, record: pd.DataFrame, time_unit: str) -> None:
         axes.plot(ends, [place - 0.12] * 2, color=BLUE, linewidth=2)
         axes.plot(one["predicted"], place - 0.12, "s", color=BLUE)
     axes.set_xscale("log")
+    for each in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
+        each(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_locator(LogLocator(subs=(2, 5)))
     axes.set_ylim(-0.6, len(record) - 0.4)
     axes.set_yticks(range(len(record)), [str(one) for one in record["attractor"]])
     axes.invert_yaxis()
