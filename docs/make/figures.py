@@ -18,6 +18,11 @@ from pathlib import Path
 
 import pandas as pd
 
+from siq.numerics.measured_text import range_text, value_text
+from siq.report.landscape_answer import counted_text, foreseen_text
+from siq.report.record_answer import with_visits
+from siq.report.said_landscape import SaidLandscape
+
 ROOT = Path(__file__).parents[2]
 FIGURES = ROOT / "docs" / "figures.json"
 README = ROOT / "README.md"
@@ -69,8 +74,48 @@ def proof(tables: Path) -> Found:
     }
 
 
+def greenland_ice(tables: Path) -> Found:
+    """The study of that name: two states, how long they last, and what divides them."""
+    overview = json.loads((tables.parent / "overview.json").read_text(encoding="utf-8"))
+    record = pd.read_parquet(tables / "record.parquet")
+    certificates = pd.read_parquet(tables / "certificates.parquet")
+    noise = json.loads((tables.parent / "runs" / "000" / "vector_field.json").read_text(encoding="utf-8"))[
+        "noise"
+    ]
+    said = SaidLandscape(with_visits(overview, record) or {})
+    found: Found = {}
+    for name, well in zip(("warm", "cold"), sorted(said.wells, key=lambda one: one.position[0]), strict=True):
+        assert well.visits is not None
+        found[f"{name}_place"] = value_text(well.position[0], well.position_errors[0])
+        found[f"{name}_counted"] = counted_text(well.visits)
+        found[f"{name}_foreseen"] = foreseen_text(well.visits)
+        found[f"{name}_barrier"] = value_text(*said.relative_depth(well))
+    missing = certificates.set_index("test")["value"]["existence"]
+    assert said.noise is not None
+    return found | {
+        "hops": str(int(record["visits"].sum())),
+        "cycle": f"{record['counted'].sum():,.0f}",
+        "no_saddle": f"{100 * missing:.0f} %",
+        "sensor": value_text(noise["measurement"][0], noise["measurement_error"][0]),
+        "noise": value_text(said.noise.intensity, said.noise.standard_error),
+    }
+
+
+def neuromorphic_chip(tables: Path) -> Found:
+    """The study of that name: two states that the record shows without any formula."""
+    seen = json.loads((tables.parent / "drawn" / "study" / "seen.json").read_text(encoding="utf-8"))
+    found = {"hops": str(seen["hops"])}
+    for name, level, one in zip(("quiet", "active"), seen["levels"], seen["counts"], strict=True):
+        found[f"{name}_level"] = value_text(level, digits=2)
+        ends = range_text(one["lowest"], one["highest"])
+        found[f"{name}_counted"] = f"{value_text(one['mean'], digits=3)} ({ends})"
+    return found
+
+
 SOURCES: dict[str, tuple[str, Callable[[Path], Found], str]] = {
     "archetype3d": ("archetype3d/tables", archetype3d, "make statistics"),
+    "greenland_ice": ("greenland-ice/tables", greenland_ice, "siq run greenland-ice"),
+    "neuromorphic_chip": ("neuromorphic-chip/tables", neuromorphic_chip, "siq run neuromorphic-chip"),
     "proof": ("proof/proof/tables", proof, "snakemake --cores 2 proof"),
     "proof_full": ("proof/proof_full/tables", proof, "snakemake --cores 2 proof_full"),
 }

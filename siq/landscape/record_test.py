@@ -147,7 +147,7 @@ class RecordTest:
         """
         if self.unseen is not None:
             rarity, limit = -float(np.log10(self.unseen.probability)), -float(np.log10(LEVEL))
-            return Verdict(rarity, limit, False, self._unseen())
+            return Verdict(rarity, limit, False, self.missing or "")
         found = [one.probability for one in self.visits] + [one.probability for one in self.densities]
         if self.missing is not None or not found:
             return None
@@ -155,14 +155,6 @@ class RecordTest:
         rarity = -float(np.log10(min(max(least * len(found), 1e-300), 1.0)))
         limit = -float(np.log10(false_alarms))
         return Verdict(rarity, limit, rarity <= limit, "" if rarity <= limit else self._reason(least))
-
-    def _unseen(self) -> str:
-        assert self.unseen is not None
-        low, high = self.unseen.levels
-        return (
-            f"the record hops between two states, at {low:.3g} and {high:.3g}, with {self.unseen.hops}"
-            " transitions seen, and what was identified has one stable state"
-        )
 
     def _reason(self, least: float) -> str:
         for one in self.visits:
@@ -209,9 +201,13 @@ def record_test(
         return RecordTest(missing="the strength of the random forces is not known")
     if len(portrait.attractors) < 2:
         seen = switching(joined(recordings)) if found.dynamics.dimension == 1 else None
+        if seen is None or not seen.supported:
+            return RecordTest(missing="there is one stable state, so that nothing hops")
+        low, high = seen.levels
         return RecordTest(
-            missing="there is one stable state, so that nothing hops",
-            unseen=seen if seen is not None and seen.supported else None,
+            missing=f"the record hops between two states, at {low:.3g} and {high:.3g}, with {seen.hops}"
+            " transitions seen, and what was identified has one stable state",
+            unseen=seen,
         )
     cores = cores_about(found.dynamics, portrait, noise.intensity)
     runs = runs_of(recordings)

