@@ -1,23 +1,5 @@
 """Which drift and which noise do recordings show?
 
-`identification`    which terms has f?
-`selection`         which terms does noise allow for, and which others would do nearly as well?
-`stability`         in how many resampled recordings would each term be chosen?
-`flow_regression`   which coefficients of given terms make f lead from X0 to Xh?
-`identified_field`  what is known of the f that was found, errors included?
-`library`           which candidate functions are there, with which derivatives and constraints?
-`flow`              where does f lead within the step of a pair?
-`diffusion`         which D, where nobody gave it?
-`random_forces`     how strong are the random forces behind residuals of a whole step?
-`noisy_sensor`      which f do recordings show whose sensor is noisy?
-`residuals`         what do its residuals say: no noise, process noise, noise of the measurement?
-`lagged_pairs`      which f, where recordings remember for some steps?
-`memory`            and what has to be said of that?
-`rounding`          were values rounded when they were written, and does it matter?
-`prediction`        where does f lead in the long run?
-`storage`           how is it kept in a file?
-==================  ===========================================================================
-=======
 ======================  ===========================================================================
 `identification`        which terms has f?
 `selection`             which terms does noise allow for, and which others would do nearly as well?
@@ -29,6 +11,8 @@
 `diffusion`             which D, where nobody gave it?
 `random_forces`         how strong are the random forces behind residuals of a whole step?
 `noisy_sensor`          which f do recordings show whose sensor is noisy?
+`seen_states`           how do samples show the states?
+`filtered_states`       what does such an f say of held-out recordings, and of the states themselves?
 `exposure`              what does a sample tell that is a mean over its step?
 `residuals`             what do its residuals say: no noise, process noise, noise of the measurement?
 `lagged_pairs`          which f, where recordings remember for some steps?

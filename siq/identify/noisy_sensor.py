@@ -14,22 +14,20 @@ import numpy as np
 import scipy.linalg
 import scipy.special
 
-from siq.data.recordings import LONGEST_STEP, Recordings
+from siq.data.recordings import Recordings
 from siq.dynamics.diffusion import Diffusion
-from siq.dynamics.dynamics import Dynamics
 from siq.errors import NumericalFailure
 from siq.estimation.estimation import Fit, fit_by_filter
 from siq.estimation.innovations import Noise, Whitened, solve, whiten
-from siq.estimation.linearisation import Grid, linearise
 from siq.estimation.measurements import Measurements
 from siq.estimation.noise import log_likelihood
 from siq.estimation.noise_uncertainty import NoiseUncertainty, noise_uncertainty
 from siq.estimation.process_noise import process_noise_needed
-from siq.identify.exposure import exposed, exposed_measurements, exposed_noise
 from siq.identify.flow import FlowMap
 from siq.identify.flow_regression import positive
-from siq.identify.identified_field import IdentifiedField, field_dynamics
+from siq.identify.identified_field import IdentifiedField
 from siq.identify.library import CandidateLibrary
+from siq.identify.seen_states import View, settled
 from siq.identify.selection import Equation, best_support, doubts_of_all, strong_terms
 from siq.identify.stability import blocks_of, stability, triangles
 
@@ -109,7 +107,7 @@ def identify_by_likelihood(
     NumericalFailure
         When the fit does not settle, or a library is too large for the recordings.
     """
-    view = _View(library, diffusion, exposure)
+    view = View(library, diffusion, exposure)
     data = view.measured(recordings, pair_step)
     q, d = library.size, library.dimension
     everything = np.array([(i, k) for i in range(d) for k in range(q)])
@@ -137,11 +135,11 @@ def identify_by_likelihood(
     for component, name in enumerate(library.states):
         if component not in support[:, 0]:
             raise NumericalFailure(f"no term of the equation of {name} is significant")
-    fit = _settled(view, support, data, whole.noise, values=values[chosen], x=whole.linearised_at)
+    fit = settled(view, support, data, whole.noise, values=values[chosen], x=whole.linearised_at)
     while (weak := _weakest(fit, support, critical)) is not None:
         support = np.delete(support, weak, axis=0)
         kept = np.delete(fit.model.values, weak)
-        fit = _settled(view, support, data, fit.noise, values=kept, x=fit.linearised_at)
+        fit = settled(view, support, data, fit.noise, values=kept, x=fit.linearised_at)
     fit = _without_forces(fit, data)
     one = _as_field(view, support, fit, data, noise_uncertainty(fit, data))
     own = (support[:, 0] * q + support[:, 1]).tolist()
@@ -155,172 +153,6 @@ def identify_by_likelihood(
     )
     field = replace(one.found, doubts=doubts_of_all(equations, support, dimension=d), stability=shares)
     return replace(one, found=field)
-
-
-def unbroken(recordings: Recordings, *, pair_step: float | None = None) -> Measurements:
-    """Recordings as measurements of their states, a new one behind every gap.
-
-    Parameters
-    ----------
-    recordings
-        Whole trajectories.
-    pair_step
-        Longest time between samples that still belong together; by default `LONGEST_STEP` median steps.
-    """
-    gap, recording = np.diff(recordings.t), recordings.recording
-    inside = recording[1:] == recording[:-1]
-    if pair_step is None and inside.any():
-        pair_step = LONGEST_STEP * float(np.quantile(gap[inside], 0.5, method="lower"))
-    broken = ~inside if pair_step is None else ~inside | (gap > pair_step * (1 + 1e-6))
-    first = np.concatenate([[0], np.flatnonzero(broken) + 1, [len(recordings.t)]])
-    return Measurements(
-        labels=tuple(recordings.labels[recording[row]] for row in first[:-1]),
-        first=first,
-        t=recordings.t,
-        outputs=np.ascontiguousarray(recordings.values),
-        courses=((),) * (len(first) - 1),
-    )
-
-
-def held_out_evidence(
-    one: FilteredField, training: Recordings, unseen: Recordings, *, pair_step: float | None = None
-) -> tuple[float, float]:
-    """Does f hold for recordings that it was not fitted to?
-
-    Parameters
-    ----------
-    one
-        Fitted to all recordings; its terms are fitted to the training recordings again.
-    training, unseen
-        The two parts.
-    pair_step
-        As for `identify_by_likelihood`.
-
-    Returns
-    -------
-    probability, ratio
-        Of the unseen innovations having no part left that any function of the library explains, by an F test;
-        and of their mean square to that of the training recordings.
-    """
-    library, support = one.found.library, one.found.support
-    view = _View(library, one.found.diffusion, one.exposure)
-    noise = view.noise(_noise_of(one.found, one.sensor))
-    own = view.measured(training, pair_step)
-    x = view.states(training.values)
-    fit = _settled(view, support, own, noise, values=one.found.values, x=x)
-    other = view.measured(unseen, pair_step)
-    still = tuple(replace(each, fixed=True) for each in fit.model.parameters)
-    follow = fit_by_filter(
-        replace(fit.model, parameters=still), other, x=view.states(unseen.values), noise=fit.noise,
-        estimate_process=False, estimate_sensor=False, substeps=fit.substeps,
-    )  # fmt: skip
-    q, d = library.size, library.dimension
-    everything = np.array([(i, k) for i in range(d) for k in range(q)])
-    values = np.zeros(len(everything))
-    values[support[:, 0] * q + support[:, 1]] = fit.model.values
-    whole = view.model(everything, values)
-    along = linearise(whole, Grid(other, fit.substeps), values, follow.linearised_at)
-    # The innovations are those of the filter itself; the library's columns are along the same states.
-    white = whiten(replace(along, gap=follow.linearisation.gap), other, follow.noise)
-    basis = np.linalg.qr(white.columns / positive(np.linalg.norm(white.columns, axis=0)))[0]
-    explained = float(((basis.T @ white.innovations) ** 2).sum())
-    count, rest = basis.shape[1], white.degrees_of_freedom - basis.shape[1]
-    total = float(white.innovations @ white.innovations)
-    if rest <= 0:
-        return 1.0, 1.0
-    probability = float(scipy.special.fdtrc(count, rest, explained / count / ((total - explained) / rest)))
-    usual = fit.sum_of_squares / fit.degrees_of_freedom
-    return probability, total / white.degrees_of_freedom / usual
-
-
-def filtered_recordings(
-    found: IdentifiedField,
-    sensor: np.ndarray,
-    recordings: Recordings,
-    *,
-    pair_step: float | None = None,
-    exposure: float | None = None,
-) -> Recordings:
-    """The states as a filter knows them at each sample, from that and the earlier ones.
-
-    Their increments have the mean of f, as those of the states do; those of the measured values do not.
-
-    Parameters
-    ----------
-    found
-        f and the random forces.
-    sensor
-        Variance of each state's sensor noise, shape ``(d,)``.
-    recordings, pair_step, exposure
-        As for `identify_by_likelihood`.
-    """
-    view = _View(found.library, found.diffusion, exposure)
-    data = view.measured(recordings, pair_step)
-    model = view.model(found.support, found.values)
-    still = replace(model, parameters=tuple(replace(each, fixed=True) for each in model.parameters))
-    follow = fit_by_filter(
-        still, data, x=view.states(recordings.values), noise=view.noise(_noise_of(found, sensor)),
-        estimate_process=False, estimate_sensor=False, substeps=found.flow.steps,
-    )  # fmt: skip
-    return replace(recordings, values=follow.linearised_at[:, : len(sensor)].copy())
-
-
-@dataclass(frozen=True)
-class _View:
-    """How samples show the states: as they are, or as means over the step before them."""
-
-    library: CandidateLibrary
-    diffusion: Diffusion
-    exposure: float | None
-
-    def model(self, support: np.ndarray, values: np.ndarray) -> Dynamics:
-        """Dynamics with the coefficients of a support as parameters, as they are measured."""
-        plain = field_dynamics(self.library, support, values, diffusion=self.diffusion)
-        return plain if self.exposure is None else exposed(plain, self.exposure)
-
-    def measured(self, recordings: Recordings, pair_step: float | None) -> Measurements:
-        data = unbroken(recordings, pair_step=pair_step)
-        return data if self.exposure is None else exposed_measurements(data, self.library.dimension)
-
-    def noise(self, noise: Noise) -> Noise:
-        return noise if self.exposure is None else exposed_noise(noise, self.library.dimension)
-
-    def states(self, values: np.ndarray) -> np.ndarray:
-        return values if self.exposure is None else np.column_stack([values, values])
-
-
-def _noise_of(found: IdentifiedField, sensor: np.ndarray) -> Noise:
-    rate = found.noise_rate
-    if not rate.any():
-        return Noise(sensor, np.zeros(len(rate)))
-    size = np.sqrt(np.diag(rate))
-    return Noise(sensor, np.diag(rate).copy(), (rate / np.outer(size, size))[None])
-
-
-def _settled(
-    view: _View,
-    support: np.ndarray,
-    data: Measurements,
-    noise: Noise,
-    *,
-    values: np.ndarray,
-    x: np.ndarray,
-) -> Fit:
-    """The fit of some terms.
-
-    Raises
-    ------
-    NumericalFailure
-        When it does not settle.
-    """
-    fit = fit_by_filter(view.model(support, values), data, x=x, noise=noise)
-    if not fit.converged:
-        raise NumericalFailure(
-            "the fit of f beside sensor noise does not settle"
-            + (f": {fit.fault}" if fit.fault else "")
-            + "; record more, or sample more often"
-        )
-    return fit
 
 
 def _without_forces(fit: Fit, data: Measurements) -> Fit:
@@ -350,7 +182,7 @@ def _weakest(fit: Fit, support: np.ndarray, critical: np.ndarray) -> int | None:
 
 
 def _as_field(
-    view: _View,
+    view: View,
     support: np.ndarray,
     fit: Fit,
     data: Measurements,

@@ -12,12 +12,13 @@ from siq.dynamics.diffusion import Diffusion
 from siq.errors import NumericalFailure
 from siq.estimation.innovations import Noise
 from siq.identify.diffusion import DiffusionSource, check_units, estimated_diffusion
+from siq.identify.filtered_states import held_out_evidence
 from siq.identify.flow_regression import residuals
 from siq.identify.identification import IdentificationOptions
 from siq.identify.identified_field import IdentifiedField
 from siq.identify.library import CandidateLibrary
 from siq.identify.noise_regression import constant_noise_probability
-from siq.identify.noisy_sensor import FilteredField, held_out_evidence, identify_by_likelihood
+from siq.identify.noisy_sensor import FilteredField, identify_by_likelihood
 from siq.identify.residuals import LARGE, SIGNIFICANT, shared_errors
 from siq.identify.rounding import HARMLESS, is_rounding, rounding_bias, rounding_errors
 from siq.identify.selection import critical_values

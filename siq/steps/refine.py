@@ -33,9 +33,9 @@ from siq.data.held_out import held_out_recordings
 from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
 from siq.dynamics.phase_portrait import PhasePortrait, evenly_spread, phase_portrait
 from siq.errors import NumericalFailure
+from siq.identify.filtered_states import filtered_recordings
 from siq.identify.identified_field import IdentifiedField
 from siq.identify.lagged_pairs import coarse_pairs
-from siq.identify.noisy_sensor import filtered_recordings
 from siq.identify.storage import FieldRecord
 from siq.landscape.dwell_times import NoiseStrength
 from siq.landscape.record_test import RecordTest, record_test

@@ -10,15 +10,11 @@ import pytest
 from siq.data.recordings import Recordings, snapshot_pairs
 from siq.data.selection import select_recordings
 from siq.estimation.innovations import Noise
+from siq.identify.filtered_states import filtered_recordings, held_out_evidence
 from siq.identify.identification import IdentificationOptions, identify_vector_field
 from siq.identify.library import candidate_library
-from siq.identify.noisy_sensor import (
-    FilteredField,
-    filtered_recordings,
-    held_out_evidence,
-    identify_by_likelihood,
-    unbroken,
-)
+from siq.identify.noisy_sensor import FilteredField, identify_by_likelihood
+from siq.identify.seen_states import unbroken
 from siq.identify.selection import critical_values
 from siq.steps import identify
 from siq.steps.outcomes import Status

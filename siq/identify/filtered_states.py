@@ -1,0 +1,100 @@
+"""What does an f that was found beside sensor noise say of other recordings, and of the states in its own?"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import scipy.special
+
+from siq.data.recordings import Recordings
+from siq.estimation.estimation import fit_by_filter
+from siq.estimation.innovations import whiten
+from siq.estimation.linearisation import Grid, linearise
+from siq.identify.flow_regression import positive
+from siq.identify.identified_field import IdentifiedField
+from siq.identify.noisy_sensor import FilteredField
+from siq.identify.seen_states import View, noise_of, settled
+
+
+def held_out_evidence(
+    one: FilteredField, training: Recordings, unseen: Recordings, *, pair_step: float | None = None
+) -> tuple[float, float]:
+    """Does f hold for recordings that it was not fitted to?
+
+    Parameters
+    ----------
+    one
+        Fitted to all recordings; its terms are fitted to the training recordings again.
+    training, unseen
+        The two parts.
+    pair_step
+        As for `identify_by_likelihood`.
+
+    Returns
+    -------
+    probability, ratio
+        Of the unseen innovations having no part left that any function of the library explains, by an F test;
+        and of their mean square to that of the training recordings.
+    """
+    library, support = one.found.library, one.found.support
+    view = View(library, one.found.diffusion, one.exposure)
+    noise = view.noise(noise_of(one.found, one.sensor))
+    own = view.measured(training, pair_step)
+    x = view.states(training.values)
+    fit = settled(view, support, own, noise, values=one.found.values, x=x)
+    other = view.measured(unseen, pair_step)
+    still = tuple(replace(each, fixed=True) for each in fit.model.parameters)
+    follow = fit_by_filter(
+        replace(fit.model, parameters=still), other, x=view.states(unseen.values), noise=fit.noise,
+        estimate_process=False, estimate_sensor=False, substeps=fit.substeps,
+    )  # fmt: skip
+    q, d = library.size, library.dimension
+    everything = np.array([(i, k) for i in range(d) for k in range(q)])
+    values = np.zeros(len(everything))
+    values[support[:, 0] * q + support[:, 1]] = fit.model.values
+    whole = view.model(everything, values)
+    along = linearise(whole, Grid(other, fit.substeps), values, follow.linearised_at)
+    # The innovations are those of the filter itself; the library's columns are along the same states.
+    white = whiten(replace(along, gap=follow.linearisation.gap), other, follow.noise)
+    basis = np.linalg.qr(white.columns / positive(np.linalg.norm(white.columns, axis=0)))[0]
+    explained = float(((basis.T @ white.innovations) ** 2).sum())
+    count, rest = basis.shape[1], white.degrees_of_freedom - basis.shape[1]
+    total = float(white.innovations @ white.innovations)
+    if rest <= 0:
+        return 1.0, 1.0
+    probability = float(scipy.special.fdtrc(count, rest, explained / count / ((total - explained) / rest)))
+    usual = fit.sum_of_squares / fit.degrees_of_freedom
+    return probability, total / white.degrees_of_freedom / usual
+
+
+def filtered_recordings(
+    found: IdentifiedField,
+    sensor: np.ndarray,
+    recordings: Recordings,
+    *,
+    pair_step: float | None = None,
+    exposure: float | None = None,
+) -> Recordings:
+    """The states as a filter knows them at each sample, from that and the earlier ones.
+
+    Their increments have the mean of f, as those of the states do; those of the measured values do not.
+
+    Parameters
+    ----------
+    found
+        f and the random forces.
+    sensor
+        Variance of each state's sensor noise, shape ``(d,)``.
+    recordings, pair_step, exposure
+        As for `identify_by_likelihood`.
+    """
+    view = View(found.library, found.diffusion, exposure)
+    data = view.measured(recordings, pair_step)
+    model = view.model(found.support, found.values)
+    still = replace(model, parameters=tuple(replace(each, fixed=True) for each in model.parameters))
+    follow = fit_by_filter(
+        still, data, x=view.states(recordings.values), noise=view.noise(noise_of(found, sensor)),
+        estimate_process=False, estimate_sensor=False, substeps=found.flow.steps,
+    )  # fmt: skip
+    return replace(recordings, values=follow.linearised_at[:, : len(sensor)].copy())
