@@ -92,7 +92,9 @@ def greenland_ice(tables: Path) -> Found:
         found[f"{name}_barrier"] = value_text(*said.relative_depth(well))
     missing = certificates.set_index("test")["value"]["existence"]
     assert said.noise is not None
+    seen = json.loads((tables.parent / "drawn" / "study" / "seen.json").read_text(encoding="utf-8"))
     return found | {
+        "one_state": f"{seen['probability']:.2g}",
         "hops": str(int(record["visits"].sum())),
         "cycle": f"{record['counted'].sum():,.0f}",
         "no_saddle": f"{100 * missing:.0f} %",

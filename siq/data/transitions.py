@@ -46,7 +46,8 @@ from siq.numerics.machine_code import machine_code
 LEVEL = 0.01  # probability with which a single state is taken for two
 DECIDED = 1e-5  # probability for the first test from which on the second one is not asked
 PULLED = -3.0  # standard errors: where f falls so clearly from every place to every other, one state attracts
-SURROGATES = 999
+SURROGATES = 999  # for each state that is looked at: fewer could not be rare enough for all of them
+ENOUGH = 20  # as deep as the record: the probability is then known to a fifth
 MOST_POINTS = 8192  # of a series that surrogates are made of
 BINS = 40  # of a histogram with a valley
 DEGREE = 5  # of f in the test: two attractors that differ in depth and width need more than a cubic
@@ -177,18 +178,21 @@ def switching(recordings: Recordings, *, generator: np.random.Generator | None =
     """
     runs, step = runs_of(recordings), usual_step(recordings)
     generator = np.random.default_rng(0) if generator is None else generator
-    tests: list[tuple[float, float, float, float]] = []
-    for column in recordings.values.T:
+    tests: dict[int, tuple[float, float, float, float]] = {}
+    for place, column in enumerate(recordings.values.T):
         relaxation = relaxation_samples(column, runs)
-        if relaxation is None:
-            return None
+        if relaxation is None:  # too short, or a column that runs on like a clock
+            continue
         pushed = pushed_apart(column, runs, relaxation) or (float("nan"), 1.0)
         if pushed[0] < PULLED or pushed[1] < DECIDED:
             valley = (valley_between(column, runs, relaxation, generator=None)[0], 1.0)
         else:
-            valley = valley_between(column, runs, relaxation, generator=generator)
-        tests.append((min(pushed[1], valley[1]), pushed[0], valley[0], relaxation))
-    state = min(range(len(tests)), key=lambda place: (tests[place][0], -tests[place][2]))
+            number = SURROGATES * recordings.values.shape[1]
+            valley = valley_between(column, runs, relaxation, generator=generator, surrogates=number)
+        tests[place] = (min(pushed[1], valley[1]), pushed[0], valley[0], relaxation)
+    if not tests:
+        return None
+    state = min(tests, key=lambda place: (tests[place][0], -tests[place][2]))
     probability, push, depth, relaxation = tests[state]
     values = recordings.values[:, state]
     background, levels, spreads = _levels(recordings, values, runs, relaxation)
@@ -285,7 +289,12 @@ def pushed_apart(values: np.ndarray, runs: list[slice], relaxation: float) -> tu
 
 
 def valley_between(
-    values: np.ndarray, runs: list[slice], relaxation: float, *, generator: np.random.Generator | None
+    values: np.ndarray,
+    runs: list[slice],
+    relaxation: float,
+    *,
+    generator: np.random.Generator | None,
+    surrogates: int = SURROGATES,
 ) -> tuple[float, float]:
     """How much of the record lies in the lesser peak of its histogram, and how probable that is.
 
@@ -295,6 +304,9 @@ def valley_between(
         As of `pushed_apart`.
     generator
         Where the phases of the surrogates come from; None makes none.
+    surrogates
+        How many, unless `ENOUGH` of them are as deep before: then it is no rare thing (Besag and Clifford,
+        Biometrika 78 (1991) 301).
 
     Returns
     -------
@@ -311,14 +323,16 @@ def valley_between(
         return seen, 1.0
     spectra = [(np.fft.rfft(part), len(part)) for part in parts]
     deeper = 0
-    for _ in range(SURROGATES):
+    for number in range(surrogates):
         drawn = []
         for spectrum, size in spectra:
             turned = spectrum * np.exp(2j * np.pi * generator.random(len(spectrum)))
             turned[0] = spectrum[0]
             drawn.append(np.fft.irfft(turned, n=size))
         deeper += _valley(np.concatenate(drawn)) >= seen
-    return seen, (1 + deeper) / (1 + SURROGATES)
+        if deeper == ENOUGH:
+            return seen, deeper / (number + 1)
+    return seen, (1 + deeper) / (1 + surrogates)
 
 
 def _less_lines(values: np.ndarray, runs: list[slice], length: int) -> np.ndarray:
