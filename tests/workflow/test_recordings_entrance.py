@@ -33,6 +33,7 @@ landscape: false
 """
 
 
+@pytest.mark.slow
 def test_both_entrances_give_the_same_answer_on_the_same_data(fresh_project, finished):
     project = fresh_project
     shutil.copy(finished.path("results/mini/runs/000/recordings.parquet"), project.path("measured.parquet"))
