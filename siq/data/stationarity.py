@@ -58,20 +58,35 @@ def usual_step(recordings: Recordings) -> float:
     return float(np.quantile(gaps, 0.5, method="lower")) if len(gaps) else float("nan")
 
 
-def runs_of(recordings: Recordings) -> list[slice]:
-    """Rows of one recording without a gap between them, each a slice."""
-    step = usual_step(recordings)
+def runs_of(recordings: Recordings, *, longest: float | None = None) -> list[slice]:
+    """Rows of one recording without a gap between them, each a slice.
+
+    Parameters
+    ----------
+    recordings
+        Trajectories.
+    longest
+        Time between samples that is no gap yet; by default `LONGEST_STEP` median steps.
+    """
+    if longest is None:
+        longest = LONGEST_STEP * usual_step(recordings)
     broken = np.diff(recordings.recording) != 0
-    if np.isfinite(step):
-        broken |= np.diff(recordings.t) > LONGEST_STEP * step * (1 + 1e-6)
+    if np.isfinite(longest):
+        broken |= np.diff(recordings.t) > longest * (1 + 1e-6)
     bounds = np.concatenate([[0], np.flatnonzero(broken) + 1, [len(recordings.t)]])
     return [slice(int(a), int(b)) for a, b in pairwise(bounds) if b > a]
 
 
+def stretches_of_all(runs: list[slice], length: int) -> np.ndarray:
+    """First rows of all stretches of that many samples; a run that is shorter gives none."""
+    return np.concatenate(
+        [np.zeros(0, dtype=int), *(np.arange(run.start, run.stop - length + 1, length) for run in runs)]
+    )
+
+
 def stretches_of(runs: list[slice], length: int) -> np.ndarray:
-    """First rows of stretches of that many samples that lie in a run, one behind the other."""
-    begins = [np.arange(run.start, run.stop - length + 1, length) for run in runs]
-    found = np.concatenate([np.zeros(0, dtype=int), *begins])
+    """First rows of stretches of that many samples in a run, one behind the other; a part of many."""
+    found = stretches_of_all(runs, length)
     return found[:: max(len(found) // MOST_STRETCHES, 1)]
 
 

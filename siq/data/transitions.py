@@ -38,6 +38,7 @@ from siq.data.stationarity import (
     relaxation_samples,
     runs_of,
     stretches_of,
+    stretches_of_all,
     usual_step,
     without_background,
 )
@@ -68,7 +69,7 @@ class DwellCount:
     Attributes
     ----------
     visits
-        How many ended before the eyes of the record: each by a hop.
+        How many were seen to end, each by a hop.
     time
         Spent in the state by all visits, in the unit of time.
     """
@@ -393,13 +394,6 @@ def _levels(
         if unchanged:
             break
     return background, levels, spreads
-
-
-def stretches_of_all(runs: list[slice], length: int) -> np.ndarray:
-    """First rows of all stretches of that many samples; a run that is shorter gives none."""
-    return np.concatenate(
-        [np.zeros(0, dtype=int), *(np.arange(run.start, run.stop - length + 1, length) for run in runs)]
-    )
 
 
 def _two_normals(series: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -32,7 +32,13 @@ from siq.identify.flow_regression import (
 )
 from siq.identify.identified_field import NOISE_FREE, IdentifiedField
 from siq.identify.library import CandidateLibrary
-from siq.identify.selection import Equation, best_support, critical_values, doubts_by_equation
+from siq.identify.selection import (
+    Equation,
+    best_support,
+    critical_values,
+    doubts_by_equation,
+    weakest_term,
+)
 from siq.identify.stability import blocks_of, stability, triangles
 
 
@@ -261,9 +267,4 @@ def _weakest(
     else:
         standing = np.abs(found.values) / np.sqrt(np.diag(found.covariance))
         strength = standing / critical[found.support[:, 1]]
-    for index in np.argsort(strength):
-        if strength[index] >= 1:
-            return None
-        if np.sum(found.support[:, 0] == found.support[index, 0]) > 1:
-            return int(index)
-    return None
+    return weakest_term(strength, found.support)

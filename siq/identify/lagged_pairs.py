@@ -38,6 +38,7 @@ from siq.identify.selection import (
     critical_values,
     doubts_by_equation,
     strong_terms,
+    weakest_term,
 )
 
 ROUNDS = 6  # of deferred correction, each of which gains a factor of about h times the Jacobian
@@ -251,14 +252,10 @@ def identify_from_earlier(
     while True:
         found = _fitted(moments, np.array(support), noise)
         strength = np.abs(found.values) / np.sqrt(np.diag(found.covariance)) / critical[found.support[:, 1]]
-        weak = [
-            place
-            for place in np.argsort(strength)
-            if strength[place] < 1 and sum(i == support[place][0] for i, _ in support) > 1
-        ]
-        if not weak:
+        weak = weakest_term(strength, found.support)
+        if weak is None:
             return replace(found, doubts=doubts_by_equation(equations, found.support))
-        del support[weak[0]]
+        del support[weak]
 
 
 def refit_from_earlier(found: IdentifiedField, given: LaggedPairs) -> IdentifiedField:

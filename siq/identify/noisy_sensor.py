@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
-import scipy.special
 
 from siq.data.recordings import Recordings
 from siq.dynamics.diffusion import Diffusion
@@ -28,7 +27,7 @@ from siq.identify.flow_regression import positive
 from siq.identify.identified_field import IdentifiedField
 from siq.identify.library import CandidateLibrary
 from siq.identify.seen_states import View, settled
-from siq.identify.selection import Equation, best_support, doubts_of_all, strong_terms
+from siq.identify.selection import Equation, best_support, doubts_of_all, strong_terms, weakest_term
 from siq.identify.stability import blocks_of, stability, triangles
 
 ROUNDS = 8  # of the fit of a whole library, which only chooses terms
@@ -171,14 +170,8 @@ def _last_change(fit: Fit, white: Whitened) -> np.ndarray:
 
 
 def _weakest(fit: Fit, support: np.ndarray, critical: np.ndarray) -> int | None:
-    """The least significant term, if it is not significant, and not the last of its equation."""
     strength = np.abs(fit.model.values) / fit.standard_errors / critical[support[:, 1]]
-    for place in np.argsort(strength):
-        if strength[place] >= 1:
-            return None
-        if np.sum(support[:, 0] == support[place, 0]) > 1:
-            return int(place)
-    return None
+    return weakest_term(strength, support)
 
 
 def _as_field(

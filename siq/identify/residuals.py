@@ -8,7 +8,7 @@ which makes their residuals anticorrelated; it enters X0 as well, and biases eve
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import scipy.special
@@ -78,6 +78,17 @@ class NoiseDiagnosis:
     rounding_bias: float = 0.0
     decimals: int = 0
     memory: str | None = None
+
+    def as_data(self) -> dict[str, Any]:
+        """What is kept of it in `vector_field.json`, without the note."""
+        return {
+            "kind": self.kind,
+            "intensity": self.intensity,
+            "covariance": self.covariance.tolist(),
+            "correlation": self.correlation,
+            "correlation_score": self.correlation_score,
+            "measurement": self.measurement.tolist(),
+        }
 
     @property
     def note(self) -> str | None:

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from siq.data.recordings import LONGEST_STEP, Recordings
+from siq.data.recordings import Recordings
+from siq.data.stationarity import runs_of
 from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.dynamics import Dynamics
 from siq.errors import NumericalFailure
@@ -88,14 +89,10 @@ def unbroken(recordings: Recordings, *, pair_step: float | None = None) -> Measu
     recordings
         Whole trajectories.
     pair_step
-        Longest time between samples that still belong together; by default `LONGEST_STEP` median steps.
+        Longest time between samples that still belong together; by default one and a half median steps.
     """
-    gap, recording = np.diff(recordings.t), recordings.recording
-    inside = recording[1:] == recording[:-1]
-    if pair_step is None and inside.any():
-        pair_step = LONGEST_STEP * float(np.quantile(gap[inside], 0.5, method="lower"))
-    broken = ~inside if pair_step is None else ~inside | (gap > pair_step * (1 + 1e-6))
-    first = np.concatenate([[0], np.flatnonzero(broken) + 1, [len(recordings.t)]])
+    runs, recording = runs_of(recordings, longest=pair_step), recordings.recording
+    first = np.array([*(run.start for run in runs), len(recordings.t)])
     return Measurements(
         labels=tuple(recordings.labels[recording[row]] for row in first[:-1]),
         first=first,

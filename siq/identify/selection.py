@@ -176,6 +176,24 @@ def improved_support(equation: Equation, start: Sequence[int]) -> tuple[int, ...
     return support
 
 
+def weakest_term(strength: np.ndarray, support: np.ndarray) -> int | None:
+    """The least significant coefficient that is not significant, nor the last of its equation; None of none.
+
+    Parameters
+    ----------
+    strength
+        Of each coefficient, shape ``(p,)``: below one it is not significant.
+    support
+        Component and term of each, shape ``(p, 2)``.
+    """
+    for place in np.argsort(strength):
+        if strength[place] >= 1:
+            return None
+        if np.sum(support[:, 0] == support[place, 0]) > 1:
+            return int(place)
+    return None
+
+
 def rival_changes(equation: Equation, support: Sequence[int]) -> np.ndarray:
     """What rivals of a support would change in its coefficients, shape ``(r, q)``.
 

@@ -146,12 +146,7 @@ def _identified(settings: IdentifySettings, recordings: Recordings, number: int)
         found, fitted, parts, held_out, fault=noise.fault(recordings.names), limits=settings.prediction
     )
     kept = {
-        "kind": noise.kind,
-        "intensity": noise.intensity,
-        "covariance": noise.covariance.tolist(),
-        "correlation": noise.correlation,
-        "correlation_score": noise.correlation_score,
-        "measurement": noise.measurement.tolist(),
+        **noise.as_data(),
         "diffusion": str(source),
         "note": "; ".join(
             each for each in (noise.note, _unlike(found, noise, source, recordings, settings)) if each

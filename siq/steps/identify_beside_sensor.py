@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from siq.certificate.tests import PredictionLimits, check_prediction
-from siq.data.recordings import Recordings, snapshot_pairs
+from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
 from siq.dynamics.diffusion import Diffusion
 from siq.errors import NumericalFailure
 from siq.estimation.innovations import Noise
@@ -65,10 +65,10 @@ def beside_sensor_noise(
     if not (score < SUSPECT).any():
         return None
     pairs = snapshot_pairs(recordings, pair_step=pair_step)
-    if _harmless_rounding(found, recordings, correlation, pair_step=pair_step):
+    if _harmless_rounding(found, recordings, pairs, correlation):
         return None
     much = bool(((score < -SIGNIFICANT) & (correlation < -LARGE)).any())
-    if not much and _uneven(found, recordings, options.false_terms, pair_step=pair_step):
+    if not much and constant_noise_probability(found, pairs, residuals(found, pairs)) < options.false_terms:
         return None
     share = np.clip(-correlation, LEAST, MOST)
     variance = np.diag(found.noise_rate) * float(np.median(pairs.h))
@@ -154,7 +154,8 @@ def filtered_record(
     verdict = check_prediction(
         noise_fault=(
             f"the innovations of neighbouring samples are correlated ({filtered.correlation:.2f}) though"
-            " noise of the sensor is allowed for: the random forces have a memory, or a state is missing"
+            " noise of the sensor is allowed for: the random forces have a memory, or a state is missing;"
+            " record that state, or keep every few samples only"
         )
         if coloured else None,
         errors=None, mean_probability=probability, held_out_ratio=ratio, limits=limits,
@@ -175,7 +176,7 @@ def filtered_record(
             "measurement_error": (sizes * filtered.sensor_error / 2).tolist(),
             "diffusion": str(source),
             "exposure": filtered.exposure,
-            "note": f"the noise of the sensor, {said}, was estimated beside f, which it does not bias"
+            "note": f"the noise of the sensor, {said}, was estimated beside f and is allowed for"
             + (
                 ""
                 if filtered.exposure is None
@@ -193,21 +194,12 @@ def units_of_states(recordings: Recordings, space: StateSpace) -> list[str | Non
 
 
 def _harmless_rounding(
-    found: IdentifiedField, recordings: Recordings, correlation: np.ndarray, *, pair_step: float | None
+    found: IdentifiedField, recordings: Recordings, pairs: SnapshotPairs, correlation: np.ndarray
 ) -> bool:
     """Whether the noise of the sensor is that of rounding, and too little to bias f."""
     rounding = rounding_errors(recordings)
-    pairs = snapshot_pairs(recordings, pair_step=pair_step)
     size = np.diag(found.noise_rate) * float(np.median(pairs.h))
     measured = np.sqrt(np.maximum(-correlation, 0.0) * size)
     if not is_rounding(measured, rounding, correlation=float(correlation.min())):
         return False
     return rounding_bias(found, pairs, rounding) <= HARMLESS
-
-
-def _uneven(
-    found: IdentifiedField, recordings: Recordings, false_terms: float, *, pair_step: float | None
-) -> bool:
-    """Whether random forces are stronger at some states than at others."""
-    pairs = snapshot_pairs(recordings, pair_step=pair_step)
-    return constant_noise_probability(found, pairs, residuals(found, pairs)) < false_terms

@@ -83,12 +83,7 @@ def record_from_earlier(
         limits=limits,
     )
     kept = {
-        "kind": noise.kind,
-        "intensity": noise.intensity,
-        "covariance": noise.covariance.tolist(),
-        "correlation": noise.correlation,
-        "correlation_score": noise.correlation_score,
-        "measurement": noise.measurement.tolist(),
+        **noise.as_data(),
         "diffusion": str(source),
         "note": noise.note,
         "pairs": independent,
