@@ -7,8 +7,8 @@ CORES ?= 2
 # takes that one.
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 
-.PHONY: statistics examples test full untuned noise wheel test-pages newcomer laboratories coverage docs \
-        docs-full lint format environment clean
+.PHONY: statistics examples test full untuned noise wheel test-pages newcomer laboratories coverage supports \
+        official docs docs-full lint format environment clean
 
 statistics: environment
 	$(BIN)/snakemake --cores $(CORES) statistics
@@ -54,6 +54,15 @@ laboratories: environment
 # Whether standard errors cover at every ratio of sensor noise to random forces.
 coverage: environment
 	$(BIN)/python -m benchmarks.laboratories.coverage --seeds 200 --cores $(CORES)
+
+# Whether f has the true terms, and no others, in records that hold the evidence.
+supports: environment
+	$(BIN)/python -m benchmarks.laboratories.supports --seeds $(SEEDS) --cores $(CORES)
+
+# The official tests of public benchmarks: results/official/page.md, a table with published figures, and a
+# picture of each. Nothing is downloaded; `make official SIQ_RESOURCES=DIR` names the folder of their files.
+official: environment
+	SIQ_RESOURCES=$(SIQ_RESOURCES) $(BIN)/snakemake --cores $(CORES) official
 
 # docs/_build/html/index.html: the pages and the reference. A warning is an error.
 docs: environment

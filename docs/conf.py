@@ -31,6 +31,7 @@ release = version = siq.__version__
 
 extensions = [
     "mathml",  # docs/extensions
+    "mechanism_pages",  # docs/extensions
     "myst_nb",
     "schemas",  # docs/extensions
     "sphinx.ext.autodoc",

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from siq.errors import InputError, MissingExtra, NumericalFailure
     from siq.identify.library import candidate_library
     from siq.landscape.landscape import Landscape
+    from siq.landscape.refusal import NoLandscape
     from siq.mismatch.case import read_case
     from siq.mismatch.diagnosis import Diagnosis, diagnose, solve_case
     from siq.mismatch.study import MismatchStudy
@@ -53,6 +54,7 @@ __all__ = [
     "Landscape",
     "MismatchStudy",
     "MissingExtra",
+    "NoLandscape",
     "NumericalFailure",
     "PipelineSettings",
     "Recordings",
@@ -93,6 +95,7 @@ _MODULES = {
     "Landscape": "siq.landscape.landscape",
     "MismatchStudy": "siq.mismatch.study",
     "MissingExtra": "siq.errors",
+    "NoLandscape": "siq.landscape.refusal",
     "NumericalFailure": "siq.errors",
     "PipelineSettings": "siq.steps.pipeline",
     "Recordings": "siq.data.recordings",

@@ -255,6 +255,22 @@ def test_the_reference_says_how_many_mechanisms_there_are_by_listing_them() -> N
     assert "```{mechanisms}" in (DOCS / "reference" / "mechanisms.md").read_text(encoding="utf-8")
 
 
+def test_the_page_of_mechanisms_says_all_that_their_file_does() -> None:
+    pages = loaded(DOCS / "extensions" / "mechanism_pages.py")
+    text = pages.page(standard_dictionary())
+    anchors = set(re.findall(r":name: (\S+)", text))
+    assert set(re.findall(r"\(#(\S+?)\)", text)) == anchors
+    assert len(anchors) == len(standard_dictionary())
+    for mechanism in standard_dictionary():
+        said = "\n".join(pages.entry(mechanism))
+        assert mechanism.sentence in said and mechanism.reference in said
+        for form in mechanism.forms:
+            for name, parameter in form.parameters.items():
+                assert f"| `{name}` | `{parameter.unit}` | {parameter.sign} |" in said
+            for formula in (*form.terms.values(), *form.replace.values(), *form.outputs.values()):
+                assert pages.one_line(formula) in said
+
+
 # Snakemake's conventions.
 
 

@@ -154,20 +154,6 @@ class ColumnsTable(SphinxDirective):
         return self.parse_text_to_nodes("\n".join(text))
 
 
-class Mechanisms(SphinxDirective):
-    """The dictionary of mechanisms that comes with the library."""
-
-    def run(self) -> list[nodes.Node]:
-        """Write it from `siq/mismatch/mechanisms.yaml`."""
-        from siq.mismatch import dictionary
-
-        self.env.note_dependency(inspect.getfile(dictionary))
-        text = ["| name | what it is | source |", "|---|---|---|"]
-        for one in dictionary.standard_dictionary():
-            text.append(f"| {one.name} | {one.sentence} | {one.reference} |")
-        return self.parse_text_to_nodes("\n".join(text))
-
-
 class CommandLine(SphinxDirective):
     """What `siq --help` and the help of each subcommand say, where the library has a command."""
 
@@ -194,6 +180,5 @@ def setup(app: Sphinx) -> dict[str, bool]:
     """Make the directives known."""
     app.add_directive("schema", SchemaTable)
     app.add_directive("columns-of-tables", ColumnsTable)
-    app.add_directive("mechanisms", Mechanisms)
     app.add_directive("command-line", CommandLine)
     return {"parallel_read_safe": True}

@@ -19,6 +19,7 @@ from pathlib import Path
 import pandas as pd
 
 from siq.numerics.measured_text import range_text, value_text
+from siq.report.inspection_section import read_seen
 from siq.report.landscape_answer import counted_text, foreseen_text
 from siq.report.record_answer import with_visits
 from siq.report.said_landscape import SaidLandscape
@@ -92,9 +93,10 @@ def greenland_ice(tables: Path) -> Found:
         found[f"{name}_barrier"] = value_text(*said.relative_depth(well))
     missing = certificates.set_index("test")["value"]["existence"]
     assert said.noise is not None
-    seen = json.loads((tables.parent / "drawn" / "study" / "seen.json").read_text(encoding="utf-8"))
+    seen = read_seen(tables.parent / "drawn" / "study")
+    assert seen is not None
     return found | {
-        "one_state": f"{seen['probability']:.2g}",
+        "one_state": f"{seen.probability:.2g}",
         "hops": str(int(record["visits"].sum())),
         "cycle": f"{record['counted'].sum():,.0f}",
         "no_saddle": f"{100 * missing:.0f} %",
@@ -105,12 +107,12 @@ def greenland_ice(tables: Path) -> Found:
 
 def neuromorphic_chip(tables: Path) -> Found:
     """The study of that name: two states that the record shows without any formula."""
-    seen = json.loads((tables.parent / "drawn" / "study" / "seen.json").read_text(encoding="utf-8"))
-    found = {"hops": str(seen["hops"])}
-    for name, level, one in zip(("quiet", "active"), seen["levels"], seen["counts"], strict=True):
+    seen = read_seen(tables.parent / "drawn" / "study")
+    assert seen is not None
+    found = {"hops": str(seen.transitions)}
+    for name, level, one in zip(("quiet", "active"), seen.levels, seen.counts, strict=True):
         found[f"{name}_level"] = value_text(level, digits=2)
-        ends = range_text(one["lowest"], one["highest"])
-        found[f"{name}_counted"] = f"{value_text(one['mean'], digits=3)} ({ends})"
+        found[f"{name}_counted"] = f"{value_text(one.mean, digits=3)} ({range_text(*one.limits)})"
     return found
 
 

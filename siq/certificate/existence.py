@@ -99,8 +99,8 @@ def _drawn_changes(found: IdentifiedField, draw: np.random.Generator) -> np.ndar
     changes = np.zeros((DRAWS, found.library.size, found.library.dimension))
     own = draw.multivariate_normal(np.zeros(len(found.support)), found.covariance, size=DRAWS, method="eigh")
     changes[:, found.support[:, 1], found.support[:, 0]] = own
-    if found.doubts is not None and len(found.doubts):
-        changes += np.tensordot(draw.standard_normal((DRAWS, len(found.doubts))), found.doubts, axes=1)
+    if found.rivals is not None:
+        changes += found.rivals.drawn(DRAWS, generator=draw)
     return changes
 
 

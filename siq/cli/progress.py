@@ -64,6 +64,7 @@ class Progress:
     errors: list[str] = field(default_factory=list)
     broken: bool = False
     planned: list[str] = field(default_factory=list)
+    _doing: dict[str, str] = field(default_factory=dict)
     _rules: dict[int, str] = field(default_factory=dict)
     _words: dict[int, str] = field(default_factory=dict)
     _latest_words: str = "starting"
@@ -85,6 +86,8 @@ class Progress:
             self._rules[job] = event["rule_name"]
             self._words[job] = self.running[job] = _in_short(event.get("rule_msg") or event["rule_name"])
             self.planned.append(self._words[job])
+        elif kind == "doing":
+            self._doing[str(event["of"])] = str(event["text"])
         elif kind == "job_finished":
             self._end(int(event["job_id"]))
         elif kind == "job_error":
@@ -95,10 +98,17 @@ class Progress:
             self.errors.append(str(event.get("text", "")))
 
     def _end(self, job: int) -> None:
+        words = self._words.get(job, "")
+        self._doing = {of: text for of, text in self._doing.items() if not words.endswith(f"({of})")}
         self.running.pop(job, None)
         self.done += 1
         self._worked += _seconds(self._rules.get(job, ""))
         self._latest = self.clock()
+
+    def _within(self, words: str) -> str:
+        """What a running job said last of what it is doing."""
+        said = [text for of, text in self._doing.items() if words.endswith(f"({of})")]
+        return f": {said[-1]}" if said else ""
 
     def left(self) -> float | None:
         """Seconds that are left, as far as can be told; None before anything has begun."""
@@ -114,7 +124,7 @@ class Progress:
             return "reading and checking your files"
         words = list(self.running.values())
         if words:
-            self._latest_words = words[-1]
+            self._latest_words = words[-1] + self._within(words[-1])
         what = "finishing" if self.done == self.total else self._latest_words
         more = f" (and {len(words) - 1} more)" if len(words) > 1 else ""
         left = self.left()

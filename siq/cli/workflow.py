@@ -91,6 +91,10 @@ class Request:
         return [*words, *self.further, "--", *self.targets]
 
 
+FOLLOWED = "SIQ_FOLLOWED"
+"""Environment variable that tells jobs that what they say of their progress is read."""
+
+
 @dataclass(frozen=True)
 class Ended:
     """How a workflow ended.
@@ -127,7 +131,7 @@ def run_workflow(request: Request) -> Ended:
     need_workflow()
     process = subprocess.Popen(
         request.command(),
-        env=_environment(),
+        env=_environment() | ({} if request.verbose else {FOLLOWED: "1"}),
         stdout=None if request.verbose else subprocess.PIPE,
         stderr=None if request.verbose else subprocess.STDOUT,
         text=None if request.verbose else True,

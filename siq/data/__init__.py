@@ -17,6 +17,7 @@
 `quantum`            how finely were the numbers of a column written?
 `stationarity`       how fast does a record forget, and does its background drift slowly?
 `transitions`        how many states does it support by itself, and how often does it hop?
+`record_states`      what does it say of its two states, without any formula?
 `noise_floor`        how strong are the two kinds of noise, at a first look?
 `lagged`             where are samples evenly spaced, and how do neighbours go together over lags?
 `noise_memory`       sensor noise, an exposure, or forces with a memory?

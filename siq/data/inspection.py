@@ -27,6 +27,7 @@ from siq.data.prospects import (
     noise_prospects,
     transition_sentences,
 )
+from siq.data.record_states import RecordStates, states_of_record
 from siq.data.recordings import LONGEST_STEP, Recordings, read_recordings
 from siq.data.transitions import Switching, switching
 from siq.numerics.measured_text import value_text
@@ -34,6 +35,9 @@ from siq.numerics.measured_text import value_text
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
+
+
+RESTFUL = ("none", "unknown")  # of a memory: what relaxes without noise neither hops nor drifts
 
 
 @dataclass(frozen=True)
@@ -87,6 +91,11 @@ class Inspection:
     findings: tuple[str, ...]
     notes: tuple[str, ...]
     prospects: tuple[str, ...]
+
+    @property
+    def seen(self) -> RecordStates | None:
+        """The two states that the recordings show by themselves; None where nothing is known of them."""
+        return states_of_record(self.recordings, self.switching)
 
     def text(self) -> str:
         """As lines of plain text, for a terminal."""
@@ -160,8 +169,7 @@ def inspection_of(recordings: Recordings, *, file: str = "the recordings") -> In
     usual = _usual_step(recordings)
     near = int((gaps <= LONGEST_STEP * usual * (1 + 1e-6)).sum())
     memory, coverage = markov_lag(recordings), coverage_of(recordings)
-    # What relaxes without noise neither hops nor drifts.
-    hops = None if memory.kind in ("none", "unknown") else switching(recordings)
+    hops = None if memory.kind in RESTFUL else switching(recordings)
     return Inspection(
         file=file,
         recordings=recordings,
@@ -178,6 +186,13 @@ def inspection_of(recordings: Recordings, *, file: str = "the recordings") -> In
         notes=(*recordings.notes, *remarks(recordings)),
         prospects=_prospects(recordings, states, memory),
     )
+
+
+def seen_states(recordings: Recordings) -> RecordStates | None:
+    """The two states that recordings show by themselves, without the rest of an inspection."""
+    if markov_lag(recordings).kind in RESTFUL:
+        return None
+    return states_of_record(recordings, switching(recordings))
 
 
 def _findings(

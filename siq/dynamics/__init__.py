@@ -10,6 +10,7 @@
 `exports`         how is a formula used elsewhere: as text, in LaTeX, in sympy?
 `source_code`     and as source in numpy, C and Julia?
 `parametric`      how does f change with states, signals and parameters?
+`tape`            and how is it written for a loop in machine code?
 `simulation`      which trajectories does it have?
 `sampling`        how is it simulated where nobody says it?
 `equilibria`      where does it rest, and where do its trajectories end?

@@ -43,6 +43,10 @@ class Parameter:
     fixed: bool = False
 
 
+COMPILED = ("functions", "delays", "_lags")
+"""What a dynamics works out once, and what does not depend on its parameters' values."""
+
+
 @dataclass(frozen=True, eq=False)
 class Dynamics:
     """A system: ``dx = f dt + √ε σ dW``, with what is known of its units, inputs and outputs.
@@ -220,7 +224,13 @@ class Dynamics:
             replace(parameter, value=float(value))
             for parameter, value in zip(self.parameters, values, strict=True)
         )
-        return replace(self, parameters=tuple(changed))
+        result = replace(self, parameters=tuple(changed))
+        for (
+            name
+        ) in COMPILED:  # formulas and names are the same, and compiling them takes longer than most uses
+            if name in self.__dict__:
+                result.__dict__[name] = self.__dict__[name]
+        return result
 
     def with_diffusion(self, diffusion: Diffusion) -> Dynamics:
         """The same drift under another noise."""

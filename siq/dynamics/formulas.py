@@ -283,6 +283,18 @@ class _ProductPrinter(NumPyPrinter):
         # The derivative of sign, which a Jacobian has; it is zero but on a set of measure zero.
         return "0.0"
 
+    # Conditions that are numbers and such that are arrays are joined one by one; numpy wants equal shapes.
+    def _print_And(self, expr: sympy.And) -> str:  # noqa: N802
+        return self._joined("logical_and", expr)
+
+    def _print_Or(self, expr: sympy.Or) -> str:  # noqa: N802
+        return self._joined("logical_or", expr)
+
+    def _joined(self, operation: str, expr: sympy.Basic) -> str:
+        parts = ", ".join(self._print(each) for each in expr.args)
+        one_by_one = self._module_format("functools.reduce")
+        return f"{one_by_one}({self._module_format(f'numpy.{operation}')}, [{parts}])"
+
 
 def _integer_power(base: np.ndarray, exponent: int) -> np.ndarray:
     product = base

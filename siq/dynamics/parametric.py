@@ -8,17 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 import sympy
 
 from siq.dynamics.formulas import compile_values, delay
+from siq.dynamics.tape import Tape, tape_of
 
 if TYPE_CHECKING:
     from siq.dynamics.dynamics import Dynamics
 
 TIME = sympy.Symbol("t", real=True)
+Compiled = Callable[..., Sequence[np.ndarray | float]]
 SMOOTHER = 30.0  # widths of a jump over which its derivative is spread
 
 
@@ -58,28 +61,45 @@ class ParametricFunctions:
 
     def __init__(self, dynamics: Dynamics) -> None:
         formulas = [*dynamics.equations, *(formula for _, formula in dynamics.outputs)]
-        delays = dynamics.delays
+        self._delays = dynamics.delays
         self._arguments = arguments_of(dynamics)
         written = [evaluable(formula, dynamics) for formula in formulas]
-        equations, outputs = written[: dynamics.dimension], written[dynamics.dimension :]
+        self._equations, self._measured = written[: dynamics.dimension], written[dynamics.dimension :]
         # A jump's derivative is a spike. Spread over more than a step it is seen in full by every rule of
         # integration, and carries deviations across the jump as they are carried in the mean.
-        smooth = [evaluable(formula, dynamics, wider=SMOOTHER) for formula in dynamics.equations]
-        states = [symbol(name) for name in dynamics.states]
-        free = [symbol(dynamics.parameters[place].name) for place in dynamics.free]
-        self._shapes = (dynamics.dimension, len(outputs), len(free))
-        self._rates = compile_values(equations, self._arguments)
-        self._outputs = compile_values(outputs, self._arguments)
-        self._slopes = compile_values(
-            [each.diff(state) for each in smooth for state in states]
-            + [by_parameter(each, parameter, delays) for each in equations for parameter in free],
+        self._smooth = [evaluable(formula, dynamics, wider=SMOOTHER) for formula in dynamics.equations]
+        self._states = [symbol(name) for name in dynamics.states]
+        self._free = [symbol(dynamics.parameters[place].name) for place in dynamics.free]
+        self._shapes = (dynamics.dimension, len(self._measured), len(self._free))
+
+    @cached_property
+    def _rates(self) -> Compiled:
+        return compile_values(self._equations, self._arguments)
+
+    @cached_property
+    def _outputs(self) -> Compiled:
+        return compile_values(self._measured, self._arguments)
+
+    @cached_property
+    def _slopes(self) -> Compiled:
+        return compile_values(
+            [each.diff(state) for each in self._smooth for state in self._states]
+            + [by_parameter(each, one, self._delays) for each in self._equations for one in self._free],
             self._arguments,
         )
-        self._output_slopes = compile_values(
-            [each.diff(state) for each in outputs for state in states]
-            + [by_parameter(each, parameter, delays) for each in outputs for parameter in free],
+
+    @cached_property
+    def _output_slopes(self) -> Compiled:
+        return compile_values(
+            [without_teeth(each).diff(state) for each in self._measured for state in self._states]
+            + [by_parameter(each, one, self._delays) for each in self._measured for one in self._free],
             self._arguments,
         )
+
+    @cached_property
+    def tape(self) -> Tape | None:
+        """F as a tape in the same arguments; None where it has a function that no tape knows."""
+        return tape_of(self._equations, self._arguments)
 
     def rates(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> np.ndarray:
         """F at states ``(d, n)``, for parameters' values ``(p,)``: shape ``(d, n)``."""
@@ -126,6 +146,18 @@ def evaluable(formula: sympy.Expr, dynamics: Dynamics, *, wider: float = 1.0) ->
     """A formula with its jumps spread, over a multiple of their widths, and symbols for delayed inputs."""
     spread = {sympy.sign(at): sympy.tanh(at / (wider * width)) for at, width in dynamics.edges}
     return formula.xreplace(spread).xreplace({each: _delayed(k) for k, each in enumerate(dynamics.delays)})
+
+
+def without_teeth(formula: sympy.Expr) -> sympy.Expr:
+    """A formula whose sawtooth ``atan(tan(z))``, as of rounding, is taken for its mean, zero.
+
+    A reading that is rounded stands still and jumps: its slope is nothing almost everywhere, and says nothing
+    of what it follows, step by step. On the whole it follows with the slope that it has without the teeth.
+    """
+    return formula.replace(
+        lambda each: isinstance(each, sympy.atan) and isinstance(each.args[0], sympy.tan),
+        lambda each: sympy.Integer(0),
+    )
 
 
 def by_parameter(formula: sympy.Expr, parameter: sympy.Symbol, delays: Sequence[sympy.Expr]) -> sympy.Expr:

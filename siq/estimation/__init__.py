@@ -9,12 +9,17 @@ Imports `siq.dynamics` and what it may import.
 `innovations`        what does a filter not foresee?
 `closure`            what does the spread of a state do to its mean?
 `noise`              how strong are the sensors' noise and random forces?
+`stretches`          which parts of long recordings are enough to begin with?
 `noise_kernel`       the likelihood of both, compiled
+`score_kernel`       what does it say of formulas of the noise, compiled?
+`budget`             how much work may it take?
 `first_states`       with which states does a fit begin?
 `shooting`           where does one step of a fit lead?
 `estimation`         which parameters, states and noise fit best?
+`unknown_forces`     and where nobody knows how strong random forces are?
 `noise_uncertainty`  how well is the noise known, and what does that leave open?
 `trajectories`       the same, where trajectories may not leave their equations
+`trajectory_kernel`  whole trajectories, compiled
 `jumps`              how finely must a jump of f be followed?
 `process_noise`      does a model need random forces to explain recordings?
 `recalibration`      which values of its own parameters make a simulation fit best?

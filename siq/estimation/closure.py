@@ -61,5 +61,9 @@ class FunctionsAtSpread:
         """Its derivatives by states and by free parameters: ``(d, d, n)`` and ``(d, p, n)``."""
         return self._closed.functions.slopes(x, self._with_spread(signals), values)
 
+    def at_intervals(self, chosen: np.ndarray) -> FunctionsAtSpread:
+        """Those of some of the intervals, by their places."""
+        return FunctionsAtSpread(self._closed, self._spread[:, chosen])
+
     def _with_spread(self, signals: Signals) -> Signals:
         return replace(signals, inputs=np.concatenate([signals.inputs, self._spread]))

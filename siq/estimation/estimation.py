@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from siq.dynamics.dynamics import Dynamics
+from siq.estimation.budget import Budget
 from siq.estimation.closure import ClosedFunctions
 from siq.estimation.innovations import Noise, solve, whiten
 from siq.estimation.linearisation import Grid, Linearisation, linearise, substeps_needed
@@ -105,6 +106,7 @@ def fit_by_multiple_shooting(
     estimate_process: bool,
     substeps: int | None = None,
     iterations: int = 25,
+    budget: Budget | None = None,
 ) -> Fit:
     """Fit free parameters, states and noise, by Gauss–Newton steps along linearised trajectories.
 
@@ -124,12 +126,19 @@ def fit_by_multiple_shooting(
         Runge–Kutta steps between samples; by default as many as the accuracy needs.
     iterations
         Most steps.
+    budget
+        Charged for every evaluation.
 
     Returns
     -------
     Fit
         Not converged, with a log-likelihood of -∞ and the reason as its `fault`, where the simulation runs
         away.
+
+    Raises
+    ------
+    BudgetSpent
+        When nothing is left of what is allowed.
     """
     with np.errstate(all="ignore"):  # what runs away is told as a fault
         if substeps is None:
@@ -138,7 +147,7 @@ def fit_by_multiple_shooting(
         begin = Iterate(model.values, x, linearise(model, grid, model.values, x), x)
         if not begin.along.finite:
             return _failed(model, begin, noise, substeps, RUNS_AWAY)
-        shooting = Shooting(model, grid, _sizes(model, x))
+        shooting = Shooting(model, grid, _sizes(model, x), budget=budget)
         try:
             fit = _gauss_newton(shooting, begin, noise, estimate_process=estimate_process, most=iterations)
         except (ArithmeticError, np.linalg.LinAlgError) as error:
@@ -147,7 +156,7 @@ def fit_by_multiple_shooting(
         return fit
     return fit_by_filter(
         fit.model, data, x=fit.x, noise=fit.noise, estimate_process=estimate_process, substeps=substeps,
-        iterations=iterations, closure=False,
+        iterations=iterations, closure=False, budget=budget,
     )  # fmt: skip
 
 
@@ -162,12 +171,13 @@ def fit_by_filter(
     substeps: int | None = None,
     iterations: int = 25,
     closure: bool = True,
+    budget: Budget | None = None,
 ) -> Fit:
     """The second half of `fit_by_multiple_shooting` alone, for a model that follows the data from the start.
 
     Parameters
     ----------
-    model, data, x, noise, estimate_process, substeps, iterations
+    model, data, x, noise, estimate_process, substeps, iterations, budget
         See there; random forces have to drive the states.
     estimate_sensor
         Whether the noise of the sensors is estimated; if not, the random forces are as given, too.
@@ -185,7 +195,9 @@ def fit_by_filter(
         closed = ClosedFunctions(model) if closure else None
         if not estimate_sensor:
             data = replace(data, sensor_noise=noise.measurement)
-        shooting = Shooting(model, Grid(data, substeps), _sizes(model, x), filtered=True, closed=closed)
+        shooting = Shooting(
+            model, Grid(data, substeps), _sizes(model, x), filtered=True, closed=closed, budget=budget
+        )
         begin = Iterate(model.values, x, shooting.linearised(model.values, x, None, noise), x)
         if not begin.along.finite:
             return _failed(model, begin, noise, substeps, RUNS_AWAY)
@@ -203,8 +215,13 @@ def _gauss_newton(
     totals: list[float] = []
     converged, settled_noise, whole = False, False, False
     for iteration in range(most):
+        noise = shooting.noise_at(now, noise)
         if iteration in (0, 2) or settled_noise:
-            noise = noise_along(now.along, data, noise, estimate_process)
+            noise = noise_along(
+                now.along, data, noise, estimate_process,
+                charge=shooting.charge, coarse=not settled_noise,
+            )  # fmt: skip
+        shooting.charge()
         white = whiten(now.along, data, noise)
         change, _ = solve(white.columns, white.innovations)
         explained = white.columns @ change

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import sympy
 
 from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.parametric import Signals
+from siq.dynamics.parametric import Signals, symbol
 from siq.estimation.measurements import Measurements
 
 
@@ -16,7 +17,7 @@ def first_states(model: Dynamics, data: Measurements) -> np.ndarray:
     slope at zero, such as a square root.
     """
     states = np.tile(_middle(model), (len(data.t), 1))
-    from_output = {str(formula): place for place, (_, formula) in enumerate(model.outputs)}
+    from_output = _measured_states(model)
     derivative_of = {
         str(equation): name
         for name, equation, is_definition in zip(model.states, model.equations, model.kinematic, strict=True)
@@ -24,14 +25,32 @@ def first_states(model: Dynamics, data: Measurements) -> np.ndarray:
     }
     for place, name in enumerate(model.states):
         if name in from_output:
-            states[:, place] = _filled(data, data.outputs[:, from_output[name]])
+            states[:, place] = _read_off(data, *from_output[name])
     for place, name in enumerate(model.states):
         if name not in from_output and derivative_of.get(name) in from_output:
-            position = _filled(data, data.outputs[:, from_output[derivative_of[name]]])
+            position = _read_off(data, *from_output[derivative_of[name]])
             for begin, end in zip(data.first[:-1], data.first[1:], strict=True):
                 if end - begin > 1:
                     states[begin:end, place] = np.gradient(position[begin:end], data.t[begin:end])
     return states
+
+
+def _measured_states(model: Dynamics) -> dict[str, tuple[int, float, float]]:
+    """States that an output is, up to a factor and an offset: its place, the factor and the offset."""
+    values = {symbol(each.name): each.value for each in model.parameters}
+    found = {}
+    for place, (_, formula) in enumerate(model.outputs):
+        known = formula.xreplace(values)
+        for name in model.states:
+            slope = known.diff(symbol(name))
+            rest = sympy.expand(known - slope * symbol(name))
+            if slope.is_number and slope != 0 and rest.is_number:
+                found[name] = (place, float(slope), float(rest))
+    return found
+
+
+def _read_off(data: Measurements, place: int, slope: float, rest: float) -> np.ndarray:
+    return (_filled(data, data.outputs[:, place]) - rest) / slope
 
 
 def _middle(model: Dynamics) -> np.ndarray:

@@ -39,7 +39,7 @@ class FreeRun:
 
 
 def free_run(
-    model: Dynamics, data: Measurements, *, noise: Noise, substeps: int, prefix: float = PREFIX
+    model: Dynamics, data: Measurements, *, noise: Noise, substeps: int, told: int | None = None
 ) -> FreeRun:
     """Simulate recordings from states that their prefixes tell.
 
@@ -53,11 +53,15 @@ def free_run(
         The measurement noise weighs the outputs; the process noise lets the states follow the prefix first.
     substeps
         Runge–Kutta steps between samples.
-    prefix
-        Share of each recording.
+    told
+        Samples of each prefix; by default a fifth of the recording, and `SHORTEST_PREFIX` at least.
     """
     lengths = np.diff(data.first)
-    rows = np.minimum(np.maximum((prefix * lengths).astype(int), SHORTEST_PREFIX), lengths - 1)
+    if told is None:
+        rows = np.maximum((PREFIX * lengths).astype(int), SHORTEST_PREFIX)
+    else:
+        rows = np.full(len(lengths), told)
+    rows = np.minimum(rows, lengths - 1)
     x = initial_states(model, data.until(np.maximum(rows, 2)), noise=noise, substeps=substeps)
     states = run(model, Grid(data, substeps), x)
     signals = data.signals(data.t, data.recording, delays=model.lags(model.values))

@@ -7,16 +7,37 @@ explains of them, the unknown initial states projected out, are all that estimat
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
-import scipy.linalg
 
 from siq.errors import NumericalFailure
 from siq.estimation.kernels import whitened_innovations
 from siq.estimation.linearisation import Linearisation
 from siq.estimation.measurements import Measurements
+from siq.numerics.triangle import triangle_of
 
 RANK = 1e-4  # singular values below this share of the largest say nothing
+
+
+class NoiseField(Protocol):
+    """How strong random forces are at the states at which a filter is."""
+
+    def over(self, x: np.ndarray, spread: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """Their mean intensity over intervals.
+
+        Parameters
+        ----------
+        x, spread
+            Mean state in the middle of each, ``(n, d)``, and its covariance at the begin, ``(n, d, d)``.
+        step
+            Their lengths, shape ``(n,)``.
+
+        Returns
+        -------
+        numpy.ndarray
+            Shape ``(n, d, d)``, per time.
+        """
 
 
 @dataclass(frozen=True)
@@ -32,11 +53,21 @@ class Noise:
     shape
         Of the random forces, where they are no independent ones of constant strength: ``(1, d, d)``, or
         ``(n, d, d)`` for one at each sample. The intensity is then ``√Q_i shape_ij √Q_j``.
+    field
+        What the shape is at each sample, where it depends on the state; a fit keeps the shape up with it.
     """
 
     measurement: np.ndarray
     process: np.ndarray
     shape: np.ndarray | None = None
+    field: NoiseField | None = None
+
+    def along(self, x: np.ndarray, spread: np.ndarray | None, step: np.ndarray) -> Noise:
+        """The same noise with the shape that its field has at states; see `NoiseField.over`."""
+        if self.field is None:
+            return self
+        spread = np.zeros((*x.shape, x.shape[1])) if spread is None else spread
+        return replace(self, shape=self.field.over(x, spread, step))
 
     def without_process(self) -> Noise:
         """The same measurement noise, and states that follow their equations exactly."""
@@ -181,12 +212,13 @@ def solve(columns: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarr
         return np.zeros(0), np.zeros((0, 0))
     if not (np.isfinite(columns).all() and np.isfinite(target).all()):
         raise NumericalFailure("the effect of a parameter on what is measured is beyond all numbers")
-    scale = np.sqrt((columns**2).sum(axis=0))
+    scale = np.sqrt(np.einsum("np,np->p", columns, columns))
     scale[scale == 0] = 1.0
-    left, values, right = scipy.linalg.svd(columns / scale, full_matrices=False)
+    triangle = triangle_of(columns, target)
+    left, values, right = np.linalg.svd(triangle[:, :-1] / scale, full_matrices=False)
     kept = values > RANK * values[0] if values[0] > 0 else np.zeros(len(values), dtype=bool)
     inverse = right[kept].T / values[kept] / scale[:, None]
-    return inverse @ (left[:, kept].T @ target), inverse @ inverse.T
+    return inverse @ (left[:, kept].T @ triangle[:, -1]), inverse @ inverse.T
 
 
 def with_parameters_changed(linearisation: Linearisation, change: np.ndarray) -> Linearisation:

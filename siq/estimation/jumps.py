@@ -14,6 +14,7 @@ import sympy
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.formulas import compile_values
 from siq.dynamics.parametric import arguments_of, evaluable
+from siq.estimation.budget import Budget
 from siq.estimation.estimation import Fit, fit_by_multiple_shooting
 from siq.estimation.measurements import Measurements
 from siq.estimation.trajectories import fit_trajectories
@@ -61,7 +62,7 @@ def spread_edges(model: Dynamics, data: Measurements, x: np.ndarray, *, substeps
     return replace(model, edges=tuple(zip(arguments, widths, strict=True)))
 
 
-def sharpened(rough: Fit, data: Measurements) -> Fit:
+def sharpened(rough: Fit, data: Measurements, *, budget: Budget | None = None) -> Fit:
     """A fit whose jumps are spread so little that it no longer matters; motion that sticks asks for this.
 
     Without process noise only: with it the states follow the data anyway.
@@ -71,12 +72,20 @@ def sharpened(rough: Fit, data: Measurements) -> Fit:
     ):
         substeps = 2 * rough.substeps
         model = spread_edges(rough.model, data, rough.x, substeps=substeps)
-        finer = fit_by_multiple_shooting(
-            model, data, x=rough.x, noise=rough.noise, estimate_process=False, substeps=substeps
+        begin = rough.x[data.first[:-1]]
+        finer = fit_trajectories(
+            model, data, begin=begin, noise=rough.noise, substeps=substeps, budget=budget
         )
         if not finer.converged:
-            begin = rough.x[data.first[:-1]]
-            finer = fit_trajectories(model, data, begin=begin, noise=rough.noise, substeps=substeps)
+            finer = fit_by_multiple_shooting(
+                model,
+                data,
+                x=rough.x,
+                noise=rough.noise,
+                estimate_process=False,
+                substeps=substeps,
+                budget=budget,
+            )
         if not finer.converged:
             break
         gained, rough = finer.log_likelihood - rough.log_likelihood, finer

@@ -30,7 +30,7 @@ class Columns(Protocol):
         """In the outputs, at states ``(d, n)`` of all samples: shape ``(m, q, n)``."""
 
 
-class Drift(Protocol):
+class Rates(Protocol):
     """F and its derivatives, as `siq.dynamics.parametric.ParametricFunctions` has them."""
 
     def rates(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> np.ndarray:
@@ -40,6 +40,14 @@ class Drift(Protocol):
         """By states and by free parameters: ``(d, d, n)`` and ``(d, p, n)``."""
 
 
+class Drift(Rates, Protocol):
+    """The same where it differs from interval to interval."""
+
+    def at_intervals(self, chosen: np.ndarray) -> Rates:
+        """That of some of the intervals, by their places."""
+
+
+INTERVALS = 1 << 14  # numerical: carried together, since their derivatives at three places are much to keep
 MOST_SUBSTEPS = 16
 INSIDE = 1e-9  # share of a substep by which its ends lie inside, where an input jumps between samples
 
@@ -165,12 +173,58 @@ def linearise(
         F where it is another than the model's, such as the mean of f over a spread of states.
     """
     data, compiled, delays = grid.data, model.functions, model.lags(values)
-    drift = compiled if drift is None else drift
-    rows, step = grid.rows, grid.step
-    state = np.array(x[rows].T)
+    dimension, rows, count = x.shape[1], grid.rows, len(grid.rows)
+    transition = np.zeros((len(x), dimension, dimension))
+    response = np.zeros((len(x), dimension, 0))
+    gap = np.zeros((len(x), dimension))
+    # Candidates have their own grid, and come as they are.
+    together = count if columns is not None else INTERVALS
+    for begin in range(0, count, together):
+        chosen = np.arange(begin, min(begin + together, count))
+        whole = len(chosen) == count
+        part = grid if whole else grid.at_intervals(chosen)
+        along: Rates = compiled
+        if drift is not None:
+            along = drift if whole else drift.at_intervals(chosen)
+        ends, by_state, by_parameter = _carried(
+            model, part, values, np.array(x[part.rows].T), along, columns=columns
+        )
+        if not begin:
+            response = np.zeros((len(x), *by_parameter.shape[1:]))
+        at = rows[chosen]
+        transition[at], response[at] = by_state, by_parameter
+        with np.errstate(invalid="ignore"):
+            gap[at] = ends.T - x[at + 1]
+    samples = np.ascontiguousarray(x.T)
+    signals = grid.at_samples(delays)
+    by_state, by_parameter = compiled.output_slopes(samples, signals, values)
+    if columns is not None:
+        by_parameter = np.concatenate([by_parameter, columns.outputs(samples, values)], axis=1)
+    simulated = compiled.outputs(samples, signals, values).T
+    return Linearisation(
+        transition=transition,
+        response=response,
+        gap=gap,
+        measured=np.ascontiguousarray(np.moveaxis(by_state, 2, 0)),
+        measured_response=np.ascontiguousarray(np.moveaxis(by_parameter, 2, 0)),
+        residual=data.outputs - np.where(np.isfinite(simulated), simulated, np.inf),
+    )
+
+
+def _carried(
+    model: Dynamics,
+    grid: Grid,
+    values: np.ndarray,
+    state: np.ndarray,
+    drift: Rates,
+    *,
+    columns: Columns | None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """States ``(d, k)`` at the ends of intervals, with their derivatives ``(k, d, d)`` and ``(k, d, p)``."""
+    delays, step = model.lags(values), grid.step
     dimension, count = state.shape
     transition = np.broadcast_to(np.eye(dimension), (count, dimension, dimension)).copy()
-    for place in data.restarting:
+    for place in grid.data.restarting:
         state[place] = 0.0
         transition[:, place, place] = 0.0
     response: np.ndarray | None = None
@@ -194,27 +248,7 @@ def linearise(
         )
         state = after
     assert response is not None
-    samples = np.ascontiguousarray(x.T)
-    signals = grid.at_samples(delays)
-    by_state, by_parameter = compiled.output_slopes(samples, signals, values)
-    if columns is not None:
-        by_parameter = np.concatenate([by_parameter, columns.outputs(samples, values)], axis=1)
-    simulated = compiled.outputs(samples, signals, values).T
-    full = np.zeros((len(x), dimension, response.shape[2]))
-    full[rows] = response
-    transitions = np.zeros((len(x), dimension, dimension))
-    transitions[rows] = transition
-    gap = np.zeros((len(x), dimension))
-    with np.errstate(invalid="ignore"):
-        gap[rows] = state.T - x[rows + 1]
-    return Linearisation(
-        transition=transitions,
-        response=full,
-        gap=gap,
-        measured=np.ascontiguousarray(np.moveaxis(by_state, 2, 0)),
-        measured_response=np.ascontiguousarray(np.moveaxis(by_parameter, 2, 0)),
-        residual=data.outputs - np.where(np.isfinite(simulated), simulated, np.inf),
-    )
+    return state, transition, response
 
 
 def substeps_needed(
@@ -247,7 +281,7 @@ def substeps_needed(
 
 
 def _runge_kutta(
-    drift: Drift,
+    drift: Rates,
     grid: Grid,
     values: np.ndarray,
     x: np.ndarray,

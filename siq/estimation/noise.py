@@ -6,6 +6,7 @@ that are fitted beside them.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,9 +16,13 @@ from siq.dynamics.dynamics import Dynamics
 from siq.estimation.innovations import Noise, solve, whiten, with_parameters_changed
 from siq.estimation.linearisation import Linearisation
 from siq.estimation.measurements import Measurements
-from siq.estimation.noise_kernel import noise_likelihood
+from siq.estimation.stretches import Stretches
 
 SMOOTHEST = 1e-4  # least measurement noise, as a share of what third differences show
+MANY = 8000  # samples, whose noise is known to 2 %: enough to begin with
+AWAY = 0.05  # numerical: of a logarithm, for differences of the likelihood
+TOLD = 1.0  # curvature along a logarithm, from which on its standard error is below one
+NEAR = 0.5  # of a logarithm, within which the likelihood is a parabola
 LOWEST = np.exp(-23.0)  # of a process noise, relative to where the search began; below it there is none
 
 
@@ -102,7 +107,14 @@ def noise_coordinates(data: Measurements, origin: Noise) -> NoiseCoordinates:
     return NoiseCoordinates(origin, known if data.sensor_noise is None else np.isfinite(data.sensor_noise))
 
 
-def estimate_noise(linearisation: Linearisation, data: Measurements, start: Noise) -> Noise:
+def estimate_noise(
+    linearisation: Linearisation,
+    data: Measurements,
+    start: Noise,
+    *,
+    charge: Callable[[float], None] | None = None,
+    coarse: bool = False,
+) -> Noise:
     """The noise of highest restricted likelihood along the trajectories in hand.
 
     The parameters are those that are best for the noise that the search begins with: they depend little on
@@ -116,18 +128,35 @@ def estimate_noise(linearisation: Linearisation, data: Measurements, start: Nois
         The measurements.
     start
         Where the search begins. A process noise that is zero stays so.
+    charge
+        Called before each evaluation of the likelihood, with the share of the samples that it is for.
+    coarse
+        Whether some thousand samples are enough, where there are many more.
     """
     coordinates = noise_coordinates(data, start)
     driven, outputs = coordinates.driven, len(start.measurement)
     white = whiten(linearisation, data, start)
     linearisation = with_parameters_changed(linearisation, solve(white.columns, white.innovations)[0])
 
-    def cost(vector: np.ndarray) -> float:
-        value = -log_likelihood(linearisation, data, coordinates.noise_at(vector))
-        return value if np.isfinite(value) else 1e300
+    whole = Stretches(data.first, linearisation, np.append(np.diff(data.t), 0.0))
+    some = whole.some(MANY)
 
+    def cost_along(stretches: Stretches) -> Callable[[np.ndarray], float]:
+        share = len(stretches.step) / len(whole.step)
+
+        def cost(vector: np.ndarray) -> float:
+            if charge is not None:
+                charge(share)
+            total, log_determinant, freedom = stretches.sums(coordinates.noise_at(vector))
+            value = 0.5 * (total + log_determinant + freedom * np.log(2 * np.pi))
+            return value if np.isfinite(value) else 1e300
+
+        return cost
+
+    cost = cost_along(some)
     begins = [np.zeros(coordinates.size)]
-    for factor in (1e-2, 1e-4, 1e-6) if len(driven) else ():
+    # Upwards, too: a candidate that promised to need hardly any random forces may not have kept that.
+    for factor in (1e-2, 1e-4, 1e-6, 1e2, 1e4) if len(driven) else ():
         begins.append(np.zeros(coordinates.size))
         begins[-1][outputs : outputs + len(driven)] = np.log(factor)
     best = min(begins, key=cost)
@@ -138,14 +167,69 @@ def estimate_noise(linearisation: Linearisation, data: Measurements, start: Nois
     ]
     bounds += [(np.log(LOWEST), 12.0)] * len(driven)
     bounds += [(-10.0, 10.0)] * (coordinates.size - len(bounds))
-    found = scipy.optimize.minimize(
-        cost, best, method="L-BFGS-B", bounds=bounds, options={"maxiter": 12, "ftol": 1e-7, "eps": 1e-3}
-    )
-    vector = found.x if found.fun <= cost(best) else best
+    vector = _lowest(cost, best, bounds)
+    if some is not whole and not coarse:
+        ratio = len(whole.step) / len(some.step)
+        vector = _corrected(vector, cost_along(whole), cost, ratio=ratio, bounds=bounds)
     noise = coordinates.noise_at(vector)
     gone = vector[outputs : outputs + len(driven)] <= np.log(LOWEST) + 1
     noise.process[driven[gone]] = 0.0
     return noise
+
+
+def _lowest(
+    cost: Callable[[np.ndarray], float], begin: np.ndarray, bounds: Sequence[tuple[float, float]]
+) -> np.ndarray:
+    found = scipy.optimize.minimize(
+        cost, begin, method="L-BFGS-B", bounds=bounds, options={"maxiter": 12, "ftol": 1e-7, "eps": 1e-3}
+    )
+    return found.x if found.fun <= cost(begin) else begin
+
+
+def _corrected(
+    vector: np.ndarray,
+    whole: Callable[[np.ndarray], float],
+    some: Callable[[np.ndarray], float],
+    *,
+    ratio: float,
+    bounds: Sequence[tuple[float, float]],
+) -> np.ndarray:
+    """The minimum of a cost from that of a part of it, by one Newton step with the curvature of the part.
+
+    What is left is of second order in the difference of the two, which many samples make small; where they
+    differ so much that the step leads upwards all is searched.
+
+    Parameters
+    ----------
+    vector
+        Where the part has its minimum.
+    whole, some
+        The two costs.
+    ratio
+        How much larger the whole is.
+    bounds
+        A coordinate at one of them stays there.
+    """
+    lower, upper = np.array(bounds).T
+    inside = np.flatnonzero((vector > lower + AWAY) & (vector < upper - AWAY))
+    unit = AWAY * np.eye(len(vector))[inside]
+    middle, part = whole(vector), some(vector)
+    ahead = np.array([some(vector + one) for one in unit])
+    curvature = np.empty((len(inside), len(inside)))
+    for row, one in enumerate(unit):
+        curvature[row, row] = ahead[row] + some(vector - one) - 2 * part
+        for column in range(row):
+            both = some(vector + one + unit[column])
+            curvature[row, column] = curvature[column, row] = both - ahead[row] - ahead[column] + part
+    curvature *= ratio / AWAY**2
+    slope = np.array([whole(vector + one) - middle for one in unit]) / AWAY - AWAY / 2 * np.diag(curvature)
+    values, directions = np.linalg.eigh(curvature)
+    # Where the likelihood is flat, as towards no random forces, there is nothing to correct.
+    told = directions[:, values > TOLD]
+    step = -told @ (told.T @ slope / values[values > TOLD])
+    moved = vector.copy()
+    moved[inside] += np.clip(step, -NEAR, NEAR)
+    return moved if whole(moved) <= middle else _lowest(whole, vector, bounds)
 
 
 def log_likelihood(linearisation: Linearisation, data: Measurements, noise: Noise) -> float:
@@ -166,27 +250,23 @@ def likelihood_sums(
     weight
         Factor on the process noise at each sample, shape ``(n,)``.
     """
-    total, log_determinant, freedom = noise_likelihood(
-        data.first,
-        linearisation.transition,
-        linearisation.response,
-        linearisation.gap,
-        linearisation.measured,
-        linearisation.measured_response,
-        linearisation.residual,
-        weight * np.append(np.diff(data.t), 0.0),
-        noise.measurement,
-        noise.intensity,
-    )
+    whole = Stretches(data.first, linearisation, np.append(np.diff(data.t), 0.0))
+    total, log_determinant, freedom = whole.sums(noise, weight=weight)
     return total, freedom, log_determinant
 
 
 def noise_along(
-    linearisation: Linearisation, data: Measurements, noise: Noise, estimate_process: bool
+    linearisation: Linearisation,
+    data: Measurements,
+    noise: Noise,
+    estimate_process: bool,
+    *,
+    charge: Callable[[float], None] | None = None,
+    coarse: bool = False,
 ) -> Noise:
     """The noise along the trajectories in hand, the process noise only where it is to be estimated, too."""
     if estimate_process and (noise.process > 0).any():
-        return estimate_noise(linearisation, data, noise)
+        return estimate_noise(linearisation, data, noise, charge=charge, coarse=coarse)
     driven = bool((noise.process > 0).any())
     if driven and data.sensor_noise is not None:
         return noise

@@ -62,6 +62,15 @@ def noise_likelihood(
     gain = np.empty(dimension)
     shown = np.empty(width)
     own = np.empty((width, width))
+    pairs = np.empty((dimension * dimension, 2), dtype=np.int64)
+    driven = 0
+    for m in range(dimension):
+        for other in range(dimension):
+            for row in range(len(intensity)):
+                if intensity[row, m, other] != 0.0:
+                    pairs[driven, 0], pairs[driven, 1] = m, other
+                    driven += 1
+                    break
     for recording in range(len(first) - 1):
         state[:] = 0.0
         covariance[:] = 0.0
@@ -124,16 +133,14 @@ def noise_likelihood(
                     value = 0.0
                     for m in range(dimension):
                         value += half[i, m] * transition[k, j, m]
-                        for other in range(dimension):
-                            strength = intensity[row, m, other]
-                            if strength == 0.0:
-                                continue
-                            # Simpson's rule, as in siq.estimation.innovations.process_covariance.
-                            a, b = transition[k, i, m], transition[k, j, other]
-                            same_i = 1.0 if i == m else 0.0
-                            same_j = 1.0 if j == other else 0.0
-                            added = a * b + (a + same_i) * (b + same_j) + same_i * same_j
-                            value += strength * added * step[k] / 6.0
+                    for pair in range(driven):
+                        m, other = pairs[pair, 0], pairs[pair, 1]
+                        # Simpson's rule, as in siq.estimation.innovations.process_covariance.
+                        a, b = transition[k, i, m], transition[k, j, other]
+                        same_i = 1.0 if i == m else 0.0
+                        same_j = 1.0 if j == other else 0.0
+                        added = a * b + (a + same_i) * (b + same_j) + same_i * same_j
+                        value += intensity[row, m, other] * added * step[k] / 6.0
                     covariance[i, j] = value
                     covariance[j, i] = value
         removed, logarithm = _eliminate(own, kept)

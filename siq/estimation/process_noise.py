@@ -8,7 +8,9 @@ import numpy as np
 import scipy.stats
 
 from siq.dynamics.dynamics import Dynamics
+from siq.estimation.budget import COMPILATION, Budget
 from siq.estimation.estimation import Fit, fit_by_multiple_shooting
+from siq.estimation.innovations import Noise
 from siq.estimation.jumps import EDGE_SUBSTEPS, jumps_of, spread_edges
 from siq.estimation.measurements import Measurements
 from siq.estimation.trajectories import fit_trajectories
@@ -17,10 +19,18 @@ THRESHOLD = 1e-4  # probability by chance, below which random forces are believe
 
 
 def fit_with_process_noise_as_needed(
-    model: Dynamics, data: Measurements, begin: Fit, *, level: float = 1.0, x: np.ndarray | None = None
+    model: Dynamics,
+    data: Measurements,
+    begin: Fit,
+    *,
+    level: float = 1.0,
+    x: np.ndarray | None = None,
+    budget: Budget | None = None,
 ) -> Fit:
     """Fit with process noise estimated, and without; the simpler unless the data speak against it."""
-    return simpler_fit(*fit_with_and_without_process_noise(model, data, begin, level=level, x=x))
+    return simpler_fit(
+        *fit_with_and_without_process_noise(model, data, begin, level=level, x=x, budget=budget)
+    )
 
 
 def simpler_fit(loose: Fit | None, strict: Fit) -> Fit:
@@ -29,7 +39,14 @@ def simpler_fit(loose: Fit | None, strict: Fit) -> Fit:
 
 
 def fit_with_and_without_process_noise(
-    model: Dynamics, data: Measurements, begin: Fit, *, level: float = 1.0, x: np.ndarray | None = None
+    model: Dynamics,
+    data: Measurements,
+    begin: Fit,
+    *,
+    level: float = 1.0,
+    x: np.ndarray | None = None,
+    settled: bool = False,
+    budget: Budget | None = None,
 ) -> tuple[Fit | None, Fit]:
     """Fit with process noise estimated, where that was begun with, and without.
 
@@ -45,7 +62,18 @@ def fit_with_and_without_process_noise(
         Factor on its process noise.
     x
         States, where the model has more of them.
+    settled
+        Whether `begin` is itself the fit of the model with process noise, and need not be made again.
+    budget
+        Charged for every evaluation.
+
+    Raises
+    ------
+    BudgetSpent
+        When nothing is left of what is allowed.
     """
+    if budget is not None:
+        budget.charge(COMPILATION)
     states = begin.x if x is None else x
     substeps = begin.substeps
     if jumps_of(model):
@@ -55,7 +83,10 @@ def fit_with_and_without_process_noise(
     if len(noise.process) != model.dimension:  # what a mechanism brings is driven by no noise of its own
         driven = noise.process[: model.dimension]
         noise = replace(noise, process=np.append(driven, np.zeros(model.dimension - len(driven))))
-    if noise.process.any():
+    loose: Fit | None = None
+    if settled and not jumps_of(model):
+        loose = begin
+    elif noise.process.any():
         loose = fit_by_multiple_shooting(
             model,
             data,
@@ -63,30 +94,52 @@ def fit_with_and_without_process_noise(
             noise=noise.scaled(max(level, 1e-6)),
             estimate_process=True,
             substeps=substeps,
+            budget=budget,
         )
-    else:
-        loose = None
     start = loose if loose is not None and loose.converged else None
-    strict = fit_by_multiple_shooting(
-        model if start is None else start.model,
-        data,
-        x=states if start is None else start.x,
-        noise=(noise if start is None else start.noise).without_process(),
-        estimate_process=False,
-        substeps=substeps,
-    )
-    if not strict.converged:
+    begun = model if start is None else start.model
+    x, still = (states, noise) if start is None else (start.x, start.noise)
+
+    def at_all_samples() -> Fit:
+        return fit_by_multiple_shooting(
+            begun, data, x=x, noise=still.without_process(), estimate_process=False, substeps=substeps,
+            budget=budget,
+        )  # fmt: skip
+
+    def as_trajectories() -> Fit:
         # Where random forces led to nothing better, they led away.
-        if loose is not None and loose.log_likelihood > begin.log_likelihood:
-            model, states, noise = loose.model, loose.x, loose.noise
-        strict = fit_trajectories(model, data, begin=states[data.first[:-1]], noise=noise, substeps=substeps)
-    return loose, strict
+        better = start is not None or (loose is not None and loose.log_likelihood > begin.log_likelihood)
+        of = loose if loose is not None and better else None
+        return fit_trajectories(
+            model if of is None else of.model,
+            data,
+            begin=(states if of is None else of.x)[data.first[:-1]],
+            noise=noise if of is None else of.noise,
+            substeps=substeps,
+            budget=budget,
+        )
+
+    # Where f jumps, steps of all samples at once go to and fro.
+    ways = (as_trajectories, at_all_samples) if jumps_of(model) else (at_all_samples, as_trajectories)
+    strict = ways[0]()
+    return loose, strict if strict.converged else better_of(strict, ways[1]())
+
+
+def better_of(one: Fit, other: Fit) -> Fit:
+    """The one that settled, and of two that did not the likelier."""
+    if one.converged != other.converged:
+        return one if one.converged else other
+    return one if one.log_likelihood > other.log_likelihood else other
 
 
 def process_noise_needed(loose: Fit, strict: Fit) -> bool:
     """Whether the likelihood ratio speaks for process noise; its null distribution has half its mass at 0."""
     if not strict.converged:
         return True
-    ratio = max(2 * (loose.log_likelihood - strict.log_likelihood), 0.0)
-    driven = int((loose.noise.process > 0).sum())
-    return driven > 0 and 0.5 * scipy.stats.chi2.sf(ratio, max(driven, 1)) < THRESHOLD
+    return 2 * (loose.log_likelihood - strict.log_likelihood) > least_to_believe(loose.noise)
+
+
+def least_to_believe(noise: Noise) -> float:
+    """Twice the increase of the log-likelihood from which on random forces are believed."""
+    driven = int((noise.process > 0).sum())
+    return float(scipy.stats.chi2.isf(2 * THRESHOLD, driven)) if driven else np.inf

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from siq.dynamics.dynamics import Dynamics
+from siq.estimation.budget import Budget, evaluation
 from siq.estimation.closure import ClosedFunctions
 from siq.estimation.innovations import Noise, process_covariance, solve, with_parameters_changed
 from siq.estimation.kernels import smoothed_states, whitened_innovations
@@ -76,6 +77,8 @@ class Shooting:
         Whether f is taken at what a filter knows, rather than at smoothed states.
     closed
         F with the effect of the filter's spread on it, where that is wanted.
+    budget
+        Charged for every evaluation; None where nobody counts.
     """
 
     model: Dynamics
@@ -83,11 +86,24 @@ class Shooting:
     scale: np.ndarray
     filtered: bool = False
     closed: ClosedFunctions | None = None
+    budget: Budget | None = None
+
+    def charge(self, evaluations: float = 1.0) -> None:
+        """Count evaluations of the likelihood.
+
+        Raises
+        ------
+        BudgetSpent
+            When nothing is left of what is allowed.
+        """
+        if self.budget is not None:
+            self.budget.charge(evaluations * evaluation(self.model, self.grid.data))
 
     def linearised(
         self, values: np.ndarray, x: np.ndarray, spread: np.ndarray | None, noise: Noise
     ) -> Linearisation:
         """At parameters ``(p,)`` and states ``(n, d)``."""
+        self.charge(self.grid.substeps)
         if self.closed is None or spread is None:
             return linearise(self.model, self.grid, values, x)
         rows, data = self.grid.rows, self.grid.data
@@ -96,6 +112,15 @@ class Shooting:
         intensity = noise.intensity if len(noise.intensity) == 1 else noise.intensity[rows]
         drift = self.closed.at(spread[rows] + intensity * half)
         return linearise(self.model, self.grid, values, x, drift=drift)
+
+    def noise_at(self, now: Iterate, noise: Noise) -> Noise:
+        """The noise where a fit stands: random forces may depend on the state."""
+        if noise.field is None:
+            return noise
+        rows, data = self.grid.rows, self.grid.data
+        middle, step = now.x.copy(), np.append(np.diff(data.t), 0.0)
+        middle[rows] += (now.x[rows + 1] + now.along.gap[rows] - now.x[rows]) / 2
+        return noise.along(middle, now.spread, step)
 
     def stepped(self, now: Iterate, change: np.ndarray, noise: Noise) -> tuple[Iterate, float] | None:
         """The step that the linearisation suggests, shortened until it does about what was foreseen.

@@ -2,7 +2,8 @@
 
 ======================  ===========================================================================
 `identification`        which terms has f?
-`selection`             which terms does noise allow for, and which others would do nearly as well?
+`selection`             which terms does noise allow for?
+`rival_terms`           which others would do nearly as well, and what do they make of f?
 `stability`             in how many resampled recordings would each term be chosen?
 `flow_regression`       which coefficients of given terms make f lead from X0 to Xh?
 `identified_field`      what is known of the f that was found, errors included?
@@ -21,6 +22,8 @@
 `prediction`            where does f lead in the long run?
 `noise_formula`         what is known of a D that is a formula of the states, errors included?
 `noise_regression`      does the noise depend on the state, and by which formula?
+`noise_selection`       and with which terms?
+`noise_beside_sensor`   the same, where the sensor is noisy
 `weighted_regression`   which f, where the noise is stronger here than there?
 `storage`               how is it kept in a file?
 ======================  ===========================================================================

@@ -37,6 +37,10 @@ class DiffusionSource(StrEnum):
         }[self]
 
 
+UNLIKE_GIVEN = (
+    "the noise is stronger at some states than at others, and the D that was given is the same everywhere:"
+    " leave it out, or give formulas of the states"
+)
 STANDARD_ERRORS = 4.0  # derived: chance passes it once in 16 000 pairs of states
 
 

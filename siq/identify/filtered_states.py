@@ -14,7 +14,7 @@ from siq.estimation.linearisation import Grid, linearise
 from siq.identify.flow_regression import positive
 from siq.identify.identified_field import IdentifiedField
 from siq.identify.noisy_sensor import FilteredField
-from siq.identify.seen_states import View, noise_of, settled
+from siq.identify.seen_states import View, kept_rows, noise_of, settled
 
 
 def held_out_evidence(
@@ -41,12 +41,12 @@ def held_out_evidence(
     view = View(library, one.found.diffusion, one.exposure)
     noise = view.noise(noise_of(one.found, one.sensor))
     own = view.measured(training, pair_step)
-    x = view.states(training.values)
+    x = view.states(own)
     fit = settled(view, support, own, noise, values=one.found.values, x=x)
     other = view.measured(unseen, pair_step)
     still = tuple(replace(each, fixed=True) for each in fit.model.parameters)
     follow = fit_by_filter(
-        replace(fit.model, parameters=still), other, x=view.states(unseen.values), noise=fit.noise,
+        replace(fit.model, parameters=still), other, x=view.states(other), noise=fit.noise,
         estimate_process=False, estimate_sensor=False, substeps=fit.substeps,
     )  # fmt: skip
     q, d = library.size, library.dimension
@@ -76,7 +76,7 @@ def filtered_recordings(
     pair_step: float | None = None,
     exposure: float | None = None,
 ) -> Recordings:
-    """The states as a filter knows them at each sample, from that and the earlier ones.
+    """The states as a filter knows them at each sample that it uses, from that and the earlier ones.
 
     Their increments have the mean of f, as those of the states do; those of the measured values do not.
 
@@ -94,7 +94,14 @@ def filtered_recordings(
     model = view.model(found.support, found.values)
     still = replace(model, parameters=tuple(replace(each, fixed=True) for each in model.parameters))
     follow = fit_by_filter(
-        still, data, x=view.states(recordings.values), noise=view.noise(noise_of(found, sensor)),
+        still, data, x=view.states(data), noise=view.noise(noise_of(found, sensor)),
         estimate_process=False, estimate_sensor=False, substeps=found.flow.steps,
     )  # fmt: skip
-    return replace(recordings, values=follow.linearised_at[:, : len(sensor)].copy())
+    rows = np.concatenate(kept_rows(recordings, pair_step=pair_step, every=view.every(recordings)))
+    measured = ~np.isnan(data.outputs).all(axis=1)
+    return replace(
+        recordings,
+        recording=recordings.recording[rows],
+        t=recordings.t[rows],
+        values=follow.linearised_at[measured, : len(sensor)].copy(),
+    )

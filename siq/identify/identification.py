@@ -11,7 +11,6 @@ takes part, and V and g are not known yet. That makes it the yardstick of the ce
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Annotated
 
@@ -32,11 +31,11 @@ from siq.identify.flow_regression import (
 )
 from siq.identify.identified_field import NOISE_FREE, IdentifiedField
 from siq.identify.library import CandidateLibrary
+from siq.identify.rival_terms import rivals_by_equation
 from siq.identify.selection import (
     Equation,
     best_support,
     critical_values,
-    doubts_by_equation,
     weakest_term,
 )
 from siq.identify.stability import blocks_of, stability, triangles
@@ -64,7 +63,7 @@ class IdentificationOptions:
 
     degree: Annotated[int, Field(ge=1, le=12)] = 5
     functions: tuple[str, ...] = ()
-    false_terms: Annotated[float, Field(gt=0, lt=0.5)] = 0.05
+    false_terms: Annotated[float, Field(gt=0, lt=0.5)] = 0.02
     precision: Annotated[float, Field(gt=0, lt=0.1)] = 1e-7
     pairs: Annotated[int, Field(ge=100)] = 8_000
 
@@ -147,13 +146,13 @@ def _identify(
     equations = [Equation.of_triangle(triangle, i, samples=n / repeated, critical=critical) for i in range(d)]
     chosen = []
     for i, equation in enumerate(equations):
-        kept: Sequence[int] = _significant(
-            triangle, q, i, n / repeated, options=options, noise_free=noise_free, critical=critical
-        ).tolist()
-        chosen += [(i, k) for k in (kept if noise_free else best_support(equation, kept))]
+        kept = _contributing(triangle, q, i, options.precision) if noise_free else best_support(equation)
+        chosen += [(i, k) for k in kept]
     if len({i for i, _ in chosen}) < d:
         missing = next(i for i in range(d) if i not in {j for j, _ in chosen})
-        raise NumericalFailure(f"no term of the equation of {library.states[missing]} is significant")
+        raise NumericalFailure(
+            f"no term of the equation of {library.states[missing]} is significant; record longer"
+        )
     coefficients = np.zeros((q, d))
     support = np.array(chosen)
     for i, k in chosen:
@@ -170,7 +169,7 @@ def _identify(
         coefficients[support[:, 1], support[:, 0]] = found.coefficients[support[:, 1], support[:, 0]]
         problem = FlowRegression(library, pairs, support)
         found = fit_support(replace(found, coefficients=coefficients, support=support), problem)
-    return found if noise_free else replace(found, doubts=doubts_by_equation(equations, found.support))
+    return found if noise_free else replace(found, rivals=rivals_by_equation(equations, found.support))
 
 
 def with_stability(
@@ -198,9 +197,10 @@ def with_stability(
     everything = np.array([(i, k) for i in range(d) for k in range(q)])
     problem = FlowRegression(library, pairs, everything)
     velocity = problem.corrected(found.coefficients.T.ravel(), found.flow, found.noise_rate)
-    rows = np.column_stack([problem.theta.T, velocity]) * np.sqrt(pairs.h)[:, None]
+    weight = np.sqrt(pairs.h)[:, None]
     order = np.argsort(pairs.recording, kind="stable")
-    parts = triangles(rows[order], blocks_of(pairs.recording[order]))
+    rows = (problem.theta.T * weight)[order], (velocity * weight)[order]
+    parts = triangles(*rows, blocks_of(pairs.recording[order]))
     critical = critical_values(library, false_terms=options.false_terms)
     samples = len(pairs.h) / copies(pairs)
 
@@ -223,37 +223,20 @@ def _check_count(library: CandidateLibrary, pairs: SnapshotPairs) -> None:
         )
 
 
-def _significant(
-    triangle: np.ndarray,
-    q: int,
-    component: int,
-    n: float,
-    *,
-    options: IdentificationOptions,
-    noise_free: bool,
-    critical: np.ndarray,
-) -> np.ndarray:
-    """Backward elimination of one equation: the least significant term leaves, until all are significant."""
+def _contributing(triangle: np.ndarray, q: int, component: int, precision: float) -> tuple[int, ...]:
+    """Backward elimination of one equation without noise: the least contribution leaves, until all count."""
     goal = triangle[:, q + component]
     size = np.linalg.norm(goal)
     active = np.arange(q)
     while len(active):
         orthogonal, upper = np.linalg.qr(triangle[:, active])
         coefficients = scipy.linalg.solve_triangular(upper, orthogonal.T @ goal)
-        misfit = goal - triangle[:, active] @ coefficients
-        variance = misfit @ misfit / max(n - len(active), 1)
-        inverse = scipy.linalg.solve_triangular(upper, np.eye(len(active)))
-        errors = np.sqrt(variance) * np.linalg.norm(inverse, axis=1)
         contribution = np.abs(coefficients) * np.linalg.norm(triangle[:, active], axis=0) / (size or 1.0)
-        standing = np.abs(coefficients) / np.where(errors > 0, errors, 1e-300)
-        strength = np.minimum(standing / critical[active], 1e30)
-        if noise_free:
-            strength = contribution / options.precision
-        weakest = int(np.argmin(strength))
-        if strength[weakest] >= 1 and contribution.min() >= options.precision:
+        weakest = int(np.argmin(contribution))
+        if contribution[weakest] >= precision:
             break
         active = np.delete(active, weakest)
-    return active
+    return tuple(active.tolist())
 
 
 def _weakest(

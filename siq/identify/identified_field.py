@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -14,6 +15,7 @@ from siq.dynamics.parametric import symbol
 from siq.identify.flow import FlowMap
 from siq.identify.library import CandidateLibrary
 from siq.identify.noise_formula import NoiseFormula
+from siq.identify.rival_terms import RivalTerms
 
 NOISE_FREE = 1e-6  # residuals below this share of the increments are the integrator's and the rounding's
 
@@ -41,15 +43,16 @@ class IdentifiedField:
         The map over a pair's step that was fitted.
     diffusion
         D, which recordings do not tell apart from ε: of these only the product, `noise_rate`, is identified.
-    doubts
-        Shape ``(r, q, d)``: by how much f would change with other terms that fit nearly as well, each scaled
-        by the square root of its probability (`siq.identify.selection`). None where nobody asked.
+    rivals
+        What other terms that fit nearly as well make of f. None where nobody asked.
     stability
         Shape ``(p,)``: the share of resampled recordings in which each term would be chosen
         (`siq.identify.stability`). None where nobody asked.
     noise
         εD as a formula of the states, where the recordings show that it depends on them; `noise_rate` is its
         mean over the recorded states then.
+    constant_noise
+        εD with its errors, where D was estimated and is the same everywhere; None elsewhere.
     """
 
     library: CandidateLibrary
@@ -60,17 +63,33 @@ class IdentifiedField:
     residual_ratio: float
     flow: FlowMap
     diffusion: Diffusion
-    doubts: np.ndarray | None = None
+    rivals: RivalTerms | None = None
     stability: np.ndarray | None = None
     noise: NoiseFormula | None = None
+    constant_noise: NoiseFormula | None = None
 
-    def variance(self, slopes: np.ndarray) -> np.ndarray:
+    def mean_change(self, slopes: np.ndarray) -> np.ndarray:
+        """By how much the mean over rival terms moves what follows from f to first order, shape ``(...)``.
+
+        Parameters
+        ----------
+        slopes
+            Derivatives by all coefficients, shape ``(..., q, d)``.
+        """
+        if self.rivals is None:
+            return np.zeros(slopes.shape[:-2])
+        return np.asarray(np.einsum("...qd,qd->...", slopes, self.rivals.mean_change))
+
+    def variance(self, slopes: np.ndarray, *, of_mean: bool = False) -> np.ndarray:
         """Variance of what follows from f to first order, by its coefficients and by which terms there are.
 
         Parameters
         ----------
         slopes
             Derivatives by all coefficients, shape ``(..., q, d)``.
+        of_mean
+            Whether what follows from f has been moved by `mean_change`. If not, the square of that is a part
+            of the result.
 
         Returns
         -------
@@ -80,10 +99,40 @@ class IdentifiedField:
         components, terms = self.support.T
         own = slopes[..., terms, components]
         total = np.einsum("...p,pr,...r->...", own, self.covariance, own)
-        if self.doubts is not None and len(self.doubts):
-            changes = np.tensordot(slopes, self.doubts, axes=([-2, -1], [-2, -1]))
+        if self.rivals is not None:
+            changes = np.tensordot(slopes, self.rivals.spread, axes=([-2, -1], [-2, -1]))
             total = total + (changes**2).sum(axis=-1)
+            if not of_mean:
+                total = total + self.mean_change(slopes) ** 2
         return np.asarray(np.maximum(total, 0.0))
+
+    @cached_property
+    def noise_slopes(self) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+        """``p·(∂D/∂θ) p`` by the k coefficients θ of an estimated εD, at points and momenta: to ``(n, k)``.
+
+        There are none where D was given. Of a constant D only its shape changes: its determinant is 1 by
+        definition, and what is left is the error of ε, which stands beside it.
+        """
+        if self.noise is not None:
+            own, intensity = self.noise, self.intensity
+            return lambda x, momenta: own.push_slopes(x, momenta) / intensity
+        if self.constant_noise is None:
+            return lambda x, momenta: np.zeros((len(x), 0))
+        constant, intensity = self.constant_noise, self.diffusion.intensity(self.noise_rate)
+        scale = constant.strength_slopes(np.zeros((1, self.library.dimension)))
+
+        def of_shape(x: np.ndarray, momenta: np.ndarray) -> np.ndarray:
+            slopes = constant.push_slopes(x, momenta)
+            return np.asarray(slopes - (slopes @ constant.values)[:, None] * scale) / intensity
+
+        return of_shape
+
+    def noise_variance(self, slopes: np.ndarray) -> np.ndarray:
+        """Variance of what follows from D to first order, from derivatives ``(..., k)`` by the same θ."""
+        known = self.noise or self.constant_noise
+        if known is None:
+            return np.zeros(slopes.shape[:-1])
+        return np.asarray(np.einsum("...k,kl,...l->...", slopes, known.covariance, slopes))
 
     @property
     def noise_free(self) -> bool:

@@ -32,12 +32,11 @@ from siq.identify.flow_regression import FlowRegression, copies, positive
 from siq.identify.identification import IdentificationOptions
 from siq.identify.identified_field import IdentifiedField
 from siq.identify.library import CandidateLibrary
+from siq.identify.rival_terms import rivals_by_equation
 from siq.identify.selection import (
     Equation,
     best_support,
     critical_values,
-    doubts_by_equation,
-    strong_terms,
     weakest_term,
 )
 
@@ -240,7 +239,7 @@ def identify_from_earlier(
         Equation(moments.functions, moments.directions.T @ moved[:, i], float(spread[i, i]), critical)
         for i in range(d)
     ]
-    support = [(i, k) for i, one in enumerate(equations) for k in best_support(one, strong_terms(one))]
+    support = [(i, k) for i, one in enumerate(equations) for k in best_support(one)]
     missing = sorted(set(range(d)) - {i for i, _ in support})
     if missing:
         raise NumericalFailure(
@@ -254,7 +253,7 @@ def identify_from_earlier(
         strength = np.abs(found.values) / np.sqrt(np.diag(found.covariance)) / critical[found.support[:, 1]]
         weak = weakest_term(strength, found.support)
         if weak is None:
-            return replace(found, doubts=doubts_by_equation(equations, found.support))
+            return replace(found, rivals=rivals_by_equation(equations, found.support))
         del support[weak]
 
 

@@ -8,12 +8,29 @@ from siq.data.markov_lag import MarkovLag
 from siq.identify.identified_field import IdentifiedField
 from siq.identify.residuals import NoiseDiagnosis
 
+NEAR = 0.05  # of an exposure, as exactly as residuals show it of some thousand samples
 CAUSES = {
     "blur": "each sample is the mean over an exposure of {memory}",
     "coloured": "the random forces, or a slow sensor, have a memory of {memory}",
     "memory": "what is recorded remembers for some steps, as with an oscillation or a state not recorded",
     "either": "samples are means over an exposure, or the random forces have a memory",
 }
+
+
+def possible_exposures(found: MarkovLag) -> list[float]:
+    """Exposures that samples may be means over, the likeliest first; none where they are no such means.
+
+    A camera is mostly exposed for a whole number of steps: where the memory is near one, that is tried first.
+    One that may be as well that of coloured forces says no more than that; only a whole step is tried then.
+    """
+    if found.kind == "either":
+        return [found.step]
+    if found.kind != "blur":
+        return []
+    steps = found.memory / found.step
+    whole = round(steps)
+    near = [whole * found.step] if abs(steps - whole) < NEAR * steps else []
+    return [*near, found.memory]
 
 
 def memory_text(found: MarkovLag, *, time_unit: str | None = None) -> str:

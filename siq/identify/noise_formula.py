@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,20 @@ import sympy
 from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.formulas import compile_formulas, parse_formula
 from siq.dynamics.state_noise import state_noise
+
+
+def constant_noise(symbols: Sequence[sympy.Symbol], rate: np.ndarray, *, samples: float) -> NoiseFormula:
+    """εD that is the same everywhere, from the covariance of so many residuals per time, ``(d, d)``.
+
+    The entries of a covariance of n normal residuals have the covariance ``(R_ik R_jl + R_il R_jk)/n``.
+    """
+    d = len(symbols)
+    places = np.array([(i, j) for i in range(d) for j in range(i, d)])
+    i, j = places.T
+    straight, crossed = rate[np.ix_(i, i)] * rate[np.ix_(j, j)], rate[np.ix_(i, j)] * rate[np.ix_(j, i)]
+    values, one = rate[i, j], sympy.Integer(1)
+    covariance = (straight + crossed) / samples
+    return NoiseFormula(tuple(symbols), places, (one,) * len(places), values, covariance, 1.0)
 
 
 @dataclass(frozen=True)
@@ -47,6 +62,10 @@ class NoiseFormula:
             rows[i][j] += sympy.Float(float(value / intensity), 17) * term
         return state_noise(self.symbols, [[rows[min(i, j)][max(i, j)] for j in range(d)] for i in range(d)])
 
+    @cached_property
+    def _functions(self) -> Callable[[np.ndarray], np.ndarray]:
+        return compile_formulas(self.terms, self.symbols)
+
     @property
     def standard_errors(self) -> np.ndarray:
         """Shape ``(p,)``."""
@@ -54,9 +73,20 @@ class NoiseFormula:
 
     def push_slopes(self, x: np.ndarray, momenta: np.ndarray) -> np.ndarray:
         """``p·(∂εD/∂value) p`` at points and momenta ``(n, d)``: shape ``(n, p)``."""
-        terms = compile_formulas(self.terms, self.symbols)(np.ascontiguousarray(x.T)).T
+        terms = self._functions(np.ascontiguousarray(x.T)).T
         i, j = self.places.T
         return np.asarray(np.where(i == j, 1.0, 2.0) * momenta[:, i] * momenta[:, j] * terms)
+
+    def strength_slopes(self, x: np.ndarray) -> np.ndarray:
+        """Derivatives of ``ln ε`` by the coefficients, shape ``(p,)``.
+
+        ε is such that the determinant of D has the geometric mean one over the states ``(n, d)``.
+        """
+        terms = self._functions(np.ascontiguousarray(x.T))
+        precision = self.diffusion(1.0).precision_at(x)
+        i, j = self.places.T
+        share = np.where(i == j, 1.0, 2.0)[:, None] * precision[:, i, j].T * terms
+        return np.asarray(share.mean(axis=1) / len(self.symbols))
 
     def as_data(self) -> dict[str, Any]:
         """The terms with their errors, and the covariance, as plain data."""

@@ -23,7 +23,6 @@ from functools import cached_property
 import numpy as np
 import scipy.linalg
 import scipy.special
-import sympy
 
 from siq.data.recordings import SnapshotPairs
 from siq.dynamics.formulas import compile_formulas
@@ -31,10 +30,8 @@ from siq.errors import NumericalFailure
 from siq.identify.identified_field import IdentifiedField
 from siq.identify.library import monomial_exponents
 from siq.identify.noise_formula import NoiseFormula
+from siq.identify.noise_selection import DEGREE, HARMLESS, noise_functions, selected_noise
 
-DEGREE = 2  # of the formulas: the least that can bend, and keep positive where a straight line does not
-LARGE = 0.02  # relative change of D over the states below which a constant one does no harm, see `residuals`
-FEW_STATES = 3  # of which correlations may depend on the state: sixty coefficients
 MOST_NUMBERS = 2e7  # numerical: of an array in memory, 160 MB
 FEWEST = 20  # residuals for each coefficient of D: fewer do not show its sum of squares
 STEPS, HALVINGS = 60, 30  # numerical: most steps of Fisher's scoring, each halved until it gains
@@ -72,7 +69,7 @@ def constant_noise_probability(found: IdentifiedField, pairs: SnapshotPairs, res
     products = np.stack([z[:, i] * z[:, j] - (i == j) for i in range(d) for j in range(i + 1)], axis=1)
     score = (products[:, :, None] * functions[:, None, :]).reshape(n, -1)
     change = np.linalg.lstsq(functions, products, rcond=None)[0]
-    if np.sqrt(((functions @ change) ** 2).mean(axis=0)).max() < LARGE:
+    if np.sqrt(((functions @ change) ** 2).mean(axis=0)).max() < HARMLESS:
         return 1.0
     total = score.sum(axis=0)
     statistic = float(total @ np.linalg.pinv(score.T @ score, hermitian=True) @ total)
@@ -100,58 +97,7 @@ def fitted_noise(
         When no formula of this kind is positive at all recorded states.
     """
     data = _Residuals(found, *_affordable(pairs, rest))
-    d, m = data.rest.shape[1], data.functions.shape[1]
-    # Of many states the correlations are constant: their formulas would be most of all coefficients.
-    whole = d <= FEW_STATES
-    chosen = np.array(
-        [(i, j, k) for i in range(d) for j in range(i, d) for k in range(m if i == j or whole else 1)]
-    )
-    start = data.rest.T @ data.rest / len(data.rest)
-    values = np.array([start[i, j] if k == 0 else 0.0 for i, j, k in chosen])
-    critical = float(-scipy.special.ndtri(false_terms / (2 * len(chosen))))
-    while True:
-        values, covariance = data.scored(chosen, values)
-        kept, values = _eliminated(chosen, values, covariance, critical)
-        if len(kept) == len(chosen):
-            break
-        chosen = chosen[kept]
-        # What is left may not be positive: then the others begin where they are sure to be, if they can.
-        if not data.positive(chosen, values):
-            values = np.array([start[i, j] * (i == j) if k == 0 else 0.0 for i, j, k in chosen])
-        if not data.positive(chosen, values):
-            values = data.least_squares(chosen)
-    return NoiseFormula(
-        found.library.symbols,
-        chosen[:, :2],
-        tuple(data.terms[k] for k in chosen[:, 2]),
-        values,
-        covariance,
-        probability,
-    )
-
-
-def _eliminated(
-    chosen: np.ndarray, values: np.ndarray, covariance: np.ndarray, critical: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Backward elimination about the largest likelihood: the coefficients that stay, and what they become.
-
-    The last term of a state's own noise stays: without it there would be none.
-    """
-    kept = np.arange(len(chosen))
-    while len(kept):
-        own = chosen[kept, 0] == chosen[kept, 1]
-        count = np.array([(own & (chosen[kept, 0] == i)).sum() for i in chosen[kept, 0]])
-        strength = np.abs(values) / np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
-        strength[own & (count == 1)] = np.inf
-        weakest = int(np.argmin(strength))
-        if strength[weakest] >= critical:
-            break
-        along = covariance[:, weakest] / covariance[weakest, weakest]
-        values = np.delete(values - along * values[weakest], weakest)
-        covariance = covariance - np.outer(along, covariance[weakest])
-        covariance = np.delete(np.delete(covariance, weakest, axis=0), weakest, axis=1)
-        kept = np.delete(kept, weakest)
-    return kept, values
+    return selected_noise(data, false_terms=false_terms, probability=probability)
 
 
 def remembered(found: IdentifiedField) -> float:
@@ -187,10 +133,7 @@ class _Residuals:
     def __init__(self, found: IdentifiedField, pairs: SnapshotPairs, rest: np.ndarray) -> None:
         self.found = found
         symbols, d = found.library.symbols, found.library.dimension
-        self.terms = [
-            sympy.Mul(*(each**power for each, power in zip(symbols, powers, strict=True)))
-            for powers in monomial_exponents(d, DEGREE)
-        ]
+        self.symbols, self.terms = symbols, noise_functions(symbols)
         x, h = pairs.x0, pairs.h
         self.rest, share = random_forces_of(found, pairs, rest), remembered(found)
         first = [term.diff(one) for term in self.terms for one in symbols]
@@ -203,6 +146,11 @@ class _Residuals:
         moved += 0.5 * np.einsum("kan,a->kn", bends, found.noise_rate.ravel())
         self.functions = (values + share * h * moved).T
         self.plain = values.T
+
+    @cached_property
+    def start(self) -> np.ndarray:
+        """The constant εD, shape ``(d, d)``."""
+        return np.asarray(self.rest.T @ self.rest / len(self.rest))
 
     @cached_property
     def size(self) -> np.ndarray:

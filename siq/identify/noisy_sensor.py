@@ -11,8 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.linalg
 
+from siq.data.labels import sources
 from siq.data.recordings import Recordings
 from siq.dynamics.diffusion import Diffusion
 from siq.errors import NumericalFailure
@@ -26,10 +26,14 @@ from siq.identify.flow import FlowMap
 from siq.identify.flow_regression import positive
 from siq.identify.identified_field import IdentifiedField
 from siq.identify.library import CandidateLibrary
+from siq.identify.noise_beside_sensor import FilteredNoise, formula_noise, left_open, noise_by_state
+from siq.identify.rival_terms import rivals_of_all
 from siq.identify.seen_states import View, settled
-from siq.identify.selection import Equation, best_support, doubts_of_all, strong_terms, weakest_term
+from siq.identify.selection import Equation, best_support, critical_values, weakest_term
 from siq.identify.stability import blocks_of, stability, triangles
+from siq.identify.weighted_regression import with_formula
 
+NOISE_ROUNDS = 2  # of D by the trajectories of f, and f by the weights of D
 ROUNDS = 8  # of the fit of a whole library, which only chooses terms
 LAGS = (1, 2, 3)  # steps over which innovations are compared: what remembers at all remembers so long
 WITHOUT = 1e-6  # of a sensor's variance: as good as none
@@ -48,21 +52,21 @@ class FilteredField:
         Variance of each state's sensor noise, shape ``(d,)``.
     sensor_error
         Standard error of its logarithm, shape ``(d,)``.
-    forces_error
-        The same of the random forces' intensity.
+    intensity_error
+        Standard error of the logarithm of ε, the strength of the random forces.
     correlation, score
         Of neighbouring innovations, the strongest over the states, and in standard errors: white where the
         model holds.
     gain
         Twice the log-likelihood ratio to the same terms without sensor noise.
     exposure
-        The step over which samples are means, None where they are not.
+        The time over which samples are means, None where they are not.
     """
 
     found: IdentifiedField
     sensor: np.ndarray
     sensor_error: np.ndarray
-    forces_error: np.ndarray
+    intensity_error: float
     correlation: float
     score: float
     gain: float
@@ -75,7 +79,7 @@ def identify_by_likelihood(
     diffusion: Diffusion,
     noise: Noise,
     *,
-    critical: np.ndarray,
+    false_terms: float,
     generator: np.random.Generator,
     pair_step: float | None = None,
     exposure: float | None = None,
@@ -92,14 +96,15 @@ def identify_by_likelihood(
         D, on which f does not depend.
     noise
         To begin with.
-    critical
-        Standard errors that the coefficient of each function has to exceed, shape ``(q,)``.
+    false_terms
+        Probability that a constant D is given up by chance; and that chance brings any false term into f, or
+        into D.
     generator
         Draws recordings again, see `siq.identify.stability`.
     pair_step
         Longest time between samples that still belong together.
     exposure
-        The step over which each sample is a mean (`siq.identify.exposure`), None where it is none.
+        The time over which each sample is a mean (`siq.identify.exposure`), None where it is none.
 
     Raises
     ------
@@ -109,6 +114,7 @@ def identify_by_likelihood(
     view = View(library, diffusion, exposure)
     data = view.measured(recordings, pair_step)
     q, d = library.size, library.dimension
+    critical = critical_values(library, false_terms=false_terms)
     everything = np.array([(i, k) for i in range(d) for k in range(q)])
     if data.outputs.size * len(everything) > NUMBERS:
         raise NumericalFailure(
@@ -117,40 +123,55 @@ def identify_by_likelihood(
         )
     noise = view.noise(replace(noise, shape=np.eye(d)[None]))
     model = view.model(everything, np.zeros(len(everything)))
-    x = view.states(recordings.values)
+    x = view.states(data)
     whole = fit_by_filter(model, data, x=x, noise=noise, iterations=ROUNDS, closure=False)
     if whole.fault:
         raise NumericalFailure(f"the likelihood beside sensor noise cannot be worked out: {whole.fault}")
+    seen = FilteredNoise(library.symbols, whole, data)
+    chance = seen.constant_probability()
+    by_state = chance < false_terms and bool(whole.noise.process.any())
+    if by_state:
+        # Weights that are wrong everywhere would choose wrong terms.
+        own = noise_by_state(seen, false_terms=false_terms, probability=chance)
+        whole = fit_by_filter(
+            whole.model, data, x=whole.linearised_at,
+            noise=view.noise(formula_noise(own.formula, own.sensor)), iterations=ROUNDS, closure=False,
+        )  # fmt: skip
+        if whole.fault:
+            raise NumericalFailure(f"the likelihood beside sensor noise cannot be worked out: {whole.fault}")
     white = whiten(whole.linearisation, data, whole.noise)
     values = whole.model.values
     goal = white.innovations + white.columns @ (values - _last_change(whole, white))
-    triangle = scipy.linalg.qr(
-        np.column_stack([white.columns, goal]), mode="r", overwrite_a=True, check_finite=False
-    )[0][: len(values) + 1]
+    # Whitened values stand one behind the other, all states of a sample together.
+    parts = triangles(white.columns, goal, np.repeat(blocks_of(sources(data.labels)[data.recording]), d))
+    triangle = np.asarray(np.linalg.qr(np.concatenate(parts), mode="r"))
     # In units of the innovations' errors; all equations at once, since a filter couples them.
     equations = Equation(triangle[:, :-1], triangle[:, -1], 1.0, np.tile(critical, d))
-    chosen = list(best_support(equations, strong_terms(equations)))
+    chosen = list(best_support(equations))
     support = everything[chosen]
     for component, name in enumerate(library.states):
         if component not in support[:, 0]:
-            raise NumericalFailure(f"no term of the equation of {name} is significant")
+            raise NumericalFailure(f"no term of the equation of {name} is significant; record longer")
     fit = settled(view, support, data, whole.noise, values=values[chosen], x=whole.linearised_at)
     while (weak := _weakest(fit, support, critical)) is not None:
         support = np.delete(support, weak, axis=0)
         kept = np.delete(fit.model.values, weak)
         fit = settled(view, support, data, fit.noise, values=kept, x=fit.linearised_at)
-    fit = _without_forces(fit, data)
-    one = _as_field(view, support, fit, data, noise_uncertainty(fit, data))
-    own = (support[:, 0] * q + support[:, 1]).tolist()
-    # Whitened values stand one behind the other, all states of a sample together.
-    parts = triangles(np.column_stack([white.columns, goal]), np.repeat(blocks_of(recordings.recording), d))
+    if by_state:
+        one = _with_formula(view, support, fit, data, false_terms=false_terms, probability=chance)
+    else:
+        fit = _without_forces(fit, data)
+        one = _as_field(view, support, fit, data, noise_uncertainty(fit, data))
+        if one.found.noise_rate.any():
+            one = replace(one, found=replace(one.found, constant_noise=seen.constant.formula))
+    places = (support[:, 0] * q + support[:, 1]).tolist()
     (shares,) = stability(
         parts,
         lambda drawn: [Equation(drawn[:, :-1], drawn[:, -1], 1.0, equations.critical)],
-        [own],
+        [places],
         generator=generator,
     )
-    field = replace(one.found, doubts=doubts_of_all(equations, support, dimension=d), stability=shares)
+    field = replace(one.found, rivals=rivals_of_all(equations, support, dimension=d), stability=shares)
     return replace(one, found=field)
 
 
@@ -184,10 +205,10 @@ def _as_field(
     library, d = view.library, view.library.dimension
     coefficients = np.zeros((library.size, d))
     coefficients[support[:, 1], support[:, 0]] = fit.model.values
-    rate = fit.noise.intensity[0][:d, :d]
     rows = data.begins
-    moved = ((data.outputs[rows + 1] - data.outputs[rows]) ** 2).mean(axis=0)
-    step = float(np.mean(data.t[rows + 1] - data.t[rows]))
+    intensity = fit.noise.intensity
+    rate = (intensity[0] if len(intensity) == 1 else intensity[rows].mean(axis=0))[:d, :d]
+    moved, step = moved_by(data)
     ratio = float(np.sqrt(((np.diag(rate) * step + 2 * fit.noise.measurement) / positive(moved)).mean()))
     found = IdentifiedField(
         library,
@@ -211,7 +232,7 @@ def _as_field(
         found,
         fit.noise.measurement,
         certain.measurement,
-        certain.process[:d],
+        float(np.sqrt((certain.process[:d] ** 2).sum())) / d,
         correlation,
         score,
         2 * (best - base),
@@ -219,12 +240,64 @@ def _as_field(
     )
 
 
+def moved_by(data: Measurements) -> tuple[np.ndarray, float]:
+    """Mean square of what each output moves by from a measured sample to the next, and the mean time.
+
+    Raises
+    ------
+    NumericalFailure
+        Where no sample has a next one.
+    """
+    measured = np.flatnonzero(~np.isnan(data.outputs).all(axis=1))
+    before, after = measured[:-1], measured[1:]
+    same = data.recording[before] == data.recording[after]
+    before, after = before[same], after[same]
+    if not len(before):
+        raise NumericalFailure(
+            "no two samples are so near in time that one tells of the other; record longer"
+        )
+    moved = ((data.outputs[after] - data.outputs[before]) ** 2).mean(axis=0)
+    return moved, float((data.t[after] - data.t[before]).mean())
+
+
+def _with_formula(
+    view: View, support: np.ndarray, fit: Fit, data: Measurements, *, false_terms: float, probability: float
+) -> FilteredField:
+    """What is kept of a fit whose random forces depend on the state, once f and D know of each other."""
+    symbols = view.library.symbols
+    for _ in range(NOISE_ROUNDS):
+        seen = FilteredNoise(symbols, fit, data)
+        own = noise_by_state(seen, false_terms=false_terms, probability=probability)
+        fit = fit_by_filter(
+            fit.model, data, x=fit.linearised_at, noise=view.noise(formula_noise(own.formula, own.sensor)),
+            estimate_process=False, estimate_sensor=False, substeps=fit.substeps,
+        )  # fmt: skip
+        if not fit.converged:
+            raise NumericalFailure(
+                "the fit of f beside sensor noise and random forces that depend on the state does not settle"
+                + (f": {fit.fault}" if fit.fault else "")
+                + "; record more, or sample more often"
+            )
+    p = len(own.formula.values)
+    certain = NoiseUncertainty(
+        np.sqrt(np.diag(own.covariance)[p:]),
+        np.zeros(len(symbols)),
+        fit.covariance + left_open(seen, own, fit, data),
+    )
+    one = _as_field(view, support, fit, data, certain)
+    states = fit.linearised_at[:, : len(symbols)]
+    slopes = own.formula.strength_slopes(states)
+    error = float(np.sqrt(slopes @ own.formula.covariance @ slopes))
+    return replace(one, found=with_formula(one.found, own.formula, states), intensity_error=error)
+
+
 def _neighbours(white: Whitened, data: Measurements) -> tuple[float, float]:
     """Strongest correlation of near innovations over outputs and lags, and in standard errors."""
-    innovations = white.innovations.reshape(len(data.t), -1)
+    measured = white.known.reshape(len(data.t), -1).any(axis=1)
+    innovations, recording = white.innovations.reshape(len(data.t), -1)[measured], data.recording[measured]
     found: list[tuple[float, float, float]] = []
     for lag in LAGS:
-        rows = np.flatnonzero(data.recording[lag:] == data.recording[:-lag])
+        rows = np.flatnonzero(recording[lag:] == recording[:-lag])
         first, second = innovations[rows], innovations[rows + lag]
         product = first * second
         size = np.sqrt((first**2).mean(axis=0) * (second**2).mean(axis=0))

@@ -7,21 +7,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from siq.data.recordings import Recordings
-from siq.data.stationarity import runs_of
+from siq.data.stationarity import runs_of, usual_step
 from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.dynamics import Dynamics
 from siq.errors import NumericalFailure
 from siq.estimation.estimation import Fit, fit_by_filter
 from siq.estimation.innovations import Noise
 from siq.estimation.measurements import Measurements
-from siq.identify.exposure import exposed, exposed_measurements, exposed_noise
+from siq.identify.exposure import exposed, exposed_measurements, exposed_noise, kept_samples
 from siq.identify.identified_field import IdentifiedField, field_dynamics
 from siq.identify.library import CandidateLibrary
+from siq.identify.noise_beside_sensor import formula_noise
 
 
 @dataclass(frozen=True)
 class View:
-    """How samples show the states: as they are, or as means over the step before them."""
+    """How samples show the states: as they are, or as means over an exposure before them."""
 
     library: CandidateLibrary
     diffusion: Diffusion
@@ -34,20 +35,31 @@ class View:
 
     def measured(self, recordings: Recordings, pair_step: float | None) -> Measurements:
         """The recordings as measurements, a new one behind every gap."""
-        data = unbroken(recordings, pair_step=pair_step)
-        return data if self.exposure is None else exposed_measurements(data, self.library.dimension)
+        data = unbroken(recordings, pair_step=pair_step, every=self.every(recordings))
+        if self.exposure is None:
+            return data
+        return exposed_measurements(data, self.library.dimension, self.exposure)
+
+    def every(self, recordings: Recordings) -> int:
+        """Of how many samples one is kept."""
+        return 1 if self.exposure is None else kept_samples(usual_step(recordings), self.exposure)
 
     def noise(self, noise: Noise) -> Noise:
         """The noise of the states, as it drives the model."""
         return noise if self.exposure is None else exposed_noise(noise, self.library.dimension)
 
-    def states(self, values: np.ndarray) -> np.ndarray:
-        """States of the model to begin with, from measured values ``(n, d)``."""
+    def states(self, data: Measurements) -> np.ndarray:
+        """States of the model to begin with, as they are measured next."""
+        unknown = np.isnan(data.outputs).any(axis=1)
+        rows = np.arange(len(unknown))
+        values = data.outputs[rows + unknown]  # never two in a row, nor at an end
         return values if self.exposure is None else np.column_stack([values, values])
 
 
 def noise_of(found: IdentifiedField, sensor: np.ndarray) -> Noise:
     """Both noises of an identified f, with the variance of each state's sensor."""
+    if found.noise is not None:
+        return formula_noise(found.noise, sensor)
     rate = found.noise_rate
     if not rate.any():
         return Noise(sensor, np.zeros(len(rate)))
@@ -81,7 +93,7 @@ def settled(
     return fit
 
 
-def unbroken(recordings: Recordings, *, pair_step: float | None = None) -> Measurements:
+def unbroken(recordings: Recordings, *, pair_step: float | None = None, every: int = 1) -> Measurements:
     """Recordings as measurements of their states, a new one behind every gap.
 
     Parameters
@@ -90,13 +102,20 @@ def unbroken(recordings: Recordings, *, pair_step: float | None = None) -> Measu
         Whole trajectories.
     pair_step
         Longest time between samples that still belong together; by default one and a half median steps.
+    every
+        Of so many samples one is kept.
     """
-    runs, recording = runs_of(recordings, longest=pair_step), recordings.recording
-    first = np.array([*(run.start for run in runs), len(recordings.t)])
+    runs = kept_rows(recordings, pair_step=pair_step, every=every)
+    rows = np.concatenate(runs)
     return Measurements(
-        labels=tuple(recordings.labels[recording[row]] for row in first[:-1]),
-        first=first,
-        t=recordings.t,
-        outputs=np.ascontiguousarray(recordings.values),
-        courses=((),) * (len(first) - 1),
+        labels=tuple(recordings.labels[recordings.recording[run[0]]] for run in runs),
+        first=np.cumsum([0, *map(len, runs)]),
+        t=recordings.t[rows],
+        outputs=np.ascontiguousarray(recordings.values[rows]),
+        courses=((),) * len(runs),
     )
+
+
+def kept_rows(recordings: Recordings, *, pair_step: float | None, every: int) -> list[np.ndarray]:
+    """The rows of each stretch without a gap, of every so many one; see `unbroken`."""
+    return [np.arange(run.start, run.stop, every) for run in runs_of(recordings, longest=pair_step)]

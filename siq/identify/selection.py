@@ -8,15 +8,15 @@ wrong one on its way and never looks back. Here supports are compared as wholes,
 
 χ² being that of the residuals and c_k the number of standard errors that the term k has to be from zero.
 Terms are added, dropped and exchanged as long as that lowers the score. Of two terms that fit equally well
-the one of the lower degree is taken: the probability of a false term is shared among degrees in the ratio
-1 : ½ : ¼ …, and among the terms of a degree evenly.
+the one of the lower degree is taken: the probability of a false term is shared among the degrees k as 1/k!,
+by which the coefficients of a Taylor series fall, and among the terms of a degree evenly.
 
-The supports next to the chosen one are *rivals*. Each would do with the probability ``exp(-Δscore/2)``
-relative to it, and what it would change in f belongs to the error of f as the covariance does.
+What other supports that do nearly as well make of f is told by `siq.identify.rival_terms`.
 """
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -27,8 +27,8 @@ import scipy.special
 from siq.identify.library import CandidateLibrary, total_degree
 
 MOST_MOVES = 200  # numerical, a guard: each lowers the score
+BREADTH = 50  # numerical: supports whose neighbours are looked at; twice as many find no better ones
 SAME = 1e-10  # of a term's square: what is left of it beside the others is rounding
-LEAST_WEIGHT = 1e-3  # of a rival: what weighs less changes an error by less than its third digit
 FURTHER_DEGREE = 1  # of a function that the user named: it is no less likely than a state itself
 
 
@@ -50,7 +50,7 @@ def critical_values(library: CandidateLibrary, *, false_terms: float) -> np.ndar
         ]
     )
     present, counts = np.unique(degrees, return_counts=True)
-    shares = 0.5 ** present.astype(float)
+    shares = 1 / scipy.special.factorial(present)
     budget = false_terms * shares / shares.sum() / (counts * library.dimension)
     each = budget[np.searchsorted(present, degrees)]
     return np.asarray(-scipy.special.ndtri(each / 2))
@@ -136,9 +136,18 @@ class Equation:
             yield float(score), tuple(sorted((*support, int(place))))
 
 
-def strong_terms(equation: Equation) -> tuple[int, ...]:
-    """What is left when the weakest term leaves again and again, until all are significant."""
-    active = np.flatnonzero(np.linalg.norm(equation.columns, axis=0) > 0)
+def strong_terms(equation: Equation, *, among: np.ndarray | None = None) -> tuple[int, ...]:
+    """What is left when the weakest term leaves again and again, until all are significant.
+
+    Parameters
+    ----------
+    equation
+        Of q functions.
+    among
+        The functions that are begun with, shape ``(q,)``; by default all.
+    """
+    present = np.linalg.norm(equation.columns, axis=0) > 0
+    active = np.flatnonzero(present if among is None else present & among)
     while len(active):
         chosen = equation.columns[:, active]
         size = np.linalg.norm(chosen, axis=0)
@@ -153,15 +162,26 @@ def strong_terms(equation: Equation) -> tuple[int, ...]:
     return tuple(int(place) for place in active)
 
 
-def best_support(equation: Equation, start: Sequence[int]) -> tuple[int, ...]:
-    """The support of the lowest score that exchanges reach, from a start and from no term at all.
+def best_support(equation: Equation) -> tuple[int, ...]:
+    """The support of the lowest score that is found; an empty one only where nothing else is significant.
 
-    Elimination may leave many terms that make up together what a few would do, none of which it still has: no
-    exchange of a single one leads back from there, but the way up from nothing does. It may also stay at
-    nothing, where two terms are strong together and weak alone, as x and x³ within two wells: no answer then.
+    Elimination from a rich library may leave many terms that make up together what a few of low degree would
+    do, none of which it still has, and exchanges of single terms do not lead back. So it begins from every
+    library of lower degree as well, and from nothing. From where these end the search goes on to neighbours
+    of neighbours, as long as that leads to any of the `BREADTH` best.
     """
-    found = [improved_support(equation, one) for one in (start, ())]
-    return min((one for one in found if one), key=lambda one: equation.score(one), default=())
+    ends = {improved_support(equation, ())}
+    for most in np.unique(equation.critical):
+        ends.add(improved_support(equation, strong_terms(equation, among=equation.critical <= most)))
+    scores = {one: equation.score(one) for one in ends}
+    visited: set[tuple[int, ...]] = set()
+    while waiting := [one for one in scores if one not in visited]:
+        following = min(waiting, key=scores.__getitem__)
+        visited.add(following)
+        scores.update((other, score) for score, other in equation.neighbours(following))
+        scores = {one: scores[one] for one in heapq.nsmallest(BREADTH, scores, key=scores.__getitem__)}
+    best = min(scores, key=scores.__getitem__)
+    return best or min((one for one in ends if one), key=equation.score, default=())
 
 
 def improved_support(equation: Equation, start: Sequence[int]) -> tuple[int, ...]:
@@ -192,43 +212,3 @@ def weakest_term(strength: np.ndarray, support: np.ndarray) -> int | None:
         if np.sum(support[:, 0] == support[place, 0]) > 1:
             return int(place)
     return None
-
-
-def rival_changes(equation: Equation, support: Sequence[int]) -> np.ndarray:
-    """What rivals of a support would change in its coefficients, shape ``(r, q)``.
-
-    Each is scaled by the square root of its probability, so that the sum of their squares is the mean square
-    change; see the module.
-    """
-    own = tuple(sorted(int(place) for place in support))
-    score, coefficients = equation.score(own), equation.fitted(own)
-    kept = [(np.exp(-(its - score) / 2), other) for its, other in equation.neighbours(own)]
-    kept = [(weight, other) for weight, other in kept if weight > LEAST_WEIGHT]
-    total = 1.0 + sum(weight for weight, _ in kept)
-    changes = [np.sqrt(weight / total) * (equation.fitted(other) - coefficients) for weight, other in kept]
-    return np.array(changes).reshape(-1, equation.columns.shape[1])
-
-
-def doubts_by_equation(equations: Sequence[Equation], support: np.ndarray) -> np.ndarray:
-    """What rivals would change in f, equation by equation: shape ``(r, q, d)``.
-
-    Parameters
-    ----------
-    equations
-        One for each component of f.
-    support
-        Component and term of each coefficient, shape ``(p, 2)``.
-    """
-    doubts = []
-    for i, equation in enumerate(equations):
-        changes = rival_changes(equation, support[support[:, 0] == i, 1].tolist())
-        doubts.append(np.zeros((*changes.shape, len(equations))))
-        doubts[-1][:, :, i] = changes
-    return np.concatenate(doubts)
-
-
-def doubts_of_all(together: Equation, support: np.ndarray, *, dimension: int) -> np.ndarray:
-    """The same where all components are one problem, its columns one component after the other."""
-    functions = together.columns.shape[1] // dimension
-    changes = rival_changes(together, (support[:, 0] * functions + support[:, 1]).tolist())
-    return changes.reshape(-1, dimension, functions).transpose(0, 2, 1)

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from siq.identify.selection import Equation, improved_support
+from siq.numerics.triangle import triangle_of
 
 DRAWS = 40  # numerical: a share of one half is known to 0.08
 MOST_BLOCKS = 20  # numerical: what is drawn; more would be slower and tell nothing new
@@ -32,17 +33,17 @@ def blocks_of(recording: np.ndarray) -> np.ndarray:
     return np.asarray(place % MOST_BLOCKS)
 
 
-def triangles(columns: np.ndarray, block: np.ndarray) -> tuple[np.ndarray, ...]:
+def triangles(columns: np.ndarray, goals: np.ndarray, block: np.ndarray) -> tuple[np.ndarray, ...]:
     """R of the QR decomposition of each block of rows, on which every fit to it depends.
 
     Parameters
     ----------
-    columns
-        Regressors and goals, shape ``(n, c)``.
+    columns, goals
+        What explains, shape ``(n, c)``, and what is to be explained, shape ``(n,)`` or ``(n, g)``.
     block
         Of each row, shape ``(n,)``.
     """
-    return tuple(_triangle(columns[block == one]) for one in np.unique(block))
+    return tuple(triangle_of(columns[block == one], goals[block == one]) for one in np.unique(block))
 
 
 def stability(
@@ -73,11 +74,7 @@ def stability(
     counts = [np.zeros(len(one)) for one in chosen]
     for _ in range(DRAWS):
         drawn = generator.integers(len(parts), size=len(parts))
-        triangle = _triangle(np.concatenate([parts[place] for place in drawn]))
+        triangle = np.asarray(np.linalg.qr(np.concatenate([parts[place] for place in drawn]), mode="r"))
         for count, equation, support in zip(counts, equations_of(triangle), chosen, strict=True):
             count += np.isin(support, improved_support(equation, support))
     return [count / DRAWS for count in counts]
-
-
-def _triangle(rows: np.ndarray) -> np.ndarray:
-    return np.asarray(np.linalg.qr(rows, mode="r"))

@@ -19,6 +19,7 @@ from siq.identify.identification import IdentificationOptions
 from siq.identify.identified_field import IdentifiedField
 from siq.identify.library import CandidateLibrary, candidate_library
 from siq.identify.noise_formula import NoiseFormula
+from siq.identify.rival_terms import RivalTerms
 
 
 @dataclass(frozen=True)
@@ -106,11 +107,14 @@ def write_field(path: str | Path, record: FieldRecord, options: IdentificationOp
             for place, (i, k) in enumerate(found.support)
         ],
         "covariance": found.covariance.tolist(),
-        "doubts": None if found.doubts is None else found.doubts.tolist(),
+        "rivals": None
+        if found.rivals is None
+        else {"mean_change": found.rivals.mean_change.tolist(), "spread": found.rivals.spread.tolist()},
         "noise_rate": found.noise_rate.tolist(),
         "residual_ratio": found.residual_ratio,
         "diffusion": diffusion_rows_of(found.diffusion),
         "noise_formula": None if found.noise is None else found.noise.as_data(),
+        "constant_noise": None if found.constant_noise is None else found.constant_noise.as_data(),
         "flow": {"steps": found.flow.steps, "euler": found.flow.euler},
         "noise": dict(record.noise),
         "prediction": dict(record.prediction),
@@ -119,8 +123,17 @@ def write_field(path: str | Path, record: FieldRecord, options: IdentificationOp
         partial.write_text(json.dumps(data, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
-def _doubts(written: Any, library: CandidateLibrary) -> np.ndarray | None:
-    return None if written is None else np.array(written).reshape(-1, library.size, library.dimension)
+def _rivals(written: Mapping[str, Any] | None, library: CandidateLibrary) -> RivalTerms | None:
+    if written is None:
+        return None
+    shape = (library.size, library.dimension)
+    return RivalTerms(
+        np.array(written["mean_change"]).reshape(shape), np.array(written["spread"]).reshape(-1, *shape)
+    )
+
+
+def _noise(written: Any, library: CandidateLibrary) -> NoiseFormula | None:
+    return None if written is None else NoiseFormula.from_data(written, library.symbols)
 
 
 def _stability(terms: Sequence[Mapping[str, Any]]) -> np.ndarray | None:
@@ -149,13 +162,13 @@ def read_field(path: str | Path) -> FieldRecord | None:
         coefficients = np.zeros((library.size, library.dimension))
         for (i, k), row in zip(support, data["terms"], strict=True):
             coefficients[k, i] = row["coefficient"]
-        noise = data.get("noise_formula")  # older files have none
         found = IdentifiedField(
             library, coefficients, support, np.array(data["covariance"]), np.array(data["noise_rate"]),
             float(data["residual_ratio"]), FlowMap(**data["flow"]),
             diffusion_of_rows(library.symbols, data["diffusion"]),
-            doubts=_doubts(data.get("doubts"), library), stability=_stability(data["terms"]),
-            noise=None if noise is None else NoiseFormula.from_data(noise, library.symbols),
+            rivals=_rivals(data.get("rivals"), library), stability=_stability(data["terms"]),
+            noise=_noise(data.get("noise_formula"), library),  # older files have neither
+            constant_noise=_noise(data.get("constant_noise"), library),
         )  # fmt: skip
         p, d = len(support), library.dimension
         if found.covariance.shape != (p, p) or found.noise_rate.shape != (d, d):

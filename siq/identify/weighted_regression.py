@@ -18,7 +18,8 @@ from siq.identify.flow_regression import FlowRegression, copies, residuals
 from siq.identify.identified_field import IdentifiedField
 from siq.identify.noise_formula import NoiseFormula
 from siq.identify.noise_regression import constant_noise_probability, fitted_noise, random_forces_of
-from siq.identify.selection import Equation, best_support, critical_values, doubts_of_all, strong_terms
+from siq.identify.rival_terms import rivals_of_all
+from siq.identify.selection import Equation, best_support, critical_values
 
 ROUNDS = 2  # of D by the residuals of f, and f by the weights of D: each changes the other by little
 CHUNK = 20_000  # residuals worked on together
@@ -59,23 +60,29 @@ def with_noise_formula(
         return None
     formula = fitted_noise(found, pairs, rest, false_terms=false_terms, probability=probability)
     for _ in range(ROUNDS):
-        found = identify_weighted(_with(found, formula, pairs), pairs, false_terms=false_terms)
+        found = identify_weighted(with_formula(found, formula, pairs.x0), pairs, false_terms=false_terms)
         formula = fitted_noise(
             found, pairs, residuals(found, pairs), false_terms=false_terms, probability=probability
         )
-    return fit_weighted(_with(found, formula, pairs), pairs)
+    return fit_weighted(with_formula(found, formula, pairs.x0), pairs)
 
 
-def _with(found: IdentifiedField, formula: NoiseFormula, pairs: SnapshotPairs) -> IdentifiedField:
-    """The field with D of a formula, and the mean of εD in the place of the noise rate."""
+def with_formula(found: IdentifiedField, formula: NoiseFormula, x: np.ndarray) -> IdentifiedField:
+    """The field with D of a formula, and the mean of εD over recorded states in the place of the noise rate.
+
+    Raises
+    ------
+    NumericalFailure
+        Where εD is not positive at one of the states.
+    """
     whole = formula.diffusion(1.0)
-    matrices = whole.at(pairs.x0)
+    matrices = whole.at(x)
     signs, logarithms = np.linalg.slogdet(matrices)
     if not (signs > 0).all():
         raise NumericalFailure("the formula of the noise is not positive at all recorded states")
     intensity = float(np.exp(logarithms.mean() / len(matrices[0])))
     diffusion, mean = formula.diffusion(intensity), matrices.mean(axis=0)
-    return replace(found, diffusion=diffusion, noise_rate=mean, noise=formula)
+    return replace(found, diffusion=diffusion, noise_rate=mean, noise=formula, constant_noise=None)
 
 
 def identify_weighted(found: IdentifiedField, pairs: SnapshotPairs, *, false_terms: float) -> IdentifiedField:
@@ -98,16 +105,16 @@ def identify_weighted(found: IdentifiedField, pairs: SnapshotPairs, *, false_ter
     triangle, intensity = _triangle(found, pairs, everything)
     critical = np.tile(critical_values(found.library, false_terms=false_terms), d)
     together = Equation(triangle[:, :-1], triangle[:, -1], intensity * copies(pairs), critical)
-    kept = list(best_support(together, strong_terms(together)))
+    kept = list(best_support(together))
     support = everything[kept]
     for i, name in enumerate(found.library.states):
         if not (support[:, 0] == i).any():
-            raise NumericalFailure(f"no term of the equation of {name} is significant")
+            raise NumericalFailure(f"no term of the equation of {name} is significant; record longer")
     coefficients = np.zeros_like(found.coefficients)
     start = np.linalg.lstsq(triangle[:, kept], triangle[:, -1], rcond=None)[0]
     coefficients[support[:, 1], support[:, 0]] = start
     found = replace(found, coefficients=coefficients, support=support, covariance=np.eye(len(support)))
-    return replace(fit_weighted(found, pairs), doubts=doubts_of_all(together, support, dimension=d))
+    return replace(fit_weighted(found, pairs), rivals=rivals_of_all(together, support, dimension=d))
 
 
 def fit_weighted(found: IdentifiedField, pairs: SnapshotPairs) -> IdentifiedField:

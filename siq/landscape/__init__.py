@@ -10,6 +10,7 @@
 `transitions`             which barriers part the wells, how sure are they, and what does a way out look like?
 `global_quasipotential`   what is U over all wells?
 `landscape`               all of this of one identified vector field
+`refusal`                 why is there none, and what is known all the same?
 `storage`                 how is it kept in a file?
 `block_quadrature`        what is the integral of exp(-U/ε) over a box?
 `invariant_distribution`  which density follows from one formula of U?

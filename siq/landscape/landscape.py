@@ -11,7 +11,10 @@ import numpy as np
 import pandas as pd
 
 from siq.certificate.certify import Certificate
+from siq.data.inspection import seen_states
+from siq.data.record_states import RecordStates
 from siq.data.recordings import Recordings
+from siq.data.selection import joined
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.equilibria import Equilibrium
 from siq.dynamics.phase_portrait import PhasePortrait
@@ -20,6 +23,7 @@ from siq.identify.identified_field import IdentifiedField
 from siq.landscape.dwell_times import Exit, NoiseStrength, dwell_time
 from siq.landscape.global_quasipotential import GlobalQuasipotential, heights_of_attractors, matched
 from siq.landscape.record_test import VisitTest
+from siq.landscape.refusal import NoLandscape
 from siq.landscape.transitions import (
     Transition,
     missing_diffusion,
@@ -77,6 +81,9 @@ class Landscape:
     visits
         How long visits to the wells last, as counted on the recordings and as f and D say; empty where this
         was not compared.
+    seen
+        The two states between which the recordings hop by themselves, without any formula; None where
+        nothing is known of them, or several wells are certified.
     """
 
     dynamics: Dynamics
@@ -92,6 +99,7 @@ class Landscape:
     noise: NoiseStrength | None = None
     found: IdentifiedField | None = None
     visits: tuple[VisitTest, ...] = ()
+    seen: RecordStates | None = None
 
     @classmethod
     def from_recordings(cls, recordings: Recordings, settings: PipelineSettings | None = None) -> Landscape:
@@ -107,8 +115,9 @@ class Landscape:
 
         Raises
         ------
-        NumericalFailure
-            When f cannot be identified, or it has no landscape; the message is that of the step.
+        NoLandscape
+            When f cannot be identified, or it has no landscape. It says why, and what would make it an
+            answer; its `states` are what the recordings show by themselves all the same.
 
         Examples
         --------
@@ -128,15 +137,18 @@ class Landscape:
         V &= 0.25 \Delta_{x}^{4} + 1.0 \Delta_{x}^{3} + 1.0 \Delta_{x}^{2} + 0.5 y^{2}
         \end{aligned}
         """
+        from siq.steps.outcomes import why_no_landscape
         from siq.steps.pipeline import PipelineSettings, analyse
 
         settings = settings or PipelineSettings()
         analysis = analyse(recordings, settings)
         found = None if analysis.landscape is None else analysis.landscape.landscape
+        certified = found is not None and found.certificate is not None and found.certificate.certified
+        whole = certified and found is not None and len(found.attractors) > 1
+        seen = None if whole else seen_states(joined(recordings))
         if found is None:
-            raise NumericalFailure(
-                "; ".join(one.reason for one in analysis.outcomes if one.status != "ok" and one.reason)
-            )
+            raise NoLandscape(why_no_landscape(analysis.outcomes), seen, analysis.dynamics)
+        found = replace(found, seen=seen)
         units = tuple(
             unit or settings.space.unit(name, unknown="1")
             for name, unit in zip(recordings.names, recordings.units, strict=True)

@@ -234,8 +234,8 @@ def drawn_system(found: IdentifiedField, *, generator: np.random.Generator) -> D
     coefficients = np.zeros_like(found.coefficients)
     own = generator.multivariate_normal(found.values, found.covariance, method="eigh")
     coefficients[found.support[:, 1], found.support[:, 0]] = own
-    if found.doubts is not None and len(found.doubts):
-        coefficients += np.tensordot(generator.standard_normal(len(found.doubts)), found.doubts, 1)
+    if found.rivals is not None:
+        coefficients += found.rivals.drawn(1, generator=generator)[0]
     support = np.argwhere(coefficients.T != 0)
     diffusion = found.diffusion
     if found.noise is not None:

@@ -3,15 +3,16 @@
 K follows from f by determinants at both ends of the path and by an integral along it, and the path itself
 moves with f. So f is changed by standard deviations along the axes of its covariance, the path found again
 from the old one, forwards and back: half of what then differs in ln K and in ΔU, axis by axis, makes their
-variances and their covariance.
+variances and their covariance. A D that was found as a formula of the state is changed with f.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.linalg
 
 from siq.dynamics.dynamics import Dynamics
 from siq.errors import NumericalFailure
@@ -30,7 +31,7 @@ FARTHEST = 0.5  # of that distance: an equilibrium that moves by more is another
 
 @dataclass(frozen=True)
 class PrefactorError:
-    """The uncertainty of ln K from that of f.
+    """The uncertainty of ln K from that of f and D.
 
     Attributes
     ----------
@@ -66,17 +67,28 @@ def prefactor_error(
     if found.noise_free:
         return PrefactorError(0.0, 0.0)
     changes = []
-    axes = covariance_axes(found.covariance, np.random.default_rng(seed))
+    covariance = found.covariance
+    if found.noise is not None:
+        covariance = scipy.linalg.block_diag(covariance, found.noise.covariance)
+    axes = covariance_axes(covariance, np.random.default_rng(seed))
     for axis in axes:
-        up, down = (
-            _log_prefactor(found.dynamics.with_values(found.values + one), path) for one in (axis, -axis)
-        )
+        up, down = (_log_prefactor(_changed(found, one), path) for one in (axis, -axis))
         if up is not None and down is not None:
             changes.append(np.subtract(up, down) / 2)
     if len(changes) < FEWEST * len(axes):
         return None
     logarithm, barrier = np.array(changes).T * np.sqrt(len(axes) / len(changes))
     return PrefactorError(float(np.linalg.norm(logarithm)), float(logarithm @ barrier))
+
+
+def _changed(found: IdentifiedField, change: np.ndarray) -> Dynamics:
+    """The dynamics with the coefficients of f changed, and those of εD where it depends on the state."""
+    count = len(found.values)
+    dynamics = found.dynamics.with_values(found.values + change[:count])
+    if found.noise is None:
+        return dynamics
+    noise = replace(found.noise, values=found.noise.values + change[count:])
+    return replace(dynamics, diffusion=noise.diffusion(found.intensity))
 
 
 def covariance_axes(covariance: np.ndarray, draw: np.random.Generator) -> Sequence[np.ndarray]:

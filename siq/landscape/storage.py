@@ -133,6 +133,7 @@ def _transition(one: Transition) -> dict[str, Any]:
         "formula_share": _number(one.formula_share),
         "standard_error": _number(one.standard_error),
         "error": _number(one.error),
+        "by_rivals": _number(one.by_rivals),
         "minimum_action": None if path is None else path.uphill.action,
         "prefactor": None if rate is None else rate.prefactor,
         "prefactor_error": None if one.prefactor_error is None else one.prefactor_error.standard_error,

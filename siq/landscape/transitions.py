@@ -2,7 +2,8 @@
 
 A barrier of U is what the formula of V says of the path of least action, from the attractor to where the
 formula is believed for the last time, and the action of the path from there to the saddle, where formulas
-are at their worst. The action of the whole path, which knows no formula, stands beside it.
+are at their worst. The action of the whole path, which knows no formula, stands beside it. Where the terms of
+f are in doubt, the mean over rival terms moves the barrier (`siq.identify.rival_terms`).
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from siq.potential.well import Well
 
 logger = logging.getLogger(__name__)
 
+WORTH_A_WORD = 0.5  # of its standard error, by which rival terms move a barrier (a choice)
 DIFFERENT = 0.02  # share of a barrier by which two ways to it may differ without a word
 PATH_TOLERANCE = 1e-5  # of the action; prefactors follow the end of the path and need more than barriers
 
@@ -49,6 +51,8 @@ class Transition:
         Share of the barrier that the formula accounts for.
     standard_error
         Of the barrier, from the uncertainty of f.
+    by_rivals
+        What other terms of f that fit nearly as well have added to the barrier, in the mean.
     rate
         Law of the mean escape time, None where it fails.
     notes
@@ -70,13 +74,14 @@ class Transition:
     notes: tuple[str, ...] = ()
     prefactor_error: PrefactorError | None = None
     leverage: float = 1.0
+    by_rivals: float = 0.0
 
     @property
     def error(self) -> float:
         """Standard error of the barrier: from f, and by how much the formula and the path alone differ."""
         if self.path is None:
             return self.standard_error
-        return float(np.hypot(self.standard_error, self.barrier - self.path.uphill.action))
+        return float(np.hypot(self.standard_error, self.barrier - self.by_rivals - self.path.uphill.action))
 
     @property
     def exit(self) -> Exit:
@@ -199,10 +204,12 @@ def _transition(found: IdentifiedField, way: WayOut, well: Well | None) -> Trans
             notes.append("the formula and the path alone give different barriers")
     logger.info("barrier of U from attractor %d: %.5g by formula, %.5g by the path", way.start, barrier,
                 path.uphill.action)  # fmt: skip
-    spread = barrier_standard_error(path, found)
+    spread, by_rivals = barrier_uncertainty(path, found)
+    if abs(by_rivals) > WORTH_A_WORD * spread:
+        notes.append(f"{by_rivals:+.2g} of the barrier is due to other terms of f that fit nearly as well")
     return Transition(
-        way.start, way.end, way.saddle, path, barrier, share, spread, rate, tuple(dict.fromkeys(notes)),
-        of_prefactor, noise_leverage(path.uphill, found.dynamics),
+        way.start, way.end, way.saddle, path, barrier + by_rivals, share, spread, rate,
+        tuple(dict.fromkeys(notes)), of_prefactor, noise_leverage(path.uphill, found.dynamics), by_rivals,
     )  # fmt: skip
 
 
@@ -218,8 +225,8 @@ def barrier_by_formula(path: TransitionPath, well: Well) -> tuple[float, float]:
     return float(barrier), float(formula[last] / barrier)
 
 
-def barrier_standard_error(path: TransitionPath, found: IdentifiedField) -> float:
-    """Standard error of a barrier of U from that of f, to first order.
+def barrier_uncertainty(path: TransitionPath, found: IdentifiedField) -> tuple[float, float]:
+    """Standard error of a barrier of U from that of f, to first order, and what the mean over rivals adds.
 
     The action ``½∫∣ẋ - f∣² dt`` is minimal along the path, so that a change of f changes it by
 
@@ -228,11 +235,11 @@ def barrier_standard_error(path: TransitionPath, found: IdentifiedField) -> floa
     middle, force, spent = _along(path.uphill, found.dynamics)
     terms = found.library.evaluate(middle)
     slope = -2 * np.einsum("n,nq,nd->qd", spent, terms, force)
-    variance = float(found.variance(slope))
+    variance, by_rivals = float(found.variance(slope, of_mean=True)), float(found.mean_change(slope))
     if found.noise is not None:  # and by ∂U/∂D = -2 ∫ p·∂D p dt
         slope = -2 * (spent[:, None] * found.noise.push_slopes(middle, force)).sum(axis=0) / found.intensity
         variance += float(slope @ found.noise.covariance @ slope)
-    return float(np.sqrt(max(variance, 0.0)))
+    return float(np.sqrt(max(variance, 0.0))), by_rivals
 
 
 def noise_leverage(path: MinimumActionPath, dynamics: Dynamics) -> float:

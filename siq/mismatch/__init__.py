@@ -3,33 +3,44 @@
 `siq.diagnose` takes a simulation and recordings, and answers with everything that is reported. Imports
 `siq.estimation`, `siq.landscape` and what they may import.
 
-================  ===========================================================================
-`diagnosis`       what does a simulation lack? (`siq.diagnose`)
-`case`            what is compared with what?
-`study`           which recordings are held out, what is known of their noise?
-`search_options`  what counts as found?
-`dictionary`      which mechanisms have a name?
-`roles`           what is each state: a position, a population, a level?
-`assignments`     who can fill the roles of a mechanism?
-`candidates`      what would each mechanism change in this simulation?
-`units`           in which units are its parameters?
-`probes`          what does a little of each do to what is measured?
-`screening`       how much would each candidate gain, to first order?
-`trials`          and how much in earnest?
-`clusters`        does it stand, whatever errors within a recording are like?
-`search`          which mechanisms are found?
-`structure`       along which coordinates is something missing?
-`remainder`       what do the mechanisms leave?
-`steadiness`      are random forces those of surroundings?
-`investigation`   what is the verdict, and which fits does it rest on?
-`location`        where does the mismatch sit?
-`held_out`        how well does it run on recordings that had no part in it?
-`verdict`         what is the verdict?
-`statement`       what is stated, and as data?
-`sentences`       and how would a colleague say it?
-`augmented`       what is the simulation with what was found?
-`tables`          which tables are figures drawn from?
-`scores`          how large are errors in the recordings' own units?
-`consequences`    what does it do to wells and escape times?
-================  ===========================================================================
+==================  ========================================================================
+`diagnosis`         what does a simulation lack? (`siq.diagnose`)
+`case`              what is compared with what?
+`study`             which recordings are held out, what is known of their noise?
+`search_options`    what counts as found?
+`dictionary`        which mechanisms have a name?
+`roles`             what is each state: a position, a population, a level?
+`assignments`       who can fill the roles of a mechanism?
+`building`          what does a mechanism become in this simulation?
+`recalibrations`    which mechanisms are no more than other values of its parameters?
+`candidates`        what would each mechanism change in this simulation?
+`units`             in which units are its parameters?
+`places`            at which values of a shape does a search begin?
+`probes`            what does a little of each do to what is measured?
+`screening`         how much would each candidate gain, to first order?
+`trials`            and how much in earnest?
+`clusters`          does it stand, whatever errors within a recording are like?
+`search`            which mechanisms are found?
+`structure`         along which coordinates is something missing?
+`remainder`         what do the mechanisms leave?
+`steadiness`        are random forces those of surroundings?
+`function_places`   where may a function without a name stand?
+`evidence`          is a mechanism likelier than such a function?
+`matches`           how often do mechanisms explain as much by chance?
+`naming`            which of the mechanisms found may be named?
+`functions`         what is a function without a name, as a formula?
+`described`         and which of them models what has no name?
+`investigation`     what is the verdict, and which fits does it rest on?
+`location`          where does the mismatch sit?
+`held_out`          how well does it run on recordings that had no part in it?
+`verdict`           what is the verdict?
+`statement`         what is stated, and as data?
+`stated_functions`  what is stated of a model without a name?
+`sentences`         and how would a colleague say it?
+`augmented`         what is the simulation with what was found?
+`tables`            which tables are figures drawn from?
+`scores`            how large are errors in the recordings' own units?
+`official_tests`    and in the official tests of benchmarks, beside those of others?
+`consequences`      what does it do to wells and escape times?
+==================  ========================================================================
 """

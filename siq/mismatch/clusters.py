@@ -20,6 +20,57 @@ from siq.mismatch.candidates import MechanismCandidate
 LONG = 4.0  # correlation times in a block
 
 
+def probability_by_chance(
+    fit: Fit, before: Fit, data: Measurements, candidate: MechanismCandidate, *, blocks: int
+) -> float:
+    """Probability of a mechanism by chance, where errors of a recording hang together.
+
+    Among many recordings each counts as one (`clustered_probability`). Of a few, blocks are too few to know a
+    covariance from them; how long errors hang together is known all the same (`correlated_probability`).
+
+    Parameters
+    ----------
+    fit, before
+        With the mechanism and without it.
+    data, candidate
+        The recordings, and the mechanism.
+    blocks
+        Where there are fewer recordings than half of it, they are few.
+    """
+    if len(data.labels) >= blocks // 2 or fit.has_process_noise or before.has_process_noise:
+        return clustered_probability(fit, data, candidate, blocks=blocks)
+    gained = 2 * (fit.log_likelihood - before.log_likelihood)
+    return correlated_probability(fit, data, candidate, gained=gained)
+
+
+def correlated_probability(
+    fit: Fit, data: Measurements, candidate: MechanismCandidate, *, gained: float
+) -> float:
+    """Probability by chance of a gain in likelihood, for errors that are correlated over time.
+
+    Of n errors with an integral correlation time τ, n/τ are independent, and so much less does twice the
+    logarithm of a ratio of likelihoods weigh. Places at which a shape was looked for are chances, too.
+
+    Parameters
+    ----------
+    fit
+        With the mechanism; it tells τ.
+    data, candidate
+        The recordings, and the mechanism.
+    gained
+        Twice the increase of the log-likelihood.
+    """
+    white = whiten(fit.linearisation, data, fit.noise)
+    change, _ = solve(white.columns, white.innovations)
+    left = white.innovations - white.columns @ change
+    weights = np.bincount(white.recording)
+    times = [correlation_time(left[white.recording == place]) for place in range(len(weights))]
+    together = float(np.average(times, weights=weights))
+    places = [each.frequencies or len(each.at) for each in candidate.searches]
+    alone = float(scipy.stats.chi2.sf(max(gained, 0.0) / together, max(len(candidate.new), 1)))
+    return min(1.0, float(np.prod(places)) * alone)
+
+
 def clustered_probability(
     fit: Fit, data: Measurements, candidate: MechanismCandidate, *, blocks: int
 ) -> float:

@@ -2,26 +2,30 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from siq.dynamics.dynamics import Dynamics
-from siq.errors import NumericalFailure
+from siq.errors import InputError, NumericalFailure
+from siq.estimation.budget import Budget
 from siq.mismatch.augmented import completed
 from siq.mismatch.case import Comparison, comparison_of
 from siq.mismatch.held_out import HeldOutRuns, held_out_runs
 from siq.mismatch.investigation import Investigation, MismatchVerdict, investigate
 from siq.mismatch.location import Location
 from siq.mismatch.study import MismatchStudy
+from siq.mismatch.trials import UNFORESEEN
 from siq.mismatch.verdict import StatedMechanism, Statement, statement_of
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from siq.data.recordings import Recordings
+
+LOGGER = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, repr=False)
@@ -33,8 +37,8 @@ class Diagnosis:
     statement
         The verdict in a sentence, mechanisms with parameters, errors and evidence, place, fit and bounds.
     augmented
-        The simulation with what was found, its parameters fitted; the recalibrated one where nothing is
-        missing or what is missing has no name.
+        The simulation with what was found, its parameters fitted; with a function where what is missing has
+        no name; the recalibrated one where nothing is missing, or nothing that was added helped.
     recalibrated
         The simulation with its own parameters fitted and nothing added.
 
@@ -145,22 +149,36 @@ def diagnose(
     return solve_case(comparison_of(system, recordings, settings))
 
 
-def solve_case(case: Comparison) -> Diagnosis:
+def solve_case(case: Comparison, *, tell: Callable[[str], None] = LOGGER.info) -> Diagnosis:
     """Diagnose what `siq.read_case` has read; see `diagnose`.
+
+    Parameters
+    ----------
+    case
+        What is compared with what.
+    tell
+        Called with what is being done, whenever something new begins; by default it is logged.
 
     Raises
     ------
     NumericalFailure
         When the simulation cannot be fitted at all.
     """
+    allowed = case.settings.budget
+    budget = Budget(work=allowed.evaluations, seconds=allowed.seconds, tell=tell)
     try:
-        found = investigate(case.system, case.learn, case.dictionary, case.settings)
+        found = investigate(case.system, case.learn, case.dictionary, case.settings, budget=budget)
         shown = held_out_runs(found, case.learn, case.kept)
         statement = statement_of(found, case.learn, shown)
-    except (ArithmeticError, np.linalg.LinAlgError) as error:
+    except InputError:
+        raise
+    except UNFORESEEN as error:
         raise NumericalFailure(f"the simulation cannot be fitted to the recordings: {error}") from error
-    final = found.final
-    model = shown.model if found.verdict is MismatchVerdict.MISSING_PHYSICS else final.model
+    final, model = found.final, found.final.model
+    if found.verdict is MismatchVerdict.MISSING_PHYSICS:
+        model = shown.model
+    elif shown.described_fit is not None and shown.gained:
+        final, model = shown.described_fit, shown.model
     process = final.noise.process if found.process_noise else None
     recalibrated = found.search.recalibrated
     return Diagnosis(

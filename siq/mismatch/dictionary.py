@@ -14,8 +14,9 @@ from siq.errors import InputError
 from siq.files.documents import read_document, validate
 
 Role = Literal[
-    "position", "velocity", "amplitude", "population", "level", "state", "input", "parameter", "output"
-]
+    "position", "displacement", "angle", "velocity", "amplitude", "population", "prey", "predator", "level",
+    "upper level", "lower level", "store", "stock", "state", "input", "parameter", "output",
+]  # fmt: skip
 
 
 class _Part(BaseModel):
@@ -37,6 +38,14 @@ class Shape(_Part):
         The same of its inverse.
     quantiles_of
         A formula: its quantiles at these probabilities are tried.
+    time_of
+        A formula: multiples of the time in which it changes by its own spread are tried.
+    lattice_of
+        An output: the step of the lattice on which its recorded values lie. It is known from the recordings
+        and not fitted; where they lie on none that holds zero, the mechanism is not tried.
+    top_of, bottom_of
+        An output: where its recorded values end in a plateau, above or below. Where there is none, the
+        mechanism is not tried.
     samples
         Multiples of the time between samples are tried.
     frequencies
@@ -47,15 +56,27 @@ class Shape(_Part):
     scale_of: str | None = None
     inverse_scale_of: str | None = None
     quantiles_of: str | None = None
+    time_of: str | None = None
+    lattice_of: str | None = None
+    top_of: str | None = None
+    bottom_of: str | None = None
     samples: bool = False
     frequencies: Annotated[int, Field(ge=2, le=2000)] | None = None
 
     @model_validator(mode="after")
     def _one(self) -> Shape:
-        given = (self.scale_of, self.inverse_scale_of, self.quantiles_of, self.frequencies)
+        given = (
+            self.scale_of, self.inverse_scale_of, self.quantiles_of, self.time_of, self.lattice_of,
+            self.top_of, self.bottom_of, self.frequencies,
+        )  # fmt: skip
         if sum(each is not None for each in given) + self.samples != 1:
             raise ValueError("a shape is looked for in one way; give one of scale_of, quantiles_of, ...")
         return self
+
+    @property
+    def recorded(self) -> str | None:
+        """The output whose recorded values tell the shape by themselves."""
+        return self.lattice_of or self.top_of or self.bottom_of
 
 
 class MechanismParameter(_Part):
@@ -77,7 +98,7 @@ class MechanismParameter(_Part):
 
 
 class FurtherState(_Part):
-    """A state that a mechanism brings. It begins at zero.
+    """A state that a mechanism brings.
 
     Attributes
     ----------
@@ -87,11 +108,14 @@ class FurtherState(_Part):
         In terms of the roles.
     scale
         A formula of its size.
+    begin
+        A formula of the roles: where it is taken to begin in every recording, until a fit tells.
     """
 
     equation: Formula
     unit: str = "1"
     scale: str
+    begin: Formula = 0
 
 
 class Form(_Part):
@@ -105,6 +129,9 @@ class Form(_Part):
         Formulas that are added to the equation of the state in that role.
     replace
         Formulas that take the place of an input or a parameter, wherever it stands.
+    within
+        Formulas that take the place of a state in the equation of another: ``{q: {p: z}}`` puts z in the
+        place of p in the equation of q.
     outputs
         Formulas of what a sensor reads instead; ``y`` stands for what it read before.
     states
@@ -115,25 +142,36 @@ class Form(_Part):
         What the mechanism's formulas need to know, by name.
     coordinate
         Along which role the mechanism acts.
+    variant
+        What tells the form from others of the same roles, in words that follow the name: ``from above``.
     symmetric
         Whether exchanging the roles gives the same mechanism.
+    one_unit
+        Whether the states that fill the roles must have one unit, and not be mere numbers.
     """
 
     roles: dict[Name, Role]
     terms: dict[Name, Formula] = {}
     replace: dict[Name, Formula] = {}
+    within: dict[Name, dict[Name, Formula]] = {}
     outputs: dict[Name, Formula] = {}
     states: dict[Name, FurtherState] = {}
     noise: Name | None = None
     parameters: dict[Name, MechanismParameter]
     coordinate: str
+    variant: str = ""
     symmetric: bool = False
+    one_unit: bool = False
 
     @model_validator(mode="after")
     def _about_roles(self) -> Form:
-        if not (self.terms or self.replace or self.outputs or self.noise):
-            raise ValueError("a form changes nothing; give terms, replace, outputs or noise")
-        for name in (*self.terms, *self.replace, *self.outputs, *([self.noise] if self.noise else [])):
+        changed = [
+            *self.terms, *self.replace, *self.outputs, *self.within,
+            *(name for put in self.within.values() for name in put), *([self.noise] if self.noise else []),
+        ]  # fmt: skip
+        if not changed:
+            raise ValueError("a form changes nothing; give terms, replace, within, outputs or noise")
+        for name in changed:
             if name not in self.roles:
                 raise ValueError(f"'{name}' has no role; add 'roles: {{{name}: state}}' or another role")
         return self

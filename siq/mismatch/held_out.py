@@ -8,8 +8,10 @@ from typing import Literal
 import numpy as np
 
 from siq.dynamics.dynamics import Dynamics
+from siq.estimation.estimation import Fit
 from siq.estimation.free_runs import FreeRun, free_run, normalised_rms
 from siq.estimation.measurements import Measurements
+from siq.mismatch.described import Model
 from siq.mismatch.investigation import Investigation
 
 Change = Literal["better", "same", "worse", "unknown"]
@@ -79,6 +81,12 @@ class HeldOutRuns:
         The augmented simulation that was run.
     errors
         Of the three.
+    independent
+        Whether the recordings are others than those that were learned from, rather than a later part.
+    described
+        The model of what has no name that was run; None where nothing was described.
+    described_fit
+        Its estimates that were run.
     """
 
     before: FreeRun
@@ -86,10 +94,22 @@ class HeldOutRuns:
     augmented: FreeRun
     model: Dynamics
     errors: HeldOutErrors
+    independent: bool = True
+    described: Model | None = None
+    described_fit: Fit | None = None
+
+    @property
+    def gained(self) -> bool:
+        """Whether the augmented simulation is better than the others."""
+        known = [each for each in (self.errors.before, self.errors.recalibrated) if each is not None]
+        return self.errors.change(min(known, default=None), self.errors.augmented) == "better"
 
 
 def held_out_runs(investigation: Investigation, learned: Measurements, data: Measurements) -> HeldOutRuns:
     """Show the fit on recordings that had no part in anything.
+
+    Of several models of what has no name the likeliest is shown that makes the prediction better; the first,
+    where none does.
 
     Parameters
     ----------
@@ -110,17 +130,41 @@ def held_out_runs(investigation: Investigation, learned: Measurements, data: Mea
     # What fits best with random forces admitted need not be what runs best without.
     recalibrated = search.recalibrated.model
     if search.recalibrated.has_process_noise and np.isfinite(investigation.least_squares.sum_of_squares):
-        choices = (investigation.least_squares.model, recalibrated, investigation.model)
-        recalibrated = min(choices, key=error_where_learned)
-    augmented = search.fit.model
-    if investigation.augmented_least_squares is not None:
-        augmented = min((investigation.augmented_least_squares.model, augmented), key=error_where_learned)
-    models = {"before": investigation.model, "recalibrated": recalibrated, "augmented": augmented}
-    runs = {name: free_run(model, data, noise=noise, substeps=substeps) for name, model in models.items()}
-    scores = {name: normalised_rms(data.outputs, simulated) for name, simulated in runs.items()}
-    scored = runs["before"].scored
-    spread = np.nanvar(data.outputs[scored], axis=0)
+        refits = (investigation.least_squares.model, recalibrated, investigation.model)
+        recalibrated = min(refits, key=error_where_learned)
+    choices: list[tuple[Model | None, Fit]] = []
+    for model in investigation.models:
+        fits = [each for each in (model.fit, model.exact) if each is not None]
+        choices.append((model, min(fits, key=lambda each: error_where_learned(each.model))))
+    if not choices:
+        fits = [each for each in (investigation.augmented_least_squares, search.fit) if each is not None]
+        choices.append((None, min(fits, key=lambda each: error_where_learned(each.model))))
+    before = free_run(investigation.model, data, noise=noise, substeps=substeps)
+    refitted = free_run(recalibrated, data, noise=noise, substeps=substeps)
+    spread = np.nanvar(data.outputs[before.scored], axis=0)
     floor = np.sqrt(np.mean(search.fit.noise.measurement / np.where(spread > 0, spread, 1.0)))
-    values = int(np.isfinite(data.outputs[scored]).sum())
-    errors = HeldOutErrors(**scores, noise_floor=float(floor), values=values)
-    return HeldOutRuns(**runs, model=augmented, errors=errors)
+    shown: list[HeldOutRuns] = []
+    for described, fit in choices:
+        run = free_run(fit.model, data, noise=noise, substeps=max(substeps, fit.substeps))
+        errors = HeldOutErrors(
+            before=normalised_rms(data.outputs, before),
+            recalibrated=normalised_rms(data.outputs, refitted),
+            augmented=normalised_rms(data.outputs, run),
+            noise_floor=float(floor),
+            values=int(np.isfinite(data.outputs[before.scored]).sum()),
+        )
+        shown.append(
+            HeldOutRuns(
+                before=before,
+                recalibrated=refitted,
+                augmented=run,
+                model=fit.model,
+                errors=errors,
+                independent=not set(learned.labels) & set(data.labels),
+                described=described,
+                described_fit=fit if described is not None else None,
+            )
+        )
+        if shown[-1].gained:
+            return shown[-1]
+    return shown[0]

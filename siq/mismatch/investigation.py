@@ -11,15 +11,21 @@ import scipy.stats
 
 from siq.dynamics.dynamics import Dynamics
 from siq.errors import NumericalFailure
+from siq.estimation.budget import UNLIMITED, Account, Budget
 from siq.estimation.estimation import Fit
 from siq.estimation.measurements import Measurements
 from siq.estimation.process_noise import fit_with_and_without_process_noise
 from siq.estimation.recalibration import recalibrate
+from siq.estimation.unknown_forces import covariance_with_unknown_forces
 from siq.mismatch.candidates import MechanismCandidate, candidates_of, generic_candidates
+from siq.mismatch.described import Model, models_of_the_nameless
 from siq.mismatch.dictionary import Mechanism
-from siq.mismatch.remainder import Remainder, what_is_left, without_patches
+from siq.mismatch.evidence import log_evidence_of
+from siq.mismatch.naming import Naming, naming_of
+from siq.mismatch.remainder import Remainder, what_is_left
 from siq.mismatch.roles import Roles, roles_of
 from siq.mismatch.search import Search, search
+from siq.mismatch.search_options import SearchOptions
 from siq.mismatch.steadiness import unsteadiness
 from siq.mismatch.structure import Structure
 from siq.mismatch.study import MismatchStudy
@@ -41,11 +47,6 @@ class MismatchVerdict(StrEnum):
         return self in (MismatchVerdict.MISSING_PHYSICS, MismatchVerdict.UNEXPLAINED)
 
 
-SHIFTED = 1e-4  # probability below which parameters are not called unchanged
-ENOUGH = 0.998  # share of the excess that mechanisms explain, beyond which a remainder is only remarked
-MOSTLY = 0.99  # share that the first of several must explain alone for that
-MANY = 3  # mechanisms that together are a description rather than an explanation
-UNSTEADY = 6.0  # twice the difference of log-likelihoods, from which random forces follow the motion
 GROWING = "Random forces would explain it only if they grew with the motion; a hidden state is more likely."
 EXACT = (
     "The estimates allow for random forces that stand for what remains. The new card has the estimates of"
@@ -85,8 +86,12 @@ class Investigation:
         Sentences about reservations.
     candidates
         All mechanisms that were considered.
-    too_faint
-        Whether what was found leaves nothing, and is not named since it gains too little.
+    naming
+        What was asked of mechanisms before they could be named; None where none was found.
+    models
+        Of what has no name, the likeliest first.
+    account
+        The work that it took, and whether something was left undone.
     """
 
     verdict: MismatchVerdict
@@ -102,7 +107,16 @@ class Investigation:
     share: float
     remarks: tuple[str, ...]
     candidates: tuple[MechanismCandidate, ...]
-    too_faint: bool = False
+    naming: Naming | None = None
+    models: tuple[Model, ...] = ()
+    account: Account = UNLIMITED
+
+    @property
+    def too_faint(self) -> bool:
+        """Whether what was found explains enough, and is not named since a function is nearly as likely."""
+        return (
+            self.verdict is MismatchVerdict.UNEXPLAINED and self.naming is not None and self.naming.convincing
+        )
 
     @property
     def final(self) -> Fit:
@@ -119,6 +133,8 @@ def investigate(
     study: MismatchStudy,
     *,
     file: str = "the dictionary",
+    seed: int = 0,
+    budget: Budget | None = None,
 ) -> Investigation:
     """Say whether, where and in which way a simulation differs from recordings.
 
@@ -134,47 +150,71 @@ def investigate(
         What counts as found, and whether monomials do.
     file
         Where the dictionary's entries come from, for messages.
+    seed
+        Of the effects without a name that mechanisms are held against.
+    budget
+        Charged for the work; what it does not reach is left undone, and the answer is that of the rest.
 
     Raises
     ------
     NumericalFailure
         When not even the recalibrated simulation with process noise can be fitted.
     """
+    options = study.search
     roles = roles_of(model)
     candidates = considered(model, roles, dictionary, study, file=file)
-    recalibrated, least_squares = recalibrate(model, data)
-    found = search(model, data, recalibrated, candidates, options=study.search)
+    budget = budget or Budget()
+    budget.says("fitting the simulation's own parameters")
+    with budget.exempt():
+        recalibrated, least_squares = recalibrate(model, data, budget=budget)
+    found = search(model, data, recalibrated, candidates, options=options, budget=budget)
     found, by_each = remainders(model, data, found, roles)
-    first, left = by_each[0], by_each[-1]
-    alone = found.found[0].best.fit if found.found else recalibrated
-    if len(found.found) > 1 and (first.share >= ENOUGH or not (first.doubtful or alone.has_process_noise)):
-        found, left = without_patches(found, by_each, least=study.search.named)
-    doubtful = left.doubtful or found.fit.has_process_noise or len(found.found) >= MANY
+    left = by_each[-1]
     p_shift = shift_probability(model, recalibrated)
     exact: Fit | None = None
-    too_faint = False
-    verdict: MismatchVerdict
+    naming: Naming | None = None
+    models: tuple[Model, ...] = ()
+    verdict, remarks = MismatchVerdict.NO_MISMATCH, tuple[str, ...]()
+
+    def modelled() -> tuple[Model, ...]:
+        return models_of_the_nameless(
+            data, found, roles, degree=study.degree, blocks=options.blocks, considered=len(candidates),
+            budget=budget,
+        )  # fmt: skip
+
     if found.found:
-        good = not doubtful or (left.share >= ENOUGH and first.share >= MOSTLY)
-        verdict, remarks = named_or_not(found, left, doubtful, good, least=study.search.named)
-        too_faint = good and verdict is MismatchVerdict.UNEXPLAINED
+        generator = np.random.default_rng(seed)
+        naming = naming_of(
+            found, by_each, data, model, roles, candidates, options=options, generator=generator
+        )
+        found, left = naming.search, naming.left
+        verdict, remarks = named_or_not(naming, options)
         if verdict is MismatchVerdict.MISSING_PHYSICS and found.fit.has_process_noise:
             still = replace(found.fit, noise=found.fit.noise.without_process())
-            followed = fit_with_and_without_process_noise(found.fit.model, data, still)[1]
+            with budget.exempt():
+                followed = fit_with_and_without_process_noise(found.fit.model, data, still, budget=budget)[1]
             if followed.converged:
                 exact, remarks = followed, (*remarks, EXACT)
     elif found.fit.has_process_noise:
-        steady = unsteadiness(found.fit, data) < UNSTEADY
+        steady = unsteadiness(found.fit, data) < 2 * options.least_log_odds
         knows_noise = any(form.noise for mechanism in dictionary for form in mechanism.forms)
-        named = knows_noise and steady and not left.doubtful
-        verdict = MismatchVerdict.MISSING_PHYSICS if named else MismatchVerdict.UNEXPLAINED
-        remarks = () if steady else (GROWING,)
+        verdict, remarks = MismatchVerdict.UNEXPLAINED, () if steady else (GROWING,)
+        if knows_noise and steady and not left.doubtful:
+            # Random forces are an explanation among others: a function without any may be likelier.
+            alone = log_evidence_of(recalibrated, data)
+            models = tuple(each for each in modelled() if not each.fit.has_process_noise)
+            if not models or models[0].log_evidence < alone + options.least_log_odds:
+                verdict, models = MismatchVerdict.MISSING_PHYSICS, ()
     elif left.structured:
-        verdict, remarks = MismatchVerdict.UNEXPLAINED, ()
-    else:
-        shifted = p_shift < SHIFTED
-        verdict = MismatchVerdict.PARAMETER_SHIFT if shifted else MismatchVerdict.NO_MISMATCH
-        remarks = ()
+        verdict = MismatchVerdict.UNEXPLAINED
+    elif p_shift < options.false_alarms:
+        verdict = MismatchVerdict.PARAMETER_SHIFT
+    if verdict is MismatchVerdict.UNEXPLAINED and not models:
+        models = modelled()
+    budget.says("working out how well parameters are known")
+    with budget.exempt():
+        covariance = covariance_with_unknown_forces(found.fit, data, budget=budget)
+    found = replace(found, fit=replace(found.fit, covariance=covariance))
     return Investigation(
         verdict=verdict,
         model=model,
@@ -189,7 +229,9 @@ def investigate(
         share=left.share,
         remarks=remarks,
         candidates=tuple(candidates),
-        too_faint=too_faint,
+        naming=naming,
+        models=models,
+        account=budget.account(),
     )
 
 
@@ -224,42 +266,32 @@ def considered(
     """The candidates of the dictionary, and monomials where the study or the lack of roles allows them."""
     candidates = candidates_of(model, roles, dictionary, file=file)
     if study.generic if study.generic is not None else not roles.physical:
-        monomials = generic_candidates(model, roles, degree=study.degree)
+        monomials = generic_candidates(model, roles, degree=study.degree, named=candidates)
         candidates += [each for each in monomials if each.coordinate != "constant"]
     return candidates
 
 
-def named_or_not(
-    search: Search, left: Remainder, doubtful: bool, good: bool, *, least: float
-) -> tuple[MismatchVerdict, tuple[str, ...]]:
-    """Whether mechanisms that were found are named, and with which reservations.
-
-    Parameters
-    ----------
-    search
-        With what was found.
-    left
-        What that leaves.
-    doubtful, good
-        Whether there is a reason for doubt, and whether they explain enough all the same: several terms that
-        fit well together, and yet leave structure, are what a false explanation looks like.
-    least
-        χ² that each must gain.
-    """
-    if not good:
+def named_or_not(naming: Naming, options: SearchOptions) -> tuple[MismatchVerdict, tuple[str, ...]]:
+    """Whether mechanisms that were found are named, and with which reservations."""
+    if not naming.convincing:
         return MismatchVerdict.UNEXPLAINED, ()
-    remarks = tuple(filter(None, [remains(left)])) if doubtful else ()
-    found = [each.best for each in search.found]
-    faintest = min(found, key=lambda each: each.delta_chi2)
-    if faintest.delta_chi2 >= least:
+    remarks = tuple(filter(None, [remains(naming.left)])) if naming.p_alike is not None else ()
+    if naming.likely:
         return MismatchVerdict.MISSING_PHYSICS, remarks
-    names = " and ".join(each.candidate.name for each in found)
-    which = "is" if len(found) == 1 else f"{faintest.candidate.name} is"
-    faint = (
-        f"It looks like {names}, but {which} too faint to be named: it gains {faintest.delta_chi2:.0f} in χ²,"
-        f" and a name takes {least:g}."
+    names = " and ".join(each.best.candidate.name for each in naming.search.found)
+    least = min(*naming.log_odds, naming.together)
+    return MismatchVerdict.UNEXPLAINED, (
+        *remarks,
+        f"It looks like {names}, but a function without a name is {_as_likely(least)}; a name takes odds of"
+        f" {np.exp(options.least_log_odds):.0f} to 1.",
     )
-    return MismatchVerdict.UNEXPLAINED, (*remarks, faint)
+
+
+def _as_likely(log_odds: float) -> str:
+    """How likely a function without a name is, beside a mechanism."""
+    if log_odds < 0:
+        return "likelier"
+    return f"nearly as likely (odds of {np.exp(log_odds):.0f} to 1)"
 
 
 def remains(left: Remainder) -> str:

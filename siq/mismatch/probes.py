@@ -14,12 +14,15 @@ import numpy as np
 import sympy
 
 from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.formulas import compile_values, parse_formula
+from siq.dynamics.formulas import compile_values
 from siq.dynamics.parametric import arguments_of, evaluable, symbol
+from siq.dynamics.tape import tape_of
+from siq.errors import NumericalFailure
 from siq.estimation.linearisation import Grid
 from siq.estimation.measurements import Measurements
+from siq.estimation.trajectories import run_along
 from siq.mismatch.candidates import MechanismCandidate
-from siq.mismatch.dictionary import Shape
+from siq.mismatch.places import along, places_of
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,15 @@ class Probe:
 
     candidate: MechanismCandidate
     shapes: tuple[tuple[str, float], ...]
+
+    @property
+    def recorded(self) -> bool:
+        """Whether the recordings themselves show its shape.
+
+        States that follow what was recorded never leave the range of a sensor: along them such a mechanism
+        seems to change nothing, and only its fit tells.
+        """
+        return any(search.recorded is not None for search in self.candidate.searches)
 
     @property
     def width(self) -> int:
@@ -92,12 +104,12 @@ class ProbeColumns:
         """See `siq.estimation.linearisation.Columns`."""
         result = np.zeros((len(self._model.outputs), self.width, x.shape[1]))
         place = 0
-        for probe in self._probes:
+        for index, probe in enumerate(self._probes):
             compiled = self._compiled[id(probe.candidate)]
             if compiled.output_entries:
                 signals = self._grid.at_samples(compiled.delays_at(probe))
-                zeros = np.zeros((len(probe.candidate.scales), x.shape[1]))
-                at = (*x, *zeros, *signals.inputs, *signals.delayed, *signals.slopes, signals.t)
+                further = self.further_states(index).T if probe.candidate.scales else x[:0]
+                at = (*x, *further, *signals.inputs, *signals.delayed, *signals.slopes, signals.t)
                 numbers = compiled.numbers(probe, values)
                 _fill(result, place, compiled.output_entries, compiled.outputs(*at, *numbers))
             place += probe.width
@@ -105,13 +117,22 @@ class ProbeColumns:
 
     @cached_property
     def _node_states(self) -> list[np.ndarray]:
-        """States of the simulation at all nodes, between the samples of `x` by straight lines."""
-        rows = self._grid.rows
+        """States of the simulation at all nodes: between samples cubics that have the slopes of f.
+
+        Straight lines would be early or late by half a sample, as much as what a sensor's lag does.
+        """
+        grid, model = self._grid, self._model
+        rows, substeps = grid.rows, grid.substeps
         begin, end = self._x[rows].T, self._x[rows + 1].T
-        substeps = self._grid.substeps
-        return [
-            begin + (end - begin) * ((node // 3 + (node % 3) / 2) / substeps) for node in range(3 * substeps)
-        ]
+        delays, whole = model.lags(self._values), grid.step * substeps
+        first, last = (
+            whole * model.functions.rates(x, grid.signals(node, delays), self._values)
+            for x, node in ((begin, 0), (end, 3 * substeps - 1))
+        )
+        turn = first + last - 2 * (end - begin)
+        bend = 3 * (end - begin) - 2 * first - last
+        shares = [(node // 3 + (node % 3) / 2) / substeps for node in range(3 * substeps)]
+        return [begin + share * (first + share * (bend + share * turn)) for share in shares]
 
     def further_states(self, index: int) -> np.ndarray:
         """The states that a probe brings, at all samples, shape ``(n, k)``."""
@@ -123,47 +144,45 @@ class ProbeColumns:
         return states
 
     def _memory(self, index: int) -> list[np.ndarray]:
-        """The further states of a probe at all nodes, carried along each recording from zero."""
+        """The further states of a probe at all nodes, carried along each recording from its begin."""
         cache = self.__dict__.setdefault("_memories", {})
         if index not in cache:
             cache[index] = self._carry(self._probes[index])
         return cache[index]
 
     def _carry(self, probe: Probe) -> list[np.ndarray]:
+        """Sample after sample along each recording, then within all intervals side by side."""
         compiled = self._compiled[id(probe.candidate)]
-        grid, data = self._grid, self._grid.data
-        rows = grid.rows
-        count = len(probe.candidate.scales)
-        nodes = [np.zeros((count, len(rows))) for _ in range(3 * grid.substeps)]
+        grid = self._grid
+        step = grid.step
         numbers = compiled.numbers(probe, self._values)
-        lengths = np.diff(data.first) - 1
-        begins = np.concatenate([[0], np.cumsum(lengths)])[:-1]
-        state = np.zeros((count, len(lengths)))
-        signals = [grid.signals(node, compiled.delays_at(probe)) for node in range(3 * grid.substeps)]
+        begin = np.empty((len(grid.data.labels), len(probe.candidate.begins)))
+        model = self._model.with_values(self._values)
+        for place, formula in enumerate(probe.candidate.begins):
+            begin[:, place] = along(str(formula), grid.data, model, self._x)[grid.data.first[:-1]]
+        signals = [
+            np.concatenate([x, s.inputs, s.delayed, s.slopes, s.t[None]])
+            for x, s in (
+                (self._node_states[node], grid.signals(node, compiled.delays_at(probe)))
+                for node in range(3 * grid.substeps)
+            )
+        ]
 
-        def rate(z: np.ndarray, node: int, at: np.ndarray) -> np.ndarray:
-            s = signals[node]
-            arguments = (
-                *self._node_states[node][:, at], *z, *s.inputs[:, at],
-                *s.delayed[:, at], *s.slopes[:, at], s.t[at],
-            )  # fmt: skip
-            return np.array([np.broadcast_to(v, at.shape) for v in compiled.memory(*arguments, *numbers)])
+        def rate(z: np.ndarray, node: int) -> np.ndarray:
+            values = compiled.memory(*z, *signals[node], *numbers)
+            return np.array([np.broadcast_to(value, z.shape[1:]) for value in values])
 
-        for sample in range(int(lengths.max(initial=0))):
-            alive = np.flatnonzero(lengths > sample)
-            at = begins[alive] + sample
-            z, step = state[:, alive], grid.step[at]
-            for part in range(grid.substeps):
-                first, middle, last = 3 * part, 3 * part + 1, 3 * part + 2
-                k1 = rate(z, first, at)
-                k2 = rate(z + step / 2 * k1, middle, at)
-                k3 = rate(z + step / 2 * k2, middle, at)
-                k4 = rate(z + step * k3, last, at)
-                after = z + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-                nodes[first][:, at], nodes[last][:, at] = z, after
-                nodes[middle][:, at] = z + step / 2 * k2
-                z = after
-            state[:, alive] = z
+        z = compiled.carried(grid, np.stack(signals), numbers, begin)[grid.rows].T
+        nodes = []
+        for part in range(grid.substeps):
+            first, middle, last = 3 * part, 3 * part + 1, 3 * part + 2
+            k1 = rate(z, first)
+            k2 = rate(z + step / 2 * k1, middle)
+            k3 = rate(z + step / 2 * k2, middle)
+            k4 = rate(z + step * k3, last)
+            after = z + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+            nodes += [z, z + step / 2 * k2, after]
+            z = after
         return nodes
 
 
@@ -196,14 +215,38 @@ class _Compiled:
         self.outputs = compile_values(
             [outputs[i][j] for i, j in self.output_entries], arguments, common=False
         )
-        further = written[model.dimension : augmented.dimension]
-        self.memory = compile_values(further, arguments, common=False)
+        # Of further states, which come first: they are carried, and all else is known along the recordings.
+        self._further = written[model.dimension : augmented.dimension]
+        own = [symbol(name) for name in augmented.states[model.dimension :]]
+        self._memory_arguments = [*own, *(each for each in arguments if each not in own)]
+        self.memory = compile_values(self._further, self._memory_arguments, common=False)
 
     def numbers(self, probe: Probe, values: np.ndarray) -> tuple[float, ...]:
         """All parameters: the simulation's, then the mechanism's."""
         shapes = dict(probe.shapes)
         new = self._candidate.model.parameters[self._count :]
-        return (*values, *(shapes.get(each.name, 0.0) for each in new))
+        # As numpy has them: a division by zero is then infinite, and no error.
+        return (*values, *(np.float64(shapes.get(each.name, 0.0)) for each in new))
+
+    def carried(
+        self, grid: Grid, signals: np.ndarray, numbers: tuple[float, ...], begin: np.ndarray
+    ) -> np.ndarray:
+        """The further states at all samples, shape ``(n, k)``.
+
+        Parameters
+        ----------
+        grid, signals
+            What is known at all nodes, shape ``(3 substeps, s, intervals)``.
+        numbers
+            All parameters.
+        begin
+            Where they begin, shape ``(recordings, k)``.
+        """
+        tape = tape_of(self._further, self._memory_arguments)
+        if tape is None:
+            names = ", ".join(map(str, self._further))
+            raise NumericalFailure(f"a state of its own has a formula that cannot be followed: {names}")
+        return run_along(tape, grid, signals, np.array(numbers), begin)
 
     def delays_at(self, probe: Probe) -> tuple[tuple[int, float], ...]:
         """Delayed inputs of the candidate's formulas."""
@@ -229,36 +272,6 @@ def probes_of(
         found = places_of(search, data, model, x)
         choices = [(*before, (name, float(place))) for before in choices for place in found]
     return [Probe(candidate, shapes) for shapes in choices]
-
-
-def places_of(search: Shape, data: Measurements, model: Dynamics, x: np.ndarray) -> np.ndarray:
-    """The values of a shape that a search begins with."""
-    factors = np.array(search.at)
-    steps = np.diff(data.t)[np.diff(data.recording) == 0]
-    if search.samples:
-        return factors * np.median(steps)
-    if search.frequencies is not None:
-        longest = max(
-            data.t[end - 1] - data.t[begin]
-            for begin, end in zip(data.first[:-1], data.first[1:], strict=True)
-        )
-        # From one period in the longest recording to four samples a period.
-        return np.linspace(2 * np.pi / longest, np.pi / (2 * np.median(steps)), search.frequencies)
-    text = search.scale_of or search.inverse_scale_of or search.quantiles_of
-    course = along(str(text), data, model, x)
-    if search.quantiles_of is not None:
-        return np.quantile(course, factors)
-    size = float(np.sqrt(np.mean(course**2))) or 1.0
-    return factors * size if search.scale_of is not None else factors / size
-
-
-def along(text: str, data: Measurements, model: Dynamics, x: np.ndarray) -> np.ndarray:
-    """A formula of states and inputs at all samples, shape ``(n,)``."""
-    formula = parse_formula(text, model.names)
-    signals = data.signals(data.t, data.recording, delays=())
-    arguments = [*(symbol(n) for n in model.states), *(symbol(e.name) for e in model.inputs), symbol("t")]
-    value = compile_values([formula], arguments, common=False)(*x.T, *signals.inputs, signals.t)[0]
-    return np.broadcast_to(value, data.t.shape)
 
 
 def _fill(result: np.ndarray, place: int, entries: list[tuple[int, int]], found: Sequence[object]) -> None:

@@ -1,9 +1,8 @@
-"""What mechanisms leave of the excess over noise, and which of them only patch a trifle."""
+"""What mechanisms leave of the excess over noise."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,7 +11,6 @@ from siq.estimation.estimation import Fit
 from siq.estimation.innovations import Noise
 from siq.estimation.measurements import Measurements
 from siq.mismatch.roles import Roles
-from siq.mismatch.search import Search
 from siq.mismatch.structure import Structure, structure_of
 
 STRUCTURED = 1e-4  # probability below which residuals are not called random
@@ -68,28 +66,6 @@ def what_is_left(
     if final.has_process_noise:
         alone = structure_of(final.model, data, final, roles, noise=final.noise.without_process())
     return Remainder(before, after, explained_share(before, alone))
-
-
-def without_patches(search: Search, left: Sequence[Remainder], *, least: float) -> tuple[Search, Remainder]:
-    """The first mechanism, and those after it as long as each gains enough and leaves less of the excess.
-
-    Parameters
-    ----------
-    search
-        With mechanisms of which the first explains all but a trifle.
-    left
-        What is left with each.
-    least
-        Enough, in χ².
-    """
-    kept = 1
-    while (
-        kept < len(left)
-        and search.found[kept].best.delta_chi2 >= least
-        and left[kept].share > left[kept - 1].share
-    ):
-        kept += 1
-    return replace(search, found=search.found[:kept], fit=search.found[kept - 1].best.fit), left[kept - 1]
 
 
 def explained_share(before: Structure, after: Structure) -> float:

@@ -1,19 +1,21 @@
 """Roles: what each state of a simulation is, as far as its equations tell.
 
 Mechanisms are written for roles - a position, a velocity, the two quadratures of a rotating frame, a
-population, a level - and roles are read off the equations, never off names. A system without any of them is
-described by generic monomials only.
+population, a level, a store - and roles are read off equations and units, never off names. A system of mere
+numbers is described by generic monomials only.
 """
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
 import sympy
 
 from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.parametric import Signals, symbol
+from siq.dynamics.formulas import compile_values
+from siq.dynamics.parametric import Signals, arguments_of, evaluable, symbol
 
 SAME = 1e-9  # relative difference of values of formulas that are the same
 TRIALS = 12
@@ -28,22 +30,35 @@ class Roles:
     ----------
     motions
         Pairs of position and velocity, ``x' = v``.
+    angles
+        Positions that are angles: in radians, or within a sine or cosine of the equations.
     amplitudes
         Pairs of quadratures: but for a constant drive, the equations look the same from every angle, and turn
         the state.
     populations
         States that stay zero once they are.
+    feeding
+        Pairs of prey and predator: populations whose meetings make the one fewer and the other more.
     levels
         States whose own outflow goes with their square root.
+    cascades
+        Pairs of levels of which the first flows into the second.
+    stores
+        All others that have a unit: a charge, a temperature, a concentration. Of a mere number nothing is
+        known that a mechanism could be written for.
     states
         All that are not mere derivatives; only in their equations can physics be missing.
     """
 
-    motions: tuple[tuple[str, str], ...]
-    amplitudes: tuple[tuple[str, str], ...]
-    populations: tuple[str, ...]
-    levels: tuple[str, ...]
-    states: tuple[str, ...]
+    motions: tuple[tuple[str, str], ...] = ()
+    angles: tuple[str, ...] = ()
+    amplitudes: tuple[tuple[str, str], ...] = ()
+    populations: tuple[str, ...] = ()
+    feeding: tuple[tuple[str, str], ...] = ()
+    levels: tuple[str, ...] = ()
+    cascades: tuple[tuple[str, str], ...] = ()
+    stores: tuple[str, ...] = ()
+    states: tuple[str, ...] = ()
 
     @property
     def physical(self) -> bool:
@@ -73,22 +88,100 @@ def roles_of(model: Dynamics) -> Roles:
     alone = [name for name in others if name not in in_pairs]
     equations = dict(zip(model.states, model.equations, strict=True))
     levels = tuple(name for name in alone if _has_root(equations[name], name))
+    populations = tuple(
+        name for name in alone if name not in levels and _stays_zero(model, model.states.index(name))
+    )
+    units = dict(zip(model.states, model.units, strict=True))
     return Roles(
         motions=motions,
+        angles=tuple(x for x, _ in motions if units[x] == "rad" or _turns_round(model, x)),
         amplitudes=amplitudes,
-        populations=tuple(
-            name for name in alone if name not in levels and _stays_zero(model, model.states.index(name))
+        populations=populations,
+        feeding=tuple(
+            (prey, predator)
+            for prey, predator in itertools.permutations(populations, 2)
+            if _feeds(model, prey, predator)
         ),
         levels=levels,
+        cascades=tuple(
+            (upper, lower)
+            for upper, lower in itertools.permutations(levels, 2)
+            if _has_root(equations[lower], upper)
+        ),
+        stores=tuple(name for name in alone if name not in (*levels, *populations) and units[name] != "1"),
         states=dynamic,
     )
+
+
+def meetings(equation: sympy.Expr, one: str, other: str) -> sympy.Expr:
+    """The part of an equation in which two states stand together."""
+    terms = sympy.Add.make_args(sympy.expand(equation))
+    both = {symbol(one), symbol(other)}
+    return sympy.Add(*(term for term in terms if both <= term.free_symbols))
+
+
+def trial_points(
+    model: Dynamics, count: int = TRIALS, *, either_sign: bool = False
+) -> tuple[np.ndarray, Signals]:
+    """States and signals at which formulas are compared; any will do that are the same each time.
+
+    Parameters
+    ----------
+    model
+        Its domain is where the states lie.
+    count
+        How many points.
+    either_sign
+        Whether inputs, and states without a domain, are of either sign.
+
+    Returns
+    -------
+    np.ndarray, Signals
+        States of shape ``(d, count)``, and the signals there.
+    """
+    generator = np.random.default_rng(0)
+    known = np.isfinite(model.limits).all(axis=1)
+    lower, upper = np.where(known[:, None], model.limits, ANYWHERE).T
+    x = generator.uniform(lower[:, None], upper[:, None], size=(model.dimension, count))
+    inputs = generator.uniform(*ANYWHERE, size=(len(model.inputs), count))
+    delayed = generator.uniform(*ANYWHERE, size=(len(model.delays), count))
+    if either_sign:
+        x[~known] *= generator.choice([-1.0, 1.0], size=(int((~known).sum()), count))
+        inputs *= generator.choice([-1.0, 1.0], size=inputs.shape)
+    return x, Signals(
+        inputs=inputs,
+        delayed=delayed,
+        slopes=np.zeros_like(delayed),
+        t=generator.uniform(0.0, 1.0, size=count),
+    )
+
+
+def _turns_round(model: Dynamics, name: str) -> bool:
+    """Whether a state stands within a sine or cosine."""
+    return any(
+        symbol(name) in each.free_symbols
+        for formula in (*model.equations, *dict(model.outputs).values())
+        for each in formula.atoms(sympy.sin, sympy.cos)
+    )
+
+
+def _feeds(model: Dynamics, prey: str, predator: str) -> bool:
+    equations = dict(zip(model.states, model.equations, strict=True))
+    lost, won = meetings(equations[prey], prey, predator), meetings(equations[predator], prey, predator)
+    if lost == 0 or won == 0:
+        return False
+    x, signals = trial_points(model)
+    at = (*np.abs(x), *signals.inputs, *signals.delayed, *signals.slopes, signals.t, *model.values)
+    written = [evaluable(each, model) for each in (lost, won)]
+    losses, gains = compile_values(written, arguments_of(model), common=False)(*at)
+    return bool(np.all(np.asarray(losses) <= 0) and np.all(np.asarray(gains) >= 0))
 
 
 def _turns(model: Dynamics, first: int, second: int) -> bool:
     """Whether f commutes with rotations of two states, but for a constant, and itself turns them."""
     if model.units[first] != model.units[second]:
         return False
-    x, signals = _trials(model)
+    x, signals = trial_points(model)
     angle = np.linspace(0.3, 5.9, TRIALS)
     turned = x.copy()
     turned[first] = np.cos(angle) * x[first] - np.sin(angle) * x[second]
@@ -109,7 +202,7 @@ def _turns(model: Dynamics, first: int, second: int) -> bool:
 
 
 def _stays_zero(model: Dynamics, place: int) -> bool:
-    x, signals = _trials(model)
+    x, signals = trial_points(model)
     moving = model.functions.rates(x, signals, model.values)[place]
     x[place] = 0.0
     rate = model.functions.rates(x, signals, model.values)[place]
@@ -122,18 +215,4 @@ def _has_root(equation: sympy.Expr, name: str) -> bool:
     return any(
         power.exp == sympy.Rational(1, 2) and symbol(name) in power.base.free_symbols
         for power in equation.atoms(sympy.Pow)
-    )
-
-
-def _trials(model: Dynamics) -> tuple[np.ndarray, Signals]:
-    """States and signals at which formulas are compared; any will do that are the same each time."""
-    generator = np.random.default_rng(0)
-    lower, upper = np.where(np.isfinite(model.limits), model.limits, ANYWHERE).T
-    x = generator.uniform(lower[:, None], upper[:, None], size=(model.dimension, TRIALS))
-    delays = len(model.delays)
-    return x, Signals(
-        inputs=generator.uniform(0.5, 1.5, size=(len(model.inputs), TRIALS)),
-        delayed=generator.uniform(0.5, 1.5, size=(delays, TRIALS)),
-        slopes=np.zeros((delays, TRIALS)),
-        t=generator.uniform(0.0, 1.0, size=TRIALS),
     )

@@ -7,7 +7,7 @@ noise: where physics is missing the fit had to admit such noise, and the right p
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,6 +21,8 @@ from siq.estimation.measurements import Measurements
 
 LEVELS = (1.0, 0.1, 1e-2, 1e-3, 1e-4, 0.0)
 """Process noise, relative to that of the fit."""
+LARGEST_PORTION = 20_000_000  # numbers that are worked out at once; with copies about a gigabyte
+LEAST_PORTION = 10  # columns
 COLLINEAR = 0.02  # share of a column left beside the parameters, below which its amplitude knows no bounds
 
 
@@ -45,6 +47,19 @@ class Screened:
     amplitudes: np.ndarray
     standard_errors: np.ndarray
     finite: bool = True
+
+
+def in_portions(widths: Sequence[int], model: Dynamics, data: Measurements) -> Iterator[slice]:
+    """Groups of columns, by their widths, divided so that the response to a portion fits into the memory."""
+    most = max(LARGEST_PORTION // (len(data.t) * (model.dimension + len(model.outputs))), LEAST_PORTION)
+    first, columns = 0, 0
+    for place, width in enumerate(widths):
+        if columns and columns + width > most:
+            yield slice(first, place)
+            first, columns = place, 0
+        columns += width
+    if columns:
+        yield slice(first, len(widths))
 
 
 def probe_response(model: Dynamics, grid: Grid, fit: Fit, columns: Columns) -> Linearisation:

@@ -16,10 +16,12 @@ import sympy
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.parametric import symbol
 from siq.errors import NumericalFailure
+from siq.estimation.budget import Budget
 from siq.estimation.estimation import Fit
 from siq.estimation.measurements import Measurements
+from siq.estimation.process_noise import fit_with_process_noise_as_needed
 from siq.mismatch.candidates import MechanismCandidate
-from siq.mismatch.clusters import clustered_probability
+from siq.mismatch.clusters import clustered_probability, probability_by_chance
 from siq.mismatch.probes import Probe
 from siq.mismatch.roles import roles_of
 from siq.mismatch.screening import Screened
@@ -29,7 +31,6 @@ from siq.mismatch.trials import (
     TriedMechanism,
     UntriedMechanism,
     fit_most_promising,
-    overflowing,
     screen_all,
 )
 
@@ -95,10 +96,13 @@ def search(
     candidates: Sequence[MechanismCandidate],
     *,
     options: SearchOptions,
+    budget: Budget | None = None,
 ) -> Search:
-    """Look for mechanisms, one after the other."""
+    """Look for mechanisms, one after the other, until nothing is found or the budget is spent."""
     begin = Search(recalibrated, (), recalibrated, ())
-    return _extended(begin, model, data, candidates, options=options, on_trial=True)
+    return _extended(
+        begin, model, data, candidates, options=options, budget=budget or Budget(), on_trial=True
+    )
 
 
 def _extended(
@@ -108,6 +112,7 @@ def _extended(
     candidates: Sequence[MechanismCandidate],
     *,
     options: SearchOptions,
+    budget: Budget,
     on_trial: bool,
 ) -> Search:
     """A search carried on until nothing more is found.
@@ -119,23 +124,26 @@ def _extended(
     while True:
         found, current = progress.found, progress.fit
         base = current.model
-        if found and (len(found) == options.mechanisms or not _something_left(base, data, current)):
+        if found and (len(found) == options.mechanisms or not something_left(current, data)):
             return progress
         if base.dimension > model.dimension:
             return progress  # nothing is sought on top of a mechanism that has states of its own
+        if found and budget.stopped_by is not None:
+            return progress
         labels = [each.best.candidate.label for each in found]
         remaining = [
             rebased
             for each in candidates
-            if each.label not in labels
+            if not any(_once_more(each, other.best.candidate) for other in found)
             and (rebased := _rebased(each, model, base) if found else each) is not None
         ]
-        screened = screen_all(base, data, current, remaining)
+        screened, unscreened = screen_all(base, data, current, remaining, budget=budget)
         trials, failed = fit_most_promising(
             data, current, base, screened,
             most=options.fitted, least_gain=options.same, blocks=options.blocks,
+            budget=budget,
         )  # fmt: skip
-        untried = _together(progress.untried, (*overflowing(screened), *failed), trials)
+        untried = _together(progress.untried, (*unscreened, *failed), trials)
         progress = replace(progress, screened=tuple(screened), untried=untried, screened_beside=tuple(labels))
         for trial in trials:
             LOGGER.info(
@@ -153,8 +161,9 @@ def _extended(
         ):
             LOGGER.info("%s is on trial", best.best.candidate.label)
             further = _extended(
-                _with(progress, best), model, data, candidates, options=options, on_trial=False
-            )
+                _with(progress, best), model, data, candidates,
+                options=options, budget=budget, on_trial=False,
+            )  # fmt: skip
             together = tried_together(further, progress, data, chance=chance, options=options)
             if together is not None:
                 return together
@@ -163,6 +172,17 @@ def _extended(
             return progress
         LOGGER.info("found %s, chi2 better by %.1f", stands.best.candidate.label, stands.best.delta_chi2)
         progress = _with(progress, stands)
+
+
+def _once_more(candidate: MechanismCandidate, found: MechanismCandidate) -> bool:
+    """Whether a candidate is what was found already: the same, or in another form at the same place.
+
+    A second threshold beside the first, or a second spring in the same place, is no further physics.
+    """
+    same_place = candidate.coordinate == found.coordinate and set(candidate.equations) & set(found.equations)
+    return candidate.label == found.label or (
+        candidate.name == found.name and candidate.coordinate in found.model.states and bool(same_place)
+    )
 
 
 def _together(
@@ -204,7 +224,7 @@ def tried_together(
     if len(progress.found) < place + 2:
         return None
     on_trial = progress.found[place]
-    p_cluster = clustered_probability(progress.fit, data, on_trial.best.candidate, blocks=options.blocks)
+    p_cluster = _probability_in_place(progress.fit, data, on_trial.best.candidate, options=options)
     LOGGER.info("%s on trial: p %.1e clustered", on_trial.best.candidate.label, p_cluster)
     if p_cluster >= chance:
         return None
@@ -212,8 +232,28 @@ def tried_together(
     return replace(progress, found=(*progress.found[:place], stands, *progress.found[place + 1 :]))
 
 
-def _something_left(model: Dynamics, data: Measurements, current: Fit) -> bool:
-    """Whether it is worth looking for another mechanism."""
+def _probability_in_place(
+    fit: Fit, data: Measurements, candidate: MechanismCandidate, *, options: SearchOptions
+) -> float:
+    """Probability of a mechanism by chance beside those that were found after it."""
+    names = [each.name for each in fit.model.parameters]
+    if not candidate.amplitudes or not set(candidate.new) <= set(names):
+        return clustered_probability(fit, data, candidate, blocks=options.blocks)
+    absent = tuple(
+        replace(each, value=0.0 if each.name in candidate.amplitudes else each.value, fixed=True)
+        if each.name in candidate.new
+        else each
+        for each in fit.model.parameters
+    )
+    without = fit_with_process_noise_as_needed(replace(fit.model, parameters=absent), data, fit)
+    if not without.converged:
+        return clustered_probability(fit, data, candidate, blocks=options.blocks)
+    return probability_by_chance(fit, without, data, candidate, blocks=options.blocks)
+
+
+def something_left(current: Fit, data: Measurements) -> bool:
+    """Whether it is worth looking for something on top of a fit."""
+    model = current.model
     if current.has_process_noise:
         return True
     try:

@@ -10,14 +10,20 @@ from collections.abc import Mapping, Sequence
 from siq.mismatch.candidates import GENERIC, PROCESS_NOISE
 from siq.mismatch.held_out import HeldOutErrors
 from siq.mismatch.investigation import MismatchVerdict
-from siq.mismatch.statement import Description, Recalibrated, Rival, StatedMechanism, Statement
+from siq.mismatch.statement import (
+    Description,
+    Recalibrated,
+    Rival,
+    StatedFunction,
+    StatedMechanism,
+    Statement,
+)
 from siq.numerics.measured_text import value_text
 from siq.numerics.number_text import LARGEST_PLAIN_NUMBER, number_text
 from siq.numerics.share_text import SMALLEST_SHARE, p_equation, p_text, percent
 
 NOTICED = 1.96  # standard errors beyond which a parameter counts as changed
 LISTED = 2  # names in a sentence, before the rest is counted
-MOSTLY = 0.99  # share of the difference that is nearly all; siq.mismatch.investigation.MOSTLY
 LOOKS_RANDOM = 2e-3  # the p-value below which a name is refused; siq.mismatch.remainder.DOUBTFUL
 COUNTABLE = {"bias", "coupling", "delay", "drift", "drive", "offset"}  # last words that take an article
 
@@ -42,7 +48,7 @@ def sentence_of(statement: Statement, units: Mapping[str, str]) -> str:
             f"The simulation's equations explain the recordings, but with other parameters: {said}. {gain}"
         ).strip()
     if statement.verdict is MismatchVerdict.UNEXPLAINED:
-        return f"{_unexplained(statement)} {_error_stays(errors)}".strip()
+        return f"{_unexplained(statement)} {_described(statement)}".strip()
     if statement.random_forces:
         return f"{_random_forces(statement.mechanisms[0])} {_not_foreseen(errors)}".strip()
     what = " and ".join(named(each) for each in statement.mechanisms)
@@ -148,11 +154,13 @@ def left_over(description: Description) -> tuple[str, ...]:
     lines = []
     if description.by and description.too_faint:
         lines.append(
-            "It is not named, since an effect as faint as this one could as well be one that the dictionary"
-            " does not have."
+            "It is not named, since a smooth function that the dictionary does not have is nearly as likely."
         )
-    elif description.by and description.share_described > MOSTLY:
-        lines.append("It is not named, since something else could look the same.")
+    elif description.by and description.p_alike is not None:
+        lines.append(
+            "It is not named: of effects that have no name, mechanisms explain as much with a probability of"
+            f" {p_text(description.p_alike)}."
+        )
     elif description.by:
         lines.append("It is not named: what explains only a part may be standing in for something else.")
     if p >= LOOKS_RANDOM:
@@ -274,6 +282,34 @@ def _error_stays(errors: HeldOutErrors) -> str:
     )
 
 
+def _described(statement: Statement) -> str:
+    """What the model of something without a name does to the held-out error, or that nothing was gained."""
+    errors = statement.errors
+    if errors.noise_floor is None or statement.description is None:
+        return _error_stays(errors)
+    if not statement.described:
+        return (
+            "Neither a mechanism nor a function of its coordinates improves the prediction of recordings"
+            f" held out, so that the simulation stays as it was. {_error_stays(errors)}"
+        ).strip()
+    known = [each for each in (errors.before, errors.recalibrated) if each is not None]
+    gain = gained(errors, min(known, default=None), errors.augmented, it="With it", them="it")
+    named = {each.label for each in statement.description.by}
+    if all(each.label in named for each in statement.described):
+        return gain
+    what = " and ".join(described_part(each) for each in statement.described)
+    many = len(statement.described) > 1
+    return f"{_capital(what)} {'describe' if many else 'describes'} it. {gain}".strip()
+
+
+def described_part(part: StatedFunction) -> str:
+    """A part of the model of what has no name, with its place: ``a function of x in the equation of v``."""
+    if part.equations:
+        many = "s" if len(part.equations) > 1 else ""
+        return f"{part.name} in the equation{many} of {_listed(list(part.equations), 'and')}"
+    return f"{part.name} in the measurement of {_listed(list(part.outputs), 'and')}"
+
+
 def _not_foreseen(errors: HeldOutErrors) -> str:
     if errors.noise_floor is None or errors.recalibrated is None:
         return ""
@@ -304,7 +340,7 @@ def _unexplained(statement: Statement) -> str:
     what += _or_else(description.by[0]) if len(description.by) == 1 else ""
     share = percent(description.share_described)
     if description.too_faint:
-        return f"{begin}. It looks like {what}, but is too faint to be named."
+        return f"{begin}. It looks like {what}, which is not certain enough to be named."
     if description.share_described > 1 - SMALLEST_SHARE:
         return (
             f"{begin}. {_capital(what)} would account for {share} of it, but not convincingly enough to be"

@@ -8,10 +8,12 @@ from typing import Any, Literal
 
 import numpy as np
 
+from siq.estimation.budget import UNLIMITED, Account
 from siq.mismatch.candidates import PROCESS_NOISE
 from siq.mismatch.held_out import HeldOutErrors
 from siq.mismatch.investigation import MismatchVerdict
 from siq.mismatch.location import Location
+from siq.mismatch.trials import BUDGET_SPENT
 
 METRIC = "normalised rms, held-out recordings"
 UNKNOWN_ERRORS = HeldOutErrors(None, None, None, None)
@@ -37,12 +39,15 @@ class Evidence:
     p_white, p_cluster
         Probabilities of as much by chance: if all errors are independent, and whatever errors within a
         recording have to do with each other.
+    log_odds
+        Logarithm of the odds that it is this mechanism, rather than a function without a name.
     """
 
     delta_chi2: float | None
     delta_bic: float | None
     p_white: float | None
     p_cluster: float | None
+    log_odds: float | None = None
 
 
 Standing = Literal["same", "needless", "less"]
@@ -111,6 +116,57 @@ class StatedMechanism:
 
 
 @dataclass(frozen=True)
+class DescribedCurve:
+    """A function of one coordinate with its band.
+
+    Attributes
+    ----------
+    coordinate
+        Of which it is a function.
+    at, value, standard_error
+        In the units of the card; each as long.
+    """
+
+    coordinate: str
+    at: tuple[float, ...]
+    value: tuple[float, ...]
+    standard_error: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class StatedFunction:
+    """A part of the model of what has no name.
+
+    Attributes
+    ----------
+    name, label, terms, parameters, evidence, equations, beside
+        As of `StatedMechanism`.
+    kind
+        ``formula``: a sum of a few powers. ``spline``: a smooth curve through values. ``mechanism``: one of
+        the dictionary that is not certain enough for its name.
+    outputs
+        What is measured otherwise, for a fault of the sensor.
+    coordinates
+        What it depends on.
+    curve
+        Where it is a function of one coordinate, or a spline; a spline in two coordinates is the
+        coefficient of the second.
+    """
+
+    name: str
+    label: str
+    kind: Literal["formula", "spline", "mechanism"]
+    terms: Mapping[str, str]
+    parameters: Mapping[str, Estimate]
+    evidence: Evidence
+    equations: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
+    coordinates: tuple[str, ...] = ()
+    curve: DescribedCurve | None = None
+    beside: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class Description:
     """What is known of a mismatch that has no name.
 
@@ -125,7 +181,11 @@ class Description:
     random_forces_admitted
         Whether the fit needed random forces.
     too_faint
-        Whether the mechanisms in `by` leave nothing, and are not named since they gain too little.
+        Whether the mechanisms in `by` explain enough, and are not named since a function without a name is
+        nearly as likely.
+    p_alike
+        Probability that as many mechanisms explain as much of an effect that has no name; None where nothing
+        is left.
     """
 
     share_described: float
@@ -133,6 +193,7 @@ class Description:
     p_residuals_random: float
     random_forces_admitted: bool
     too_faint: bool = False
+    p_alike: float | None = None
 
 
 @dataclass(frozen=True)
@@ -164,6 +225,23 @@ class NotFitted:
 
 
 @dataclass(frozen=True)
+class Explanation:
+    """A whole explanation of the recordings, and how likely it makes them.
+
+    Attributes
+    ----------
+    what
+        What it consists of.
+    log_evidence
+        Logarithm of its marginal likelihood, less that of the likeliest; see
+        `siq.mismatch.evidence.log_evidence_of`.
+    """
+
+    what: str
+    log_evidence: float
+
+
+@dataclass(frozen=True)
 class Statement:
     """All that a diagnosis states.
 
@@ -177,6 +255,8 @@ class Statement:
         What is named.
     description
         Of a mismatch without a name.
+    described
+        The model of it that is part of the new card; empty where nothing that was added helped.
     location
         Where the mismatch sits, if there is one.
     recalibration
@@ -191,12 +271,17 @@ class Statement:
         What could not be judged.
     words
         Further sentences by what they are about; see `siq.mismatch.sentences.words_of`.
+    explanations
+        Whole explanations that were compared, the likeliest first.
+    account
+        The work that it took, and whether something was left undone.
     """
 
     verdict: MismatchVerdict
     sentence: str
     mechanisms: tuple[StatedMechanism, ...] = ()
     description: Description | None = None
+    described: tuple[StatedFunction, ...] = ()
     location: Location | None = None
     recalibration: Mapping[str, Recalibrated] | None = None
     errors: HeldOutErrors = UNKNOWN_ERRORS
@@ -204,6 +289,18 @@ class Statement:
     remarks: tuple[str, ...] = ()
     not_fitted: tuple[NotFitted, ...] = ()
     words: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    explanations: tuple[Explanation, ...] = ()
+    account: Account = UNLIMITED
+
+    @property
+    def partial(self) -> bool:
+        """Whether the budget was spent before all was tried."""
+        return self.account.partial
+
+    @property
+    def not_tried(self) -> tuple[str, ...]:
+        """Labels of the mechanisms that the budget did not reach."""
+        return tuple(each.label for each in self.not_fitted if each.reason == BUDGET_SPENT)
 
     @property
     def random_forces(self) -> bool:
@@ -219,12 +316,17 @@ class Statement:
             "description": None
             if self.description is None
             else asdict(self.description) | {"by": [_mechanism_data(each) for each in self.description.by]},
+            "described": [asdict(each) for each in self.described],
             "location": None if self.location is None else self.location.as_data(),
             "recalibration": {name: asdict(each) for name, each in (self.recalibration or {}).items()},
             "fit": {"metric": METRIC, **asdict(self.errors)},
             "excluded": {label: asdict(each) for label, each in (self.excluded or {}).items()},
             "remarks": list(self.remarks),
             "not_fitted": [asdict(each) for each in self.not_fitted],
+            "explanations": [asdict(each) for each in self.explanations],
+            "partial": self.partial,
+            "not_tried": list(self.not_tried),
+            "budget": asdict(self.account),
             "words": {about: list(lines) for about, lines in self.words.items()},
         }
         plain: dict[str, Any] = _plain(data)

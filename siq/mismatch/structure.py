@@ -14,11 +14,11 @@ import scipy.stats
 
 from siq.dynamics.dynamics import Dynamics
 from siq.estimation.estimation import Fit
-from siq.estimation.innovations import Noise, solve, whiten
+from siq.estimation.innovations import Noise, Whitened, solve, whiten
 from siq.estimation.linearisation import Grid
 from siq.estimation.measurements import Measurements
 from siq.mismatch.roles import Roles
-from siq.mismatch.screening import probe_response, projected
+from siq.mismatch.screening import in_portions, probe_response, projected
 
 KNOTS = 9  # of the functions that are tried: a choice
 SUBSTEPS = 2  # between samples, for the response to these functions
@@ -190,25 +190,31 @@ def structure_of(
     """
     directions = directions_of(model, roles, data, fit.x)
     grid = Grid(data, min(fit.substeps, SUBSTEPS))
-    response = probe_response(model, grid, fit, HatColumns(model, grid, directions))
     noise = fit.noise if noise is None else noise
-    white = whiten(response, data, noise)
     parameters = len(fit.model.free)
-    left, columns = projected(white, parameters)
+
+    def projected_with(some: tuple[Direction, ...]) -> tuple[Whitened, np.ndarray, np.ndarray]:
+        white = whiten(probe_response(model, grid, fit, HatColumns(model, grid, some)), data, noise)
+        return white, *projected(white, parameters)
+
+    white, left, _ = projected_with(())
     freedom = white.degrees_of_freedom - parameters
     total = float(left @ left)
     # Below its measurement noise a fit has no scale of its own; above it errors are as large as they are.
     scale = 1.0 if noise.process.any() or not fit.has_process_noise else max(total / freedom, 1.0)
-    curves, place = [], 0
-    for direction in directions:
-        own = columns[:, place : place + len(direction.knots)]
-        place += len(direction.knots)
-        values, covariance = solve(own, left)
-        gain = total - float(((left - own @ values) ** 2).sum())
-        rank = int((np.linalg.svd(own, compute_uv=False) > 1e-9 * max(np.abs(own).max(), 1e-300)).sum())
-        p_value = float(scipy.stats.chi2.sf(max(gain, 0.0) / scale, max(rank, 1)))
-        errors = np.sqrt(np.diag(covariance) * scale)
-        curves.append(Curve(direction, values, errors, gain, p_value))
+    curves = []
+    for portion in in_portions([len(each.knots) for each in directions], model, data):
+        _, left, columns = projected_with(directions[portion])
+        place = 0
+        for direction in directions[portion]:
+            own = columns[:, place : place + len(direction.knots)]
+            place += len(direction.knots)
+            values, covariance = solve(own, left)
+            gain = total - float(((left - own @ values) ** 2).sum())
+            rank = int((np.linalg.svd(own, compute_uv=False) > 1e-9 * max(np.abs(own).max(), 1e-300)).sum())
+            p_value = float(scipy.stats.chi2.sf(max(gain, 0.0) / scale, max(rank, 1)))
+            errors = np.sqrt(np.diag(covariance) * scale)
+            curves.append(Curve(direction, values, errors, gain, p_value))
     curves.sort(key=lambda each: -each.gain)
     best = min((each.p_value for each in curves), default=1.0)
     return Structure(

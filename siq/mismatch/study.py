@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from siq.data.recordings import Recordings, read_recordings
 from siq.dynamics.dynamics import Dynamics
 from siq.errors import InputError
+from siq.estimation.budget import DEFAULT_SECONDS, DEFAULT_WORK
 from siq.estimation.measurements import Measurements, columns_of, measurements
 from siq.files.documents import read_document, validate
 from siq.mismatch.dictionary import Mechanism
@@ -22,6 +23,24 @@ if TYPE_CHECKING:
     import pandas as pd
 
 FEWEST = 8  # samples of a recording that something can be learned from
+
+
+class Allowance(BaseModel):
+    """How much work a case may take.
+
+    Attributes
+    ----------
+    evaluations
+        Of the likelihood for one sample, one state and one column of derivatives
+        (`siq.estimation.budget`). The default takes about five minutes of a core.
+    seconds
+        By the clock, a safety net for machines on which that takes far longer.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    evaluations: Annotated[float, Field(gt=0)] = DEFAULT_WORK
+    seconds: Annotated[float, Field(gt=0)] = DEFAULT_SECONDS
 
 
 class MismatchStudy(BaseModel):
@@ -51,6 +70,8 @@ class MismatchStudy(BaseModel):
         Highest degree of these monomials.
     search
         What counts as found.
+    budget
+        How much work the search may take before the best answer so far is given.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -65,6 +86,7 @@ class MismatchStudy(BaseModel):
     generic: bool | None = None
     degree: Annotated[int, Field(ge=1, le=5)] = 3
     search: SearchOptions = SearchOptions()
+    budget: Allowance = Allowance()
 
 
 def load_mismatch_study(path: str | Path) -> MismatchStudy:

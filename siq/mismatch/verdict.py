@@ -9,17 +9,20 @@ import numpy as np
 from siq.estimation.estimation import Fit
 from siq.estimation.measurements import Measurements
 from siq.mismatch.candidates import PROCESS_NOISE
+from siq.mismatch.evidence import log_evidence_of
 from siq.mismatch.held_out import HeldOutRuns
 from siq.mismatch.investigation import Investigation, MismatchVerdict
 from siq.mismatch.location import locate
 from siq.mismatch.search import Found
 from siq.mismatch.sentences import sentence_of, words_of
+from siq.mismatch.stated_functions import stated_functions
 from siq.mismatch.statement import (
     METRIC,
     UNKNOWN_ERRORS,
     Description,
     Estimate,
     Evidence,
+    Explanation,
     NotFitted,
     Recalibrated,
     Rival,
@@ -28,7 +31,7 @@ from siq.mismatch.statement import (
     Statement,
     UpperBound,
 )
-from siq.mismatch.trials import TriedMechanism
+from siq.mismatch.trials import BUDGET_SPENT, TriedMechanism
 from siq.mismatch.units import unit_of
 
 __all__ = [
@@ -44,6 +47,9 @@ __all__ = [
     "statement_of_failure",
 ]
 
+NOT_INDEPENDENT = (
+    "There is one recording only. What is held out is its later part, which is no independent recording."
+)
 BOUND = 1.96  # standard errors on either side of an estimate within which 95 % lie
 
 
@@ -79,18 +85,40 @@ def statement_of(investigation: Investigation, data: Measurements, shown: HeldOu
         sentence="",
         mechanisms=mechanisms_of(investigation),
         description=description_of(investigation),
+        described=stated_functions(shown),
         location=locate(investigation, data),
-        recalibration=recalibration_of(investigation),
+        recalibration=recalibration_of(investigation, shown),
         errors=shown.errors,
         excluded={} if investigation.verdict.mismatch else excluded(investigation),
-        remarks=investigation.remarks,
+        explanations=explanations_of(investigation, data),
+        remarks=(
+            *investigation.remarks,
+            *left_undone(investigation),
+            *(() if shown.independent else (NOT_INDEPENDENT,)),
+        ),
         not_fitted=tuple(
             NotFitted(each.candidate.name, each.candidate.label, each.reason)
             for each in investigation.search.untried
         ),
+        account=investigation.account,
     )
     units = {entry.name: entry.unit for entry in investigation.model.parameters}
     return replace(stated, sentence=sentence_of(stated, units), words=words_of(stated))
+
+
+def left_undone(investigation: Investigation) -> tuple[str, ...]:
+    """The sentence that says that an answer is partial, where it is."""
+    if not investigation.account.partial:
+        return ()
+    left = sum(each.reason == BUDGET_SPENT for each in investigation.search.untried)
+    what = f"{left} candidates were not tried" if left > 1 else "one candidate was not tried"
+    if not left:
+        what = "further mechanisms were not looked for"
+    which = "work" if investigation.account.stopped_by == "work" else "time"
+    return (
+        f"This answer is partial: the {which} allowed for the case was spent, and {what}."
+        " A larger budget in the study tries the rest.",
+    )
 
 
 def mechanisms_of(investigation: Investigation) -> tuple[StatedMechanism, ...]:
@@ -110,6 +138,26 @@ def mechanisms_of(investigation: Investigation) -> tuple[StatedMechanism, ...]:
     )
 
 
+def explanations_of(investigation: Investigation, data: Measurements) -> tuple[Explanation, ...]:
+    """Whole explanations with their evidence: parameters, with forces, with mechanisms, with functions."""
+    search = investigation.search
+    fits = [("other parameters", investigation.least_squares), ("other parameters", search.recalibrated)]
+    if search.found:
+        fits.append((" and ".join(each.best.candidate.label for each in search.found), search.fit))
+    fits += [
+        (" and ".join(part.trial.candidate.label for part in model.parts), model.fit)
+        for model in investigation.models
+    ]
+    found: dict[str, float] = {}
+    for what, fit in fits:
+        if np.isfinite(fit.log_likelihood):
+            forces = " and random forces" if fit.has_process_noise else ""
+            found[f"{what}{forces}"] = log_evidence_of(fit, data)
+    best = max(found.values(), default=0.0)
+    ranked = sorted(found.items(), key=lambda each: -each[1])
+    return tuple(Explanation(what, value - best) for what, value in ranked)
+
+
 def description_of(investigation: Investigation) -> Description | None:
     """What is known of a mismatch that has no name."""
     if investigation.verdict is not MismatchVerdict.UNEXPLAINED:
@@ -122,12 +170,15 @@ def description_of(investigation: Investigation) -> Description | None:
         p_residuals_random=investigation.after.p_value,
         random_forces_admitted=search.fit.has_process_noise,
         too_faint=investigation.too_faint,
+        p_alike=None if investigation.naming is None else investigation.naming.p_alike,
     )
 
 
-def recalibration_of(investigation: Investigation) -> dict[str, Recalibrated]:
+def recalibration_of(investigation: Investigation, shown: HeldOutRuns) -> dict[str, Recalibrated]:
     """The simulation's own parameters: on the card, and in the simulation that the verdict ends with."""
     fit = investigation.final
+    if shown.described_fit is not None and shown.gained:
+        fit = shown.described_fit
     errors = standard_errors(fit)
     return {
         entry.name: Recalibrated(entry.value, float(fit.model.values[place]), errors[entry.name])
@@ -162,13 +213,16 @@ def _all_stated(investigation: Investigation) -> tuple[StatedMechanism, ...]:
     """Every mechanism that was found, whether it is named or only describes."""
     search = investigation.search
     labels = [each.best.candidate.label for each in search.found]
+    log_odds = investigation.naming.log_odds if investigation.naming is not None else ()
     return tuple(
-        _stated(each, search.fit, investigation.share, tuple(labels[:place]))
-        for place, each in enumerate(search.found)
+        _stated(each, search.fit, investigation.share, tuple(labels[:place]), odds)
+        for place, (each, odds) in enumerate(zip(search.found, log_odds, strict=True))
     )
 
 
-def _stated(found: Found, final: Fit, share: float, beside: tuple[str, ...]) -> StatedMechanism:
+def _stated(
+    found: Found, final: Fit, share: float, beside: tuple[str, ...], log_odds: float
+) -> StatedMechanism:
     trial, candidate = found.best, found.best.candidate
     standings: tuple[tuple[Standing, tuple[TriedMechanism, ...]], ...] = (
         ("same", found.indistinguishable),
@@ -197,7 +251,7 @@ def _stated(found: Found, final: Fit, share: float, beside: tuple[str, ...]) -> 
             for name in candidate.new
             if name in known
         },
-        evidence=Evidence(trial.delta_chi2, trial.delta_bic, trial.p_white, trial.p_cluster),
+        evidence=Evidence(trial.delta_chi2, trial.delta_bic, trial.p_white, trial.p_cluster, log_odds),
         share_of_excess=share,
         equations=candidate.equations,
         beside=beside,

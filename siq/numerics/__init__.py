@@ -5,6 +5,7 @@
 `machine_code`        how does a loop become machine code?
 `randomness`          where do the random numbers of a study come from?
 `thinning`            which points represent a region evenly?
+`triangle`            what do all least-squares fits to very many rows depend on?
 `density_comparison`  how far are samples from a density on a plane of two states?
 `number_text`         how is a number written for a reader?
 `measured_text`       and a measured value, with its error and its unit?

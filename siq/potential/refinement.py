@@ -24,6 +24,7 @@ from siq.dynamics.phase_portrait import PhasePortrait
 from siq.errors import NumericalFailure
 from siq.identify.identified_field import IdentifiedField
 from siq.identify.library import CandidateLibrary, joint_library, total_degree
+from siq.identify.rival_terms import RivalTerms
 from siq.potential.bases import affordable_degree
 from siq.potential.global_route import (
     GlobalPotential,
@@ -300,12 +301,14 @@ def over_library(found: IdentifiedField, library: CandidateLibrary) -> Identifie
         place = position[found.library.terms[term]]
         support[row] = component, place
         coefficients[place, component] = found.coefficients[term, component]
-    doubts = found.doubts
-    if doubts is not None:
+    rivals = found.rivals
+    if rivals is not None:
         places = [position[term] for term in found.library.terms]
-        doubts = np.zeros((len(doubts), library.size, library.dimension))
-        doubts[:, places] = found.doubts
-    return replace(found, library=library, coefficients=coefficients, support=support, doubts=doubts)
+        mean = np.zeros_like(coefficients)
+        spread = np.zeros((len(rivals.spread), *coefficients.shape))
+        mean[places], spread[:, places] = rivals.mean_change, rivals.spread
+        rivals = RivalTerms(mean, spread)
+    return replace(found, library=library, coefficients=coefficients, support=support, rivals=rivals)
 
 
 def local_wells(

@@ -1,12 +1,13 @@
-"""How far does the uncertainty of f carry V off, at every state?
+"""How far does the uncertainty of f, and of D, carry V off, at every state?
 
-A change δf of f changes V, to first order, by
+Changes δf of f and δD of D change V, to first order, by
 
-    δV(x) = -∫ p·δf dt,    p = ∇V,
+    δV(x) = -∫ (p·δf + p·δD p) dt,    p = ∇V,
 
 along the path ``dx/dt = f + 2D∇V`` that ends at x. It is a characteristic of the Hamilton–Jacobi equation,
 along which the action is stationary, so that the path itself need not be changed. V is zero at the attractor,
-wherever f moves that to. The integral is linear in the coefficients of f; their covariance does the rest.
+wherever f moves that to. The integral is linear in the coefficients of f and of D; their covariance does the
+rest.
 """
 
 from __future__ import annotations
@@ -32,12 +33,12 @@ def potential_errors(
     attractor: np.ndarray,
     x: np.ndarray,
 ) -> np.ndarray:
-    """Standard errors of ``V(x) - V(attractor)``, from what is not known of f.
+    """Standard errors of ``V(x) - V(attractor)``, from what is not known of f, and of a D that was estimated.
 
     Parameters
     ----------
     found
-        f with the covariance of its coefficients, and its doubts about which terms there are.
+        f with the covariance of its coefficients, and its doubts about which terms there are; D likewise.
     gradient
         ∇V, points ``(n, d)`` to ``(n, d)``.
     attractor
@@ -52,7 +53,8 @@ def potential_errors(
     """
     if found.noise_free or not len(x):
         return np.zeros(len(x))
-    return np.asarray(np.sqrt(found.variance(potential_slopes(found, gradient, attractor, x))))
+    of_field, of_noise = potential_slopes(found, gradient, attractor, x)
+    return np.asarray(np.sqrt(found.variance(of_field) + found.noise_variance(of_noise)))
 
 
 def potential_slopes(
@@ -60,8 +62,10 @@ def potential_slopes(
     gradient: Callable[[np.ndarray], np.ndarray],
     attractor: np.ndarray,
     x: np.ndarray,
-) -> np.ndarray:
-    """∂V/∂Ξ at points, by every coefficient that f might have: shape ``(n, q, d)``; NaN as above.
+) -> tuple[np.ndarray, np.ndarray]:
+    """∂V/∂Ξ at points, by every coefficient that f might have, and ∂V/∂θ by those of an estimated εD.
+
+    Shapes ``(n, q, d)`` and ``(n, k)``; NaN as above.
 
     Parameters
     ----------
@@ -83,12 +87,15 @@ def potential_slopes(
     steps = int(np.clip(duration * fastest / STEP, FEWEST_STEPS, MOST_STEPS))
     step = duration / steps
 
+    q, d = found.library.size, found.library.dimension
+
     def back(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         slope = gradient(points)
         velocity = -(dynamics.drift(points) + 2 * dynamics.diffusion.push(points, slope))
-        return velocity, np.einsum("nq,nd->nqd", found.library.evaluate(points), slope)
+        of_field = np.einsum("nq,nd->nqd", found.library.evaluate(points), slope).reshape(len(points), -1)
+        return velocity, np.column_stack([of_field, found.noise_slopes(points, slope)])
 
-    total = np.zeros((len(x), found.library.size, found.library.dimension))
+    total = np.zeros((len(x), 1))
     lost = np.zeros(len(x), dtype=bool)
     with np.errstate(over="ignore", invalid="ignore"):
         velocity, integrand = back(x)
@@ -97,11 +104,11 @@ def potential_slopes(
             lost |= ~(np.abs(moved - middle) < FAR * width).all(axis=1)
             x = np.where(lost[:, None], x, moved)
             velocity, following = back(x)
-            total -= step / 2 * (integrand + following)
+            total = total - step / 2 * (integrand + following)
             integrand = following
     lost |= ~(np.abs(x - attractor) < ARRIVED * width).all(axis=1)
-    total[lost] = np.nan
-    return total
+    total = np.where(lost[:, None], np.nan, total)
+    return total[:, : q * d].reshape(-1, q, d), total[:, q * d :]
 
 
 def relative_error(

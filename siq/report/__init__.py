@@ -28,10 +28,12 @@
 `invariant_tables`       what does it say of the invariant distribution?
 `reproduction_page`      what does the page say that lists a publication's results beside ours?
 `mismatch_page`          what does the page of a diagnosis say?
+`largest_difference`     where do a simulation and held-out recordings differ most?
 `mismatch_first_screen`  and what does it open with?
 `mismatch_sections`      which sections has it?
 `mismatch_findings`      what is it made from?
 `mismatch_answer`        and what does a terminal print at its end?
+`official_tests`         and what do official tests of benchmarks say, in one table?
 `plots`                  the figures themselves
 =======================  ======================================================================
 

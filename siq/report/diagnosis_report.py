@@ -5,7 +5,7 @@ from __future__ import annotations
 from html import escape
 
 from siq.dynamics.dynamics import Dynamics
-from siq.mismatch.statement import METRIC, Estimate, StatedMechanism, Statement
+from siq.mismatch.statement import METRIC, Estimate, StatedFunction, StatedMechanism, Statement
 from siq.numerics.measured_text import value_text
 from siq.numerics.share_text import p_text
 
@@ -41,11 +41,12 @@ def diagnosis_html(statement: Statement, system: Dynamics) -> str:
 
 def _sections(statement: Statement, system: Dynamics) -> list[Section]:
     """Every section that has something to say."""
-    described = () if statement.description is None else statement.description.by
+    closest = () if statement.description is None else statement.description.by
     found = [
         (f"Verdict: {statement.verdict}", [statement.sentence, *statement.remarks]),
         ("Mechanisms", [line for each in statement.mechanisms for line in _mechanism(each)]),
-        ("What comes closest", [line for each in described for line in _mechanism(each)]),
+        ("What comes closest", [line for each in closest for line in _mechanism(each)]),
+        ("A model of it", [line for each in statement.described for line in _mechanism(each)]),
         ("How sure it is", [line for lines in statement.words.values() for line in lines]),
         ("Location", _location(statement)),
         ("Parameters", _parameters(statement, system)),
@@ -64,7 +65,7 @@ def with_error(entry: Estimate) -> str:
     return f"{text} ({100 * entry.standard_error / abs(entry.estimate):.2g} %)"
 
 
-def _mechanism(mechanism: StatedMechanism) -> list[str]:
+def _mechanism(mechanism: StatedMechanism | StatedFunction) -> list[str]:
     lines = [mechanism.label]
     lines += [f"  {name}: {formula}" for name, formula in mechanism.terms.items()]
     lines += [f"  {name} = {with_error(entry)}" for name, entry in mechanism.parameters.items()]

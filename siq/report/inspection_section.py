@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from siq.data.inspection import Inspection, inspection_of
+from siq.data.inspection import inspection_of
+from siq.data.record_states import RecordStates
 from siq.data.recordings import Recordings
 from siq.data.selection import joined
 from siq.report.page import ReportFigure, ReportSection
@@ -34,40 +35,18 @@ def inspection_drawn(recordings: Recordings, *, folder: Path) -> dict[str, Figur
     found = inspection_of(joined(recordings))
     (folder / FILE).write_text(json.dumps(found.lines(), ensure_ascii=False) + "\n", encoding="utf-8")
     (folder / SEEN).write_text(
-        json.dumps(seen_data(found), ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8"
+        json.dumps(None if found.seen is None else found.seen.as_data(), ensure_ascii=False, allow_nan=False)
+        + "\n",
+        encoding="utf-8",
     )
     return inspection_figures(found)
 
 
-def seen_data(found: Inspection) -> dict[str, Any] | None:
-    """The two states that recordings show by themselves, as plain data; None where nothing is known."""
-    seen = found.switching
-    if seen is None:
-        return None
-    return {
-        "state": found.recordings.titles[seen.state],
-        "unit": found.recordings.units[seen.state],
-        "time_unit": found.recordings.time_unit,
-        "supported": seen.supported,
-        "probability": seen.probability,
-        "levels": list(seen.levels),
-        "hops": seen.hops,
-        "counts": [
-            {
-                "visits": one.visits,
-                "mean": one.mean if one.visits else None,
-                "lowest": one.limits[0],
-                "highest": one.limits[1] if one.visits else None,
-            }
-            for one in seen.counts
-        ],
-    }
-
-
-def read_seen(folder: str | Path) -> dict[str, Any] | None:
+def read_seen(folder: str | Path) -> RecordStates | None:
     """What `inspection_drawn` wrote of two states; None where recordings were simulated."""
     file = Path(folder) / SEEN
-    return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else None
+    data = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else None
+    return None if data is None else RecordStates.from_data(data)
 
 
 def read_inspection(folder: str | Path) -> list[str] | None:

@@ -10,6 +10,7 @@ from siq.landscape.landscape import Landscape
 from siq.landscape.storage import landscape_data
 from siq.report.certificate_text import certificate_line
 from siq.report.landscape_answer import headline, remarks, wells_table
+from siq.report.record_answer import with_seen_states
 from siq.report.said_landscape import well_name
 
 
@@ -35,7 +36,11 @@ def _opening(landscape: Landscape) -> list[str]:
     """What the page of a study opens with, too: the sentence, the verdict, what has to be known of it."""
     data = landscape_data(landscape, dynamics=landscape.dynamics)
     certificate = None if landscape.certificate is None else landscape.certificate.as_data()
-    return [headline(data), certificate_line(certificate), *remarks(data)]
+    answer, *further = with_seen_states(
+        [headline(data), *remarks(data)], data, landscape.seen,
+        certified=certificate is not None and bool(certificate["certified"]),
+    )  # fmt: skip
+    return [answer, certificate_line(certificate), *further]
 
 
 def _tables(landscape: Landscape) -> list[tuple[str, pd.DataFrame]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from siq.report.mismatch_findings import FINAL
+from siq.report.mismatch_findings import final_simulation
 
 
 def mismatch_answer(verdict: Mapping[str, Any], *, title: str) -> dict[str, Any]:
@@ -27,13 +27,12 @@ def mismatch_answer(verdict: Mapping[str, Any], *, title: str) -> dict[str, Any]
         of the spread of what was measured; null where a simulation ran away.
     """
     fit = verdict["fit"]
-    after = FINAL.get(str(verdict["verdict"]), "recalibrated")
     return {
         "title": title,
         "sentence": verdict["sentence"],
         "verdict": verdict["verdict"],
         "compared": fit["noise_floor"] is not None,
         "held_out_before": fit["before"],
-        "held_out_after": fit[after],
+        "held_out_after": fit[final_simulation(verdict)],
         "held_out_noise": fit["noise_floor"],
     }

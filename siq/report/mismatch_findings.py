@@ -13,13 +13,12 @@ from markupsafe import Markup, escape
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.formulas import FormulaError, parse_formula
 from siq.dynamics.parametric import symbol
+from siq.mismatch.candidates import PROCESS_NOISE
 from siq.mismatch.dictionary import Mechanism
 from siq.report.formatting import formula_mathml
 from siq.report.page import ReportFigure
 
 DIGITS = 3
-FINAL = {"missing physics": "augmented", "no mismatch": "before"}
-"""Which of the three simulations a verdict ends with; the recalibrated one where nothing is said."""
 SIMULATIONS = {
     "before": "as given",
     "recalibrated": "its own parameters refitted",
@@ -76,7 +75,7 @@ class Findings:
     @property
     def final(self) -> str:
         """Which of the three simulations the verdict ends with."""
-        return "recalibrated" if self.kind == "random forces" else FINAL.get(self.kind, "recalibrated")
+        return final_simulation(self.verdict)
 
     def words(self, about: str) -> list[str]:
         """Sentences of the verdict; see `siq.mismatch.sentences.words_of`."""
@@ -88,10 +87,25 @@ class Findings:
         return [] if image is None else [ReportFigure(caption, caption, image, "svg")]
 
 
+def final_simulation(verdict: Mapping[str, Any]) -> str:
+    """Which of the three simulations a verdict ends with, by the names of `SIMULATIONS`."""
+    random_forces = [each["name"] for each in verdict["mechanisms"]] == [PROCESS_NOISE]
+    if verdict["verdict"] == "no mismatch":
+        return "before"
+    if verdict.get("described") or (verdict["verdict"] == "missing physics" and not random_forces):
+        return "augmented"
+    return "recalibrated"
+
+
 def mechanisms_said(findings: Findings) -> list[Mapping[str, Any]]:
     """What was named, or what describes a mismatch that has no name."""
     description = findings.verdict.get("description") or {}
     return [*findings.verdict["mechanisms"], *description.get("by", [])]
+
+
+def described(findings: Findings) -> list[Mapping[str, Any]]:
+    """The model of what has no name; see `siq.mismatch.statement.StatedFunction`."""
+    return list(findings.verdict.get("described") or [])
 
 
 def capital(text: str) -> str:

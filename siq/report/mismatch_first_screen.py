@@ -6,19 +6,14 @@ import numpy as np
 import pandas as pd
 
 from siq.numerics.measured_text import unit_text, value_text
-from siq.report.mismatch_findings import SIMULATIONS, Findings, capital, mechanisms_said
+from siq.report.largest_difference import largest_difference
+from siq.report.mismatch_findings import SIMULATIONS, Findings, capital, described, mechanisms_said
 from siq.report.page import Badge, ReportFigure, ReportTable
 
-BEFORE_AFTER = {
-    "before": "A held-out recording, which had no part in the comparison, and the simulation as given.",
-    "recalibrated": "A held-out recording, which had no part in the fit, the simulation as given, and the"
-    " same simulation with its own parameters refitted.",
-    "augmented": "A held-out recording, which had no part in the search, the simulation as given, and the"
-    " simulation with what was found.",
-}
 PANELS = (
     " Above: the course in time. Below: simulation minus recording; grey: two standard deviations of the"
-    " sensor's noise. Each simulation is told how the recording begins, and runs freely from there."
+    " sensor's noise. The recording had no part in the search. Each simulation is told how it begins, and"
+    " runs freely from there."
 )
 
 
@@ -45,7 +40,7 @@ PROMISES = {
     "unexplained": (
         "The recordings show more than noise and wrong parameters, but nothing here is certain enough to be"
         " named as its cause.",
-        "Below you find where the difference sits and what comes closest.",
+        "Below you find where the difference sits, and what describes it or comes closest.",
     ),
 }
 
@@ -68,9 +63,30 @@ def answer(findings: Findings) -> list[str]:
 
 
 def picture(findings: Findings) -> ReportFigure | None:
-    """A held-out recording before and after."""
-    found = findings.figure("before_after", BEFORE_AFTER[findings.final] + PANELS)
+    """The held-out recording in which the difference is largest, before and after, and a sentence on it."""
+    found = findings.figure("before_after", difference_said(findings) + PANELS)
     return found[0] if found else None
+
+
+def difference_said(findings: Findings) -> str:
+    """How far each simulation is off in the held-out recording in which the difference is largest."""
+    largest = None
+    if not findings.held_out.empty:
+        largest = largest_difference(findings.held_out, after=findings.final)
+    if largest is None:
+        return "A recording that was held out."
+    unit = units_of_outputs(findings).get(largest.output, "1")
+
+    def off(error: float) -> str:
+        return f"is off by {value_text(error, unit=unit, digits=2)}" if np.isfinite(error) else "runs away"
+
+    where = f"In the held-out recording {largest.recording}"
+    if largest.recordings > 1:
+        where += f", of {largest.recordings} the one in which the difference is largest"
+    said = f"{where}, {largest.output} as simulated {off(largest.before)} as given"
+    if findings.final == "before":
+        return f"{said} (root mean square)."
+    return f"{said}, and {off(largest.after)} {SIMULATIONS[findings.final]} (root mean square)."
 
 
 def numbers(findings: Findings) -> ReportTable | None:
@@ -81,7 +97,7 @@ def numbers(findings: Findings) -> ReportTable | None:
         return None
     own = errors_in_units(findings)
     shown = ["before", "recalibrated", "augmented"]
-    if not mechanisms_said(findings) or findings.kind == "random forces":
+    if not (mechanisms_said(findings) or described(findings)) or findings.kind == "random forces":
         shown.remove("augmented")
     if fit["before"] == fit["recalibrated"]:  # no parameter was free, or none changed
         shown.remove("recalibrated")
@@ -90,7 +106,7 @@ def numbers(findings: Findings) -> ReportTable | None:
         error = fit[name]
         words = SIMULATIONS[name]
         if name == "augmented" and findings.kind == "unexplained":
-            words = "with what comes closest"
+            words = "with what describes it" if described(findings) else "with what comes closest"
         row = {"simulation": words, **own.get(name, {})}
         row["of the spread"] = "ran away" if error is None else _percent(error)
         row["times noise"] = "" if error is None or not floor > 0 else value_text(error / floor, digits=2)
@@ -113,8 +129,7 @@ def errors_in_units(findings: Findings) -> dict[str, dict[str, str]]:
     if table.empty:
         return {}
     scored = table[table["scored"].astype(bool)]
-    units = dict(zip(findings.before.states, findings.before.units, strict=True))
-    by_name = {name: units.get(str(formula), "1") for name, formula in findings.before.outputs}
+    by_name = units_of_outputs(findings)
     found: dict[str, dict[str, str]] = {}
     for output, rows in scored.groupby("output", sort=False):
         unit = unit_text(by_name.get(str(output), "1"))
@@ -127,6 +142,12 @@ def errors_in_units(findings: Findings) -> dict[str, dict[str, str]]:
             )
             found.setdefault(name, {})[f"{output} ({unit})" if unit else str(output)] = text or "ran away"
     return found
+
+
+def units_of_outputs(findings: Findings) -> dict[str, str]:
+    """The unit of each output that is a state as measured."""
+    units = dict(zip(findings.before.states, findings.before.units, strict=True))
+    return {name: units.get(str(formula), "1") for name, formula in findings.before.outputs}
 
 
 def _percent(share: float) -> str:

@@ -11,12 +11,13 @@ from siq.report.page import ReportContent, render_report
 
 
 def mismatch_page(findings: Findings, *, title: str, commands: Sequence[str]) -> str:
-    """Write the page as HTML: the verdict, the recording before and after, the number, and the rest."""
+    """Write the page as HTML: the recording that differs most, the verdict, the number, and the rest."""
     content = ReportContent(
         title=title,
         answer=answer(findings),
         badge=badge(findings),
         figure=picture(findings),
+        figure_first=True,
         table=numbers(findings),
         sections=sections(findings, commands=commands),
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -14,6 +15,7 @@ from siq.report.mismatch_findings import (
     SIMULATIONS,
     Findings,
     capital,
+    described,
     listed,
     mathml,
     mechanisms_said,
@@ -22,6 +24,8 @@ from siq.report.mismatch_findings import (
 )
 from siq.report.page import FormulaRow, ReportSection, ReportTable
 
+SPLINE = "a smooth curve (natural cubic spline)"
+CERTAIN = math.log(1e6)  # beyond which odds are not told
 CANDIDATES_SHOWN = 12
 RECORDINGS_LISTED = 12
 CAPTIONS = {
@@ -31,6 +35,8 @@ CAPTIONS = {
     " left out where they would fill it.",
     "map": "What is missing, over the two states along which most of it can be seen, averaged over cells;"
     " one panel for each equation. Grey: no recordings.",
+    "described": "What was added, as a function of one coordinate, with a band of 95 %. Dots: the values that"
+    " were fitted, or where a formula was evaluated.",
     "candidates": "How much each mechanism explains. Fitted: what was found, and what was fitted in its"
     " place. Grey bars are estimates for mechanisms that were not fitted.",
     "held_out": "Held-out recordings with all three simulations. For each recording above: the course in"
@@ -52,6 +58,7 @@ def sections(findings: Findings, *, commands: Sequence[str] = ()) -> list[Report
     """Every section that has something to say, in the order of the page."""
     found = [
         _formula(findings),
+        _described(findings),
         _how_sure(findings),
         _where(findings),
         _wells(findings),
@@ -99,6 +106,42 @@ def _formula(findings: Findings) -> ReportSection | None:
     return ReportSection(heading, (), lines, tables, notes=list(dict.fromkeys(notes)))
 
 
+def _described(findings: Findings) -> ReportSection | None:
+    """The model of what has no name: its formulas, and its course with a band of 95 %."""
+    parts = described(findings)
+    if not parts:
+        return None
+    lines, tables = [], []
+    known = {entry.name: entry for entry in findings.dictionary}
+    for each in parts:
+        lines += [
+            FormulaRow(
+                each["label"],
+                typeset(formula, findings.after, each["parameters"]) if each["kind"] != "spline" else SPLINE,
+                _of_what(name, known.get(each["name"]), findings),
+                whole=formula if each["kind"] == "spline" else None,
+            )
+            for name, formula in each["terms"].items()
+        ]
+        curve = each.get("curve")
+        if curve is not None:
+            rows = [
+                {curve["coordinate"]: value_text(at, digits=3), "value": value_text(value, error)}
+                for at, value, error in zip(curve["at"], curve["value"], curve["standard_error"], strict=True)
+            ]
+            tables.append(ReportTable(f"{capital(each['label'])}, with standard errors.", pd.DataFrame(rows)))
+        elif each["parameters"]:
+            rows = [{"parameter": name, "value": _value(value)} for name, value in each["parameters"].items()]
+            tables.append(ReportTable(f"Coefficients of {each['label']}.", pd.DataFrame(rows)))
+    text = [
+        "What is missing has no name that is certain enough. This model is part of the new card, since it"
+        " makes the prediction of the held-out recordings better."
+    ]
+    notes = ["The simulation with it is a system card like any other: system.yaml."]
+    figures = findings.figure("described", CAPTIONS["described"])
+    return ReportSection("A model of what is missing", text, lines, tables, figures, notes)
+
+
 def _of_what(name: str, entry: Mechanism | None, findings: Findings) -> str:
     """What a formula of a mechanism is; see `siq.mismatch.candidates.MechanismCandidate.changes`."""
     measured = name in [output for output, _ in findings.before.outputs]
@@ -121,6 +164,7 @@ def _how_sure(findings: Findings) -> ReportSection:
             "mechanism": each["label"],
             "gain in χ²": round(evidence["delta_chi2"]),
             "ΔBIC": round(evidence["delta_bic"]),
+            "odds of the name": odds_text(evidence.get("log_odds")),
             "p, independent errors": p_text(evidence["p_white"]),
             "p, errors of a recording together": p_text(evidence["p_cluster"]),
         }
@@ -141,6 +185,7 @@ def _how_sure(findings: Findings) -> ReportSection:
                     "gain in χ²": "by how much twice the log-likelihood rises with it",
                     "ΔBIC": "change of the Bayesian information criterion; negative where the gain is worth"
                     " the further parameters",
+                    "odds of the name": "how much likelier it is than a smooth function without a name",
                     "p, independent errors": "how often chance alone would gain as much, if all errors were"
                     " independent",
                     "p, errors of a recording together": "the same, if only errors of different recordings"
@@ -148,11 +193,40 @@ def _how_sure(findings: Findings) -> ReportSection:
                 },
             )
         )
+    whole = findings.verdict.get("explanations", [])
+    if len(whole) > 1 and findings.verdict["verdict"] in ("missing physics", "unexplained"):
+        tables.append(
+            ReportTable(
+                "Whole explanations of the recordings, the likeliest first.",
+                pd.DataFrame(
+                    [
+                        {"explanation": each["what"], "log-evidence": round(each["log_evidence"], 1)}
+                        for each in whole
+                    ]
+                ),
+                {"log-evidence": "of its marginal likelihood, less that of the likeliest: 5 is 150 to 1"},
+            )
+        )
     notes = [
         f"{capital(each['label'])} could not be judged: {each['reason']}."
         for each in findings.verdict.get("not_fitted", [])
     ]
     return ReportSection("How sure it is", text, tables=tables, notes=notes)
+
+
+def odds_text(log_odds: float | None) -> str:
+    """Odds such as ``340 to 1``; empty where they are not known."""
+    if log_odds is None:
+        return ""
+    if abs(log_odds) > CERTAIN:
+        return "beyond 10⁶ to 1" if log_odds > 0 else "beyond 1 to 10⁶"
+    odds = math.exp(abs(log_odds))
+    return f"{_round(odds)} to 1" if log_odds >= 0 else f"1 to {_round(odds)}"
+
+
+def _round(odds: float) -> str:
+    digits = max(len(str(int(odds))) - 2, 0)
+    return f"{round(odds, -digits):.0f}" if odds >= 10 else f"{odds:.1f}"
 
 
 NOTHING_FOUND = {
@@ -290,8 +364,10 @@ def _parameters(findings: Findings) -> ReportSection | None:
 def _held_out(findings: Findings) -> ReportSection | None:
     tables = []
     if len(findings.scores):
-        caption = "Scores of the public benchmark: root mean square errors on its held-out recordings."
-        tables.append(ReportTable(caption, findings.scores, {}, f"{findings.folder}/real_recordings.csv"))
+        caption = (
+            "The official tests of the public benchmark: root mean square errors, ours and published ones."
+        )
+        tables.append(ReportTable(caption, findings.scores, {}, f"{findings.folder}/official_tests.csv"))
     figures = findings.figure("held_out", CAPTIONS["held_out"])
     if not tables and not figures:
         return None

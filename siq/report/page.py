@@ -161,6 +161,8 @@ class ReportContent:
         Whether it may be believed.
     figure, table
         What it looks like, beside each other.
+    figure_first
+        Whether the figure stands above the answer.
     interactive
         A view that can be turned, with its script; None where there is none.
     sections
@@ -174,6 +176,7 @@ class ReportContent:
     badge: Badge | None = None
     figure: ReportFigure | None = None
     table: ReportTable | None = None
+    figure_first: bool = False
     interactive: Markup | None = None
     sections: Sequence[ReportSection] = ()
     language: str = "en"

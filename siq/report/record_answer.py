@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
+from siq.data.record_states import RecordStates
 from siq.numerics.measured_text import place_text, range_text, unit_text, value_text
 from siq.report.page import ReportTable
 
@@ -46,30 +47,30 @@ def with_visits(overview: Mapping[str, Any] | None, record: pd.DataFrame) -> dic
     return {**overview, "visits": visits}
 
 
-def seen_sentence(seen: Mapping[str, Any] | None) -> str:
-    """The two states between which the recordings hop by themselves, in a sentence; empty where they do not.
+def with_seen_states(
+    told: Sequence[str], overview: Mapping[str, Any], seen: RecordStates | None, *, certified: bool
+) -> list[str]:
+    """What is told of a landscape, with the states that the recordings show by themselves.
 
     Parameters
     ----------
+    told
+        The answer in one sentence, and what has to be known of it.
+    overview
+        The landscape as plain data.
     seen
-        What `siq.data.inspection` found, see `siq.report.inspection_section`.
+        The states, None where nothing is known of them.
+    certified
+        Whether the landscape may be believed: then nothing is added.
     """
-    if seen is None or not seen["supported"]:
-        return ""
-    low, high = (value_text(level, unit=seen["unit"] or "", digits=3) for level in seen["levels"])
-    time = unit_text(seen["time_unit"]) or "time units"
-    means = " and ".join(_seen_mean(one) for one in seen["counts"])
-    return (
-        f"The recordings hop between two states of {seen['state']}, at {low} and {high}: {seen['hops']}"
-        f" transition{'s were' if seen['hops'] > 1 else ' was'} seen, from level to level, and the states"
-        f" last {means} {time} in the mean."
-    )
-
-
-def _seen_mean(one: Mapping[str, Any]) -> str:
-    if not one["visits"]:
-        return f"more than {value_text(one['lowest'], digits=2)}"
-    return f"{value_text(one['mean'], digits=3)} ({range_text(one['lowest'], one['highest'])})"
+    own = "" if seen is None else seen.sentence()
+    if own and len(overview["wells"]) == 1:
+        # What is seen without any formula comes first where the formula misses it.
+        alone = f"What was identified misses them: {told[0][0].lower()}{told[0][1:]}"
+        return [own, alone, *told[1:]]
+    if own and not certified:
+        return [*told, f"Without any formula: {own[0].lower()}{own[1:]}"]
+    return list(told)
 
 
 def record_sentences(record: pd.DataFrame, missing: str) -> list[str]:

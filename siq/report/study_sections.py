@@ -13,8 +13,10 @@ import pandas as pd
 import yaml
 from markupsafe import Markup
 
+from siq.data.record_states import RecordStates
 from siq.identify.diffusion import DiffusionSource
 from siq.identify.storage import FieldRecord
+from siq.landscape.refusal import told_without_landscape
 from siq.potential.symbolic import SymbolicDecomposition
 from siq.report.certificate_text import certificate_badge, tests_table
 from siq.report.formatting import formula_matrix_mathml, matrix_mathml, vector_mathml
@@ -23,13 +25,13 @@ from siq.report.invariant_tables import invariant_tables
 from siq.report.landscape_answer import headline, remarks
 from siq.report.landscape_tables import errors_table, escape_table, landscape_sentences, landscape_tables
 from siq.report.page import Badge, FormulaRow, ReportSection, ReportTable
-from siq.report.record_answer import record_sentences, record_table, seen_sentence
+from siq.report.record_answer import record_sentences, record_table, with_seen_states
 from siq.report.said_landscape import SaidLandscape
 from siq.report.sentences import control_sentences, run_sentences
 from siq.report.study_captions import Part, figures_of
 from siq.report.study_formulas import coefficient_table, formula_rows
 from siq.report.study_runs import method_tables
-from siq.steps.outcomes import Method, Status, Step
+from siq.steps.outcomes import Method, Outcome, Status, Step, why_no_landscape
 from siq.steps.shown import ModelFiles, Shown
 from siq.study.study import Study
 from siq.study.tables import as_table
@@ -72,7 +74,7 @@ class StudyResults:
     inspection
         What is in the recordings, line by line; None where they were simulated.
     seen
-        The two states that they show by themselves, as plain data; None where nothing is known of that.
+        The two states that they show by themselves; None where nothing is known of that.
     """
 
     tables: Mapping[str, pd.DataFrame]
@@ -86,7 +88,7 @@ class StudyResults:
     record: FieldRecord | None = None
     interactive: Markup | None = None
     inspection: Sequence[str] | None = None
-    seen: Mapping[str, Any] | None = None
+    seen: RecordStates | None = None
 
 
 @dataclass(frozen=True)
@@ -116,30 +118,19 @@ class StudyParts:
 
     def answer(self) -> list[str]:
         """The sentence, and what has to be known of it."""
-        overview, seen = self.results.overview, seen_sentence(self.results.seen)
+        overview, seen = self.results.overview, self.results.seen
         if overview is None or not overview["wells"]:
-            missing = f"{'But no' if seen else 'No'} landscape was found: {self._why()}."
-            return [seen, missing] if seen else [missing]
-        told = [headline(overview), *remarks(overview)]
-        if seen and len(overview["wells"]) == 1:
-            # What is seen without any formula comes first where the formula misses it.
-            alone = f"What was identified misses them: {told[0][0].lower()}{told[0][1:]}"
-            return [seen, alone, *told[1:]]
+            return told_without_landscape(self._why(), seen)
         certificate = self._certificate()
-        if seen and (certificate is None or not certificate["certified"]):
-            told.append(f"Without any formula: {seen[0].lower()}{seen[1:]}")
-        return told
+        certified = certificate is not None and bool(certificate["certified"])
+        return with_seen_states([headline(overview), *remarks(overview)], overview, seen, certified=certified)
 
     def _why(self) -> str:
-        """Why there is none: what the step said that came as far as any."""
-        outcomes = self.results.tables["outcomes"]
-        for status in (Status.FAILED, Status.WARNING, Status.SKIPPED):
-            mine = outcomes[(outcomes["status"] == status) & (outcomes["reason"].fillna("") != "")]
-            of_landscape = mine[mine["step"] == Step.LANDSCAPE]
-            for rows in (of_landscape, mine):
-                if len(rows):
-                    return str(rows["reason"].iloc[0]).removeprefix("not certified: ").rstrip(".")
-        return "the recorded states lead to no stable state"
+        rows = self.results.tables["outcomes"].fillna({"reason": ""}).to_dict("records")
+        return why_no_landscape(
+            Outcome(int(row["run"]), Step(row["step"]), Status(row["status"]), str(row["reason"]))
+            for row in rows
+        )
 
     def badge(self) -> Badge:
         """Whether the answer may be believed."""

@@ -16,7 +16,7 @@ from siq.data.markov_lag import markov_lag
 from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
 from siq.data.selection import joined, select_recordings
 from siq.errors import NumericalFailure
-from siq.identify.diffusion import DiffusionSource, check_units, estimated_diffusion
+from siq.identify.diffusion import UNLIKE_GIVEN, DiffusionSource, check_units, estimated_diffusion
 from siq.identify.flow_regression import refit, residuals
 from siq.identify.identification import (
     IdentificationOptions,
@@ -25,6 +25,8 @@ from siq.identify.identification import (
     with_stability,
 )
 from siq.identify.identified_field import IdentifiedField
+from siq.identify.memory import possible_exposures
+from siq.identify.noise_formula import constant_noise
 from siq.identify.noise_regression import constant_noise_probability
 from siq.identify.prediction import prediction_errors
 from siq.identify.random_forces import with_random_forces
@@ -105,10 +107,10 @@ def _identified(settings: IdentifySettings, recordings: Recordings, number: int)
     )
     noisy = carries_noise(library, parts[0], options=options, integrator_step=maker)
     if noisy and maker is None and (memory := markov_lag(joined(recordings))).remembers:
-        if memory.kind in ("blur", "either"):
+        for exposure in possible_exposures(memory):
             draw = generator(settings.seed, number, Purpose.STABILITY)
             means = means_over_exposures(
-                recordings, library=library, options=options, pair_step=step, generator=draw
+                recordings, exposure, library=library, options=options, pair_step=step, generator=draw
             )
             if means is not None:
                 return filtered_record(
@@ -172,7 +174,8 @@ def _with_diffusion(
         return found, residual_noise(found, recordings, pair_step=step), DiffusionSource.GIVEN
     estimated = estimated_diffusion(found, pairs=pairs)
     if estimated is not None:
-        with_own = replace(found, diffusion=estimated)
+        own = constant_noise(found.library.symbols, found.noise_rate, samples=pairs)
+        with_own = replace(found, diffusion=estimated, constant_noise=own)
         noise = residual_noise(with_own, recordings, pair_step=step)
         if noise.kind == "process":
             by_state = with_noise_formula(with_own, everything, false_terms=false_terms)
@@ -198,10 +201,7 @@ def _unlike(
     probability = constant_noise_probability(found, pairs, residuals(found, pairs))
     if probability >= settings.identification.false_terms:
         return None
-    return (
-        "the noise is stronger at some states than at others, and the D that was given is the same"
-        " everywhere: leave it out, or give formulas of the states"
-    )
+    return UNLIKE_GIVEN
 
 
 def _held_out_verdict(

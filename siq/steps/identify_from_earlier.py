@@ -24,6 +24,7 @@ from siq.identify.lagged_pairs import (
 )
 from siq.identify.library import CandidateLibrary
 from siq.identify.memory import lagged_noise
+from siq.identify.noise_formula import constant_noise
 from siq.identify.random_forces import with_random_forces
 from siq.identify.storage import FieldRecord
 from siq.steps.identify_beside_sensor import units_of_states
@@ -107,6 +108,7 @@ def _with_diffusion(
         return replace(found, diffusion=given), DiffusionSource.GIVEN
     estimated = estimated_diffusion(found, pairs=independent)
     if estimated is not None:
-        return replace(found, diffusion=estimated), DiffusionSource.ESTIMATED
+        own = constant_noise(found.library.symbols, found.noise_rate, samples=independent)
+        return replace(found, diffusion=estimated, constant_noise=own), DiffusionSource.ESTIMATED
     check_units(recordings.names, units_of_states(recordings, space))
     return found, DiffusionSource.UNIT

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -91,6 +91,16 @@ def outcome_of_data(data: Mapping[str, Any]) -> Outcome:
     """The outcome that `Outcome.as_data` gave."""
     details = {key: value for key, value in data.items() if key not in ("run", "step", "status", "reason")}
     return Outcome(int(data["run"]), Step(data["step"]), Status(data["status"]), data["reason"], details)
+
+
+def why_no_landscape(outcomes: Iterable[Outcome]) -> str:
+    """Why steps left no landscape: what the one said that came as far as any, without a full stop."""
+    outcomes = [one for one in outcomes if one.reason]
+    for status in (Status.FAILED, Status.WARNING, Status.SKIPPED):
+        mine = [one for one in outcomes if one.status == status]
+        for one in sorted(mine, key=lambda each: each.step != Step.LANDSCAPE):
+            return one.reason.removeprefix("not certified: ").rstrip(".")
+    return "the recorded states lead to no stable state"
 
 
 def write_outcomes(path: str | Path, outcomes: Sequence[Outcome]) -> None:

@@ -16,6 +16,7 @@ from siq.certificate.tests import CertificateOptions, PredictionLimits
 from siq.data.recordings import Recordings
 from siq.data.selection import in_stretches
 from siq.data.transitions import without_slow_drift
+from siq.dynamics.dynamics import Dynamics
 from siq.identify.identification import IdentificationOptions
 from siq.landscape.options import LandscapeOptions
 from siq.networks.options import TrainingOptions
@@ -103,6 +104,12 @@ class Analysis:
         """What became of each step."""
         steps = (self.identified, self.trained, self.regressed, self.refined, self.landscape)
         return tuple(one.outcome for one in steps if one is not None)
+
+    @property
+    def dynamics(self) -> Dynamics | None:
+        """What was identified, None where nothing was."""
+        record = self.identified.record
+        return None if record is None else record.found.dynamics
 
 
 def analyse(

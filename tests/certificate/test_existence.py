@@ -12,6 +12,7 @@ from siq.certificate.existence import check_existence, lost_shares
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.phase_portrait import PhasePortrait, phase_portrait
 from siq.identify.identified_field import IdentifiedField
+from siq.identify.rival_terms import RivalTerms
 
 X, Y = sympy.symbols("x y", real=True)
 CHANCE = 4 / np.sqrt(4 * 200)  # four standard deviations of a share of 200 draws, at most
@@ -53,7 +54,9 @@ def test_rivals_of_the_terms_count() -> None:
     found, portrait = two_wells(0.2, 0.01)
     doubt = np.zeros((1, found.library.size, 2))
     doubt[0, list(found.library.terms).index(X), 0] = 0.2
-    shares = lost_shares(replace(found, doubts=doubt), portrait.attractors, box=portrait.box)
+    shares = lost_shares(
+        replace(found, rivals=RivalTerms(0 * doubt[0], doubt)), portrait.attractors, box=portrait.box
+    )
     assert shares == pytest.approx(np.full(2, ndtr(-1.0)), abs=CHANCE / 2)
 
 

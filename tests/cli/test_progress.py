@@ -40,6 +40,15 @@ def test_the_line_says_what_runs_how_many_of_how_many_and_the_time_left() -> Non
     assert progress.left() is not None and progress.done == 1
 
 
+def test_a_job_says_what_it_is_doing() -> None:
+    progress = Progress(clock=Clock())
+    for event in EVENTS:
+        progress.take(event)
+    progress.take({"event": "doing", "of": "bead", "text": "candidate 2 of 6: dry friction"})
+    progress.take({"event": "doing", "of": "another", "text": "candidate 9 of 9"})
+    assert progress.line().startswith("2 of 3: refining (bead): candidate 2 of 6: dry friction, about ")
+
+
 def test_on_a_terminal_the_line_is_rewritten_and_fits() -> None:
     stream = io.StringIO()
     follow(map(line, EVENTS), Screen(stream, columns=30), Progress(clock=Clock()))

@@ -1,56 +1,63 @@
-"""Files of public benchmarks, imitated, and the scores of simulations."""
+"""Files of public benchmarks, imitated."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
+import pandas as pd
 import pytest
 
-from siq.data.public_recordings import BENCHMARKS, MULTISINE, SAMPLES, read_silverbox, read_tanks
-from siq.data.recordings import Recordings
-from siq.dynamics.cards import load_system
+from siq.data.public_recordings import BENCHMARKS, SILVERBOX_TRAINING, read_silverbox, read_tanks
 from siq.errors import InputError
-from siq.estimation.measurements import measurements
-from siq.mismatch.scores import root_mean_square, windows
 
-CARD = """\
-name: decay
-states: {x: {domain: [0, 2]}}
-parameters: {k: {value: 1.0}}
-equations: {x: -k*x}
-"""
+REST = 0.006  # V that the generator gives while it is silent
 
 
-def silverbox_text(realisations: int) -> str:
-    generator = np.random.default_rng(0)
-    arrow = np.linspace(0, 0.15, 12_000) * generator.uniform(-1, 1, 12_000)
-    parts = [arrow]
-    for _ in range(realisations):
-        parts += [np.zeros(90), 0.1 * np.sign(generator.normal(size=MULTISINE + 400))]
-    u = np.concatenate([*parts, np.zeros(90), arrow[:500]])
-    rows = [f"{value + 0.006},{2 * value + 0.001}," for value in u]
-    return "\n".join(['"V1","V2",', *rows]) + "\n"
+def silverbox_file(path: Path, *, gaps: bool = True, rows: int = 127_500) -> Path:
+    """A file like the benchmark's: every row is told from every other, and tests have another offset."""
+    row = np.arange(rows)
+    training = (row >= SILVERBOX_TRAINING[0]) & (row < SILVERBOX_TRAINING[1])
+    silent = (row % 8000 < 90) & gaps
+    # Its mean is off the value at rest.
+    driven = REST + np.where(silent, 0.0, 0.05 * np.sign(np.cos(row)) + 0.01)
+    u = np.where(training, driven, 7.0 + 1e-6 * row)
+    pd.DataFrame({"V1": u, "V2": 2 * u, "": np.nan}).to_csv(path, index=False)
+    return path
 
 
-def test_silverbox_is_cut_at_its_gaps_and_freed_of_offsets(write):
-    found = read_silverbox(write(silverbox_text(4), "box.csv"))
-    assert found.labels == ("arrow", "multisine1", "multisine2", "multisine3")
-    lengths = np.bincount(found.recording)
-    assert lengths[0] == pytest.approx(12_000, abs=60)
-    assert (lengths[1:] == SAMPLES).all()
-    y, u = found.values.T
-    assert y == pytest.approx(2 * u, abs=1e-9)
-    assert abs(u).max() < 0.16
+def test_silverbox_has_the_rows_of_the_official_loader(tmp_path):
+    found = read_silverbox(silverbox_file(tmp_path / "box.csv"))
+    lengths = dict(zip(found.labels, np.bincount(found.recording), strict=True))
+    assert {name: lengths.pop(name) for name in BENCHMARKS["silverbox"].tests} == {
+        "multisine": 127_400 - 105_712,
+        "arrow": 40_575 - 100,
+        "arrow without extrapolation": 32_000,
+    }
+    assert sum(lengths.values()) == 105_712 - 40_650
+    assert set(lengths) == {f"multisine{place}" for place in range(1, 9)}
+    first = {name: found.values[found.recording == place, 1][0] for place, name in enumerate(found.labels)}
+    assert first["multisine"] - first["arrow"] == pytest.approx(1e-6 * (105_712 - 100), abs=1e-9)
+    assert first["arrow"] == first["arrow without extrapolation"]
     assert np.diff(found.t[:3]) == pytest.approx(2**14 / 1e7)
+
+
+def test_rest_of_the_silverbox_is_that_of_the_gaps_for_learning(tmp_path):
+    found = read_silverbox(silverbox_file(tmp_path / "box.csv"))
+    y, u = found.values.T
+    assert u == pytest.approx(y / 2 - REST, abs=1e-9)
+    with pytest.raises(InputError, match="no gaps"):
+        read_silverbox(silverbox_file(tmp_path / "box.csv", gaps=False))
 
 
 @pytest.mark.parametrize(
     ("text", "part"),
     [
-        (silverbox_text(1), "no gaps"),
+        ('"V1","V2",\n1.0,2.0,\n', "1 rows of at least 127400"),
         ("a,b\n1,2\n", "no columns"),
         ('"V1","V2",\n1.0,,\n', "missing"),
     ],
-    ids=["no gaps", "no columns", "missing"],  # the text is long
+    ids=["short", "no columns", "missing"],
 )
 def test_other_files_are_refused_in_a_sentence(write, text, part):
     with pytest.raises(InputError, match=part):
@@ -65,31 +72,14 @@ def test_tanks_have_two_recordings(write):
     assert found.t.tolist() == [0, 4, 0, 4]
 
 
-def test_every_benchmark_says_what_to_get():
+def test_every_benchmark_says_what_to_get_and_whose_figures_are_quoted():
     for one in BENCHMARKS.values():
-        assert one.what and one.score and set(one.published) <= set(one.score)
+        assert one.what and one.tests
+        for test in one.tests.values():
+            assert test.window > 0
+            assert all(each.method and each.scored and each.source for each in test.published)
 
 
-@pytest.mark.parametrize("window", [None, 20])
-def test_score_is_the_error_of_a_free_run(write, window):
-    model = load_system(write(CARD))
-    t = np.linspace(0, 1, 101)
-    truth = Recordings(("x",), (None,), ("a",), np.zeros(101, dtype=int), t, np.exp(-t)[:, None])
-    data = measurements(truth, model)
-    (right,) = root_mean_square(model, data, variance=np.array([1e-8]), window=window)
-    (wrong,) = root_mean_square(
-        model.with_values(np.array([1.5])), data, variance=np.array([1e-8]), window=window
-    )
-    assert right < 1e-6 < 1e-3 < wrong
-
-
-def test_windows_cover_a_recording_and_keep_its_inputs(write):
-    model = load_system(write(CARD))
-    t = np.linspace(0, 1, 101)
-    data = measurements(
-        Recordings(("x",), (None,), ("a",), np.zeros(101, dtype=int), t, np.exp(-t)[:, None]), model
-    )
-    cut = windows(data, 20)
-    assert len(cut.labels) == 5
-    assert np.array_equal(cut.outputs, data.outputs[:100])
-    assert cut.first.tolist() == [0, 20, 40, 60, 80, 100]
+def test_windows_of_official_tests_are_those_of_the_official_loader():
+    windows = {name: {test.window for test in one.tests.values()} for name, one in BENCHMARKS.items()}
+    assert windows == {"silverbox": {50}, "cascaded-tanks": {5}}

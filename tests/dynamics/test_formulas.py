@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import sympy
 
-from siq.dynamics.formulas import FUNCTIONS, FormulaError, compile_formulas, parse_formula
+from siq.dynamics.formulas import FUNCTIONS, FormulaError, compile_formulas, compile_values, parse_formula
 
 x, y, zeta = (sympy.Symbol(name, real=True) for name in ("x", "y", "zeta"))
 NAMES = {"x": x, "y": y, "zeta": zeta}
@@ -255,3 +255,11 @@ def test_compiled_values_equal_those_of_sympy_on_a_random_formula() -> None:
     values = compile_formulas([formula], (x, y))(TINY_POINTS)[0]
     expected = [float(formula.subs({x: a, y: b}).evalf(20)) for a, b in TINY_POINTS.T]
     np.testing.assert_allclose(values, expected, rtol=1e-13)
+
+
+def test_derivatives_of_a_limit_take_numbers_beside_arrays() -> None:
+    x, limit = sympy.symbols("x limit", real=True)
+    slopes = compile_values([sympy.Min(10, limit, x).diff(x), sympy.Max(-limit, x).diff(limit)], [x, limit])
+    by_state, by_limit = slopes(np.array([-6.0, 3.0, 7.0, 12.0]), 5.0)
+    assert by_state.tolist() == [1, 1, 0, 0]
+    assert by_limit.tolist() == [-1, 0, 0, 0]

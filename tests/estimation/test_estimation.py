@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.linalg
@@ -78,6 +80,14 @@ def fitted(data: Measurements, *, estimate_process: bool) -> Fit:
         return loose
     noise = loose.noise.without_process()
     return fit_by_multiple_shooting(loose.model, data, x=loose.x, noise=noise, estimate_process=False)
+
+
+def test_states_are_read_off_sensors_with_a_gain_and_an_offset() -> None:
+    data = oscillations(recordings=2, samples=12, noise=0.05, seed=1)
+    parameters = {**OSCILLATOR["parameters"], "g": {"value": 2.0}, "o": {"value": 0.5}}
+    model = model_of({**OSCILLATOR, "parameters": parameters, "outputs": {"y": "g*x + o"}})
+    seen = replace(data, outputs=2 * data.outputs + 0.5)
+    np.testing.assert_allclose(first_states(model, seen), first_states(model_of(OSCILLATOR), data))
 
 
 @pytest.fixture(scope="module")
@@ -221,6 +231,23 @@ def test_the_search_for_noise_ends_where_the_likelihood_is_highest() -> None:
         assert log_likelihood(found.linearisation, data, best.scaled(factor)) < top
         wide = Noise(best.measurement * factor, best.process)
         assert log_likelihood(found.linearisation, data, wide) < top
+
+
+def test_of_many_samples_some_tell_the_noise_and_all_correct_it() -> None:
+    data = oscillations(recordings=6, samples=3000, noise=0.03, seed=4, drive=0.02)
+    model = model_of(OSCILLATOR)
+    x = first_states(model, data)
+    line, start = linearise(model, Grid(data, 1), model.values, x), first_noise(model, data, x)
+    work: list[float] = []
+    best = estimate_noise(line, data, start, charge=work.append)
+    rough = estimate_noise(line, data, start, coarse=True)
+    top = log_likelihood(line, data, best)
+    assert log_likelihood(line, data, rough) < top
+    assert rough.measurement == pytest.approx(best.measurement, rel=0.1)
+    for factor in (0.99, 1.01):
+        assert log_likelihood(line, data, best.scaled(factor)) < top
+        assert log_likelihood(line, data, Noise(best.measurement * factor, best.process)) < top
+    assert sum(each == 1.0 for each in work) <= 4 < sum(each < 0.6 for each in work)
 
 
 def test_the_order_of_recordings_changes_nothing() -> None:

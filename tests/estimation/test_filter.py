@@ -9,6 +9,7 @@ import sympy
 from siq.data.recordings import Recordings
 from siq.dynamics.dynamics import Dynamics, Parameter
 from siq.dynamics.parametric import Signals
+from siq.estimation import linearisation
 from siq.estimation.closure import ClosedFunctions
 from siq.estimation.estimation import Fit, fit_by_filter
 from siq.estimation.innovations import Noise
@@ -153,3 +154,14 @@ def test_correlated_forces_are_found_beside_a_sensor() -> None:
     assert (np.abs(fit.model.values - np.diag(rate)) < 3.5 * fit.standard_errors).all()
     np.testing.assert_allclose(fit.noise.intensity[0], forces, rtol=0.08)
     np.testing.assert_allclose(fit.noise.measurement, sensor, rtol=0.15)
+
+
+def test_intervals_taken_some_at_a_time_give_the_same_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    sensor = FORCES * STEP
+    recordings = double_well(5, sensor=sensor, samples=200)
+    whole, _ = fitted(recordings, sensor=sensor)
+    monkeypatch.setattr(linearisation, "INTERVALS", 37)
+    parts, _ = fitted(recordings, sensor=sensor)
+    assert whole.converged
+    np.testing.assert_allclose(parts.model.values, whole.model.values, rtol=1e-9)
+    np.testing.assert_allclose(parts.covariance, whole.covariance, rtol=1e-9)

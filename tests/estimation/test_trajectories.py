@@ -9,7 +9,7 @@ import pytest
 import sympy
 
 from siq.dynamics.cards import SystemCard, build_system
-from siq.dynamics.dynamics import Dynamics
+from siq.dynamics.dynamics import Dynamics, Parameter
 from siq.estimation.estimation import fit_by_multiple_shooting
 from siq.estimation.first_states import first_states
 from siq.estimation.innovations import Noise
@@ -17,7 +17,7 @@ from siq.estimation.jumps import jumps_of, spread_edges
 from siq.estimation.linearisation import Grid, integrate_intervals, linearise
 from siq.estimation.measurements import Measurements, course_of_input
 from siq.estimation.process_noise import fit_with_and_without_process_noise
-from siq.estimation.trajectories import fit_trajectories, run, sensitivities
+from siq.estimation.trajectories import _run_side_by_side, fit_trajectories, normal_equations, run
 from siq.files.documents import Document, validate
 
 PENDULUM = {
@@ -59,22 +59,63 @@ def with_values(model: Dynamics, **values: float) -> Dynamics:
     return model.with_values(np.array([values.get(each.name, each.value) for each in model.parameters]))
 
 
-def test_sensitivities_are_differences_of_trajectories() -> None:
+def test_the_normal_equations_are_those_of_differences_of_trajectories() -> None:
     model = with_values(
         model_of({**PENDULUM, "equations": {"x": "v", "v": "-k*sin(x) - d*v + c*x + u"}}), c=0.1
     )
     data, states = driven(model, substeps=2)
-    grid = Grid(data, 2)
-    columns = sensitivities(linearise(model, grid, model.values, states), data)[:, 0]
-    begin = states[data.first[:-1]]
-    for place in range(columns.shape[1]):
-        shift = np.zeros(columns.shape[1])
+    grid, begin = Grid(data, 2), states[data.first[:-1]]
+    data = replace(data, outputs=data.outputs + np.random.default_rng(0).normal(size=data.outputs.shape))
+    columns = []
+    for place in range(7):
+        shift = np.zeros(7)
         shift[place] = 1e-5
         ends = []
         for sign in (1, -1):
             moved = model.with_values(model.values + sign * shift[:3])
-            ends.append(run(moved, Grid(data, 2), begin + sign * shift[3:].reshape(2, 2))[:, 0])
-        assert columns[:, place] == pytest.approx((ends[0] - ends[1]) / 2e-5, abs=2e-4)
+            ends.append(run(moved, grid, begin + sign * shift[3:].reshape(2, 2))[:, 0])
+        columns.append((ends[0] - ends[1]) / 2e-5 / 0.5)
+    whole = np.stack(columns, axis=1)
+    left = (data.outputs - states[:, :1])[:, 0] / 0.5
+    gram, target = whole.T @ whole, whole.T @ left
+    along = linearise(model, Grid(data, 2), model.values, states)
+    found = normal_equations(along, data, np.array([0.25]))
+    size = np.abs(gram).max()
+    assert found.shared == pytest.approx(gram[:3, :3], abs=1e-3 * size)
+    assert found.own == pytest.approx(np.stack([gram[3:5, 3:5], gram[5:, 5:]]), abs=1e-3 * size)
+    assert found.between == pytest.approx(np.stack([gram[:3, 3:5], gram[:3, 5:]]), abs=1e-3 * size)
+    assert found.shared_target == pytest.approx(target[:3], abs=1e-2 * np.abs(target).max())
+    # One undamped step solves them, and a damped one gains less.
+    change, moved, gained = found.step(0.0)
+    exact = np.linalg.solve(gram, target)
+    assert np.concatenate([change, moved.ravel()]) == pytest.approx(exact, rel=0.05, abs=0.01)
+    assert gained == pytest.approx(target @ exact, rel=1e-2)
+    assert found.step(1.0)[2] < gained
+
+
+def test_a_tape_and_numpy_give_the_same_trajectories() -> None:
+    x, v, k = sympy.symbols("x v k", real=True)
+    smooth = sympy.exp(-(x**2)) * sympy.cos(v) / (2 + sympy.sin(x)) + sympy.log(1 + x**2) + sympy.tan(x / 9)
+    rough = sympy.Max(x, v, 0) ** 2 / 9 - sympy.Min(x, v) + sympy.sqrt(sympy.Abs(v)) * sympy.sign(x)
+    forces = {
+        "every function": rough + smooth - sympy.tanh(x) - sympy.atan(v) - 2 * x - v - x * (1 + x**2) ** k,
+        "what runs away": k * x**3 + 1,
+        "what no tape knows": -k * sympy.sinh(x),
+    }
+    for name, force in forces.items():
+        model = Dynamics(
+            states=("x", "v"), equations=(v, force), diffusion=Dynamics.of((x, v), (v, x)).diffusion,
+            parameters=(Parameter("k", 0.7),),
+        )  # fmt: skip
+        data, _ = driven(model_of(PENDULUM))
+        begin, grid = np.array([[0.5, 0.3], [1.5, 0.1]]), Grid(replace(data, courses=((), ())), 3)
+        fast = run(model, grid, begin)
+        slow = _run_side_by_side(model, grid, begin)
+        assert (model.functions.tape is None) == (name == "what no tape knows")
+        finite = np.isfinite(slow)
+        assert (np.isfinite(fast) <= finite).all() and (name != "what runs away" or not finite.all())
+        both = np.isfinite(fast)
+        np.testing.assert_allclose(fast[both], slow[both], rtol=1e-9, atol=1e-12)
 
 
 def test_friction_that_sticks_is_fitted_from_far_away() -> None:

@@ -115,7 +115,14 @@ def test_the_step_says_that_it_looked_from_earlier() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "given",
-    [{"memory": 5.0}, {"memory": 2.0, "states": 2}, {"exposure": 1.0}, {"exposure": 4.0, "states": 2}],
+    [
+        {"memory": 5.0},
+        {"memory": 2.0, "states": 2},
+        {"exposure": 1.0},
+        {"exposure": 4.0, "states": 2},
+        {"exposure": 1.5},
+        {"exposure": 10.0},
+    ],
 )
 @pytest.mark.parametrize("seed", [1, 2])
 def test_barriers_are_certified_and_right(given: dict[str, float], seed: int) -> None:

@@ -6,21 +6,30 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from remembering import STEP as TIME
+from remembering import double_wells
 
+from siq.data.markov_lag import markov_lag
 from siq.data.recordings import Recordings, snapshot_pairs
 from siq.data.selection import select_recordings
+from siq.dynamics.diffusion import Diffusion
 from siq.estimation.innovations import Noise
 from siq.identify.filtered_states import filtered_recordings, held_out_evidence
 from siq.identify.identification import IdentificationOptions, identify_vector_field
 from siq.identify.library import candidate_library
+from siq.identify.memory import possible_exposures
 from siq.identify.noisy_sensor import FilteredField, identify_by_likelihood
-from siq.identify.seen_states import unbroken
-from siq.identify.selection import critical_values
+from siq.identify.seen_states import View, unbroken
 from siq.steps import identify
+from siq.steps.identify_beside_sensor import means_over_exposures
 from siq.steps.outcomes import Status
 from siq.steps.pipeline import PipelineSettings
 
 STEP, FORCES, SENSOR = 0.02, 0.3, 0.1
+
+
+def recorded(values: np.ndarray) -> Recordings:
+    return Recordings.from_arrays(TIME * np.arange(values.shape[1]), values, names=["x"])
 
 
 def double_well(seed: int, *, samples: int = 3000, records: int = 6) -> tuple[Recordings, np.ndarray]:
@@ -44,7 +53,7 @@ def identified(recordings: Recordings, *, degree: int) -> FilteredField:
     )
     return identify_by_likelihood(
         library, recordings, begin.diffusion, Noise(np.array([0.003]), np.array([0.5])),
-        critical=critical_values(library, false_terms=0.05), generator=np.random.default_rng(0),
+        false_terms=0.05, generator=np.random.default_rng(0),
     )  # fmt: skip
 
 
@@ -133,7 +142,7 @@ def test_means_over_an_exposure_are_treated_as_such() -> None:
     assert field.noise_rate[0, 0] == pytest.approx(FORCES, rel=0.05)
     assert done.record.sensor_variance is not None
     assert np.sqrt(done.record.sensor_variance[0]) == pytest.approx(0.03, rel=0.1)
-    assert "mean over the step" in done.outcome.reason
+    assert "as the mean over the 0.04 before it" in done.outcome.reason
 
 
 def test_a_gap_begins_another_recording() -> None:
@@ -151,3 +160,43 @@ def test_the_step_asks_the_likelihood_where_sensors_are_noisy() -> None:
     assert done.record.sensor_variance is not None
     assert np.sqrt(done.record.sensor_variance[0]) == pytest.approx(SENSOR, rel=0.1)
     assert "the noise of the sensor" in done.outcome.reason
+
+
+@pytest.mark.parametrize(("steps", "kept", "rows"), [(0.4, 1, 2), (1.0, 1, 1), (1.5, 2, 2), (10.0, 10, 1)])
+def test_exposures_do_not_overlap_and_begin_at_rows_of_their_own(steps: float, kept: int, rows: int) -> None:
+    t = np.concatenate([0.1 * np.arange(101), 20 + 0.1 * np.arange(41)])
+    recordings = Recordings.from_arrays(t, np.sin(t)[:, None], names=["x"])
+    view = View(candidate_library(["x"], degree=1), Diffusion.identity(1), 0.1 * steps)
+    data = view.measured(recordings, None)
+    known = ~np.isnan(data.outputs[:, 0])
+    assert view.every(recordings) == kept
+    assert len(data.first) == 3 and known[data.first[:-1]].all()
+    np.testing.assert_allclose(data.outputs[known, 0], np.sin(data.t[known]))
+    intervals = np.diff(data.t)[data.begins]
+    lengths = {round(float(one), 9) for one in intervals}
+    assert round(0.1 * steps, 9) in lengths and len(lengths) == rows
+    assert np.isfinite(view.states(data)).all()
+    assert data.restarting == (1,)
+
+
+@pytest.mark.parametrize("steps", [0.5, pytest.param(3.0, marks=pytest.mark.slow)])
+def test_means_over_an_exposure_of_another_length_are_treated_as_such(steps: float) -> None:
+    recordings = recorded(double_wells(1, exposure=steps, samples=4_000, sensor=0.01))
+    library = candidate_library(["x"], degree=3)
+    found = means_over_exposures(
+        recordings, steps * TIME, library=library, options=IdentificationOptions(degree=3), pair_step=None,
+        generator=np.random.default_rng(0),
+    )  # fmt: skip
+    assert found is not None and found.exposure == steps * TIME
+    field = found.found
+    assert [field.library.names[k] for _, k in field.support] == ["x", "x**3"]
+    assert (np.abs(field.values - [1, -1]) < 3.5 * np.sqrt(np.diag(field.covariance))).all()
+    assert field.noise_rate[0, 0] == pytest.approx(0.2, rel=0.06)
+
+
+def test_exposures_that_are_tried_are_those_that_residuals_show() -> None:
+    memory = markov_lag(recorded(double_wells(1, exposure=10.0, samples=6_000)))
+    first, second = possible_exposures(memory)
+    assert first == pytest.approx(0.1) and second == memory.memory == pytest.approx(0.1, rel=0.03)
+    assert possible_exposures(replace(memory, kind="either")) == [memory.step]
+    assert possible_exposures(replace(memory, kind="coloured")) == []

@@ -5,7 +5,7 @@ import pytest
 from scipy.special import ndtr
 
 from siq.identify.library import CandidateLibrary, candidate_library
-from siq.identify.selection import Equation, best_support, critical_values, improved_support, rival_changes
+from siq.identify.selection import Equation, best_support, critical_values, improved_support
 
 LIBRARY = candidate_library(["x", "y"], degree=5)
 NAMES = list(LIBRARY.names)
@@ -21,9 +21,13 @@ def equation(seed: int, terms: dict[str, float], *, library: CandidateLibrary = 
     goal = draw.standard_normal(count)
     for name, value in terms.items():
         goal = goal + value * functions[:, list(library.names).index(name)]
-    triangle = np.linalg.qr(np.column_stack([functions, goal]), mode="r")
+    return of_rows(np.column_stack([functions, goal]), library)
+
+
+def of_rows(rows: np.ndarray, library: CandidateLibrary) -> Equation:
+    """The equation of functions and, in the last column, what they are to explain."""
     critical = critical_values(library, false_terms=0.05)
-    return Equation.of_triangle(triangle, 0, samples=count, critical=critical)
+    return Equation.of_triangle(np.linalg.qr(rows, mode="r"), 0, samples=len(rows), critical=critical)
 
 
 def named(support: tuple[int, ...]) -> set[str]:
@@ -51,23 +55,25 @@ def test_a_term_that_elimination_mistook_is_exchanged(seed: int) -> None:
 
 def test_many_terms_that_make_up_a_few_are_left_for_these() -> None:
     made = equation(1, {"x": 2.0, "x**2": -2.0, "x*y": -3.0})
-    start = [NAMES.index(one) for one in ("x**3", "x**4", "x**5", "x**3*y", "x*y**3", "x**4*y")]
-    assert named(best_support(made, start)) == {"x", "x**2", "x*y"}
+    assert named(best_support(made)) == {"x", "x**2", "x*y"}
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_states_far_from_the_origin_hide_no_better_support(seed: int) -> None:
+    """Where all monomials are nearly alike, exchanges of single terms end far from the best."""
+    draw = np.random.default_rng(seed)
+    functions = LIBRARY.evaluate(1.5 + 0.5 * draw.standard_normal((4000, 2)))
+    terms = {"x": 1.0, "y": -1.0, "x**2*y": 1.0, "y**3": -0.5}
+    true = tuple(sorted(NAMES.index(name) for name in terms))
+    goal = functions[:, true] @ [terms[NAMES[place]] for place in true] + draw.standard_normal(4000)
+    made = of_rows(np.column_stack([functions, goal]), LIBRARY)
+    assert made.score(best_support(made)) <= made.score(true) + 1e-6
 
 
 def test_noise_alone_brings_few_terms() -> None:
     false = [improved_support(equation(seed, {}), ()) for seed in range(60)]
     # One equation of two: 2.5 % of the seeds are expected to have one.
     assert sum(map(bool, false)) <= 4
-
-
-def test_rivals_are_the_likelier_the_less_the_data_tell_them_apart() -> None:
-    own = (NAMES.index("y"), NAMES.index("x**2*y"))
-    apart, close = (equation(0, {"y": -2.0, "x**2*y": size}) for size in (-10.0, -0.6))
-    # Against x⁴y, that is, which is nearly the same function on these states.
-    sizes = [np.linalg.norm(rival_changes(one, own)[:, own[1]]) for one in (apart, close)]
-    assert sizes[0] < 0.1 * sizes[1]
-    assert rival_changes(apart, own).shape[1] == LIBRARY.size
 
 
 def test_scores_of_neighbours_are_those_of_fits() -> None:

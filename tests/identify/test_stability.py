@@ -22,7 +22,7 @@ def test_what_one_recording_alone_asks_for_is_not_stable() -> None:
     columns = generator.standard_normal((len(block), 4))
     goal = 0.5 * columns[:, 0] + generator.standard_normal(len(block))
     goal[block == 3] += 2.0 * columns[block == 3, 2]
-    parts = triangles(np.column_stack([columns, goal]), block)
+    parts = triangles(columns, goal, block)
     critical = np.full(4, 3.0)
     (shares,) = stability(
         parts, lambda drawn: [Equation(drawn[:, :-1], drawn[:, -1], 1.0, critical)], [[0, 2]],

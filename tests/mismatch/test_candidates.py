@@ -16,11 +16,16 @@ from siq.mismatch.roles import roles_of
 from siq.mismatch.units import unit_of
 
 NAMES = (
-    "quadratic stiffness", "cubic stiffness", "quintic stiffness", "quadratic drag", "cubic damping",
-    "amplitude-dependent damping", "dry friction", "asymmetric friction", "Stribeck friction",
-    "position-dependent damping", "constant bias", "linear coupling", "nonlinear coupling", "self-limitation",
-    "saturation", "parametric drive", "parameter drift", "periodic forcing", "overflow", "input delay",
-    "hysteresis", "process noise", "sensor gain or offset",
+    "linear stiffness", "geometric stiffness", "preload", "backlash", "gravity", "added mass",
+    "moment of inertia", "linear damping", "quadratic stiffness", "cubic stiffness", "quintic stiffness",
+    "quadratic drag", "cubic damping", "amplitude-dependent damping", "dry friction", "asymmetric friction",
+    "Stribeck friction", "position-dependent damping", "constant bias", "linear coupling",
+    "nonlinear coupling", "self-limitation", "mortality", "harvest", "Allee effect", "prey refuge",
+    "sigmoid functional response", "predator interference", "decay or leakage", "delayed response",
+    "saturation", "parametric drive", "parameter drift", "periodic forcing", "overflow", "leak",
+    "input delay",
+    "hysteresis", "process noise", "sensor gain or offset", "thermal drift", "sensor lag", "quantisation",
+    "clipping", "clock offset and drift",
 )  # fmt: skip
 
 
@@ -89,6 +94,11 @@ def test_populations_and_levels() -> None:
         }
     )
     assert roles_of(tanks).levels == ("h", "g")
+    assert roles_of(tanks).cascades == (("h", "g"),)  # the upper flows into the lower, and not back
+    apart = model_of(
+        {"states": states("h", "g"), "equations": {"h": "-sqrt(Max(h, 0)) + 1", "g": "1 - sqrt(Max(g, 0))"}}
+    )
+    assert roles_of(apart).cascades == ()
 
 
 def test_a_system_without_roles_is_described_by_monomials() -> None:

@@ -14,12 +14,14 @@ import yaml
 
 from siq.dynamics.cards import load_system
 from siq.dynamics.dynamics import Dynamics
+from siq.dynamics.parametric import Signals
 from siq.errors import InputError, NumericalFailure
 from siq.mismatch import trials
 from siq.mismatch.case import read_case
 from siq.mismatch.diagnosis import Diagnosis, solve_case
 from siq.mismatch.dictionary import standard_dictionary
 from siq.mismatch.probes import Probe
+from tests.mismatch.foreign_cases import falling_ball
 
 CARD = {
     "name": "oscillator",
@@ -149,13 +151,38 @@ def test_a_hardening_spring_is_named_measured_and_located(tmp_path: Path) -> Non
     json.dumps(verdict, allow_nan=False)
 
 
-def test_a_faint_mechanism_is_described_but_not_named(tmp_path: Path) -> None:
+def test_a_mechanism_that_is_not_certain_enough_is_described_but_not_named(tmp_path: Path) -> None:
     table = recordings_of(lambda x, v, t: -0.03 * x**3)
-    study = {"held_out": ["r2", "r5"], "search": {"named": 1e6}}
+    study = {"held_out": ["r2", "r5"], "search": {"wrong_names": 1e-200}}
     diagnosis = solved(tmp_path, table, study=study)
     assert said(diagnosis)["verdict"] == "unexplained" and names(diagnosis) == []
     assert said(diagnosis)["description"]["by"][0]["name"] == "cubic stiffness"
-    assert "too faint to be named" in said(diagnosis)["remarks"][-1]
+    assert "a name takes odds of" in said(diagnosis)["remarks"][-1]
+    # It is in the new card all the same, since the card foresees more with it.
+    (part,) = said(diagnosis)["described"]
+    assert part["equations"] == ["v"] and part["coordinates"] == ["x"]
+    assert said(diagnosis)["fit"]["augmented"] < 0.9 * said(diagnosis)["fit"]["recalibrated"]
+
+
+def test_the_later_part_of_a_single_recording_is_not_called_independent(tmp_path: Path) -> None:
+    table = recordings_of(lambda x, v, t: -0.5 * x**3)
+    diagnosis = solved(tmp_path, table[table["recording"] == "r6"], study={"held_out": 0.3})
+    assert names(diagnosis) == ["cubic stiffness"]
+    assert "no independent recording" in said(diagnosis)["remarks"][-1]
+
+
+@pytest.mark.parametrize("drag", [0.005, 0.5])
+def test_drag_is_named_from_one_drop_of_45_heights(drag: float, tmp_path: Path) -> None:
+    """Free fall is off by a tenth, or by nearly all; random forces could explain any 45 heights."""
+    diagnosis = solve_case(falling_ball(drag).read(tmp_path))
+    (found,) = said(diagnosis)["mechanisms"]
+    assert found["name"] == "quadratic drag"
+    (parameter,) = found["parameters"].values()
+    assert abs(parameter["estimate"] - drag) < 3 * parameter["standard_error"]
+    # Random forces explain more than free fall alone, and drag without any explains more than they do.
+    said_of = {each["what"]: each["log_evidence"] for each in said(diagnosis)["explanations"]}
+    assert said_of["quadratic drag in w"] == 0
+    assert said_of["other parameters"] < said_of["other parameters and random forces"] < -10
 
 
 def test_dry_friction_is_told_from_other_friction(tmp_path: Path) -> None:
@@ -180,6 +207,9 @@ def test_random_forces_that_follow_the_motion_are_not_those_of_surroundings(tmp_
     diagnosis = solved(tmp_path, recordings_of(nothing, drive=0.03, fading=True))
     assert said(diagnosis)["verdict"] == "unexplained"
     assert any("hidden state" in remark for remark in said(diagnosis)["remarks"])
+    # No function foresees them: the card stays as it was, and this is said.
+    assert said(diagnosis)["described"] == []
+    assert "the simulation stays as it was" in said(diagnosis)["sentence"]
 
 
 def test_unequal_friction_is_found_though_its_first_fit_may_lead_nowhere(tmp_path: Path) -> None:
@@ -195,6 +225,21 @@ def test_what_the_dictionary_lacks_stays_unexplained(tmp_path: Path) -> None:
     diagnosis = solved(tmp_path, recordings_of(lambda x, v, t: 1.5 * np.exp(-(((x - 0.5) / 0.15) ** 2))))
     assert said(diagnosis)["verdict"] == "unexplained" and said(diagnosis)["mechanisms"] == []
     assert said(diagnosis)["location"]["coordinate"] == "x"
+    # And gets a model: its function of x, which foresees recordings that had no part in it.
+    part = said(diagnosis)["described"][0]
+    assert part["kind"] == "spline" and part["equations"] == ["v"] and part["coordinates"] == ["x"]
+    assert said(diagnosis)["fit"]["augmented"] < 0.5 * said(diagnosis)["fit"]["recalibrated"]
+    assert " it. With it, the error on held-out recordings falls from" in said(diagnosis)["sentence"]
+    path = tmp_path / "augmented.yaml"
+    path.write_text(diagnosis.to_card(), encoding="utf-8")
+    again = load_system(path)
+    at = np.linspace(-1.5, 1.5, 61)
+    states = np.stack([at, np.zeros_like(at)])
+    before = diagnosis.recalibrated
+    signals = Signals(np.zeros((1, 61)), np.zeros((0, 61)), np.zeros((0, 61)), at)
+    missing = again.functions.rates(states, signals, again.values)[1]
+    missing = missing - before.functions.rates(states, signals, before.values)[1]
+    assert abs(at[np.argmax(missing)] - 0.5) <= 0.15
 
 
 def test_a_bias_and_an_offset_of_the_sensor_are_one_class(tmp_path: Path) -> None:

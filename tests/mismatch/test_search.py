@@ -7,13 +7,24 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import scipy.stats
+import sympy
 
-from siq.mismatch.clusters import blocks_of, correlation_time
+from siq.data.recordings import Recordings
+from siq.dynamics.diffusion import Diffusion
+from siq.dynamics.dynamics import Dynamics, Parameter
+from siq.estimation.estimation import Fit
+from siq.estimation.measurements import Measurements, measurements
+from siq.estimation.recalibration import recalibrate
+from siq.mismatch import naming
+from siq.mismatch.clusters import blocks_of, correlated_probability, correlation_time
+from siq.mismatch.dictionary import Shape
 from siq.mismatch.investigation import named_or_not
 from siq.mismatch.location import most_telling
-from siq.mismatch.remainder import Remainder, without_patches
+from siq.mismatch.naming import Naming, naming_of
+from siq.mismatch.remainder import Remainder
 from siq.mismatch.roles import Roles
-from siq.mismatch.search import Found, Search, accepted
+from siq.mismatch.search import Found, Search, _once_more, accepted
 from siq.mismatch.search_options import SearchOptions
 from siq.mismatch.structure import Curve, Direction, Structure
 from siq.mismatch.trials import TriedMechanism
@@ -50,6 +61,59 @@ def test_there_are_at_least_so_many_blocks() -> None:
     assert blocks_of(np.zeros(400, dtype=int), autoregressive(0.99, 400), least=10).max() == 9
 
 
+@pytest.fixture(scope="module")
+def decaying() -> Dynamics:
+    x, k = sympy.symbols("x k", real=True)
+    return Dynamics(("x",), (-k * x,), Diffusion.identity(1), parameters=(Parameter("k", 1.0),))
+
+
+def fit_with_errors(model: Dynamics, errors: np.ndarray) -> tuple[Fit, Measurements]:
+    """A simulation fitted to one recording that is off by given errors."""
+    t = np.linspace(0, 3, len(errors))
+    table = Recordings(
+        ("x",), (None,), ("a",), np.zeros(len(t), dtype=int), t, (np.exp(-t) + errors)[:, None]
+    )
+    data = measurements(table, model)
+    return recalibrate(model, data)[1], data
+
+
+def test_a_gain_weighs_as_much_as_there_are_independent_errors(decaying: Dynamics) -> None:
+    """Likelihood weighs n errors; of those that hang together over τ samples it may count n/τ."""
+    candidate = SimpleNamespace(searches=(), new=("c",))
+    found = {}
+    for memory in (0.0, 0.9):
+        fit, data = fit_with_errors(decaying, 0.01 * autoregressive(memory, 2000))
+        found[memory] = correlated_probability(fit, data, candidate, gained=60.0)
+    assert found[0.0] == pytest.approx(scipy.stats.chi2.sf(60.0, 1), rel=30)
+    assert 1e-3 < found[0.9] < 0.5  # about χ² of 60/19
+
+
+def test_every_place_at_which_a_shape_was_looked_for_is_a_chance(decaying: Dynamics) -> None:
+    fit, data = fit_with_errors(decaying, 0.01 * autoregressive(0.0, 400))
+    once = SimpleNamespace(searches=(), new=("c", "w"))
+    often = SimpleNamespace(
+        searches=(Shape(frequencies=90), Shape(scale_of="x", at=(1.0, 2.0))), new=("c", "w")
+    )
+    alone = correlated_probability(fit, data, once, gained=30.0)
+    assert correlated_probability(fit, data, often, gained=30.0) == pytest.approx(180 * alone)
+
+
+def test_a_mechanism_that_was_found_is_not_found_once_more_in_another_form() -> None:
+    def one(name: str, label: str, equations: tuple[str, ...], coordinate: str) -> SimpleNamespace:
+        model = SimpleNamespace(states=("h", "g"))
+        return SimpleNamespace(
+            name=name, label=label, equations=equations, coordinate=coordinate, model=model
+        )
+
+    found = one("overflow", "overflow in h, g", ("h", "g"), "h")
+    assert _once_more(one("overflow", "overflow in h", ("h",), "h"), found)
+    assert not _once_more(one("overflow", "overflow in g", ("g",), "g"), found)
+    assert not _once_more(one("leak", "leak in h", ("h",), "h"), found)
+    # Two parameters may drift in time, each by its own.
+    drift = one("parameter drift", "parameter drift in h (a)", ("h",), "t")
+    assert not _once_more(one("parameter drift", "parameter drift in h (b)", ("h",), "t"), drift)
+
+
 def structure(excess: float, *gains: tuple[str, str, float]) -> Structure:
     curves = [
         Curve(Direction((equation,), coordinate, False, np.zeros(4)), np.zeros(4), np.ones(4), gain, 0.0)
@@ -63,20 +127,21 @@ def remainder(share: float, p_curves: float = 1.0) -> Remainder:
     return Remainder(structure(0), Structure((), p_curves, 1.0, 100, 100), share)
 
 
-def found_with(*gains: float) -> Search:
-    """A search that found one mechanism after the other, each with what it gained."""
+def found_with(number: int) -> Search:
+    """A search that found so many mechanisms, one after the other."""
 
-    def found(place: int, gain: float) -> Found:
-        candidate = SimpleNamespace(name=f"mechanism {place}")
-        return Found(TriedMechanism(candidate, SimpleNamespace(number=place), gain, -gain, 0.0, 0.0), ())
+    def found(place: int) -> Found:
+        candidate = SimpleNamespace(name=f"mechanism {place}", label=f"mechanism {place}", number=place)
+        fit = SimpleNamespace(number=place, has_process_noise=False, noise=SimpleNamespace(measurement=1.0))
+        return Found(TriedMechanism(candidate, fit, 100.0, -90.0, 0.0, 0.0), ())
 
-    each = tuple(found(place, gain) for place, gain in enumerate(gains, start=1))
-    return Search(SimpleNamespace(number=0), each, each[-1].best.fit, ())
+    each = tuple(found(place) for place in range(1, number + 1))
+    return Search(SimpleNamespace(number=0, x=None), each, each[-1].best.fit, ())
 
 
-MOTION = Roles((("x", "v"),), (), (), (), ("v",))
-FRAME = Roles((), (("P", "Q"),), (), (), ("P", "Q"))
-POPULATIONS = Roles((), (), ("prey", "predator"), (), ("prey", "predator"))
+MOTION = Roles(motions=(("x", "v"),), states=("v",))
+FRAME = Roles(amplitudes=(("P", "Q"),), states=("P", "Q"))
+POPULATIONS = Roles(populations=("prey", "predator"), states=("prey", "predator"))
 
 
 @pytest.mark.parametrize(
@@ -111,38 +176,74 @@ def test_of_a_rotating_frame_the_motion_is_its_amplitude() -> None:
     assert most_telling(found, FRAME) == (("P", "Q"), "amplitude")
 
 
-@pytest.mark.parametrize(
-    ("gains", "shares", "kept"),
-    [
-        ((900.0, 300.0), (0.998, 0.9999), 2),
-        ((900.0, 40.0), (0.998, 0.9999), 1),  # too faint
-        ((900.0, 300.0), (0.9993, 0.9991), 1),  # leaves more than without it
-        ((900.0, 40.0, 300.0), (0.998, 0.999, 0.9999), 1),  # what came after a patch goes with it
-    ],
-)
-def test_further_mechanisms_stay_as_long_as_each_gains_enough_and_leaves_less(
-    gains: tuple[float, ...], shares: tuple[float, ...], kept: int
-) -> None:
-    search, left = without_patches(found_with(*gains), [remainder(share) for share in shares], least=100)
-    assert len(search.found) == kept
-    assert search.fit.number == kept
-    assert left.share == shares[kept - 1]
+def judged(
+    monkeypatch: pytest.MonkeyPatch,
+    odds: tuple[float, ...],
+    left: list[Remainder],
+    *,
+    together: float = 20.0,
+    p_alike: float = 0.5,
+) -> Naming:
+    """A search of so many mechanisms, judged by odds and matches that are given."""
+
+    def of_a_name(
+        fit: SimpleNamespace, data: object, candidates: list[SimpleNamespace], *rest: object, **_: object
+    ) -> float:
+        return odds[candidates[0].number - 1] if len(candidates) == 1 else together
+
+    monkeypatch.setattr(naming, "log_odds_of_a_name", of_a_name)
+    monkeypatch.setattr(naming, "probability_of_a_match", lambda *_, **__: p_alike)
+    data = SimpleNamespace()
+    return naming_of(
+        found_with(len(odds)), left, data, SimpleNamespace(), MOTION, (),
+        options=SearchOptions(wrong_names=0.05, unnamed=0.2), generator=np.random.default_rng(0),
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(
-    ("gains", "verdict", "said"),
+    ("odds", "shares", "kept"),
     [
-        ((900.0,), "missing physics", None),
-        ((900.0, 300.0), "missing physics", None),
-        ((60.0,), "unexplained", "It looks like mechanism 1, but is too faint"),
-        ((900.0, 23.0), "unexplained", "mechanism 1 and mechanism 2, but mechanism 2 is too faint"),
+        ((9.0, 5.0), (0.998, 0.9999), 2),
+        ((9.0, 2.0), (0.998, 0.9999), 1),  # a function without a name would do as well
+        ((9.0, 5.0), (0.9993, 0.9991), 1),  # leaves more than without it
+        ((9.0, 2.0, 5.0), (0.998, 0.999, 0.9999), 1),  # what came after a patch goes with it
     ],
 )
-def test_what_is_named_has_to_be_strong_each_of_it(
-    gains: tuple[float, ...], verdict: str, said: str | None
+def test_further_mechanisms_stay_as_long_as_each_is_likely_and_leaves_less(
+    odds: tuple[float, ...], shares: tuple[float, ...], kept: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    found, remarks = named_or_not(found_with(*gains), remainder(0.9999), False, True, least=100)
-    assert found == verdict
+    found = judged(monkeypatch, odds, [remainder(share) for share in shares])
+    assert len(found.search.found) == kept
+    assert found.search.fit.number == kept
+    assert found.left.share == shares[kept - 1]
+
+
+@pytest.mark.parametrize(
+    ("odds", "together", "p_alike", "p_left", "verdict", "said"),
+    [
+        ((9.0,), 20.0, 0.5, 1.0, "missing physics", None),
+        ((2.5,), 20.0, 0.5, 1.0, "unexplained", "nearly as likely (odds of 12 to 1)"),
+        ((-1.0,), 20.0, 0.5, 1.0, "unexplained", "a function without a name is likelier"),
+        # Two that are a description of one function.
+        ((9.0, 9.0), 1.0, 0.5, 1.0, "unexplained", "mechanism 1 and mechanism 2"),
+        # Of what leaves something, the share has to be more than mechanisms reach by chance.
+        ((9.0,), 20.0, 0.5, 1e-9, "unexplained", None),
+        ((9.0,), 20.0, 0.01, 1e-9, "missing physics", None),
+    ],
+)
+def test_a_name_has_to_be_likelier_than_none(
+    odds: tuple[float, ...],
+    together: float,
+    p_alike: float,
+    p_left: float,
+    verdict: str,
+    said: str | None,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    left = [remainder(0.99 + 0.001 * place, p_left) for place in range(len(odds))]
+    found = judged(monkeypatch, odds, left, together=together, p_alike=p_alike)
+    given, remarks = named_or_not(found, SearchOptions(wrong_names=0.05, unnamed=0.2))
+    assert given == verdict
     assert said is None or said in remarks[-1]
 
 

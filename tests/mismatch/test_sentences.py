@@ -19,6 +19,7 @@ from siq.mismatch.statement import (
     Evidence,
     Recalibrated,
     Rival,
+    StatedFunction,
     StatedMechanism,
     Statement,
 )
@@ -193,6 +194,27 @@ def test_all_of_it_is_never_said_of_what_is_not_explained():
         if description.share_described > 0.999:
             assert "nothing explains it fully" not in text
         assert ("looks like noise (p =" in text) == (description.p_residuals_random >= 2e-3)
+
+
+@pytest.mark.parametrize("described", [False, True])
+def test_a_model_without_a_name_is_said_with_its_gain_or_that_nothing_was_gained(described):
+    part = StatedFunction(
+        "a function of x", "a function of x in v", "spline", {}, {}, Evidence(90.0, -80.0, 0.0, 0.0), ("v",)
+    )
+    errors = HeldOutErrors(0.5, 0.3, 0.05 if described else 0.31, 0.04, values=1000)
+    description = Description(0.0, (), 0.0, False)
+    text = sentence_of(
+        Statement(
+            MismatchVerdict.UNEXPLAINED, "", description=description, errors=errors,
+            described=(part,) if described else (),
+        ),
+        {},
+    )  # fmt: skip
+    if described:
+        assert "A function of x in the equation of v describes it. With it, the error" in text
+        assert percentages(text.split("falls from")[1])[:3] == [50.0, 30.0, 5.0]
+    else:
+        assert "the simulation stays as it was" in text and "falls from" not in text
 
 
 def test_random_forces_are_a_verdict_of_their_own():

@@ -11,11 +11,24 @@ FIT = {"before": 0.5, "recalibrated": 0.1, "augmented": 0.02, "noise_floor": 0.0
 
 
 @pytest.mark.parametrize(
-    ("verdict", "after"),
-    [("missing physics", 0.02), ("parameter shift", 0.1), ("unexplained", 0.1), ("no mismatch", 0.5)],
+    ("verdict", "named", "described", "after"),
+    [
+        ("missing physics", ["cubic stiffness"], [], 0.02),
+        ("missing physics", ["process noise"], [], 0.1),
+        ("parameter shift", [], [], 0.1),
+        ("unexplained", [], [], 0.1),
+        ("unexplained", [], [{"kind": "spline"}], 0.02),
+        ("no mismatch", [], [], 0.5),
+    ],
 )
-def test_the_error_after_is_that_of_the_simulation_that_the_verdict_ends_with(verdict, after):
-    answer = mismatch_answer({"verdict": verdict, "sentence": "So.", "fit": FIT}, title="A spring")
+def test_the_error_after_is_that_of_the_simulation_that_the_verdict_ends_with(
+    verdict, named, described, after
+):
+    said = {
+        "verdict": verdict, "sentence": "So.", "fit": FIT, "described": described,
+        "mechanisms": [{"name": name} for name in named],
+    }  # fmt: skip
+    answer = mismatch_answer(said, title="A spring")
     assert answer == {
         "title": "A spring", "sentence": "So.", "verdict": verdict, "compared": True,
         "held_out_before": 0.5, "held_out_after": after, "held_out_noise": 0.01,

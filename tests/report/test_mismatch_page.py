@@ -17,10 +17,12 @@ from siq.dynamics.dynamics import Dynamics
 from siq.mismatch.consequences import compare_landscapes, identified, obstacle
 from siq.mismatch.dictionary import dictionary_of
 from siq.mismatch.verdict import statement_of_failure
+from siq.report.largest_difference import largest_difference
 from siq.report.mismatch_findings import Findings
 from siq.report.mismatch_page import mismatch_page
 from siq.report.mismatch_sections import CAPTIONS
-from siq.report.plots.before_after import most_telling, plot_before_after, plot_held_out
+from siq.report.plots.before_after import plot_before_after, plot_held_out
+from siq.report.plots.described import plot_described
 from siq.report.plots.mismatch import limits_of, plot_candidates, plot_curves, plot_escapes, plot_missing
 from siq.report.plots.reading import rate_unit
 
@@ -242,19 +244,78 @@ def test_the_first_picture_shows_one_recording_before_and_after(after, curves):
     assert lower.get_ylabel() == "error (mm)"
 
 
-def test_the_first_picture_is_of_the_output_that_is_furthest_off_and_a_typical_recording():
+@pytest.mark.parametrize(
+    ("runaway", "recording", "before"), [(False, "worst", 0.5), (True, "runaway", np.inf)]
+)
+def test_the_page_begins_with_the_largest_difference(runaway, recording, before):
+    """Of the output that is off the furthest in the middle of all recordings: one runaway does not decide."""
     t = np.arange(20.0)
     parts = [
         pd.DataFrame(
             {
-                "recording": recording, "t": t, "output": output, "measured": np.sin(t), "scored": True,
-                "before": np.sin(t) + off, "recalibrated": 0.0, "augmented": 0.0,
+                "recording": name, "t": t, "output": output, "measured": np.sin(t), "scored": True,
+                "before": np.sin(t) + off, "recalibrated": 0.0, "augmented": np.sin(t) + 0.1,
             }
         )
         for output, scale in (("x", 0.1), ("y", 1.0))
-        for recording, off in (("best", 0.1 * scale), ("worst", np.nan), ("typical", 0.5 * scale))
+        for name, off in (
+            ("best", 0.1 * scale), ("runaway", np.nan if runaway or output == "x" else 0.0),
+            ("worst", 0.5 * scale),
+        )
     ]  # fmt: skip
-    assert most_telling(pd.concat(parts)) == ("typical", "y")
+    found = largest_difference(pd.concat(parts), after="augmented")
+    assert (found.output, found.recording, found.recordings) == ("y", recording, 3)
+    assert found.before == pytest.approx(before) and found.after == pytest.approx(0.1)
+
+
+DESCRIBED = {
+    "name": "a function of x", "label": "a function of x in v", "kind": "spline",
+    "terms": {"v": "f_1*Abs(x)**3 + f_2"},
+    "parameters": {"f_1": {"estimate": 0.2, "standard_error": 0.1, "unit": "mm/s**2"}},
+    "evidence": {"delta_chi2": 90.0, "delta_bic": -80.0, "p_white": 0.0, "p_cluster": 0.0},
+    "equations": ["v"], "outputs": [], "coordinates": ["x"], "beside": [],
+    "curve": {
+        "coordinate": "x", "at": [-1.0, -0.5, 0.2, 0.7, 1.5], "value": [0.1, 0.0, 0.3, 1.1, 0.2],
+        "standard_error": [0.05, 0.02, 0.01, 0.02, 0.1],
+    },
+}  # fmt: skip
+
+
+def test_the_model_of_what_has_no_name_is_on_the_page_and_drawn_with_its_band(models):
+    figure = plot_described([DESCRIBED, DESCRIBED | {"curve": None}], units={"x": "mm"}, time_unit="s")
+    (axes,) = figure.axes
+    assert axes.get_xlabel() == "$x$ (mm)" and axes.get_ylabel() == "added in the equation of $v$"
+    (band,) = axes.collections
+    heights = band.get_paths()[0].vertices[:, 1]
+    assert heights.max() > 1.1 and heights.min() < 0
+    description = {
+        "share_described": 0.0, "by": [], "p_residuals_random": 0.0, "random_forces_admitted": False,
+        "too_faint": False,
+    }  # fmt: skip
+    said = {
+        "verdict": "unexplained", "mechanisms": [], "description": description, "described": [DESCRIBED],
+        "words": {},
+    }  # fmt: skip
+    shown = findings(models, verdict=said)
+    assert shown.final == "augmented"
+    page = mismatch_page(shown, title="t", commands=())
+    assert "A model of what is missing" in page and re.search(r"1\.10+\s±\s0\.020?", page)
+    assert "with what describes it" in page
+    explanations = [{"what": "drag in v", "log_evidence": 0.0}, {"what": "forces", "log_evidence": -31.25}]
+    told = findings(models, verdict={"explanations": explanations})
+    assert "\N{MINUS SIGN}31.2" in mismatch_page(told, title="t", commands=()).replace(
+        "-31.2", "\N{MINUS SIGN}31.2"
+    )
+
+
+def test_the_picture_stands_above_the_answer(models):
+    figure = b'<svg xmlns="http://www.w3.org/2000/svg"></svg>'
+    shown = replace(findings(models), figures={"before_after": figure}, held_out=held_out())
+    page = mismatch_page(shown, title="t", commands=())
+    assert 0 < page.index("<figure") < page.index('class="answer')
+    assert re.search(
+        "In the held-out recording .*, x as simulated .* as given, and .* with what was found", page
+    )
 
 
 def test_curve_of_the_named_mechanism_comes_first():

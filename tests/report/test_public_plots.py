@@ -18,7 +18,7 @@ import siq
 from siq.dynamics.simulation import runge_kutta_step
 from siq.landscape.landscape import Landscape, find_landscape
 from siq.landscape.storage import landscape_data
-from siq.landscape.transitions import barrier_standard_error
+from siq.landscape.transitions import barrier_uncertainty
 from siq.potential.local_wells import WellOptions
 from siq.potential.symbolic import SymbolicDecomposition
 from siq.report.drawn_landscape import DrawnLandscape, DrawnPoint, DrawnWay, drawn, drawn_data
@@ -114,7 +114,7 @@ def test_the_band_of_one_state_is_that_of_the_barrier() -> None:
     band = shown.standard_error(x)
     assert band is not None
     top = np.interp(float(way.saddle.position[0]), x, band)
-    assert top == pytest.approx(barrier_standard_error(way.path, field), rel=1e-3)
+    assert top == pytest.approx(barrier_uncertainty(way.path, field)[0], rel=1e-3)
     assert np.interp(float(found.attractors[deepest].position[0]), x, band) < 1e-3 * top
     assert drawn(landscape(2)).standard_error(x) is None
 

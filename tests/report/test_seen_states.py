@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 from told_landscapes import NOISE, landscape
 
-from siq.report.record_answer import seen_sentence, with_visits
+from siq.data.record_states import RecordStates
+from siq.data.transitions import DwellCount
+from siq.report.record_answer import with_visits
 from siq.report.said_landscape import SaidLandscape
 from siq.study.tables import as_table
 
-SEEN = {
-    "state": "rate", "unit": "Hz", "time_unit": "s", "supported": True, "levels": [0.825, 35.29], "hops": 96,
-    "counts": [
-        {"visits": 48, "mean": 1.74, "lowest": 1.31, "highest": 2.36},
-        {"visits": 0, "mean": None, "lowest": 0.3, "highest": None},
-    ],
-}  # fmt: skip
+SEEN = RecordStates(
+    "rate", "Hz", "s", True, 1e-6, (0.825, 35.29), (DwellCount(48, 48 * 1.74), DwellCount(0, 1.1)),
+    np.array([0.0, 1.0]), np.array([1.0]),
+)  # fmt: skip
 
 
 def test_two_states_of_a_record_are_told_without_any_formula() -> None:
-    said = seen_sentence(SEEN)
-    assert "two states of rate, at 0.825\u00a0Hz and 35.3\u00a0Hz: 96 transitions were seen" in said
+    said = SEEN.sentence()
+    assert "two states of rate, at 0.825\u00a0Hz and 35.3\u00a0Hz: 48 transitions were seen" in said
     assert "last 1.74 (1.3 to 2.4) and more than 0.30 s in the mean" in said
-    assert seen_sentence(SEEN | {"supported": False}) == "" == seen_sentence(None)
+    assert replace(SEEN, supported=False).sentence() == ""
 
 
 def test_visits_belong_to_the_well_at_their_place() -> None:

@@ -20,7 +20,7 @@ from siq.estimation.free_runs import free_run, normalised_rms
 from siq.estimation.jumps import sharpened
 from siq.estimation.process_noise import fit_with_process_noise_as_needed
 from siq.estimation.recalibration import recalibrate
-from siq.mismatch.candidates import MechanismCandidate, build_candidate
+from siq.mismatch.building import MechanismCandidate, build_candidate
 from siq.mismatch.case import Comparison
 from siq.mismatch.dictionary import Form, FurtherState, Mechanism, MechanismParameter
 from siq.mismatch.dictionary import Role as RoleKind

@@ -46,7 +46,7 @@ def scores_if_any(wildcards):
     """Input function: scores in units of their own, which public benchmarks have."""
     if case_of(wildcards).benchmark is None:
         return []
-    return f"results/mismatch/{wildcards.case}/tables/real_recordings.parquet"
+    return f"results/mismatch/{wildcards.case}/tables/official_tests.parquet"
 
 
 def mismatch_pages(wildcards):

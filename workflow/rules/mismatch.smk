@@ -4,6 +4,12 @@
 localrules:
     mismatch,
     diagnose,
+    official,
+
+
+rule official:
+    input:
+        "results/official/page.md",
 
 
 rule mismatch:
@@ -100,7 +106,7 @@ rule mismatch_landscape:
         "../scripts/mismatch_landscape.py"
 
 
-rule real_recordings:
+rule official_tests:
     input:
         card=case_file("card"),
         recordings=case_file("recordings"),
@@ -109,22 +115,55 @@ rule real_recordings:
         system="results/mismatch/{case}/system.yaml",
         noise="results/mismatch/{case}/tables/noise.parquet",
     output:
-        table="results/mismatch/{case}/tables/real_recordings.parquet",
-        csv="results/mismatch/{case}/tables/real_recordings.csv",
+        table="results/mismatch/{case}/tables/official_tests.parquet",
+        csv="results/mismatch/{case}/tables/official_tests.csv",
+        runs="results/mismatch/{case}/tables/official_runs.parquet",
+        runs_csv="results/mismatch/{case}/tables/official_runs.csv",
     log:
-        "results/mismatch/{case}/logs/real_recordings.log",
+        "results/mismatch/{case}/logs/official_tests.log",
     benchmark:
-        "results/mismatch/{case}/benchmarks/real_recordings.tsv"
+        "results/mismatch/{case}/benchmarks/official_tests.tsv"
     conda:
         "../envs/siq.yaml"
     threads: 1
     params:
-        code=code("real_recordings.py"),
+        code=code("official_tests.py"),
         benchmark=lambda wildcards: case_of(wildcards).benchmark,
     message:
-        "{wildcards.case}: scoring the simulations on held-out recordings"
+        "{wildcards.case}: scoring the simulations in the official tests"
     script:
-        "../scripts/real_recordings.py"
+        "../scripts/official_tests.py"
+
+
+rule official_summary:
+    input:
+        tables=expand(
+            "results/mismatch/{case}/tables/official_tests.parquet", case=BENCHMARKS
+        ),
+        runs=expand(
+            "results/mismatch/{case}/tables/official_runs.parquet", case=BENCHMARKS
+        ),
+        verdicts=expand("results/mismatch/{case}/verdict.json", case=BENCHMARKS),
+        cards=expand("results/mismatch/{case}/system.yaml", case=BENCHMARKS),
+    output:
+        table="results/official/table.parquet",
+        csv="results/official/table.csv",
+        page="results/official/page.md",
+        figures=directory("results/official/figures"),
+    log:
+        "results/official/logs/official_summary.log",
+    benchmark:
+        "results/official/benchmarks/official_summary.tsv"
+    conda:
+        "../envs/siq.yaml"
+    threads: 1
+    params:
+        code=code("official_summary.py"),
+        benchmarks=list(BENCHMARKS),
+    message:
+        "putting the official tests of all benchmarks into one table"
+    script:
+        "../scripts/official_summary.py"
 
 
 rule mismatch_figures:

@@ -15,7 +15,7 @@ from siq.mismatch.diagnosis import solve_case
 from siq.mismatch.tables import tables_of, tables_of_failure
 from siq.mismatch.verdict import statement_of_failure
 from siq.study.tables import write_table
-from step import job
+from step import job, teller
 
 LOGGER = logging.getLogger(__name__)
 
@@ -25,7 +25,7 @@ def main(snakemake: Any) -> None:
     study = snakemake.input.get("study")
     case = read_case(snakemake.input.card, snakemake.input.recordings, study or None)
     try:
-        diagnosis = solve_case(case)
+        diagnosis = solve_case(case, tell=teller(snakemake.wildcards.case))
         statement, tables = diagnosis.statement, tables_of(diagnosis)
         after, recalibrated = diagnosis.augmented, diagnosis.recalibrated
     except NumericalFailure as error:  # which is a verdict, too: the page says what happened

@@ -16,8 +16,8 @@ from siq.dynamics.cards import load_system
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.formulas import compile_formulas
 from siq.dynamics.parametric import symbol
-from siq.mismatch.candidates import PROCESS_NOISE
-from siq.report.mismatch_findings import FINAL
+from siq.report.mismatch_findings import final_simulation
+from siq.report.plots.described import plot_described
 from siq.report.plots.mismatch import (
     plot_before_after,
     plot_candidates,
@@ -95,8 +95,7 @@ def main(snakemake: Any) -> None:
     units, time_unit = units_of(before), before.time_unit
     held_out, noise = read_table(source.held_out), read_table(source.noise)
     sensors = noise[(noise["stage"] == "final") & (noise["kind"] == "measurement")]
-    random_forces = [each["name"] for each in verdict["mechanisms"]] == [PROCESS_NOISE]
-    final = "recalibrated" if random_forces else FINAL.get(verdict["verdict"], "recalibrated")
+    final = final_simulation(verdict)
     figures = {
         "before_after": plot_before_after(
             held_out, after=final, noise=dict(zip(sensors["name"], sensors["variance"], strict=True)),
@@ -105,6 +104,7 @@ def main(snakemake: Any) -> None:
         "held_out": plot_held_out(held_out, units=units, time_unit=time_unit),
         "curves": plot_curves(curves, named=named, units=units, time_unit=time_unit)
         if verdict["location"] is not None else None,
+        "described": plot_described(verdict["described"], units=units, time_unit=time_unit),
         "map": missing_map(before, after, read_table(source.forces), curves, verdict),
         "candidates": plot_candidates(read_table(source.candidates)),
         "escapes": plot_escapes(read_table(source.escape), time_unit=time_unit),

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,10 @@ from pydantic import TypeAdapter
 from siq.errors import InputError
 
 Settings = TypeVar("Settings")
+FOLLOWED = "SIQ_FOLLOWED"
+"""Environment variable that `siq run` and `siq diagnose` set where they read events and show progress."""
+
+MARK = "\x1e"  # begins a line that is an event, as those of Snakemake do there
 
 
 @dataclass(frozen=True)
@@ -77,6 +82,25 @@ def job(snakemake: Any = None) -> Iterator[Job]:
     except BaseException:
         logging.exception("the step stopped")
         raise
+
+
+def teller(of: str) -> Callable[[str], None]:
+    """What passes on what a long job is doing: into its log, and to whoever follows the workflow.
+
+    Parameters
+    ----------
+    of
+        What the job is about, as the message of its rule begins.
+    """
+
+    def tell(text: str) -> None:
+        logging.info("%s", text)
+        if os.environ.get(FOLLOWED):
+            event = {"event": "doing", "of": of, "text": text}
+            sys.stderr.write(f"\n{MARK}{json.dumps(event)}\n")
+            sys.stderr.flush()
+
+    return tell
 
 
 def read_json(path: str | Path) -> Any:

@@ -9,6 +9,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from siq.report.largest_difference import largest_difference
 from siq.report.plots.reading import WIDTH, axis_unit, drawn_to_be_read
 from siq.report.plots.style import BLACK, BLUE, GREY, VERMILLION, name_label
 
@@ -22,25 +23,6 @@ WORDS = {
 }
 
 
-def most_telling(table: pd.DataFrame) -> tuple[str, str] | None:
-    """The recording and output to be shown first; None where nothing was held out.
-
-    The output is the one in which the simulation as given is off the furthest, in units of its spread; of its
-    recordings it is the one whose error is in the middle, neither the best nor the worst.
-    """
-    scored = table[table["scored"].astype(bool) & table["measured"].notna()]
-    if scored.empty:
-        return None
-    off = (scored["before"] - scored["measured"]) ** 2
-    errors = scored.assign(off=off.fillna(np.inf)).groupby(["output", "recording"], sort=False)["off"].mean()
-    spread = scored.groupby("output", sort=False)["measured"].var()
-    # One recording along which the simulation runs away must not decide.
-    middle = errors.groupby("output", sort=False).median()
-    output = str((middle / spread.where(spread > 0, 1.0)).idxmax())
-    ranked = errors.loc[output].sort_values(kind="stable")
-    return str(ranked.index[(len(ranked) - 1) // 2]), output
-
-
 @drawn_to_be_read
 def plot_before_after(
     table: pd.DataFrame,
@@ -50,7 +32,7 @@ def plot_before_after(
     units: Mapping[str, str] | None = None,
     time_unit: str = "1",
 ) -> Figure | None:
-    """Draw one held-out recording with the simulation before and after, and what each is off by.
+    """Draw the held-out recording that differs most, with the simulation before and after.
 
     Parameters
     ----------
@@ -71,9 +53,10 @@ def plot_before_after(
     matplotlib.figure.Figure or None
         The course above, simulation minus recording below; None where no recording was held out.
     """
-    pair = most_telling(table)
-    if pair is None:
+    largest = largest_difference(table, after=after)
+    if largest is None:
         return None
+    pair = (largest.recording, largest.output)
     figure = Figure(figsize=(WIDTH, 4.2))
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[1.7, 1])
     shown = ["before"] if after == "before" else ["before", after]

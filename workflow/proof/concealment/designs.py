@@ -31,6 +31,8 @@ PROOF_FULL: Mapping[str, float] = {
     "withheld": 0.10,
 }
 NOISE_LEVELS = (40.0, 30.0, 20.0)
+ALWAYS_WITHHELD: Mapping[str, tuple[str, ...]] = {"predator_prey": ("Allee effect", "delayed response")}
+"""Entries of the dictionary that are, or contain, an effect that this generator calls withheld."""
 DECOYS = 0.15  # of the mechanical cases say "without hysteresis" though there is none
 
 
@@ -146,8 +148,11 @@ def log_uniform(low: float, high: float, rng: np.random.Generator) -> float:
 
 
 def _without(system: str, kind: str, mechanism: str | None, rng: np.random.Generator) -> tuple[str, ...]:
+    """Entries that the diagnosis has to do without; what is always withheld gives nothing away."""
+    always = ALWAYS_WITHHELD.get(system, ())
     decoy = rng.random() < DECOYS
     if mechanism == "hysteresis":
-        return ("hysteresis",) if kind == "withheld" else ()
+        return (*always, "hysteresis") if kind == "withheld" else always
     # A study that does without hysteresis must not give away that this is what is concealed.
-    return ("hysteresis",) if decoy and "hysteresis" in CATALOGUES[system].mechanisms else ()
+    hidden = decoy and "hysteresis" in CATALOGUES[system].mechanisms
+    return (*always, "hysteresis") if hidden else always

@@ -1,0 +1,248 @@
+"""Evidence: is a mechanism likelier than some smooth function that has no name?
+
+Both are compared as whole explanations of what is missing, by their marginal likelihoods: along the
+trajectories of the fit with the mechanism everything is linear, and amplitudes, shapes and functions have
+normal priors. How large an effect is nobody knows beforehand, so that its size on the recordings is drawn
+evenly on a logarithmic scale, for both alike. A smooth function could have been anything, and pays for it:
+the more so the more the recordings tell. (MacKay, Information Theory, Inference, and Learning Algorithms,
+chapter 28.)
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import scipy.special
+
+from siq.dynamics.dynamics import Dynamics
+from siq.estimation.estimation import Fit
+from siq.estimation.innovations import Whitened, solve, whiten
+from siq.estimation.measurements import Measurements
+from siq.mismatch.candidates import MechanismCandidate
+from siq.mismatch.function_places import Place, linearised_with_places, places_in, products_in
+from siq.mismatch.roles import Roles
+
+LENGTHS = (0.125, 0.25, 0.5)
+"""Of the range of the coordinate, over which a smooth function changes.
+
+At a half of it the values at both ends know little of each other.
+"""
+JITTER = 1e-9  # numerical: on the diagonal of a prior's covariance
+
+
+def log_odds_of_a_name(
+    fit: Fit,
+    data: Measurements,
+    candidates: Sequence[MechanismCandidate],
+    roles: Roles,
+    model: Dynamics,
+    *,
+    considered: Sequence[MechanismCandidate],
+    unnamed: float,
+) -> float:
+    """Logarithm of the odds that what is missing is the mechanism, rather than a function without a name.
+
+    Parameters
+    ----------
+    fit, data
+        The fit with the mechanism in place, and the recordings.
+    candidates
+        The mechanism; where there are several, all of them together against one function.
+    roles, model
+        The simulation as its author believes it, and the roles of its states.
+    considered
+        The mechanisms that could have been named: each name is as likely beforehand, and so is each of its
+        forms and places.
+    unnamed
+        Probability beforehand that what is missing has no name.
+
+    Returns
+    -------
+    float
+        Positive where the name is likelier.
+    """
+    ours, theirs = -np.inf, []
+    single = places_in(model, roles, data, fit.x)
+    there = {name for each in candidates for name in each.equations}
+    products = products_in([each for each in single if there & set(each.targets)], model, data, fit.x)
+    for response, some in linearised_with_places(fit, data, (*single, *products)):
+        problem = Missing(whiten(response, data, fit.noise), fit, candidates)
+        ours = problem.log_evidence_of_mechanisms()
+        theirs += [
+            problem.log_evidence_of_function(columns, place) for columns, place in problem.functions(some)
+        ]
+    if not theirs:
+        return np.inf
+    forms = Counter(each.name for each in considered)
+    chosen = sum(np.log(len(forms) * forms[each.name]) for each in candidates if forms[each.name])
+    named = ours + np.log1p(-unnamed) - chosen
+    nameless = scipy.special.logsumexp(theirs) + np.log(unnamed) - np.log(len(theirs))
+    return float(named - nameless)
+
+
+class Missing:
+    """What is missing, as a linear problem: innovations without the mechanism, and what could explain them.
+
+    Parameters
+    ----------
+    white
+        Innovations of the fit with the mechanism, with columns of its parameters and of places.
+    fit
+        The fit.
+    candidates
+        The mechanisms whose effect counts as missing.
+    """
+
+    def __init__(self, white: Whitened, fit: Fit, candidates: Sequence[MechanismCandidate]) -> None:
+        names = [fit.model.parameters[place].name for place in fit.model.free]
+        own = white.columns[:, : len(names)]
+        change, _ = solve(own, white.innovations)
+        values = fit.model.values[list(fit.model.free)] + change
+        linear = [n for each in candidates for n in (each.amplitudes or each.shapes) if n in names]
+        others = [n for each in candidates for n in each.shapes if n in names and n not in linear]
+        self._tested = [names.index(name) for name in (*linear, *others)]
+        self._linear = len(linear)
+        rest = [place for place in range(len(names)) if place not in self._tested]
+        self._basis = orthonormal(own[:, rest])
+        effect = own[:, self._tested[: self._linear]] @ values[self._tested[: self._linear]]
+        left = white.innovations - own @ change
+        self._target = self._projected((left + effect)[:, None])[:, 0]
+        self._total = float(self._target @ self._target)
+        self._freedom = white.degrees_of_freedom - len(rest)
+        self._values = values[self._tested]
+        self._white, self._parameters = white, len(names)
+
+    def _projected(self, columns: np.ndarray) -> np.ndarray:
+        return columns - self._basis @ (self._basis.T @ columns)
+
+    def functions(self, places: Sequence[Place]) -> Iterator[tuple[np.ndarray, Place]]:
+        """The columns of each place, its parameters' effect taken off, shape ``(n, k)``."""
+        begin = self._parameters
+        for place in places:
+            columns = self._white.columns[:, begin : begin + len(place.knots)]
+            begin += len(place.knots)
+            if np.isfinite(columns).all():
+                yield self._projected(columns), place
+
+    def log_evidence_of_mechanisms(self) -> float:
+        """Log-likelihood of the mechanisms, averaged over their amplitudes and shapes, to that of nothing.
+
+        An amplitude has the size that the effect has; a shape may be off by as much as it is.
+        """
+        columns = self._projected(self._white.columns[:, self._tested])
+        gram = columns.T @ columns
+        own = np.diag(gram)[: self._linear]
+        unit, wide = np.zeros(len(self._tested)), np.zeros(len(self._tested))
+        unit[: self._linear] = 1.0 / np.where(own > 0, own, np.inf) / self._linear
+        wide[self._linear :] = self._values[self._linear :] ** 2
+        priors = [np.diag(size * unit + wide) for size in sizes_of_effects(self._total)]
+        return averaged_evidence(gram, columns.T @ self._target, priors, self._total, self._freedom)
+
+    def log_evidence_of_function(self, columns: np.ndarray, place: Place) -> float:
+        """The same of a smooth function; see `evidence_of_function`."""
+        return evidence_of_function(columns, self._target, place.knots, freedom=self._freedom)
+
+
+def evidence_of_function(
+    columns: np.ndarray, target: np.ndarray, knots: np.ndarray, *, freedom: int
+) -> float:
+    """Log-likelihood of a smooth function, averaged over its values, size and smoothness, to that of nothing.
+
+    Parameters
+    ----------
+    columns
+        What its value at each knot does to the innovations, in units of noise, shape ``(n, k)``.
+    target
+        The innovations, shape ``(n,)``.
+    knots
+        Shape ``(k,)``.
+    freedom
+        Degrees of freedom of the target.
+    """
+    gram, overlap, total = columns.T @ columns, columns.T @ target, float(target @ target)
+    sizes = sizes_of_effects(total)
+    values = []
+    for length in LENGTHS:
+        # In the eigenvectors of what the recordings tell, the evidence is a sum for every size.
+        root = np.linalg.cholesky(smooth_prior(knots, length))
+        told, vectors = np.linalg.eigh(root.T @ gram @ root)
+        told = np.maximum(told, 0.0)
+        if not told.any():
+            continue
+        seen = (vectors.T @ (root.T @ overlap)) ** 2
+        scale = sizes[:, None] / told.sum()
+        explained = (scale * seen / (1 + scale * told)).sum(axis=1)
+        left = np.maximum(total - explained, 1e-12 * total)
+        values.append(-0.5 * np.log1p(scale * told).sum(axis=1) - 0.5 * freedom * np.log(left / total))
+    return float(scipy.special.logsumexp(values) - np.log(np.size(values))) if values else 0.0
+
+
+def averaged_evidence(
+    gram: np.ndarray, overlap: np.ndarray, priors: Sequence[np.ndarray], total: float, freedom: int
+) -> float:
+    """Logarithm of the mean evidence over priors; see `log_evidence`."""
+    values = [log_evidence(gram, overlap, prior, total=total, freedom=freedom) for prior in priors]
+    return float(scipy.special.logsumexp(values) - np.log(len(values)))
+
+
+def sizes_of_effects(total: float) -> np.ndarray:
+    """Expected squares of an effect's size on the recordings, in units of noise, evenly on a logarithm."""
+    return np.exp2(np.arange(0.0, max(np.log2(max(total, 2.0)), 1.0) + 2))
+
+
+def smooth_prior(knots: np.ndarray, length: float) -> np.ndarray:
+    """Covariance of a smooth function at knots, as a share of whose range the length is given."""
+    distance = np.subtract.outer(knots, knots) / np.ptp(knots)
+    return np.exp(-0.5 * (distance / length) ** 2) + JITTER * np.eye(len(knots))
+
+
+def log_evidence(
+    gram: np.ndarray, overlap: np.ndarray, prior: np.ndarray, *, total: float, freedom: int
+) -> float:
+    """Log-likelihood of columns with normal coefficients, over that without them.
+
+    Parameters
+    ----------
+    gram, overlap
+        Of the columns with each other and with the target, in units of noise; shapes ``(k, k)`` and ``(k,)``.
+    prior
+        Covariance of the coefficients, shape ``(k, k)``.
+    total, freedom
+        Sum of squares of the target, and its degrees of freedom. The scale of the noise is at its best, so
+        that a target much larger than noise does not make small differences count.
+
+    Returns
+    -------
+    float
+        -½ log det(1 + K G) - ½ν log(1 - q/total), with q = bᵀ K (1 + G K)⁻¹ b.
+    """
+    unit = np.eye(len(gram))
+    inner = unit + gram @ prior
+    sign, determinant = np.linalg.slogdet(inner)
+    explained = float(overlap @ (prior @ np.linalg.solve(inner, overlap)))
+    left = max(total - explained, 1e-12 * total)
+    return float(-0.5 * determinant - 0.5 * freedom * np.log(left / total)) if sign > 0 else -np.inf
+
+
+def orthonormal(columns: np.ndarray) -> np.ndarray:
+    """Orthonormal basis of what columns span, shape ``(n, r)``."""
+    if not columns.shape[1]:
+        return columns
+    scale = np.sqrt((columns**2).sum(axis=0))
+    basis, values, _ = np.linalg.svd(columns / np.where(scale > 0, scale, 1.0), full_matrices=False)
+    return basis[:, values > 1e-9 * values[0]] if values[0] > 0 else basis[:, :0]
+
+
+def log_evidence_of(fit: Fit, data: Measurements) -> float:
+    """Log-likelihood of a whole explanation, less what its parameters would gain by chance.
+
+    Schwarz's approximation of the marginal likelihood, -½ k log n, with random forces counted as
+    parameters, so that explanations with and without them can be compared. What the recordings do not tell
+    of the parameters does not count.
+    """
+    white = whiten(fit.linearisation, data, fit.noise)
+    told = orthonormal(white.columns).shape[1]
+    variances = int((fit.noise.process > 0).sum())
+    return float(fit.log_likelihood - 0.5 * (told + variances) * np.log(max(int(white.known.sum()), 2)))

@@ -1,0 +1,90 @@
+"""What is stated of the model of what has no name?"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from siq.dynamics.dynamics import Dynamics
+from siq.dynamics.formulas import compile_values
+from siq.dynamics.parametric import symbol
+from siq.estimation.estimation import Fit
+from siq.mismatch.described import MECHANISM, Part
+from siq.mismatch.functions import SPLINE
+from siq.mismatch.held_out import HeldOutRuns
+from siq.mismatch.statement import DescribedCurve, Estimate, Evidence, StatedFunction
+
+
+def stated_functions(shown: HeldOutRuns) -> tuple[StatedFunction, ...]:
+    """The parts of the model that is in the new card; none where nothing that was added helped."""
+    if shown.described is None or shown.described_fit is None or not shown.gained:
+        return ()
+    labels = [each.trial.candidate.label for each in shown.described.parts]
+    return tuple(
+        _stated(part, shown.described_fit, tuple(labels[:place]))
+        for place, part in enumerate(shown.described.parts)
+    )
+
+
+def _stated(part: Part, fit: Fit, beside: tuple[str, ...]) -> StatedFunction:
+    trial, candidate = part.trial, part.trial.candidate
+    errors = dict(
+        zip(
+            (fit.model.parameters[place].name for place in fit.model.free),
+            map(float, fit.standard_errors),
+            strict=True,
+        )
+    )
+    known = {entry.name: entry for entry in fit.model.parameters}
+    changed = [name for name, _ in candidate.changes]
+    return StatedFunction(
+        name=candidate.name,
+        label=candidate.label,
+        kind="mechanism" if part.kind == MECHANISM else "spline" if part.kind == SPLINE else "formula",
+        terms={name: str(formula) for name, formula in candidate.changes},
+        parameters={
+            name: Estimate(known[name].value, errors.get(name), known[name].unit) for name in candidate.new
+        },
+        evidence=Evidence(trial.delta_chi2, trial.delta_bic, trial.p_white, trial.p_cluster),
+        equations=candidate.equations,
+        outputs=tuple(name for name in changed if name in fit.model.output_names)
+        if not candidate.equations
+        else (),
+        coordinates=part.place.words if part.place is not None else tuple(candidate.coordinate.split(", ")),
+        curve=curve_of(part, fit),
+        beside=beside,
+    )
+
+
+def curve_of(part: Part, fit: Fit) -> DescribedCurve | None:
+    """A function of one coordinate at the knots of its place, with its standard errors.
+
+    None for a formula in two coordinates, and for a mechanism.
+    """
+    place = part.place
+    if place is None or (part.kind != SPLINE and len(place.words) > 1):
+        return None
+    knots = place.knots if part.knots is None else part.knots
+    names = part.trial.candidate.amplitudes
+    free = [fit.model.parameters[each].name for each in fit.model.free]
+    rows = [free.index(name) for name in names]
+    weights = np.eye(len(names)) if part.kind == SPLINE else _terms(part, fit.model, knots)
+    values = weights @ fit.model.values[[fit.model.free[row] for row in rows]]
+    covariance = weights @ fit.covariance[np.ix_(rows, rows)] @ weights.T
+    errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    return DescribedCurve(
+        place.words[0], tuple(map(float, knots)), tuple(map(float, values)), tuple(map(float, errors))
+    )
+
+
+def _terms(part: Part, model: Dynamics, knots: np.ndarray) -> np.ndarray:
+    """What a unit of each coefficient of a formula is at the knots, shape ``(k, c)``."""
+    assert part.place is not None
+    candidate, coordinate = part.trial.candidate, symbol("coordinate")
+    name, formula = candidate.changes[0]
+    factor = dict((*part.place.equations, *part.place.outputs))[name]
+    columns = []
+    for amplitude in candidate.amplitudes:
+        term = (formula.diff(symbol(amplitude)) / factor).subs(part.place.coordinate, coordinate)
+        value = compile_values([term], [coordinate], common=False)(knots)[0]
+        columns.append(np.broadcast_to(np.asarray(value, dtype=float), knots.shape))
+    return np.stack(columns, axis=1)

@@ -1,0 +1,483 @@
+"""A home for every form of every mechanism: a card that lacks it, and recordings of the system that has it.
+
+The truth is the candidate's own model with values of its parameters, integrated in small steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from siq.dynamics.cards import SystemCard, build_system
+from siq.dynamics.dynamics import Dynamics
+from siq.dynamics.formulas import compile_values
+from siq.dynamics.parametric import Signals, symbol
+from siq.estimation.linearisation import Grid
+from siq.estimation.measurements import Measurements
+from siq.files.documents import Document, validate
+from siq.mismatch.candidates import MechanismCandidate, candidates_of
+from siq.mismatch.dictionary import standard_dictionary
+from siq.mismatch.roles import roles_of
+from siq.mismatch.study import measurements_of
+
+FINE = 10  # steps of integration between samples
+NOISE = 0.01  # of the spread of what is measured
+
+
+@dataclass(frozen=True)
+class Home:
+    """A card, and how its system is recorded.
+
+    Attributes
+    ----------
+    card
+        Without a name.
+    step, samples, recordings
+        Of the recordings.
+    begin
+        Draws the first state of a recording, shape ``(d,)``.
+    drive
+        Draws the inputs of a recording from its times, shape ``(inputs, samples)``.
+    """
+
+    card: Mapping[str, Any]
+    step: float
+    begin: Callable[[np.random.Generator], np.ndarray]
+    drive: Callable[[np.random.Generator, np.ndarray], np.ndarray] = lambda rng, t: np.zeros((0, len(t)))
+    samples: int = 80
+    recordings: int = 4
+
+    @property
+    def model(self) -> Dynamics:
+        """The simulation that lacks something."""
+        return model_of(self.card)
+
+
+@dataclass(frozen=True)
+class Resident:
+    """A form of a mechanism at home, and the values of its parameters.
+
+    The label is a part of the candidate's, or of what it changes, where several have the same parameters.
+    """
+
+    name: str
+    home: str
+    values: Mapping[str, float]
+    label: str = ""
+
+
+def model_of(card: Mapping[str, Any]) -> Dynamics:
+    """The simulation of a card, which needs no name."""
+    document = Document("card.yaml", {"name": "home", **card}, {})
+    return build_system(document, validate(document, SystemCard))
+
+
+def states(**units: str) -> dict[str, dict[str, str]]:
+    return {name: {"unit": unit} for name, unit in units.items()}
+
+
+def numbers(**values: float) -> dict[str, dict[str, Any]]:
+    """Parameters that are free; with an underscore at the end they are fixed."""
+    return {name.rstrip("_"): {"value": value, "fixed": name.endswith("_")} for name, value in values.items()}
+
+
+def waves(rng: np.random.Generator, t: np.ndarray, *, size: float = 1.0, slowest: float = 0.6) -> np.ndarray:
+    """An input of four frequencies, of another strength in every recording."""
+    omega, phase = rng.uniform(slowest, 4 * slowest, (4, 1)), rng.uniform(0, 2 * np.pi, (4, 1))
+    return size * rng.uniform(0.4, 1.6) * np.cos(omega * t + phase).sum(axis=0, keepdims=True)
+
+
+def inflow(rng: np.random.Generator, t: np.ndarray, *, size: float = 1.0) -> np.ndarray:
+    """An input that is held for a while at a level, and never negative."""
+    levels = size * rng.uniform(0.1, 2.0, len(t) // 10 + 1)
+    return np.repeat(levels, 10)[None, : len(t)]
+
+
+HOMES: Mapping[str, Home] = {
+    "mass": Home(
+        {
+            "time_unit": "s",
+            "states": states(x="m", v="m/s"),
+            "inputs": {"u": {"unit": "N"}},
+            "parameters": numbers(k=4.0, d=0.3, m_=1.0),
+            "equations": {"x": "v", "v": "(-k*x - d*v + u)/m"},
+            "outputs": {"x": "x"},
+        },
+        0.15,
+        lambda rng: rng.normal(size=2) * [0.8, 1.0],
+        waves,
+    ),
+    "mass without damping": Home(
+        {
+            "time_unit": "s",
+            "states": states(x="m", v="m/s"),
+            "inputs": {"u": {"unit": "N"}},
+            "parameters": numbers(k=4.0, m_=1.0),
+            "equations": {"x": "v", "v": "(-k*x + u)/m"},
+            "outputs": {"x": "x"},
+        },
+        0.15,
+        lambda rng: rng.normal(size=2) * [0.8, 1.0],
+        waves,
+    ),
+    "mass without spring": Home(
+        {
+            "time_unit": "s",
+            "states": states(x="m", v="m/s"),
+            "inputs": {"u": {"unit": "N"}},
+            "parameters": numbers(d=0.3, m_=1.0),
+            "equations": {"x": "v", "v": "(-d*v + u)/m"},
+            "outputs": {"x": "x"},
+        },
+        0.15,
+        lambda rng: rng.normal(size=2) * [0.8, 1.0],
+        waves,
+    ),
+    "pendulum": Home(
+        {
+            "time_unit": "s",
+            "states": states(q="rad", w="rad/s"),
+            "parameters": numbers(d=0.1, g_=9.81, l_=1.0),
+            "equations": {"q": "w", "w": "-g/l*sin(q) - d*w"},
+            "outputs": {"q": "q"},
+        },
+        0.1,
+        lambda rng: rng.normal(size=2) * [1.0, 2.0],
+    ),
+    "arm": Home(
+        {
+            "time_unit": "s",
+            "states": states(q="rad", w="rad/s"),
+            "inputs": {"u": {"unit": "N*m"}},
+            "parameters": numbers(d=0.5, i_=1.0),
+            "equations": {"q": "w", "w": "(u - d*w)/i"},
+            "outputs": {"q": "q"},
+        },
+        0.1,
+        lambda rng: rng.normal(size=2) * [1.5, 1.0],
+        lambda rng, t: waves(rng, t, size=2.0),
+    ),
+    "double pendulum": Home(
+        {
+            "time_unit": "s",
+            "states": states(a="rad", p="rad/s", b="rad", q="rad/s"),
+            "parameters": numbers(g_=9.81, c=0.05),
+            "equations": {
+                "a": "p",
+                "p": "(-2*g*sin(a) + cos(a - b)*g*sin(b) - sin(a - b)*(q**2 + cos(a - b)*p**2))"
+                "/(2 - cos(a - b)**2) - c*p",
+                "b": "q",
+                "q": "(2*g*(cos(a - b)*sin(a) - sin(b)) + sin(a - b)*(2*p**2 + cos(a - b)*q**2))"
+                "/(2 - cos(a - b)**2) - c*q",
+            },
+            "outputs": {"a": "a", "b": "b"},
+        },
+        0.04,
+        lambda rng: rng.normal(size=4) * [0.6, 0.5, 0.6, 0.5],
+    ),
+    "two masses": Home(
+        {
+            "time_unit": "s",
+            "states": states(x="m", v="m/s", y="m", w="m/s"),
+            "inputs": {"u": {"unit": "N"}},
+            "parameters": numbers(k=4.0, h=6.0, d=0.3, m_=1.0),
+            "equations": {"x": "v", "v": "(-k*x - d*v + u)/m", "y": "w", "w": "(-h*y - d*w)/m"},
+            "outputs": {"x": "x", "y": "y"},
+        },
+        0.15,
+        lambda rng: rng.normal(size=4) * [0.8, 1.0, 0.8, 1.0],
+        waves,
+    ),
+    "two driven masses": Home(
+        {
+            "time_unit": "s",
+            "states": states(x="m", v="m/s", y="m", w="m/s"),
+            "parameters": numbers(k=4.0, h=6.0, s=2.0, d=0.1),
+            "equations": {
+                "x": "v",
+                "v": "-k*x - d*v + s*(y - x)",
+                "y": "w",
+                "w": "-h*y - d*w + s*(x - y)",
+            },
+            "outputs": {"x": "x", "y": "y"},
+        },
+        0.15,
+        lambda rng: rng.normal(size=4) * [0.8, 1.0, 0.8, 1.0],
+    ),
+    "rotating frame": Home(
+        {
+            "time_unit": "s",
+            "states": states(a="m", b="m"),
+            "parameters": numbers(f=0.5, g=0.1, h=0.3),
+            "equations": {"a": "f*b - g*a", "b": "-f*a - g*b - h"},
+        },
+        0.3,
+        lambda rng: rng.normal(size=2),
+    ),
+    "rotating frame without damping": Home(
+        {
+            "time_unit": "s",
+            "states": states(a="m", b="m"),
+            "parameters": numbers(f=0.5, h=0.3),
+            "equations": {"a": "f*b", "b": "-f*a - h"},
+        },
+        0.3,
+        lambda rng: rng.normal(size=2),
+    ),
+    "rotating frame on resonance": Home(
+        {
+            "time_unit": "s",
+            "states": states(a="m", b="m"),
+            "parameters": numbers(f_=0.5, g=0.1, h=0.3),
+            "equations": {"a": "f*b - g*a", "b": "-f*a - g*b - h"},
+        },
+        0.3,
+        lambda rng: rng.normal(size=2),
+    ),
+    "prey and predator": Home(
+        {
+            "time_unit": "a",
+            "states": states(n="1/km**2", p="1/km**2"),
+            "parameters": numbers(r=1.0, b=0.5, e=0.25, m=0.75),
+            "equations": {"n": "r*n - b*n*p", "p": "-m*p + e*n*p"},
+        },
+        0.3,
+        lambda rng: np.array([3.0, 2.0]) * np.exp(rng.normal(size=2) * 0.6),
+    ),
+    "prey with limits and predator": Home(
+        {
+            "time_unit": "a",
+            "states": states(n="1/km**2", p="1/km**2"),
+            "parameters": numbers(r=1.0, s=0.1, b=0.5, e=0.25, m=0.5),
+            "equations": {"n": "r*n - s*n**2 - b*n*p", "p": "-m*p + e*n*p"},
+        },
+        0.3,
+        lambda rng: np.array([3.0, 1.5]) * np.exp(rng.normal(size=2) * 0.6),
+    ),
+    "crop": Home(
+        {
+            "time_unit": "a",
+            "states": states(n="t"),
+            "parameters": numbers(r=1.0, c=0.2),
+            "equations": {"n": "r*n - c*n**2"},
+        },
+        0.15,
+        lambda rng: rng.uniform(0.3, 9.0, size=1),
+    ),
+    "crop of known growth": Home(
+        {
+            "time_unit": "a",
+            "states": states(n="t"),
+            "parameters": numbers(r_=1.0, c=0.2),
+            "equations": {"n": "r*n - c*n**2"},
+        },
+        0.15,
+        lambda rng: rng.uniform(0.3, 9.0, size=1),
+    ),
+    "heat": Home(
+        {
+            "time_unit": "s",
+            "states": states(s="K", r="K"),
+            "inputs": {"u": {"unit": "W"}},
+            "parameters": numbers(g=1.0, h=0.2, c_=1.0),
+            "equations": {"s": "g*u/c", "r": "h*(s - r)"},
+        },
+        0.2,
+        lambda rng: rng.uniform(0.0, 4.0, size=2),
+        lambda rng, t: waves(rng, t, size=1.0),
+    ),
+    "two bodies": Home(
+        {
+            "time_unit": "s",
+            "states": states(s="K", r="K"),
+            "inputs": {"u": {"unit": "W"}},
+            "parameters": numbers(g=1.0, a=0.5, b=0.2),
+            "equations": {"s": "g*u - a*s", "r": "-b*r + g*u"},
+        },
+        0.2,
+        lambda rng: rng.uniform(0.0, 4.0, size=2),
+        lambda rng, t: waves(rng, t, size=1.0),
+    ),
+    "two tanks": Home(
+        {
+            "time_unit": "s",
+            "states": states(h="cm", g="cm"),
+            "inputs": {"u": {"unit": "V", "interpolation": "zero_order"}},
+            "parameters": numbers(a=1.0, b=1.0, c=1.2, e=1.0),
+            "equations": {
+                "h": "e*u - a*sqrt(Max(h, 0))",
+                "g": "c*sqrt(Max(h, 0)) - b*sqrt(Max(g, 0))",
+            },
+        },
+        0.3,
+        lambda rng: rng.uniform(1.0, 4.0, size=2),
+        lambda rng, t: inflow(rng, t, size=1.5),
+    ),
+}
+
+RESIDENTS: Sequence[Resident] = (
+    Resident("linear stiffness", "mass without spring", {"c": 3.0}),
+    Resident("linear stiffness", "rotating frame on resonance", {"c": 0.1}),
+    Resident("geometric stiffness", "mass", {"c": 4.0, "a": 0.5}),
+    Resident("preload", "mass", {"c": 0.8}),
+    Resident("backlash", "mass", {"c": 3.0, "a": 0.3}),
+    Resident("backlash", "mass", {"a": 0.4}),
+    Resident("backlash", "two masses", {"c": 1.5, "d": 1.5, "a": 0.4}),
+    Resident("gravity", "arm", {"c": 3.0}),
+    Resident("gravity", "arm", {"d": 2.0}),
+    Resident("gravity", "arm", {"c": 2.0, "d": 1.5}),
+    Resident("added mass", "mass", {"c": 0.3}),
+    Resident("moment of inertia", "pendulum", {"c": 0.3}),
+    Resident("moment of inertia", "double pendulum", {"c": 0.15, "d": 0.2, "p": 0.5, "q": 1.0}),
+    Resident("linear damping", "mass without damping", {"c": 0.4}),
+    Resident("linear damping", "rotating frame without damping", {"c": 0.15}),
+    Resident("quadratic stiffness", "mass", {"c": 0.4}),
+    Resident("cubic stiffness", "mass", {"c": 1.0}),
+    Resident("cubic stiffness", "rotating frame", {"c": 0.2}),
+    Resident("quintic stiffness", "mass", {"c": 0.5}),
+    Resident("quintic stiffness", "rotating frame", {"c": 0.05}),
+    Resident("quadratic drag", "mass", {"c": 0.4}),
+    Resident("quadratic drag", "rotating frame", {"c": 0.2}),
+    Resident("cubic damping", "mass", {"c": 0.2}),
+    Resident("amplitude-dependent damping", "rotating frame", {"c": 0.1}),
+    Resident("dry friction", "mass", {"c": 0.4}),
+    Resident("dry friction", "rotating frame", {"c": 0.03}),
+    Resident("asymmetric friction", "mass", {"c": 0.5, "d": 0.15}),
+    Resident("Stribeck friction", "mass", {"c": 0.3, "s": 0.6, "w": 0.5}),
+    Resident("position-dependent damping", "mass", {"c": 0.8}),
+    Resident("constant bias", "mass", {"c": 0.8}),
+    Resident("linear coupling", "two bodies", {"c": 0.3, "d": 0.3}),
+    Resident("linear coupling", "two masses", {"c": 0.5, "d": 0.5}, "-v + w"),
+    Resident("linear coupling", "two masses", {"c": 1.5, "d": 1.5}, "-x + y"),
+    Resident("linear coupling", "heat", {"c": 0.3}),
+    Resident("nonlinear coupling", "two masses", {"c": 1.0, "d": 1.0}),
+    Resident("nonlinear coupling", "prey and predator", {"c": -0.05}, "n*p**2"),
+    Resident("nonlinear coupling", "prey with limits and predator", {"c": -0.05}, "n**2*p"),
+    Resident("self-limitation", "prey and predator", {"c": 0.05}),
+    Resident("mortality", "crop of known growth", {"c": 0.3}),
+    Resident("harvest", "crop", {"c": 1.0, "w": 0.8}),
+    Resident("Allee effect", "crop", {"c": 1.6, "w": 1.0}),
+    Resident("prey refuge", "prey and predator", {"m": 0.8}),
+    Resident("sigmoid functional response", "prey with limits and predator", {"w": 1.5}, "with satiation"),
+    Resident("sigmoid functional response", "prey and predator", {"w": 0.8}, "without satiation"),
+    Resident("predator interference", "prey with limits and predator", {"k": 0.3}),
+    Resident("predator interference", "prey with limits and predator", {"h": 0.1, "k": 0.3}),
+    Resident("decay or leakage", "heat", {"c": 0.3}),
+    Resident("decay or leakage", "heat", {"c": 0.3, "d": 0.8}),
+    Resident("delayed response", "prey with limits and predator", {"c": 1.0, "tau": 1.0}, "stage in p"),
+    Resident("delayed response", "prey with limits and predator", {"c": 1.0, "tau": 1.5}, "stages in p"),
+    Resident("delayed response", "heat", {"c": 1.0, "tau": 1.5}, "one stage"),
+    Resident("saturation", "mass", {"c": 0.5}),
+    Resident("saturation", "prey with limits and predator", {"h": 0.2}),
+    Resident("parametric drive", "mass", {"c": 1.0, "d": 0.5, "w": 3.0}),
+    Resident("parametric drive", "rotating frame", {"c": 0.1, "d": 0.05}),
+    Resident("parameter drift", "mass", {"r": 0.03}),
+    Resident("periodic forcing", "mass", {"c": 0.5, "d": 0.3, "w": 3.0}),
+    Resident("overflow", "two tanks", {"c": 1.0, "L": 2.5}),
+    Resident("overflow", "two tanks", {"c": 1.0, "d": 0.6, "L": 2.5}, "h, g"),
+    Resident("overflow", "two tanks", {"c": 1.0, "d": 0.8, "L": 2.2, "M": 3.0}, "h, g"),
+    Resident("leak", "two tanks", {"c": 0.3}, "in h"),
+    Resident("leak", "two tanks", {"c": 0.3, "d": 0.2}, "h, g"),
+    Resident("input delay", "mass", {"tau": 0.3}),
+    Resident("hysteresis", "mass", {"c": 2.0, "b": 1.5, "g": 0.5}),
+    Resident("sensor gain or offset", "mass", {"g": 0.2}),
+    Resident("sensor gain or offset", "mass", {"o": 0.3}),
+    Resident("sensor gain or offset", "mass", {"g": 0.2, "o": 0.3}),
+    Resident("thermal drift", "mass", {"r": 0.05}, "of the zero"),
+    Resident("thermal drift", "mass", {"r": 0.04}, "of the gain"),
+    Resident("thermal drift", "mass", {"c": 0.5, "tau": 3.0}),
+    Resident("sensor lag", "mass", {"tau": 0.1}),
+    Resident("quantisation", "mass", {"c": 1.0, "q": 0.3}),
+    Resident("clipping", "mass", {"L": 1.2}, "above"),
+    Resident("clipping", "mass", {"L": -1.2}, "below"),
+    Resident("clipping", "mass", {"H": 1.2, "L": -1.0}),
+    Resident("clock offset and drift", "mass", {"o": 0.06}),
+    Resident("clock offset and drift", "mass", {"o": 0.05, "r": 0.01}),
+    Resident("clock offset and drift", "two driven masses", {"o": 0.06}),
+)  # fmt: skip
+
+
+@cache
+def _candidates(home: str) -> tuple[MechanismCandidate, ...]:
+    model = HOMES[home].model
+    return tuple(candidates_of(model, roles_of(model), standard_dictionary()))
+
+
+def truth_of(resident: Resident) -> MechanismCandidate:
+    """The candidate whose model is the truth, with its parameters' values in it."""
+    for candidate in _candidates(resident.home):
+        stems = {name.rsplit("_", 1)[0]: name for name in candidate.new}
+        said = f"{candidate.label} {candidate.changes}"
+        if candidate.name == resident.name and set(stems) == set(resident.values) and resident.label in said:
+            new = {stems[stem]: value for stem, value in resident.values.items()}
+            values = [new.get(each.name, each.value) for each in candidate.model.parameters]
+            return replace(candidate, model=candidate.model.with_values(np.array(values)))
+    raise LookupError(f"{resident} has no home")
+
+
+def recorded(resident: Resident, *, seed: int = 1) -> Measurements:
+    """Recordings of the system that has the mechanism, with noise of one per cent."""
+    home, truth = HOMES[resident.home], truth_of(resident)
+    rng = np.random.default_rng(seed)
+    t = home.step * np.arange(home.samples)
+    before = home.model
+    tables = [
+        pd.DataFrame({"recording": f"r{place}", "t": t}).assign(
+            **dict.fromkeys(before.output_names, 0.0),
+            **dict(zip([each.name for each in before.inputs], home.drive(rng, t), strict=True)),
+        )
+        for place in range(home.recordings)
+    ]
+    empty = measurements_of(pd.concat(tables), before)
+    begin = np.stack([home.begin(rng) for _ in range(home.recordings)], axis=1)
+    states = simulated(truth, empty, begin)
+    known, signals = before.dimension, empty.signals(empty.t, empty.recording, delays=())
+    clean = before.functions.outputs(states[:known], signals, before.values)
+    noise = NOISE * clean.std(axis=1, keepdims=True) * rng.normal(size=clean.shape)
+    signals = empty.signals(empty.t, empty.recording, delays=truth.model.lags(truth.model.values))
+    measured = truth.model.functions.outputs(states, signals, truth.model.values) + noise
+    if resident.name == "quantisation":  # noise is there before a sensor rounds
+        step = resident.values["q"]
+        measured = step * np.rint((clean + noise) / step)
+    return replace(empty, outputs=np.ascontiguousarray(measured.T))
+
+
+def simulated(truth: MechanismCandidate, data: Measurements, begin: np.ndarray) -> np.ndarray:
+    """States at all samples, shape ``(d, n)``, from those at the begins, ``(k, recordings)``.
+
+    States that the mechanism brings begin where its entry says.
+    """
+    model, grid = truth.model, Grid(data, FINE)
+    delays = model.lags(model.values)
+    names = [symbol(name) for name in model.states[: len(begin)]]
+    further = [
+        np.full(begin.shape[1], 0.0) + compile_values([each], names)(*begin)[0] for each in truth.begins
+    ]
+    x = np.concatenate([begin, np.array(further).reshape(-1, begin.shape[1])])
+    count, length = len(data.labels), len(data.t) // len(data.labels)
+    path = np.empty((model.dimension, count, length))
+    nodes = [grid.signals(node, delays) for node in range(3 * FINE)]
+
+    def rates(at: np.ndarray, node: int, rows: np.ndarray) -> np.ndarray:
+        s = nodes[node]
+        here = Signals(s.inputs[:, rows], s.delayed[:, rows], s.slopes[:, rows], s.t[rows])
+        return model.functions.rates(at, here, model.values)
+
+    for sample in range(length):
+        path[:, :, sample] = x
+        if sample == length - 1:
+            break
+        rows = np.arange(count) * (length - 1) + sample
+        h = grid.step[rows]
+        for part in range(FINE):
+            k1 = rates(x, 3 * part, rows)
+            k2 = rates(x + h / 2 * k1, 3 * part + 1, rows)
+            k3 = rates(x + h / 2 * k2, 3 * part + 1, rows)
+            k4 = rates(x + h * k3, 3 * part + 2, rows)
+            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    return path.reshape(model.dimension, -1)
