@@ -59,7 +59,7 @@ def with_spline(model: Dynamics, place: Place, knots: np.ndarray) -> MechanismCa
 
 
 def spline(coordinate: sympy.Expr, knots: np.ndarray, values: Sequence[sympy.Expr]) -> sympy.Expr:
-    """A natural cubic spline through values at knots: ``a + b z + Σ w |z - z_k|³`` with ``Σ w = Σ w z_k = 0``.
+    """A natural cubic spline through values at knots: ``a + b z + Σ w |z - z_k|³``, ``Σ w = Σ w z_k = 0``.
 
     Parameters
     ----------
