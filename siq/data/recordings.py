@@ -250,6 +250,19 @@ def read_recordings(
     return Recordings(**read_tables(path, columns=columns, units=units, gaps=gaps)._asdict())
 
 
+def recordings_of(source: str | Path | Recordings | pd.DataFrame) -> Recordings:
+    """Recordings, whatever they are in: a file or a folder, a table in memory, or recordings as they are.
+
+    Raises
+    ------
+    InputError
+        For the first thing that cannot be read; see `read_recordings` and `Recordings.from_frame`.
+    """
+    if isinstance(source, Recordings):
+        return source
+    return read_recordings(source) if isinstance(source, str | Path) else Recordings.from_frame(source)
+
+
 def write_recordings(path: str | Path, recordings: Recordings) -> None:
     """Write recordings as Parquet; `read_recordings` gives them back to the last bit.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +14,7 @@ import pandas as pd
 from siq.certificate.certify import Certificate
 from siq.data.inspection import seen_states
 from siq.data.record_states import RecordStates
-from siq.data.recordings import Recordings
+from siq.data.recordings import Recordings, recordings_of
 from siq.data.selection import joined
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.equilibria import Equilibrium
@@ -102,19 +103,24 @@ class Landscape:
     seen: RecordStates | None = None
 
     @classmethod
-    def from_recordings(cls, recordings: Recordings, settings: PipelineSettings | None = None) -> Landscape:
+    def from_recordings(
+        cls, recordings: str | Path | Recordings | pd.DataFrame, settings: PipelineSettings | None = None
+    ) -> Landscape:
         r"""The landscape that recordings show: f identified, V refined and certified, transitions found.
 
         Parameters
         ----------
         recordings
-            Trajectories; see `siq.Recordings.from_frame` and `siq.read_recordings`.
+            Trajectories: a file, a folder of files, `siq.Recordings`, or a table as
+            `siq.Recordings.from_frame` takes it.
         settings
             Of all steps; see `siq.steps.pipeline.PipelineSettings`. By default V comes from f alone, without
             networks.
 
         Raises
         ------
+        InputError
+            For the first thing that cannot be read.
         NoLandscape
             When f cannot be identified, or it has no landscape. It says why, and what would make it an
             answer; its `states` are what the recordings show by themselves all the same.
@@ -140,20 +146,20 @@ class Landscape:
         from siq.steps.outcomes import why_no_landscape
         from siq.steps.pipeline import PipelineSettings, analyse
 
-        settings = settings or PipelineSettings()
-        analysis = analyse(recordings, settings)
+        settings, trajectories = settings or PipelineSettings(), recordings_of(recordings)
+        analysis = analyse(trajectories, settings)
         found = None if analysis.landscape is None else analysis.landscape.landscape
         certified = found is not None and found.certificate is not None and found.certificate.certified
         whole = certified and found is not None and len(found.attractors) > 1
-        seen = None if whole else seen_states(joined(recordings))
+        seen = None if whole else seen_states(joined(trajectories))
         if found is None:
             raise NoLandscape(why_no_landscape(analysis.outcomes), seen, analysis.dynamics)
         found = replace(found, seen=seen)
         units = tuple(
             unit or settings.space.unit(name, unknown="1")
-            for name, unit in zip(recordings.names, recordings.units, strict=True)
+            for name, unit in zip(trajectories.names, trajectories.units, strict=True)
         )
-        time = recordings.time_unit or settings.space.unit("t", unknown="1")
+        time = trajectories.time_unit or settings.space.unit("t", unknown="1")
         return found.in_units(units, time=time)
 
     def in_units(self, units: Sequence[str], *, time: str = "1") -> Landscape:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import functools
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import sympy
 from known_escapes import line_exit_time
@@ -71,6 +73,17 @@ def test_recordings_of_one_state_give_barriers() -> None:
     barriers = from_recordings().barriers()
     assert list(barriers["start"]) == [0, 1] and list(barriers["end"]) == [1, 0]
     np.testing.assert_allclose(barriers["barrier"], [top - left, top - right], rtol=1e-7)
+
+
+def test_a_file_and_a_table_do_as_well(tmp_path: Path) -> None:
+    file = tmp_path / "recorded.csv"
+    rows = recorded(three_roots())
+    label = np.array(rows.labels)[rows.recording]
+    table = pd.DataFrame({"recording": label, "t": rows.t, "x": rows.values[:, 0]})
+    table.to_csv(file, index=False)
+    known = from_recordings().barriers()["barrier"]
+    for source in (file, str(file), table):
+        np.testing.assert_allclose(Landscape.from_recordings(source).barriers()["barrier"], known, rtol=1e-9)
 
 
 def test_equal_wells_have_a_barrier_of_a_half() -> None:
