@@ -251,6 +251,10 @@ class Diffusion(NoiseField):
         """σ⁻¹ at points: ``(n, d)`` to ``(n, d, d)``; raises as `whitening`."""
         return np.broadcast_to(self.whitening, (len(x), *self.matrix.shape))
 
+    def positive_at(self, x: np.ndarray) -> np.ndarray:
+        """Mask of the points ``(n, d)`` at which D is positive definite: shape ``(n,)``."""
+        return np.full(len(x), bool(np.linalg.eigvalsh(self.matrix)[0] > 0))
+
     def precision_at(self, x: np.ndarray) -> np.ndarray:
         """D⁻¹ at points: ``(n, d)`` to ``(n, d, d)``; raises as `precision`."""
         return np.broadcast_to(self.precision, (len(x), *self.matrix.shape))

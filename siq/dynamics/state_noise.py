@@ -167,6 +167,17 @@ class StateNoise(Diffusion):
         """σ⁻¹ at points: ``(n, d)`` to ``(n, d, d)``; raises as `root_at`."""
         return np.linalg.inv(self.root_at(x))
 
+    def positive_at(self, x: np.ndarray) -> np.ndarray:
+        """Mask of the points ``(n, d)`` at which D is positive definite: shape ``(n,)``.
+
+        Far from the states that they were learned from formulas may be no covariance.
+        """
+        matrices = self.at(x)
+        finite = np.isfinite(matrices).all(axis=(1, 2))
+        return np.asarray(
+            finite & (np.linalg.eigvalsh(np.where(finite[:, None, None], matrices, 0.0))[:, 0] > 0)
+        )
+
     def precision_at(self, x: np.ndarray) -> np.ndarray:
         """D⁻¹ at points: ``(n, d)`` to ``(n, d, d)``; raises as `root_at`."""
         whitening = self.whitening_at(x)

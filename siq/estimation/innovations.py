@@ -17,7 +17,7 @@ from siq.estimation.linearisation import Linearisation
 from siq.estimation.measurements import Measurements
 from siq.numerics.triangle import triangle_of
 
-RANK = 1e-4  # singular values below this share of the largest say nothing
+RANK = 1e-9  # numerical: singular values below this share of the largest are rounding
 
 
 class NoiseField(Protocol):

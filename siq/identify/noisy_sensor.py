@@ -152,11 +152,15 @@ def identify_by_likelihood(
     for component, name in enumerate(library.states):
         if component not in support[:, 0]:
             raise NumericalFailure(f"no term of the equation of {name} is significant; record longer")
-    fit = settled(view, support, data, whole.noise, values=values[chosen], x=whole.linearised_at)
+    # Where functions are nearly alike, those that stay take over what the others did: all begin anew.
+    fit = settled(
+        view, support, data, whole.noise, values=equations.fitted(chosen)[chosen], x=whole.linearised_at
+    )
     while (weak := _weakest(fit, support, critical)) is not None:
-        support = np.delete(support, weak, axis=0)
-        kept = np.delete(fit.model.values, weak)
-        fit = settled(view, support, data, fit.noise, values=kept, x=fit.linearised_at)
+        support, chosen = np.delete(support, weak, axis=0), np.delete(chosen, weak).tolist()
+        fit = settled(
+            view, support, data, fit.noise, values=equations.fitted(chosen)[chosen], x=fit.linearised_at
+        )
     if by_state:
         one = _with_formula(view, support, fit, data, false_terms=false_terms, probability=chance)
     else:

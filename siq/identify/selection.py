@@ -11,6 +11,10 @@ Terms are added, dropped and exchanged as long as that lowers the score. Of two 
 the one of the lower degree is taken: the probability of a false term is shared among the degrees k as 1/k!,
 by which the coefficients of a Taylor series fall, and among the terms of a degree evenly.
 
+A price for each term is too much for terms that are needed together: where the origin of a state is far from
+its wells, a cubic is four monomials, none of which does much without the others. So a support is not taken
+that all functions of some degree fit better than chance would let them (`lacks_terms`).
+
 What other supports that do nearly as well make of f is told by `siq.identify.rival_terms`.
 """
 
@@ -172,7 +176,8 @@ def best_support(equation: Equation) -> tuple[int, ...]:
     """
     ends = {improved_support(equation, ())}
     for most in np.unique(equation.critical):
-        ends.add(improved_support(equation, strong_terms(equation, among=equation.critical <= most)))
+        strong = strong_terms(equation, among=equation.critical <= most)
+        ends |= {strong, improved_support(equation, strong)}
     scores = {one: equation.score(one) for one in ends}
     visited: set[tuple[int, ...]] = set()
     while waiting := [one for one in scores if one not in visited]:
@@ -180,8 +185,27 @@ def best_support(equation: Equation) -> tuple[int, ...]:
         visited.add(following)
         scores.update((other, score) for score, other in equation.neighbours(following))
         scores = {one: scores[one] for one in heapq.nsmallest(BREADTH, scores, key=scores.__getitem__)}
-    best = min(scores, key=scores.__getitem__)
+    ranked = sorted({*scores, *ends}, key=equation.score)
+    best = next((one for one in ranked if not lacks_terms(equation, one)), ranked[0])
     return best or min((one for one in ends if one), key=equation.score, default=())
+
+
+def lacks_terms(equation: Equation, support: Sequence[int]) -> bool:
+    """Whether all functions of some degree fit better than chance would let them, once those are there.
+
+    Chance may do so as often as it may bring in a false term, which the critical values say; the degrees
+    share that.
+    """
+    levels = np.unique(equation.critical)
+    chance = 2 * scipy.special.ndtr(-equation.critical).sum() / len(levels)
+    own = equation.chi_square(support)
+    for most in levels:
+        whole = np.union1d(np.flatnonzero(equation.critical <= most), np.array(support, dtype=int))
+        further = len(whole) - len(support)
+        gain = own - equation.chi_square(whole.tolist())
+        if further and scipy.special.chdtrc(further, max(gain, 0.0)) < chance:
+            return True
+    return False
 
 
 def improved_support(equation: Equation, start: Sequence[int]) -> tuple[int, ...]:

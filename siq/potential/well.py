@@ -125,8 +125,11 @@ class Well:
         return np.where(self.believed(x), self.values(x), np.nan)
 
     def believed(self, x: np.ndarray) -> np.ndarray:
-        """Mask of the points that the formula reaches, and where it solves the Hamilton–Jacobi equation."""
-        believed = self.reaches(x)
+        """Mask of the points that the formula reaches, and where it solves the Hamilton–Jacobi equation.
+
+        That has no meaning where a formula of D is no covariance.
+        """
+        believed = self.reaches(x) & self.dynamics.diffusion.positive_at(x)
         believed[believed] = self.residual_at(x[believed]) <= self.tolerance
         return believed
 

@@ -33,6 +33,7 @@ from siq.errors import NumericalFailure
 CELLS = {1: 2000, 2: 120}  # along each state: visits of a double well are then good to 1e-4 and 1e-2
 COARSE = 1.0  # z between neighbours, in the mean over the density: beyond, wells are narrower than cells
 SELDOM = 1e-9  # of the fastest rate
+LEAST = 1e-9  # numerical: of the strongest noise; where it is weaker it is none
 STEEP = 700.0  # of z: beyond, exp overflows, and B has its limits
 
 
@@ -104,6 +105,11 @@ def cell_process(
     ------
     NumericalFailure
         With more than two states, or where the noise is too weak for so few cells or does not reach a state.
+
+    Notes
+    -----
+    A formula of D that was learned from recordings may be no covariance far from them. Cells where that is so
+    are left out, and nothing goes there.
     """
     dimension = dynamics.dimension
     if dimension not in CELLS:
@@ -120,21 +126,44 @@ def cell_process(
     y = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, dimension)
     inverse = np.linalg.inv(shear)
 
+    def tensors(points: np.ndarray) -> np.ndarray:
+        return np.asarray(inverse @ dynamics.diffusion.at(points @ shear.T) @ inverse.T)
+
+    floor = LEAST * float(np.linalg.eigvalsh(tensors(y)).max())
+
     def noise(points: np.ndarray) -> np.ndarray:
-        d = dynamics.diffusion.at(points @ shear.T)
-        return np.asarray(0.5 * intensity * inverse @ d @ inverse.T)
+        return 0.5 * intensity * _raised(tensors(points), floor)
 
     def flow(points: np.ndarray) -> np.ndarray:
         return np.asarray(dynamics.drift(points @ shear.T) @ inverse.T)
 
-    if not np.all(np.diagonal(noise(y), axis1=1, axis2=2) > 0):
+    usable = np.linalg.eigvalsh(tensors(y))[:, 0] > floor
+    if not usable.any():
         raise NumericalFailure("the noise does not reach every state: no Fokker–Planck operator is solved")
-    rates = _rates(flow, noise, y, steps, count)
-    density = _invariant(rates)
+    rates, kept = _connected(_rates(flow, noise, y, steps, count), usable)
+    y, density = y[kept], _invariant(rates)
     tensor, drift = np.diagonal(noise(y), axis1=1, axis2=2), flow(y)
     if float((density[:, None] * np.abs(drift) * steps / tensor).sum(axis=0).max()) > COARSE:
         raise NumericalFailure("the noise is too weak for a grid: the wells are narrower than its cells")
     return CellProcess(y @ shear.T, rates, density)
+
+
+def _connected(flows: sparse.csr_matrix, usable: np.ndarray) -> tuple[sparse.csr_matrix, np.ndarray]:
+    """The generator of the largest set of usable cells that hang together, and which these are."""
+    places = np.flatnonzero(usable)
+    inner = flows[places][:, places]
+    _, piece = sparse.csgraph.connected_components(inner, directed=True, connection="strong")
+    own = piece == np.argmax(np.bincount(piece))
+    places, inner = places[own], inner[own][:, own]
+    return (inner - sparse.diags(np.asarray(inner.sum(axis=1)).ravel())).tocsr(), places
+
+
+def _raised(matrices: np.ndarray, floor: float) -> np.ndarray:
+    """Symmetric matrices ``(n, d, d)`` without eigenvalues below the floor."""
+    levels, vectors = np.linalg.eigh(matrices)
+    if (levels >= floor).all():
+        return matrices
+    return np.einsum("nik,nk,njk->nij", vectors, np.maximum(levels, floor), vectors)
 
 
 def _shear(matrix: np.ndarray) -> np.ndarray:
@@ -190,7 +219,7 @@ def _rates(
     total = sparse.csr_matrix(
         (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=(len(y), len(y))
     )
-    return (total - sparse.diags(np.asarray(total.sum(axis=1)).ravel())).tocsr()
+    return total
 
 
 def _bernoulli(z: np.ndarray) -> np.ndarray:

@@ -65,6 +65,12 @@ def test_who_needs_a_constant_d_is_refused() -> None:
 def test_a_d_that_is_negative_somewhere_is_refused_there() -> None:
     noise = StateNoise((X,), ((1 + X,),))
     noise.root_at(np.array([[0.0], [1.0]]))
+    assert noise.positive_at(np.array([[0.0], [-1.0], [-2.0], [np.nan]])).tolist() == [
+        True,
+        False,
+        False,
+        False,
+    ]
     for ask in (
         lambda: noise.root_at(np.array([[0.0], [-2.0], [-3.0]])),
         lambda: noise.frozen(np.array([-3.0])),

@@ -74,6 +74,20 @@ def test_terms_and_noises_are_found(found: tuple[FilteredField, Recordings, np.n
     assert found[0].gain > 100 and abs(found[0].score) < 4
 
 
+def test_where_the_origin_is_does_not_matter(found: tuple[FilteredField, Recordings, np.ndarray]) -> None:
+    """Five states away from its wells a cubic is four monomials that are nearly alike."""
+    one, recordings, _ = found
+    away = identified(replace(recordings, values=recordings.values + 5), degree=5)
+    assert [away.found.library.names[k] for _, k in away.found.support] == ["1", "x", "x**2", "x**3"]
+    x = np.linspace(-1.3, 1.3, 14)[:, None]
+    functions = away.found.library.evaluate(x + 5)[:, away.found.support[:, 1]]
+    error = np.sqrt(np.einsum("np,pq,nq->n", functions, away.found.covariance, functions))
+    change = away.found.dynamics.drift(x + 5)[:, 0] - one.found.dynamics.drift(x)[:, 0]
+    assert (np.abs(change) < 3 * error).all() and error.max() < 0.5
+    assert (np.abs(away.found.values) < 50 * np.sqrt(np.diag(away.found.covariance))).all()
+    assert away.sensor[0] == pytest.approx(one.sensor[0], rel=0.02)
+
+
 def test_filtered_states_are_nearer_and_keep_the_mean_of_f(
     found: tuple[FilteredField, Recordings, np.ndarray],
 ) -> None:

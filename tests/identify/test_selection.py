@@ -5,7 +5,13 @@ import pytest
 from scipy.special import ndtr
 
 from siq.identify.library import CandidateLibrary, candidate_library
-from siq.identify.selection import Equation, best_support, critical_values, improved_support
+from siq.identify.selection import (
+    Equation,
+    best_support,
+    critical_values,
+    improved_support,
+    lacks_terms,
+)
 
 LIBRARY = candidate_library(["x", "y"], degree=5)
 NAMES = list(LIBRARY.names)
@@ -68,6 +74,29 @@ def test_states_far_from_the_origin_hide_no_better_support(seed: int) -> None:
     goal = functions[:, true] @ [terms[NAMES[place]] for place in true] + draw.standard_normal(4000)
     made = of_rows(np.column_stack([functions, goal]), LIBRARY)
     assert made.score(best_support(made)) <= made.score(true) + 1e-6
+
+
+ONE_STATE = candidate_library(["x"], degree=5)
+
+
+def away_from_the_origin(seed: int, *, bend: float) -> Equation:
+    draw = np.random.default_rng(seed)
+    x = draw.uniform(3.0, 6.3, 4800)
+    goal = -(x - 4.6) + bend * (x - 3.8) * (x - 4.6) * (x - 5.5) + 8 * draw.standard_normal(len(x))
+    return of_rows(np.column_stack([ONE_STATE.evaluate(x[:, None]), goal]), ONE_STATE)
+
+
+def test_terms_that_are_needed_together_are_taken_together() -> None:
+    """None of the four monomials of a cubic far from the origin does much without the others."""
+    made = [away_from_the_origin(seed, bend=1.5) for seed in range(10)]
+    assert all(lacks_terms(one, (0, 1)) for one in made)
+    assert all(len(best_support(one)) >= 3 for one in made)
+    assert not any(lacks_terms(one, best_support(one)) for one in made)
+
+
+def test_a_straight_line_lacks_nothing() -> None:
+    lacking = [lacks_terms(away_from_the_origin(seed, bend=0.0), (0, 1)) for seed in range(100)]
+    assert sum(lacking) <= 9  # 5 expected at most
 
 
 def test_noise_alone_brings_few_terms() -> None:

@@ -12,10 +12,11 @@ from siq.data.stationarity import runs_of
 from siq.data.transitions import continued_visits, dwell_counts
 from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.dynamics import Dynamics
+from siq.dynamics.state_noise import StateNoise
 from siq.errors import NumericalFailure
 from siq.reference.fokker_planck import cell_process, cores_of
 
-x, y = sympy.symbols("x y")
+x, y = sympy.symbols("x y", real=True)
 TILTED = Dynamics(("x",), (x - x**3 + sympy.Rational(1, 10),), Diffusion.identity(1))
 WELLS = np.sort(np.roots([-1, 0, 1, 0.1]).real)[[0, 2]]
 BOX = np.array([[-2.0, 2.0]])
@@ -52,6 +53,20 @@ def test_one_state_by_quadrature(intensity: float, graded: bool) -> None:
     for well, mass in enumerate((below, below[-1] - below)):
         exact = 2 / intensity * np.trapezoid((mass / scale)[between], grid[between])
         assert process.mean_visit(core, well) == pytest.approx(exact, rel=3e-3)
+
+
+def test_cells_where_a_formula_of_the_noise_is_none_are_left_out() -> None:
+    """D = 1 - x² on a wider box: Jacobi's process, with the density (1 - x²)^(1/ε - 1)."""
+    system = Dynamics(("x",), (-x,), StateNoise((x,), ((1 - x**2,),)))
+    intensity = 0.4
+    process = cell_process(system, intensity, BOX)
+    place = process.points[:, 0]
+    assert np.abs(place).max() < 1 and np.abs(place).max() > 0.99
+    expected = (1 - place**2) ** (1 / intensity - 1)
+    assert process.density == pytest.approx(expected / expected.sum(), rel=1e-3, abs=1e-6)
+    beyond = system.with_diffusion(StateNoise((x,), ((x**2 - 9,),)))
+    with pytest.raises(NumericalFailure, match="does not reach every state"):
+        cell_process(beyond, intensity, BOX)
 
 
 @pytest.mark.parametrize("mixed", [0.0, 0.5])
