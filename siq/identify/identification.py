@@ -140,23 +140,21 @@ def _identify(
     _check_count(library, pairs)
     q, d, n = library.size, library.dimension, len(pairs.h)
     dense = fit_everything(library, pairs, integrator_step=integrator_step)
-    triangle, values, noise_free = dense.triangle, dense.values, dense.ratio < NOISE_FREE
+    triangle, noise_free = dense.triangle, dense.ratio < NOISE_FREE
     repeated = 1.0 if noise_free else copies(pairs)
     critical = critical_values(library, false_terms=options.false_terms)
     equations = [Equation.of_triangle(triangle, i, samples=n / repeated, critical=critical) for i in range(d)]
-    chosen = []
+    chosen, coefficients = [], np.zeros((q, d))
     for i, equation in enumerate(equations):
         kept = _contributing(triangle, q, i, options.precision) if noise_free else best_support(equation)
         chosen += [(i, k) for k in kept]
+        coefficients[:, i] = equation.fitted(kept)
     if len({i for i, _ in chosen}) < d:
         missing = next(i for i in range(d) if i not in {j for j, _ in chosen})
         raise NumericalFailure(
             f"no term of the equation of {library.states[missing]} is significant; record longer"
         )
-    coefficients = np.zeros((q, d))
     support = np.array(chosen)
-    for i, k in chosen:
-        coefficients[k, i] = values[i * q + k]
     found = IdentifiedField(
         library, coefficients, support, np.eye(len(support)), dense.rate, dense.ratio, dense.flow, diffusion
     )
@@ -165,8 +163,10 @@ def _identify(
     # With the final support and flow a term may turn out to be superfluous after all.
     while (weak := _weakest(found, problem, options, critical)) is not None:
         support = np.delete(found.support, weak, axis=0)
-        coefficients = np.zeros_like(found.coefficients)
-        coefficients[support[:, 1], support[:, 0]] = found.coefficients[support[:, 1], support[:, 0]]
+        left = [support[support[:, 0] == i, 1].tolist() for i in range(d)]
+        coefficients = np.column_stack(
+            [equation.fitted(own) for equation, own in zip(equations, left, strict=True)]
+        )
         problem = FlowRegression(library, pairs, support)
         found = fit_support(replace(found, coefficients=coefficients, support=support), problem)
     return found if noise_free else replace(found, rivals=rivals_by_equation(equations, found.support))

@@ -18,6 +18,9 @@ import sympy
 
 from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.formulas import FormulaError, compile_formulas, parse_formula
+from siq.errors import NumericalFailure
+
+FAR = 10.0  # half ranges from the origin within which powers are alike for other reasons
 
 
 @dataclass(frozen=True)
@@ -171,6 +174,41 @@ def joint_library(
             others.append(name)
     return candidate_library(
         of_field.states, degree=highest, potential_degree=potential_degree, further=others
+    )
+
+
+def check_origin(library: CandidateLibrary, x: np.ndarray, *, names: Sequence[str]) -> None:
+    """Refuse states whose origin is so far from them that their powers are all the same function.
+
+    Parameters
+    ----------
+    library
+        The functions.
+    x
+        Recorded states, shape ``(n, d)``.
+    names
+        What people call them.
+
+    Raises
+    ------
+    NumericalFailure
+        Where errors of coefficients would be rounding. It says what to subtract.
+    """
+    low, high = x.min(axis=0), x.max(axis=0)
+    middle, half = (low + high) / 2, (high - low) / 2
+    away = np.abs(middle) > FAR * half
+    columns = library.evaluate(x)
+    size = np.linalg.norm(columns, axis=0)
+    values = np.linalg.svd(np.linalg.qr(columns / np.where(size > 0, size, 1.0), mode="r"), compute_uv=False)
+    # Covariances lose twice the digits that coefficients lose.
+    if not away.any() or values[-1] > np.sqrt(np.finfo(float).eps) * values[0]:
+        return
+    worst = int(np.argmax(np.abs(middle) / np.where(half > 0, half, np.inf)))
+    digits = int(np.floor(np.log10(half[worst])))
+    raise NumericalFailure(
+        f"{names[worst]} stays so far from zero, between {low[worst]:.6g} and {high[worst]:.6g}, that its"
+        f" powers cannot be told apart; subtract {round(float(middle[worst]), -digits):.10g} from it, or name"
+        " the functions of f"
     )
 
 

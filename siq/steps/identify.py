@@ -25,6 +25,7 @@ from siq.identify.identification import (
     with_stability,
 )
 from siq.identify.identified_field import IdentifiedField
+from siq.identify.library import check_origin
 from siq.identify.memory import possible_exposures
 from siq.identify.noise_formula import constant_noise
 from siq.identify.noise_regression import constant_noise_probability
@@ -99,6 +100,7 @@ def _identified(settings: IdentifySettings, recordings: Recordings, number: int)
     step, maker = sampling.pair_step, sampling.integrator_step
     parts = snapshot_pairs(training, pair_step=step), snapshot_pairs(held_out, pair_step=step)
     library = field_library(recordings.names, options)
+    check_origin(library, recordings.values, names=recordings.titles)
     identify_pairs = partial(
         identify_vector_field,
         library,

@@ -8,7 +8,14 @@ import sympy
 
 from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.formulas import FormulaError
-from siq.identify.library import CandidateLibrary, candidate_library, constraint_matrix, monomial_exponents
+from siq.errors import NumericalFailure
+from siq.identify.library import (
+    CandidateLibrary,
+    candidate_library,
+    check_origin,
+    constraint_matrix,
+    monomial_exponents,
+)
 
 STATES = ("x", "y", "z", "w")
 FULL = np.array([[2.0, 0.3], [0.3, 1.0]])
@@ -183,3 +190,15 @@ def test_further_zeros_are_imposed() -> None:
 def test_a_further_function_that_does_not_fit_is_refused(further: list[str], message: str) -> None:
     with pytest.raises(FormulaError, match=message):
         candidate_library(("x", "y"), degree=2, further=further)
+
+
+def test_states_far_from_their_origin_are_refused_with_what_to_subtract() -> None:
+    library = candidate_library(["T"], degree=5)
+    states = np.random.default_rng(0).uniform(-1.7, 1.7, (500, 1))
+    for near in (0.0, 5.0, 15.0):
+        check_origin(library, states + near, names=["T"])
+    with pytest.raises(
+        NumericalFailure, match=r"^T stays .* between 271.\d+ and 274.\d+, .* subtract 273 from it"
+    ):
+        check_origin(library, states + 273, names=["T"])
+    check_origin(candidate_library(["T"], degree=1), states + 273, names=["T"])
