@@ -14,7 +14,7 @@ import yaml
 from pyarrow import parquet
 
 from workflow.proof.foreign.designs import IN_SENSOR, STRENGTHS, ForeignDesign
-from workflow.proof.foreign.effects import Effect, draw_effect
+from workflow.proof.foreign.effects import draw_effect
 from workflow.proof.foreign.formulas import evaluator, rounded
 from workflow.proof.foreign.motion import PILOT, Motion, RanAway, Truth, move
 from workflow.proof.foreign.sensors import Sensors, draw_sensors, reader, recorded
@@ -175,7 +175,7 @@ def _assembled(
 ) -> ForeignCase:
     system, effect = truth.system, truth.effect
     shifts = _shifts(system, truth.parameters, rng) if design.shifted else {}
-    table, noise, steps = recorded(truth, motion, experiment, sensors, rng)
+    table = recorded(truth, motion, experiment, sensors, rng)
     believed = {name: shift["card"] for name, shift in shifts.items()}
     key: dict[str, Any] = {
         "case": design.name,
@@ -190,15 +190,18 @@ def _assembled(
         "shifts": shifts,
         "effect": effect.formulas() if effect else {},
         "sensors": {
-            "noise": noise, "steps": steps, "lost": sensors.lost, "jitter": sensors.jitter * system.interval,
+            "noise": table.noise,
+            "steps": table.steps,
+            "lost": 0.0 if system.driven else sensors.lost,
+            "jitter": sensors.jitter,
         },
-    }  # fmt: skip
+    }
     return ForeignCase(
         system.card({**truth.parameters, **believed}),
-        _study(table, rng),
-        table,
+        _study(table.columns, rng),
+        table.columns,
         key,
-        _rows(truth, motion, experiment, effect),
+        {**_rows(truth, motion, experiment), "starts": experiment.starts[:, table.order].T},
     )
 
 
@@ -211,9 +214,7 @@ def _study(table: Mapping[str, np.ndarray], rng: np.random.Generator) -> dict[st
     return {"held_out": sorted(map(str, rng.choice(labels, size=count, replace=False)))}
 
 
-def _rows(
-    truth: Truth, motion: Motion, experiment: Experiment, effect: Effect | None
-) -> dict[str, np.ndarray]:
+def _rows(truth: Truth, motion: Motion, experiment: Experiment) -> dict[str, np.ndarray]:
     """Arrays of the key: noise-free states and their derivatives, thinned evenly."""
     states, drive = _within(motion, experiment)
     rows = np.unique(np.linspace(0, len(drive) - 1, min(KEY_ROWS, len(drive))).astype(int))

@@ -53,21 +53,34 @@ def draw_sensors(noise_db: float, rng: np.random.Generator) -> Sensors:
     )
 
 
+@dataclass(frozen=True)
+class Table:
+    """What was recorded.
+
+    Attributes
+    ----------
+    columns
+        ``recording``, ``t``, the outputs and the input.
+    noise
+        Deviation of each output's noise.
+    steps
+        In which each output is read; empty where nothing is rounded.
+    order
+        The place in the experiment of each label, shape ``(R,)``.
+    """
+
+    columns: dict[str, np.ndarray]
+    noise: dict[str, float]
+    steps: dict[str, float]
+    order: np.ndarray
+
+
 def recorded(
     truth: Truth, motion: Motion, experiment: Experiment, sensors: Sensors, rng: np.random.Generator
-) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, float]]:
+) -> Table:
     """The table of recordings.
 
     Samples are lost as rows, and only where nothing drives the system: nobody knows the input of a lost row.
-
-    Returns
-    -------
-    dict
-        Columns ``recording``, ``t``, the outputs and the input.
-    dict
-        Deviation of each output's noise.
-    dict
-        The step in which each output is read; empty where nothing is rounded.
     """
     system, interval = truth.system, truth.system.interval
     read = reader(truth)
@@ -105,10 +118,11 @@ def recorded(
     columns |= dict(zip(system.outputs, measured, strict=True))
     if system.driven:
         columns["u"] = np.concatenate(inputs)
-    return (
+    return Table(
         {name: column[kept] for name, column in columns.items()},
         dict(zip(system.outputs, map(float, noise), strict=True)),
         steps,
+        order,
     )
 
 

@@ -2,7 +2,7 @@
 
 A *polynomial* system has random rotations and random products, held together by cubes. A *rational* one is a
 network of stores that further or hinder one another, each emptying in proportion to what it holds. A
-*mechanical* one is a chain of masses on random springs that stiffen. A draw that leaves its bounds is not used.
+*mechanical* one is a chain of masses on random springs that stiffen. What leaves its bounds is drawn again.
 """
 
 from __future__ import annotations
