@@ -33,6 +33,8 @@ rule conceal:
     output:
         cases=directory("results/proof/{proof}/cases/{batch}"),
         digests="results/proof/{proof}/digests/{batch}.json",
+    wildcard_constraints:
+        proof=OWN_SETS,
     log:
         "results/proof/{proof}/logs/conceal/{batch}.log",
     benchmark:
@@ -99,6 +101,8 @@ rule open_keys:
         verdicts=all_batches("results/proof/{proof}/verdicts/{batch}.json"),
     output:
         temp(directory("results/proof/{proof}/keys/{batch}")),
+    wildcard_constraints:
+        proof=OWN_SETS,
     log:
         "results/proof/{proof}/logs/open_keys/{batch}.log",
     benchmark:
@@ -123,6 +127,8 @@ rule score_batch:
     output:
         table="results/proof/{proof}/scores/{batch}.parquet",
         csv="results/proof/{proof}/scores/{batch}.csv",
+    wildcard_constraints:
+        proof=OWN_SETS,
     log:
         "results/proof/{proof}/logs/score/{batch}.log",
     benchmark:
@@ -144,6 +150,8 @@ rule collect_scores:
     output:
         table="results/proof/{proof}/tables/score.parquet",
         csv="results/proof/{proof}/tables/score.csv",
+    wildcard_constraints:
+        proof=OWN_SETS,
     log:
         "results/proof/{proof}/logs/collect_scores.log",
     benchmark:
@@ -173,6 +181,8 @@ rule score_proof:
         png="results/proof/{proof}/figures/verdicts.png",
         targets="results/proof/{proof}/tables/targets.parquet",
         csv="results/proof/{proof}/tables/targets.csv",
+    wildcard_constraints:
+        proof=OWN_SETS,
     log:
         "results/proof/{proof}/logs/page.log",
     benchmark:

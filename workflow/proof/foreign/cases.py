@@ -13,12 +13,14 @@ import pyarrow as pa
 import yaml
 from pyarrow import parquet
 
-from workflow.proof.foreign.designs import IN_SENSOR, STRENGTHS, ForeignDesign
+from workflow.proof.foreign.designs import IN_SENSOR, STRENGTHS, ForeignDesign, draw_cases
 from workflow.proof.foreign.effects import draw_effect
 from workflow.proof.foreign.formulas import evaluator, rounded
 from workflow.proof.foreign.motion import PILOT, Motion, RanAway, Truth, move
 from workflow.proof.foreign.sensors import Sensors, draw_sensors, reader, recorded
 from workflow.proof.foreign.systems import FAMILIES, Experiment, RandomSystem, draw_experiment
+
+__all__ = ["ForeignCase", "ForeignDesign", "draw_cases", "make_case", "write_case"]
 
 ATTEMPTS = 60
 ROUNDS = 4  # in which the amplitude of an effect is found
@@ -51,7 +53,7 @@ class ForeignCase:
     truth: Mapping[str, Any]
 
 
-def make_foreign_case(design: ForeignDesign) -> ForeignCase:
+def make_case(design: ForeignDesign) -> ForeignCase:
     """Draw and simulate a case. The same design makes the same case.
 
     Raises
@@ -229,7 +231,7 @@ def _rows(truth: Truth, motion: Motion, experiment: Experiment) -> dict[str, np.
     }
 
 
-def write_foreign_case(design: ForeignDesign, *, cases: Path, keys: Path) -> None:
+def write_case(design: ForeignDesign, *, cases: Path, keys: Path) -> None:
     """Make a case and write it, and its key, to two folders.
 
     Parameters
@@ -241,7 +243,7 @@ def write_foreign_case(design: ForeignDesign, *, cases: Path, keys: Path) -> Non
     keys
         Gets ``CASE.json`` and ``CASE.npz``.
     """
-    case = make_foreign_case(design)
+    case = make_case(design)
     folder = cases / design.name
     folder.mkdir(parents=True, exist_ok=True)
     keys.mkdir(parents=True, exist_ok=True)

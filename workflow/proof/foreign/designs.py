@@ -51,7 +51,7 @@ class ForeignDesign:
     seed: int
 
 
-def draw_foreign_cases(*, count: int, seed: int, shares: Mapping[str, float]) -> list[ForeignDesign]:
+def draw_cases(*, count: int, seed: int, shares: Mapping[str, float]) -> list[ForeignDesign]:
     """Decide which cases there are.
 
     Parameters

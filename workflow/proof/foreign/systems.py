@@ -271,7 +271,7 @@ class Experiment:
 
 
 RECORDINGS = (1, 2, 3, 4, 5, 6, 8)
-SAMPLES = (300, 1200)  # in all; few, since a laboratory has few
+SAMPLES = (300, 1200)  # in all, of two states; of more states fewer, so that each case takes as long
 LONGEST, SHORTEST = 400, 40  # of a recording
 
 
@@ -279,7 +279,8 @@ def draw_experiment(system: RandomSystem, rng: np.random.Generator) -> Experimen
     """A few recordings of unequal length from random first states, with random tones as input."""
     recordings = int(rng.choice(RECORDINGS))
     share = np.exp(rng.uniform(-0.7, 0.7, recordings))
-    lengths = np.clip(rng.integers(*SAMPLES) * share / share.sum(), SHORTEST, LONGEST).astype(int)
+    total = max(rng.integers(*SAMPLES) * np.sqrt(2 / len(system.states)), SAMPLES[0])
+    lengths = np.clip(total * share / share.sum(), SHORTEST, LONGEST).astype(int)
     low, high = system.box.T
     starts = rng.uniform(low[:, None], high[:, None], (len(low), recordings))
     times = system.interval * np.arange(lengths.max())

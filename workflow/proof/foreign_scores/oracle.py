@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.optimize
 
 from siq.dynamics.dynamics import Dynamics
-from siq.estimation.free_runs import free_run
-from siq.estimation.innovations import Noise
 from siq.estimation.measurements import Measurements
 from siq.mismatch.case import Comparison
 from workflow.proof.foreign_scores.integrator import Integrator
-from workflow.proof.keys import CaseKey
+from workflow.proof.keys import CaseKey, Truth
 from workflow.proof.oracle import true_model
 
 EVALUATIONS = 60  # of a fit, at most
+PREFIX, SHORTEST = 0.2, 8  # of a held-out recording, from which its first states are told; samples, at least
+WIDE = 3.0  # deviations of the states about their means, within which first states are sought
+NUDGE = 1e-5  # of a state in units of this width, for a difference
 BLOCKS = 12  # of held-out samples, whose differences tell the error of a gain
 
 
@@ -73,15 +75,15 @@ class TrueSimulation:
     gain_error: float
 
 
-def true_simulation(case: Comparison, key: CaseKey, starts: np.ndarray) -> TrueSimulation:
+def true_simulation(case: Comparison, key: CaseKey, truth: Truth, starts: np.ndarray) -> TrueSimulation:
     """Fit the true simulation and the card's.
 
     Parameters
     ----------
     case
         As the diagnosis had it.
-    key
-        What it conceals.
+    key, truth
+        What it conceals, and where the system was.
     starts
         True first states of the recordings that are learned from, shape ``(recordings, d)``.
 
@@ -101,7 +103,7 @@ def true_simulation(case: Comparison, key: CaseKey, starts: np.ndarray) -> TrueS
         for values, first in zip(begin, (starts, true.starts), strict=True)
     ]
     card = min(fits, key=lambda fit: fit.chi2)
-    errors = [held_out_errors(fit, case.kept) for fit in (true, card)]
+    errors = [free_errors(fit.model, case.kept, noise, truth) for fit in (true, card)]
     middle = [_rms(each) for each in errors]
     return TrueSimulation(
         true,
@@ -172,19 +174,76 @@ def _jacobian(
     return np.nan_to_num(flat, nan=0.0, posinf=0.0, neginf=0.0)
 
 
-def held_out_errors(fit: LeastSquares, kept: Measurements) -> np.ndarray:
-    """Normalised squared errors of a free run of the held-out recordings, one for each scored sample."""
-    return free_errors(fit.model, kept, fit.noise)
+def free_errors(model: Dynamics, kept: Measurements, noise: np.ndarray, truth: Truth) -> np.ndarray:
+    """Normalised squared errors of a free run of held-out recordings, the mean over outputs at each sample.
 
+    The first states are those that fit the first fifth of a recording best, which is not scored; what it does
+    not tell of them is where the system usually is.
 
-def free_errors(model: Dynamics, kept: Measurements, noise: np.ndarray) -> np.ndarray:
-    """The same of any model; without random forces, for each scored sample the mean over the outputs."""
-    still = Noise(noise**2, np.zeros(model.dimension))
-    run = free_run(model, kept, noise=still, substeps=4)
-    measured = kept.outputs[run.scored]
-    spread = np.nanvar(measured, axis=0)
-    squares: np.ndarray = (run.outputs[run.scored] - measured) ** 2 / np.where(spread > 0, spread, 1.0)
+    Parameters
+    ----------
+    model
+        With the parameters' values to be used.
+    kept
+        The recordings.
+    noise
+        Deviation of each output's noise.
+    truth
+        Tells where the system usually is.
+    """
+    lengths = np.diff(kept.first)
+    rows = np.maximum((PREFIX * lengths).astype(int), SHORTEST)
+    prefix = Integrator(model, kept.until(rows))
+    usual, spread = truth.states.mean(axis=0), WIDE * truth.states.std(axis=0)
+    added = model.dimension - len(usual)  # states that the truth has none of
+    usual, spread = np.append(usual, np.zeros(added)), np.append(spread, np.ones(added))
+    shape = (len(lengths), model.dimension)
+
+    def residuals(z: np.ndarray) -> np.ndarray:
+        first = usual + spread * z.reshape(shape)
+        outputs = prefix.outputs(prefix.run(model.values, first), model.values)
+        return np.concatenate([((outputs - prefix.data.outputs) / noise).ravel(), z])
+
+    begin = np.zeros(shape)
+    for place, (_, formula) in enumerate(model.outputs):
+        if str(formula) in model.states:
+            state = model.states.index(str(formula))
+            begin[:, state] = (kept.outputs[kept.first[:-1], place] - usual[state]) / spread[state]
+    best = _settled(residuals, begin.ravel(), shape, prefix)
+    whole = Integrator(model, kept)
+    outputs = whole.outputs(whole.run(model.values, usual + spread * best.reshape(shape)), model.values)
+    scored = np.arange(len(kept.t)) - kept.first[kept.recording] >= rows[kept.recording]
+    measured = kept.outputs[scored]
+    size = np.nanvar(measured, axis=0)
+    squares: np.ndarray = (outputs[scored] - measured) ** 2 / np.where(size > 0, size, 1.0)
     return squares.mean(axis=1)
+
+
+def _settled(
+    residuals: Callable[[np.ndarray], np.ndarray],
+    begin: np.ndarray,
+    shape: tuple[int, int],
+    prefix: Integrator,
+) -> np.ndarray:
+    """First states by least squares; each recording has its own, so that they are differenced together."""
+    recordings, d = shape
+    owner = np.concatenate(
+        [np.repeat(prefix.data.recording, len(prefix.model.outputs)), np.repeat(np.arange(recordings), d)]
+    )
+
+    def jacobian(z: np.ndarray) -> np.ndarray:
+        base = residuals(z)
+        result = np.zeros((len(base), len(z)))
+        for state in range(d):
+            moved = z.reshape(shape).copy()
+            moved[:, state] += NUDGE
+            change = (residuals(moved.ravel()) - base) / NUDGE
+            result[np.arange(len(base)), owner * d + state] = change
+        return np.nan_to_num(result, nan=0.0, posinf=0.0, neginf=0.0)
+
+    found = scipy.optimize.least_squares(residuals, begin, jac=jacobian, max_nfev=EVALUATIONS)
+    best: np.ndarray = found.x
+    return best
 
 
 def _rms(squares: np.ndarray) -> float:

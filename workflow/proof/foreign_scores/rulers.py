@@ -87,7 +87,7 @@ def _all_values(model: Dynamics, truth: Truth) -> np.ndarray:
 
 
 def unreal_names(mechanisms: Sequence[Mapping[str, Any]], key: CaseKey) -> list[str]:
-    """Names but for those of the sensors' faults: that a sensor rounds is right where it does, in these steps."""
+    """Names but for those of sensors' faults: that a sensor rounds is right where it does."""
     return [str(each["name"]) for each in mechanisms if not _rounds(each, key)]
 
 

@@ -13,7 +13,7 @@ from siq.mismatch.case import Comparison, read_case
 from workflow.proof.foreign_scores.oracle import TrueSimulation, free_errors, true_simulation
 from workflow.proof.foreign_scores.places import Told, told_places
 from workflow.proof.foreign_scores.rulers import NEAR, name_error, said_place, true_place, unreal_names
-from workflow.proof.keys import CaseKey, read_key, read_truth
+from workflow.proof.keys import CaseKey, Truth, read_key, read_truth
 from workflow.proof.scoring import FAILED, NOTHING, Answer, model_of
 
 KNOWN = 100.0
@@ -100,8 +100,8 @@ def score_foreign_case(name: str, folder: str | Path, keys: str | Path, answer: 
         row["wrong_name"] = not row["name_error"] <= NEAR
         row["right"] = not row["wrong_name"]
     try:
-        oracle = true_simulation(case, key, _starts(case, keys / f"{name}.npz"))
-        row |= gains(case, key, oracle, answer)
+        oracle = true_simulation(case, key, truth, _starts(case, keys / f"{name}.npz"))
+        row |= gains(case, key, truth, oracle, answer)
         if key.kind == "withheld":
             row |= places(key, told_places(case, key, oracle.true), answer)
     except (ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
@@ -147,16 +147,14 @@ def said(key: CaseKey, answer: Answer) -> dict[str, Any]:
     }
 
 
-def gains(case: Comparison, key: CaseKey, oracle: TrueSimulation, answer: Answer) -> dict[str, Any]:
-    """How much better held-out recordings are predicted, by the oracle and by the mended simulation.
-
-    The card's simulation is refitted by the oracle and by the diagnosis; the better one counts.
-    """
-    told = (answer.verdict or {}).get("fit", {}).get("recalibrated")
-    card = min(oracle.card_error, np.inf if told is None else float(told))
-    augmented = np.nan
+def gains(
+    case: Comparison, key: CaseKey, truth: Truth, oracle: TrueSimulation, answer: Answer
+) -> dict[str, Any]:
+    """How much better held-out recordings are predicted, by the oracle and by the mended simulation."""
+    card, augmented = oracle.card_error, np.nan
     if answer.verdict is not None:
-        augmented = float(np.sqrt(free_errors(model_of(answer.card), case.kept, oracle.true.noise).mean()))
+        errors = free_errors(model_of(answer.card), case.kept, oracle.true.noise, truth)
+        augmented = float(np.sqrt(errors.mean()))
     gain = card - oracle.true_error
     asked = key.kind == "withheld" and bool(gain > SURE * oracle.gain_error)
     share = (card - augmented) / gain if asked else np.nan
