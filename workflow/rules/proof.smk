@@ -33,12 +33,12 @@ rule conceal:
     output:
         cases=directory("results/proof/{proof}/cases/{batch}"),
         digests="results/proof/{proof}/digests/{batch}.json",
-    wildcard_constraints:
-        proof=OWN_SETS,
     log:
         "results/proof/{proof}/logs/conceal/{batch}.log",
     benchmark:
         "results/proof/{proof}/benchmarks/conceal/{batch}.tsv"
+    wildcard_constraints:
+        proof=OWN_SETS,
     conda:
         "../envs/siq.yaml"
     threads: 1
@@ -101,12 +101,12 @@ rule open_keys:
         verdicts=all_batches("results/proof/{proof}/verdicts/{batch}.json"),
     output:
         temp(directory("results/proof/{proof}/keys/{batch}")),
-    wildcard_constraints:
-        proof=OWN_SETS,
     log:
         "results/proof/{proof}/logs/open_keys/{batch}.log",
     benchmark:
         "results/proof/{proof}/benchmarks/open_keys/{batch}.tsv"
+    wildcard_constraints:
+        proof=OWN_SETS,
     conda:
         "../envs/siq.yaml"
     threads: 1
@@ -127,12 +127,12 @@ rule score_batch:
     output:
         table="results/proof/{proof}/scores/{batch}.parquet",
         csv="results/proof/{proof}/scores/{batch}.csv",
-    wildcard_constraints:
-        proof=OWN_SETS,
     log:
         "results/proof/{proof}/logs/score/{batch}.log",
     benchmark:
         "results/proof/{proof}/benchmarks/score/{batch}.tsv"
+    wildcard_constraints:
+        proof=OWN_SETS,
     conda:
         "../envs/siq.yaml"
     threads: 1
@@ -150,12 +150,12 @@ rule collect_scores:
     output:
         table="results/proof/{proof}/tables/score.parquet",
         csv="results/proof/{proof}/tables/score.csv",
-    wildcard_constraints:
-        proof=OWN_SETS,
     log:
         "results/proof/{proof}/logs/collect_scores.log",
     benchmark:
         "results/proof/{proof}/benchmarks/collect_scores.tsv"
+    wildcard_constraints:
+        proof=OWN_SETS,
     conda:
         "../envs/siq.yaml"
     threads: 1
@@ -181,12 +181,12 @@ rule score_proof:
         png="results/proof/{proof}/figures/verdicts.png",
         targets="results/proof/{proof}/tables/targets.parquet",
         csv="results/proof/{proof}/tables/targets.csv",
-    wildcard_constraints:
-        proof=OWN_SETS,
     log:
         "results/proof/{proof}/logs/page.log",
     benchmark:
         "results/proof/{proof}/benchmarks/page.tsv"
+    wildcard_constraints:
+        proof=OWN_SETS,
     conda:
         "../envs/siq.yaml"
     threads: 1

@@ -20,12 +20,12 @@ rule conceal_foreign:
     output:
         cases=directory("results/proof/{proof}/cases/{batch}"),
         digests="results/proof/{proof}/digests/{batch}.json",
-    wildcard_constraints:
-        proof=FOREIGN_SETS,
     log:
         "results/proof/{proof}/logs/conceal/{batch}.log",
     benchmark:
         "results/proof/{proof}/benchmarks/conceal/{batch}.tsv"
+    wildcard_constraints:
+        proof=FOREIGN_SETS,
     conda:
         "../envs/siq.yaml"
     threads: 1
@@ -45,12 +45,12 @@ rule open_foreign_keys:
         verdicts=all_batches("results/proof/{proof}/verdicts/{batch}.json"),
     output:
         temp(directory("results/proof/{proof}/keys/{batch}")),
-    wildcard_constraints:
-        proof=FOREIGN_SETS,
     log:
         "results/proof/{proof}/logs/open_keys/{batch}.log",
     benchmark:
         "results/proof/{proof}/benchmarks/open_keys/{batch}.tsv"
+    wildcard_constraints:
+        proof=FOREIGN_SETS,
     conda:
         "../envs/siq.yaml"
     threads: 1
@@ -71,12 +71,12 @@ rule score_foreign_batch:
     output:
         table="results/proof/{proof}/scores/{batch}.parquet",
         csv="results/proof/{proof}/scores/{batch}.csv",
-    wildcard_constraints:
-        proof=FOREIGN_SETS,
     log:
         "results/proof/{proof}/logs/score/{batch}.log",
     benchmark:
         "results/proof/{proof}/benchmarks/score/{batch}.tsv"
+    wildcard_constraints:
+        proof=FOREIGN_SETS,
     conda:
         "../envs/siq.yaml"
     threads: 1
@@ -94,12 +94,12 @@ rule collect_foreign_scores:
     output:
         table="results/proof/{proof}/tables/score.parquet",
         csv="results/proof/{proof}/tables/score.csv",
-    wildcard_constraints:
-        proof=FOREIGN_SETS,
     log:
         "results/proof/{proof}/logs/collect_scores.log",
     benchmark:
         "results/proof/{proof}/benchmarks/collect_scores.tsv"
+    wildcard_constraints:
+        proof=FOREIGN_SETS,
     conda:
         "../envs/siq.yaml"
     threads: 1
@@ -125,12 +125,12 @@ rule score_foreign:
         png="results/proof/{proof}/figures/gains.png",
         targets="results/proof/{proof}/tables/targets.parquet",
         csv="results/proof/{proof}/tables/targets.csv",
-    wildcard_constraints:
-        proof=FOREIGN_SETS,
     log:
         "results/proof/{proof}/logs/page.log",
     benchmark:
         "results/proof/{proof}/benchmarks/page.tsv"
+    wildcard_constraints:
+        proof=FOREIGN_SETS,
     conda:
         "../envs/siq.yaml"
     threads: 1
