@@ -370,19 +370,11 @@ def test_that_a_sensor_rounds_is_right_where_it_does() -> None:
     assert said(key, Answer(verdict, ""))["false_alarm"]
 
 
-def test_the_place_is_that_of_the_function_in_the_new_card_or_else_that_of_the_verdict() -> None:
-    location = {"equations": {"v": 0.9}, "coordinate": "x, v"}
-    assert said_place({"location": location}) == ({"v"}, {"x", "v"})
-    described = [{"equations": ["w"], "outputs": [], "coordinates": ["q"]}]
-    assert said_place({"location": location, "described": described}) == ({"w"}, {"q"})
-    described = [{"equations": [], "outputs": ["x"], "coordinates": ["x"]}]
-    assert said_place({"described": described}) == ({"sensor x"}, {"x"})
-    sensor = {
-        "location": {"equations": {}, "coordinate": "measurement"},
-        "mechanisms": [{"terms": {"x": ""}}],
-    }
-    assert said_place(sensor) == ({"sensor x"}, {"x"})
-    assert said_place({}) == (set(), set())
+def test_the_place_is_that_of_the_verdict() -> None:
+    assert said_place({"location": {"equations": {"v": 0.9}, "coordinate": "x, v"}}) == ({"v"}, {"x", "v"})
+    sensor = {"equations": {}, "outputs": ["x"], "coordinate": "measurement"}
+    assert said_place({"location": sensor}) == ({"sensor x"}, {"x"})
+    assert said_place({"location": None}) == (set(), set())
 
 
 # --- Scores and targets
@@ -395,17 +387,17 @@ def test_a_case_is_scored_as_a_whole(
     monkeypatch.setattr(scores, "true_simulation", lambda *_: oracle)  # which takes seconds
     true, _ = true_model(case.system, key)
 
-    def scored(verdict: str, described: list[Any], card: str) -> dict[str, Any]:
-        said = {"verdict": verdict, "mechanisms": [], "described": described}
+    def scored(verdict: str, described: list[Any], location: Any, card: str) -> dict[str, Any]:
+        said = {"verdict": verdict, "mechanisms": [], "described": described, "location": location}
         return score_foreign_case(
             "case-0001", folder / "cases/case-0001", folder / "keys", Answer(said, card, 3.0)
         )
 
-    place = {"equations": list(key.equations), "outputs": [], "coordinates": list(key.coordinates)}
-    row = scored("unexplained", [{"label": "f", **place}], true.to_card())
+    place = {"equations": dict.fromkeys(key.equations, 1.0), "coordinate": key.coordinates[0]}
+    row = scored("unexplained", [{"label": "f"}], place, true.to_card())
     assert row["gain_asked"] and row["gain_had"] and row["share_of_gain"] == pytest.approx(1.0, abs=0.05)
     assert row["place_asked"] and row["place_right"] and row["note"] == "" and row["right"]
-    row = scored("no mismatch", [], case.system.to_card())
+    row = scored("no mismatch", [], None, case.system.to_card())
     assert row["gain_asked"] and not row["gain_had"] and not row["place_right"] and not row["detected"]
     assert list(foreign_score_table([row]).columns) == list(COLUMNS)
 
@@ -419,8 +411,8 @@ def table() -> pd.DataFrame:
         {
             "case": f"w{k}", "kind": "withheld", "system": "rational, 3 states", "verdict": "unexplained",
             "noise_db": 30.0, "recordings": 1 + k % 2, "gain_asked": True, "gain_had": k != 0,
-            "detected": True, "share_of_gain": 0.97, "place_asked": True, "place_right": k > 1, "told_effect": 1e3,
-            "told_equation": 500.0, "wrong_name": k == 5,
+            "detected": True, "share_of_gain": 0.97, "place_asked": True, "place_right": k > 1,
+            "told_effect": 1e3, "told_equation": 500.0, "wrong_name": k == 5,
         }
         for k in range(20)
     ]  # fmt: skip

@@ -100,19 +100,10 @@ def _rounds(mechanism: Mapping[str, Any], key: CaseKey) -> bool:
 
 
 def said_place(verdict: Mapping[str, Any]) -> tuple[set[str], set[str]]:
-    """Equations, or sensors, and coordinates that a verdict names, as the reader finds them.
-
-    Where a function has become part of the simulation it is its place; otherwise that which the verdict says.
-    """
-    described = verdict.get("described") or []
-    if described:
-        first = described[0]
-        sensors = {f"sensor {name}" for name in first["outputs"]}
-        return sensors or set(first["equations"]), set(first["coordinates"])
+    """Equations, or sensors, and coordinates that a verdict names as the place of a mismatch."""
     place = verdict.get("location") or {}
-    named = verdict.get("mechanisms") or []
-    if place.get("coordinate") == "measurement" and named:
-        outputs = set(named[0]["terms"])
+    if place.get("coordinate") == "measurement":
+        outputs = set(place.get("outputs", []))
         return {f"sensor {name}" for name in outputs}, outputs
     return set(place.get("equations", {})), set(re.findall(r"\w+", str(place.get("coordinate", ""))))
 
