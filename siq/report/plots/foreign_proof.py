@@ -63,10 +63,10 @@ def _gains(axes: Axes, asked: pd.DataFrame, enough: float) -> None:
         )  # fmt: skip
     axes.axhline(enough, color=GREY, linewidth=0.8, linestyle="--")
     axes.set_xscale("log")
-    axes.set_xlabel(r"what recordings tell of the function, $\Delta\chi^2$ (dimensionless)")
+    axes.set_xlabel("$\\Delta\\chi^2$ of the function\n(dimensionless)")
     axes.set_ylabel("share of the oracle's gain\non held-out recordings")
     axes.set_title(counted(len(asked), "case"))
-    axes.legend(loc="lower right")
+    axes.legend(loc="best")
 
 
 def _places(axes: Axes, asked: pd.DataFrame) -> None:
@@ -82,7 +82,8 @@ def _places(axes: Axes, asked: pd.DataFrame) -> None:
         axes.annotate(
             str(len(own)), (edges[each] + 0.5, own.mean()), textcoords="offset points", xytext=(5, 5)
         )
+    axes.set_xlim(edges[0], edges[-1] + 1)
     axes.set_ylim(-0.03, 1.1)
-    axes.set_xlabel(r"what they tell of its place, $\log_{10}\Delta\chi^2$ (dimensionless)")
+    axes.set_xlabel("$\\log_{10}\\,\\Delta\\chi^2$ of its place\n(dimensionless)")
     axes.set_ylabel("share of right places")
     axes.set_title(f"Places ({counted(len(asked), 'case')})")
