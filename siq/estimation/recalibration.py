@@ -45,7 +45,7 @@ def recalibrate(model: Dynamics, data: Measurements, *, budget: Budget | None = 
     if not strict.converged:
         # Steps at all samples at once may lead anywhere, from where a search could explain nothing. Damped
         # steps of whole trajectories never make a fit worse than the card's own simulation is.
-        followed = fit_trajectories(
+        damped = fit_trajectories(
             model,
             data,
             begin=x[data.first[:-1]],
@@ -53,7 +53,7 @@ def recalibrate(model: Dynamics, data: Measurements, *, budget: Budget | None = 
             substeps=max(loose.substeps, 1),
             budget=budget,
         )
-        strict = better_of(strict, followed)
+        strict = better_of(strict, damped)
     if not strict.converged:
         if not np.isfinite(loose.sum_of_squares):
             raise NumericalFailure(strict.fault or loose.fault)
