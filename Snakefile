@@ -28,6 +28,7 @@ include: "workflow/rules/cases.smk"
 include: "workflow/rules/mismatch.smk"
 include: "workflow/rules/proof_common.smk"
 include: "workflow/rules/proof.smk"
+include: "workflow/rules/proof_foreign.smk"
 
 
 report: "workflow/report/workflow.rst"

@@ -13,8 +13,8 @@ from siq.estimation.innovations import Noise
 from siq.estimation.linearisation import Grid
 from siq.estimation.measurements import Measurements
 from siq.estimation.noise import first_noise
-from siq.estimation.process_noise import fit_with_and_without_process_noise, simpler_fit
-from siq.estimation.trajectories import run
+from siq.estimation.process_noise import better_of, fit_with_and_without_process_noise, simpler_fit
+from siq.estimation.trajectories import fit_trajectories, run
 
 FAINT = 1e-4  # process noise, relative to the motion, from which a fit without any is loosened
 
@@ -42,6 +42,18 @@ def recalibrate(model: Dynamics, data: Measurements, *, budget: Budget | None = 
     strict = fit_by_multiple_shooting(
         model, data, x=x, noise=noise.without_process(), estimate_process=False, budget=budget
     )
+    if not strict.converged:
+        # Steps at all samples at once may lead anywhere, from where a search could explain nothing. Damped
+        # steps of whole trajectories never make a fit worse than the card's own simulation is.
+        damped = fit_trajectories(
+            model,
+            data,
+            begin=x[data.first[:-1]],
+            noise=noise,
+            substeps=max(loose.substeps, 1),
+            budget=budget,
+        )
+        strict = better_of(strict, damped)
     if not strict.converged:
         if not np.isfinite(loose.sum_of_squares):
             raise NumericalFailure(strict.fault or loose.fault)

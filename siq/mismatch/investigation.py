@@ -200,9 +200,11 @@ def investigate(
         knows_noise = any(form.noise for mechanism in dictionary for form in mechanism.forms)
         verdict, remarks = MismatchVerdict.UNEXPLAINED, () if steady else (GROWING,)
         if knows_noise and steady and not left.doubtful:
-            # Random forces are an explanation among others: a function without any may be likelier.
+            # Random forces explain any recordings. They are named where nothing else is likelier, neither a
+            # function instead of them nor one beside what is left of them: noise does not know where a system
+            # is, so that no function of the states takes a part of it over.
             alone = log_evidence_of(recalibrated, data)
-            models = tuple(each for each in modelled() if not each.fit.has_process_noise)
+            models = modelled()
             if not models or models[0].log_evidence < alone + options.least_log_odds:
                 verdict, models = MismatchVerdict.MISSING_PHYSICS, ()
     elif left.structured:

@@ -12,6 +12,8 @@ from siq.dynamics.dynamics import Dynamics
 from siq.estimation.estimation import Fit
 from siq.estimation.innovations import Noise, solve, whiten
 from siq.estimation.measurements import Measurements
+from siq.mismatch.candidates import MechanismCandidate
+from siq.mismatch.described import Model
 from siq.mismatch.investigation import Investigation, MismatchVerdict
 from siq.mismatch.roles import Roles
 from siq.mismatch.structure import Curve, Structure
@@ -31,7 +33,7 @@ class Location:
     Attributes
     ----------
     equations
-        Share of each equation in the excess, largest first; of the outputs for a fault of the sensor.
+        Share of each equation in the excess, largest first; empty for a fault of a sensor.
     coordinate
         Along which it acts.
     region
@@ -42,6 +44,8 @@ class Location:
         Labels of those that show it.
     recordings_total
         How many it was sought in.
+    outputs
+        What is measured otherwise, for a fault of a sensor.
     sentence
         All of it in words.
     curve
@@ -56,11 +60,13 @@ class Location:
     sentence: str
     curve: Curve | None
     recordings_total: int = 0
+    outputs: tuple[str, ...] = ()
 
     def as_data(self) -> dict[str, Any]:
         """What the verdict's file says of it."""
         return {
             "equations": self.equations,
+            "outputs": list(self.outputs),
             "coordinate": self.coordinate,
             "region": {name: list(limits) for name, limits in self.region.items()},
             "time": None if self.time is None else list(self.time),
@@ -70,14 +76,33 @@ class Location:
         }
 
 
-def locate(investigation: Investigation, data: Measurements) -> Location | None:
-    """Say where a mismatch sits; None where there is none."""
+def locate(
+    investigation: Investigation, data: Measurements, described: Model | None = None
+) -> Location | None:
+    """Say where a mismatch sits; None where there is none.
+
+    What has no name is sought in all equations by what they leave unexplained. That it is in a sensor instead
+    is told by the evidence: then the likeliest function stands in what is measured.
+
+    Parameters
+    ----------
+    investigation
+        What was found.
+    data
+        The recordings that it was found in.
+    described
+        The model of it that is part of the new card; by default the likeliest one, if there is any.
+    """
     if not investigation.verdict.mismatch:
         return None
     curves = investigation.before.curves
     named = investigation.search.found[0].best.candidate if investigation.search.found else None
+    outputs: tuple[str, ...] = ()
     if investigation.verdict is MismatchVerdict.MISSING_PHYSICS and named is not None:
         equations, coordinate = named.equations, named.coordinate
+        outputs = _in_sensors(named)
+    elif outputs := _in_sensors(_first_part(investigation, described)):
+        equations, coordinate = (), "measurement"
     elif curves:
         equations, coordinate = most_telling(investigation.before, investigation.roles)
     else:
@@ -112,7 +137,24 @@ def locate(investigation: Investigation, data: Measurements) -> Location | None:
         ),
         curve=curve,
         recordings_total=len(data.labels),
+        outputs=outputs,
     )
+
+
+def _first_part(investigation: Investigation, described: Model | None) -> MechanismCandidate | None:
+    """The first part of the model of what has no name: the one that explains most."""
+    if investigation.verdict is not MismatchVerdict.UNEXPLAINED:
+        return None
+    model = described or next(iter(investigation.models), None)
+    return None if model is None else model.parts[0].trial.candidate
+
+
+def _in_sensors(candidate: MechanismCandidate | None) -> tuple[str, ...]:
+    """The outputs that a candidate changes, if it changes nothing else."""
+    if candidate is None or candidate.equations:
+        return ()
+    names = set(candidate.model.output_names)
+    return tuple(name for name, _ in candidate.changes if name in names)
 
 
 def most_telling(structure: Structure, roles: Roles) -> tuple[tuple[str, ...], str]:

@@ -86,7 +86,7 @@ def statement_of(investigation: Investigation, data: Measurements, shown: HeldOu
         mechanisms=mechanisms_of(investigation),
         description=description_of(investigation),
         described=stated_functions(shown),
-        location=locate(investigation, data),
+        location=locate(investigation, data, shown.described if shown.gained else None),
         recalibration=recalibration_of(investigation, shown),
         errors=shown.errors,
         excluded={} if investigation.verdict.mismatch else excluded(investigation),

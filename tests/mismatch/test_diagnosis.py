@@ -16,11 +16,16 @@ from siq.dynamics.cards import load_system
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.parametric import Signals
 from siq.errors import InputError, NumericalFailure
-from siq.mismatch import trials
+from siq.estimation.measurements import Measurements
+from siq.mismatch import investigation, trials
 from siq.mismatch.case import read_case
+from siq.mismatch.described import MECHANISM, Model, Part
 from siq.mismatch.diagnosis import Diagnosis, solve_case
 from siq.mismatch.dictionary import standard_dictionary
+from siq.mismatch.evidence import log_evidence_of
 from siq.mismatch.probes import Probe
+from siq.mismatch.search import Search
+from siq.mismatch.trials import TriedMechanism
 from tests.mismatch.foreign_cases import falling_ball
 
 CARD = {
@@ -203,6 +208,24 @@ def test_random_forces_are_no_mechanism_with_a_formula(tmp_path: Path) -> None:
     assert intensity == pytest.approx(0.05, rel=0.3)
 
 
+def test_random_forces_are_no_noise_where_a_function_beside_them_is_likelier(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def models(data: Measurements, search: Search, *_: Any, **__: Any) -> tuple[Model, ...]:
+        # A function of a sensor that leaves random forces, and is likelier than forces alone.
+        assert search.recalibrated.has_process_noise
+        candidate = next(each.candidate for each, _ in search.screened if not each.candidate.equations)
+        part = Part(TriedMechanism(candidate, search.recalibrated, 50.0, 40.0, 0.0, 0.0), MECHANISM, 0.0)
+        return (Model((part,), search.recalibrated, log_evidence_of(search.recalibrated, data) + 5.0),)
+
+    monkeypatch.setattr(investigation, "models_of_the_nameless", models)
+    diagnosis = solved(tmp_path, recordings_of(nothing, drive=0.05, count=4), study={"held_out": ["r2"]})
+    assert said(diagnosis)["verdict"] == "unexplained" and names(diagnosis) == []
+    # It is located where the likeliest function stands.
+    place = said(diagnosis)["location"]
+    assert place["outputs"] == ["x"] and place["coordinate"] == "measurement" and not place["equations"]
+
+
 def test_random_forces_that_follow_the_motion_are_not_those_of_surroundings(tmp_path: Path) -> None:
     diagnosis = solved(tmp_path, recordings_of(nothing, drive=0.03, fading=True))
     assert said(diagnosis)["verdict"] == "unexplained"
@@ -219,6 +242,17 @@ def test_unequal_friction_is_found_though_its_first_fit_may_lead_nowhere(tmp_pat
     diagnosis = solved(tmp_path, recordings_of(force, noise=0.03))
     assert names(diagnosis) == ["asymmetric friction"]
     assert diagnosis.investigation.search.fit.substeps > 12  # the jump was made sharp enough
+
+
+@pytest.mark.slow
+def test_a_function_of_a_sensor_is_located_in_what_is_measured(tmp_path: Path) -> None:
+    table = recordings_of(nothing, count=4)
+    table["x"] += 0.15 * np.exp(-(((table["x"] - 0.3) / 0.2) ** 2))
+    diagnosis = solved(tmp_path, table, study={"held_out": ["r2"]})
+    place = said(diagnosis)["location"]
+    assert said(diagnosis)["verdict"] == "unexplained"
+    assert place["outputs"] == ["x"] and place["coordinate"] == "measurement" and not place["equations"]
+    assert said(diagnosis)["described"][0]["outputs"] == ["x"]
 
 
 def test_what_the_dictionary_lacks_stays_unexplained(tmp_path: Path) -> None:

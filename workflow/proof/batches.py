@@ -2,19 +2,31 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from siq.errors import InputError
-from workflow.proof.concealment.cases import draw_cases, publish_digests, write_case
 
 LOGGER = logging.getLogger(__name__)
 
 
-def write_batch(settings: Mapping[str, Any], batch: int, *, cases: Path, keys: Path) -> dict[str, str]:
+class Generator(Protocol):
+    """What draws and writes cases: a module such as `workflow.proof.concealment.cases`."""
+
+    def draw_cases(self, *, count: int, seed: int, shares: Mapping[str, float]) -> Sequence[Any]:
+        """Decide which cases there are."""
+
+    def write_case(self, design: Any, *, cases: Path, keys: Path) -> None:
+        """Make a case and write it, and its key, to two folders."""
+
+
+def write_batch(
+    settings: Mapping[str, Any], batch: int, *, generator: Generator, cases: Path, keys: Path
+) -> dict[str, str]:
     """Make the cases of a batch, and their keys; the same every time.
 
     Parameters
@@ -23,6 +35,8 @@ def write_batch(settings: Mapping[str, Any], batch: int, *, cases: Path, keys: P
         The set as ``config/proof.yaml`` has it.
     batch
         Which batch, from 0.
+    generator
+        What draws and writes them.
     cases, keys
         Folders that they are written to.
 
@@ -31,16 +45,16 @@ def write_batch(settings: Mapping[str, Any], batch: int, *, cases: Path, keys: P
     dict
         SHA-256 of every key file by name of the case. A case whose motion never stayed bounded is missing.
     """
-    designs = draw_cases(count=settings["cases"], seed=settings["seed"], shares=settings["shares"])
+    designs = generator.draw_cases(count=settings["cases"], seed=settings["seed"], shares=settings["shares"])
     size = settings["batch"]
     for folder in (cases, keys):
         folder.mkdir(parents=True, exist_ok=True)
     for design in designs[batch * size : (batch + 1) * size]:
         try:
-            write_case(design, cases=cases, keys=keys)
+            generator.write_case(design, cases=cases, keys=keys)
         except RuntimeError as error:
             LOGGER.warning("left out: %s", error)
-    return publish_digests(keys)
+    return {path.stem: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(keys.glob("*.json"))}
 
 
 def check_digests(found: Mapping[str, str], published: Mapping[str, str], *, file: str | Path) -> None:

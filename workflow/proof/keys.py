@@ -45,6 +45,27 @@ class KeyEffect(_Part):
         return bool(self.terms or self.replace or self.outputs)
 
 
+class KeySensors(_Part):
+    """What sensors did to the recordings, none of which is what a simulation lacks.
+
+    Attributes
+    ----------
+    noise
+        Deviation of each output's noise.
+    steps
+        In which an output is read, where it is rounded.
+    lost
+        Share of the samples that are lost.
+    jitter
+        Deviation of the times of the samples from those that are recorded, in intervals between samples.
+    """
+
+    noise: dict[Name, float] = {}
+    steps: dict[Name, float] = {}
+    lost: float = 0.0
+    jitter: float = 0.0
+
+
 class CaseKey(_Part):
     """The schema of ``CASE.json`` in a folder of keys."""
 
@@ -59,6 +80,7 @@ class CaseKey(_Part):
     strength: float | None = None
     shifts: dict[Name, KeyShift] = {}
     effect: KeyEffect = KeyEffect()
+    sensors: KeySensors = KeySensors()
 
     @model_validator(mode="after")
     def _named(self) -> CaseKey:

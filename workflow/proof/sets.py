@@ -21,7 +21,7 @@ class ProofSet(BaseModel):
     seed
         The same seed makes the same cases.
     shares
-        Share of each kind.
+        Share of each kind; the second generator knows ``null``, ``shift`` and ``withheld``.
     batch
         Cases that one job takes.
     """
@@ -44,13 +44,27 @@ class ProofSet(BaseModel):
         return [f"{number:03d}" for number in range(-(-self.cases // self.batch))]
 
 
+FOREIGN = ("proof_foreign", "proof_foreign_small")
+"""The sets of the second generator."""
+
+
 class Proofs(BaseModel):
-    """The schema of ``config/proof.yaml``."""
+    """The schema of ``config/proof.yaml``.
+
+    Attributes
+    ----------
+    proof, proof_full
+        Of the first generator, `workflow.proof.concealment`.
+    proof_foreign, proof_foreign_small
+        Of the second, `workflow.proof.foreign`.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     proof: ProofSet
     proof_full: ProofSet
+    proof_foreign: ProofSet | None = None
+    proof_foreign_small: ProofSet | None = None
 
 
 def load_proofs(path: str | Path) -> dict[str, ProofSet]:
@@ -62,4 +76,5 @@ def load_proofs(path: str | Path) -> dict[str, ProofSet]:
         With the line of the first entry that cannot be used.
     """
     checked = validate(read_document(path), Proofs)
-    return {"proof": checked.proof, "proof_full": checked.proof_full}
+    sets = {name: getattr(checked, name) for name in Proofs.model_fields}
+    return {name: one for name, one in sets.items() if one is not None}

@@ -37,6 +37,8 @@ rule conceal:
         "results/proof/{proof}/logs/conceal/{batch}.log",
     benchmark:
         "results/proof/{proof}/benchmarks/conceal/{batch}.tsv"
+    wildcard_constraints:
+        proof=OWN_SETS,
     conda:
         "../envs/siq.yaml"
     threads: 1
@@ -103,6 +105,8 @@ rule open_keys:
         "results/proof/{proof}/logs/open_keys/{batch}.log",
     benchmark:
         "results/proof/{proof}/benchmarks/open_keys/{batch}.tsv"
+    wildcard_constraints:
+        proof=OWN_SETS,
     conda:
         "../envs/siq.yaml"
     threads: 1
@@ -127,6 +131,8 @@ rule score_batch:
         "results/proof/{proof}/logs/score/{batch}.log",
     benchmark:
         "results/proof/{proof}/benchmarks/score/{batch}.tsv"
+    wildcard_constraints:
+        proof=OWN_SETS,
     conda:
         "../envs/siq.yaml"
     threads: 1
@@ -148,6 +154,8 @@ rule collect_scores:
         "results/proof/{proof}/logs/collect_scores.log",
     benchmark:
         "results/proof/{proof}/benchmarks/collect_scores.tsv"
+    wildcard_constraints:
+        proof=OWN_SETS,
     conda:
         "../envs/siq.yaml"
     threads: 1
@@ -177,6 +185,8 @@ rule score_proof:
         "results/proof/{proof}/logs/page.log",
     benchmark:
         "results/proof/{proof}/benchmarks/page.tsv"
+    wildcard_constraints:
+        proof=OWN_SETS,
     conda:
         "../envs/siq.yaml"
     threads: 1

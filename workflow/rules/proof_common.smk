@@ -1,14 +1,22 @@
 # Helpers of the rules of the proof: its sets and batches, and cases that somebody else made.
-from workflow.proof.sets import load_proofs
+from workflow.proof.sets import FOREIGN, load_proofs
 
 try:
     PROOF_SETS = load_proofs(config_path("proof.yaml"))
 except InputError as error:
     say_and_stop(error)
 
+# Sets of the first generator, and of the second; the pattern of none of them matches nothing.
+OWN_SETS, FOREIGN_SETS = (
+    "|".join(name for name in PROOF_SETS if (name in FOREIGN) == foreign) or "(?!)"
+    for foreign in (False, True)
+)
+
 PROOF_TITLES = {
     "proof": "Proof of the diagnosis",
     "proof_full": "Proof of the diagnosis, all cases",
+    "proof_foreign": "Proof of the diagnosis on random systems",
+    "proof_foreign_small": "Proof of the diagnosis on random systems, a few cases",
 }
 
 

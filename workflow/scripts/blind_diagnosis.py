@@ -10,9 +10,11 @@ import time
 from pathlib import Path
 from typing import Any
 
+from siq.errors import NumericalFailure
 from siq.files.whole import whole_file
 from siq.mismatch.case import read_case
 from siq.mismatch.diagnosis import solve_case
+from siq.mismatch.verdict import statement_of_failure
 from step import job
 
 LOGGER = logging.getLogger(__name__)
@@ -23,10 +25,14 @@ def diagnosed(folder: Path) -> dict[str, Any]:
     begin = time.perf_counter()
     verdict, card, failure = None, "", ""
     try:
-        diagnosis = solve_case(
-            read_case(folder / "system.yaml", folder / "recordings.parquet", folder / "study.yaml")
-        )
-        verdict, card = diagnosis.statement.as_data(), diagnosis.to_card()
+        case = read_case(folder / "system.yaml", folder / "recordings.parquet", folder / "study.yaml")
+        try:
+            diagnosis = solve_case(case)
+            verdict, card = diagnosis.statement.as_data(), diagnosis.to_card()
+        except NumericalFailure as error:  # which is a verdict, too, as for every user
+            LOGGER.exception("%s: no fit has a result", folder.name)
+            failure = str(error)
+            verdict, card = statement_of_failure(failure).as_data(), case.system.to_card()
     except Exception as error:
         LOGGER.exception("%s failed", folder.name)
         failure = f"{type(error).__name__}: {error}"

@@ -12,6 +12,7 @@ from typing import Any
 from siq.files.whole import whole_file
 from step import job
 from workflow.proof.batches import write_batch
+from workflow.proof.concealment import cases as generator
 
 
 def main(snakemake: Any) -> None:
@@ -20,6 +21,7 @@ def main(snakemake: Any) -> None:
         digests = write_batch(
             snakemake.params.settings,
             int(snakemake.wildcards.batch),
+            generator=generator,
             cases=Path(snakemake.output.cases),
             keys=Path(keys),
         )

@@ -10,6 +10,7 @@ from typing import Any
 
 from step import job
 from workflow.proof.batches import check_digests, read_digests, write_batch
+from workflow.proof.concealment import cases as generator
 
 
 def main(snakemake: Any) -> None:
@@ -18,6 +19,7 @@ def main(snakemake: Any) -> None:
         found = write_batch(
             snakemake.params.settings,
             int(snakemake.wildcards.batch),
+            generator=generator,
             cases=Path(cases),
             keys=Path(snakemake.output[0]),
         )

@@ -1,0 +1,16 @@
+"""A second generator of concealed cases: random systems that lack random functions, and coarse sensors.
+
+The first generator, `workflow.proof.concealment`, conceals what the dictionary of the diagnosis has names
+for. Here no list is shared, no formula and no code: neither with the dictionary, nor with `siq`, nor with the
+first generator. Systems and functions are drawn; sensors round, lose samples, and have clocks that jitter.
+
+============  ===========================================================================
+`formulas`    how is a formula evaluated?
+`systems`     which random systems are there, and what is done to them?
+`effects`     which function is missing, of which coordinates, and where?
+`motion`      what does a system do?
+`sensors`     what is recorded of it?
+`designs`     which cases are there?
+`cases`       what is written of a case, and what does its key say?
+============  ===========================================================================
+"""
