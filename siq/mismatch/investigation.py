@@ -17,10 +17,10 @@ from siq.estimation.measurements import Measurements
 from siq.estimation.process_noise import fit_with_and_without_process_noise
 from siq.estimation.recalibration import recalibrate
 from siq.estimation.unknown_forces import covariance_with_unknown_forces
+from siq.mismatch.beside import BesideARemainder, beside_a_remainder
 from siq.mismatch.candidates import MechanismCandidate, candidates_of, generic_candidates
-from siq.mismatch.described import Model, models_of_the_nameless
+from siq.mismatch.described import Model, models_beside_names, models_of_the_nameless
 from siq.mismatch.dictionary import Mechanism
-from siq.mismatch.evidence import log_evidence_of
 from siq.mismatch.naming import Naming, naming_of
 from siq.mismatch.remainder import Remainder, what_is_left
 from siq.mismatch.roles import Roles, roles_of
@@ -48,6 +48,7 @@ class MismatchVerdict(StrEnum):
 
 
 GROWING = "Random forces would explain it only if they grew with the motion; a hidden state is more likely."
+NAMELESS = "It has no name."
 EXACT = (
     "The estimates allow for random forces that stand for what remains. The new card has the estimates of"
     " least squares instead, where it runs better with them."
@@ -89,7 +90,7 @@ class Investigation:
     naming
         What was asked of mechanisms before they could be named; None where none was found.
     models
-        Of what has no name, the likeliest first.
+        Of what has no name, be it all that is missing or what names leave, the likeliest first.
     account
         The work that it took, and whether something was left undone.
     """
@@ -174,6 +175,7 @@ def investigate(
     exact: Fit | None = None
     naming: Naming | None = None
     models: tuple[Model, ...] = ()
+    beside: BesideARemainder | None = None
     verdict, remarks = MismatchVerdict.NO_MISMATCH, tuple[str, ...]()
 
     def modelled() -> tuple[Model, ...]:
@@ -187,8 +189,24 @@ def investigate(
         naming = naming_of(
             found, by_each, data, model, roles, candidates, options=options, generator=generator
         )
-        found, left = naming.search, naming.left
+        whole, found, left = found, naming.search, naming.left
         verdict, remarks = named_or_not(naming, options)
+        if not naming.convincing:
+            beside = beside_a_remainder(
+                whole.found[0].best, recalibrated, data, roles, degree=study.degree,
+                considered=candidates, options=options, budget=budget,
+            )  # fmt: skip
+        if beside is not None and beside.log_odds >= options.least_log_odds:
+            naming = named_beside_a_remainder(naming, whole, by_each[0], beside)
+            found, left = naming.search, naming.left
+            verdict, remarks = MismatchVerdict.MISSING_PHYSICS, (f"{remains(left)} {NAMELESS}",)
+        if verdict is MismatchVerdict.MISSING_PHYSICS and (
+            len(whole.found) > len(found.found) or left.doubtful or found.fit.has_process_noise
+        ):
+            models = models_beside_names(
+                data, found, whole, roles, functions=None if beside is None else beside.on_top,
+                degree=study.degree, blocks=options.blocks, considered=len(candidates), budget=budget,
+            )  # fmt: skip
         if verdict is MismatchVerdict.MISSING_PHYSICS and found.fit.has_process_noise:
             still = replace(found.fit, noise=found.fit.noise.without_process())
             with budget.exempt():
@@ -201,9 +219,8 @@ def investigate(
         verdict, remarks = MismatchVerdict.UNEXPLAINED, () if steady else (GROWING,)
         if knows_noise and steady and not left.doubtful:
             # Random forces are an explanation among others: a function without any may be likelier.
-            alone = log_evidence_of(recalibrated, data)
             models = tuple(each for each in modelled() if not each.fit.has_process_noise)
-            if not models or models[0].log_evidence < alone + options.least_log_odds:
+            if not models or models[0].log_evidence < options.least_log_odds:
                 verdict, models = MismatchVerdict.MISSING_PHYSICS, ()
     elif left.structured:
         verdict = MismatchVerdict.UNEXPLAINED
@@ -285,6 +302,17 @@ def named_or_not(naming: Naming, options: SearchOptions) -> tuple[MismatchVerdic
         f"It looks like {names}, but a function without a name is {_as_likely(least)}; a name takes odds of"
         f" {np.exp(options.least_log_odds):.0f} to 1.",
     )
+
+
+def named_beside_a_remainder(
+    naming: Naming, whole: Search, left: Remainder, beside: BesideARemainder
+) -> Naming:
+    """The first mechanism of a search, named although what it leaves has no name."""
+    first = replace(whole, found=whole.found[:1], fit=whole.found[0].best.fit)
+    return replace(
+        naming, search=first, left=left, log_odds=(beside.log_odds,), together=beside.log_odds,
+        convincing=True, likely=True,
+    )  # fmt: skip
 
 
 def _as_likely(log_odds: float) -> str:

@@ -16,7 +16,7 @@ from siq.mismatch.statement import DescribedCurve, Estimate, Evidence, StatedFun
 
 def stated_functions(shown: HeldOutRuns) -> tuple[StatedFunction, ...]:
     """The parts of the model that is in the new card; none where nothing that was added helped."""
-    if shown.described is None or shown.described_fit is None or not shown.gained:
+    if shown.described is None or shown.described_fit is None or not shown.adopted:
         return ()
     labels = [each.trial.candidate.label for each in shown.described.parts]
     return tuple(

@@ -1,0 +1,118 @@
+"""Beside a remainder: is a mechanism likelier than a function, if another function models what it leaves?
+
+A mechanism may be right although more is missing that no entry of the dictionary does. Two explanations are
+then fitted in earnest, each with a function for the rest: the mechanism and a function on top of it, against
+a function in its place and another on top of that. Neither is all of it, and the errors that both leave hang
+together over time; they count as so many as are independent (`siq.mismatch.evidence`). Where random forces
+still have to stand in for something, the rest has no model, and nobody can say.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from siq.estimation.budget import Budget
+from siq.estimation.estimation import Fit
+from siq.estimation.measurements import Measurements
+from siq.mismatch.candidates import MechanismCandidate
+from siq.mismatch.described import Model, runs_freely, weighed, with_a_function
+from siq.mismatch.evidence import correlation_time_left, log_evidence_of
+from siq.mismatch.roles import Roles
+from siq.mismatch.search_options import SearchOptions
+from siq.mismatch.trials import TriedMechanism, admissible
+
+LOGGER = logging.getLogger(__name__)
+RIVALS = 2  # functions in the place of the mechanism that get another on top of them: a choice
+
+
+@dataclass(frozen=True)
+class BesideARemainder:
+    """How likely a mechanism is beside a function without a name, and what was fitted to know it.
+
+    Attributes
+    ----------
+    log_odds
+        Logarithm of the odds that it is the mechanism, rather than a function in its place.
+    on_top
+        Functions on top of the mechanism.
+    instead
+        Functions in its place, alone and with another on top.
+    """
+
+    log_odds: float
+    on_top: tuple[Model, ...]
+    instead: tuple[Model, ...]
+
+
+def beside_a_remainder(
+    trial: TriedMechanism,
+    recalibrated: Fit,
+    data: Measurements,
+    roles: Roles,
+    *,
+    degree: int,
+    considered: Sequence[MechanismCandidate],
+    options: SearchOptions,
+    budget: Budget | None = None,
+) -> BesideARemainder | None:
+    """Hold a mechanism against functions in its place, whatever else is missing being a function for both.
+
+    Parameters
+    ----------
+    trial
+        The mechanism, fitted without anything beside it.
+    recalibrated, data, roles
+        The simulation without it, the recordings, and the roles of its states.
+    degree
+        Highest degree of formulas.
+    considered
+        The mechanisms that could have been named.
+    options
+        Of the search.
+    budget
+        Charged for the fits.
+
+    Returns
+    -------
+    BesideARemainder or None
+        None where random forces stand in for what it leaves, or it has states of its own.
+    """
+    if trial.fit.has_process_noise or trial.fit.model.dimension > recalibrated.model.dimension:
+        return None
+    budget = budget or Budget()
+
+    def with_another(parts: Model) -> list[Model]:
+        return with_a_function(
+            parts.parts, parts.fit, data, roles, degree=degree, blocks=options.blocks, budget=budget
+        )
+
+    on_top = [
+        each
+        for each in with_another(Model((), trial.fit))
+        if not each.fit.has_process_noise
+        and admissible(each.fit, trial.candidate)
+        and runs_freely(each.fit, trial.fit, data)
+    ]
+    instead = with_another(Model((), recalibrated))
+    for one in weighed(instead, recalibrated, data)[:RIVALS]:
+        instead += with_another(one)
+    ours, theirs = [Model((), trial.fit), *on_top], [Model((), recalibrated), *instead]
+    correlated = correlation_time_left([each.fit for each in (*ours, *theirs)], data)
+
+    def best(models: Sequence[Model]) -> float:
+        return max(log_evidence_of(each.fit, data, correlated=correlated) - each.cost for each in models)
+
+    forms = Counter(each.name for each in considered)
+    chosen = np.log(max(len(forms) * forms[trial.candidate.name], 1))
+    named = best(ours) + np.log1p(-options.unnamed) - chosen
+    log_odds = float(named - best(theirs) - np.log(options.unnamed))
+    LOGGER.info(
+        "%s beside a function: log-odds %.1f, errors correlated over %.1f samples",
+        trial.candidate.label, log_odds, correlated,
+    )  # fmt: skip
+    return BesideARemainder(log_odds, tuple(on_top), tuple(instead))
