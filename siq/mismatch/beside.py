@@ -16,14 +16,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from siq.estimation.budget import Budget
 from siq.estimation.estimation import Fit
-from siq.estimation.measurements import Measurements
 from siq.mismatch.candidates import MechanismCandidate
-from siq.mismatch.described import Model, runs_freely, weighed, with_a_function
 from siq.mismatch.evidence import correlation_time_left, log_evidence_of
-from siq.mismatch.roles import Roles
-from siq.mismatch.search_options import SearchOptions
+from siq.mismatch.fitted_functions import with_a_function
+from siq.mismatch.nameless_models import Material, Model, runs_freely
 from siq.mismatch.trials import TriedMechanism, admissible
 
 LOGGER = logging.getLogger(__name__)
@@ -52,13 +49,10 @@ class BesideARemainder:
 def beside_a_remainder(
     trial: TriedMechanism,
     recalibrated: Fit,
-    data: Measurements,
-    roles: Roles,
+    material: Material,
     *,
-    degree: int,
     considered: Sequence[MechanismCandidate],
-    options: SearchOptions,
-    budget: Budget | None = None,
+    unnamed: float,
 ) -> BesideARemainder | None:
     """Hold a mechanism against functions in its place, whatever else is missing being a function for both.
 
@@ -66,16 +60,14 @@ def beside_a_remainder(
     ----------
     trial
         The mechanism, fitted without anything beside it.
-    recalibrated, data, roles
-        The simulation without it, the recordings, and the roles of its states.
-    degree
-        Highest degree of formulas.
+    recalibrated
+        The simulation without it.
+    material
+        What functions are fitted to.
     considered
         The mechanisms that could have been named.
-    options
-        Of the search.
-    budget
-        Charged for the fits.
+    unnamed
+        Probability beforehand that what is missing has no name.
 
     Returns
     -------
@@ -84,23 +76,17 @@ def beside_a_remainder(
     """
     if trial.fit.has_process_noise or trial.fit.model.dimension > recalibrated.model.dimension:
         return None
-    budget = budget or Budget()
-
-    def with_another(parts: Model) -> list[Model]:
-        return with_a_function(
-            parts.parts, parts.fit, data, roles, degree=degree, blocks=options.blocks, budget=budget
-        )
-
+    data = material.data
     on_top = [
         each
-        for each in with_another(Model((), trial.fit))
+        for each in with_a_function((), trial.fit, material)
         if not each.fit.has_process_noise
         and admissible(each.fit, trial.candidate)
         and runs_freely(each.fit, trial.fit, data)
     ]
-    instead = with_another(Model((), recalibrated))
-    for one in weighed(instead, recalibrated, data)[:RIVALS]:
-        instead += with_another(one)
+    instead = with_a_function((), recalibrated, material)
+    for one in instead[:RIVALS]:
+        instead = instead + with_a_function(one.parts, one.fit, material)
     ours, theirs = [Model((), trial.fit), *on_top], [Model((), recalibrated), *instead]
     correlated = correlation_time_left([each.fit for each in (*ours, *theirs)], data)
 
@@ -109,8 +95,8 @@ def beside_a_remainder(
 
     forms = Counter(each.name for each in considered)
     chosen = np.log(max(len(forms) * forms[trial.candidate.name], 1))
-    named = best(ours) + np.log1p(-options.unnamed) - chosen
-    log_odds = float(named - best(theirs) - np.log(options.unnamed))
+    named = best(ours) + np.log1p(-unnamed) - chosen
+    log_odds = float(named - best(theirs) - np.log(unnamed))
     LOGGER.info(
         "%s beside a function: log-odds %.1f, errors correlated over %.1f samples",
         trial.candidate.label, log_odds, correlated,

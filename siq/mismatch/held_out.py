@@ -13,9 +13,9 @@ from siq.dynamics.dynamics import Dynamics
 from siq.estimation.estimation import Fit
 from siq.estimation.free_runs import FreeRun, free_run, normalised_rms, told_rows
 from siq.estimation.measurements import Measurements
-from siq.mismatch.described import Model
 from siq.mismatch.investigation import Investigation, MismatchVerdict
 from siq.mismatch.left_out import error_left_out
+from siq.mismatch.nameless_models import Model
 
 LOGGER = logging.getLogger(__name__)
 Change = Literal["better", "same", "worse", "unknown"]
@@ -157,9 +157,10 @@ def held_out_runs(
         return np.inf if error is None else error
 
     def best_of(*fits: Fit | None) -> Fit:
-        return min(
-            (each for each in fits if each is not None), key=lambda each: error_where_learned(each.model)
-        )
+        known = [each for each in fits if each is not None]
+        if len(known) == 1:
+            return known[0]
+        return min(known, key=lambda each: error_where_learned(each.model))
 
     # What fits best with random forces admitted need not be what runs best without.
     recalibrated = search.recalibrated.model

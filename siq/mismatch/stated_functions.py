@@ -8,9 +8,9 @@ from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.formulas import compile_values
 from siq.dynamics.parametric import symbol
 from siq.estimation.estimation import Fit
-from siq.mismatch.described import MECHANISM, Part
 from siq.mismatch.functions import SPLINE
 from siq.mismatch.held_out import HeldOutRuns
+from siq.mismatch.nameless_models import MECHANISM, Part
 from siq.mismatch.statement import DescribedCurve, Estimate, Evidence, StatedFunction
 
 
