@@ -85,7 +85,7 @@ def statement_of(investigation: Investigation, data: Measurements, shown: HeldOu
         sentence="",
         mechanisms=mechanisms_of(investigation, shown.described_fit if shown.adopted else None),
         description=description_of(investigation),
-        described=stated_functions(shown),
+        described=stated_functions(shown, beside=names_in(investigation)),
         location=locate(investigation, data),
         recalibration=recalibration_of(investigation, shown),
         errors=shown.errors,
@@ -152,8 +152,9 @@ def explanations_of(investigation: Investigation, data: Measurements) -> tuple[E
     fits = [("other parameters", investigation.least_squares), ("other parameters", search.recalibrated)]
     if search.found:
         fits.append((" and ".join(each.best.candidate.label for each in search.found), search.fit))
+    names = names_in(investigation)
     fits += [
-        (" and ".join(part.trial.candidate.label for part in model.parts), model.fit)
+        (" and ".join((*names, *(part.trial.candidate.label for part in model.parts))), model.fit)
         for model in investigation.models
     ]
     found: dict[str, float] = {}
@@ -165,6 +166,13 @@ def explanations_of(investigation: Investigation, data: Measurements) -> tuple[E
     best = max(found.values(), default=0.0)
     ranked = sorted(found.items(), key=lambda each: -each[1])
     return tuple(Explanation(what, value - best) for what, value in ranked)
+
+
+def names_in(investigation: Investigation) -> tuple[str, ...]:
+    """Labels of the mechanisms that have a name, on top of which models of the rest are."""
+    if investigation.verdict is not MismatchVerdict.MISSING_PHYSICS:
+        return ()
+    return tuple(each.best.candidate.label for each in investigation.search.found)
 
 
 def description_of(investigation: Investigation) -> Description | None:

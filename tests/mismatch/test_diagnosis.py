@@ -262,6 +262,7 @@ def test_what_a_name_leaves_is_described_and_no_sample_of_a_test_chooses_it(
     assert verdict["verdict"] == "missing physics" and names(diagnosis) == ["cubic stiffness"]
     (part,) = verdict["described"]
     assert part["kind"] == "mechanism" and part["equations"] == ["v"] and "v" in part["coordinates"]
+    assert part["beside"] == [verdict["mechanisms"][0]["label"]]
     # The card has both, and its error is shown beside that of the name alone.
     assert verdict["fit"]["augmented"] < verdict["fit"]["named"] < verdict["fit"]["recalibrated"]
     assert set(part["parameters"]) <= {entry.name for entry in diagnosis.augmented.parameters}
