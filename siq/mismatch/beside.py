@@ -87,16 +87,23 @@ def beside_a_remainder(
     instead = with_a_function((), recalibrated, material)
     for one in instead[:RIVALS]:
         instead = instead + with_a_function(one.parts, one.fit, material)
-    ours, theirs = [Model((), trial.fit), *on_top], [Model((), recalibrated), *instead]
+    ours = [Model((), trial.fit), *on_top]
+    theirs = [Model((), recalibrated), *instead]
     correlated = correlation_time_left([each.fit for each in (*ours, *theirs)], data)
 
     def best(models: Sequence[Model]) -> float:
-        return max(log_evidence_of(each.fit, data, correlated=correlated) - each.cost for each in models)
+        """The largest evidence; that something without a name is missing, too, has its own probability."""
+        return max(
+            log_evidence_of(each.fit, data, correlated=correlated)
+            - each.cost
+            + len(each.parts) * np.log(unnamed)
+            for each in models
+        )
 
     forms = Counter(each.name for each in considered)
     chosen = np.log(max(len(forms) * forms[trial.candidate.name], 1))
     named = best(ours) + np.log1p(-unnamed) - chosen
-    log_odds = float(named - best(theirs) - np.log(unnamed))
+    log_odds = float(named - best(theirs))
     LOGGER.info(
         "%s beside a function: log-odds %.1f, errors correlated over %.1f samples",
         trial.candidate.label, log_odds, correlated,

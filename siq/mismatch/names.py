@@ -19,7 +19,7 @@ from siq.mismatch.beside import BesideARemainder, beside_a_remainder
 from siq.mismatch.candidates import MechanismCandidate
 from siq.mismatch.described import models_beside_names, models_of_the_nameless
 from siq.mismatch.nameless_models import Material, Model
-from siq.mismatch.naming import Naming, naming_of
+from siq.mismatch.naming import Naming, log_odds_of_the_first, naming_of
 from siq.mismatch.remainder import Remainder
 from siq.mismatch.search import Search
 from siq.mismatch.search_options import SearchOptions
@@ -86,7 +86,12 @@ def names_of(
     naming = naming_of(whole, left, data, model, roles, candidates, options=options, generator=generator)
     given, remarks = named_or_not(naming, options)
     beside: BesideARemainder | None = None
-    if not naming.convincing:
+    # Only few functions are fitted; along the trajectories of a fit all are compared. Where these speak
+    # against the name as clearly as something would have to speak for it, the few prove nothing.
+    if not naming.convincing and (
+        log_odds_of_the_first(whole, data, model, roles, candidates, options=options)
+        > -options.least_log_odds
+    ):
         beside = beside_a_remainder(
             whole.found[0].best, whole.recalibrated, material, considered=candidates, unnamed=options.unnamed
         )

@@ -96,10 +96,10 @@ def fit_of(evidence: float, *, forces: bool = False, dimension: int = 1) -> Simp
     [
         (30.0, 10.0, 20.0, True),
         # Another function in its place does as well, and so does one alone.
-        (30.0, 10.0, 29.0, False),
-        (30.0, 29.0, 20.0, False),
+        (30.0, 10.0, 30.0, False),
+        (30.0, 27.0, 20.0, False),
         # Nothing is likelier on top of it than nothing; alone it is not likely enough.
-        (0.0, 10.0, 12.0, False),
+        (0.0, 10.0, 15.0, False),
     ],
 )
 def test_a_name_stands_beside_a_rest_where_no_function_does_as_well_in_its_place(
@@ -120,8 +120,10 @@ def test_a_name_stands_beside_a_rest_where_no_function_does_as_well_in_its_place
     material = SimpleNamespace(data=None)
     considered = [SimpleNamespace(name=name) for name in ("overflow", "overflow", "leak")]
     found = beside_a_remainder(trial_of(own), base, material, considered=considered, unnamed=0.1)
-    best = max(on_top - 1.0 if on_top else 0.0, 12.0)
-    expected = best + np.log(0.9 / 0.1) - np.log(2 * 2) - max(instead - 1.0, pairs - 2.0)
+    # Each function costs what it was chosen among, and the probability that something has no name.
+    cost = 1.0 + np.log(10)
+    best = max(on_top - cost if on_top else 0.0, 12.0)
+    expected = best + np.log(0.9) - np.log(2 * 2) - max(instead - cost, pairs - 2 * cost)
     assert found is not None and found.log_odds == pytest.approx(expected)
     assert bool(found.log_odds >= np.log(19)) is given
 
