@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import sympy
 
+from siq.dynamics.parametric import symbol
 from siq.errors import NumericalFailure
 from siq.estimation.budget import BudgetSpent
 from siq.estimation.estimation import SUBSTEP_ERROR, Fit
@@ -111,7 +112,7 @@ def _formulas(
 ) -> list[Model]:
     """Formulas in the likeliest places, each once."""
     single = {(each.place.targets, each.place.words): each.place.knots for each in ranked}
-    done: set[tuple[tuple[str, sympy.Expr], ...]] = set()
+    done: set[frozenset[tuple[str, sympy.Expr]]] = set()
     models: list[Model] = []
     for likely in ranked[:FITTED]:
         terms = few_powers(likely, fit, material.data, degree=material.degree)
@@ -120,10 +121,16 @@ def _formulas(
         place, terms = simplest(likely.place, terms)
         place = replace(place, knots=single.get((place.targets, place.words), likely.place.knots))
         candidate = with_formula(fit.model, place, terms)
-        if candidate.changes not in done:
+        # A sum of x²v and xv² is the same function, whichever coordinate comes first.
+        monomials = frozenset(
+            (name, formula.diff(symbol(amplitude)))
+            for name, formula in candidate.changes
+            for amplitude in candidate.amplitudes
+        )
+        if monomials not in done:
             parts = _part(candidate, likely, place, fit, cost, material)
             models += [Model((*before, each), each.trial.fit) for each in parts]
-        done.add(candidate.changes)
+        done.add(monomials)
     return models
 
 
