@@ -56,12 +56,7 @@ def free_run(
     told
         Samples of each prefix; by default a fifth of the recording, and `SHORTEST_PREFIX` at least.
     """
-    lengths = np.diff(data.first)
-    if told is None:
-        rows = np.maximum((PREFIX * lengths).astype(int), SHORTEST_PREFIX)
-    else:
-        rows = np.full(len(lengths), told)
-    rows = np.minimum(rows, lengths - 1)
+    rows = told_rows(data, told)
     x = initial_states(model, data.until(np.maximum(rows, 2)), noise=noise, substeps=substeps)
     states = run(model, Grid(data, substeps), x)
     signals = data.signals(data.t, data.recording, delays=model.lags(model.values))
@@ -70,6 +65,16 @@ def free_run(
         outputs=model.functions.outputs(states.T, signals, model.values).T,
         scored=within >= rows[data.recording],
     )
+
+
+def told_rows(data: Measurements, told: int | None = None) -> np.ndarray:
+    """How many rows of each recording tell its initial state, shape ``(recordings,)``; see `free_run`."""
+    lengths = np.diff(data.first)
+    if told is None:
+        rows = np.maximum((PREFIX * lengths).astype(int), SHORTEST_PREFIX)
+    else:
+        rows = np.full(len(lengths), told)
+    return np.minimum(rows, lengths - 1)
 
 
 def initial_states(model: Dynamics, data: Measurements, *, noise: Noise, substeps: int) -> np.ndarray:

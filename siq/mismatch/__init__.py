@@ -29,9 +29,14 @@
 `matches`           how often do mechanisms explain as much by chance?
 `naming`            which of the mechanisms found may be named?
 `functions`         what is a function without a name, as a formula?
-`described`         and which of them models what has no name?
+`nameless_models`   what is a model of what has no name, and how likely?
+`fitted_functions`  which functions, with how many powers or knots, fit best?
+`beside`            is a mechanism likelier where a function models the rest?
+`described`         which of these models are candidates for the new card?
+`names`             what is named, and what models the rest?
 `investigation`     what is the verdict, and which fits does it rest on?
 `location`          where does the mismatch sit?
+`left_out`          does a model foresee what was left out of its fit?
 `held_out`          how well does it run on recordings that had no part in it?
 `verdict`           what is the verdict?
 `statement`         what is stated, and as data?

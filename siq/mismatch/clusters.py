@@ -18,6 +18,7 @@ from siq.estimation.measurements import Measurements
 from siq.mismatch.candidates import MechanismCandidate
 
 LONG = 4.0  # correlation times in a block
+CHANCE = 1.96  # standard deviations of an autocorrelation of white errors, which are 1/√n
 
 
 def probability_by_chance(
@@ -111,6 +112,35 @@ def correlation_time(series: np.ndarray) -> float:
     for lag in range(1, len(series) // 4):
         correlation = float(series[lag:] @ series[:-lag]) / power if power > 0 else 0.0
         if correlation <= 0:
+            break
+        total += 2 * correlation
+    return total
+
+
+def correlation_time_of(left: np.ndarray, recording: np.ndarray, *, outputs: int) -> float:
+    """Integral correlation time of all residuals in samples, at least 1; of white ones it is 1.
+
+    Autocorrelations are means over recordings and outputs. The sum ends at the first that white errors would
+    have by chance, so that noise does not lengthen it. Of n residuals, n over it count as independent.
+
+    Parameters
+    ----------
+    left, recording
+        Residuals, the outputs of a sample one behind the other, and the recording of each; shape ``(n·m,)``.
+    outputs
+        Their number m.
+    """
+    series = left.reshape(-1, outputs)
+    owner = recording.reshape(-1, outputs)[:, 0]
+    power = float((series**2).mean())
+    total = 1.0
+    for lag in range(1, len(series) // 4):
+        same = owner[lag:] == owner[:-lag]
+        pairs = int(same.sum()) * outputs
+        if not pairs or power <= 0:
+            break
+        correlation = float((series[lag:] * series[:-lag])[same].sum()) / pairs / power
+        if correlation <= CHANCE / np.sqrt(pairs):
             break
         total += 2 * correlation
     return total

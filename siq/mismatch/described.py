@@ -1,348 +1,114 @@
 """Described: a model of what has no name, from the place and the function that the recordings ask for.
 
-Smooth functions are compared in all places by their evidence (`siq.mismatch.evidence`), along the
-trajectories of the recalibrated simulation and at several levels of random forces, as mechanisms are
-screened. In the best places a formula of a few powers and a spline are fitted in earnest. What explains the
-recordings best as a whole describes them, be it a function or a mechanism that was found and is not certain
-enough for its name.
+Functions (`siq.mismatch.fitted_functions`) compete with mechanisms that were found and are not certain enough
+for their names. What mechanisms with a name leave is described in the same way, on top of them.
 """
 
 from __future__ import annotations
 
-import logging
+import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-import sympy
 
-from siq.errors import NumericalFailure
-from siq.estimation.budget import Budget, BudgetSpent
 from siq.estimation.estimation import Fit
-from siq.estimation.innovations import profile_likelihood, whiten
-from siq.estimation.linearisation import Grid
 from siq.estimation.measurements import Measurements
-from siq.estimation.process_noise import fit_with_and_without_process_noise, simpler_fit
-from siq.mismatch.candidates import MechanismCandidate
-from siq.mismatch.evidence import evidence_of_function, log_evidence_of, orthonormal
-from siq.mismatch.function_places import (
-    Place,
-    cardinal_splines,
-    linearised_with_places,
-    places_in,
-    products_in,
-)
-from siq.mismatch.functions import FORMULA, SPLINE, Power, powers, simplest, with_formula, with_spline
-from siq.mismatch.probes import Probe, ProbeColumns
-from siq.mismatch.roles import Roles
-from siq.mismatch.screening import LEVELS, probe_response, projected
+from siq.estimation.process_noise import fit_with_and_without_process_noise
+from siq.mismatch.fitted_functions import FITTED, with_a_function
+from siq.mismatch.nameless_models import MECHANISM, Material, Model, Part, runs_freely, weighed
 from siq.mismatch.search import Search, something_left
-from siq.mismatch.trials import PROBE_SUBSTEPS, UNFORESEEN, TriedMechanism, judged
+from siq.mismatch.trials import admissible
 
-MECHANISM = "mechanism"
-LOGGER = logging.getLogger(__name__)
-FITTED = 3  # places in which functions are fitted, the most likely ones: a choice
 MOST = 2  # functions that are put on top of each other: more are no description
 
 
-@dataclass(frozen=True)
-class Part:
-    """A part of a description.
-
-    Attributes
-    ----------
-    trial
-        What was added, fitted and judged.
-    kind
-        ``formula``, ``spline``, or ``mechanism``.
-    cost
-        Logarithm of the number of places, or mechanisms, that it was chosen among.
-    place
-        Where a function stands; None for a mechanism.
-    knots
-        Of a spline, shape ``(k,)``: the amplitudes are its values there.
-    """
-
-    trial: TriedMechanism
-    kind: str
-    cost: float
-    place: Place | None = None
-    knots: np.ndarray | None = None
-
-
-@dataclass(frozen=True)
-class Model:
-    """A simulation that describes what has no name.
-
-    Attributes
-    ----------
-    parts
-        What was added, in the order in which it was found.
-    fit
-        Of the simulation with all of it.
-    log_evidence
-        Of the whole (`siq.mismatch.evidence.log_evidence_of`), less the costs of its parts.
-    exact
-        The fit whose trajectories follow the equations, if random forces are part of `fit`.
-    """
-
-    parts: tuple[Part, ...]
-    fit: Fit
-    log_evidence: float
-    exact: Fit | None = None
-
-
-@dataclass(frozen=True)
-class LikelyPlace:
-    """A place, the logarithm of its evidence, and the level of random forces at which it is best.
-
-    The evidence is that of a smooth function there over that of none, each at its best level.
-    """
-
-    place: Place
-    log_evidence: float
-    level: float
-
-
 def models_of_the_nameless(
-    data: Measurements,
-    search: Search,
-    roles: Roles,
-    *,
-    degree: int,
-    blocks: int,
-    considered: int,
-    budget: Budget | None = None,
+    search: Search, material: Material, *, functions: Sequence[Model] | None = None
 ) -> tuple[Model, ...]:
     """Models of what is missing, the likeliest first; none where none is likelier than the simulation alone.
 
     Parameters
     ----------
-    data
-        The recordings.
     search
         What was found; mechanisms among it are one of the models.
-    roles
-        Of the simulation's states.
-    degree
-        Highest degree of formulas.
-    blocks
-        For clustered errors; see `siq.mismatch.clusters.clustered_probability`.
-    considered
-        How many mechanisms there are.
-    budget
-        Charged for the work; the models that it does not reach are left out.
+    material
+        What models are made from.
+    functions
+        Those without mechanisms, where they are fitted already.
     """
-    base, budget = search.recalibrated, budget or Budget()
-    models = with_a_function((), base, data, roles, degree=degree, blocks=blocks, budget=budget)
+    base, data = search.recalibrated, material.data
+    models = list(with_a_function((), base, material) if functions is None else functions)
     if search.found and np.isfinite(search.fit.log_likelihood):
-        cost = float(np.log(max(considered, 1)))
-        parts = tuple(Part(each.best, MECHANISM, cost) for each in search.found)
-        models.append(model_of(parts, search.fit, data))
-    best = max(models, key=lambda each: each.log_evidence, default=None)
+        models.append(Model(parts_of(search, material.considered), search.fit))
+    models = weighed(models, base, data)
+    best = models[0] if models else None
     if (
         best is not None
         and best.fit.model.dimension == base.model.dimension
         and len(best.parts) < MOST
+        and (functions is None or best.parts[0].kind == MECHANISM)
         and something_left(best.fit, data)
     ):
-        models += with_a_function(
-            best.parts, best.fit, data, roles, degree=degree, blocks=blocks, budget=budget
-        )
-    alone = log_evidence_of(base, data)
-    likelier = sorted(
-        (each for each in models if each.log_evidence > alone), key=lambda each: -each.log_evidence
-    )
-    return tuple(_followed(each, data) for each in likelier[:FITTED])
+        models += with_a_function(best.parts, best.fit, material)
+    return likeliest(models, base, data)
 
 
-def model_of(parts: tuple[Part, ...], fit: Fit, data: Measurements) -> Model:
-    """A model with its evidence, each part of which was chosen among others."""
-    return Model(parts, fit, log_evidence_of(fit, data) - sum(part.cost for part in parts))
+def models_beside_names(
+    named: Search, whole: Search, material: Material, *, functions: Sequence[Model] | None = None
+) -> tuple[Model, ...]:
+    """Models of what mechanisms with a name leave, the likeliest first; none where none is likelier.
 
-
-def with_a_function(
-    before: tuple[Part, ...],
-    fit: Fit,
-    data: Measurements,
-    roles: Roles,
-    *,
-    degree: int,
-    blocks: int,
-    budget: Budget,
-) -> list[Model]:
-    """Models with one function more, in the likeliest places, that earn it.
+    They are what was found beside the names, not certain enough for one itself, and functions on top of all
+    that was found.
 
     Parameters
     ----------
-    before, fit
-        What was added already, and the fit with it.
-    data, roles, degree, blocks, budget
-        See `models_of_the_nameless`.
+    named, whole
+        The search with what is named, and with all that was found.
+    material
+        What models are made from.
+    functions
+        Those on top of the names alone, where they are fitted already.
     """
-    budget.says("comparing functions without a name")
-    try:
-        ranked = likely_places(fit, data, roles)
-    except UNFORESEEN as error:
-        LOGGER.info("no function can be screened: %s", error)
-        return []
-    cost = float(np.log(max(len(ranked), 1)))  # a function is chosen among so many places
-    ranked = [each for each in ranked if each.log_evidence > cost]
-    if not ranked:
-        return []
-    alone = log_evidence_of(fit, data) - sum(part.cost for part in before)
-    models: list[Model] = []
+    base, data = named.fit, material.data
 
-    def attempt(
-        place: Place, candidate: MechanismCandidate, level: float, knots: np.ndarray | None = None
-    ) -> None:
-        kind = FORMULA if knots is None else SPLINE
-        try:
-            budget.says(f"a {kind}: {candidate.label}")
-            trial = _fitted(candidate, level, fit, data, blocks=blocks, budget=budget)
-            parts = (*before, Part(trial, kind, cost, place, knots))
-            models.append(model_of(parts, trial.fit, data))
-        except (*UNFORESEEN, BudgetSpent) as error:
-            LOGGER.info("%s as a %s cannot be fitted: %s", candidate.label, kind, error)
-            return
-        gained = models[-1].log_evidence - alone
-        LOGGER.info("%s as a %s: log-evidence better by %.1f", candidate.label, kind, gained)
+    def on_top(parts: tuple[Part, ...], fit: Fit) -> list[Model]:
+        if fit.model.dimension > named.recalibrated.model.dimension or not something_left(fit, data):
+            return []
+        return with_a_function(parts, fit, material)
 
-    single = {(each.place.targets, each.place.words): each.place.knots for each in ranked}
-    done: set[tuple[tuple[str, sympy.Expr], ...]] = set()
-    for likely in ranked[:FITTED]:
-        terms = few_powers(likely, fit, data, degree=degree)
-        if terms:
-            place, terms = simplest(likely.place, terms)
-            place = replace(place, knots=single.get((place.targets, place.words), likely.place.knots))
-            candidate = with_formula(fit.model, place, terms)
-            if candidate.changes not in done:
-                attempt(place, candidate, likely.level)
-            done.add(candidate.changes)
-    best = max(models, key=lambda each: each.log_evidence, default=None)
-    curved = {(ranked[0].place.targets, ranked[0].place.words)}
-    if best is not None and best.parts[-1].place is not None:
-        curved.add((best.parts[-1].place.targets, best.parts[-1].place.words))
-    for likely in ranked:
-        if (likely.place.targets, likely.place.words) in curved:
-            for knots in few_knots(likely, fit, data):
-                attempt(likely.place, with_spline(fit.model, likely.place, knots), likely.level, knots)
-    return [each for each in models if each.log_evidence > alone]
+    models = list(functions or ())
+    parts = parts_of(whole, material.considered)[len(named.found) :]
+    fits = [each.best.fit for each in whole.found[len(named.found) :]]
+    models += [Model(parts[: place + 1], fit) for place, fit in enumerate(fits)]
+    if parts:
+        models += on_top(parts, whole.fit)
+    elif functions is None:
+        models += on_top((), base)
+    names = [each.best.candidate for each in named.found]
+    allowed = [
+        each
+        for each in models
+        if np.isfinite(each.fit.log_likelihood) and all(admissible(each.fit, name) for name in names)
+    ]
+    return likeliest(allowed, base, data)
 
 
-def likely_places(fit: Fit, data: Measurements, roles: Roles) -> list[LikelyPlace]:
-    """All places, the one in which a smooth function is likeliest first.
-
-    Functions of one coordinate are tried everywhere, and as coefficients of other coordinates in the
-    equations in which they do best.
-    """
-    single = places_in(fit.model, roles, data, fit.x)
-    ranked = _compared(fit, data, single)
-    if not ranked:
-        return []
-    equations = {each.place.targets for each in ranked[:FITTED] if each.place.equations}
-    products = products_in([each for each in single if each.targets in equations], fit.model, data, fit.x)
-    return sorted((*ranked, *_compared(fit, data, products)), key=lambda each: -each.log_evidence)
+def parts_of(search: Search, considered: int) -> tuple[Part, ...]:
+    """The mechanisms of a search as parts of a model, each chosen among so many."""
+    cost = float(np.log(max(considered, 1)))
+    return tuple(Part(each.best, MECHANISM, cost) for each in search.found)
 
 
-def _compared(fit: Fit, data: Measurements, places: Sequence[Place]) -> list[LikelyPlace]:
-    parameters = len(fit.model.free)
-    found: dict[int, LikelyPlace] = {}
-    alone = -np.inf
-    for response, some in linearised_with_places(fit, data, places):
-        for level in LEVELS if fit.has_process_noise else (1.0,):
-            try:
-                white = whiten(response, data, fit.noise.scaled(level))
-                left, columns = projected(white, parameters)
-            except NumericalFailure:  # without random forces an unstable simulation does not follow
-                continue
-            freedom = white.degrees_of_freedom - parameters
-            base = profile_likelihood(float(left @ left), freedom, white.log_determinant)
-            alone = max(alone, base)
-            begin = 0
-            for place in some:
-                own = columns[:, begin : begin + len(place.knots)]
-                begin += len(place.knots)
-                value = base + evidence_of_function(own, left, place.knots, freedom=freedom)
-                known = found.get(id(place))
-                if own.any() and (known is None or value > known.log_evidence):
-                    found[id(place)] = LikelyPlace(place, value, level)
-    ranked = sorted(found.values(), key=lambda each: -each.log_evidence)
-    return [replace(each, log_evidence=each.log_evidence - alone) for each in ranked]
-
-
-def few_knots(likely: LikelyPlace, fit: Fit, data: Measurements) -> list[np.ndarray]:
-    """The knots that a spline needs, as many as earn their place (Schwarz), and the next finer ones."""
-    knots = likely.place.knots
-    response, _ = next(iter(linearised_with_places(fit, data, [likely.place])))
-    white = whiten(response, data, fit.noise.scaled(likely.level))
-    left, columns = projected(white, len(fit.model.free))
-    count = max(int(white.known.sum()), 2)
-    choices, costs = [], []
-    for number in sorted({min(each, len(knots)) for each in (4, 5, 7, 9, 13, len(knots))}):
-        some = knots[np.linspace(0, len(knots) - 1, number).round().astype(int)]
-        own = orthonormal(columns @ cardinal_splines(some, knots).T)
-        sum_of = max(float(((left - own @ (own.T @ left)) ** 2).sum()), 1e-300)
-        choices.append(some)
-        costs.append(count * np.log(sum_of) + own.shape[1] * np.log(count))
-    best = int(np.argmin(costs))
-    return choices[best : best + 2]
-
-
-def few_powers(likely: LikelyPlace, fit: Fit, data: Measurements, *, degree: int) -> tuple[Power, ...]:
-    """The powers that a formula needs: each added as long as it earns its place (Schwarz)."""
-    terms = powers(likely.place, degree=degree)
-    probe = Probe(with_formula(fit.model, likely.place, terms), ())
-    grid = Grid(data, min(fit.substeps, PROBE_SUBSTEPS))
-    columns = ProbeColumns(fit.model, grid, [probe], fit.x, fit.model.values)
-    white = whiten(probe_response(fit.model, grid, fit, columns), data, fit.noise.scaled(likely.level))
-    left, own = projected(white, len(fit.model.free))
-    count = max(int(white.known.sum()), 2)
-    chosen: list[int] = []
-    total = float(left @ left)
-    while len(chosen) < len(terms):
-        sums = {}
-        for place in range(len(terms)):
-            if place not in chosen and own[:, place].any():
-                some = own[:, [*chosen, place]]
-                some = some / np.sqrt((some**2).sum(axis=0))
-                sums[place] = float(((left - some @ np.linalg.lstsq(some, left, rcond=1e-9)[0]) ** 2).sum())
-        if not sums:
-            break
-        best = min(sums, key=lambda place: sums[place])
-        if count * np.log(total / max(sums[best], 1e-300)) < np.log(count):
-            break
-        chosen.append(best)
-        total = sums[best]
-    return tuple(terms[place] for place in sorted(chosen))
-
-
-def _fitted(
-    candidate: MechanismCandidate,
-    level: float,
-    begin: Fit,
-    data: Measurements,
-    *,
-    blocks: int,
-    budget: Budget,
-) -> TriedMechanism:
-    """A function, fitted and judged against the fit without it.
-
-    Raises
-    ------
-    NumericalFailure
-        When the fit does not settle.
-    """
-    known = {each.name: each.value for each in begin.model.parameters}
-    values = np.array([known.get(each.name, 0.0) for each in candidate.model.parameters])
-    trial = simpler_fit(
-        *fit_with_and_without_process_noise(
-            candidate.model.with_values(values), data, begin, level=level, budget=budget
-        )
+def likeliest(models: Sequence[Model], alone: Fit, data: Measurements) -> tuple[Model, ...]:
+    """The few models that are likelier than the simulation without them, the likeliest first."""
+    likelier = (
+        each
+        for each in weighed(models, alone, data)
+        if each.log_evidence > 0 and runs_freely(each.fit, alone, data)
     )
-    if not trial.converged:
-        raise NumericalFailure(trial.fault or "its fit does not settle")
-    return judged(trial, begin, data, candidate, blocks=blocks)
+    return tuple(_followed(each, data) for each in itertools.islice(likelier, FITTED))
 
 
 def _followed(model: Model, data: Measurements) -> Model:

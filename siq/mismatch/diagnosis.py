@@ -168,17 +168,17 @@ def solve_case(case: Comparison, *, tell: Callable[[str], None] = LOGGER.info) -
     budget = Budget(work=allowed.evaluations, seconds=allowed.seconds, tell=tell)
     try:
         found = investigate(case.system, case.learn, case.dictionary, case.settings, budget=budget)
-        shown = held_out_runs(found, case.learn, case.kept)
+        shown = held_out_runs(found, case.learn, case.kept, tests=case.settings.tests)
         statement = statement_of(found, case.learn, shown)
     except InputError:
         raise
     except UNFORESEEN as error:
         raise NumericalFailure(f"the simulation cannot be fitted to the recordings: {error}") from error
     final, model = found.final, found.final.model
-    if found.verdict is MismatchVerdict.MISSING_PHYSICS:
-        model = shown.model
-    elif shown.described_fit is not None and shown.gained:
+    if shown.described_fit is not None and shown.adopted:
         final, model = shown.described_fit, shown.model
+    elif found.verdict is MismatchVerdict.MISSING_PHYSICS:
+        model = shown.model
     process = final.noise.process if found.process_noise else None
     recalibrated = found.search.recalibrated
     return Diagnosis(

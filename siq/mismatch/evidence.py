@@ -6,6 +6,10 @@ normal priors. How large an effect is nobody knows beforehand, so that its size 
 evenly on a logarithmic scale, for both alike. A smooth function could have been anything, and pays for it:
 the more so the more the recordings tell. (MacKay, Information Theory, Inference, and Learning Algorithms,
 chapter 28.)
+
+Errors of a simulation that lacks more than what is in question hang together over time. Of n errors with an
+integral correlation time τ, n/τ are independent; logarithms of likelihoods are divided by τ, as those of so
+many errors are. Of white errors τ is 1.
 """
 
 from __future__ import annotations
@@ -21,6 +25,7 @@ from siq.estimation.estimation import Fit
 from siq.estimation.innovations import Whitened, solve, whiten
 from siq.estimation.measurements import Measurements
 from siq.mismatch.candidates import MechanismCandidate
+from siq.mismatch.clusters import correlation_time_of
 from siq.mismatch.function_places import Place, linearised_with_places, places_in, products_in
 from siq.mismatch.roles import Roles
 
@@ -108,14 +113,16 @@ class Missing:
         self._basis = orthonormal(own[:, rest])
         effect = own[:, self._tested[: self._linear]] @ values[self._tested[: self._linear]]
         left = white.innovations - own @ change
+        self.correlated = correlation_time_of(left, white.recording, outputs=len(fit.model.outputs))
         self._target = self._projected((left + effect)[:, None])[:, 0]
         self._total = float(self._target @ self._target)
-        self._freedom = white.degrees_of_freedom - len(rest)
+        self._freedom = (white.degrees_of_freedom - len(rest)) / self.correlated
         self._values = values[self._tested]
         self._white, self._parameters = white, len(names)
 
     def _projected(self, columns: np.ndarray) -> np.ndarray:
-        return columns - self._basis @ (self._basis.T @ columns)
+        """Columns without what the other parameters can do, weighed as so many independent errors are."""
+        return (columns - self._basis @ (self._basis.T @ columns)) / np.sqrt(self.correlated)
 
     def functions(self, places: Sequence[Place]) -> Iterator[tuple[np.ndarray, Place]]:
         """The columns of each place, its parameters' effect taken off, shape ``(n, k)``."""
@@ -146,7 +153,7 @@ class Missing:
 
 
 def evidence_of_function(
-    columns: np.ndarray, target: np.ndarray, knots: np.ndarray, *, freedom: int
+    columns: np.ndarray, target: np.ndarray, knots: np.ndarray, *, freedom: float
 ) -> float:
     """Log-likelihood of a smooth function, averaged over its values, size and smoothness, to that of nothing.
 
@@ -180,7 +187,7 @@ def evidence_of_function(
 
 
 def averaged_evidence(
-    gram: np.ndarray, overlap: np.ndarray, priors: Sequence[np.ndarray], total: float, freedom: int
+    gram: np.ndarray, overlap: np.ndarray, priors: Sequence[np.ndarray], total: float, freedom: float
 ) -> float:
     """Logarithm of the mean evidence over priors; see `log_evidence`."""
     values = [log_evidence(gram, overlap, prior, total=total, freedom=freedom) for prior in priors]
@@ -199,7 +206,7 @@ def smooth_prior(knots: np.ndarray, length: float) -> np.ndarray:
 
 
 def log_evidence(
-    gram: np.ndarray, overlap: np.ndarray, prior: np.ndarray, *, total: float, freedom: int
+    gram: np.ndarray, overlap: np.ndarray, prior: np.ndarray, *, total: float, freedom: float
 ) -> float:
     """Log-likelihood of columns with normal coefficients, over that without them.
 
@@ -235,14 +242,38 @@ def orthonormal(columns: np.ndarray) -> np.ndarray:
     return basis[:, values > 1e-9 * values[0]] if values[0] > 0 else basis[:, :0]
 
 
-def log_evidence_of(fit: Fit, data: Measurements) -> float:
+def log_evidence_of(fit: Fit, data: Measurements, *, correlated: float = 1.0) -> float:
     """Log-likelihood of a whole explanation, less what its parameters would gain by chance.
 
     Schwarz's approximation of the marginal likelihood, -½ k log n, with random forces counted as
     parameters, so that explanations with and without them can be compared. What the recordings do not tell
     of the parameters does not count.
+
+    Parameters
+    ----------
+    fit, data
+        The explanation, and the recordings.
+    correlated
+        Correlation time τ of the errors in samples, the same for all explanations that are compared
+        (`correlation_time_left`): log L/τ - ½ k log(n/τ).
     """
     white = whiten(fit.linearisation, data, fit.noise)
     told = orthonormal(white.columns).shape[1]
     variances = int((fit.noise.process > 0).sum())
-    return float(fit.log_likelihood - 0.5 * (told + variances) * np.log(max(int(white.known.sum()), 2)))
+    count = max(float(white.known.sum()) / correlated, 2.0)
+    return float(fit.log_likelihood / correlated - 0.5 * (told + variances) * np.log(count))
+
+
+def correlation_time_left(fits: Sequence[Fit], data: Measurements) -> float:
+    """Correlation time of errors, as the likeliest of several fits leaves them, in samples.
+
+    What the others leave is rather the effect that they lack.
+    """
+    known = [each for each in fits if np.isfinite(each.log_likelihood)]
+    if not known:
+        return 1.0
+    closest = max(known, key=lambda each: each.log_likelihood)
+    white = whiten(closest.linearisation, data, closest.noise)
+    change, _ = solve(white.columns, white.innovations)
+    left = white.innovations - white.columns @ change
+    return correlation_time_of(left, white.recording, outputs=len(closest.model.outputs))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -9,11 +11,13 @@ import numpy as np
 
 from siq.dynamics.dynamics import Dynamics
 from siq.estimation.estimation import Fit
-from siq.estimation.free_runs import FreeRun, free_run, normalised_rms
+from siq.estimation.free_runs import FreeRun, free_run, normalised_rms, told_rows
 from siq.estimation.measurements import Measurements
-from siq.mismatch.described import Model
-from siq.mismatch.investigation import Investigation
+from siq.mismatch.investigation import Investigation, MismatchVerdict
+from siq.mismatch.left_out import error_left_out
+from siq.mismatch.nameless_models import Model
 
+LOGGER = logging.getLogger(__name__)
 Change = Literal["better", "same", "worse", "unknown"]
 WIDE = 1.96  # standard errors within which 95 % lie
 
@@ -30,6 +34,8 @@ class HeldOutErrors:
         What measurement noise alone amounts to.
     values
         Number of measured values that the errors are means over; 0 where it is not known.
+    named
+        With what has a name only, where something without a name describes the rest.
     """
 
     before: float | None
@@ -37,6 +43,12 @@ class HeldOutErrors:
     augmented: float | None
     noise_floor: float | None
     values: int = 0
+    named: float | None = None
+
+    @property
+    def without(self) -> float | None:
+        """The better one of the simulation as it is and with its parameters refitted."""
+        return min((each for each in (self.before, self.recalibrated) if each is not None), default=None)
 
     @property
     def tolerance(self) -> float:
@@ -87,6 +99,8 @@ class HeldOutRuns:
         The model of what has no name that was run; None where nothing was described.
     described_fit
         Its estimates that were run.
+    adopted
+        Whether that model is part of the new card, since it makes predictions better.
     """
 
     before: FreeRun
@@ -98,18 +112,27 @@ class HeldOutRuns:
     described: Model | None = None
     described_fit: Fit | None = None
 
+    adopted: bool = False
+
     @property
     def gained(self) -> bool:
         """Whether the augmented simulation is better than the others."""
-        known = [each for each in (self.errors.before, self.errors.recalibrated) if each is not None]
-        return self.errors.change(min(known, default=None), self.errors.augmented) == "better"
+        return self.errors.change(self.errors.without, self.errors.augmented) == "better"
 
 
-def held_out_runs(investigation: Investigation, learned: Measurements, data: Measurements) -> HeldOutRuns:
+def held_out_runs(
+    investigation: Investigation,
+    learned: Measurements,
+    data: Measurements,
+    *,
+    tests: Collection[str] = (),
+) -> HeldOutRuns:
     """Show the fit on recordings that had no part in anything.
 
-    Of several models of what has no name the likeliest is shown that makes the prediction better; the first,
-    where none does.
+    Of several models of what has no name the likeliest is adopted that makes the prediction better than it is
+    without: than that of the mechanisms with a name, where there are any, or else of the simulation. Where
+    all recordings are tests of somebody else, each part of those to learn from is left out in turn, and the
+    model is adopted that foresees them best (`siq.mismatch.left_out`).
 
     Parameters
     ----------
@@ -119,52 +142,103 @@ def held_out_runs(investigation: Investigation, learned: Measurements, data: Mea
         The recordings that it was found in; they decide which estimates run freely best.
     data
         The recordings held out.
+    tests
+        Labels of those that may choose nothing.
     """
     search = investigation.search
     noise, substeps = search.recalibrated.noise, max(search.fit.substeps, search.recalibrated.substeps)
 
+    def error_of(model: Dynamics, where: Measurements, finer: int = 0) -> float | None:
+        run = free_run(model, where, noise=noise, substeps=max(substeps, finer))
+        return normalised_rms(where.outputs, run)
+
     def error_where_learned(model: Dynamics) -> float:
-        error = normalised_rms(learned.outputs, free_run(model, learned, noise=noise, substeps=substeps))
+        error = error_of(model, learned)
         return np.inf if error is None else error
+
+    def best_of(*fits: Fit | None) -> Fit:
+        known = [each for each in fits if each is not None]
+        if len(known) == 1:
+            return known[0]
+        return min(known, key=lambda each: error_where_learned(each.model))
 
     # What fits best with random forces admitted need not be what runs best without.
     recalibrated = search.recalibrated.model
     if search.recalibrated.has_process_noise and np.isfinite(investigation.least_squares.sum_of_squares):
         refits = (investigation.least_squares.model, recalibrated, investigation.model)
         recalibrated = min(refits, key=error_where_learned)
-    choices: list[tuple[Model | None, Fit]] = []
-    for model in investigation.models:
-        fits = [each for each in (model.fit, model.exact) if each is not None]
-        choices.append((model, min(fits, key=lambda each: error_where_learned(each.model))))
-    if not choices:
-        fits = [each for each in (investigation.augmented_least_squares, search.fit) if each is not None]
-        choices.append((None, min(fits, key=lambda each: error_where_learned(each.model))))
-    before = free_run(investigation.model, data, noise=noise, substeps=substeps)
-    refitted = free_run(recalibrated, data, noise=noise, substeps=substeps)
+    plain = best_of(investigation.augmented_least_squares, search.fit)
+    choices = [(model, best_of(model.fit, model.exact)) for model in investigation.models]
+    named = investigation.verdict is MismatchVerdict.MISSING_PHYSICS
+    judges = [place for place, label in enumerate(data.labels) if label not in tests]
+    adopted = None
+    if choices and judges:
+        some = data.select(judges)
+        without = [error_of(plain.model, some, plain.substeps)]
+        if not named:
+            without = [error_of(investigation.model, some), error_of(recalibrated, some)]
+        errors = ((error_of(fit.model, some, fit.substeps), _scored(some)) for _, fit in choices)
+        adopted = first_better(_least(without), errors)
+    elif choices:
+        base = plain if named else search.recalibrated
+        alone, _ = error_left_out(base, learned, noise=noise)
+        left_out = [error_left_out(fit, learned, noise=noise) for _, fit in choices]
+        LOGGER.info("parts left out: %s without, %s with models of what has no name", alone, left_out)
+        known = [place for place, (error, _) in enumerate(left_out) if error is not None]
+        for best in sorted(known, key=lambda place: left_out[place][0] or 0.0)[:1]:
+            adopted = best if first_better(alone, [left_out[best]]) == 0 else None
+    described, fit = (None, plain) if named or not choices else choices[0]
+    if adopted is not None:
+        described, fit = choices[adopted]
+    before, refitted = (
+        free_run(each, data, noise=noise, substeps=substeps) for each in (investigation.model, recalibrated)
+    )
+    run = free_run(fit.model, data, noise=noise, substeps=max(substeps, fit.substeps))
     spread = np.nanvar(data.outputs[before.scored], axis=0)
-    floor = np.sqrt(np.mean(search.fit.noise.measurement / np.where(spread > 0, spread, 1.0)))
-    shown: list[HeldOutRuns] = []
-    for described, fit in choices:
-        run = free_run(fit.model, data, noise=noise, substeps=max(substeps, fit.substeps))
-        errors = HeldOutErrors(
+    # What a fit leaves may be more than noise; the one that leaves less is nearer to it.
+    least = np.minimum(search.fit.noise.measurement, fit.noise.measurement)
+    floor = np.sqrt(np.mean(least / np.where(spread > 0, spread, 1.0)))
+    return HeldOutRuns(
+        before=before,
+        recalibrated=refitted,
+        augmented=run,
+        model=fit.model,
+        errors=HeldOutErrors(
             before=normalised_rms(data.outputs, before),
             recalibrated=normalised_rms(data.outputs, refitted),
             augmented=normalised_rms(data.outputs, run),
             noise_floor=float(floor),
             values=int(np.isfinite(data.outputs[before.scored]).sum()),
-        )
-        shown.append(
-            HeldOutRuns(
-                before=before,
-                recalibrated=refitted,
-                augmented=run,
-                model=fit.model,
-                errors=errors,
-                independent=not set(learned.labels) & set(data.labels),
-                described=described,
-                described_fit=fit if described is not None else None,
-            )
-        )
-        if shown[-1].gained:
-            return shown[-1]
-    return shown[0]
+            named=error_of(plain.model, data, plain.substeps) if named and adopted is not None else None,
+        ),
+        independent=not set(learned.labels) & set(data.labels),
+        described=described,
+        described_fit=fit if described is not None else None,
+        adopted=adopted is not None,
+    )
+
+
+def first_better(without: float | None, errors: Iterable[tuple[float | None, int]]) -> int | None:
+    """The place of the first of several errors that is better than one; None where none is.
+
+    Parameters
+    ----------
+    without
+        The error without any of the models; None where it ran away.
+    errors
+        Of each model, the likeliest first, with the number of values that each is a mean over.
+    """
+    for place, (error, values) in enumerate(errors):
+        if HeldOutErrors(None, None, None, None, values).change(without, error) == "better":
+            return place
+    return None
+
+
+def _least(errors: Sequence[float | None]) -> float | None:
+    return min((each for each in errors if each is not None), default=None)
+
+
+def _scored(data: Measurements) -> int:
+    """How many values of free runs of recordings are scored."""
+    within = np.arange(len(data.t)) - data.first[data.recording]
+    return int(np.isfinite(data.outputs[within >= told_rows(data)[data.recording]]).sum())

@@ -14,23 +14,21 @@ from siq.errors import NumericalFailure
 from siq.estimation.budget import UNLIMITED, Account, Budget
 from siq.estimation.estimation import Fit
 from siq.estimation.measurements import Measurements
-from siq.estimation.process_noise import fit_with_and_without_process_noise
 from siq.estimation.recalibration import recalibrate
 from siq.estimation.unknown_forces import covariance_with_unknown_forces
 from siq.mismatch.candidates import MechanismCandidate, candidates_of, generic_candidates
-from siq.mismatch.described import Model, models_of_the_nameless
+from siq.mismatch.described import models_of_the_nameless
 from siq.mismatch.dictionary import Mechanism
-from siq.mismatch.evidence import log_evidence_of
-from siq.mismatch.naming import Naming, naming_of
+from siq.mismatch.nameless_models import Material, Model
+from siq.mismatch.names import names_of
+from siq.mismatch.naming import Naming
 from siq.mismatch.remainder import Remainder, what_is_left
 from siq.mismatch.roles import Roles, roles_of
 from siq.mismatch.search import Search, search
-from siq.mismatch.search_options import SearchOptions
 from siq.mismatch.steadiness import unsteadiness
 from siq.mismatch.structure import Structure
 from siq.mismatch.study import MismatchStudy
 from siq.mismatch.trials import UntriedMechanism
-from siq.numerics.share_text import p_equation, percent
 
 
 class MismatchVerdict(StrEnum):
@@ -48,10 +46,6 @@ class MismatchVerdict(StrEnum):
 
 
 GROWING = "Random forces would explain it only if they grew with the motion; a hidden state is more likely."
-EXACT = (
-    "The estimates allow for random forces that stand for what remains. The new card has the estimates of"
-    " least squares instead, where it runs better with them."
-)
 
 
 @dataclass(frozen=True)
@@ -89,7 +83,7 @@ class Investigation:
     naming
         What was asked of mechanisms before they could be named; None where none was found.
     models
-        Of what has no name, the likeliest first.
+        Of what has no name, be it all that is missing or what names leave, the likeliest first.
     account
         The work that it took, and whether something was left undone.
     """
@@ -175,26 +169,15 @@ def investigate(
     naming: Naming | None = None
     models: tuple[Model, ...] = ()
     verdict, remarks = MismatchVerdict.NO_MISMATCH, tuple[str, ...]()
-
-    def modelled() -> tuple[Model, ...]:
-        return models_of_the_nameless(
-            data, found, roles, degree=study.degree, blocks=options.blocks, considered=len(candidates),
-            budget=budget,
-        )  # fmt: skip
-
+    material = Material(data, roles, study.degree, options.blocks, len(candidates), budget)
     if found.found:
-        generator = np.random.default_rng(seed)
-        naming = naming_of(
-            found, by_each, data, model, roles, candidates, options=options, generator=generator
-        )
+        names = names_of(
+            found, by_each, model, material, candidates,
+            options=options, generator=np.random.default_rng(seed),
+        )  # fmt: skip
+        naming, models, exact, remarks = names.naming, names.models, names.exact, names.remarks
         found, left = naming.search, naming.left
-        verdict, remarks = named_or_not(naming, options)
-        if verdict is MismatchVerdict.MISSING_PHYSICS and found.fit.has_process_noise:
-            still = replace(found.fit, noise=found.fit.noise.without_process())
-            with budget.exempt():
-                followed = fit_with_and_without_process_noise(found.fit.model, data, still, budget=budget)[1]
-            if followed.converged:
-                exact, remarks = followed, (*remarks, EXACT)
+        verdict = MismatchVerdict.MISSING_PHYSICS if names.given else MismatchVerdict.UNEXPLAINED
     elif found.fit.has_process_noise:
         steady = unsteadiness(found.fit, data) < 2 * options.least_log_odds
         knows_noise = any(form.noise for mechanism in dictionary for form in mechanism.forms)
@@ -203,16 +186,15 @@ def investigate(
             # Random forces explain any recordings. They are named where nothing else is likelier, neither a
             # function instead of them nor one beside what is left of them: noise does not know where a system
             # is, so that no function of the states takes a part of it over.
-            alone = log_evidence_of(recalibrated, data)
-            models = modelled()
-            if not models or models[0].log_evidence < alone + options.least_log_odds:
+            models = models_of_the_nameless(found, material)
+            if not models or models[0].log_evidence < options.least_log_odds:
                 verdict, models = MismatchVerdict.MISSING_PHYSICS, ()
     elif left.structured:
         verdict = MismatchVerdict.UNEXPLAINED
     elif p_shift < options.false_alarms:
         verdict = MismatchVerdict.PARAMETER_SHIFT
-    if verdict is MismatchVerdict.UNEXPLAINED and not models:
-        models = modelled()
+    if verdict is MismatchVerdict.UNEXPLAINED and not (models or found.found):
+        models = models_of_the_nameless(found, material)
     budget.says("working out how well parameters are known")
     with budget.exempt():
         covariance = covariance_with_unknown_forces(found.fit, data, budget=budget)
@@ -271,40 +253,6 @@ def considered(
         monomials = generic_candidates(model, roles, degree=study.degree, named=candidates)
         candidates += [each for each in monomials if each.coordinate != "constant"]
     return candidates
-
-
-def named_or_not(naming: Naming, options: SearchOptions) -> tuple[MismatchVerdict, tuple[str, ...]]:
-    """Whether mechanisms that were found are named, and with which reservations."""
-    if not naming.convincing:
-        return MismatchVerdict.UNEXPLAINED, ()
-    remarks = tuple(filter(None, [remains(naming.left)])) if naming.p_alike is not None else ()
-    if naming.likely:
-        return MismatchVerdict.MISSING_PHYSICS, remarks
-    names = " and ".join(each.best.candidate.name for each in naming.search.found)
-    least = min(*naming.log_odds, naming.together)
-    return MismatchVerdict.UNEXPLAINED, (
-        *remarks,
-        f"It looks like {names}, but a function without a name is {_as_likely(least)}; a name takes odds of"
-        f" {np.exp(options.least_log_odds):.0f} to 1.",
-    )
-
-
-def _as_likely(log_odds: float) -> str:
-    """How likely a function without a name is, beside a mechanism."""
-    if log_odds < 0:
-        return "likelier"
-    return f"nearly as likely (odds of {np.exp(log_odds):.0f} to 1)"
-
-
-def remains(left: Remainder) -> str:
-    """How much of the excess over noise is left by what was found, and whether it looks like noise."""
-    size = percent(1 - left.share)
-    if not left.doubtful:
-        return "" if size == "none" else f"What was found leaves {size} of the difference."
-    chance = f"({p_equation(left.after.p_value)})"
-    if size == "none":
-        return f"What is left is as small as noise, but does not look like it {chance}."
-    return f"What was found leaves {size} of the difference, and this rest does not look like noise {chance}."
 
 
 def shift_probability(model: Dynamics, recalibrated: Fit) -> float:

@@ -97,6 +97,25 @@ def naming_of(
     return Naming(search, left[-1], odds, together, p_alike, convincing, likely)
 
 
+def log_odds_of_the_first(
+    search: Search,
+    data: Measurements,
+    model: Dynamics,
+    roles: Roles,
+    candidates: Sequence[MechanismCandidate],
+    *,
+    options: SearchOptions,
+) -> float:
+    """Logarithm of the odds that the first mechanism is one rather than a function, in the fit with it alone.
+
+    Parameters
+    ----------
+    search, data, model, roles, candidates, options
+        See `naming_of`.
+    """
+    return _Jury(search, data, model, roles, candidates, options, np.random.default_rng(0)).log_odds(1, [0])
+
+
 class _Jury:
     """What is asked of mechanisms several times."""
 

@@ -6,6 +6,7 @@ The page, the report as text and the terminal all show these, so that none can c
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from siq.mismatch.candidates import GENERIC, PROCESS_NOISE
 from siq.mismatch.held_out import HeldOutErrors
@@ -56,10 +57,10 @@ def sentence_of(statement: Statement, units: Mapping[str, str]) -> str:
     # What is credited to physics is only what neither the simulation as given nor other parameters can do.
     known = [each for each in (errors.before, errors.recalibrated) if each is not None]
     gain = gained(
-        errors, min(known, default=None), errors.augmented, it=f"With {'them' if they else 'it'}",
-        them="them" if they else "it",
+        errors, min(known, default=None), errors.named if statement.described else errors.augmented,
+        it=f"With {'them' if they else 'it'}", them="them" if they else "it",
     )  # fmt: skip
-    return f"The simulation lacks {what}. {gain}".strip()
+    return f"The simulation lacks {what}. {gain} {_rest(statement)}".strip()
 
 
 def words_of(statement: Statement) -> dict[str, tuple[str, ...]]:
@@ -280,6 +281,18 @@ def _error_stays(errors: HeldOutErrors) -> str:
         f"On held-out recordings the simulation {given} as given, and {by}{fitted} with its own parameters"
         f" refitted{_noise(errors)}."
     )
+
+
+def _rest(statement: Statement) -> str:
+    """What describes the rest that mechanisms with a name leave, and what that does to the held-out error."""
+    if not statement.described:
+        return ""
+    parts = _listed([described_part(each) for each in statement.described], "and")
+    verb = "describe" if len(statement.described) > 1 else "describes"
+    # The names are what it is compared with, and not the simulation without them.
+    errors = replace(statement.errors, before=statement.errors.named, recalibrated=None)
+    gain = gained(errors, errors.before, errors.augmented, it="With that, too", them="that")
+    return f"What is left has no name; {parts} {verb} it. {gain}".strip()
 
 
 def _described(statement: Statement) -> str:

@@ -8,19 +8,27 @@ from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.formulas import compile_values
 from siq.dynamics.parametric import symbol
 from siq.estimation.estimation import Fit
-from siq.mismatch.described import MECHANISM, Part
 from siq.mismatch.functions import SPLINE
 from siq.mismatch.held_out import HeldOutRuns
+from siq.mismatch.nameless_models import MECHANISM, Part
 from siq.mismatch.statement import DescribedCurve, Estimate, Evidence, StatedFunction
 
 
-def stated_functions(shown: HeldOutRuns) -> tuple[StatedFunction, ...]:
-    """The parts of the model that is in the new card; none where nothing that was added helped."""
-    if shown.described is None or shown.described_fit is None or not shown.gained:
+def stated_functions(shown: HeldOutRuns, *, beside: tuple[str, ...] = ()) -> tuple[StatedFunction, ...]:
+    """The parts of the model that is in the new card; none where nothing that was added helped.
+
+    Parameters
+    ----------
+    shown
+        The free runs, with the model.
+    beside
+        Labels of mechanisms with a name, which were in place before.
+    """
+    if shown.described is None or shown.described_fit is None or not shown.adopted:
         return ()
     labels = [each.trial.candidate.label for each in shown.described.parts]
     return tuple(
-        _stated(part, shown.described_fit, tuple(labels[:place]))
+        _stated(part, shown.described_fit, (*beside, *labels[:place]))
         for place, part in enumerate(shown.described.parts)
     )
 

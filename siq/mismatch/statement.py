@@ -256,7 +256,7 @@ class Statement:
     description
         Of a mismatch without a name.
     described
-        The model of it that is part of the new card; empty where nothing that was added helped.
+        The model of what has no name that is part of the new card; empty where nothing that was added helped.
     location
         Where the mismatch sits, if there is one.
     recalibration

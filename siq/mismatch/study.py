@@ -57,6 +57,10 @@ class MismatchStudy(BaseModel):
     held_out
         Recordings that take no part in finding anything: their labels, or their share. Where there is only
         one recording, the share is its last part.
+    tests
+        Labels of held-out recordings by which somebody else scores: they are shown, and choose nothing. Where
+        all that is held out are tests, a model of what has no name has to foresee the parts of the recordings
+        to learn from, each left out of its fit in turn.
     noise
         Standard deviation of the measurement noise by output, where it is known; by default it is estimated.
     mechanisms
@@ -80,6 +84,7 @@ class MismatchStudy(BaseModel):
     system: str | None = None
     recordings: str | None = None
     held_out: tuple[str, ...] | Annotated[float, Field(gt=0, lt=1)] = 0.25
+    tests: tuple[str, ...] = ()
     noise: dict[str, Annotated[float, Field(gt=0)]] = {}
     mechanisms: tuple[Mechanism, ...] = ()
     without: tuple[str, ...] = ()
@@ -201,6 +206,12 @@ def split(data: Measurements, study: MismatchStudy, *, file: str) -> tuple[Measu
         When a label is unknown, or nothing is left on one side.
     """
     count = len(data.labels)
+    out_by_name = () if isinstance(study.held_out, float) else study.held_out
+    for label in study.tests:
+        if label not in out_by_name:
+            raise InputError(
+                file, "tests", f"the recording '{label}' is not held out", "list it in held_out, too"
+            )
     if isinstance(study.held_out, float):
         if count == 1:
             return _cut(data, study.held_out)

@@ -284,7 +284,7 @@ def _tried(
     # With no effect it would be what it is compared with, but for random forces that are not believed.
     if 2 * (current.log_likelihood - trial.log_likelihood) > least_to_believe(current.noise):
         raise NumericalFailure("its fit leads away, to less than without it")
-    if not _admissible(trial, candidate):
+    if not admissible(trial, candidate):
         raise NumericalFailure("its best parameters have a sign that the mechanism cannot have")
     return judged(trial, current, data, candidate, blocks=blocks)
 
@@ -340,7 +340,8 @@ def judged(
     )
 
 
-def _admissible(trial: Fit, candidate: MechanismCandidate) -> bool:
+def admissible(trial: Fit, candidate: MechanismCandidate) -> bool:
+    """Whether parameters that a mechanism allows one sign only have it, or are zero within their errors."""
     names = [trial.model.parameters[place].name for place in trial.model.free]
     for name in candidate.positive:
         if name in names:

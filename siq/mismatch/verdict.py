@@ -9,7 +9,7 @@ import numpy as np
 from siq.estimation.estimation import Fit
 from siq.estimation.measurements import Measurements
 from siq.mismatch.candidates import PROCESS_NOISE
-from siq.mismatch.evidence import log_evidence_of
+from siq.mismatch.evidence import correlation_time_left, log_evidence_of
 from siq.mismatch.held_out import HeldOutRuns
 from siq.mismatch.investigation import Investigation, MismatchVerdict
 from siq.mismatch.location import locate
@@ -83,10 +83,10 @@ def statement_of(investigation: Investigation, data: Measurements, shown: HeldOu
     stated = Statement(
         verdict=investigation.verdict,
         sentence="",
-        mechanisms=mechanisms_of(investigation),
+        mechanisms=mechanisms_of(investigation, shown.described_fit if shown.adopted else None),
         description=description_of(investigation),
-        described=stated_functions(shown),
-        location=locate(investigation, data, shown.described if shown.gained else None),
+        described=stated_functions(shown, beside=names_in(investigation)),
+        location=locate(investigation, data, shown.described if shown.adopted else None),
         recalibration=recalibration_of(investigation, shown),
         errors=shown.errors,
         excluded={} if investigation.verdict.mismatch else excluded(investigation),
@@ -121,8 +121,16 @@ def left_undone(investigation: Investigation) -> tuple[str, ...]:
     )
 
 
-def mechanisms_of(investigation: Investigation) -> tuple[StatedMechanism, ...]:
-    """What is named, each with its evidence."""
+def mechanisms_of(investigation: Investigation, card: Fit | None = None) -> tuple[StatedMechanism, ...]:
+    """What is named, each with its evidence.
+
+    Parameters
+    ----------
+    investigation
+        What was found.
+    card
+        The fit whose estimates the new card has, where something without a name describes what names leave.
+    """
     if investigation.verdict is not MismatchVerdict.MISSING_PHYSICS:
         return ()
     if investigation.process_noise:
@@ -134,7 +142,7 @@ def mechanisms_of(investigation: Investigation) -> tuple[StatedMechanism, ...]:
                 sorted({each.name for each in stated.rivals if each.standing == "same"} - {stated.name})
             ),
         )
-        for stated in _all_stated(investigation)
+        for stated in _all_stated(investigation, card)
     )
 
 
@@ -144,18 +152,27 @@ def explanations_of(investigation: Investigation, data: Measurements) -> tuple[E
     fits = [("other parameters", investigation.least_squares), ("other parameters", search.recalibrated)]
     if search.found:
         fits.append((" and ".join(each.best.candidate.label for each in search.found), search.fit))
+    names = names_in(investigation)
     fits += [
-        (" and ".join(part.trial.candidate.label for part in model.parts), model.fit)
+        (" and ".join((*names, *(part.trial.candidate.label for part in model.parts))), model.fit)
         for model in investigation.models
     ]
     found: dict[str, float] = {}
+    correlated = correlation_time_left([fit for _, fit in fits], data)
     for what, fit in fits:
         if np.isfinite(fit.log_likelihood):
             forces = " and random forces" if fit.has_process_noise else ""
-            found[f"{what}{forces}"] = log_evidence_of(fit, data)
+            found[f"{what}{forces}"] = log_evidence_of(fit, data, correlated=correlated)
     best = max(found.values(), default=0.0)
     ranked = sorted(found.items(), key=lambda each: -each[1])
     return tuple(Explanation(what, value - best) for what, value in ranked)
+
+
+def names_in(investigation: Investigation) -> tuple[str, ...]:
+    """Labels of the mechanisms that have a name, on top of which models of the rest are."""
+    if investigation.verdict is not MismatchVerdict.MISSING_PHYSICS:
+        return ()
+    return tuple(each.best.candidate.label for each in investigation.search.found)
 
 
 def description_of(investigation: Investigation) -> Description | None:
@@ -177,7 +194,7 @@ def description_of(investigation: Investigation) -> Description | None:
 def recalibration_of(investigation: Investigation, shown: HeldOutRuns) -> dict[str, Recalibrated]:
     """The simulation's own parameters: on the card, and in the simulation that the verdict ends with."""
     fit = investigation.final
-    if shown.described_fit is not None and shown.gained:
+    if shown.described_fit is not None and shown.adopted:
         fit = shown.described_fit
     errors = standard_errors(fit)
     return {
@@ -209,13 +226,13 @@ def excluded(investigation: Investigation) -> dict[str, UpperBound]:
     return dict(sorted(bounds.items()))
 
 
-def _all_stated(investigation: Investigation) -> tuple[StatedMechanism, ...]:
+def _all_stated(investigation: Investigation, card: Fit | None = None) -> tuple[StatedMechanism, ...]:
     """Every mechanism that was found, whether it is named or only describes."""
     search = investigation.search
     labels = [each.best.candidate.label for each in search.found]
     log_odds = investigation.naming.log_odds if investigation.naming is not None else ()
     return tuple(
-        _stated(each, search.fit, investigation.share, tuple(labels[:place]), odds)
+        _stated(each, card or search.fit, investigation.share, tuple(labels[:place]), odds)
         for place, (each, odds) in enumerate(zip(search.found, log_odds, strict=True))
     )
 

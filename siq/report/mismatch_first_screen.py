@@ -107,6 +107,11 @@ def numbers(findings: Findings) -> ReportTable | None:
         words = SIMULATIONS[name]
         if name == "augmented" and findings.kind == "unexplained":
             words = "with what describes it" if described(findings) else "with what comes closest"
+        if name == "augmented" and fit.get("named") is not None:
+            named = {"simulation": "with what has a name only", "of the spread": _percent(fit["named"])}
+            times = fit["named"] / floor if floor > 0 else None
+            rows.append({**named, "times noise": "" if times is None else value_text(times, digits=2)})
+            words = "with what describes the rest, too"
         row = {"simulation": words, **own.get(name, {})}
         row["of the spread"] = "ran away" if error is None else _percent(error)
         row["times noise"] = "" if error is None or not floor > 0 else value_text(error / floor, digits=2)

@@ -133,9 +133,11 @@ def _described(findings: Findings) -> ReportSection | None:
         elif each["parameters"]:
             rows = [{"parameter": name, "value": _value(value)} for name, value in each["parameters"].items()]
             tables.append(ReportTable(f"Coefficients of {each['label']}.", pd.DataFrame(rows)))
+    beside = findings.verdict["verdict"] == "missing physics"
+    what = "What the named mechanisms leave" if beside else "What is missing"
     text = [
-        "What is missing has no name that is certain enough. This model is part of the new card, since it"
-        " makes the prediction of the held-out recordings better."
+        f"{what} has no name that is certain enough. This model is part of the new card, since it makes the"
+        " prediction better of recordings that it was not fitted to."
     ]
     notes = ["The simulation with it is a system card like any other: system.yaml."]
     figures = findings.figure("described", CAPTIONS["described"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,10 @@ from siq.mismatch.described import MECHANISM, Model, Part
 from siq.mismatch.diagnosis import Diagnosis, solve_case
 from siq.mismatch.dictionary import standard_dictionary
 from siq.mismatch.evidence import log_evidence_of
+from siq.mismatch.held_out import held_out_runs
+from siq.mismatch.naming import Naming
 from siq.mismatch.probes import Probe
+from siq.mismatch.remainder import Remainder
 from siq.mismatch.search import Search
 from siq.mismatch.trials import TriedMechanism
 from tests.mismatch.foreign_cases import falling_ball
@@ -276,6 +280,34 @@ def test_what_the_dictionary_lacks_stays_unexplained(tmp_path: Path) -> None:
     assert abs(at[np.argmax(missing)] - 0.5) <= 0.15
 
 
+def test_what_a_name_leaves_is_described_and_no_sample_of_a_test_chooses_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def the_first_alone(whole: Search, left: list[Remainder], *_: Any, **__: Any) -> Naming:
+        first = replace(whole, found=whole.found[:1], fit=whole.found[0].best.fit)
+        return Naming(first, left[0], (9.0,), 9.0, None, convincing=True, likely=True)
+
+    monkeypatch.setattr("siq.mismatch.names.naming_of", the_first_alone)
+    table = recordings_of(lambda x, v, t: -2.0 * x**3 - 0.1 * v * np.abs(v), count=6)
+    study = {"held_out": ["r2", "r4"], "tests": ["r2", "r4"], "search": {"mechanisms": 2}}
+    diagnosis = solved(tmp_path, table, study=study)
+    verdict = said(diagnosis)
+    assert verdict["verdict"] == "missing physics" and names(diagnosis) == ["cubic stiffness"]
+    (part,) = verdict["described"]
+    assert part["kind"] == "mechanism" and part["equations"] == ["v"] and "v" in part["coordinates"]
+    assert part["beside"] == [verdict["mechanisms"][0]["label"]]
+    # The card has both, and its error is shown beside that of the name alone.
+    assert verdict["fit"]["augmented"] < verdict["fit"]["named"] < verdict["fit"]["recalibrated"]
+    assert set(part["parameters"]) <= {entry.name for entry in diagnosis.augmented.parameters}
+    assert f"What is left has no name; {part['name']} in the equation of v desc" in verdict["sentence"]
+    # Whatever stands in the tests, the card is the same.
+    case = diagnosis.case
+    other = replace(case.kept, outputs=case.kept.outputs[::-1] + 0.3)
+    again = held_out_runs(diagnosis.investigation, case.learn, other, tests=study["tests"])
+    assert again.model == diagnosis.held_out.model
+    assert again.errors.augmented != diagnosis.held_out.errors.augmented
+
+
 def test_a_bias_and_an_offset_of_the_sensor_are_one_class(tmp_path: Path) -> None:
     diagnosis = solved(tmp_path, recordings_of(lambda x, v, t: np.full_like(x, 0.4)))
     first = said(diagnosis)["mechanisms"][0]
@@ -376,6 +408,7 @@ def test_a_candidate_whose_fit_fails_unforeseen_is_recorded_with_the_reason(
     [
         ({"held_out": ["r9"]}, "no recording is called 'r9'"),
         ({"held_out": [f"r{index}" for index in range(8)]}, "one side of the split is empty"),
+        ({"held_out": ["r2"], "tests": ["r3"]}, "the recording 'r3' is not held out"),
         ({"without": ["friction"]}, "no mechanism is called 'friction'"),
         ({"noise": {"v": 0.1}}, "'v' is no output"),
         ({"held_oud": 0.2}, "perhaps you meant 'held_out'"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -215,6 +216,18 @@ def test_a_model_without_a_name_is_said_with_its_gain_or_that_nothing_was_gained
         assert percentages(text.split("falls from")[1])[:3] == [50.0, 30.0, 5.0]
     else:
         assert "the simulation stays as it was" in text and "falls from" not in text
+
+
+def test_what_describes_a_rest_is_told_from_what_has_a_name():
+    part = StatedFunction(
+        "a function of x", "a function of x in v", "spline", {}, {}, Evidence(90.0, -80.0, 0.0, 0.0), ("v",)
+    )
+    statement = statement_from(3, MismatchVerdict.MISSING_PHYSICS)
+    errors = HeldOutErrors(0.5, 0.3, 0.05, 0.04, values=1000, named=0.2)
+    text = sentence_of(replace(statement, errors=errors, described=(part,)), {})
+    named, rest = text.split("What is left has no name; a function of x in the equation of v describes it. ")
+    assert percentages(named.split("falls from")[1])[:3] == [50.0, 30.0, 20.0]
+    assert percentages(rest.split("falls from")[1])[:2] == [20.0, 5.0] and "refitted" not in rest
 
 
 def test_random_forces_are_a_verdict_of_their_own():

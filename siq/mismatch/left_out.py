@@ -1,0 +1,120 @@
+"""Left out: which models hold on what they were not fitted to, where all that is held out are tests?
+
+Every part of the recordings to learn from is left out in turn: whole recordings, or stretches of a single
+one. All parameters are fitted to the others, so that what is left out had no part in them.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from siq.errors import NumericalFailure
+from siq.estimation.estimation import Fit
+from siq.estimation.free_runs import free_run, normalised_rms
+from siq.estimation.innovations import Noise
+from siq.estimation.measurements import Measurements
+from siq.estimation.process_noise import fit_with_process_noise_as_needed
+
+PARTS = 4  # of which one is left out at a time: a quarter, as is held out by default
+FEWEST = 16  # samples of a stretch that an initial state and an error can be told from
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """What is left out, the rest, and the rows of the rest in all of it."""
+
+    out: Measurements
+    rest: Measurements
+    rows: np.ndarray
+
+
+def parts_left_out(learned: Measurements) -> Iterator[LeftOut]:
+    """The recordings divided into parts, each left out once.
+
+    Of recordings, so many at equal distances are a part; a single one is cut into stretches, of which the
+    rest has two recordings unless it is the first or the last that is left out.
+    """
+    count = len(learned.labels)
+    if count > 1:
+        pieces = list(zip(learned.first[:-1], learned.first[1:], strict=True))
+        owner = np.arange(count)
+        groups = [np.arange(part, count, min(PARTS, count)) for part in range(min(PARTS, count))]
+    else:
+        parts = max(min(PARTS, len(learned.t) // FEWEST), 2)
+        edges = np.linspace(0, len(learned.t), parts + 1).round().astype(int)
+        pieces, owner = list(itertools.pairwise(edges)), np.zeros(parts, dtype=int)
+        groups = [np.array([part]) for part in range(parts)]
+    for group in groups:
+        others = np.setdiff1d(np.arange(len(pieces)), group)
+        chosen = [pieces[place] for place in group]
+        kept = [pieces[place] for place in others]
+        if count == 1:  # what was not cut stays one recording
+            kept = _joined(kept)
+            others = np.zeros(len(kept), dtype=int)
+        rest, rows = _stretches(learned, kept, owner[others] if count > 1 else others)
+        out, _ = _stretches(learned, chosen, owner[group])
+        yield LeftOut(out, rest, rows)
+
+
+def error_left_out(fit: Fit, learned: Measurements, *, noise: Noise) -> tuple[float | None, int]:
+    """Normalised error of free runs of the parts left out, and the number of values that it is a mean over.
+
+    Parameters
+    ----------
+    fit
+        Of a simulation to all of the recordings. It is made again without each part, from where it is.
+    learned
+        These recordings.
+    noise
+        See `siq.estimation.free_runs.free_run`.
+
+    Returns
+    -------
+    float or None, int
+        None where a fit does not settle, or a simulation runs away.
+    """
+    total, values = 0.0, 0
+    for part in parts_left_out(learned):
+        try:
+            again = fit_with_process_noise_as_needed(fit.model, part.rest, replace(fit, x=fit.x[part.rows]))
+            run = free_run(again.model, part.out, noise=noise, substeps=max(again.substeps, fit.substeps))
+        except NumericalFailure:
+            return None, 0
+        error = normalised_rms(part.out.outputs, run)
+        if error is None or not again.converged:
+            return None, 0
+        scored = int(np.isfinite(part.out.outputs[run.scored]).sum())
+        total, values = total + scored * error**2, values + scored
+    return float(np.sqrt(total / values)), values
+
+
+def _joined(stretches: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Stretches of rows, those that follow each other as one."""
+    whole: list[tuple[int, int]] = []
+    for begin, end in stretches:
+        if whole and whole[-1][1] == begin:
+            whole[-1] = (whole[-1][0], end)
+        else:
+            whole.append((begin, end))
+    return whole
+
+
+def _stretches(
+    data: Measurements, stretches: list[tuple[int, int]], owner: np.ndarray
+) -> tuple[Measurements, np.ndarray]:
+    """Stretches of rows as recordings of their own, and their rows; the inputs stay whole."""
+    rows = np.concatenate([np.arange(begin, end) for begin, end in stretches])
+    return replace(
+        data,
+        labels=tuple(
+            f"{data.labels[place]}, rows {a} to {b}" for place, (a, b) in zip(owner, stretches, strict=True)
+        ),
+        first=np.concatenate([[0], np.cumsum([end - begin for begin, end in stretches])]),
+        t=data.t[rows],
+        outputs=data.outputs[rows],
+        courses=tuple(data.courses[place] for place in owner) if data.courses else data.courses,
+    ), rows
