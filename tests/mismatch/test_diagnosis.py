@@ -17,14 +17,12 @@ from siq.dynamics.cards import load_system
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.parametric import Signals
 from siq.errors import InputError, NumericalFailure
-from siq.estimation.measurements import Measurements
 from siq.mismatch import investigation, trials
 from siq.mismatch.case import read_case
-from siq.mismatch.described import MECHANISM, Model, Part
 from siq.mismatch.diagnosis import Diagnosis, solve_case
 from siq.mismatch.dictionary import standard_dictionary
-from siq.mismatch.evidence import log_evidence_of
 from siq.mismatch.held_out import held_out_runs
+from siq.mismatch.nameless_models import MECHANISM, Material, Model, Part
 from siq.mismatch.naming import Naming
 from siq.mismatch.probes import Probe
 from siq.mismatch.remainder import Remainder
@@ -215,12 +213,12 @@ def test_random_forces_are_no_mechanism_with_a_formula(tmp_path: Path) -> None:
 def test_random_forces_are_no_noise_where_a_function_beside_them_is_likelier(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def models(data: Measurements, search: Search, *_: Any, **__: Any) -> tuple[Model, ...]:
+    def models(search: Search, _: Material) -> tuple[Model, ...]:
         # A function of a sensor that leaves random forces, and is likelier than forces alone.
         assert search.recalibrated.has_process_noise
         candidate = next(each.candidate for each, _ in search.screened if not each.candidate.equations)
         part = Part(TriedMechanism(candidate, search.recalibrated, 50.0, 40.0, 0.0, 0.0), MECHANISM, 0.0)
-        return (Model((part,), search.recalibrated, log_evidence_of(search.recalibrated, data) + 5.0),)
+        return (Model((part,), search.recalibrated, 5.0),)
 
     monkeypatch.setattr(investigation, "models_of_the_nameless", models)
     diagnosis = solved(tmp_path, recordings_of(nothing, drive=0.05, count=4), study={"held_out": ["r2"]})
