@@ -26,7 +26,7 @@ from siq.estimation.innovations import Noise, solve, whiten
 from siq.estimation.linearisation import Grid, Linearisation, linearise, substeps_needed
 from siq.estimation.measurements import Measurements
 from siq.estimation.noise import noise_along
-from siq.estimation.shooting import Iterate, Shooting, changed
+from siq.estimation.shooting import INEXACT, Iterate, Shooting, changed
 
 SUBSTEP_ERROR = 3e-6  # of the spread of a state: far below what any sensor resolves
 SETTLED = 1e-4  # change of the innovations, squared and per sample, at which a fit has converged
@@ -223,7 +223,7 @@ def _gauss_newton(
             )  # fmt: skip
         shooting.charge()
         white = whiten(now.along, data, noise)
-        change, _ = solve(white.columns, white.innovations)
+        change, _ = solve(white.columns, white.innovations, least=shooting.resolution)
         explained = white.columns @ change
         left = white.innovations - explained
         # A shortened step leaves much of what is foreseen undone, and the forecast unchanged.
@@ -250,8 +250,9 @@ def _gauss_newton(
         now, length = step
         whole = length == 1.0
     return _fit_at(
-        shooting.model, data, now, noise=noise, substeps=shooting.grid.substeps, converged=converged
-    )
+        shooting.model, data, now, noise=noise, substeps=shooting.grid.substeps, converged=converged,
+        resolution=shooting.resolution,
+    )  # fmt: skip
 
 
 def fit_of_states(
@@ -275,16 +276,25 @@ def fit_of_states(
         return _failed(model, at, noise, substeps, RUNS_AWAY)
     try:
         noise = noise_along(at.along, data, noise, estimate_process=False)
-        return _fit_at(model, data, at, noise=noise, substeps=substeps, converged=converged)
+        return _fit_at(
+            model, data, at, noise=noise, substeps=substeps, converged=converged, resolution=INEXACT
+        )
     except (ArithmeticError, np.linalg.LinAlgError) as error:
         return _failed(model, at, noise, substeps, str(error))
 
 
 def _fit_at(
-    model: Dynamics, data: Measurements, at: Iterate, *, noise: Noise, substeps: int, converged: bool
+    model: Dynamics,
+    data: Measurements,
+    at: Iterate,
+    *,
+    noise: Noise,
+    substeps: int,
+    converged: bool,
+    resolution: float,
 ) -> Fit:
     white = whiten(at.along, data, noise)
-    change, covariance = solve(white.columns, white.innovations)
+    change, covariance = solve(white.columns, white.innovations, least=resolution)
     # The last change is below the errors. The likelihood is that of the states in hand, not of a forecast.
     total = float(white.innovations @ white.innovations)
     return Fit(

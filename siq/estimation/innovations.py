@@ -195,8 +195,15 @@ def process_covariance(transition: np.ndarray, step: np.ndarray, intensity: np.n
     return total * (step / 6)[:, None, None]
 
 
-def solve(columns: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def solve(columns: np.ndarray, target: np.ndarray, *, least: float = RANK) -> tuple[np.ndarray, np.ndarray]:
     """Least squares with columns of any scale; what the data do not tell is left alone.
+
+    Parameters
+    ----------
+    columns, target
+        Shapes ``(n, p)`` and ``(n,)``.
+    least
+        Singular values below this share of the largest tell nothing.
 
     Returns
     -------
@@ -216,7 +223,7 @@ def solve(columns: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarr
     scale[scale == 0] = 1.0
     triangle = triangle_of(columns, target)
     left, values, right = np.linalg.svd(triangle[:, :-1] / scale, full_matrices=False)
-    kept = values > RANK * values[0] if values[0] > 0 else np.zeros(len(values), dtype=bool)
+    kept = values > least * values[0] if values[0] > 0 else np.zeros(len(values), dtype=bool)
     inverse = right[kept].T / values[kept] / scale[:, None]
     return inverse @ (left[:, kept].T @ triangle[:, -1]), inverse @ inverse.T
 

@@ -10,12 +10,13 @@ import numpy as np
 from siq.dynamics.dynamics import Dynamics
 from siq.estimation.budget import Budget, evaluation
 from siq.estimation.closure import ClosedFunctions
-from siq.estimation.innovations import Noise, process_covariance, solve, with_parameters_changed
+from siq.estimation.innovations import RANK, Noise, process_covariance, solve, with_parameters_changed
 from siq.estimation.kernels import smoothed_states, whitened_innovations
 from siq.estimation.linearisation import Grid, Linearisation, linearise
 from siq.estimation.measurements import Measurements
 
 SMALLEST_STEP = 1 / 64
+INEXACT = 1e-4  # numerical: of effects carried along whole trajectories, where f may jump, the rest is error
 NONLINEAR = 0.5  # share of a step's effect that may be unforeseen before the step is shortened
 HARMLESS = 0.1  # of a filter's own corrections: what is unforeseen below that is corrected as they are
 
@@ -87,6 +88,11 @@ class Shooting:
     filtered: bool = False
     closed: ClosedFunctions | None = None
     budget: Budget | None = None
+
+    @property
+    def resolution(self) -> float:
+        """How unlike the effects of parameters have to be for the data to tell them apart; see `solve`."""
+        return RANK if self.filtered else INEXACT
 
     def charge(self, evaluations: float = 1.0) -> None:
         """Count evaluations of the likelihood.
@@ -187,7 +193,7 @@ def state_changes(
     begin = np.empty((len(data.labels), gap.shape[1]))
     for place, (start, end) in enumerate(zip(data.first[:-1], data.first[1:], strict=True)):
         columns = initial[start:end].reshape(-1, gap.shape[1])
-        begin[place] = solve(columns, innovations[start:end].ravel())[0]
+        begin[place] = solve(columns, innovations[start:end].ravel(), least=INEXACT)[0]
     return StateChanges(
         *smoothed_states(
             data.first,
