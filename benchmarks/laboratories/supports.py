@@ -71,7 +71,7 @@ def weakest(laboratory: Laboratory, recordings: Recordings, library: CandidateLi
     support, values = np.array(list(true)), np.array(list(true.values()))
     unit = Diffusion.identity(laboratory.dimension)
     noise = laboratory.intensities[0] * np.ones(laboratory.dimension)
-    if laboratory.sensor_noise:
+    if any(laboratory.sensor_noise):
         view, start = View(library, unit, None), Noise(laboratory.sensor**2, noise)
         fit = settled(view, support, unbroken(recordings), start, values=values, x=recordings.values)
         return float((np.abs(fit.model.values) / fit.standard_errors).min())

@@ -33,6 +33,7 @@ from siq.identify.library import CandidateLibrary, total_degree
 MOST_MOVES = 200  # numerical, a guard: each lowers the score
 BREADTH = 50  # numerical: supports whose neighbours are looked at; twice as many find no better ones
 SAME = 1e-10  # of a term's square: what is left of it beside the others is rounding
+TOGETHER = 0.1  # of the probability of a false term: a second way to get one should hardly add to the first
 FURTHER_DEGREE = 1  # of a function that the user named: it is no less likely than a state itself
 
 
@@ -193,11 +194,11 @@ def best_support(equation: Equation) -> tuple[int, ...]:
 def lacks_terms(equation: Equation, support: Sequence[int]) -> bool:
     """Whether all functions of some degree fit better than chance would let them, once those are there.
 
-    Chance may do so as often as it may bring in a false term, which the critical values say; the degrees
-    share that.
+    Chance may do so a tenth as often as it may bring in a false term, which the critical values say; the
+    degrees share that.
     """
     levels = np.unique(equation.critical)
-    chance = 2 * scipy.special.ndtr(-equation.critical).sum() / len(levels)
+    chance = TOGETHER * 2 * scipy.special.ndtr(-equation.critical).sum() / len(levels)
     own = equation.chi_square(support)
     for most in levels:
         whole = np.union1d(np.flatnonzero(equation.critical <= most), np.array(support, dtype=int))
