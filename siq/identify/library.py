@@ -207,8 +207,7 @@ def check_origin(library: CandidateLibrary, x: np.ndarray, *, names: Sequence[st
     digits = int(np.floor(np.log10(half[worst])))
     raise NumericalFailure(
         f"{names[worst]} stays so far from zero, between {low[worst]:.6g} and {high[worst]:.6g}, that its"
-        f" powers cannot be told apart; subtract {round(float(middle[worst]), -digits):.10g} from it, or name"
-        " the functions of f"
+        f" powers cannot be told apart; subtract {round(float(middle[worst]), -digits):.10g} from it"
     )
 
 
