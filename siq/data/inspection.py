@@ -28,7 +28,7 @@ from siq.data.prospects import (
     transition_sentences,
 )
 from siq.data.record_states import RecordStates, states_of_record
-from siq.data.recordings import LONGEST_STEP, Recordings, read_recordings
+from siq.data.recordings import LONGEST_STEP, Recordings, read_recordings, recordings_of
 from siq.data.transitions import Switching, switching
 from siq.numerics.measured_text import value_text
 
@@ -143,9 +143,8 @@ def inspect(source: str | Path | Recordings | pd.DataFrame) -> Inspection:
     """
     if isinstance(source, str | Path):
         return inspect_recordings(source)
-    if isinstance(source, Recordings):
-        return inspection_of(source)
-    return inspection_of(Recordings.from_frame(source), file="the table")
+    named = "the recordings" if isinstance(source, Recordings) else "the table"
+    return inspection_of(recordings_of(source), file=named)
 
 
 def inspect_recordings(path: str | Path) -> Inspection:

@@ -225,9 +225,8 @@ class Dynamics:
             for parameter, value in zip(self.parameters, values, strict=True)
         )
         result = replace(self, parameters=tuple(changed))
-        for (
-            name
-        ) in COMPILED:  # formulas and names are the same, and compiling them takes longer than most uses
+        # Formulas and names are the same, and compiling them takes longer than most uses.
+        for name in COMPILED:
             if name in self.__dict__:
                 result.__dict__[name] = self.__dict__[name]
         return result

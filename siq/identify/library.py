@@ -196,12 +196,13 @@ def check_origin(library: CandidateLibrary, x: np.ndarray, *, names: Sequence[st
     """
     low, high = x.min(axis=0), x.max(axis=0)
     middle, half = (low + high) / 2, (high - low) / 2
-    away = np.abs(middle) > FAR * half
+    if not (np.abs(middle) > FAR * half).any():
+        return
     columns = library.evaluate(x)
     size = np.linalg.norm(columns, axis=0)
     values = np.linalg.svd(np.linalg.qr(columns / np.where(size > 0, size, 1.0), mode="r"), compute_uv=False)
     # Covariances lose twice the digits that coefficients lose.
-    if not away.any() or values[-1] > np.sqrt(np.finfo(float).eps) * values[0]:
+    if values[-1] > np.sqrt(np.finfo(float).eps) * values[0]:
         return
     worst = int(np.argmax(np.abs(middle) / np.where(half > 0, half, np.inf)))
     digits = int(np.floor(np.log10(half[worst])))

@@ -29,6 +29,7 @@ import numpy as np
 from scipy import stats
 
 from siq.certificate.tests import Verdict
+from siq.data.record_states import BINS
 from siq.data.recordings import Recordings
 from siq.data.selection import joined
 from siq.data.stationarity import correlated_samples, runs_of, usual_step
@@ -42,7 +43,6 @@ from siq.reference.fokker_planck import CELLS
 NO_WONDER = 0.01  # probability of no hop at all, below which it contradicts the prediction
 NODES = 41  # of the integral over the prediction's own error
 FEWEST = 20  # independent samples: fewer say nothing of a distribution
-BINS = 40  # of a histogram
 PLACES = 200  # at which distribution functions are compared
 MEAN_DISTANCE = 0.8687  # of Kolmogorov's statistic: √(π/2) ln 2
 

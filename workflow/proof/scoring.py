@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -94,6 +95,15 @@ class Answer:
     card: str
     seconds: float = np.nan
     failure: str = ""
+
+
+def read_answers(path: str | Path) -> dict[str, Answer]:
+    """The answers of a batch by name of the case."""
+    found = json.loads(Path(path).read_text(encoding="utf-8"))
+    return {
+        each["case"]: Answer(each["verdict"], each["card"], each["seconds"], each["failure"])
+        for each in found
+    }
 
 
 def score_case(name: str, folder: str | Path, keys: str | Path, answer: Answer) -> dict[str, Any]:

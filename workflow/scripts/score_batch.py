@@ -4,28 +4,18 @@ from workflow.warm import run_warm
 
 run_warm()
 
-import json
 from pathlib import Path
 from typing import Any
 
 from siq.study.tables import write_table
 from step import job
-from workflow.proof.scoring import Answer, score_case, score_table
-
-
-def batch_answers(path: str | Path) -> dict[str, Answer]:
-    """The answers of a batch by name of the case."""
-    found = json.loads(Path(path).read_text(encoding="utf-8"))
-    return {
-        each["case"]: Answer(each["verdict"], each["card"], each["seconds"], each["failure"])
-        for each in found
-    }
+from workflow.proof.scoring import read_answers, score_case, score_table
 
 
 def main(snakemake: Any) -> None:
     """Run as a rule's script."""
     folder, keys = Path(snakemake.input.cases), Path(snakemake.input.opened)
-    answers = batch_answers(snakemake.input.answers)
+    answers = read_answers(snakemake.input.answers)
     rows = [score_case(name, folder / name, keys, answer) for name, answer in answers.items()]
     write_table(snakemake.output.table, score_table(rows))
 

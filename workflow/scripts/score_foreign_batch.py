@@ -4,29 +4,19 @@ from workflow.warm import run_warm
 
 run_warm()
 
-import json
 from pathlib import Path
 from typing import Any
 
 from siq.study.tables import write_table
 from step import job
 from workflow.proof.foreign_scores.scores import foreign_score_table, score_foreign_case
-from workflow.proof.scoring import Answer
-
-
-def batch_answers(path: str | Path) -> dict[str, Answer]:
-    """The answers of a batch by name of the case."""
-    found = json.loads(Path(path).read_text(encoding="utf-8"))
-    return {
-        each["case"]: Answer(each["verdict"], each["card"], each["seconds"], each["failure"])
-        for each in found
-    }
+from workflow.proof.scoring import read_answers
 
 
 def main(snakemake: Any) -> None:
     """Run as a rule's script."""
     folder, keys = Path(snakemake.input.cases), Path(snakemake.input.opened)
-    answers = batch_answers(snakemake.input.answers)
+    answers = read_answers(snakemake.input.answers)
     rows = [score_foreign_case(name, folder / name, keys, answer) for name, answer in answers.items()]
     write_table(snakemake.output.table, foreign_score_table(rows))
 
