@@ -1,0 +1,41 @@
+"""`siq` itself, with the settings of every user but for its time, and held-out recordings that choose nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from benchmarks.discrepancies.answers import Answer
+from siq.errors import NumericalFailure
+from siq.mismatch.case import Comparison
+from siq.mismatch.diagnosis import solve_case
+from siq.mismatch.study import Allowance
+from siq.mismatch.verdict import statement_of_failure
+from workflow.proof.foreign_scores.rulers import said_place
+from workflow.proof.scoring import NOTHING
+
+SEARCHING = 0.75  # of the time allowed: what follows the search is not cut short
+
+
+def diagnosed(case: Comparison, seconds: float) -> Answer:
+    """The diagnosis within a time.
+
+    Held-out recordings are called ``tests``: other methods choose nothing by them either.
+    """
+    settings = case.settings.model_copy(
+        update={"budget": Allowance(seconds=SEARCHING * seconds), "tests": case.kept.labels}
+    )
+    try:
+        found = solve_case(replace(case, settings=settings))
+    except NumericalFailure as error:
+        return Answer(
+            fault=str(error), card=case.system.to_card(), verdict=statement_of_failure(str(error)).as_data()
+        )
+    verdict = found.statement.as_data()
+    equations, coordinates = said_place(verdict)
+    return Answer(
+        detected=verdict["verdict"] not in NOTHING,
+        equations=tuple(sorted(equations)),
+        coordinates=tuple(sorted(coordinates)),
+        card=found.to_card(),
+        verdict=verdict,
+    )

@@ -1,0 +1,141 @@
+"""Sparse regression of derivatives (PySINDy), plain and in its weak form."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from benchmarks.discrepancies.added import Polynomial, products
+from benchmarks.discrepancies.answers import Answer, Term
+from benchmarks.discrepancies.regression import Equation, Found, chosen_terms, joint, powers
+from benchmarks.discrepancies.states import SeenStates, seen_states
+from siq.dynamics.dynamics import Dynamics
+from siq.estimation.measurements import Measurements
+from siq.estimation.recalibration import recalibrate
+from siq.mismatch.case import Comparison
+
+WINDOW = 8.0  # samples, at least, of half a window of the weak form; by default a twentieth of a recording
+WINDOWS = 0.5  # for each sample
+SEED = 0  # of where windows lie
+
+
+def plain(case: Comparison) -> Answer:
+    """Derivatives of smoothing splines, regressed on a library of degree three."""
+    return _regressed(case, weak=False)
+
+
+def weak(case: Comparison) -> Answer:
+    """Integrals against test functions in the place of derivatives."""
+    return _regressed(case, weak=True)
+
+
+def _regressed(case: Comparison, *, weak: bool) -> Answer:
+    recalibrated, _ = recalibrate(case.system, case.learn)
+    model = recalibrated.model
+    seen = seen_states(model, case.learn)
+    if seen is None:
+        return Answer(applied=False, values=values_of(model), fault="a state cannot be had from what was measured")
+    exponents = powers(len(seen.coordinates))
+    equations = (weak_equations if weak else plain_equations)(model, case.learn, seen, exponents)
+    return said(model, equations, [chosen_terms(each) for each in equations], exponents)
+
+
+def values_of(model: Dynamics) -> dict[str, float]:
+    """The parameters' values by name."""
+    return {each.name: float(each.value) for each in model.parameters}
+
+
+def dynamic(model: Dynamics) -> list[int]:
+    """Places of the equations that something can be missing in: all but ``x' = v``."""
+    return [place for place, kinematic in enumerate(model.kinematic) if not kinematic]
+
+
+def plain_equations(
+    model: Dynamics, data: Measurements, seen: SeenStates, exponents: np.ndarray
+) -> list[Equation]:
+    """What the card leaves of the derivatives of smoothed states, at the samples."""
+    rates = model.functions.rates(seen.x, seen.signals, model.values)
+    _, slopes = model.functions.slopes(seen.x, seen.signals, model.values)
+    library, rows = products(exponents, seen.coordinates), seen.inside
+    return [
+        Equation(
+            place, (seen.rates - rates)[place, rows], slopes[place][:, rows].T, library[:, rows].T,
+            seen.block[rows], seen.fold[rows],
+        )
+        for place in dynamic(model)
+    ]  # fmt: skip
+
+
+def weak_equations(
+    model: Dynamics, data: Measurements, seen: SeenStates, exponents: np.ndarray
+) -> list[Equation]:
+    """What the card leaves of integrals of the derivatives against test functions, by PySINDy's own weights."""
+    from pysindy.feature_library import PolynomialLibrary, WeakPDELibrary  # noqa: PLC0415 (takes seconds)
+
+    np.random.seed(SEED)  # noqa: NPY002 (PySINDy draws its windows from numpy's global generator)
+    rates = model.functions.rates(seen.x, seen.signals, model.values)
+    _, slopes = model.functions.slopes(seen.x, seen.signals, model.values)
+    library = products(exponents, seen.coordinates)
+    d, p = rates.shape[0], slopes.shape[1]
+    # Library, rates and slopes are known functions of the states already: the weak form only integrates them.
+    columns = np.concatenate([rates, slopes.reshape(d * p, -1), library]).T
+    integrals, derivatives, middles = [], [], []
+    for begin, end in zip(data.first[:-1], data.first[1:], strict=True):
+        rows = slice(begin, end)
+        t = data.t[rows]
+        half = max((t[-1] - t[0]) / 20, WINDOW * float(np.median(np.diff(t))))
+        windows = WeakPDELibrary(
+            function_library=PolynomialLibrary(degree=1, include_bias=False), spatiotemporal_grid=t,
+            K=max(int(WINDOWS * len(t)), 10), H_xt=min(half, 0.45 * (t[-1] - t[0])),
+        )  # fmt: skip
+        weights, inside = windows.fullweights0, windows.inds_k
+        integrals.append(np.stack([w @ columns[rows][k[0]] for w, k in zip(weights, inside, strict=True)]))
+        derivatives.append(windows.convert_u_dot_integral(seen.x[:, rows].T))
+        middles.append(begin + np.array([int(np.mean(k[0])) for k in inside]))
+    summed, driven, middle = map(np.concatenate, (integrals, derivatives, middles))
+    return [
+        Equation(
+            place, driven[:, place] - summed[:, place], summed[:, d + place * p : d + (place + 1) * p],
+            summed[:, d + d * p :], seen.block[middle], seen.fold[middle],
+        )
+        for place in dynamic(model)
+    ]  # fmt: skip
+
+
+def said(model: Dynamics, equations: list[Equation], found: list[Found], exponents: np.ndarray) -> Answer:
+    """The answer of a regression: terms of the equations that are better foreseen with them.
+
+    Where nothing is detected the card stays as it was recalibrated.
+    """
+    strongest = max(range(len(found)), key=lambda k: found[k].evidence)
+    evidence = found[strongest].evidence
+    detected = [one.detected for one in found]
+    if not any(detected):
+        return Answer(evidence=evidence, values=values_of(model))
+    strongest = max(np.flatnonzero(detected), key=lambda k: found[k].evidence)
+    coefficients, change = joint(equations, found)
+    values = model.values
+    values[list(model.free)] += change
+    kept = np.flatnonzero(np.any(coefficients != 0, axis=0))
+    whole = np.zeros((model.dimension, len(kept)))
+    for row, equation in zip(coefficients, equations, strict=True):
+        whole[equation.state] = row[kept]
+    terms = tuple(
+        Term(equation=model.states[state], exponents=tuple(map(int, exponents[kept[k]])), coefficient=whole[state, k])
+        for state, k in np.argwhere(whole != 0)
+    )
+    first = exponents[int(np.where(found[strongest].support, found[strongest].contributions, -1).argmax())]
+    return Answer(
+        detected=True,
+        evidence=evidence,
+        equations=(model.states[equations[strongest].state],),
+        coordinates=along(model, first),
+        terms=terms,
+        values=values_of(model.with_values(values)),
+        added=Polynomial(exponents=exponents[kept].tolist(), coefficients=whole.tolist()),
+    )
+
+
+def along(model: Dynamics, exponents: np.ndarray) -> tuple[str, ...]:
+    """The states and inputs that a product depends on."""
+    names = (*model.states, *(each.name for each in model.inputs))
+    return tuple(name for name, power in zip(names, exponents, strict=True) if power)
