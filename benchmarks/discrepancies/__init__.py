@@ -8,12 +8,14 @@
 `added`        what can a method add to the equations of a card?
 `states`       which states, and which derivatives, can be had from what was measured?
 `regression`   which terms of a library explain what a card leaves over?
+`refit`        of what was found, what is kept?
 `sindy`        sparse regression of derivatives, plain and in its weak form
 `gaussian`     Gaussian processes of what is left over
 `segments`     recordings in short segments, for training through an integrator
 `universal`    a universal differential equation: a network within the equations
 `ours`         `siq` itself
 `methods`      all of them by name, and how one is run within its time
+`asking`       every method asked about every case
 `simulation`   how does a card with something added run freely?
 `truth`        what is concealed, as a polynomial, and what does an oracle do?
 `scores`       what of an answer is right? One row a case and method

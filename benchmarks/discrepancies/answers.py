@@ -94,3 +94,8 @@ def write_answer(path: Path, answer: Answer) -> None:
 def read_answer(path: Path) -> Answer:
     """Read an answer."""
     return Answer.model_validate_json(path.read_text(encoding="utf-8"))
+
+
+def answer_file(folder: Path, generator: str, case: str, method: str) -> Path:
+    """Where the answer of a method lies."""
+    return folder / "answers" / generator / f"{case}-{method.replace(', ', '-').replace(' ', '-')}.json"

@@ -1,4 +1,7 @@
-"""Which cases are there, and how are their keys made again? Both generators of the proof, from seeds of their own."""
+"""Which cases are there, and how are their keys made again?
+
+They come from both generators of the proof, from seeds of their own.
+"""
 
 from __future__ import annotations
 

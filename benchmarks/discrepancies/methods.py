@@ -8,19 +8,21 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.discrepancies import ours, sindy
+from benchmarks.discrepancies import gaussian, ours, sindy, universal
 from benchmarks.discrepancies.answers import Answer, read_answer, write_answer
 from benchmarks.discrepancies.cases import CaseFiles
 from siq.mismatch.case import Comparison
 
 Report = Callable[[Answer], None]
 Method = Callable[[Comparison, float, Report], Answer]
-"""Takes a case, the seconds allowed, and a function that keeps the best answer so far; returns the last one."""
+"""Takes a case, the seconds allowed, and a function that keeps the best answer so far."""
 
 METHODS: Mapping[str, Method] = {
     "siq": lambda case, seconds, report: ours.diagnosed(case, seconds),
-    "PySINDy": lambda case, seconds, report: sindy.plain(case),
-    "PySINDy, weak": lambda case, seconds, report: sindy.weak(case),
+    "PySINDy": sindy.plain,
+    "PySINDy, weak": sindy.weak,
+    "Gaussian process": gaussian.gaussian_process,
+    "universal differential equation": universal.universal,
 }
 
 

@@ -1,4 +1,4 @@
-"""`siq` itself, with the settings of every user but for its time, and held-out recordings that choose nothing."""
+"""`siq` itself, with the settings of every user but for its time; held-out recordings choose nothing."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Which terms of a library explain what a card leaves over? Sequentially thresholded least squares.
 
 What other values of the card's own free parameters can do is no discrepancy: their columns take part in every
-fit without a penalty, by being projected out of the target and of the library. The threshold is the largest whose
-error on parts left out is within one standard error of the least one.
+fit without a penalty, by being projected out of the target and of the library. The threshold is the largest
+whose error on parts left out is within one standard error of the least one.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ def improvement(first: np.ndarray, second: np.ndarray) -> tuple[float, float]:
 
 def fitted(equation: Equation, rows: np.ndarray, threshold: float) -> tuple[np.ndarray, np.ndarray]:
     """Coefficients ``(L,)`` of the library and changes ``(p,)`` of parameters, told by some rows."""
-    from pysindy import STLSQ  # noqa: PLC0415 (takes seconds)
+    from pysindy import STLSQ
 
     left, parameters, library = equation.left[rows], equation.parameters[rows], equation.library[rows]
     coefficients = np.zeros(library.shape[1])
@@ -143,14 +143,16 @@ def fitted(equation: Equation, rows: np.ndarray, threshold: float) -> tuple[np.n
         if len(free) and scale > 0:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # that no term is left is an answer
-                found = STLSQ(threshold=threshold, alpha=1e-3).fit(beyond[:, free] / size[free], target / scale)
+                found = STLSQ(threshold=threshold, alpha=1e-3).fit(
+                    beyond[:, free] / size[free], target / scale
+                )
             coefficients[free] = found.coef_.ravel() * scale / size[free]
     slopes = least_squares(parameters, left - library @ coefficients)
     return coefficients, slopes
 
 
 def joint(equations: Sequence[Equation], found: Sequence[Found]) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients ``(equations, L)`` of chosen terms and changes ``(p,)`` of parameters, of all equations at once.
+    """Coefficients ``(equations, L)`` of chosen terms, and changes ``(p,)`` of parameters, of all equations.
 
     Parameters are shared by equations; each is weighed by what remains of it.
     """

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from benchmarks.discrepancies.added import Polynomial, products
 from benchmarks.discrepancies.answers import Answer, Term
+from benchmarks.discrepancies.refit import refitted, runs_better
 from benchmarks.discrepancies.regression import Equation, Found, chosen_terms, joint, powers
 from benchmarks.discrepancies.states import SeenStates, seen_states
 from siq.dynamics.dynamics import Dynamics
+from siq.estimation.estimation import Fit
 from siq.estimation.measurements import Measurements
 from siq.estimation.recalibration import recalibrate
 from siq.mismatch.case import Comparison
@@ -16,27 +20,54 @@ from siq.mismatch.case import Comparison
 WINDOW = 8.0  # samples, at least, of half a window of the weak form; by default a twentieth of a recording
 WINDOWS = 0.5  # for each sample
 SEED = 0  # of where windows lie
+WORSE = "what was found runs worse than the card along the recordings that it was learned from"
+UNSEEN = "a state cannot be had from what was measured"
+Report = Callable[[Answer], None]
 
 
-def plain(case: Comparison) -> Answer:
+def plain(case: Comparison, seconds: float, report: Report) -> Answer:
     """Derivatives of smoothing splines, regressed on a library of degree three."""
-    return _regressed(case, weak=False)
+    return _regressed(case, report, weak=False)
 
 
-def weak(case: Comparison) -> Answer:
+def weak(case: Comparison, seconds: float, report: Report) -> Answer:
     """Integrals against test functions in the place of derivatives."""
-    return _regressed(case, weak=True)
+    return _regressed(case, report, weak=True)
 
 
-def _regressed(case: Comparison, *, weak: bool) -> Answer:
+def _regressed(case: Comparison, report: Report, *, weak: bool) -> Answer:
     recalibrated, _ = recalibrate(case.system, case.learn)
     model = recalibrated.model
     seen = seen_states(model, case.learn)
     if seen is None:
-        return Answer(applied=False, values=values_of(model), fault="a state cannot be had from what was measured")
+        return Answer(
+            applied=False, values=values_of(model), fault="a state cannot be had from what was measured"
+        )
     exponents = powers(len(seen.coordinates))
     equations = (weak_equations if weak else plain_equations)(model, case.learn, seen, exponents)
-    return said(model, equations, [chosen_terms(each) for each in equations], exponents)
+    report(Answer(values=values_of(model)))
+    answer = said(model, equations, [chosen_terms(each) for each in equations], exponents)
+    report(answer)
+    return _kept(answer, recalibrated, case.learn, seen)
+
+
+def _kept(answer: Answer, card: Fit, data: Measurements, seen: SeenStates) -> Answer:
+    """The answer with refitted coefficients; without them where the card runs better than any of them."""
+    if not isinstance(answer.added, Polynomial):
+        return answer
+    values = np.array([answer.values[each.name] for each in card.model.parameters])
+    model, added = refitted(card, card.model.with_values(values), answer.added, data)
+    if not runs_better(card.model, model, added, data, seen.first_states(data)):
+        return answer.model_copy(update={"values": values_of(card.model), "added": None, "fault": WORSE})
+    coefficients = {
+        (model.states[state], tuple(added.exponents[term])): added.coefficients[state][term]
+        for state, term in np.argwhere(np.array(added.coefficients) != 0)
+    }
+    terms = tuple(
+        each.model_copy(update={"coefficient": coefficients[each.equation, each.exponents]})
+        for each in answer.terms
+    )
+    return answer.model_copy(update={"values": values_of(model), "added": added, "terms": terms})
 
 
 def values_of(model: Dynamics) -> dict[str, float]:
@@ -68,8 +99,8 @@ def plain_equations(
 def weak_equations(
     model: Dynamics, data: Measurements, seen: SeenStates, exponents: np.ndarray
 ) -> list[Equation]:
-    """What the card leaves of integrals of the derivatives against test functions, by PySINDy's own weights."""
-    from pysindy.feature_library import PolynomialLibrary, WeakPDELibrary  # noqa: PLC0415 (takes seconds)
+    """What the card leaves of integrals of derivatives against test functions, by PySINDy's own weights."""
+    from pysindy.feature_library import PolynomialLibrary, WeakPDELibrary
 
     np.random.seed(SEED)  # noqa: NPY002 (PySINDy draws its windows from numpy's global generator)
     rates = model.functions.rates(seen.x, seen.signals, model.values)
@@ -120,19 +151,31 @@ def said(model: Dynamics, equations: list[Equation], found: list[Found], exponen
     for row, equation in zip(coefficients, equations, strict=True):
         whole[equation.state] = row[kept]
     terms = tuple(
-        Term(equation=model.states[state], exponents=tuple(map(int, exponents[kept[k]])), coefficient=whole[state, k])
+        Term(
+            equation=model.states[state],
+            exponents=tuple(map(int, exponents[kept[k]])),
+            coefficient=whole[state, k],
+        )
         for state, k in np.argwhere(whole != 0)
     )
-    first = exponents[int(np.where(found[strongest].support, found[strongest].contributions, -1).argmax())]
     return Answer(
         detected=True,
         evidence=evidence,
-        equations=(model.states[equations[strongest].state],),
-        coordinates=along(model, first),
+        equations=tuple(
+            model.states[each.state] for each, one in zip(equations, found, strict=True) if one.detected
+        ),
+        coordinates=along(model, strongest_term(found[strongest], exponents)),
         terms=terms,
         values=values_of(model.with_values(values)),
         added=Polynomial(exponents=exponents[kept].tolist(), coefficients=whole.tolist()),
     )
+
+
+def strongest_term(found: Found, exponents: np.ndarray) -> np.ndarray:
+    """Exponents of the term that does most; a constant only where nothing else was chosen."""
+    size = np.where(found.support, found.contributions, -1.0)
+    size = np.where(exponents.any(axis=1), size, size / 1e12)
+    return exponents[int(np.where(found.support, size, -1.0).argmax())]
 
 
 def along(model: Dynamics, exponents: np.ndarray) -> tuple[str, ...]:

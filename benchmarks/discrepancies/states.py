@@ -1,8 +1,8 @@
 """Which states, and which derivatives, can be had from what was measured?
 
-As one would without a filter: a smoothing spline of every output that is a state (its stiffness by generalised
-cross-validation), and where ``x' = v`` the derivative of one as the other. A state that cannot be had in this
-way is missing, and so is every method that needs it.
+As one would without a filter: a smoothing spline of every output that is a state (its stiffness by
+generalised cross-validation), and where ``x' = v`` the derivative of one as the other. Where a state cannot
+be had in this way, no method that needs it can be applied.
 """
 
 from __future__ import annotations
@@ -49,6 +49,10 @@ class SeenStates:
     def coordinates(self) -> np.ndarray:
         """States and inputs, shape ``(d + i, n)``."""
         return np.concatenate([self.x, self.signals.inputs])
+
+    def first_states(self, data: Measurements) -> np.ndarray:
+        """States in which the recordings begin, shape ``(recordings, d)``."""
+        return self.x[:, data.first[:-1]].T
 
 
 def seen_states(model: Dynamics, data: Measurements) -> SeenStates | None:

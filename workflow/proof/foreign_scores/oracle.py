@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import scipy.optimize
@@ -174,7 +175,27 @@ def _jacobian(
     return np.nan_to_num(flat, nan=0.0, posinf=0.0, neginf=0.0)
 
 
-def free_errors(model: Dynamics, kept: Measurements, noise: np.ndarray, truth: Truth) -> np.ndarray:
+class Simulator(Protocol):
+    """What runs a model along recordings, such as `Integrator`."""
+
+    model: Dynamics
+    data: Measurements
+
+    def run(self, values: np.ndarray, starts: np.ndarray) -> np.ndarray:
+        """States at all samples, shape ``(n, d)``, from the first ones ``(recordings, d)``."""
+
+    def outputs(self, states: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """What is measured at the samples, ``(n, m)``, for states ``(n, d)``."""
+
+
+def free_errors(
+    model: Dynamics,
+    kept: Measurements,
+    noise: np.ndarray,
+    truth: Truth,
+    *,
+    simulator: Callable[[Dynamics, Measurements], Simulator] = Integrator,
+) -> np.ndarray:
     """Normalised squared errors of a free run of held-out recordings, the mean over outputs at each sample.
 
     The first states are those that fit the first fifth of a recording best, which is not scored; what it does
@@ -190,10 +211,12 @@ def free_errors(model: Dynamics, kept: Measurements, noise: np.ndarray, truth: T
         Deviation of each output's noise.
     truth
         Tells where the system usually is.
+    simulator
+        Makes what runs the model.
     """
     lengths = np.diff(kept.first)
     rows = np.maximum((PREFIX * lengths).astype(int), SHORTEST)
-    prefix = Integrator(model, kept.until(rows))
+    prefix = simulator(model, kept.until(rows))
     usual, spread = truth.states.mean(axis=0), WIDE * truth.states.std(axis=0)
     added = model.dimension - len(usual)  # states that the truth has none of
     usual, spread = np.append(usual, np.zeros(added)), np.append(spread, np.ones(added))
@@ -210,7 +233,7 @@ def free_errors(model: Dynamics, kept: Measurements, noise: np.ndarray, truth: T
             state = model.states.index(str(formula))
             begin[:, state] = (kept.outputs[kept.first[:-1], place] - usual[state]) / spread[state]
     best = _settled(residuals, begin.ravel(), shape, prefix)
-    whole = Integrator(model, kept)
+    whole = simulator(model, kept)
     outputs = whole.outputs(whole.run(model.values, usual + spread * best.reshape(shape)), model.values)
     scored = np.arange(len(kept.t)) - kept.first[kept.recording] >= rows[kept.recording]
     measured = kept.outputs[scored]
@@ -223,7 +246,7 @@ def _settled(
     residuals: Callable[[np.ndarray], np.ndarray],
     begin: np.ndarray,
     shape: tuple[int, int],
-    prefix: Integrator,
+    prefix: Simulator,
 ) -> np.ndarray:
     """First states by least squares; each recording has its own, so that they are differenced together."""
     recordings, d = shape
