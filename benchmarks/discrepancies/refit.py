@@ -1,4 +1,4 @@
-"""Of what was found, what is kept? What runs better than the card, formulas being refitted along trajectories.
+"""Of what was found, what is kept? What runs better than the card; formulas are refitted along trajectories.
 
 Regression of derivatives leaves biased numbers. So a formula gets the same fit as the card's own parameters
 got, which is more than the method itself would do. A simulation that then runs worse along the recordings
