@@ -21,8 +21,8 @@ from benchmarks.discrepancies.regression import (
     Equation,
     block_means,
     fitted,
-    improvement,
     powers,
+    sureness,
 )
 from benchmarks.discrepancies.sindy import WORSE, plain_equations, values_of
 from benchmarks.discrepancies.states import SeenStates, seen_states
@@ -78,7 +78,9 @@ def gaussian_process(case: Comparison, seconds: float, report: Report) -> Answer
     if answer.added is not None:
         values = np.array([answer.values[each.name] for each in model.parameters])
         for mended in (model.with_values(values), model):
-            if runs_better(model, mended, answer.added, case.learn, seen.first_states(case.learn)):
+            if runs_better(
+                model, mended, answer.added, case.learn, seen.first_states(case.learn, recalibrated)
+            ):
                 return answer.model_copy(update={"values": values_of(mended)})
         answer = answer.model_copy(update={"values": values_of(model), "added": None, "fault": WORSE})
     return answer
@@ -141,9 +143,7 @@ def _process(equation: Equation, seen: SeenStates, model: Dynamics) -> Fitted:
                 )
         rows = thinned(np.arange(len(z)), POINTS)
         final = GaussianProcessRegressor(told, optimizer=None).fit(z[rows], y[rows])
-    gain, unsure = improvement(
-        block_means(y**2, equation.block), block_means((y - foreseen) ** 2, equation.block)
-    )
+    evidence = sureness(block_means(y**2, equation.block), block_means((y - foreseen) ** 2, equation.block))
     lengths = np.atleast_1d(told.k1.k2.length_scale)
     kernel = Kernel(
         equation=equation.state,
@@ -151,7 +151,7 @@ def _process(equation: Equation, seen: SeenStates, model: Dynamics) -> Fitted:
         weights=(size * told.k1.k1.constant_value * final.alpha_).tolist(),
         lengths=lengths.tolist(),
     )
-    return Fitted(kernel, gain / unsure if unsure > 0 else 0.0, lengths, slopes)
+    return Fitted(kernel, evidence, lengths, slopes)
 
 
 def thinned(rows: np.ndarray, most: int) -> np.ndarray:

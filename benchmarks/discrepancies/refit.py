@@ -7,6 +7,7 @@ that it was learned from is not used: nobody would.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -70,10 +71,23 @@ def refitted(
 
 
 def runs_better(
-    card: Dynamics, model: Dynamics, added: Added, data: Measurements, starts: np.ndarray
+    card: Dynamics, model: Dynamics, added: Added, data: Measurements, starts: Sequence[np.ndarray]
 ) -> bool:
-    """Whether a mended simulation runs better than the card along the recordings, from first states."""
-    return _error(model, added, data, starts) < _error(card, None, data, starts)
+    """Whether a mended simulation runs better than the card along the recordings.
+
+    Parameters
+    ----------
+    card
+        Recalibrated.
+    model, added
+        The mended one.
+    data
+        The recordings.
+    starts
+        First states as they may be told, ``(recordings, d)`` each; every simulation has those that suit it best.
+    """
+    mended = min(_error(model, added, data, each) for each in starts)
+    return mended < min(_error(card, None, data, each) for each in starts)
 
 
 def _error(model: Dynamics, added: Added | None, data: Measurements, starts: np.ndarray) -> float:

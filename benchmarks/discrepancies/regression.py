@@ -2,7 +2,7 @@
 
 What other values of the card's own free parameters can do is no discrepancy: their columns take part in every
 fit without a penalty, by being projected out of the target and of the library. The threshold is the largest
-whose error on parts left out is within one standard error of the least one.
+whose errors on parts left out are within one standard error of the least ones.
 """
 
 from __future__ import annotations
@@ -13,10 +13,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.stats
 
 DEGREE = 3
 THRESHOLDS = np.geomspace(1.0, 0.01, 10)  # of a term's size in that of the target
 SURE = 2.0  # standard errors by which parts left out must be foreseen better than by the card
+HARDLY = 1.0  # the same for one threshold against the best
 DEPENDENT = 1e-4  # share of a column that parameters cannot do, below which it is theirs
 FEWEST = 4  # blocks, from which on an improvement has a standard error
 
@@ -98,12 +100,10 @@ def chosen_terms(equation: Equation) -> Found:
     means = block_means(squares, equation.block)
     best = int(means.mean(axis=1).argmin())
     chosen = best
-    for place in range(best):  # the sparsest that is not surely worse than the best
-        worse, unsure = improvement(means[place], means[best])
-        if worse <= unsure:
+    for place in range(best):  # the sparsest that is hardly worse than the best
+        if sureness(means[place], means[best]) <= HARDLY:
             chosen = place
             break
-    gain, unsure = improvement(means[0], means[chosen])
     everything = np.ones(len(equation.left), dtype=bool)
     threshold = (np.inf, *THRESHOLDS)[chosen]
     coefficients, slopes = fitted(equation, everything, threshold)
@@ -111,7 +111,7 @@ def chosen_terms(equation: Equation) -> Found:
     return Found(
         coefficients != 0,
         np.abs(coefficients) * np.sqrt(np.mean(equation.library**2, axis=0)),
-        gain / unsure if unsure > 0 else 0.0,
+        sureness(means[0], means[chosen]),
         float(np.std(remains)) or 1e-300,
     )
 
@@ -121,12 +121,22 @@ def block_means(squares: np.ndarray, block: np.ndarray) -> np.ndarray:
     return np.stack([squares[..., block == one].mean(axis=-1) for one in np.unique(block)], axis=-1)
 
 
-def improvement(first: np.ndarray, second: np.ndarray) -> tuple[float, float]:
-    """By how much the one of two mean squared errors exceeds the other, and the standard error of this."""
+def sureness(first: np.ndarray, second: np.ndarray) -> float:
+    """How surely the one of two errors exceeds the other, in standard errors: Wilcoxon's signed-rank test.
+
+    Ranks, since a few blocks of large motion may have nearly all of the gain: the standard error of the mean
+    gain would then be as large as the gain.
+
+    Parameters
+    ----------
+    first, second
+        Mean squared errors of blocks, shape ``(blocks,)``.
+    """
     gain = first - second
-    if len(gain) < FEWEST:
-        return float(gain.mean()), np.inf
-    return float(gain.mean()), float(gain.std(ddof=1) / np.sqrt(len(gain)))
+    if len(gain) < FEWEST or not gain.any() or not np.isfinite(gain).all():
+        return 0.0
+    chance = scipy.stats.wilcoxon(gain, alternative="greater", method="asymptotic").pvalue
+    return float(scipy.stats.norm.isf(chance))
 
 
 def fitted(equation: Equation, rows: np.ndarray, threshold: float) -> tuple[np.ndarray, np.ndarray]:

@@ -57,7 +57,7 @@ def _kept(answer: Answer, card: Fit, data: Measurements, seen: SeenStates) -> An
         return answer
     values = np.array([answer.values[each.name] for each in card.model.parameters])
     model, added = refitted(card, card.model.with_values(values), answer.added, data)
-    if not runs_better(card.model, model, added, data, seen.first_states(data)):
+    if not runs_better(card.model, model, added, data, seen.first_states(data, card)):
         return answer.model_copy(update={"values": values_of(card.model), "added": None, "fault": WORSE})
     coefficients = {
         (model.states[state], tuple(added.exponents[term])): added.coefficients[state][term]

@@ -15,6 +15,7 @@ import scipy.interpolate
 
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.parametric import Signals
+from siq.estimation.estimation import Fit
 from siq.estimation.measurements import Measurements
 
 TRIMMED = 0.05  # of a recording, at each end, where derivatives of a smoothing spline are poor
@@ -50,9 +51,9 @@ class SeenStates:
         """States and inputs, shape ``(d + i, n)``."""
         return np.concatenate([self.x, self.signals.inputs])
 
-    def first_states(self, data: Measurements) -> np.ndarray:
-        """States in which the recordings begin, shape ``(recordings, d)``."""
-        return self.x[:, data.first[:-1]].T
+    def first_states(self, data: Measurements, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
+        """States in which the recordings begin, ``(recordings, d)``: as seen, and as the card's fit has them."""
+        return self.x[:, data.first[:-1]].T, fit.x[data.first[:-1]]
 
 
 def seen_states(model: Dynamics, data: Measurements) -> SeenStates | None:

@@ -20,7 +20,7 @@ import torch
 from benchmarks.discrepancies.added import Network, products
 from benchmarks.discrepancies.answers import Answer, Term
 from benchmarks.discrepancies.refit import runs_better
-from benchmarks.discrepancies.regression import SURE, Equation, chosen_terms, improvement, powers
+from benchmarks.discrepancies.regression import SURE, Equation, chosen_terms, powers, sureness
 from benchmarks.discrepancies.segments import Segments, segments_of
 from benchmarks.discrepancies.sindy import WORSE, along, dynamic, strongest_term, values_of
 from benchmarks.discrepancies.states import SeenStates, parts, seen_states, smooth
@@ -37,7 +37,7 @@ BEGIN = 80  # steps with the card alone
 CARD = 0.15  # of the time, at most, for these
 TAUGHT = 300  # steps in which the network learns what the card leaves of smoothed derivatives, to begin with
 CHECK = 40  # steps between looks at what is left out
-PATIENCE = 25  # looks without a gain, after which training ends
+PATIENCE = 15  # looks without a gain, after which training ends
 ADAM = 0.75  # of the time left for training; the rest is L-BFGS's
 REGRESSING = 7.0  # seconds kept for the regression
 SEED = 0
@@ -58,13 +58,12 @@ def universal(case: Comparison, seconds: float, report: Report) -> Answer:
     outside = torch.optim.Adam([left_out.starts], lr=2 * RATE)
     both = Both(Training(recalibrated, case.learn, learned), left_out, outside)
     without, best = trained(both, end, seen_states(recalibrated.model, case.learn))
-    gain, unsure = improvement(without.left_out, best.left_out)
-    evidence = gain / unsure if unsure > 0 else 0.0
+    evidence = sureness(without.left_out, best.left_out)
     if not evidence > SURE:
         return Answer(evidence=evidence, values=values_of(recalibrated.model))
     answer = _said(recalibrated, case.learn, both.learned.network(best), best, evidence)
     mended, starts = recalibrated.model.with_values(best.values), recalibrated.x[case.learn.first[:-1]]
-    if runs_better(recalibrated.model, mended, both.learned.network(best), case.learn, starts):
+    if runs_better(recalibrated.model, mended, both.learned.network(best), case.learn, [starts]):
         return answer
     return answer.model_copy(update={"values": values_of(recalibrated.model), "added": None, "fault": WORSE})
 

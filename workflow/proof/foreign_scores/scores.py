@@ -100,7 +100,7 @@ def score_foreign_case(name: str, folder: str | Path, keys: str | Path, answer: 
         row["wrong_name"] = not row["name_error"] <= NEAR
         row["right"] = not row["wrong_name"]
     try:
-        oracle = true_simulation(case, key, truth, _starts(case, keys / f"{name}.npz"))
+        oracle = true_simulation(case, key, truth, first_states(case, keys / f"{name}.npz"))
         row |= gains(case, key, truth, oracle, answer)
         if key.kind == "withheld":
             row |= places(key, told_places(case, key, oracle.true), answer)
@@ -109,7 +109,7 @@ def score_foreign_case(name: str, folder: str | Path, keys: str | Path, answer: 
     return row | {"note": "; ".join(each for each in notes if each)}
 
 
-def _starts(case: Comparison, path: Path) -> np.ndarray:
+def first_states(case: Comparison, path: Path) -> np.ndarray:
     """True first states of the recordings that were learned from; labels are r01, r02, and so on."""
     with np.load(path, allow_pickle=False) as arrays:
         starts = arrays["starts"]
