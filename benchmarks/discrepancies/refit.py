@@ -84,7 +84,7 @@ def runs_better(
     data
         The recordings.
     starts
-        First states as they may be told, ``(recordings, d)`` each; every simulation has those that suit it best.
+        First states as they may be told, ``(recordings, d)`` each; a simulation has those that suit it best.
     """
     mended = min(_error(model, added, data, each) for each in starts)
     return mended < min(_error(card, None, data, each) for each in starts)

@@ -52,7 +52,7 @@ class SeenStates:
         return np.concatenate([self.x, self.signals.inputs])
 
     def first_states(self, data: Measurements, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
-        """States in which the recordings begin, ``(recordings, d)``: as seen, and as the card's fit has them."""
+        """First states of the recordings, ``(recordings, d)``: as seen, and as the card's fit has them."""
         return self.x[:, data.first[:-1]].T, fit.x[data.first[:-1]]
 
 

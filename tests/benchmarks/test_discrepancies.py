@@ -1,4 +1,4 @@
-"""A spring that stiffens, and a card that does not know: every method finds the equation, and predicts better."""
+"""A spring that stiffens, and a card that does not know: every method finds where, and predicts better."""
 
 from __future__ import annotations
 
@@ -171,8 +171,8 @@ def test_simulations_agree_with_those_of_the_proof(stiffening: tuple[Comparison,
 
 def test_what_is_added_survives_its_file(tmp_path: Path) -> None:
     network = Network(
-        weights=[[[0.5, 0.1]], [[2.0], [0.0]]], biases=[[0.1], [0.3, 0.0]], middle=[0.0, 1.0], width=[1.0, 2.0],
-        size=[1.0, 0.5],
+        weights=[[[0.5, 0.1]], [[2.0], [0.0]]], biases=[[0.1], [0.3, 0.0]],
+        middle=[0.0, 1.0], width=[1.0, 2.0], size=[1.0, 0.5],
     )  # fmt: skip
     process = Process(
         kernels=[Kernel(equation=1, points=[[0.0, 0.0]], weights=[2.0], lengths=[1.0, 2.0])],
