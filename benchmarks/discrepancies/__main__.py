@@ -30,7 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--settings", type=Path, default=Path("config/discrepancies.yaml"))
     parser.add_argument("--folder", type=Path, default=Path("results/discrepancies"))
-    parser.add_argument("--seconds", type=float, default=60.0, help="for each case and method, on one core")
+    parser.add_argument("--seconds", type=float, default=60.0, help="of a core, for each case and method")
     parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=list(METHODS), metavar="NAME")
     parser.add_argument(
         "--cases", type=int, default=None, help="only the first so many cases are asked about"

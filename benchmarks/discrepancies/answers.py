@@ -55,7 +55,7 @@ class Answer(BaseModel):
     verdict
         The content of ``verdict.json``, of `siq`.
     seconds
-        By the clock, on one core.
+        Of a core.
     fault
         Why there is no answer, or which part of it is missing.
     commit

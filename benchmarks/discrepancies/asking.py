@@ -24,7 +24,7 @@ def ask(cases: Sequence[CaseFiles], folder: Path, methods: Sequence[str], *, sec
     methods
         Names of `benchmarks.discrepancies.methods.METHODS`.
     seconds
-        Allowed for each case and method, by the clock.
+        Of a core, allowed for each case and method.
     """
     warm()
     commit, began = commit_now(), time.perf_counter()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 from benchmarks.discrepancies.answers import Answer
@@ -13,7 +14,7 @@ from siq.mismatch.verdict import statement_of_failure
 from workflow.proof.foreign_scores.rulers import said_place
 from workflow.proof.scoring import NOTHING
 
-SEARCHING = 0.75  # of the time allowed: what follows the search is not cut short
+SEARCHING = 0.6  # of the time allowed: what follows the search is not cut short
 
 
 def diagnosed(case: Comparison, seconds: float) -> Answer:
@@ -25,7 +26,7 @@ def diagnosed(case: Comparison, seconds: float) -> Answer:
         update={"budget": Allowance(seconds=SEARCHING * seconds), "tests": case.kept.labels}
     )
     try:
-        found = solve_case(replace(case, settings=settings))
+        found = solve_case(replace(case, settings=settings), clock=time.process_time)
     except NumericalFailure as error:
         return Answer(
             fault=str(error), card=case.system.to_card(), verdict=statement_of_failure(str(error)).as_data()

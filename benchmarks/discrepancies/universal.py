@@ -37,7 +37,7 @@ BEGIN = 80  # steps with the card alone
 CARD = 0.15  # of the time, at most, for these
 TAUGHT = 300  # steps in which the network learns what the card leaves of smoothed derivatives, to begin with
 CHECK = 40  # steps between looks at what is left out
-PATIENCE = 15  # looks without a gain, after which training ends
+PATIENCE = 10  # looks without a gain, after which training ends
 ADAM = 0.75  # of the time left for training; the rest is L-BFGS's
 REGRESSING = 7.0  # seconds kept for the regression
 SEED = 0
@@ -47,7 +47,7 @@ Report = Callable[[Answer], None]
 
 def universal(case: Comparison, seconds: float, report: Report) -> Answer:
     """Train a universal differential equation within a time, and say what its network has learned."""
-    end = time.perf_counter() + seconds - REGRESSING
+    end = time.process_time() + seconds - REGRESSING
     recalibrated, _ = recalibrate(case.system, case.learn)
     report(Answer(values=values_of(recalibrated.model)))
     torch.set_default_dtype(torch.float64)
@@ -243,7 +243,7 @@ def taught(equations: Equations, seen: SeenStates) -> None:
 def trained(both: Both, end: float, seen: SeenStates | None = None) -> tuple[State, State]:
     """Train the card alone, then with its network: the states that foresee best what is left out."""
     equations = both.learned.equations
-    begin = time.perf_counter()
+    begin = time.process_time()
     without = _with_adam(
         both, [both.learned.starts, equations.change], _looked(both, 20),
         end=begin + CARD * (end - begin), most=BEGIN // CHECK,
@@ -253,9 +253,7 @@ def trained(both: Both, end: float, seen: SeenStates | None = None) -> tuple[Sta
     equations.on = True
     own = [both.learned.starts, *equations.parameters()]
     best = _with_adam(both, own, without, end=begin + ADAM * (end - begin))
-    if best is not without:
-        best = _with_newton(both, own, best, end=end)
-    return without, best
+    return without, _with_newton(both, own, best, end=end)
 
 
 def _looked(both: Both, steps: int) -> State:
@@ -281,9 +279,9 @@ def _with_adam(
     """Steps of Adam until a time, a number of looks, or until nothing is gained any more."""
     optimizer = torch.optim.Adam(own, lr=RATE)
     look = last = 0
-    while time.perf_counter() < end and look - last < PATIENCE and (most is None or look < most):
+    while time.process_time() < end and look - last < PATIENCE and (most is None or look < most):
         for _ in range(CHECK):
-            if time.perf_counter() > end or not _step(optimizer, both.learned, both.learned.equations):
+            if time.process_time() > end or not _step(optimizer, both.learned, both.learned.equations):
                 break
         look += 1
         found = _looked(both, 10)
@@ -302,12 +300,14 @@ def _with_newton(both: Both, own: list[torch.nn.Parameter], best: State, *, end:
         loss.backward()
         return loss
 
-    longest = 0.0
-    while (now := time.perf_counter()) + longest < end:
+    longest, look, last = 0.0, 0, 0
+    while (now := time.process_time()) + longest < end and look - last < PATIENCE:
         if not torch.isfinite(fine.step(closure)):
             break
-        best = _better(best, _looked(both, 10))
-        longest = max(longest, time.perf_counter() - now)
+        look, found = look + 1, _looked(both, 10)
+        if _better(best, found) is found:
+            best, last = found, look
+        longest = max(longest, time.process_time() - now)
     return best
 
 

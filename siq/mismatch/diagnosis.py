@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -149,7 +150,12 @@ def diagnose(
     return solve_case(comparison_of(system, recordings, settings))
 
 
-def solve_case(case: Comparison, *, tell: Callable[[str], None] = LOGGER.info) -> Diagnosis:
+def solve_case(
+    case: Comparison,
+    *,
+    tell: Callable[[str], None] = LOGGER.info,
+    clock: Callable[[], float] = time.monotonic,
+) -> Diagnosis:
     """Diagnose what `siq.read_case` has read; see `diagnose`.
 
     Parameters
@@ -158,6 +164,8 @@ def solve_case(case: Comparison, *, tell: Callable[[str], None] = LOGGER.info) -
         What is compared with what.
     tell
         Called with what is being done, whenever something new begins; by default it is logged.
+    clock
+        Seconds by which the budget is kept, such as `time.process_time` where others share the core.
 
     Raises
     ------
@@ -165,7 +173,7 @@ def solve_case(case: Comparison, *, tell: Callable[[str], None] = LOGGER.info) -
         When the simulation cannot be fitted at all.
     """
     allowed = case.settings.budget
-    budget = Budget(work=allowed.evaluations, seconds=allowed.seconds, tell=tell)
+    budget = Budget(work=allowed.evaluations, seconds=allowed.seconds, tell=tell, clock=clock)
     try:
         found = investigate(case.system, case.learn, case.dictionary, case.settings, budget=budget)
         shown = held_out_runs(found, case.learn, case.kept, tests=case.settings.tests)
