@@ -114,10 +114,24 @@ def normalised_rms(outputs: np.ndarray, simulated: FreeRun) -> float | None:
     simulated
         The free run of the same recordings.
     """
+    squares = squared_errors(outputs, simulated)
+    return None if squares is None else float(np.sqrt(squares.mean()))
+
+
+def squared_errors(outputs: np.ndarray, simulated: FreeRun) -> np.ndarray | None:
+    """Squared errors over the variance of each output, of every value that is scored; see `normalised_rms`.
+
+    Returns
+    -------
+    numpy.ndarray or None
+        Shape ``(values,)``, sample by sample; what was not measured is left out. None where a simulation ran
+        away.
+    """
     measured = outputs[simulated.scored]
     error = simulated.outputs[simulated.scored] - measured
     known = np.isfinite(measured)
     if not np.isfinite(error[known]).all():
         return None
     spread = np.nanvar(measured, axis=0)
-    return float(np.sqrt(np.nanmean(error**2 / np.where(spread > 0, spread, 1.0))))
+    squares: np.ndarray = (error**2 / np.where(spread > 0, spread, 1.0))[known]
+    return squares

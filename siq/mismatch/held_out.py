@@ -3,82 +3,21 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from siq.dynamics.dynamics import Dynamics
 from siq.estimation.estimation import Fit
-from siq.estimation.free_runs import FreeRun, free_run, normalised_rms, told_rows
+from siq.estimation.free_runs import FreeRun, free_run, squared_errors
 from siq.estimation.measurements import Measurements
+from siq.mismatch.held_out_errors import HeldOutErrors, change_between, in_blocks
 from siq.mismatch.investigation import Investigation, MismatchVerdict
-from siq.mismatch.left_out import error_left_out
+from siq.mismatch.left_out import errors_left_out
 from siq.mismatch.nameless_models import Model
 
 LOGGER = logging.getLogger(__name__)
-Change = Literal["better", "same", "worse", "unknown"]
-WIDE = 1.96  # standard errors within which 95 % lie
-
-
-@dataclass(frozen=True)
-class HeldOutErrors:
-    """Normalised errors on held-out recordings; None where a simulation ran away.
-
-    Attributes
-    ----------
-    before, recalibrated, augmented
-        Of the simulation as it is, with its parameters refitted, and with what was found.
-    noise_floor
-        What measurement noise alone amounts to.
-    values
-        Number of measured values that the errors are means over; 0 where it is not known.
-    named
-        With what has a name only, where something without a name describes the rest.
-    """
-
-    before: float | None
-    recalibrated: float | None
-    augmented: float | None
-    noise_floor: float | None
-    values: int = 0
-    named: float | None = None
-
-    @property
-    def without(self) -> float | None:
-        """The better one of the simulation as it is and with its parameters refitted."""
-        return min((each for each in (self.before, self.recalibrated) if each is not None), default=None)
-
-    @property
-    def tolerance(self) -> float:
-        """Relative difference of two errors that so many values show by chance in one case out of twenty.
-
-        The root mean square of n independent values has the relative standard error 1/√(2n).
-        """
-        return WIDE / float(np.sqrt(2 * self.values)) if self.values else 0.0
-
-    def change(self, first: float | None, second: float | None) -> Change:
-        """Whether one error is better than another, by more than the number of values lets appear by chance.
-
-        Parameters
-        ----------
-        first, second
-            Without and with what is judged; None where the simulation ran away.
-        """
-        if first is None and second is None:
-            return "unknown"
-        if first is None or second is None:
-            return "better" if first is None else "worse"
-        if second < first * (1 - self.tolerance):
-            return "better"
-        return "worse" if second * (1 - self.tolerance) > first else "same"
-
-    def at_noise(self, error: float | None) -> bool:
-        """Whether an error is that of measurement noise alone."""
-        if error is None or self.noise_floor is None:
-            return False
-        return error * (1 - self.tolerance) <= self.noise_floor
 
 
 @dataclass(frozen=True)
@@ -117,7 +56,7 @@ class HeldOutRuns:
     @property
     def gained(self) -> bool:
         """Whether the augmented simulation is better than the others."""
-        return self.errors.change(self.errors.without, self.errors.augmented) == "better"
+        return self.errors.change("without", "augmented") == "better"
 
 
 def held_out_runs(
@@ -148,13 +87,13 @@ def held_out_runs(
     search = investigation.search
     noise, substeps = search.recalibrated.noise, max(search.fit.substeps, search.recalibrated.substeps)
 
-    def error_of(model: Dynamics, where: Measurements, finer: int = 0) -> float | None:
+    def errors_of(model: Dynamics, where: Measurements, finer: int = 0) -> np.ndarray | None:
         run = free_run(model, where, noise=noise, substeps=max(substeps, finer))
-        return normalised_rms(where.outputs, run)
+        return squared_errors(where.outputs, run)
 
     def error_where_learned(model: Dynamics) -> float:
-        error = error_of(model, learned)
-        return np.inf if error is None else error
+        errors = errors_of(model, learned)
+        return np.inf if errors is None else float(errors.mean())
 
     def best_of(*fits: Fit | None) -> Fit:
         known = [each for each in fits if each is not None]
@@ -174,19 +113,19 @@ def held_out_runs(
     adopted = None
     if choices and judges:
         some = data.select(judges)
-        without = [error_of(plain.model, some, plain.substeps)]
+        without = [errors_of(plain.model, some, plain.substeps)]
         if not named:
-            without = [error_of(investigation.model, some), error_of(recalibrated, some)]
-        errors = ((error_of(fit.model, some, fit.substeps), _scored(some)) for _, fit in choices)
-        adopted = first_better(_least(without), errors)
+            without = [errors_of(investigation.model, some), errors_of(recalibrated, some)]
+        known = [each for each in without if each is not None]
+        least = min(known, key=np.mean, default=None)
+        adopted = first_better(least, (errors_of(fit.model, some, fit.substeps) for _, fit in choices))
     elif choices:
-        base = plain if named else search.recalibrated
-        alone, _ = error_left_out(base, learned, noise=noise)
-        left_out = [error_left_out(fit, learned, noise=noise) for _, fit in choices]
-        LOGGER.info("parts left out: %s without, %s with models of what has no name", alone, left_out)
-        known = [place for place, (error, _) in enumerate(left_out) if error is not None]
-        for best in sorted(known, key=lambda place: left_out[place][0] or 0.0)[:1]:
-            adopted = best if first_better(alone, [left_out[best]]) == 0 else None
+        alone = errors_left_out(plain if named else search.recalibrated, learned, noise=noise)
+        left_out = [errors_left_out(fit, learned, noise=noise) for _, fit in choices]
+        errors = [np.inf if each is None else float(each.mean()) for each in left_out]
+        LOGGER.info("parts left out: mean squared errors %s with models of what has no name", errors)
+        best = int(np.argmin(errors))
+        adopted = best if first_better(alone, [left_out[best]]) == 0 else None
     described, fit = (None, plain) if named or not choices else choices[0]
     if adopted is not None:
         described, fit = choices[adopted]
@@ -198,19 +137,18 @@ def held_out_runs(
     # What a fit leaves may be more than noise; the one that leaves less is nearer to it.
     least = np.minimum(search.fit.noise.measurement, fit.noise.measurement)
     floor = np.sqrt(np.mean(least / np.where(spread > 0, spread, 1.0)))
+    runs = {
+        "before": squared_errors(data.outputs, before),
+        "recalibrated": squared_errors(data.outputs, refitted),
+        "augmented": squared_errors(data.outputs, run),
+        "named": errors_of(plain.model, data, plain.substeps) if named and adopted is not None else None,
+    }
     return HeldOutRuns(
         before=before,
         recalibrated=refitted,
         augmented=run,
         model=fit.model,
-        errors=HeldOutErrors(
-            before=normalised_rms(data.outputs, before),
-            recalibrated=normalised_rms(data.outputs, refitted),
-            augmented=normalised_rms(data.outputs, run),
-            noise_floor=float(floor),
-            values=int(np.isfinite(data.outputs[before.scored]).sum()),
-            named=error_of(plain.model, data, plain.substeps) if named and adopted is not None else None,
-        ),
+        errors=HeldOutErrors.of(runs, noise_floor=float(floor)),
         independent=not set(learned.labels) & set(data.labels),
         described=described,
         described_fit=fit if described is not None else None,
@@ -218,27 +156,18 @@ def held_out_runs(
     )
 
 
-def first_better(without: float | None, errors: Iterable[tuple[float | None, int]]) -> int | None:
-    """The place of the first of several errors that is better than one; None where none is.
+def first_better(without: np.ndarray | None, models: Iterable[np.ndarray | None]) -> int | None:
+    """The place of the first of several models that foresees better than without it; None where none does.
 
     Parameters
     ----------
     without
-        The error without any of the models; None where it ran away.
-    errors
-        Of each model, the likeliest first, with the number of values that each is a mean over.
+        Squared errors without any of the models, shape ``(values,)``; None where it ran away.
+    models
+        Those of each model, the likeliest first.
     """
-    for place, (error, values) in enumerate(errors):
-        if HeldOutErrors(None, None, None, None, values).change(without, error) == "better":
+    blocks = None if without is None else in_blocks(without)
+    for place, squares in enumerate(models):
+        if squares is not None and change_between(blocks, in_blocks(squares)) == "better":
             return place
     return None
-
-
-def _least(errors: Sequence[float | None]) -> float | None:
-    return min((each for each in errors if each is not None), default=None)
-
-
-def _scored(data: Measurements) -> int:
-    """How many values of free runs of recordings are scored."""
-    within = np.arange(len(data.t)) - data.first[data.recording]
-    return int(np.isfinite(data.outputs[within >= told_rows(data)[data.recording]]).sum())
