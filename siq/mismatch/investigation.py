@@ -86,6 +86,8 @@ class Investigation:
         Of what has no name, be it all that is missing or what names leave, the likeliest first.
     account
         The work that it took, and whether something was left undone.
+    withdrawn
+        Whether a name was given, and mislead on recordings held out (`siq.mismatch.withdrawal`).
     """
 
     verdict: MismatchVerdict
@@ -104,12 +106,16 @@ class Investigation:
     naming: Naming | None = None
     models: tuple[Model, ...] = ()
     account: Account = UNLIMITED
+    withdrawn: bool = False
 
     @property
     def too_faint(self) -> bool:
         """Whether what was found explains enough, and is not named since a function is nearly as likely."""
         return (
-            self.verdict is MismatchVerdict.UNEXPLAINED and self.naming is not None and self.naming.convincing
+            self.verdict is MismatchVerdict.UNEXPLAINED
+            and not self.withdrawn
+            and self.naming is not None
+            and self.naming.convincing
         )
 
     @property

@@ -151,7 +151,12 @@ def left_over(description: Description) -> tuple[str, ...]:
     """Why a mismatch has no name: what is left, and whether it looks like noise."""
     p = description.p_residuals_random
     lines = []
-    if description.by and description.too_faint:
+    if description.by and description.misleading:
+        lines.append(
+            "It is not named: with it, recordings held out are foreseen worse than without, so that it stands in"
+            " for something else."
+        )
+    elif description.by and description.too_faint:
         lines.append(
             "It is not named, since a smooth function that the dictionary does not have is nearly as likely."
         )
@@ -348,6 +353,8 @@ def _unexplained(statement: Statement) -> str:
     what = " and ".join(f"{_noun(each)}{_place(each)}" for each in description.by)
     what += _or_else(description.by[0]) if len(description.by) == 1 else ""
     share = percent(description.share_described)
+    if description.misleading:
+        return f"{begin}. It looks like {what}, but recordings held out are foreseen worse with that."
     if description.too_faint:
         return f"{begin}. It looks like {what}, which is not certain enough to be named."
     if description.share_described > 1 - SMALLEST_SHARE:

@@ -186,6 +186,8 @@ class Description:
     p_alike
         Probability that as many mechanisms explain as much of an effect that has no name; None where nothing
         is left.
+    misleading
+        Whether the mechanisms in `by` are not named since recordings held out are foreseen worse with them.
     """
 
     share_described: float
@@ -194,6 +196,7 @@ class Description:
     random_forces_admitted: bool
     too_faint: bool = False
     p_alike: float | None = None
+    misleading: bool = False
 
 
 @dataclass(frozen=True)
