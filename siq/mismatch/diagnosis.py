@@ -169,10 +169,11 @@ def solve_case(case: Comparison, *, tell: Callable[[str], None] = LOGGER.info) -
     budget = Budget(work=allowed.evaluations, seconds=allowed.seconds, tell=tell)
     try:
         found = investigate(case.system, case.learn, case.dictionary, case.settings, budget=budget)
-        shown = held_out_runs(found, case.learn, case.kept, tests=case.settings.tests)
+        certain = case.settings.search.least_log_odds
+        shown = held_out_runs(found, case.learn, case.kept, certain=certain, tests=case.settings.tests)
         if not case.settings.tests and misleads(found, shown):
             found = withdrawn(found, case, budget)
-            shown = held_out_runs(found, case.learn, case.kept)
+            shown = held_out_runs(found, case.learn, case.kept, certain=certain)
         statement = statement_of(found, case.learn, shown)
     except InputError:
         raise

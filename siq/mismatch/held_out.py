@@ -64,12 +64,14 @@ def held_out_runs(
     learned: Measurements,
     data: Measurements,
     *,
+    certain: float,
     tests: Collection[str] = (),
 ) -> HeldOutRuns:
     """Show the fit on recordings that had no part in anything.
 
     Of several models of what has no name the likeliest is adopted that makes the prediction better than it is
-    without: than that of the mechanisms with a name, where there are any, or else of the simulation. Where
+    without: than that of the mechanisms with a name, where there are any, or else of the simulation. What is
+    not certain where it was found has to be better by more than appears by chance. Where
     all recordings are tests of somebody else, each part of those to learn from is left out in turn, and the
     model is adopted that foresees them best (`siq.mismatch.left_out`).
 
@@ -81,6 +83,8 @@ def held_out_runs(
         The recordings that it was found in; they decide which estimates run freely best.
     data
         The recordings held out.
+    certain
+        Logarithm of the odds from which on a model is certain where it was found.
     tests
         Labels of those that may choose nothing.
     """
@@ -118,14 +122,15 @@ def held_out_runs(
             without = [errors_of(investigation.model, some), errors_of(recalibrated, some)]
         known = [each for each in without if each is not None]
         least = min(known, key=np.mean, default=None)
-        adopted = first_better(least, (errors_of(fit.model, some, fit.substeps) for _, fit in choices))
+        errors = (errors_of(fit.model, some, fit.substeps) for _, fit in choices)
+        adopted = first_better(least, errors, [model.log_evidence >= certain for model, _ in choices])
     elif choices:
         alone = errors_left_out(plain if named else search.recalibrated, learned, noise=noise)
         left_out = [errors_left_out(fit, learned, noise=noise) for _, fit in choices]
-        errors = [np.inf if each is None else float(each.mean()) for each in left_out]
-        LOGGER.info("parts left out: mean squared errors %s with models of what has no name", errors)
-        best = int(np.argmin(errors))
-        adopted = best if first_better(alone, [left_out[best]]) == 0 else None
+        sizes = [np.inf if each is None else float(each.mean()) for each in left_out]
+        LOGGER.info("parts left out: mean squared errors %s with models of what has no name", sizes)
+        best = int(np.argmin(sizes))
+        adopted = best if first_better(alone, [left_out[best]], [False]) == 0 else None
     described, fit = (None, plain) if named or not choices else choices[0]
     if adopted is not None:
         described, fit = choices[adopted]
@@ -156,7 +161,9 @@ def held_out_runs(
     )
 
 
-def first_better(without: np.ndarray | None, models: Iterable[np.ndarray | None]) -> int | None:
+def first_better(
+    without: np.ndarray | None, models: Iterable[np.ndarray | None], certain: Iterable[bool]
+) -> int | None:
     """The place of the first of several models that foresees better than without it; None where none does.
 
     Parameters
@@ -165,9 +172,15 @@ def first_better(without: np.ndarray | None, models: Iterable[np.ndarray | None]
         Squared errors without any of the models, shape ``(values,)``; None where it ran away.
     models
         Those of each model, the likeliest first.
+    certain
+        Whether recordings that it was found in leave no doubt of it. Others have to be better by more than
+        appears by chance.
     """
-    blocks = None if without is None else in_blocks(without)
-    for place, squares in enumerate(models):
-        if squares is not None and change_between(blocks, in_blocks(squares)) == "better":
+    for place, (squares, known) in enumerate(zip(models, certain, strict=True)):
+        if squares is None:
+            continue
+        if without is None or (known and squares.mean() < without.mean()):
+            return place
+        if change_between(in_blocks(without), in_blocks(squares)) == "better":
             return place
     return None

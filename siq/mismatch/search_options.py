@@ -24,9 +24,9 @@ class SearchOptions:
     mechanisms
         Most mechanisms that are looked for.
     unnamed
-        Probability beforehand that what a simulation lacks is not in the dictionary. As likely as not, so that
-        a name takes what the recordings themselves say: of effects without a name, no more than the share
-        `wrong_names` looks so much like a mechanism.
+        Probability beforehand that what a simulation lacks is not in the dictionary. It is as likely as not
+        by default: a name then takes what the recordings say by themselves, and of effects without a name no
+        more than the share `wrong_names` looks so much like a mechanism.
     wrong_names
         Most probability of a name that is wrong, since something without a name looks alike. What is less
         certain is detected, and described.

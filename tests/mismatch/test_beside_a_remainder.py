@@ -197,18 +197,20 @@ def squares(draw: np.random.Generator, size: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("without", "models", "place"),
+    ("without", "models", "certain", "place"),
     [
-        (1.0, [0.99, 0.5, 0.1], 1),  # the first by more than chance, not the least
-        (1.0, [0.99], None),
-        (1.0, [None, 0.5], 1),  # one that runs away is none
-        (None, [3.0], 0),  # without, it runs away
-        (1.0, [], None),
+        (1.0, [0.95, 0.5, 0.1], False, 1),  # the first by more than chance, not the least
+        (1.0, [0.95], False, None),
+        (1.0, [0.95], True, 0),  # what is certain where it was found has to be better, by however little
+        (1.0, [1.2], True, None),
+        (1.0, [None, 0.5], False, 1),  # one that runs away is none
+        (None, [3.0], False, 0),  # without, it runs away
+        (1.0, [], False, None),
     ],
 )
-def test_the_likeliest_model_that_is_better_by_more_than_chance_is_adopted(
-    without: float | None, models: list, place: int | None
+def test_the_likeliest_model_that_foresees_better_is_adopted(
+    without: float | None, models: list, certain: bool, place: int | None
 ) -> None:
     draw = np.random.default_rng(1)
     runs = [None if size is None else squares(draw, size) for size in (without, *models)]
-    assert first_better(runs[0], runs[1:]) == place
+    assert first_better(runs[0], runs[1:], [certain] * len(models)) == place

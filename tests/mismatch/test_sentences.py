@@ -163,8 +163,10 @@ def test_a_gain_is_said_only_where_the_held_out_error_falls(verdict):
             assert not falls
             continue
         first, second = pair
-        assert falls == (errors.change(first, second) == "better")
-        if falls:
+        by_chance = "no more than it may by chance" in text
+        assert falls == (errors.change(first, second) == "better" or by_chance)
+        assert not by_chance or errors.change(first, second) == "same"
+        if falls and not by_chance:
             *before, after, _noise = percentages(text.split("falls from")[1])
             assert after < min(before)
         elif errors.at_noise(first) and errors.change(first, second) != "worse":
