@@ -53,11 +53,6 @@ class HeldOutRuns:
 
     adopted: bool = False
 
-    @property
-    def gained(self) -> bool:
-        """Whether the augmented simulation is better than the others."""
-        return self.errors.change("without", "augmented") == "better"
-
 
 def held_out_runs(
     investigation: Investigation,

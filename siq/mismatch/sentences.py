@@ -243,20 +243,15 @@ def gained(errors: HeldOutErrors, without: Run, with_it: Run, *, it: str, them: 
                 f"{_error(errors.before)} of their spread ({_error(first)} with its own parameters refitted)"
             )
         return f"{it}, the error on held-out recordings falls from {before} to {_error(second)}{noise}."
-    if (
-        change == "same"
-        and second < first
-        and _error(first) != _error(second)
-        and not errors.at_noise(without)
-    ):
-        return (
-            f"{it}, the error on held-out recordings falls from {_error(first)} of their spread to"
-            f" {_error(second)}, no more than it may by chance{noise}."
-        )
     if errors.at_noise(without) and change != "worse":
         return (
             f"The held-out recordings are too noisy to show it: their error is {_error(first)} without {them}"
             f" and {_error(second)} with {them}{noise}."
+        )
+    if change == "same" and second < first and _error(first) != _error(second):
+        return (
+            f"{it}, the error on held-out recordings falls from {_error(first)} of their spread to"
+            f" {_error(second)}, no more than it may by chance{noise}."
         )
     what = (
         "does not improve the prediction of recordings held out"

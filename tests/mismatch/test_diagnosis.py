@@ -301,7 +301,7 @@ def test_what_a_name_leaves_is_described_and_no_sample_of_a_test_chooses_it(
     # Whatever stands in the tests, the card is the same.
     case = diagnosis.case
     other = replace(case.kept, outputs=case.kept.outputs[::-1] + 0.3)
-    again = held_out_runs(diagnosis.investigation, case.learn, other, tests=study["tests"])
+    again = held_out_runs(diagnosis.investigation, case.learn, other, certain=3.0, tests=study["tests"])
     assert again.model == diagnosis.held_out.model
     assert again.errors.augmented != diagnosis.held_out.errors.augmented
 
