@@ -35,12 +35,17 @@ class Input:
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter with its value; a fixed one is never recalibrated."""
+    """A parameter with its value; a fixed one is never recalibrated.
+
+    Where a value is expected, estimates are about that, within its own size, unless recordings tell more
+    (`siq.estimation.expectations`).
+    """
 
     name: str
     value: float
     unit: str = "1"
     fixed: bool = False
+    expected: float | None = None
 
 
 COMPILED = ("functions", "delays", "_lags")

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from siq.dynamics.dynamics import Dynamics
 from siq.estimation.estimation import Fit
-from siq.estimation.free_runs import FreeRun, free_run, squared_errors
+from siq.estimation.free_runs import FreeRun, UsualStates, free_run, squared_errors
 from siq.estimation.measurements import Measurements
 from siq.mismatch.held_out_errors import HeldOutErrors, change_between, in_blocks
 from siq.mismatch.investigation import Investigation, MismatchVerdict
@@ -86,25 +86,26 @@ def held_out_runs(
     search = investigation.search
     noise, substeps = search.recalibrated.noise, max(search.fit.substeps, search.recalibrated.substeps)
 
-    def errors_of(model: Dynamics, where: Measurements, finer: int = 0) -> np.ndarray | None:
-        run = free_run(model, where, noise=noise, substeps=max(substeps, finer))
-        return squared_errors(where.outputs, run)
+    def run_of(fit: Fit, where: Measurements) -> FreeRun:
+        finer = max(substeps, fit.substeps)
+        return free_run(fit.model, where, noise=noise, substeps=finer, usual=UsualStates.along(fit.x))
 
-    def error_where_learned(model: Dynamics) -> float:
-        errors = errors_of(model, learned)
+    def errors_of(fit: Fit, where: Measurements) -> np.ndarray | None:
+        return squared_errors(where.outputs, run_of(fit, where))
+
+    def error_where_learned(fit: Fit) -> float:
+        errors = errors_of(fit, learned)
         return np.inf if errors is None else float(errors.mean())
 
     def best_of(*fits: Fit | None) -> Fit:
         known = [each for each in fits if each is not None]
-        if len(known) == 1:
-            return known[0]
-        return min(known, key=lambda each: error_where_learned(each.model))
+        return known[0] if len(known) == 1 else min(known, key=error_where_learned)
 
+    card = replace(search.recalibrated, model=investigation.model)
     # What fits best with random forces admitted need not be what runs best without.
-    recalibrated = search.recalibrated.model
-    if search.recalibrated.has_process_noise and np.isfinite(investigation.least_squares.sum_of_squares):
-        refits = (investigation.least_squares.model, recalibrated, investigation.model)
-        recalibrated = min(refits, key=error_where_learned)
+    recalibrated = search.recalibrated
+    if recalibrated.has_process_noise and np.isfinite(investigation.least_squares.sum_of_squares):
+        recalibrated = best_of(investigation.least_squares, recalibrated, card)
     plain = best_of(investigation.augmented_least_squares, search.fit)
     choices = [(model, best_of(model.fit, model.exact)) for model in investigation.models]
     named = investigation.verdict is MismatchVerdict.MISSING_PHYSICS
@@ -112,12 +113,10 @@ def held_out_runs(
     adopted = None
     if choices and judges:
         some = data.select(judges)
-        without = [errors_of(plain.model, some, plain.substeps)]
-        if not named:
-            without = [errors_of(investigation.model, some), errors_of(recalibrated, some)]
+        without = [errors_of(each, some) for each in ((plain,) if named else (card, recalibrated))]
         known = [each for each in without if each is not None]
         least = min(known, key=np.mean, default=None)
-        errors = (errors_of(fit.model, some, fit.substeps) for _, fit in choices)
+        errors = (errors_of(fit, some) for _, fit in choices)
         adopted = first_better(least, errors, [model.log_evidence >= certain for model, _ in choices])
     elif choices:
         alone = errors_left_out(plain if named else search.recalibrated, learned, noise=noise)
@@ -129,10 +128,7 @@ def held_out_runs(
     described, fit = (None, plain) if named or not choices else choices[0]
     if adopted is not None:
         described, fit = choices[adopted]
-    before, refitted = (
-        free_run(each, data, noise=noise, substeps=substeps) for each in (investigation.model, recalibrated)
-    )
-    run = free_run(fit.model, data, noise=noise, substeps=max(substeps, fit.substeps))
+    before, refitted, run = (run_of(each, data) for each in (card, recalibrated, fit))
     spread = np.nanvar(data.outputs[before.scored], axis=0)
     # What a fit leaves may be more than noise; the one that leaves less is nearer to it.
     least = np.minimum(search.fit.noise.measurement, fit.noise.measurement)
@@ -141,7 +137,7 @@ def held_out_runs(
         "before": squared_errors(data.outputs, before),
         "recalibrated": squared_errors(data.outputs, refitted),
         "augmented": squared_errors(data.outputs, run),
-        "named": errors_of(plain.model, data, plain.substeps) if named and adopted is not None else None,
+        "named": errors_of(plain, data) if named and adopted is not None else None,
     }
     return HeldOutRuns(
         before=before,

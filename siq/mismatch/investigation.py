@@ -13,6 +13,7 @@ from siq.dynamics.dynamics import Dynamics
 from siq.errors import NumericalFailure
 from siq.estimation.budget import UNLIMITED, Account, Budget
 from siq.estimation.estimation import Fit
+from siq.estimation.expectations import with_expectations
 from siq.estimation.measurements import Measurements
 from siq.estimation.recalibration import recalibrate
 from siq.estimation.unknown_forces import covariance_with_unknown_forces
@@ -161,6 +162,7 @@ def investigate(
         When not even the recalibrated simulation with process noise can be fitted.
     """
     options = study.search
+    model = with_expectations(model)
     roles = roles_of(model)
     candidates = considered(model, roles, dictionary, study, file=file)
     budget = budget or Budget()

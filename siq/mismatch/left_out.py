@@ -14,7 +14,7 @@ import numpy as np
 
 from siq.errors import NumericalFailure
 from siq.estimation.estimation import Fit
-from siq.estimation.free_runs import free_run, squared_errors
+from siq.estimation.free_runs import UsualStates, free_run, squared_errors
 from siq.estimation.innovations import Noise
 from siq.estimation.measurements import Measurements
 from siq.estimation.process_noise import fit_with_process_noise_as_needed
@@ -82,7 +82,10 @@ def errors_left_out(fit: Fit, learned: Measurements, *, noise: Noise) -> np.ndar
     for part in parts_left_out(learned):
         try:
             again = fit_with_process_noise_as_needed(fit.model, part.rest, replace(fit, x=fit.x[part.rows]))
-            run = free_run(again.model, part.out, noise=noise, substeps=max(again.substeps, fit.substeps))
+            run = free_run(
+                again.model, part.out, noise=noise, substeps=max(again.substeps, fit.substeps),
+                usual=UsualStates.along(again.x),
+            )  # fmt: skip
         except NumericalFailure:
             return None
         own = squared_errors(part.out.outputs, run)

@@ -24,9 +24,7 @@ class SearchOptions:
     mechanisms
         Most mechanisms that are looked for.
     unnamed
-        Probability beforehand that what a simulation lacks is not in the dictionary. It is as likely as not
-        by default: a name then takes what the recordings say by themselves, and of effects without a name no
-        more than the share `wrong_names` looks so much like a mechanism.
+        Probability beforehand that what a simulation lacks is not in the dictionary.
     wrong_names
         Most probability of a name that is wrong, since something without a name looks alike. What is less
         certain is detected, and described.
@@ -39,7 +37,7 @@ class SearchOptions:
     same: Annotated[float, Field(gt=0)] = 10.0
     fitted: Annotated[int, Field(ge=1)] = 6
     mechanisms: Annotated[int, Field(ge=1, le=5)] = 3
-    unnamed: Annotated[float, Field(gt=0, lt=1)] = 0.5
+    unnamed: Annotated[float, Field(gt=0, lt=1)] = 0.1
     wrong_names: Annotated[float, Field(gt=0, lt=0.5)] = 0.05
     blocks: Annotated[int, Field(ge=4)] = 10
 
