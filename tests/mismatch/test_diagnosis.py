@@ -423,3 +423,22 @@ def test_a_study_that_cannot_be_used_is_refused_in_a_sentence(
 def test_a_missing_column_is_told(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="u"):
         solved(tmp_path, recordings_of(nothing).drop(columns="u"))
+
+
+def test_a_name_that_misleads_on_recordings_held_out_is_withdrawn(tmp_path: Path) -> None:
+    def tilted(x: np.ndarray, v: np.ndarray, t: float) -> np.ndarray:
+        return np.where(np.arange(len(x)) % 4 == 2, 0.0, 0.4)  # r2 and r6 are level
+
+    table = recordings_of(tilted)
+    diagnosis = solved(tmp_path, table, study={"held_out": ["r2", "r6"]})
+    verdict = said(diagnosis)
+    assert verdict["verdict"] == "unexplained" and names(diagnosis) == []
+    assert verdict["description"]["misleading"] and verdict["description"]["by"][0]["name"] == "constant bias"
+    assert "looks like a constant bias in the equation of v" in verdict["sentence"]
+    assert "but recordings held out are foreseen worse with that" in verdict["sentence"]
+    assert any("stands in for something else" in line for line in verdict["words"]["left"])
+    # Nothing that was found is put into the card that would make it worse.
+    assert verdict["described"] == [] and verdict["fit"]["before"] < verdict["fit"]["augmented"]
+    # Held out otherwise, the same recordings show the bias and nothing against it.
+    diagnosis = solved(tmp_path, table[~table["recording"].isin(["r2", "r6"])], study={"held_out": ["r1"]})
+    assert said(diagnosis)["verdict"] == "missing physics"
