@@ -117,7 +117,9 @@ def held_out_runs(
         known = [each for each in without if each is not None]
         least = min(known, key=np.mean, default=None)
         errors = (errors_of(fit, some) for _, fit in choices)
-        adopted = first_better(least, errors, [model.log_evidence >= certain for model, _ in choices])
+        # Beside random forces a free run is off by them, and what a function does to that may be chance.
+        sure = [model.log_evidence >= certain and not model.fit.has_process_noise for model, _ in choices]
+        adopted = first_better(least, errors, sure)
     elif choices:
         alone = errors_left_out(plain if named else search.recalibrated, learned, noise=noise)
         left_out = [errors_left_out(fit, learned, noise=noise) for _, fit in choices]
