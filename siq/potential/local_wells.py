@@ -23,6 +23,7 @@ from siq.errors import NumericalFailure
 from siq.potential.bases import affordable_degree
 from siq.potential.hamilton_jacobi import HamiltonJacobi, equation_at, gauss_newton
 from siq.potential.local_route import grow_well
+from siq.potential.raised_wells import Depth, raised_wells
 from siq.potential.well import TOLERANCE, DegreeTrial, Well
 
 STEP = 1.06  # of the level, from one fit to the next
@@ -57,7 +58,13 @@ class WellOptions:
 
 
 def local_well(
-    dynamics: Dynamics, portrait: PhasePortrait, index: int, *, options: WellOptions, seed: int = 0
+    dynamics: Dynamics,
+    portrait: PhasePortrait,
+    index: int,
+    *,
+    options: WellOptions,
+    seed: int = 0,
+    depth: Depth | None = None,
 ) -> Well:
     """V about one attractor, of the lowest degree that no other betters by much.
 
@@ -73,6 +80,9 @@ def local_well(
         Degrees, reach and tolerance.
     seed
         Decides which points are used where there are too many.
+    depth
+        The lowest saddle with V there, where the path of least action has told it before, as it does for
+        given equations.
 
     Raises
     ------
@@ -82,17 +92,17 @@ def local_well(
     basin = portrait.basins[index]
     rows = np.arange(len(basin.chosen))
     elsewhere = states_elsewhere(portrait, index)
-    grown = _grown_wells(dynamics, portrait, index, options, seed)
-    # No formula tells V of the saddle as well as the finest does.
-    goal = options.reach * grown[-1].level
-    wells = [
-        replace(
-            extend_well(well, basin, goal=goal, rows=rows[rows % HELD_OUT != 0]),
-            tolerance=options.tolerance,
-            elsewhere=elsewhere,
+    kept = rows[rows % HELD_OUT != 0]
+    if depth is None:
+        grown = _grown_wells(dynamics, portrait, index, options, seed)
+        # No formula tells V of the saddle as well as the finest does.
+        goal = options.reach * grown[-1].level
+        extended = [extend_well(well, basin, goal=goal, rows=kept) for well in grown]
+    else:
+        extended = raised_wells(
+            dynamics, portrait.attractors[index], basin, depth, options=options, rows=kept, seed=seed
         )
-        for well in grown
-    ]
+    wells = [replace(well, tolerance=options.tolerance, elsewhere=elsewhere) for well in extended]
     trials = _trials(wells, basin.points(rows[rows % HELD_OUT == 0]))
     return replace(wells[best_trial(trials)], trials=trials)
 

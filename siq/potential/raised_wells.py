@@ -1,0 +1,192 @@
+"""V about an attractor whose depth is known beforehand, degree by degree.
+
+For given equations the path of least action to the lowest saddle comes first, so that the depth of the well
+is known. V is grown once, in the lowest powers that follow it up there (`siq.potential.local_route`). From
+there every higher degree starts on the whole sublevel set, from the formula of the degree below: grown by
+itself it would be an extrapolation at each level, which of high powers is bad. The fits are made in
+combinations of powers that are orthonormal over the sublevel set.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from siq.dynamics.basins import Basin
+from siq.dynamics.dynamics import Dynamics
+from siq.dynamics.equilibria import Equilibrium, hessian_at
+from siq.errors import NumericalFailure
+from siq.potential.bases import affordable_degree, power_basis
+from siq.potential.hamilton_jacobi import (
+    HamiltonJacobi,
+    equation_at,
+    gauss_newton,
+    orthonormalised,
+)
+from siq.potential.local_route import grow_well
+from siq.potential.well import Well
+
+if TYPE_CHECKING:
+    from siq.potential.local_wells import WellOptions
+
+STEP = 1.06  # of the level, from one fit to the next
+REWEIGHTINGS = 3
+ITERATIONS = 8  # of Gauss–Newton between two reweightings
+STEEP = 3.0  # of the median residual: what is larger counts less and less
+FINEST = 1e-5  # residual below which nothing is an outlier
+MOST_POINTS = 5000  # of one fit
+RUNAWAY = 1.5  # of a level: where the formula of the degree below is higher, a lower V is an extrapolation
+GAP = 0.25  # of the distance at which the level lies: as far new points may be from those of the last fit
+WORSE = 3.0  # times the residual of the degree below: a higher one that is worse by that has run away
+ENDED = 2  # higher degrees in a row that do not improve: there is nothing more to be had
+
+
+@dataclass(frozen=True)
+class Depth:
+    """The lowest saddle of a well, and V there."""
+
+    saddle: Equilibrium
+    value: float
+
+
+def raised_wells(
+    dynamics: Dynamics,
+    attractor: Equilibrium,
+    basin: Basin,
+    depth: Depth,
+    *,
+    options: WellOptions,
+    rows: np.ndarray,
+    seed: int = 0,
+) -> list[Well]:
+    """V about an attractor by rising degree, each sought up to ``options.reach`` of the depth.
+
+    Parameters
+    ----------
+    dynamics
+        f and D.
+    attractor
+        Where V is zero.
+    basin
+        States that lead there.
+    depth
+        Of the well.
+    options
+        Degrees, accuracy and reach.
+    rows
+        Rows of ``basin.chosen`` that may be used.
+    seed
+        Decides which points are used where there are too many.
+
+    Raises
+    ------
+    NumericalFailure
+        When no degree follows V up to the saddle.
+    """
+    wells: list[Well] = []
+    failure, idle = NumericalFailure("no degree is affordable"), 0
+    for degree in options.degrees:
+        if wells and affordable_degree(dynamics.dimension, degree) < degree:
+            break
+        generator = np.random.default_rng(seed)
+        try:
+            if wells:
+                start = _embedded(wells[-1], degree)
+            else:
+                start = grow_well(
+                    dynamics, attractor, basin, [depth.saddle], degree=degree, generator=generator,
+                    depth=depth.value,
+                )  # fmt: skip
+            well = _raised(start, basin, depth.value, options.reach, rows, generator)
+        except NumericalFailure as error:  # of one degree: another may do
+            failure = error
+            continue
+        if wells and not well.residual < wells[-1].residual:
+            idle += 1
+            if idle == ENDED or not well.residual < WORSE * wells[-1].residual:
+                break
+            continue
+        wells.append(well)
+        idle = 0
+        if well.residual < options.accuracy:
+            break
+    if not wells:
+        raise failure
+    return wells
+
+
+def _embedded(well: Well, degree: int) -> Well:
+    """The same formula in powers up to a higher degree; the lower ones come first."""
+    basis = power_basis(well.basis.symbols, well.basis.center, well.basis.scale, degree=degree)
+    coefficients = np.zeros(basis.size)
+    coefficients[: well.basis.size] = well.coefficients
+    return replace(well, basis=basis, coefficients=coefficients)
+
+
+def _raised(
+    start: Well, basin: Basin, depth: float, reach: float, rows: np.ndarray, generator: np.random.Generator
+) -> Well:
+    """A formula fitted from 0.9 of the depth to its reach, level by level."""
+    goal, level = reach * depth, min(0.9 * start.level, reach * depth)
+    shape, flat = basin.states.shape[:2], basin.states.reshape(-1, basin.states.shape[2])
+    functions = start.basis.values(flat)
+    before = (functions @ start.coefficients).reshape(shape)
+    free = start.basis.exponents.sum(axis=1) > 2
+    metric = np.linalg.cholesky(hessian_at(start.dynamics, start.attractor))
+    places = basin.points(np.arange(len(basin.chosen))) @ metric
+    coefficients, fitted = start.coefficients, basin.below(before, level)
+    while True:
+        along = (functions @ coefficients).reshape(shape)
+        chosen = np.intersect1d(basin.below(along, level), basin.below(before, RUNAWAY * level))
+        if len(fitted) and len(chosen):
+            away = cKDTree(places[fitted]).query(places[chosen])[0]
+            chosen = chosen[away < GAP * np.sqrt(2 * level)]
+        fitted = chosen
+        used = np.intersect1d(chosen, rows)
+        if len(used) > MOST_POINTS:
+            used = np.sort(generator.choice(used, MOST_POINTS, replace=False))
+        if len(used) < 2 * start.basis.size:
+            raise NumericalFailure(
+                f"V about the attractor near {start.attractor.round(4)} is told by {len(used)} states alone"
+            )
+        equation = equation_at(start.basis, basin.points(used), start.dynamics)
+        last = level >= goal
+        coefficients = _robust(equation, coefficients, free, rounds=REWEIGHTINGS if last else 1)
+        if last:
+            break
+        level = min(goal, STEP * level)
+    residual = float(np.median(_relative(equation, coefficients)))
+    if not np.isfinite(residual):
+        raise NumericalFailure(f"powers of degree {start.degree} do not follow V to its saddle")
+    return replace(
+        start, coefficients=coefficients, level=min(depth, start.level), reach=goal, residual=residual,
+        points=basin.points(np.intersect1d(fitted, rows)),
+    )  # fmt: skip
+
+
+def _robust(
+    equation: HamiltonJacobi, coefficients: np.ndarray, free: np.ndarray, *, rounds: int
+) -> np.ndarray:
+    """Gauss–Newton with weights that fall with the square of what is left (Cauchy's)."""
+    turned_equation, turned = orthonormalised(equation, free)
+    stay = int((~free).sum())
+    moving = np.arange(turned.shape[1]) < turned.shape[1] - stay
+    theta = np.linalg.lstsq(turned[free], coefficients[free], rcond=None)[0]
+    theta[~moving] = coefficients[~free]
+    for _ in range(rounds):
+        rest = _relative(turned_equation, theta)
+        scale = max(STEEP * float(np.median(rest)), FINEST)
+        weighted = replace(turned_equation, weight=equation.weight / np.sqrt(1 + (rest / scale) ** 2))
+        theta = gauss_newton(weighted, theta, free=moving, steps=ITERATIONS).coefficients
+    return np.asarray(turned @ theta)
+
+
+def _relative(equation: HamiltonJacobi, coefficients: np.ndarray) -> np.ndarray:
+    """The residual at the points, relative to ∣∇V∣ ∣f∣."""
+    slope = equation.slopes(coefficients)
+    size = np.sqrt(equation.diffusion.steepness(equation.points, slope))
+    return np.asarray(np.abs(equation.residual(coefficients)) / np.where(size > 0, size, np.inf))
