@@ -135,6 +135,7 @@ class Dynamics:
         equations: Sequence[sympy.Expr],
         *,
         diffusion: Diffusion | np.ndarray | Sequence[Sequence[sympy.Expr | float]] | None = None,
+        domain: Sequence[Sequence[float]] | np.ndarray | None = None,
     ) -> Dynamics:
         """Dynamics of formulas alone, with D = 1 unless another is given.
 
@@ -146,6 +147,8 @@ class Dynamics:
             The components of f.
         diffusion
             D, as `Diffusion`, as a matrix ``(d, d)``, or as rows of formulas.
+        domain
+            Two limits a state, where somebody says them.
         """
         if diffusion is None:
             diffusion = Diffusion.identity(len(symbols))
@@ -153,7 +156,9 @@ class Dynamics:
             diffusion = Diffusion(np.asarray(diffusion, dtype=float))
         elif not isinstance(diffusion, Diffusion):
             diffusion = state_noise(symbols, diffusion)
-        return cls(tuple(each.name for each in symbols), tuple(map(sympy.sympify, equations)), diffusion)
+        names, formulas = tuple(each.name for each in symbols), tuple(map(sympy.sympify, equations))
+        box = None if domain is None else np.asarray(domain, dtype=float)
+        return cls(names, formulas, diffusion, domain=box)
 
     @property
     def dimension(self) -> int:

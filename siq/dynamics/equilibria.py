@@ -310,10 +310,33 @@ def neighbours(
     box: np.ndarray,
 ) -> set[int]:
     """The attractors that lie below a saddle, on either side of its unstable directions."""
+    return {int(end) for end in _sides(dynamics, saddle, attractors, box=box) if end >= 0}
+
+
+def leads_back(
+    dynamics: Dynamics,
+    saddle: Equilibrium,
+    attractors: Sequence[Equilibrium],
+    *,
+    box: np.ndarray,
+) -> bool:
+    """Whether f leads from all sides of a saddle to one and the same attractor: it parts no wells."""
+    ends = _sides(dynamics, saddle, attractors, box=box)
+    return bool(ends[0] >= 0 and (ends == ends[0]).all())
+
+
+def _sides(
+    dynamics: Dynamics,
+    saddle: Equilibrium,
+    attractors: Sequence[Equilibrium],
+    *,
+    box: np.ndarray,
+) -> np.ndarray:
+    """Where f leads from both sides of each unstable direction of a saddle: attractors, or -1."""
     values, vectors = np.linalg.eig(dynamics.jacobian(saddle.position[None])[0])
     width = box[:, 1] - box[:, 0]
     starts = []
     for vector in vectors[:, values.real > 0].T:
         direction = vector.real / np.abs(vector.real / width).max()
         starts += [saddle.position + 1e-3 * direction, saddle.position - 1e-3 * direction]
-    return {int(end) for end in follow(dynamics, np.array(starts), attractors, box=box).ends if end >= 0}
+    return follow(dynamics, np.array(starts), attractors, box=box).ends

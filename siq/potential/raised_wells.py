@@ -37,7 +37,10 @@ STEP = 1.06  # of the level, from one fit to the next
 REWEIGHTINGS = 3
 ITERATIONS = 8  # of Gauss–Newton between two reweightings
 STEEP = 3.0  # of the median residual: what is larger counts less and less
-FINEST = 1e-5  # residual below which nothing is an outlier
+FINEST = 0.01  # residual below which nothing is an outlier: it may be where the well is narrow, and few points lie
+BESIDE = 0.05  # of the extent of the well: states so close to the path are below a level where the path is
+PATH_FROM, PATH_TO = 0.02, 0.98  # of the depth: where the path tells ∇V
+UNTOLD = 1e-10  # of the largest singular value: combinations of powers that the points leave open
 MOST_POINTS = 5000  # of one fit
 RUNAWAY = 1.5  # of a level: where the formula of the degree below is higher, a lower V is an extrapolation
 GAP = 0.25  # of the distance at which the level lies: as far new points may be from those of the last fit
@@ -45,12 +48,29 @@ WORSE = 3.0  # times the residual of the degree below: a higher one that is wors
 ENDED = 2  # higher degrees in a row that do not improve: there is nothing more to be had
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Depth:
-    """The lowest saddle of a well, and V there."""
+    """How deep a well is, as the path of least action to its lowest saddle tells.
+
+    Attributes
+    ----------
+    saddle
+        That saddle.
+    points
+        Along the path, shape ``(n, d)``.
+    values, slopes
+        V and ∇V there, shape ``(n,)`` and ``(n, d)``.
+    """
 
     saddle: Equilibrium
-    value: float
+    points: np.ndarray
+    values: np.ndarray
+    slopes: np.ndarray
+
+    @property
+    def value(self) -> float:
+        """V at the saddle."""
+        return float(self.values[-1])
 
 
 def raised_wells(
@@ -101,7 +121,7 @@ def raised_wells(
                     dynamics, attractor, basin, [depth.saddle], degree=degree, generator=generator,
                     depth=depth.value,
                 )  # fmt: skip
-            well = _raised(start, basin, depth.value, options.reach, rows, generator)
+            well = _raised(start, basin, depth, options.reach, rows, generator)
         except NumericalFailure as error:  # of one degree: another may do
             failure = error
             continue
@@ -128,24 +148,29 @@ def _embedded(well: Well, degree: int) -> Well:
 
 
 def _raised(
-    start: Well, basin: Basin, depth: float, reach: float, rows: np.ndarray, generator: np.random.Generator
+    start: Well, basin: Basin, depth: Depth, reach: float, rows: np.ndarray, generator: np.random.Generator
 ) -> Well:
     """A formula fitted from 0.9 of the depth to its reach, level by level."""
-    goal, level = reach * depth, min(0.9 * start.level, reach * depth)
+    goal, level = reach * depth.value, min(0.9 * start.level, reach * depth.value)
     shape, flat = basin.states.shape[:2], basin.states.reshape(-1, basin.states.shape[2])
     functions = start.basis.values(flat)
     before = (functions @ start.coefficients).reshape(shape)
     free = start.basis.exponents.sum(axis=1) > 2
     metric = np.linalg.cholesky(hessian_at(start.dynamics, start.attractor))
     places = basin.points(np.arange(len(basin.chosen))) @ metric
-    coefficients, fitted = start.coefficients, basin.below(before, level)
+    fitted = basin.below(before, level)
+    # Where the well narrows towards its saddle, V in lower powers may be far off, and few states be below it.
+    way = depth.points @ metric
+    distance, nearest = cKDTree(way).query(places)
+    beside = np.where(distance < BESIDE * np.sqrt(2 * depth.value), depth.values[nearest], np.inf)
+    coefficients = _towards_path(start, basin.points(fitted), depth, free)
     while True:
         along = (functions @ coefficients).reshape(shape)
         chosen = np.intersect1d(basin.below(along, level), basin.below(before, RUNAWAY * level))
         if len(fitted) and len(chosen):
             away = cKDTree(places[fitted]).query(places[chosen])[0]
             chosen = chosen[away < GAP * np.sqrt(2 * level)]
-        fitted = chosen
+        fitted = chosen = np.union1d(chosen, np.flatnonzero(beside < level))
         used = np.intersect1d(chosen, rows)
         if len(used) > MOST_POINTS:
             used = np.sort(generator.choice(used, MOST_POINTS, replace=False))
@@ -163,9 +188,40 @@ def _raised(
     if not np.isfinite(residual):
         raise NumericalFailure(f"powers of degree {start.degree} do not follow V to its saddle")
     return replace(
-        start, coefficients=coefficients, level=min(depth, start.level), reach=goal, residual=residual,
+        start, coefficients=coefficients, level=depth.value, reach=goal, residual=residual,
         points=basin.points(np.intersect1d(fitted, rows)),
     )  # fmt: skip
+
+
+def _towards_path(well: Well, x: np.ndarray, depth: Depth, free: np.ndarray) -> np.ndarray:
+    """Coefficients of a formula that is left as it is at points, but for the path, whose ∇V is known.
+
+    They are but a start: what is fitted from there is the equation alone.
+    """
+    noise = well.dynamics.diffusion
+    rising = (depth.values > PATH_FROM * depth.value) & (depth.values < PATH_TO * depth.value)
+    where, slopes = depth.points[rising], depth.slopes[rising]
+    if not len(where) or not len(x):
+        return well.coefficients
+    old, along = well.basis.gradients(x), well.basis.gradients(where)
+    size = np.sqrt(noise.steepness(where, slopes))
+    weight = np.sqrt(len(x) / len(where)) / size
+    rest = slopes - along @ well.coefficients
+    steep = np.sqrt(noise.steepness(x, old @ well.coefficients))
+    steep = np.maximum(steep, np.median(steep))
+    roots = noise.root_at(where), noise.root_at(x)
+    rows = [
+        np.einsum("n,nij,nim->njm", weight, roots[0], along[:, :, free], optimize=True),
+        np.einsum("n,nij,nim->njm", 1 / steep, roots[1], old[:, :, free], optimize=True),
+    ]
+    wanted = np.einsum("n,nij,ni->nj", weight, roots[0], rest).ravel()
+    matrix = np.concatenate([one.reshape(-1, one.shape[2]) for one in rows])
+    right = np.concatenate([wanted, np.zeros(len(matrix) - len(wanted))])
+    scale = np.linalg.norm(matrix, axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    coefficients = well.coefficients.copy()
+    coefficients[free] += np.linalg.lstsq(matrix / scale, right, rcond=UNTOLD)[0] / scale
+    return coefficients
 
 
 def _robust(

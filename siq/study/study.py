@@ -284,33 +284,31 @@ def _with_landscape(path: Path) -> Dynamics:
     """The system of a card that can be simulated by itself, and has a landscape that we can work out."""
     document = read_document(path)
     system = build_system(document, validate(document, SystemCard))
+    if (fault := fault_for_landscape(system)) is not None:
+        keys, what, remedy = fault
+        raise InputError(document.file, document.place(keys), what, remedy)
+    return system
 
-    def refuse(keys: tuple[str, ...], fault: str, remedy: str) -> None:
-        raise InputError(document.file, document.place(keys), fault, remedy)
 
+def fault_for_landscape(system: Dynamics) -> tuple[tuple[str, ...], str, str] | None:
+    """Why no landscape of a system can be worked out: the place in its card, the fault and the remedy."""
     if not system.autonomous:
         key, what = ("inputs", "inputs") if system.inputs else ("equations", "time")
-        refuse(
-            (key,),
-            "a driven system has no quasipotential",
-            f"leave the {what} out, or use the card in a study of mismatch",
-        )
+        remedy = f"leave the {what} out, or use the card in a study of mismatch"
+        return (key,), "a driven system has no quasipotential", remedy
     for name, limits in zip(system.states, system.limits, strict=True):
         if np.isnan(limits).any():
-            refuse(
-                ("states", name),
-                f"the state '{name}' has no domain, in which a simulation could begin",
-                "add 'domain: [lower, upper]' to it",
-            )
+            what = f"the state '{name}' has no domain, in which a simulation could begin"
+            return ("states", name), what, "add 'domain: [lower, upper]' to it"
     if not system.diffusion.regular:
-        refuse(
-            ("diffusion",),
-            "the noise does not reach every state, and landscapes are worked out only where it does",
-            "give a positive definite matrix, or use the card in a study of mismatch",
-        )
+        what = "the noise does not reach every state, and landscapes are worked out only where it does"
+        return (
+            ("diffusion",), what, "give a positive definite matrix, or use the card in a study of mismatch"
+        )  # fmt: skip
     if (found := fault_over_domain(system)) is not None:
-        refuse(("equations", found[0]), f"the equation {found[1]}", "choose a domain in which it has a value")
-    return system
+        remedy = "choose a domain in which it has a value"
+        return ("equations", found[0]), f"the equation {found[1]}", remedy
+    return None
 
 
 def check_states(study: Study, states: Sequence[str], *, file: str) -> None:
