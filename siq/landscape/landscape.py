@@ -87,6 +87,8 @@ class Landscape:
     seen
         The two states between which the recordings hop by themselves, without any formula; None where
         nothing is known of them, or several wells are certified.
+    given
+        Whether f was given as equations: the region is their domain then, and nothing of f is uncertain.
     """
 
     dynamics: Dynamics
@@ -103,6 +105,7 @@ class Landscape:
     found: IdentifiedField | None = None
     visits: tuple[VisitTest, ...] = ()
     seen: RecordStates | None = None
+    given: bool = False
 
     @classmethod
     def from_recordings(
@@ -297,7 +300,7 @@ class Landscape:
         strength = self.noise if noise is None else NoiseStrength(noise)
         if strength is None:
             raise ValueError(
-                "the recordings show no noise, and how long a well lasts follows from it; give 'noise'"
+                "no noise is known, and how long a well lasts follows from it; give 'noise'"
             )
         rows = []
         for index in range(len(self.attractors)):
@@ -439,6 +442,7 @@ def assembled(
         np.array([position_standard_errors(found, one.position) for one in portrait.attractors]),
         noise,
         None if isinstance(found, GivenField) else found,
+        given=isinstance(found, GivenField),
     )
 
 

@@ -8,10 +8,13 @@ characteristics, as that of recordings is.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import dataclass as plain_dataclass
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from pydantic.dataclasses import dataclass
 
 from siq.certificate.certify import caustics_below, certify_given_wells
@@ -31,14 +34,18 @@ from siq.landscape.dwell_times import NoiseStrength
 from siq.landscape.landscape import Landscape, assembled
 from siq.landscape.options import LandscapeOptions
 from siq.landscape.refusal import NoLandscape
+from siq.landscape.storage import write_landscape
 from siq.landscape.transitions import WayOut, transitions, ways_out
 from siq.numerics.randomness import Purpose, generator
 from siq.potential.local_wells import local_well
 from siq.potential.raised_wells import Depth
 from siq.potential.refinement import RefinementOptions
 from siq.potential.well import Well
+from siq.steps.landscape_tables import degree_rows, landscape_rows
+from siq.steps.outcomes import Method, Outcome, Status, Step
 from siq.steps.settings import STRICT
 from siq.study.study import fault_for_landscape
+from siq.study.tables import as_table, write_table
 
 ALONG = 300  # states along a path, from the neighbourhood of which further descents start
 BESIDE = (0.02, 0.05, 0.1)  # of the extent of the well: how far from the path
@@ -125,6 +132,60 @@ def landscape_of_equations(system: Dynamics, settings: EquationSettings) -> Land
         found, portrait, wells, transitions(found, ways, wells), notes, certificate=certificate,
         noise=NoiseStrength(noises[0]) if noises else None,
     )  # fmt: skip
+
+
+@plain_dataclass(frozen=True)
+class FoundOfEquations:
+    """The landscape of a study of equations, None where there is none, and what became of the step."""
+
+    landscape: Landscape | None
+    outcome: Outcome
+
+
+def run(settings: EquationSettings, system: Dynamics) -> FoundOfEquations:
+    """The landscape of a system; where it has none, the outcome says why."""
+    try:
+        found = landscape_of_equations(system, settings)
+    except (NumericalFailure, np.linalg.LinAlgError) as error:
+        reason = error.reason if isinstance(error, NoLandscape) else str(error)
+        return FoundOfEquations(None, Outcome(0, Step.LANDSCAPE, Status.FAILED, reason))
+    whole = found.over_wells is not None
+    outcome = Outcome(0, Step.LANDSCAPE, Status.OK if whole else Status.WARNING, "; ".join(found.notes))
+    return FoundOfEquations(found, outcome)
+
+
+def write(found: FoundOfEquations, *, quasipotential: str | Path, tables: Mapping[str, str | Path]) -> None:
+    """Write `quasipotential.json`, empty where there is no landscape, and the tables by name.
+
+    Parameters
+    ----------
+    found
+        What `run` gave.
+    quasipotential
+        Its file.
+    tables
+        Files of ``landscape``, ``degrees``, ``certificates`` and ``outcomes``.
+    """
+    rows: dict[str, pd.DataFrame] = {name: as_table(name, []) for name in tables}
+    kept = found.outcome
+    rows["outcomes"] = as_table("outcomes", [kept.as_data() | {"step": kept.step, "status": kept.status}])
+    if found.landscape is None:
+        Path(quasipotential).touch()
+    else:
+        write_landscape(quasipotential, found.landscape, dynamics=found.landscape.dynamics)
+        rows["landscape"] = landscape_rows(0, found.landscape)
+        rows["degrees"] = degree_rows(0, found.landscape)
+        certificate = found.landscape.certificate
+        made = {} if certificate is None else certificate.tests
+        rows["certificates"] = as_table(
+            "certificates",
+            [
+                {"run": 0, "method": str(Method.REFINED), "test": name} | verdict.as_data()
+                for name, verdict in made.items()
+            ],
+        )
+    for name, path in tables.items():
+        write_table(path, rows[name])
 
 
 def _lowest(ways: list[WayOut], index: int) -> WayOut | None:

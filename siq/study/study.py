@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
@@ -29,6 +29,8 @@ from siq.landscape.options import LandscapeOptions
 from siq.networks.options import TrainingOptions
 from siq.networks.regression import RegressionOptions
 from siq.potential.refinement import RefinementOptions
+
+Entrance = Literal["trajectories", "equations"]
 
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"
 
@@ -88,6 +90,12 @@ class RecordingsOptions(BaseModel):
         return states
 
 
+OF_TRAJECTORIES = (
+    "recordings", "runs", "published", "simulation", "identification", "regression", "training", "invariant",
+)  # fmt: skip
+"""Keys of a study that equations have no use for."""
+
+
 class Study(BaseModel):
     """The schema of a study.
 
@@ -100,6 +108,9 @@ class Study(BaseModel):
     system
         Name of a system card, or path of one. Simulated, unless there are recordings; then it only lends
         its states, units, D and exact answers.
+    entrance
+        In the file the key ``from``. ``trajectories``: of recordings, or of a simulation of the system.
+        ``equations``: of the system's equations alone, without simulation, identification or training.
     recordings
         Measured trajectories in the place of a simulation.
     runs
@@ -123,11 +134,12 @@ class Study(BaseModel):
         the page shows.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
 
     name: str = Field(pattern=NAME)
     title: str = ""
     system: str | None = None
+    entrance: Annotated[Entrance, Field(alias="from")] = "trajectories"
     recordings: RecordingsOptions | None = None
     runs: Annotated[int, Field(ge=1, le=10_000)] = 1
     seed: Annotated[int, Field(ge=0)] = 0
@@ -166,14 +178,28 @@ class Study(BaseModel):
                 "'refinement.routes' names the network route, but no networks are asked for; add"
                 " 'training: {}', or leave the routes out"
             )
+        if self.entrance == "equations":
+            self._check_equations()
         if self.simulation.pair_step is not None and self.simulation.interval is not None:
             self.simulation.options()
         return self
 
+    def _check_equations(self) -> None:
+        """Whether a study of equations asks for what only trajectories can give."""
+        if self.system is None:
+            raise ValueError("'from: equations' needs equations; add 'system: NAME'")
+        if self.landscape is None:
+            raise ValueError("'from: equations' finds a landscape and nothing else; remove 'landscape: false'")
+        for key in OF_TRAJECTORIES:
+            if getattr(self, key) != type(self).model_fields[key].get_default():
+                raise ValueError(
+                    f"'{key}' belongs to studies of trajectories; remove it, or 'from: equations'"
+                )
+
 
 def completed(study: Study, system: Dynamics | None) -> Study:
     """A study with what follows from its system where it says nothing: how this is simulated."""
-    if system is None or study.recordings is not None:
+    if system is None or study.recordings is not None or study.entrance == "equations":
         return study
     return study.model_copy(update={"simulation": complete(study.simulation, system)})
 
