@@ -203,9 +203,7 @@ def check_branch(candidate: Candidate, found: AnyField, *, limit: float, seed: i
     return Verdict(worst, allowed, passed, "" if passed else reason)
 
 
-def stated_error(
-    candidate: Candidate, found: AnyField, *, seed: int = 0
-) -> tuple[float, np.ndarray | None]:
+def stated_error(candidate: Candidate, found: AnyField, *, seed: int = 0) -> tuple[float, np.ndarray | None]:
     """Relative error of V that its own residual and the uncertainty of f leave open.
 
     Returns

@@ -149,7 +149,7 @@ def enlarged(
     states = np.concatenate([basin.states, mine])
     # Points lie about as dense as before, also where the new ones are.
     center, width = attractors[index].position, np.ptp(mine.reshape(-1, len(box)), axis=0)
-    added = _chosen(mine, center, width, generator) + [len(basin.states), 0]
+    added = _chosen(mine, center, width, generator) + np.array([len(basin.states), 0])
     return Basin(states, np.concatenate([basin.chosen, added]), spread)
 
 

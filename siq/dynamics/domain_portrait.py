@@ -31,7 +31,8 @@ FAR = (
 )
 AROUND = 64  # directions in which the neighbourhood of a degenerate equilibrium is asked where it leads
 RESTING = 1e-3  # of the rate: what is so slow outside the domain does not come back
-CLOSE = 1e-3  # of the domain: so far from it
+CLOSE = 0.02  # of the domain: so far from it
+DECIDED = 0.5  # share of these directions that has to have led somewhere: f is slow where it is degenerate
 
 
 def domain_portrait(dynamics: Dynamics, *, seed: int = 0) -> PhasePortrait:
@@ -113,7 +114,7 @@ def _harmless(
     box: np.ndarray,
     generator: np.random.Generator,
 ) -> tuple[tuple[Equilibrium, ...], list[str]]:
-    """Degenerate equilibria from all about which f leads to one attractor: they part no wells, and hold none."""
+    """Degenerate equilibria from all about which f leads to one attractor: they part no wells."""
     found, notes, width = [], [], np.ptp(box, axis=1)
     for one in equilibria:
         if one.kind != "degenerate" or not attractors:
@@ -122,8 +123,12 @@ def _harmless(
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         starts = one.position + CLOSE * width * directions
         starts = starts[((starts > box[:, 0]) & (starts < box[:, 1])).all(axis=1)]
-        ends = follow(dynamics, starts, attractors, box=box).ends if len(starts) else np.array([-1])
-        if ends[0] >= 0 and (ends == ends[0]).all():
+        if not len(starts):
+            continue
+        ways = follow(dynamics, starts, attractors, box=box)
+        creeping = (np.abs((ways.paths[:, -1] - one.position) / width) < 2 * CLOSE).all(axis=1)
+        ends = ways.ends[(ways.ends >= 0) | ~creeping]
+        if len(ends) > DECIDED * len(starts) and ends[0] >= 0 and (ends == ends[0]).all():
             found.append(one)
             notes.append(
                 f"the equilibrium {one.position.round(4).tolist()} is neither stable nor unstable to first"

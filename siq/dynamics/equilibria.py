@@ -166,7 +166,7 @@ def _newton(
 
 
 def _deflation(offset: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Factor of Newton's step, ``(n, 1)``, that deflation makes; offsets from the k known roots ``(n, k, d)``.
+    """Factor of Newton's step, ``(n, 1)``, that deflation makes, from offsets to known roots ``(n, k, d)``.
 
     With ``m f`` in the place of f, Newton's step s becomes ``s/(1 - s·∇m/m)``.
     """

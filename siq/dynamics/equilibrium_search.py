@@ -45,7 +45,7 @@ class FoundEquilibria:
 
 
 def spread_evenly(box: np.ndarray, count: int, *, generator: np.random.Generator) -> np.ndarray:
-    """Points of a scrambled Sobol sequence in a box of the shape ``(d, 2)``: shape ``(n, d)``, n ≥ `count`."""
+    """Points of a scrambled Sobol sequence in a box ``(d, 2)``: shape ``(n, d)``, n not below `count`."""
     sequence = qmc.Sobol(len(box), scramble=True, seed=generator)
     share = sequence.random_base2(max(int(np.ceil(np.log2(count))), 1))
     return np.asarray(box[:, 0] + share * (box[:, 1] - box[:, 0]))
@@ -104,7 +104,7 @@ def boundary_degree(dynamics: Dynamics, equilibria: tuple[Equilibrium, ...]) -> 
         return None
     if d == 1:
         low, high = np.sign(dynamics.drift(box.T)[:, 0])
-        return int(round((high - low) / 2))
+        return round(float(high - low) / 2)
     share = np.linspace(0, 1, BOUNDARY // 4, endpoint=False)
     zero, one = np.zeros_like(share), np.ones_like(share)
     along = [(share, zero), (one, share), (1 - share, one), (zero, 1 - share)]

@@ -1,6 +1,6 @@
 """An f that is given by its equations: nothing of it was estimated, and nothing of it is uncertain.
 
-What tells wells, certificates and transitions takes an `AnyField`: an identified f with its uncertainty, or this.
+Certificates and transitions take an `AnyField`: an identified f with its uncertainty, or this.
 """
 
 from __future__ import annotations

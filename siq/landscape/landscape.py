@@ -183,8 +183,8 @@ class Landscape:
         Raises
         ------
         InputError
-            For a card that cannot be read, or a system that has no quasipotential: driven, without a domain, or
-            with noise that does not reach every state.
+            For a card that cannot be read, or a system that has no quasipotential: driven, without a domain,
+            or with noise that does not reach every state.
         NoLandscape
             When there is no stable equilibrium in the domain. It says why.
 
@@ -299,9 +299,7 @@ class Landscape:
         """
         strength = self.noise if noise is None else NoiseStrength(noise)
         if strength is None:
-            raise ValueError(
-                "no noise is known, and how long a well lasts follows from it; give 'noise'"
-            )
+            raise ValueError("no noise is known, and how long a well lasts follows from it; give 'noise'")
         rows = []
         for index in range(len(self.attractors)):
             found = dwell_time(self.exits(index), strength)

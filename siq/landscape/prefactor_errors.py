@@ -46,9 +46,7 @@ class PrefactorError:
     covariance: float
 
 
-def prefactor_error(
-    found: AnyField, path: MinimumActionPath, *, seed: int = 0
-) -> PrefactorError | None:
+def prefactor_error(found: AnyField, path: MinimumActionPath, *, seed: int = 0) -> PrefactorError | None:
     """The uncertainty of the prefactor of a way out.
 
     Parameters

@@ -90,7 +90,7 @@ def landscape_data(landscape: Landscape, *, dynamics: Dynamics) -> dict[str, Any
 
 
 def _of_given(landscape: Landscape) -> dict[str, Any]:
-    """What stands in a landscape of equations alone: it has no other file in which its certificate could stand."""
+    """What a landscape of equations has beside: no other file could hold its certificate."""
     if not landscape.given:
         return {}
     certificate = landscape.certificate

@@ -120,9 +120,7 @@ class WayOut:
     note: str = ""
 
 
-def ways_out(
-    dynamics: Dynamics, portrait: PhasePortrait, *, beyond_region: bool = False
-) -> list[WayOut]:
+def ways_out(dynamics: Dynamics, portrait: PhasePortrait, *, beyond_region: bool = False) -> list[WayOut]:
     """Every way out of every well over the saddles next to it, from f alone.
 
     Parameters
@@ -132,8 +130,8 @@ def ways_out(
     portrait
         Attractors and saddles.
     beyond_region
-        Whether a saddle behind which lies no attractor of the region is a way out, too: with f given, the path
-        up to it is as good as any other. With f identified nothing is known of what lies beyond.
+        Whether a saddle behind which lies no attractor of the region is a way out, too: of a given f the
+        path up to it is as good as any other. Of an identified one nothing is known beyond.
     """
     ways = []
     for index, attractor in enumerate(portrait.attractors):
@@ -158,9 +156,7 @@ def ways_out(
     return ways
 
 
-def _way_beyond(
-    dynamics: Dynamics, portrait: PhasePortrait, index: int, saddle: Equilibrium
-) -> list[WayOut]:
+def _way_beyond(dynamics: Dynamics, portrait: PhasePortrait, index: int, saddle: Equilibrium) -> list[WayOut]:
     """The way over a saddle from which f leads out of the region; none where it leads back on both sides."""
     if leads_back(dynamics, saddle, portrait.attractors, box=portrait.box):
         return []

@@ -19,6 +19,7 @@ from siq.potential.bases import Basis
 VANISHING = 1e-8  # of f: where D∇V is smaller, Gauss–Newton is on its way to V = 0, which is a solution, too
 INDEPENDENT = 1e-5  # diagonal of a triangular factor: below this share columns are not independent enough
 
+STEEP = 3.0  # of the median residual: what is larger counts less and less
 UNTOLD = 1e-10  # of the largest singular value: combinations of functions that the points leave open
 
 
@@ -81,6 +82,28 @@ class HamiltonJacobi:
     def restricted(self, rows: np.ndarray) -> HamiltonJacobi:
         """The equation with some of the functions only."""
         return replace(self, gradients=self.gradients[:, :, rows])
+
+
+def relative_residuals(equation: HamiltonJacobi, coefficients: np.ndarray) -> np.ndarray:
+    """``∣∇V·(f + D∇V)∣ / (∣∇V∣ ∣f∣)`` at the points, shape ``(n,)``."""
+    slope = equation.slopes(coefficients)
+    size = np.sqrt(equation.diffusion.steepness(equation.points, slope))
+    return np.asarray(np.abs(equation.residual(coefficients)) / np.where(size > 0, size, np.inf))
+
+
+def robust(equation: HamiltonJacobi, coefficients: np.ndarray, *, finest: float) -> HamiltonJacobi:
+    """The equation with weights that fall with the square of what is left (Cauchy's).
+
+    Parameters
+    ----------
+    equation, coefficients
+        What is left is that of this formula.
+    finest
+        Residual below which nothing is an outlier.
+    """
+    rest = relative_residuals(equation, coefficients)
+    scale = max(STEEP * float(np.median(rest)), finest)
+    return replace(equation, weight=equation.weight / np.sqrt(1 + (rest / scale) ** 2))
 
 
 def orthonormalised(equation: HamiltonJacobi, free: np.ndarray) -> tuple[HamiltonJacobi, np.ndarray]:

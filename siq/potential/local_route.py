@@ -163,10 +163,7 @@ def _grown(
         coefficients, residual = solution.coefficients, solution.residual
         values = along(coefficients)
         recorded = _recorded(basin.starts(values), len(attractor))
-        if depth is None:
-            limit = min(_lowest(basis.values(tops) @ coefficients, tops, points, width, level), recorded)
-        else:
-            limit = depth
+        limit = depth or min(_lowest(basis.values(tops) @ coefficients, tops, points, width, level), recorded)
         if last and abs(limit - level) < SETTLED * level and len(fitted) <= (1 + SETTLED) * before:
             break
         if any(abs(limit - one) < REPEATED * level for one in ends):  # from here on in circles
@@ -175,15 +172,10 @@ def _grown(
             ends.append(level)
         last = GROWTH * level >= limit
         level = limit if last else GROWTH * level
-    saddle = None
     if depth is not None:
         saddle = tops[0] if level == depth and residual < NO_SOLUTION else None
-    elif len(tops):
-        heights = basis.values(tops) @ coefficients
-        nearest = int(np.argmin(np.abs(heights - level)))
-        beside = _distances(tops[nearest : nearest + 1], points, width)[0] < CLOSE
-        if abs(heights[nearest] - level) < (4 if beside else 1) * AT_LEVEL * level:
-            saddle, level = tops[nearest], float(heights[nearest])
+    else:
+        saddle, level = _end(basis.values(tops) @ coefficients, tops, points, width, level)
     # A V that vanishes is a solution too, and the end of what starts far from any other.
     if not (np.isfinite(residual) and level > 0) or (saddle is None and level < (1 - SETTLED) * recorded):
         degree = int(basis.exponents.sum(axis=1).max())
@@ -192,6 +184,19 @@ def _grown(
             " saddle"
         )
     return Well(dynamics, attractor, basis, coefficients, level, saddle, residual, points)
+
+
+def _end(
+    heights: np.ndarray, tops: np.ndarray, points: np.ndarray, width: np.ndarray, level: float
+) -> tuple[np.ndarray | None, float]:
+    """The saddle at which growing has ended, with V there; None where it ended before one."""
+    if not len(tops):
+        return None, level
+    nearest = int(np.argmin(np.abs(heights - level)))
+    beside = _distances(tops[nearest : nearest + 1], points, width)[0] < CLOSE
+    if abs(heights[nearest] - level) < (4 if beside else 1) * AT_LEVEL * level:
+        return tops[nearest], float(heights[nearest])
+    return None, level
 
 
 def _too_few(attractor: np.ndarray, count: int, *, before: int, needed: int) -> str:

@@ -9,7 +9,6 @@ combinations of powers that are orthonormal over the sublevel set.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -22,10 +21,13 @@ from siq.dynamics.equilibria import Equilibrium, hessian_at
 from siq.errors import NumericalFailure
 from siq.potential.bases import affordable_degree, power_basis
 from siq.potential.hamilton_jacobi import (
+    UNTOLD,
     HamiltonJacobi,
     equation_at,
     gauss_newton,
     orthonormalised,
+    relative_residuals,
+    robust,
 )
 from siq.potential.local_route import grow_well
 from siq.potential.well import Well
@@ -36,11 +38,9 @@ if TYPE_CHECKING:
 STEP = 1.06  # of the level, from one fit to the next
 REWEIGHTINGS = 3
 ITERATIONS = 8  # of Gauss–Newton between two reweightings
-STEEP = 3.0  # of the median residual: what is larger counts less and less
-FINEST = 0.01  # residual below which nothing is an outlier: it may be where the well is narrow, and few points lie
+FINEST = 0.01  # residual below which nothing is an outlier: few points lie where a well is narrow
 BESIDE = 0.05  # of the extent of the well: states so close to the path are below a level where the path is
 PATH_FROM, PATH_TO = 0.02, 0.98  # of the depth: where the path tells ∇V
-UNTOLD = 1e-10  # of the largest singular value: combinations of powers that the points leave open
 MOST_POINTS = 5000  # of one fit
 RUNAWAY = 1.5  # of a level: where the formula of the degree below is higher, a lower V is an extrapolation
 GAP = 0.25  # of the distance at which the level lies: as far new points may be from those of the last fit
@@ -184,7 +184,7 @@ def _raised(
         if last:
             break
         level = min(goal, STEP * level)
-    residual = float(np.median(_relative(equation, coefficients)))
+    residual = float(np.median(relative_residuals(equation, coefficients)))
     if not np.isfinite(residual):
         raise NumericalFailure(f"powers of degree {start.degree} do not follow V to its saddle")
     return replace(
@@ -227,22 +227,13 @@ def _towards_path(well: Well, x: np.ndarray, depth: Depth, free: np.ndarray) -> 
 def _robust(
     equation: HamiltonJacobi, coefficients: np.ndarray, free: np.ndarray, *, rounds: int
 ) -> np.ndarray:
-    """Gauss–Newton with weights that fall with the square of what is left (Cauchy's)."""
+    """Gauss–Newton in orthonormal combinations, with weights that fall with what is left."""
     turned_equation, turned = orthonormalised(equation, free)
     stay = int((~free).sum())
     moving = np.arange(turned.shape[1]) < turned.shape[1] - stay
     theta = np.linalg.lstsq(turned[free], coefficients[free], rcond=None)[0]
     theta[~moving] = coefficients[~free]
     for _ in range(rounds):
-        rest = _relative(turned_equation, theta)
-        scale = max(STEEP * float(np.median(rest)), FINEST)
-        weighted = replace(turned_equation, weight=equation.weight / np.sqrt(1 + (rest / scale) ** 2))
+        weighted = robust(turned_equation, theta, finest=FINEST)
         theta = gauss_newton(weighted, theta, free=moving, steps=ITERATIONS).coefficients
     return np.asarray(turned @ theta)
-
-
-def _relative(equation: HamiltonJacobi, coefficients: np.ndarray) -> np.ndarray:
-    """The residual at the points, relative to ∣∇V∣ ∣f∣."""
-    slope = equation.slopes(coefficients)
-    size = np.sqrt(equation.diffusion.steepness(equation.points, slope))
-    return np.asarray(np.abs(equation.residual(coefficients)) / np.where(size > 0, size, np.inf))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import platform
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from siq.report.landscape_tables import landscape_tables
 from siq.report.page import FormulaRow, ReportContent, ReportSection, ReportTable
 from siq.report.plots.landscape_curves import plot_degrees
 from siq.report.plots.quasipotential import quasipotential_figure
-from siq.report.study_captions import OF_ONE_STATE, Part, figure_of, figures_of
+from siq.report.study_captions import OF_EQUATIONS, OF_ONE_EQUATION, Part, figure_of, figures_of
 from siq.report.study_formulas import formula_rows
 from siq.steps.outcomes import Method, Status
 from siq.study.study import Study
@@ -37,8 +37,9 @@ PRINTED = ("name", "title", "system", "from", "seed", "refinement", "certificate
 """Keys of the study that equations have a use for."""
 
 METHOD = (
-    "Nothing was simulated, recorded or learned. Equilibria were sought by Newton's method over the whole domain;"
-    " the paths of least action lead from each stable state to the saddles next to it, and give the barriers."
+    "Nothing was simulated, recorded or learned. Equilibria were sought by Newton's method over the whole"
+    " domain; the paths of least action lead from each stable state to the saddles next to it, and give the"
+    " barriers."
     " U about each stable state solves the Hamilton–Jacobi equation of f, in powers up to the degree that its"
     " residual asked for, and has to pass the tests of the certificate."
 )
@@ -123,10 +124,9 @@ def equations_page(
         shown, numbers = wells_table(data)
         table = ReportTable("Stable states, barriers and times.", shown, data=numbers, rows_named=True)
     if LEAD in results.images:
+        caption = OF_ONE_EQUATION if results.system.dimension == 1 else OF_EQUATIONS
         figure = figure_of(LEAD, results.images, results.vectors, beside_paper=False)
-    if figure is not None and results.system.dimension == 1:
-        figure = figure_of(LEAD, results.images, results.vectors, beside_paper=False)
-        figure = type(figure)(OF_ONE_STATE, OF_ONE_STATE, figure.image, figure.kind, figure.vector)
+        figure = replace(figure, caption=caption, alternative=caption)
     sections = [
         _formulas(results),
         _evidence(results),
@@ -174,9 +174,13 @@ def _formulas(results: EquationsResults) -> ReportSection:
     places = [] if stored is None else [np.array(one["attractor"]) for one in stored.data["wells"]]
     found = SymbolicDecomposition(system.symbols, None, (), system.formulas, wells)
     rows = formula_rows(found, None, places=places)
-    rows[-1] = FormulaRow(rows[-1].quantity, rows[-1].formula, "The vector field dx/dt without noise, as given.")
+    rows[-1] = FormulaRow(
+        rows[-1].quantity, rows[-1].formula, "The vector field dx/dt without noise, as given."
+    )
     noise = system.diffusion
-    typeset = matrix_mathml(noise.matrix.tolist()) if noise.constant else formula_matrix_mathml(noise.formulas)
+    typeset = (
+        matrix_mathml(noise.matrix.tolist()) if noise.constant else formula_matrix_mathml(noise.formulas)
+    )
     rows.append(FormulaRow("D", typeset, "As given."))
     return ReportSection("Formulas", formulas=rows)
 
@@ -187,7 +191,9 @@ def _evidence(results: EquationsResults) -> ReportSection | None:
     if len(tests):
         file = f"{results.folder}/certificates.csv"
         tables = [ReportTable("The tests of the certificate.", tests, {}, file, rows_named=True)]
-    notes = [] if results.data is None else [f"{note[0].upper()}{note[1:]}." for note in results.data["notes"]]
+    notes = (
+        [] if results.data is None else [f"{note[0].upper()}{note[1:]}." for note in results.data["notes"]]
+    )
     if not tables and not notes:
         return None
     return ReportSection("How far it can be trusted", tables=tables, notes=notes)
@@ -195,9 +201,7 @@ def _evidence(results: EquationsResults) -> ReportSection | None:
 
 def _landscape(study: Study, results: EquationsResults) -> ReportSection | None:
     noises = () if study.landscape is None else study.landscape.noise_intensities
-    found = landscape_tables(
-        results.data, results.tables["landscape"], noises=noises, folder=results.folder
-    )
+    found = landscape_tables(results.data, results.tables["landscape"], noises=noises, folder=results.folder)
     return ReportSection("The landscape in full", tables=found) if found else None
 
 

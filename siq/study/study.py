@@ -108,9 +108,9 @@ class Study(BaseModel):
     system
         Name of a system card, or path of one. Simulated, unless there are recordings; then it only lends
         its states, units, D and exact answers.
-    entrance
-        In the file the key ``from``. ``trajectories``: of recordings, or of a simulation of the system.
-        ``equations``: of the system's equations alone, without simulation, identification or training.
+    from
+        Where the landscape comes from, in Python `entrance`. ``trajectories``: recordings, or a simulation of
+        the system. ``equations``: the system's equations alone; nothing is simulated, identified or trained.
     recordings
         Measured trajectories in the place of a simulation.
     runs
@@ -189,7 +189,9 @@ class Study(BaseModel):
         if self.system is None:
             raise ValueError("'from: equations' needs equations; add 'system: NAME'")
         if self.landscape is None:
-            raise ValueError("'from: equations' finds a landscape and nothing else; remove 'landscape: false'")
+            raise ValueError(
+                "'from: equations' finds a landscape and nothing else; remove 'landscape: false'"
+            )
         for key in OF_TRAJECTORIES:
             if getattr(self, key) != type(self).model_fields[key].get_default():
                 raise ValueError(

@@ -39,7 +39,9 @@ if __name__ == "__main__":
         for name, figure in equations_figures(system, stored, tables["degrees"]).items():
             if figure is not None:
                 save_figure(figure, drawn / name)
-        shown = stored is not None and system.dimension > 2
+        view = None
+        if stored is not None and system.dimension > 2:
+            view = Markup(interactive_view(drawn_of(system, stored)))
         results = EquationsResults(
             system,
             stored,
@@ -47,7 +49,7 @@ if __name__ == "__main__":
             Path(now.input.landscape).parent,
             images={path.stem: path.read_bytes() for path in sorted(drawn.glob("*.png"))},
             vectors={path.stem: path.read_bytes() for path in sorted(drawn.glob("*.svg"))},
-            interactive=Markup(interactive_view(drawn_of(system, stored))) if shown else None,
+            interactive=view,
         )
         versions = {"siq": siq.__version__} | {name: version(name) for name in ("numpy", "snakemake")}
         study = now.settings(PageSettings).study
