@@ -18,6 +18,8 @@
 `basins`              which recorded points lead to an attractor?
 `phase_portrait`      which attractors are there, and which saddles next to each?
 `equilibrium_search`  where do given equations rest in their domain?
+`edge_tracking`       which saddle lies between two attractors, in many states?
+`many_states`         and which attractors and saddles have equations of many states?
 `domain_portrait`     and which attractors, saddles and basins have they?
 ====================  =====================================================================
 

@@ -132,8 +132,11 @@ def distinct_roots(
         return []
     inside = ((x >= low - margin * width) & (x <= high + margin * width)).all(axis=1)
     with np.errstate(all="ignore"):
-        speed = np.linalg.norm(dynamics.drift(starts) / width, axis=1)
-        converged = np.linalg.norm(dynamics.drift(x) / width, axis=1) < 1e-9 * np.nanmedian(speed)
+        # Few starts may all be at rest: then it is the slopes of f that tell what is small.
+        speed = np.nanmedian(np.linalg.norm(dynamics.drift(starts) / width, axis=1))
+        rate = np.nanmedian(np.linalg.norm(dynamics.jacobian(x[:1]), axis=(1, 2)))
+        small = max(1e-9 * speed, 1e-12 * rate)
+        converged = np.linalg.norm(dynamics.drift(x) / width, axis=1) < small
     found = list(known)
     # Zero but for what is left of Newton's last step reads better as zero.
     x = np.where(np.abs(x) < np.finfo(float).eps * width, 0.0, x)

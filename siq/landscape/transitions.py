@@ -24,6 +24,7 @@ from siq.landscape.dwell_times import Exit
 from siq.landscape.paths import (
     MinimumActionPath,
     TransitionPath,
+    descent,
     minimum_action_path,
     transition_path,
 )
@@ -35,6 +36,8 @@ logger = logging.getLogger(__name__)
 
 WORTH_A_WORD = 0.5  # of its standard error, by which rival terms move a barrier (a choice)
 DIFFERENT = 0.02  # share of a barrier by which two ways to it may differ without a word
+FEW_STATES = 8  # up to which first guesses of a path bend to all sides
+GUESSED = 200  # points of one that is a way down taken backwards
 PATH_TOLERANCE = 1e-5  # of the action; prefactors follow the end of the path and need more than barriers
 
 
@@ -148,12 +151,22 @@ def ways_out(dynamics: Dynamics, portrait: PhasePortrait, *, beyond_region: bool
             try:
                 path = transition_path(
                     dynamics, attractor.position, saddle.position, portrait.attractors[end].position,
-                    tolerance=PATH_TOLERANCE,
+                    tolerance=PATH_TOLERANCE, initial=_first_guesses(dynamics, attractor, saddle),
                 )  # fmt: skip
                 ways.append(WayOut(index, end, saddle, path))
             except NumericalFailure as error:
                 ways.append(WayOut(index, end, saddle, None, str(error)))
     return ways
+
+
+def _first_guesses(
+    dynamics: Dynamics, attractor: Equilibrium, saddle: Equilibrium
+) -> list[np.ndarray] | None:
+    """Of many states the way down taken backwards, and the straight line; of few None, for the usual ones."""
+    if dynamics.dimension <= FEW_STATES:
+        return None
+    down = descent(dynamics, saddle.position, attractor.position, GUESSED)
+    return [down[::-1], np.stack([attractor.position, saddle.position])]
 
 
 def _way_beyond(dynamics: Dynamics, portrait: PhasePortrait, index: int, saddle: Equilibrium) -> list[WayOut]:

@@ -7,7 +7,6 @@ characteristics, as that of recordings is.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass as plain_dataclass
 from dataclasses import replace
@@ -26,6 +25,7 @@ from siq.dynamics.domain_portrait import domain_portrait
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.equilibria import hessian_at
 from siq.dynamics.equilibrium_search import spread_evenly
+from siq.dynamics.many_states import MOST_SEARCHED, portrait_of_many
 from siq.dynamics.phase_portrait import PhasePortrait
 from siq.errors import InputError, NumericalFailure
 from siq.identify.given_field import GivenField
@@ -50,7 +50,6 @@ from siq.study.tables import as_table, write_table
 ALONG = 300  # states along a path, from the neighbourhood of which further descents start
 BESIDE = (0.02, 0.05, 0.1)  # of the extent of the well: how far from the path
 UNSEEN = 1024  # states of the domain, and of the box of each well, that no fit sees
-MOST_POWERS = 500  # of degree 4: more take longer than paths do, and V is left out
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -101,7 +100,8 @@ def landscape_of_equations(system: Dynamics, settings: EquationSettings) -> Land
     """
     draw = generator(settings.seed, Purpose.LANDSCAPE)
     try:
-        portrait = domain_portrait(system, seed=settings.seed)
+        many = system.dimension > MOST_SEARCHED
+        portrait = (portrait_of_many if many else domain_portrait)(system, seed=settings.seed)
     except NumericalFailure as error:
         raise NoLandscape(str(error), None, system) from None
     fault = portrait.fault()
@@ -111,7 +111,7 @@ def landscape_of_equations(system: Dynamics, settings: EquationSettings) -> Land
     ways = ways_out(system, portrait, beyond_region=True)
     wells: list[Well | None] = [None] * len(portrait.attractors)
     certificate = None
-    if math.comb(system.dimension + 4, 4) > MOST_POWERS:
+    if many:
         notes.append(
             f"powers of {system.dimension} states are too many to write V in: barriers and times follow from"
             " the paths of least action, which need f alone"
