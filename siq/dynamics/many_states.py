@@ -23,7 +23,8 @@ from siq.dynamics.phase_portrait import (
 )
 
 MOST_SEARCHED = 8  # states up to which Newton's method searches the whole domain
-STARTS = 64
+STARTS = 64  # independent in each state
+ALIKE = 33  # with every state at the same share of its range
 TRACKED = 2  # edges for each two attractors, from different first ways
 MOST_PAIRS = 15  # of attractors
 SAME = 1e-6  # of the domain
@@ -46,7 +47,9 @@ def portrait_of_many(dynamics: Dynamics, *, seed: int = 0) -> PhasePortrait:
     generator = np.random.default_rng(seed)
     box = dynamics.box
     width = np.ptp(box, axis=1)
-    points = spread_evenly(box, STARTS, generator=generator)
+    # Of many independent states the mean is always about the same: some starts have all states high, or low.
+    alike = np.linspace(0, 1, ALIKE)[:, None] * width + box[:, 0]
+    points = np.concatenate([spread_evenly(box, STARTS, generator=generator), alike])
     rate = float(np.median(np.linalg.norm(dynamics.drift(points) / width, axis=1)))
     resting = follow(dynamics, points, [], box=box, states=2).paths[:, -1]
     found = classified(dynamics, distinct_roots(dynamics, resting, box=box, margin=SAME), box=box, rate=rate)
