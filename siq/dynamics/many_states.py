@@ -64,6 +64,8 @@ def portrait_of_many(dynamics: Dynamics, *, seed: int = 0) -> PhasePortrait:
         ):
             saddles.append(top)
     notes = [SEARCHED.format(starts=len(points))]
+    if len(attractors) > 1 and not saddles:
+        notes.append("edges between the basins were followed, and led to no saddle: there are no barriers")
     if len(pairs) > MOST_PAIRS:
         notes.append(f"saddles were sought between {MOST_PAIRS} of {len(pairs)} pairs of attractors")
     return PhasePortrait(
