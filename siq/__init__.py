@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from siq.report.plots.quasipotential import plot_quasipotential
     from siq.report.plots.residuals import plot_residuals
     from siq.report.plots.wells import plot_paths, plot_wells
+    from siq.steps.equations import EquationSettings
     from siq.steps.pipeline import PipelineSettings
     from siq.study.study import Study, load_study
 
@@ -49,6 +50,7 @@ __all__ = [
     "Diagnosis",
     "Diffusion",
     "Dynamics",
+    "EquationSettings",
     "Formula",
     "InputError",
     "Landscape",
@@ -90,6 +92,7 @@ _MODULES = {
     "Diagnosis": "siq.mismatch.diagnosis",
     "Diffusion": "siq.dynamics.diffusion",
     "Dynamics": "siq.dynamics.dynamics",
+    "EquationSettings": "siq.steps.equations",
     "Formula": "siq.dynamics.exports",
     "InputError": "siq.errors",
     "Landscape": "siq.landscape.landscape",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -214,6 +215,22 @@ class Studies(Mapping[str, CheckedStudy]):
         if name not in self._checked:
             self._check(read_document(config_path("studies", f"{name}.yaml")), name)
         return self._checked[name]
+
+    def pattern_of(self, entrance: str) -> str:
+        """A regular expression of the names of the studies with an entrance, which matches nothing for none.
+
+        The files alone are read for it, not checked: a fault is told when somebody asks for that study.
+        """
+        named = [name for name in self if self._entrance(name) == entrance]
+        return "|".join(re.escape(name) for name in named) or "(?!)"
+
+    def _entrance(self, name: str) -> str | None:
+        if name in self._checked:
+            return self._checked[name].study.entrance
+        try:
+            return read_document(config_path("studies", f"{name}.yaml")).data.get("from")
+        except InputError:
+            return None
 
     def __iter__(self):  # type: ignore[no-untyped-def]
         own = [] if self._own is None else [self._own]

@@ -31,7 +31,7 @@ WORDS = {int: "whole number", float: "number", str: "text", bool: "yes or no", t
 def fields(schema: type) -> dict[str, FieldInfo]:
     """Fields by key, of a model or of a dataclass with pydantic's checks."""
     if issubclass(schema, BaseModel):
-        return dict(schema.model_fields)
+        return {field.alias or name: field for name, field in schema.model_fields.items()}
     return dict(schema.__pydantic_fields__)  # type: ignore[attr-defined]
 
 

@@ -30,8 +30,10 @@ from siq.certificate.tests import (
     check_identity,
     stated_error,
 )
+from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.formulas import compile_formulas
 from siq.dynamics.phase_portrait import PhasePortrait
+from siq.identify.given_field import AnyField, GivenField
 from siq.identify.identified_field import IdentifiedField
 from siq.potential.refinement import Refined
 from siq.potential.symbolic import SymbolicDecomposition
@@ -195,39 +197,8 @@ def certify_wells(
     """
     found = refined.found
     wells = refined.wells or refined.network_wells
-    tests: dict[str, Verdict] = {}
-    error, worst = (0.0, None) if wells else (np.inf, None)
-    own_error, from_field = error, 0.0
-    tested = []
-    for well in wells:
-        own = [place for place, one in enumerate(portrait.attractors) if _same(one.position, well.attractor)]
-        mine = [one for one in references if _same(one.attractor, well.attractor)]
-        part = part_of(held_out, well, basin_region(portrait, own[0]), mine[0] if mine else None)
-        tested.append(part.described)
-        if part.claimed < LEAST_CLAIMED:
-            reason = (
-                f"V claims to hold at {part.claimed:.0%} of the held-out states in the well about"
-                f" {_place(well.attractor)}: record more there, or raise refinement.degrees"
-            )
-            tests["hamilton_jacobi"] = Verdict(np.inf, options.hamilton_jacobi, False, reason)
-            error = own_error = np.inf
-            continue
-        candidate = _of_well(well, portrait, part.points)
-        its, place = stated_error(candidate, found, seed=seed)
-        # Characteristics follow the same f: what f's uncertainty adds explains no difference from them.
-        made, its, there = _common(candidate, found, part, mine, options, its, well.level, seed)
-        uncertain = STATED * _error_from_field(well, found, part.points, seed)
-        own_error, from_field = max(own_error, its), max(from_field, uncertain)
-        its += uncertain
-        for name, verdict in made.items():
-            tests[name] = _worse(tests.get(name), verdict)
-        if its >= error:
-            error, worst = its, place if there is None else there
-    missing = len(portrait.attractors) - len(wells)
-    if missing or not wells:
-        reason = f"{missing} of {len(portrait.attractors)} attractors have no formula"
-        tests["branch"] = Verdict(np.inf, options.branch, False, reason)
-    tests["error"] = check_error(own_error, limit=options.error, from_field=from_field)
+    each = _of_each(wells, found, portrait, held_out, options, references, seed)
+    tests, error, worst = each.tests, each.error, each.worst
     if portrait.attractors:
         tests["existence"] = check_existence(found, portrait, seed=seed)
     if refined.wells and refined.network_wells:
@@ -250,11 +221,105 @@ def certify_wells(
     elif compared:
         tests["agreement"] = Verdict(np.inf, 0.0, False, ALONE)
     tests["prediction"] = prediction
-    return _conclude(tests, error, worst, portrait, "wells", "; ".join(dict.fromkeys(tested)))
+    return _conclude(tests, error, worst, portrait, "wells", each.tested_on)
+
+
+def certify_given_wells(
+    wells: Sequence[Well],
+    found: GivenField,
+    portrait: PhasePortrait,
+    points: np.ndarray,
+    *,
+    options: CertificateOptions,
+    references: Sequence[Reference],
+    seed: int = 0,
+) -> Certificate:
+    """Certificate of one formula for each attractor of given equations, the worst of them deciding.
+
+    Nothing was recorded: what tests predictions, motion, and whether uncertain wells exist has no object. The
+    others are those of `certify_wells`.
+
+    Parameters
+    ----------
+    wells
+        V about the attractors.
+    found, portrait
+        f and D, and what follows from them.
+    points
+        States of the domain that no fit saw, shape ``(n, d)``.
+    options, references, seed
+        As for `certify_wells`.
+    """
+    each = _of_each(wells, found, portrait, HeldOut(points, None), options, references, seed)
+    return _conclude(each.tests, each.error, each.worst, portrait, "wells", each.tested_on)
+
+
+@dataclass(frozen=True)
+class _OfEach:
+    """Tests of one formula for each attractor, the worst verdict of each test, and the error to be stated."""
+
+    tests: dict[str, Verdict]
+    error: float
+    worst: np.ndarray | None
+    tested_on: str
+
+
+def _of_each(
+    wells: Sequence[Well],
+    found: AnyField,
+    portrait: PhasePortrait,
+    held_out: HeldOut,
+    options: CertificateOptions,
+    references: Sequence[Reference],
+    seed: int,
+) -> _OfEach:
+    tests: dict[str, Verdict] = {}
+    error, worst = (0.0, None) if wells else (np.inf, None)
+    own_error, from_field = error, 0.0
+    tested = []
+    advice = "" if isinstance(found, GivenField) else "record more there, or "
+    for well in wells:
+        own = [place for place, one in enumerate(portrait.attractors) if _same(one.position, well.attractor)]
+        mine = [one for one in references if _same(one.attractor, well.attractor)]
+        part = part_of(held_out, well, basin_region(portrait, own[0]), mine[0] if mine else None)
+        tested.append(part.described)
+        if part.claimed < LEAST_CLAIMED:
+            reason = (
+                f"V claims to hold at {part.claimed:.0%} of the held-out states in the well about"
+                f" {_place(well.attractor)}: {advice}raise refinement.degrees"
+            )
+            tests["hamilton_jacobi"] = Verdict(np.inf, options.hamilton_jacobi, False, reason)
+            error = own_error = np.inf
+            continue
+        candidate = _of_well(well, portrait, part.points)
+        its, place = stated_error(candidate, found, seed=seed)
+        # Characteristics follow the same f: what f's uncertainty adds explains no difference from them.
+        made, its, there = _common(candidate, found, part, mine, options, its, well.level, seed)
+        uncertain = STATED * _error_from_field(well, found, part.points, seed)
+        own_error, from_field = max(own_error, its), max(from_field, uncertain)
+        its += uncertain
+        for name, verdict in made.items():
+            tests[name] = _worse(tests.get(name), verdict)
+        if its >= error:
+            error, worst = its, place if there is None else there
+    missing = len(portrait.attractors) - len(wells)
+    if missing or not wells:
+        reason = f"{missing} of {len(portrait.attractors)} attractors have no formula"
+        tests["branch"] = Verdict(np.inf, options.branch, False, reason)
+    tests["error"] = check_error(own_error, limit=options.error, from_field=from_field)
+    return _OfEach(tests, error, worst, "; ".join(dict.fromkeys(tested)))
 
 
 def caustic_notes(
     refined: Refined, portrait: PhasePortrait, error: float, *, seed: int = 0
+) -> tuple[str, ...]:
+    """Where characteristics cross below the saddle of a well of a refinement; see `caustics_below`."""
+    wells = refined.wells or refined.network_wells
+    return caustics_below(refined.found.dynamics, wells, portrait, error, seed=seed)
+
+
+def caustics_below(
+    dynamics: Dynamics, wells: Sequence[Well], portrait: PhasePortrait, error: float, *, seed: int = 0
 ) -> tuple[str, ...]:
     """Where characteristics cross below the saddle of a well, in words: no smooth V exists there.
 
@@ -264,9 +329,9 @@ def caustic_notes(
     if not error > NOTICEABLE:
         return ()
     notes = []
-    for well in refined.wells or refined.network_wells:
+    for well in wells:
         fan = adapted_fan(
-            refined.found.dynamics, well.attractor, level=0.98 * well.level,
+            dynamics, well.attractor, level=0.98 * well.level,
             box=_widened(portrait.box), generator=np.random.default_rng(seed), most=FAN,
             tolerance=FAN_TOLERANCE, spacing=FAN_SPACING,
         )  # fmt: skip
@@ -297,7 +362,7 @@ def uncertified(reason: str) -> dict[str, Any]:
 
 def _common(
     candidate: Candidate,
-    found: IdentifiedField,
+    found: AnyField,
     held_out: HeldOut,
     references: Sequence[Reference],
     options: CertificateOptions,
@@ -312,9 +377,10 @@ def _common(
     tests = {
         "hamilton_jacobi": check_hamilton_jacobi(candidate, found, limit=options.hamilton_jacobi),
         "branch": check_branch(candidate, found, limit=options.branch, seed=seed),
-        "descent": check_descent(candidate, found, held_out.pairs, options=options, error=error),
-        "characteristics": followed,
     }
+    if held_out.pairs is not None and not isinstance(found, GivenField):
+        tests["descent"] = check_descent(candidate, found, held_out.pairs, options=options, error=error)
+    tests["characteristics"] = followed
     return tests, error, None if followed.passed else place
 
 
@@ -356,7 +422,7 @@ def _error_of(
     return stated_error(_of_well(well, portrait, _sublevel_points([well])[0]), found, seed=seed)
 
 
-def _error_from_field(well: Well, found: IdentifiedField, points: np.ndarray, seed: int) -> float:
+def _error_from_field(well: Well, found: AnyField, points: np.ndarray, seed: int) -> float:
     """Relative standard error of V over points, from what is not known of f."""
     generator = np.random.default_rng(seed)
     x = points[generator.choice(len(points), min(ERROR_POINTS, len(points)), replace=False)]

@@ -23,7 +23,7 @@ from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.equilibria import hessian_at
 from siq.dynamics.phase_portrait import PhasePortrait
 from siq.errors import NumericalFailure
-from siq.identify.identified_field import IdentifiedField
+from siq.identify.given_field import AnyField
 from siq.numerics.measured_text import place_text
 from siq.numerics.thinning import representative_subset
 from siq.reference.characteristics import End, Fan
@@ -132,7 +132,7 @@ def follow_well(dynamics: Dynamics, portrait: PhasePortrait, index: int, *, seed
 
 def check_characteristics(
     candidate: Candidate,
-    found: IdentifiedField,
+    found: AnyField,
     references: Sequence[Reference],
     *,
     error: float,

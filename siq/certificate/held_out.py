@@ -21,7 +21,7 @@ class HeldOut:
     points
         Evenly spread states, shape ``(n, d)``.
     pairs
-        Consecutive samples.
+        Consecutive samples; None where f is given, and no motion was recorded.
     described
         What the points are, in words.
     claimed
@@ -29,7 +29,7 @@ class HeldOut:
     """
 
     points: np.ndarray
-    pairs: SnapshotPairs
+    pairs: SnapshotPairs | None
     described: str = ""
     claimed: float = 1.0
 
@@ -76,6 +76,8 @@ def part_of(held_out: HeldOut, well: Well, region: BasinRegion, reference: Refer
     described = f"{believed.sum()} of {len(points)} states of a well, where V claims to hold"
     described += further or ", all held out"
     share = float(believed.mean()) if len(points) else 0.0
+    if pairs is None:
+        return HeldOut(points[believed], None, described, share)
     rows = inside(pairs.x0)
     rows[rows] = well.believed(pairs.x0[rows])
     kept = replace(

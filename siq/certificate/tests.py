@@ -36,6 +36,7 @@ from pydantic.dataclasses import dataclass
 
 from siq.certificate.error_bound import SAFETY, residual_integral
 from siq.dynamics.equilibria import Equilibrium, hessian_at
+from siq.identify.given_field import AnyField, GivenField
 from siq.identify.identified_field import IdentifiedField
 from siq.numerics.measured_text import place_text
 from siq.potential.well import Well
@@ -162,7 +163,7 @@ def check_identity(candidate: Candidate, found: IdentifiedField, *, limit: float
     )
 
 
-def check_hamilton_jacobi(candidate: Candidate, found: IdentifiedField, *, limit: float) -> Verdict:
+def check_hamilton_jacobi(candidate: Candidate, found: AnyField, *, limit: float) -> Verdict:
     """Whether ∇V·(f + D∇V) vanishes where ∇V does not.
 
     The cosine of ∇V and g would be 0/0 for gradient systems, in which g vanishes; this measure is not.
@@ -182,7 +183,7 @@ def check_hamilton_jacobi(candidate: Candidate, found: IdentifiedField, *, limit
     return Verdict(value, allowed, value <= allowed, reason)
 
 
-def check_branch(candidate: Candidate, found: IdentifiedField, *, limit: float, seed: int = 0) -> Verdict:
+def check_branch(candidate: Candidate, found: AnyField, *, limit: float, seed: int = 0) -> Verdict:
     """Whether V has the right curvature at every attractor: the test that exposes exact false solutions."""
     if not candidate.attractors:
         return Verdict(np.inf, limit, False, "there is no stable equilibrium at which V could be tested")
@@ -193,7 +194,7 @@ def check_branch(candidate: Candidate, found: IdentifiedField, *, limit: float, 
         difference = root @ (candidate.hessians(one.position[None])[0] - expected) @ root.T
         value = float(np.abs(np.linalg.eigvalsh((difference + difference.T) / 2)).max())
         bound = limit
-        if not found.noise_free:
+        if not isinstance(found, GivenField) and not found.noise_free:
             bound += STANDARD_ERRORS * _hessian_error(found, one, root, seed)
         if value / bound >= worst / allowed:
             worst, allowed, place = value, bound, one
@@ -202,9 +203,7 @@ def check_branch(candidate: Candidate, found: IdentifiedField, *, limit: float, 
     return Verdict(worst, allowed, passed, "" if passed else reason)
 
 
-def stated_error(
-    candidate: Candidate, found: IdentifiedField, *, seed: int = 0
-) -> tuple[float, np.ndarray | None]:
+def stated_error(candidate: Candidate, found: AnyField, *, seed: int = 0) -> tuple[float, np.ndarray | None]:
     """Relative error of V that its own residual and the uncertainty of f leave open.
 
     Returns
@@ -337,9 +336,9 @@ def check_prediction(
     return Verdict(value, limit, True)
 
 
-def _relative_error_of_drift(found: IdentifiedField, points: np.ndarray) -> float:
+def _relative_error_of_drift(found: AnyField, points: np.ndarray) -> float:
     """Rms over points of the standard error of f, over rms of f."""
-    if found.noise_free:
+    if isinstance(found, GivenField) or found.noise_free:
         return 0.0
     components, functions = found.support.T
     terms = found.library.evaluate(points)[:, functions]

@@ -35,12 +35,17 @@ class Input:
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter with its value; a fixed one is never recalibrated."""
+    """A parameter with its value; a fixed one is never recalibrated.
+
+    Where a value is expected, estimates are about that, within its own size, unless recordings tell more
+    (`siq.estimation.expectations`).
+    """
 
     name: str
     value: float
     unit: str = "1"
     fixed: bool = False
+    expected: float | None = None
 
 
 COMPILED = ("functions", "delays", "_lags")
@@ -135,6 +140,7 @@ class Dynamics:
         equations: Sequence[sympy.Expr],
         *,
         diffusion: Diffusion | np.ndarray | Sequence[Sequence[sympy.Expr | float]] | None = None,
+        domain: Sequence[Sequence[float]] | np.ndarray | None = None,
     ) -> Dynamics:
         """Dynamics of formulas alone, with D = 1 unless another is given.
 
@@ -146,6 +152,8 @@ class Dynamics:
             The components of f.
         diffusion
             D, as `Diffusion`, as a matrix ``(d, d)``, or as rows of formulas.
+        domain
+            Two limits a state, where somebody says them.
         """
         if diffusion is None:
             diffusion = Diffusion.identity(len(symbols))
@@ -153,7 +161,9 @@ class Dynamics:
             diffusion = Diffusion(np.asarray(diffusion, dtype=float))
         elif not isinstance(diffusion, Diffusion):
             diffusion = state_noise(symbols, diffusion)
-        return cls(tuple(each.name for each in symbols), tuple(map(sympy.sympify, equations)), diffusion)
+        names, formulas = tuple(each.name for each in symbols), tuple(map(sympy.sympify, equations))
+        box = None if domain is None else np.asarray(domain, dtype=float)
+        return cls(names, formulas, diffusion, domain=box)
 
     @property
     def dimension(self) -> int:
@@ -261,12 +271,33 @@ class Dynamics:
     def jacobian(self, x: np.ndarray) -> np.ndarray:
         """∂f_i/∂x_j at points: ``(n, d)`` to ``(n, d, d)``, i before j."""
         d = self.dimension
-        return self._first(_components(x)).T.reshape(len(x), d, d)
+        result = np.zeros((len(x), d, d))
+        places, compiled = self._first
+        if len(places):
+            result[:, places[:, 0], places[:, 1]] = compiled(_components(x)).T
+        return result
 
     def hessian(self, x: np.ndarray) -> np.ndarray:
         """∂²f_i/∂x_j∂x_k at points: ``(n, d)`` to ``(n, d, d, d)``, i first."""
         d = self.dimension
-        return self._second(_components(x)).T.reshape(len(x), d, d, d)
+        result = np.zeros((len(x), d, d, d))
+        places, compiled = self._second
+        if len(places):
+            i, j, k = places.T
+            result[:, i, j, k] = result[:, i, k, j] = compiled(_components(x)).T
+        return result
+
+    def bend(self, x: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """``Σ_i w_i ∂²f_i`` at points and weights ``(n, d)``: to ``(n, d, d)``, without all of `hessian`."""
+        d = self.dimension
+        result = np.zeros((len(x), d, d))
+        places, compiled = self._second
+        if len(places):
+            for (i, j, k), values in zip(places, compiled(_components(x)), strict=True):
+                result[:, j, k] += weights[:, i] * values
+                if j != k:
+                    result[:, k, j] += weights[:, i] * values
+        return result
 
     @cached_property
     def drift_of_components(self) -> Callable[[np.ndarray], np.ndarray]:
@@ -280,13 +311,33 @@ class Dynamics:
         return compile_formulas(self._autonomous_formulas(), self.symbols)
 
     @cached_property
-    def _first(self) -> Callable[[np.ndarray], np.ndarray]:
-        return compile_formulas(_derivatives(self._autonomous_formulas(), self.symbols), self.symbols)
+    def _derivatives(self) -> dict[tuple[int, int], sympy.Expr]:
+        """∂f_i/∂x_j by (i, j), those that vanish left out: in many states most of them do."""
+        number = {symbol: place for place, symbol in enumerate(self.symbols)}
+        found = {
+            (i, number[symbol]): formula.diff(symbol)
+            for i, formula in enumerate(self._autonomous_formulas())
+            for symbol in sorted(formula.free_symbols & set(self.symbols), key=number.__getitem__)
+        }
+        return {place: one for place, one in found.items() if one != 0}
 
     @cached_property
-    def _second(self) -> Callable[[np.ndarray], np.ndarray]:
-        first = _derivatives(self._autonomous_formulas(), self.symbols)
-        return compile_formulas(_derivatives(first, self.symbols), self.symbols)
+    def _first(self) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
+        """Places (i, j) of the derivatives that do not vanish, shape ``(m, 2)``, and these as a function."""
+        places = np.array(list(self._derivatives), dtype=int).reshape(-1, 2)
+        return places, compile_formulas(list(self._derivatives.values()), self.symbols)
+
+    @cached_property
+    def _second(self) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
+        """The same of second derivatives: places (i, j, k), k not below j."""
+        found = {
+            (i, j, k): second
+            for (i, j), first in self._derivatives.items()
+            for k, symbol in enumerate(self.symbols)
+            if k >= j and symbol in first.free_symbols and (second := first.diff(symbol)) != 0
+        }
+        places = np.array(list(found), dtype=int).reshape(-1, 3)
+        return places, compile_formulas(list(found.values()), self.symbols)
 
     def _autonomous_formulas(self) -> tuple[sympy.Expr, ...]:
         if not self.autonomous:
@@ -324,7 +375,3 @@ class Dynamics:
 
 def _components(x: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(x.T)
-
-
-def _derivatives(expressions: Sequence[sympy.Expr], symbols: Sequence[sympy.Symbol]) -> list[sympy.Expr]:
-    return [expression.diff(symbol) for expression in expressions for symbol in symbols]

@@ -30,7 +30,7 @@ ACCURACY = 1e-7  # of the recorded box: local error of a step
 ARRIVED = 1e-4  # of the recorded box: trajectories so close to an attractor end there
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Equilibrium:
     """A state at which f vanishes.
 
@@ -90,33 +90,101 @@ def find_equilibria(dynamics: Dynamics, points: np.ndarray) -> list[Equilibrium]
     list of Equilibrium
         By their position along the first state. Only roots of f that are isolated are found.
     """
-    low, high = points.min(axis=0), points.max(axis=0)
+    box = np.stack([points.min(axis=0), points.max(axis=0)], axis=1)
+    found = distinct_roots(dynamics, points, box=box, margin=MARGIN)
+    return classified(dynamics, found, box=box, rate=rate_of(dynamics, points))
+
+
+def distinct_roots(
+    dynamics: Dynamics,
+    starts: np.ndarray,
+    *,
+    box: np.ndarray,
+    margin: float,
+    known: Sequence[np.ndarray] = (),
+) -> list[np.ndarray]:
+    """Where f vanishes, as far as Newton's method comes there from some starts; each root once.
+
+    Parameters
+    ----------
+    dynamics
+        f.
+    starts
+        Shape ``(n, d)``.
+    box
+        Shape ``(d, 2)``: the region of interest.
+    margin
+        Share of the box by which a root may lie outside.
+    known
+        Roots that are deflated: f is multiplied by ``Π (1 + 1/∣x - r∣²)``, so that Newton's method is kept
+        away from them and comes to others. They are not given again.
+
+    References
+    ----------
+    P. E. Farrell, Á. Birkisson, S. W. Funke, SIAM J. Sci. Comput. 37 (2015) A2026: deflation.
+    """
+    low, high = box.T
     width = np.where(high > low, high - low, 1.0)
-    x = points.copy()
+    x = _newton(dynamics, starts, low, width, known)
+    if known:
+        x = _newton(dynamics, x, low, width, ())
+    if not len(x):
+        return []
+    inside = ((x >= low - margin * width) & (x <= high + margin * width)).all(axis=1)
+    with np.errstate(all="ignore"):
+        # Few starts may all be at rest: then it is the slopes of f that tell what is small.
+        speed = np.nanmedian(np.linalg.norm(dynamics.drift(starts) / width, axis=1))
+        rate = np.nanmedian(np.linalg.norm(dynamics.jacobian(x[:1]), axis=(1, 2)))
+        small = max(1e-9 * speed, 1e-12 * rate)
+        converged = np.linalg.norm(dynamics.drift(x) / width, axis=1) < small
+    found = list(known)
+    # Zero but for what is left of Newton's last step reads better as zero.
+    x = np.where(np.abs(x) < np.finfo(float).eps * width, 0.0, x)
+    for candidate in x[inside & converged]:
+        if all(np.abs((candidate - other) / width).max() > SAME for other in found):
+            found.append(candidate)
+    return found[len(known) :]
+
+
+def _newton(
+    dynamics: Dynamics, starts: np.ndarray, low: np.ndarray, width: np.ndarray, known: Sequence[np.ndarray]
+) -> np.ndarray:
+    """Where Newton's method has come from some starts; what has run away is left out."""
+    x = starts.copy()
     for _ in range(NEWTON_STEPS):
+        if not len(x):
+            break
         # In shares of the box, or states in very different units would damp each other.
         value, jacobian = dynamics.drift(x) / width, dynamics.jacobian(x) * width / width[:, None]
         size = np.linalg.norm(jacobian, axis=(1, 2))[:, None, None] + 1e-100  # its square counts
         # A little damping keeps singular Jacobians harmless and does not spoil convergence to rounding.
         normal = np.einsum("nji,njk->nik", jacobian, jacobian) + 1e-14 * size**2 * np.eye(x.shape[1])
         step = -np.linalg.solve(normal, np.einsum("nji,nj->ni", jacobian, value)[..., None])[..., 0]
+        if known:
+            step *= _deflation((x[:, None] - np.array(known)) / width, step)
         longest = np.abs(step).max(axis=1, keepdims=True)
         x = x + width * step * np.minimum(1.0, 0.2 / np.maximum(longest, 1e-300))
         x = x[np.isfinite(x).all(axis=1) & (np.abs((x - low) / width - 0.5) < 2.0).all(axis=1)]
-        if not len(x):
-            return []
-    inside = ((x > low - MARGIN * width) & (x < high + MARGIN * width)).all(axis=1)
-    speed = np.linalg.norm(dynamics.drift(points) / width, axis=1)
-    converged = np.linalg.norm(dynamics.drift(x) / width, axis=1) < 1e-9 * np.median(speed)
-    found: list[np.ndarray] = []
-    # Zero but for what is left of Newton's last step reads better as zero.
-    x = np.where(np.abs(x) < np.finfo(float).eps * width, 0.0, x)
-    for candidate in x[inside & converged]:
-        if all(np.abs((candidate - other) / width).max() > SAME for other in found):
-            found.append(candidate)
-    found.sort(key=lambda position: tuple(np.round(position / width, 6)))
-    rate = rate_of(dynamics, points)
-    return [classify(dynamics, position, rate=rate) for position in found]
+    return x
+
+
+def _deflation(offset: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Factor of Newton's step, ``(n, 1)``, that deflation makes, from offsets to known roots ``(n, k, d)``.
+
+    With ``m f`` in the place of f, Newton's step s becomes ``s/(1 - s·∇m/m)``.
+    """
+    square = np.maximum((offset**2).sum(axis=2), 1e-24)
+    slope = (-2 * offset / (square * (square + 1))[:, :, None]).sum(axis=1)
+    return np.asarray(1 / (1 - (slope * step).sum(axis=1) + 1e-12))[:, None]
+
+
+def classified(
+    dynamics: Dynamics, positions: Sequence[np.ndarray], *, box: np.ndarray, rate: float
+) -> list[Equilibrium]:
+    """Equilibria at positions, by these along the first state; see `classify` for the rate."""
+    width = np.where(box[:, 1] > box[:, 0], box[:, 1] - box[:, 0], 1.0)
+    ordered = sorted(positions, key=lambda position: tuple(np.round(position / width, 6)))
+    return [classify(dynamics, position, rate=rate) for position in ordered]
 
 
 def rate_of(dynamics: Dynamics, points: np.ndarray) -> float:
@@ -245,10 +313,33 @@ def neighbours(
     box: np.ndarray,
 ) -> set[int]:
     """The attractors that lie below a saddle, on either side of its unstable directions."""
+    return {int(end) for end in _sides(dynamics, saddle, attractors, box=box) if end >= 0}
+
+
+def leads_back(
+    dynamics: Dynamics,
+    saddle: Equilibrium,
+    attractors: Sequence[Equilibrium],
+    *,
+    box: np.ndarray,
+) -> bool:
+    """Whether f leads from all sides of a saddle to one and the same attractor: it parts no wells."""
+    ends = _sides(dynamics, saddle, attractors, box=box)
+    return bool(ends[0] >= 0 and (ends == ends[0]).all())
+
+
+def _sides(
+    dynamics: Dynamics,
+    saddle: Equilibrium,
+    attractors: Sequence[Equilibrium],
+    *,
+    box: np.ndarray,
+) -> np.ndarray:
+    """Where f leads from both sides of each unstable direction of a saddle: attractors, or -1."""
     values, vectors = np.linalg.eig(dynamics.jacobian(saddle.position[None])[0])
     width = box[:, 1] - box[:, 0]
     starts = []
     for vector in vectors[:, values.real > 0].T:
         direction = vector.real / np.abs(vector.real / width).max()
         starts += [saddle.position + 1e-3 * direction, saddle.position - 1e-3 * direction]
-    return {int(end) for end in follow(dynamics, np.array(starts), attractors, box=box).ends if end >= 0}
+    return follow(dynamics, np.array(starts), attractors, box=box).ends

@@ -6,7 +6,8 @@ the check that ends a training.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -44,6 +45,10 @@ class PhasePortrait:
         From recorded points, to whatever end.
     recurrence
         Where those lead that come to rest nowhere; None where they are few.
+    harmless
+        Degenerate equilibria that take no part in the landscape.
+    notes
+        What is not known, in words.
     """
 
     points: np.ndarray
@@ -54,6 +59,8 @@ class PhasePortrait:
     basins: tuple[Basin, ...]
     descents: Descents
     recurrence: Recurrence | None = None
+    harmless: tuple[Equilibrium, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @property
     def unsettled(self) -> float:
@@ -62,7 +69,7 @@ class PhasePortrait:
 
     def fault(self) -> str | None:
         """Why this landscape has no wells, in words; None where it has."""
-        degenerate = [one for one in self.equilibria if one.kind == "degenerate"]
+        degenerate = [one for one in self.equilibria if one.kind == "degenerate" and one not in self.harmless]
         if degenerate:
             place = np.array2string(degenerate[0].position, precision=4)
             return f"the equilibrium at {place} is neither stable nor unstable to first order"
@@ -108,27 +115,49 @@ def phase_portrait(dynamics: Dynamics, points: np.ndarray, *, seed: int = 0) -> 
     equilibria = find_equilibria(dynamics, points[few[:NEWTON_STARTS]])
     stable = [one for one in equilibria if one.kind == "attractor"]
     descents = follow(dynamics, points[few[:STARTS]], stable, box=box)
+    attractors, descents = reached_attractors(stable, descents)
+    around = saddles_beside(dynamics, equilibria, attractors, box=box)
+    basins = [
+        basin_of(dynamics, descents, index, attractors, box=box, generator=generator)
+        for index in range(len(attractors))
+    ]
+    return PhasePortrait(
+        points, box, tuple(equilibria), tuple(attractors), around, tuple(basins), descents,
+        recurrence_beyond(dynamics, descents, box=box, rate=rate_of(dynamics, points)),
+    )  # fmt: skip
+
+
+def reached_attractors(
+    stable: Sequence[Equilibrium], descents: Descents
+) -> tuple[list[Equilibrium], Descents]:
+    """Those stable equilibria at which descents end, and the descents with the numbers of these."""
     reached = [index for index in range(len(stable)) if (descents.ends == index).any()]
-    attractors = [stable[index] for index in reached]
     renumbered = np.full(len(stable) + 1, -1)
     renumbered[reached] = np.arange(len(reached))
-    descents = Descents(descents.paths, renumbered[descents.ends], descents.escaped)
+    return [stable[index] for index in reached], replace(descents, ends=renumbered[descents.ends])
+
+
+def saddles_beside(
+    dynamics: Dynamics,
+    equilibria: Sequence[Equilibrium],
+    attractors: Sequence[Equilibrium],
+    *,
+    box: np.ndarray,
+) -> tuple[tuple[Equilibrium, ...], ...]:
+    """For each attractor, the saddles next to it."""
     around: list[list[Equilibrium]] = [[] for _ in attractors]
     for one in equilibria:
         if one.kind == "saddle":
             for index in neighbours(dynamics, one, attractors, box=box):
                 around[index].append(one)
-    basins = [
-        basin_of(dynamics, descents, index, attractors, box=box, generator=generator)
-        for index in range(len(attractors))
-    ]
+    return tuple(tuple(saddles) for saddles in around)
+
+
+def recurrence_beyond(
+    dynamics: Dynamics, descents: Descents, *, box: np.ndarray, rate: float
+) -> Recurrence | None:
+    """Where those descents lead that come to rest nowhere; None where they are few."""
     unsettled = np.flatnonzero((descents.ends < 0) & ~descents.escaped)
-    recurrence = None
-    if len(unsettled) > UNSETTLED * len(descents.ends):
-        recurrence = recurrence_of(
-            dynamics, descents.paths[unsettled, -1], box=box, rate=rate_of(dynamics, points)
-        )
-    return PhasePortrait(
-        points, box, tuple(equilibria), tuple(attractors),
-        tuple(tuple(saddles) for saddles in around), tuple(basins), descents, recurrence,
-    )  # fmt: skip
+    if not len(unsettled) > UNSETTLED * len(descents.ends):
+        return None
+    return recurrence_of(dynamics, descents.paths[unsettled, -1], box=box, rate=rate)

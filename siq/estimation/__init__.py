@@ -13,6 +13,7 @@ Imports `siq.dynamics` and what it may import.
 `noise_kernel`       the likelihood of both, compiled
 `score_kernel`       what does it say of formulas of the noise, compiled?
 `budget`             how much work may it take?
+`expectations`       what does a card say of parameters that recordings do not tell?
 `first_states`       with which states does a fit begin?
 `shooting`           where does one step of a fit lead?
 `estimation`         which parameters, states and noise fit best?

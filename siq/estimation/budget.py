@@ -84,6 +84,7 @@ class Budget:
     stopped_by: Literal["work", "clock"] | None = None
     _begun: float = field(default=0.0, init=False)
     _exempt: int = field(default=0, init=False)
+    _kept: float = field(default=0.0, init=False)
 
     def __post_init__(self) -> None:
         self._begun = self.clock()
@@ -101,7 +102,7 @@ class Budget:
     @property
     def exhausted_by(self) -> Literal["work", "clock"] | None:
         """What ran out, if something did."""
-        if self.spent >= self.work:
+        if self.spent >= self.work * (1 - self._kept):
             return "work"
         return "clock" if self.elapsed >= self.seconds else None
 
@@ -126,6 +127,15 @@ class Budget:
             yield
         finally:
             self._exempt -= 1
+
+    @contextmanager
+    def keeping(self, share: float) -> Iterator[None]:
+        """Work that leaves a share of what is allowed to what comes after it."""
+        before, self._kept = self._kept, share
+        try:
+            yield
+        finally:
+            self._kept = before
 
     def account(self) -> Account:
         """What was spent until now, as a verdict records it."""

@@ -22,6 +22,7 @@ import numpy as np
 from siq.dynamics.dynamics import Dynamics
 from siq.estimation.budget import Budget
 from siq.estimation.closure import ClosedFunctions
+from siq.estimation.expectations import Expectations
 from siq.estimation.innovations import Noise, solve, whiten
 from siq.estimation.linearisation import Grid, Linearisation, linearise, substeps_needed
 from siq.estimation.measurements import Measurements
@@ -61,7 +62,8 @@ class Fit:
     log_likelihood
         Not the restricted one, which depends on the units in which a model has its states.
     sum_of_squares
-        Of the whitened innovations: about `degrees_of_freedom` where the model is right.
+        Of the whitened innovations, and of what is expected of parameters: about `degrees_of_freedom` where
+        the model is right.
     degrees_of_freedom
         Measured values less initial states and free parameters.
     substeps
@@ -210,7 +212,7 @@ def fit_by_filter(
 def _gauss_newton(
     shooting: Shooting, now: Iterate, noise: Noise, *, estimate_process: bool, most: int
 ) -> Fit:
-    data = shooting.grid.data
+    data, expected = shooting.grid.data, Expectations.of(shooting.model)
     before: np.ndarray | None = None
     totals: list[float] = []
     converged, settled_noise, whole = False, False, False
@@ -223,7 +225,10 @@ def _gauss_newton(
             )  # fmt: skip
         shooting.charge()
         white = whiten(now.along, data, noise)
-        change, _ = solve(white.columns, white.innovations, least=shooting.resolution)
+        columns, innovations = expected.beside(
+            white.columns, white.innovations, now.values[list(shooting.model.free)]
+        )
+        change, _ = solve(columns, innovations, least=shooting.resolution)
         explained = white.columns @ change
         left = white.innovations - explained
         # A shortened step leaves much of what is foreseen undone, and the forecast unchanged.
@@ -294,9 +299,12 @@ def _fit_at(
     resolution: float,
 ) -> Fit:
     white = whiten(at.along, data, noise)
-    change, covariance = solve(white.columns, white.innovations, least=resolution)
+    columns, innovations = Expectations.of(model).beside(
+        white.columns, white.innovations, at.values[list(model.free)]
+    )
+    change, covariance = solve(columns, innovations, least=resolution)
     # The last change is below the errors. The likelihood is that of the states in hand, not of a forecast.
-    total = float(white.innovations @ white.innovations)
+    total = float(innovations @ innovations)
     return Fit(
         model=model.with_values(changed(at.values, model.free, change if converged else 0 * change)),
         covariance=covariance,

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from siq.dynamics.dynamics import Dynamics
+from siq.dynamics.parametric import symbol
 from siq.estimation.estimation import fit_by_multiple_shooting
 from siq.estimation.first_states import first_states
 from siq.estimation.innovations import Noise
@@ -38,8 +39,33 @@ class FreeRun:
     scored: np.ndarray
 
 
+@dataclass(frozen=True)
+class UsualStates:
+    """Where a system usually is: what a prefix does not tell of a state that nobody measures.
+
+    Attributes
+    ----------
+    mean, width
+        Of each state: its mean, and how far from there it may well begin; shape ``(d,)``.
+    """
+
+    mean: np.ndarray
+    width: np.ndarray
+
+    @classmethod
+    def along(cls, x: np.ndarray) -> UsualStates:
+        """Of states ``(n, d)`` along recordings: anywhere within their range, as many begin at its ends."""
+        return cls(x.mean(axis=0), np.ptp(x, axis=0))
+
+
 def free_run(
-    model: Dynamics, data: Measurements, *, noise: Noise, substeps: int, told: int | None = None
+    model: Dynamics,
+    data: Measurements,
+    *,
+    noise: Noise,
+    substeps: int,
+    told: int | None = None,
+    usual: UsualStates | None = None,
 ) -> FreeRun:
     """Simulate recordings from states that their prefixes tell.
 
@@ -55,9 +81,12 @@ def free_run(
         Runge–Kutta steps between samples.
     told
         Samples of each prefix; by default a fifth of the recording, and `SHORTEST_PREFIX` at least.
+    usual
+        Where the states are expected beforehand; by default nothing is.
     """
     rows = told_rows(data, told)
-    x = initial_states(model, data.until(np.maximum(rows, 2)), noise=noise, substeps=substeps)
+    prefix = data.until(np.maximum(rows, 2))
+    x = initial_states(model, prefix, noise=noise, substeps=substeps, usual=usual)
     states = run(model, Grid(data, substeps), x)
     signals = data.signals(data.t, data.recording, delays=model.lags(model.values))
     within = np.arange(len(data.t)) - data.first[data.recording]
@@ -77,12 +106,21 @@ def told_rows(data: Measurements, told: int | None = None) -> np.ndarray:
     return np.minimum(rows, lengths - 1)
 
 
-def initial_states(model: Dynamics, data: Measurements, *, noise: Noise, substeps: int) -> np.ndarray:
+def initial_states(
+    model: Dynamics,
+    data: Measurements,
+    *,
+    noise: Noise,
+    substeps: int,
+    usual: UsualStates | None = None,
+) -> np.ndarray:
     """The states in which recordings begin, shape ``(recordings, d)``, with all parameters as they are."""
     still = replace(model, parameters=tuple(replace(each, fixed=True) for each in model.parameters))
     process = np.zeros(model.dimension)
     process[: len(noise.process)] = noise.process
     start = first_states(still, data)
+    if usual is not None:
+        still, data, noise = _with_usual_states(still, data, noise, usual)
     follow = fit_by_multiple_shooting(
         still,
         data,
@@ -104,6 +142,22 @@ def initial_states(model: Dynamics, data: Measurements, *, noise: Noise, substep
     return best[data.first[:-1]]
 
 
+def _with_usual_states(
+    model: Dynamics, data: Measurements, noise: Noise, usual: UsualStates
+) -> tuple[Dynamics, Measurements, Noise]:
+    """What is expected of first states, as if it were measured: once, and as inaccurately as it is known."""
+    moving = np.flatnonzero(usual.width > 0)
+    names = [model.states[place] for place in moving]
+    expected = np.full((len(data.t), len(names)), np.nan)
+    expected[data.first[:-1]] = usual.mean[moving]
+    variances = np.concatenate([noise.measurement, usual.width[moving] ** 2])
+    return (
+        replace(model, outputs=(*model.outputs, *((f"usual_{name}", symbol(name)) for name in names))),
+        replace(data, outputs=np.hstack([data.outputs, expected]), sensor_noise=variances),
+        replace(noise, measurement=variances),
+    )
+
+
 def normalised_rms(outputs: np.ndarray, simulated: FreeRun) -> float | None:
     """Root mean square error over that of the outputs about their mean; None where a simulation ran away.
 
@@ -114,10 +168,24 @@ def normalised_rms(outputs: np.ndarray, simulated: FreeRun) -> float | None:
     simulated
         The free run of the same recordings.
     """
+    squares = squared_errors(outputs, simulated)
+    return None if squares is None else float(np.sqrt(squares.mean()))
+
+
+def squared_errors(outputs: np.ndarray, simulated: FreeRun) -> np.ndarray | None:
+    """Squared errors over the variance of each output, of every value that is scored; see `normalised_rms`.
+
+    Returns
+    -------
+    numpy.ndarray or None
+        Shape ``(values,)``, sample by sample; what was not measured is left out. None where a simulation ran
+        away.
+    """
     measured = outputs[simulated.scored]
     error = simulated.outputs[simulated.scored] - measured
     known = np.isfinite(measured)
     if not np.isfinite(error[known]).all():
         return None
     spread = np.nanvar(measured, axis=0)
-    return float(np.sqrt(np.nanmean(error**2 / np.where(spread > 0, spread, 1.0))))
+    squares: np.ndarray = (error**2 / np.where(spread > 0, spread, 1.0))[known]
+    return squares

@@ -7,7 +7,7 @@ parameters are unknown, every trajectory follows its equations at every step, an
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.tape import Tape
 from siq.estimation.budget import Budget, evaluation
 from siq.estimation.estimation import Fit, fit_of_states
+from siq.estimation.expectations import Expectations
 from siq.estimation.innovations import Noise
 from siq.estimation.kernels import whitened_innovations
 from siq.estimation.linearisation import Grid, Linearisation, integrate_intervals, linearise
@@ -166,7 +167,8 @@ class _Course:
     values, begin, states
         All parameters; the initial states, shape ``(recordings, d)``; the states at all samples.
     total
-        Weighted sum of squared residuals; not finite where the simulation runs away.
+        Weighted sum of squared residuals, and of what is expected of parameters; not finite where the
+        simulation runs away.
     """
 
     values: np.ndarray
@@ -180,7 +182,8 @@ class _Course:
         outputs = model.functions.outputs(states.T, grid.at_samples(model.lags(values)), values).T
         known = np.isfinite(grid.data.outputs)
         left = ((outputs - grid.data.outputs) / np.sqrt(noise.measurement))[known]
-        return cls(values, begin, states, float(left @ left))
+        expected = Expectations.of(model).deviations(values[list(model.free)])
+        return cls(values, begin, states, float(left @ left + expected @ expected))
 
 
 def _descended(
@@ -196,7 +199,9 @@ def _descended(
             budget.charge(work * (RUN if normal is not None else 1.0 + RUN))
         if normal is None:
             along = linearise(model, grid, best.values, best.states)
-            normal = normal_equations(along, grid.data, noise.measurement)
+            normal = normal_equations(along, grid.data, noise.measurement).with_expectations(
+                Expectations.of(model), best.values[free]
+            )
         change, begin, foreseen = normal.step(damping)
         new = best.values.copy()
         new[free] += change
@@ -236,6 +241,14 @@ class NormalEquations:
     between: np.ndarray
     shared_target: np.ndarray
     own_target: np.ndarray
+
+    def with_expectations(self, expected: Expectations, values: np.ndarray) -> NormalEquations:
+        """The same with what is expected of the parameters, which are at `values`, shape ``(p,)``."""
+        return replace(
+            self,
+            shared=self.shared + np.diag(expected.weights**2),
+            shared_target=self.shared_target + expected.weights * expected.deviations(values),
+        )
 
     def step(self, damping: float) -> tuple[np.ndarray, np.ndarray, float]:
         """Changes of parameters ``(p,)`` and initial states ``(r, d)``, and what they gain if all is linear.

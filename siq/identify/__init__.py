@@ -7,6 +7,7 @@
 `stability`             in how many resampled recordings would each term be chosen?
 `flow_regression`       which coefficients of given terms make f lead from X0 to Xh?
 `identified_field`      what is known of the f that was found, errors included?
+`given_field`           and of one that was given?
 `library`               which candidate functions are there, with which derivatives and constraints?
 `flow`                  where does f lead within the step of a pair?
 `diffusion`             which D, where nobody gave it?

@@ -20,6 +20,7 @@ from siq.errors import NumericalFailure
 
 START_SHARE = 1e-6  # of the action: U on the ellipsoid where a chain begins
 CENTRAL = 0.005  # of the distance to the end: nearer to the attractor points lie no closer together
+MOST_BENDS = 6  # directions of bent first guesses: each costs as much as the path itself
 BEND = 0.4  # of the distance: how far bent first guesses leave the straight line
 KICKS = (0.3, 0.1, 0.03, 0.01)  # of the distance: tried from a chain that is at rest and no minimum
 AT_REST = 1e-5  # |f| at a state that counts as an equilibrium, in units of the Jacobian and the distance
@@ -114,10 +115,8 @@ class PathProblem:
 
     def bend(self, y: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """``Σ_k weights_k ∂²f_k``, ``(n, d, d)``."""
-        second = self.dynamics.hessian(self.unscaled(y))
-        return (
-            self.units.T @ np.einsum("nk,nkij->nij", weights @ self.inverse / self.rate, second) @ self.units
-        )
+        second = self.dynamics.bend(self.unscaled(y), weights @ self.inverse / self.rate)
+        return np.asarray(self.units.T @ second @ self.units)
 
     def segments(self, y: np.ndarray) -> Segments:
         """What the action of a chain is made of."""
@@ -161,7 +160,7 @@ class PathProblem:
         line = share * self.end
         chains = [line]
         # The columns of the right factor span what is across the line.
-        across = np.linalg.svd(self.end[None])[2][1:]
+        across = np.linalg.svd(self.end[None])[2][1 : MOST_BENDS + 1]
         chains += [line + BEND * side * np.sin(np.pi * share) * way for way in across for side in (1, -1)]
         if self.hessian is None:
             return chains, 0.0

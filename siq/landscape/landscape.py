@@ -20,6 +20,7 @@ from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.equilibria import Equilibrium
 from siq.dynamics.phase_portrait import PhasePortrait
 from siq.errors import NumericalFailure
+from siq.identify.given_field import AnyField, GivenField
 from siq.identify.identified_field import IdentifiedField
 from siq.landscape.dwell_times import Exit, NoiseStrength, dwell_time
 from siq.landscape.global_quasipotential import GlobalQuasipotential, heights_of_attractors, matched
@@ -39,6 +40,7 @@ from siq.potential.well import Well
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from siq.steps.equations import EquationSettings
     from siq.steps.pipeline import PipelineSettings
 
 SAME = 1e-6  # of the recorded box: one attractor, from different starts
@@ -85,6 +87,8 @@ class Landscape:
     seen
         The two states between which the recordings hop by themselves, without any formula; None where
         nothing is known of them, or several wells are certified.
+    given
+        Whether f was given as equations: the region is their domain then, and nothing of f is uncertain.
     """
 
     dynamics: Dynamics
@@ -101,6 +105,7 @@ class Landscape:
     found: IdentifiedField | None = None
     visits: tuple[VisitTest, ...] = ()
     seen: RecordStates | None = None
+    given: bool = False
 
     @classmethod
     def from_recordings(
@@ -161,6 +166,44 @@ class Landscape:
         )
         time = trajectories.time_unit or settings.space.unit("t", unknown="1")
         return found.in_units(units, time=time)
+
+    @classmethod
+    def from_equations(
+        cls, system: str | Path | Dynamics, settings: EquationSettings | None = None
+    ) -> Landscape:
+        """The landscape of given equations: no recordings, no sampling, no training.
+
+        Parameters
+        ----------
+        system
+            A system card, or `siq.Dynamics` with its domain.
+        settings
+            Of all steps; see `siq.steps.equations.EquationSettings`.
+
+        Raises
+        ------
+        InputError
+            For a card that cannot be read, or a system that has no quasipotential: driven, without a domain,
+            or with noise that does not reach every state.
+        NoLandscape
+            When there is no stable equilibrium in the domain. It says why.
+
+        Examples
+        --------
+        >>> import sympy
+        >>> x, y = sympy.symbols("x y", real=True)
+        >>> wells = Dynamics.of((x, y), (x - x**3, -y), domain=[(-2, 2), (-1, 1)])
+        >>> landscape = Landscape.from_equations(wells)
+        >>> landscape.barriers().round(3)[["start", "end", "barrier"]]
+           start  end  barrier
+        0      0    1      0.5
+        1      1    0      0.5
+        >>> landscape.certificate.certified
+        True
+        """
+        from siq.steps.equations import EquationSettings, landscape_of_equations, usable_system
+
+        return landscape_of_equations(usable_system(system), settings or EquationSettings())
 
     def in_units(self, units: Sequence[str], *, time: str = "1") -> Landscape:
         """The same with the units of the states and of the time said; nothing is converted."""
@@ -256,9 +299,7 @@ class Landscape:
         """
         strength = self.noise if noise is None else NoiseStrength(noise)
         if strength is None:
-            raise ValueError(
-                "the recordings show no noise, and how long a well lasts follows from it; give 'noise'"
-            )
+            raise ValueError("no noise is known, and how long a well lasts follows from it; give 'noise'")
         rows = []
         for index in range(len(self.attractors)):
             found = dwell_time(self.exits(index), strength)
@@ -371,20 +412,35 @@ def find_landscape(
     else:
         kept = [_given(wells, found, portrait, index, notes) for index in range(len(portrait.attractors))]
     ways = transitions(found, ways_out(found.dynamics, portrait), kept)
+    return assembled(found, portrait, kept, ways, notes, certificate=certificate, noise=noise)
+
+
+def assembled(
+    found: AnyField,
+    portrait: PhasePortrait,
+    wells: Sequence[Well | None],
+    ways: Sequence[Transition],
+    notes: list[str],
+    *,
+    certificate: Certificate | None,
+    noise: NoiseStrength | None,
+) -> Landscape:
+    """The landscape of what was found; the arguments are those of `Landscape` and of `find_landscape`."""
     ends = portrait.descents.ends
     return Landscape(
         found.dynamics,
         portrait.equilibria,
         portrait.attractors,
         np.array([float((ends == index).mean()) for index in range(len(portrait.attractors))]),
-        tuple(kept),
+        tuple(wells),
         tuple(ways),
         _heights(len(portrait.attractors), ways, notes),
         tuple(notes),
         certificate,
         np.array([position_standard_errors(found, one.position) for one in portrait.attractors]),
         noise,
-        found,
+        None if isinstance(found, GivenField) else found,
+        given=isinstance(found, GivenField),
     )
 
 
@@ -414,7 +470,7 @@ def _given(
     return None
 
 
-def _heights(count: int, ways: list[Transition], notes: list[str]) -> np.ndarray:
+def _heights(count: int, ways: Sequence[Transition], notes: list[str]) -> np.ndarray:
     barriers = np.full((count, count), np.inf)
     for way in ways:
         if way.end is not None and np.isfinite(way.barrier):

@@ -207,14 +207,14 @@ def transition_path(
     NumericalFailure
         When f leads from the saddle to the target on neither side, or for want of an uphill path.
     """
-    descent = _descent(dynamics, np.asarray(saddle, float), np.asarray(target, float), nodes)
+    downhill = descent(dynamics, np.asarray(saddle, float), np.asarray(target, float), nodes)
     uphill = minimum_action_path(
         dynamics, attractor, saddle, nodes=nodes, tolerance=tolerance, initial=initial
     )
-    return TransitionPath(uphill, descent)
+    return TransitionPath(uphill, downhill)
 
 
-def _descent(dynamics: Dynamics, saddle: np.ndarray, target: np.ndarray, nodes: int) -> np.ndarray:
+def descent(dynamics: Dynamics, saddle: np.ndarray, target: np.ndarray, nodes: int) -> np.ndarray:
     """The trajectory of f from a saddle to an attractor, in evenly spaced points."""
     problem = PathProblem(dynamics, saddle, target)
     values, vectors = np.linalg.eig(problem.jacobian(np.zeros((1, dynamics.dimension)))[0])

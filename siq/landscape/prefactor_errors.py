@@ -16,6 +16,7 @@ import scipy.linalg
 
 from siq.dynamics.dynamics import Dynamics
 from siq.errors import NumericalFailure
+from siq.identify.given_field import AnyField, GivenField
 from siq.identify.identified_field import IdentifiedField
 from siq.landscape.paths import MinimumActionPath, minimum_action_path
 from siq.landscape.rates import escape_rate
@@ -45,9 +46,7 @@ class PrefactorError:
     covariance: float
 
 
-def prefactor_error(
-    found: IdentifiedField, path: MinimumActionPath, *, seed: int = 0
-) -> PrefactorError | None:
+def prefactor_error(found: AnyField, path: MinimumActionPath, *, seed: int = 0) -> PrefactorError | None:
     """The uncertainty of the prefactor of a way out.
 
     Parameters
@@ -64,7 +63,7 @@ def prefactor_error(
     PrefactorError or None
         Zero where f carries no noise; None where the law holds for too few of the changed f.
     """
-    if found.noise_free:
+    if isinstance(found, GivenField) or found.noise_free:
         return PrefactorError(0.0, 0.0)
     changes = []
     covariance = found.covariance

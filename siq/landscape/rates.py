@@ -50,9 +50,12 @@ from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.equilibria import classify, hessian_at
 from siq.errors import NumericalFailure
 from siq.landscape.paths import MinimumActionPath
+from siq.reference.cubic_series import cubic_series
 from siq.reference.power_series import quasipotential_series
 
 NEAR_ATTRACTOR = 0.01  # of the distance from A to S, in the metric of M: up to there V is its power series
+NEAR_BY_CUBE = 0.003  # the same where V is known to its third powers only
+MOST_STATES = 8  # for a power series of degree 4
 NEAR_SADDLE = 0.003  # of the distance: from there at the latest the integrand is continued to S
 AT_REST = 1e-5  # f at an equilibrium, in units of the rate and the distance
 LONGEST_STEP = 0.2  # of Riccati's equation, in units of the largest rate
@@ -191,7 +194,10 @@ class _Frame:
         self.dynamics, self.start, self.units = dynamics, start, distance * root
         self.constant = dynamics.diffusion.constant
         self.noise = dynamics.diffusion.in_units(start, self.units, distance**2)
-        self.series = quasipotential_series(dynamics, start, degree=4)
+        many = dynamics.dimension > MOST_STATES
+        self.series = (
+            cubic_series(dynamics, start) if many else quasipotential_series(dynamics, start, degree=4)
+        )
         self.inverse, self.unit = whitening / distance, distance**2 * self.rate
         self.at_attractor = self.curvature(hessian_at(dynamics, start))
         self.at_saddle = None
@@ -201,7 +207,8 @@ class _Frame:
         points, momenta = (path.points - start) @ self.inverse.T, path.momenta @ self.units / self.unit
         level = np.einsum("ni,ij,nj->n", points, self.at_attractor, points)
         used = np.linalg.norm(points - self.end, axis=1) > NEAR_SADDLE
-        used[: int(np.sum(level < NEAR_ATTRACTOR**2 * level[-1]))] = False
+        near = NEAR_BY_CUBE if many else NEAR_ATTRACTOR
+        used[: int(np.sum(level < near**2 * level[-1]))] = False
         self._lay_grid(points[used], momenta[used])
 
     def _lay_grid(self, points: np.ndarray, momenta: np.ndarray) -> None:
@@ -249,8 +256,8 @@ class _Frame:
 
     def bend(self, y: np.ndarray, p: np.ndarray) -> np.ndarray:
         """``Σ_k p_k ∇²f_k + p·∇²D p``, ``(n, d, d)``."""
-        second = self.dynamics.hessian(self.start + y @ self.units.T)
-        bent = self.units.T @ np.einsum("nk,nkij->nij", p @ self.inverse / self.rate, second) @ self.units
+        second = self.dynamics.bend(self.start + y @ self.units.T, p @ self.inverse / self.rate)
+        bent = np.asarray(self.units.T @ second @ self.units)
         return bent if self.constant else bent + self.noise.bend(y, p)
 
     def rise(self, y: np.ndarray, p: np.ndarray, curvatures: np.ndarray) -> np.ndarray:

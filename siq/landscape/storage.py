@@ -86,7 +86,15 @@ def landscape_data(landscape: Landscape, *, dynamics: Dynamics) -> dict[str, Any
         "transitions": [_transition(one) for one in landscape.transitions],
         "visits": [_visits(one) for one in landscape.visits],
         "notes": list(landscape.notes),
-    }
+    } | _of_given(landscape)
+
+
+def _of_given(landscape: Landscape) -> dict[str, Any]:
+    """What a landscape of equations has beside: no other file could hold its certificate."""
+    if not landscape.given:
+        return {}
+    certificate = landscape.certificate
+    return {"given": True, "certificate": None if certificate is None else certificate.as_data()}
 
 
 def _visits(one: VisitTest) -> dict[str, Any]:

@@ -15,13 +15,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.equilibria import Equilibrium, neighbours
+from siq.dynamics.equilibria import Equilibrium, leads_back, neighbours
 from siq.dynamics.phase_portrait import PhasePortrait
 from siq.errors import NumericalFailure
 from siq.identify.diffusion import defined_states
-from siq.identify.identified_field import IdentifiedField
+from siq.identify.given_field import AnyField, GivenField
 from siq.landscape.dwell_times import Exit
-from siq.landscape.paths import MinimumActionPath, TransitionPath, transition_path
+from siq.landscape.paths import (
+    MinimumActionPath,
+    TransitionPath,
+    descent,
+    minimum_action_path,
+    transition_path,
+)
 from siq.landscape.prefactor_errors import PrefactorError, prefactor_error
 from siq.landscape.rates import EscapeRate, escape_rate
 from siq.potential.well import Well
@@ -30,6 +36,8 @@ logger = logging.getLogger(__name__)
 
 WORTH_A_WORD = 0.5  # of its standard error, by which rival terms move a barrier (a choice)
 DIFFERENT = 0.02  # share of a barrier by which two ways to it may differ without a word
+FEW_STATES = 8  # up to which first guesses of a path bend to all sides
+GUESSED = 200  # points of one that is a way down taken backwards
 PATH_TOLERANCE = 1e-5  # of the action; prefactors follow the end of the path and need more than barriers
 
 
@@ -115,7 +123,7 @@ class WayOut:
     note: str = ""
 
 
-def ways_out(dynamics: Dynamics, portrait: PhasePortrait) -> list[WayOut]:
+def ways_out(dynamics: Dynamics, portrait: PhasePortrait, *, beyond_region: bool = False) -> list[WayOut]:
     """Every way out of every well over the saddles next to it, from f alone.
 
     Parameters
@@ -124,11 +132,17 @@ def ways_out(dynamics: Dynamics, portrait: PhasePortrait) -> list[WayOut]:
         f and D.
     portrait
         Attractors and saddles.
+    beyond_region
+        Whether a saddle behind which lies no attractor of the region is a way out, too: of a given f the
+        path up to it is as good as any other. Of an identified one nothing is known beyond.
     """
     ways = []
     for index, attractor in enumerate(portrait.attractors):
         for saddle in portrait.saddles[index]:
             beyond = neighbours(dynamics, saddle, portrait.attractors, box=portrait.box) - {index}
+            if not beyond and beyond_region:
+                ways += _way_beyond(dynamics, portrait, index, saddle)
+                continue
             if not beyond:
                 note = "behind the saddle lies no other attractor of the recorded region"
                 ways.append(WayOut(index, None, saddle, None, note))
@@ -137,12 +151,36 @@ def ways_out(dynamics: Dynamics, portrait: PhasePortrait) -> list[WayOut]:
             try:
                 path = transition_path(
                     dynamics, attractor.position, saddle.position, portrait.attractors[end].position,
-                    tolerance=PATH_TOLERANCE,
+                    tolerance=PATH_TOLERANCE, initial=_first_guesses(dynamics, attractor, saddle),
                 )  # fmt: skip
                 ways.append(WayOut(index, end, saddle, path))
             except NumericalFailure as error:
                 ways.append(WayOut(index, end, saddle, None, str(error)))
     return ways
+
+
+def _first_guesses(
+    dynamics: Dynamics, attractor: Equilibrium, saddle: Equilibrium
+) -> list[np.ndarray] | None:
+    """Of many states the way down taken backwards, and the straight line; of few None, for the usual ones."""
+    if dynamics.dimension <= FEW_STATES:
+        return None
+    down = descent(dynamics, saddle.position, attractor.position, GUESSED)
+    return [down[::-1], np.stack([attractor.position, saddle.position])]
+
+
+def _way_beyond(dynamics: Dynamics, portrait: PhasePortrait, index: int, saddle: Equilibrium) -> list[WayOut]:
+    """The way over a saddle from which f leads out of the region; none where it leads back on both sides."""
+    if leads_back(dynamics, saddle, portrait.attractors, box=portrait.box):
+        return []
+    try:
+        uphill = minimum_action_path(
+            dynamics, portrait.attractors[index].position, saddle.position, tolerance=PATH_TOLERANCE
+        )
+    except NumericalFailure as error:
+        return [WayOut(index, None, saddle, None, str(error))]
+    note = "behind the saddle f leads out of the region"
+    return [WayOut(index, None, saddle, TransitionPath(uphill, saddle.position[None]), note)]
 
 
 def missing_diffusion(dynamics: Dynamics) -> str | None:
@@ -162,7 +200,7 @@ def missing_diffusion(dynamics: Dynamics) -> str | None:
 
 
 def transitions(
-    found: IdentifiedField,
+    found: AnyField,
     ways: Sequence[WayOut],
     wells: Sequence[Well | None],
 ) -> list[Transition]:
@@ -171,7 +209,7 @@ def transitions(
     Parameters
     ----------
     found
-        The identified f with its uncertainty.
+        f with its uncertainty.
     ways
         See `ways_out`.
     wells
@@ -180,11 +218,11 @@ def transitions(
     return [_transition(found, way, wells[way.start]) for way in ways]
 
 
-def _transition(found: IdentifiedField, way: WayOut, well: Well | None) -> Transition:
+def _transition(found: AnyField, way: WayOut, well: Well | None) -> Transition:
     path = way.path
     if path is None:
         return Transition(way.start, way.end, way.saddle, None, np.nan, np.nan, np.nan, None, (way.note,))
-    notes: list[str] = []
+    notes = [way.note] if way.note else []
     if not path.uphill.converged:
         notes.append("the minimum action path is not converged")
     rate, missing = None, missing_diffusion(found.dynamics)
@@ -202,6 +240,8 @@ def _transition(found: IdentifiedField, way: WayOut, well: Well | None) -> Trans
         barrier, share = barrier_by_formula(path, well)
         if abs(barrier / path.uphill.action - 1) > DIFFERENT:
             notes.append("the formula and the path alone give different barriers")
+        if isinstance(found, GivenField) and path.uphill.converged:  # nothing about f is to be averaged over
+            barrier, share = path.uphill.action, 0.0
     logger.info("barrier of U from attractor %d: %.5g by formula, %.5g by the path", way.start, barrier,
                 path.uphill.action)  # fmt: skip
     spread, by_rivals = barrier_uncertainty(path, found)
@@ -225,13 +265,15 @@ def barrier_by_formula(path: TransitionPath, well: Well) -> tuple[float, float]:
     return float(barrier), float(formula[last] / barrier)
 
 
-def barrier_uncertainty(path: TransitionPath, found: IdentifiedField) -> tuple[float, float]:
+def barrier_uncertainty(path: TransitionPath, found: AnyField) -> tuple[float, float]:
     """Standard error of a barrier of U from that of f, to first order, and what the mean over rivals adds.
 
     The action ``½∫∣ẋ - f∣² dt`` is minimal along the path, so that a change of f changes it by
 
         ∂U/∂c = -2 ∫ p·∂f/∂c dt.
     """
+    if isinstance(found, GivenField):
+        return 0.0, 0.0
     middle, force, spent = _along(path.uphill, found.dynamics)
     terms = found.library.evaluate(middle)
     slope = -2 * np.einsum("n,nq,nd->qd", spent, terms, force)
@@ -267,8 +309,10 @@ def _along(path: MinimumActionPath, dynamics: Dynamics) -> tuple[np.ndarray, np.
     return middle, force, spent
 
 
-def position_standard_errors(found: IdentifiedField, position: np.ndarray) -> np.ndarray:
+def position_standard_errors(found: AnyField, position: np.ndarray) -> np.ndarray:
     """Standard errors of an equilibrium's position, shape ``(d,)``: of f = 0 follows δx = -J⁻¹ δf."""
+    if isinstance(found, GivenField):
+        return np.zeros(len(position))
     terms = found.library.evaluate(position[None])[0]
     try:
         moved = np.linalg.inv(found.dynamics.jacobian(position[None])[0])

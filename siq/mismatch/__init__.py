@@ -37,7 +37,9 @@
 `investigation`     what is the verdict, and which fits does it rest on?
 `location`          where does the mismatch sit?
 `left_out`          does a model foresee what was left out of its fit?
+`held_out_errors`   which of two simulations foresees recordings better?
 `held_out`          how well does it run on recordings that had no part in it?
+`withdrawal`        does a name mislead there?
 `verdict`           what is the verdict?
 `statement`         what is stated, and as data?
 `stated_functions`  what is stated of a model without a name?

@@ -20,6 +20,7 @@ from siq.mismatch.location import Location
 from siq.mismatch.study import MismatchStudy
 from siq.mismatch.trials import UNFORESEEN
 from siq.mismatch.verdict import StatedMechanism, Statement, statement_of
+from siq.mismatch.withdrawal import misleads, withdrawn
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -176,7 +177,11 @@ def solve_case(
     budget = Budget(work=allowed.evaluations, seconds=allowed.seconds, tell=tell, clock=clock)
     try:
         found = investigate(case.system, case.learn, case.dictionary, case.settings, budget=budget)
-        shown = held_out_runs(found, case.learn, case.kept, tests=case.settings.tests)
+        certain = case.settings.search.least_log_odds
+        shown = held_out_runs(found, case.learn, case.kept, certain=certain, tests=case.settings.tests)
+        if not case.settings.tests and misleads(found, shown):
+            found = withdrawn(found, case, budget)
+            shown = held_out_runs(found, case.learn, case.kept, certain=certain)
         statement = statement_of(found, case.learn, shown)
     except InputError:
         raise

@@ -29,10 +29,10 @@ from siq.mismatch.clusters import correlation_time_of
 from siq.mismatch.function_places import Place, linearised_with_places, places_in, products_in
 from siq.mismatch.roles import Roles
 
-LENGTHS = (0.125, 0.25, 0.5)
-"""Of the range of the coordinate, over which a smooth function changes.
+LENGTHS = (0.125, 0.25)
+"""Of the range of the coordinate, over which a smooth function without a name changes.
 
-At a half of it the values at both ends know little of each other.
+What is smoother is a constant, a straight line or a parabola, for which there are names.
 """
 JITTER = 1e-9  # numerical: on the diagonal of a prior's covariance
 

@@ -13,6 +13,7 @@ from siq.dynamics.dynamics import Dynamics
 from siq.errors import NumericalFailure
 from siq.estimation.budget import UNLIMITED, Account, Budget
 from siq.estimation.estimation import Fit
+from siq.estimation.expectations import with_expectations
 from siq.estimation.measurements import Measurements
 from siq.estimation.recalibration import recalibrate
 from siq.estimation.unknown_forces import covariance_with_unknown_forces
@@ -86,6 +87,8 @@ class Investigation:
         Of what has no name, be it all that is missing or what names leave, the likeliest first.
     account
         The work that it took, and whether something was left undone.
+    withdrawn
+        Whether a name was given, and mislead on recordings held out (`siq.mismatch.withdrawal`).
     """
 
     verdict: MismatchVerdict
@@ -104,12 +107,16 @@ class Investigation:
     naming: Naming | None = None
     models: tuple[Model, ...] = ()
     account: Account = UNLIMITED
+    withdrawn: bool = False
 
     @property
     def too_faint(self) -> bool:
         """Whether what was found explains enough, and is not named since a function is nearly as likely."""
         return (
-            self.verdict is MismatchVerdict.UNEXPLAINED and self.naming is not None and self.naming.convincing
+            self.verdict is MismatchVerdict.UNEXPLAINED
+            and not self.withdrawn
+            and self.naming is not None
+            and self.naming.convincing
         )
 
     @property
@@ -155,6 +162,7 @@ def investigate(
         When not even the recalibrated simulation with process noise can be fitted.
     """
     options = study.search
+    model = with_expectations(model)
     roles = roles_of(model)
     candidates = considered(model, roles, dictionary, study, file=file)
     budget = budget or Budget()

@@ -14,7 +14,7 @@ import numpy as np
 
 from siq.errors import NumericalFailure
 from siq.estimation.estimation import Fit
-from siq.estimation.free_runs import free_run, normalised_rms
+from siq.estimation.free_runs import UsualStates, free_run, squared_errors
 from siq.estimation.innovations import Noise
 from siq.estimation.measurements import Measurements
 from siq.estimation.process_noise import fit_with_process_noise_as_needed
@@ -60,8 +60,8 @@ def parts_left_out(learned: Measurements) -> Iterator[LeftOut]:
         yield LeftOut(out, rest, rows)
 
 
-def error_left_out(fit: Fit, learned: Measurements, *, noise: Noise) -> tuple[float | None, int]:
-    """Normalised error of free runs of the parts left out, and the number of values that it is a mean over.
+def errors_left_out(fit: Fit, learned: Measurements, *, noise: Noise) -> np.ndarray | None:
+    """Normalised squared errors of free runs of the parts left out.
 
     Parameters
     ----------
@@ -74,22 +74,25 @@ def error_left_out(fit: Fit, learned: Measurements, *, noise: Noise) -> tuple[fl
 
     Returns
     -------
-    float or None, int
-        None where a fit does not settle, or a simulation runs away.
+    numpy.ndarray or None
+        One part behind the other, shape ``(values,)``; None where a fit does not settle, or a simulation runs
+        away.
     """
-    total, values = 0.0, 0
+    squares = []
     for part in parts_left_out(learned):
         try:
             again = fit_with_process_noise_as_needed(fit.model, part.rest, replace(fit, x=fit.x[part.rows]))
-            run = free_run(again.model, part.out, noise=noise, substeps=max(again.substeps, fit.substeps))
+            run = free_run(
+                again.model, part.out, noise=noise, substeps=max(again.substeps, fit.substeps),
+                usual=UsualStates.along(again.x),
+            )  # fmt: skip
         except NumericalFailure:
-            return None, 0
-        error = normalised_rms(part.out.outputs, run)
-        if error is None or not again.converged:
-            return None, 0
-        scored = int(np.isfinite(part.out.outputs[run.scored]).sum())
-        total, values = total + scored * error**2, values + scored
-    return float(np.sqrt(total / values)), values
+            return None
+        own = squared_errors(part.out.outputs, run)
+        if own is None or not again.converged:
+            return None
+        squares.append(own)
+    return np.concatenate(squares)
 
 
 def _joined(stretches: list[tuple[int, int]]) -> list[tuple[int, int]]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from siq.estimation.budget import Budget
 from siq.estimation.estimation import Fit
-from siq.estimation.free_runs import free_run, normalised_rms
+from siq.estimation.free_runs import UsualStates, free_run, normalised_rms
 from siq.estimation.measurements import Measurements
 from siq.mismatch.evidence import correlation_time_left, log_evidence_of
 from siq.mismatch.function_places import Place
@@ -132,7 +132,8 @@ def runs_freely(fit: Fit, alone: Fit, data: Measurements) -> bool:
     errors = []
     for each in (fit, alone):
         # Steps twice as fine: what depends on them is no property of the simulation.
-        run = free_run(each.model, data, noise=each.noise, substeps=2 * each.substeps)
+        usual = UsualStates.along(each.x)
+        run = free_run(each.model, data, noise=each.noise, substeps=2 * each.substeps, usual=usual)
         errors.append(normalised_rms(data.outputs, run))
     one, other = errors
     return one is not None and (other is None or one < other)

@@ -35,6 +35,7 @@ from siq.mismatch.trials import (
 )
 
 LOGGER = logging.getLogger(__name__)
+FOR_FUNCTIONS = 0.4  # of the budget, for functions without a name: a choice
 LEFT = 0.01  # probability that residuals are random, above which no further mechanism is sought
 
 
@@ -79,6 +80,8 @@ class Search:
         was screened on top of the last mechanism.
     untried
         Candidates whose fit gave nothing that could be judged, with the reason.
+    fruitless
+        Labels of those that were fitted and gained nothing.
     """
 
     recalibrated: Fit
@@ -87,6 +90,7 @@ class Search:
     screened: tuple[tuple[Probe, Screened], ...]
     untried: tuple[UntriedMechanism, ...] = ()
     screened_beside: tuple[str, ...] = ()
+    fruitless: frozenset[str] = frozenset()
 
 
 def search(
@@ -98,11 +102,10 @@ def search(
     options: SearchOptions,
     budget: Budget | None = None,
 ) -> Search:
-    """Look for mechanisms, one after the other, until nothing is found or the budget is spent."""
-    begin = Search(recalibrated, (), recalibrated, ())
-    return _extended(
-        begin, model, data, candidates, options=options, budget=budget or Budget(), on_trial=True
-    )
+    """Look for mechanisms, one after the other, until nothing is found or its part of the budget is spent."""
+    begin, budget = Search(recalibrated, (), recalibrated, ()), budget or Budget()
+    with budget.keeping(FOR_FUNCTIONS):
+        return _extended(begin, model, data, candidates, options=options, budget=budget, on_trial=True)
 
 
 def _extended(
@@ -137,14 +140,20 @@ def _extended(
             if not any(_once_more(each, other.best.candidate) for other in found)
             and (rebased := _rebased(each, model, base) if found else each) is not None
         ]
-        screened, unscreened = screen_all(base, data, current, remaining, budget=budget)
+        screened, unscreened = screen_all(
+            base, data, current, remaining, fruitless=progress.fruitless, budget=budget
+        )
         trials, failed = fit_most_promising(
             data, current, base, screened,
             most=options.fitted, least_gain=options.same, blocks=options.blocks,
             budget=budget,
         )  # fmt: skip
         untried = _together(progress.untried, (*unscreened, *failed), trials)
-        progress = replace(progress, screened=tuple(screened), untried=untried, screened_beside=tuple(labels))
+        fruitless = {each.candidate.label for each in trials if each.delta_chi2 < options.same}
+        progress = replace(
+            progress, screened=tuple(screened), untried=untried, screened_beside=tuple(labels),
+            fruitless=progress.fruitless | fruitless,
+        )  # fmt: skip
         for trial in trials:
             LOGGER.info(
                 "%s: chi2 better by %.1f, BIC %.1f, p %.1e white, %.1e clustered",

@@ -6,10 +6,9 @@ The page, the report as text and the terminal all show these, so that none can c
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 from siq.mismatch.candidates import GENERIC, PROCESS_NOISE
-from siq.mismatch.held_out import HeldOutErrors
+from siq.mismatch.held_out_errors import HeldOutErrors, Run
 from siq.mismatch.investigation import MismatchVerdict
 from siq.mismatch.statement import (
     Description,
@@ -44,7 +43,7 @@ def sentence_of(statement: Statement, units: Mapping[str, str]) -> str:
         return f"The simulation explains the recordings as it is. {_as_it_is(errors)}".strip()
     if statement.verdict is MismatchVerdict.PARAMETER_SHIFT:
         said = shifted(statement.recalibration or {}, units)
-        gain = gained(errors, errors.before, errors.recalibrated, it="With the new values", them="them")
+        gain = gained(errors, "before", "recalibrated", it="With the new values", them="them")
         return (
             f"The simulation's equations explain the recordings, but with other parameters: {said}. {gain}"
         ).strip()
@@ -55,9 +54,8 @@ def sentence_of(statement: Statement, units: Mapping[str, str]) -> str:
     what = " and ".join(named(each) for each in statement.mechanisms)
     they = len(statement.mechanisms) > 1
     # What is credited to physics is only what neither the simulation as given nor other parameters can do.
-    known = [each for each in (errors.before, errors.recalibrated) if each is not None]
     gain = gained(
-        errors, min(known, default=None), errors.named if statement.described else errors.augmented,
+        errors, "without", "named" if statement.described else "augmented",
         it=f"With {'them' if they else 'it'}", them="them" if they else "it",
     )  # fmt: skip
     return f"The simulation lacks {what}. {gain} {_rest(statement)}".strip()
@@ -153,7 +151,12 @@ def left_over(description: Description) -> tuple[str, ...]:
     """Why a mismatch has no name: what is left, and whether it looks like noise."""
     p = description.p_residuals_random
     lines = []
-    if description.by and description.too_faint:
+    if description.by and description.misleading:
+        lines.append(
+            "It is not named: with it, recordings held out are foreseen worse than without, so that it stands"
+            " in for something else."
+        )
+    elif description.by and description.too_faint:
         lines.append(
             "It is not named, since a smooth function that the dictionary does not have is nearly as likely."
         )
@@ -200,20 +203,20 @@ def shifted(recalibration: Mapping[str, Recalibrated], units: Mapping[str, str])
     return shown if more <= 0 else f"{shown}; and {more} more differ{'s' * (more == 1)}"
 
 
-def gained(errors: HeldOutErrors, first: float | None, second: float | None, *, it: str, them: str) -> str:
+def gained(errors: HeldOutErrors, without: Run, with_it: Run, *, it: str, them: str) -> str:
     """What the error on held-out recordings says, whichever way it went; empty where it is not known.
 
     Parameters
     ----------
     errors
         All of them.
-    first, second
+    without, with_it
         Without and with what was found.
     it, them
         What was found, as the sentence begins (``"With it"``) and goes on (``"it"``).
     """
     noise = _noise(errors)
-    change = errors.change(first, second)
+    change, first, second = errors.change(without, with_it), errors.error(without), errors.error(with_it)
     if first is None or second is None:
         if change == "unknown":
             known = errors.noise_floor is not None
@@ -233,17 +236,22 @@ def gained(errors: HeldOutErrors, first: float | None, second: float | None, *, 
         )
     if change == "better" and _error(first) != _error(second):
         before = f"{_error(first)} of their spread"
-        if errors.before is None and errors.recalibrated is not None:
+        if without == "without" and errors.before is None:
             before += " (with its own parameters refitted; as given, the simulation runs away)"
-        elif errors.change(errors.before, first) == "better":
+        elif without == "without" and errors.change("before", "without") == "better":
             before = (
                 f"{_error(errors.before)} of their spread ({_error(first)} with its own parameters refitted)"
             )
         return f"{it}, the error on held-out recordings falls from {before} to {_error(second)}{noise}."
-    if errors.at_noise(first) and change != "worse":
+    if errors.at_noise(without) and change != "worse":
         return (
             f"The held-out recordings are too noisy to show it: their error is {_error(first)} without {them}"
             f" and {_error(second)} with {them}{noise}."
+        )
+    if change == "same" and second < first and _error(first) != _error(second):
+        return (
+            f"{it}, the error on held-out recordings falls from {_error(first)} of their spread to"
+            f" {_error(second)}, no more than it may by chance{noise}."
         )
     what = (
         "does not improve the prediction of recordings held out"
@@ -261,7 +269,7 @@ def _as_it_is(errors: HeldOutErrors) -> str:
         return ""
     if errors.before is None:
         return "On the held-out recordings, however, it runs away."
-    if errors.at_noise(errors.before):
+    if errors.at_noise("before"):
         return f"Its error on held-out recordings is {_error(errors.before)} of their spread{_noise(errors)}."
     return (
         f"On held-out recordings, however, its error is {_error(errors.before)}, more than noise alone"
@@ -290,8 +298,7 @@ def _rest(statement: Statement) -> str:
     parts = _listed([described_part(each) for each in statement.described], "and")
     verb = "describe" if len(statement.described) > 1 else "describes"
     # The names are what it is compared with, and not the simulation without them.
-    errors = replace(statement.errors, before=statement.errors.named, recalibrated=None)
-    gain = gained(errors, errors.before, errors.augmented, it="With that, too", them="that")
+    gain = gained(statement.errors, "named", "augmented", it="With that, too", them="that")
     return f"What is left has no name; {parts} {verb} it. {gain}".strip()
 
 
@@ -305,8 +312,7 @@ def _described(statement: Statement) -> str:
             "Neither a mechanism nor a function of its coordinates improves the prediction of recordings"
             f" held out, so that the simulation stays as it was. {_error_stays(errors)}"
         ).strip()
-    known = [each for each in (errors.before, errors.recalibrated) if each is not None]
-    gain = gained(errors, min(known, default=None), errors.augmented, it="With it", them="it")
+    gain = gained(errors, "without", "augmented", it="With it", them="it")
     named = {each.label for each in statement.description.by}
     if all(each.label in named for each in statement.described):
         return gain
@@ -352,6 +358,8 @@ def _unexplained(statement: Statement) -> str:
     what = " and ".join(f"{_noun(each)}{_place(each)}" for each in description.by)
     what += _or_else(description.by[0]) if len(description.by) == 1 else ""
     share = percent(description.share_described)
+    if description.misleading:
+        return f"{begin}. It looks like {what}, but recordings held out are foreseen worse with that."
     if description.too_faint:
         return f"{begin}. It looks like {what}, which is not certain enough to be named."
     if description.share_described > 1 - SMALLEST_SHARE:

@@ -10,13 +10,13 @@ import numpy as np
 
 from siq.estimation.budget import UNLIMITED, Account
 from siq.mismatch.candidates import PROCESS_NOISE
-from siq.mismatch.held_out import HeldOutErrors
+from siq.mismatch.held_out_errors import HeldOutErrors
 from siq.mismatch.investigation import MismatchVerdict
 from siq.mismatch.location import Location
 from siq.mismatch.trials import BUDGET_SPENT
 
 METRIC = "normalised rms, held-out recordings"
-UNKNOWN_ERRORS = HeldOutErrors(None, None, None, None)
+UNKNOWN_ERRORS = HeldOutErrors()
 
 
 @dataclass(frozen=True)
@@ -186,6 +186,8 @@ class Description:
     p_alike
         Probability that as many mechanisms explain as much of an effect that has no name; None where nothing
         is left.
+    misleading
+        Whether the mechanisms in `by` are not named since recordings held out are foreseen worse with them.
     """
 
     share_described: float
@@ -194,6 +196,7 @@ class Description:
     random_forces_admitted: bool
     too_faint: bool = False
     p_alike: float | None = None
+    misleading: bool = False
 
 
 @dataclass(frozen=True)
@@ -309,6 +312,8 @@ class Statement:
 
     def as_data(self) -> dict[str, Any]:
         """The content of ``verdict.json``; a number that is not finite is null."""
+        errors = asdict(self.errors)
+        del errors["squares"]
         data = {
             "verdict": str(self.verdict),
             "sentence": self.sentence,
@@ -319,7 +324,7 @@ class Statement:
             "described": [asdict(each) for each in self.described],
             "location": None if self.location is None else self.location.as_data(),
             "recalibration": {name: asdict(each) for name, each in (self.recalibration or {}).items()},
-            "fit": {"metric": METRIC, **asdict(self.errors)},
+            "fit": {"metric": METRIC, **errors},
             "excluded": {label: asdict(each) for label, each in (self.excluded or {}).items()},
             "remarks": list(self.remarks),
             "not_fitted": [asdict(each) for each in self.not_fitted],

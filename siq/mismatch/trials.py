@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -84,11 +84,13 @@ def screen_all(
     current: Fit,
     candidates: Sequence[MechanismCandidate],
     *,
+    fruitless: Collection[str] = (),
     budget: Budget | None = None,
 ) -> tuple[list[tuple[Probe, Screened]], list[UntriedMechanism]]:
     """Screen every candidate, with its shapes at all places where they are looked for.
 
-    One whose shape the recordings themselves show promises as much as the best: see `Probe.recorded`.
+    One whose shape the recordings themselves show promises as much as the best, unless it was fitted before
+    and gained nothing: see `Probe.recorded`.
 
     Parameters
     ----------
@@ -96,6 +98,8 @@ def screen_all(
         The simulation, the recordings, and the fit that is to be improved.
     candidates
         What may be missing.
+    fruitless
+        Labels of those that gained nothing when they were fitted.
     budget
         Charged for the work; what it does not reach is not screened.
 
@@ -132,7 +136,9 @@ def screen_all(
                 untried[probe.candidate.label] = UntriedMechanism(probe.candidate, reason)
     most = max((result.gain for _, result in screened), default=0.0)
     screened = [
-        (probe, replace(result, gain=max(most, result.gain)) if probe.recorded and result.finite else result)
+        (probe, replace(result, gain=max(most, result.gain)))
+        if probe.recorded and result.finite and probe.candidate.label not in fruitless
+        else (probe, result)
         for probe, result in screened
     ]
     finite = {probe.candidate.label for probe, result in screened if result.finite}
@@ -220,7 +226,8 @@ def fit_most_promising(
             trials[candidate.label] = trial
 
     # What the recordings themselves show is fitted beside the others, and in the place of none of them.
-    shown = sum(probe.recorded for probe, _ in ranked)
+    most_promised = ranked[0][1].gain if ranked else 0.0
+    shown = sum(probe.recorded and result.gain >= most_promised for probe, result in ranked)
     for place, (probe, result) in enumerate(ranked[: shown + 2 * most], start=-shown):
         # Against what screening foresaw of those that did gain it: some promise much and gain nothing, and
         # of others the first order shows little.

@@ -188,6 +188,7 @@ def description_of(investigation: Investigation) -> Description | None:
         random_forces_admitted=search.fit.has_process_noise,
         too_faint=investigation.too_faint,
         p_alike=None if investigation.naming is None else investigation.naming.p_alike,
+        misleading=investigation.withdrawn,
     )
 
 

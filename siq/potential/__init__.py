@@ -6,6 +6,7 @@
 `well`              what is V about an attractor, up to which level, and where may it be believed?
 `local_route`       what is V about one attractor, from f alone?
 `local_wells`       of which degree is it?
+`raised_wells`      and where the depth of the well is known beforehand?
 `global_route`      what is V over the whole region, from what the networks found?
 `orthogonal_fit`    which V and g together fit f best under noise?
 `refinement`        how do these become the formulas of a run?

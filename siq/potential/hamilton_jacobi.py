@@ -19,6 +19,9 @@ from siq.potential.bases import Basis
 VANISHING = 1e-8  # of f: where D∇V is smaller, Gauss–Newton is on its way to V = 0, which is a solution, too
 INDEPENDENT = 1e-5  # diagonal of a triangular factor: below this share columns are not independent enough
 
+STEEP = 3.0  # of the median residual: what is larger counts less and less
+UNTOLD = 1e-10  # of the largest singular value: combinations of functions that the points leave open
+
 
 @dataclass(frozen=True)
 class HamiltonJacobi:
@@ -79,6 +82,65 @@ class HamiltonJacobi:
     def restricted(self, rows: np.ndarray) -> HamiltonJacobi:
         """The equation with some of the functions only."""
         return replace(self, gradients=self.gradients[:, :, rows])
+
+
+def relative_residuals(equation: HamiltonJacobi, coefficients: np.ndarray) -> np.ndarray:
+    """``∣∇V·(f + D∇V)∣ / (∣∇V∣ ∣f∣)`` at the points, shape ``(n,)``."""
+    slope = equation.slopes(coefficients)
+    size = np.sqrt(equation.diffusion.steepness(equation.points, slope))
+    return np.asarray(np.abs(equation.residual(coefficients)) / np.where(size > 0, size, np.inf))
+
+
+def robust(equation: HamiltonJacobi, coefficients: np.ndarray, *, finest: float) -> HamiltonJacobi:
+    """The equation with weights that fall with the square of what is left (Cauchy's).
+
+    Parameters
+    ----------
+    equation, coefficients
+        What is left is that of this formula.
+    finest
+        Residual below which nothing is an outlier.
+    """
+    rest = relative_residuals(equation, coefficients)
+    scale = max(STEEP * float(np.median(rest)), finest)
+    return replace(equation, weight=equation.weight / np.sqrt(1 + (rest / scale) ** 2))
+
+
+def orthonormalised(equation: HamiltonJacobi, free: np.ndarray) -> tuple[HamiltonJacobi, np.ndarray]:
+    """The equation in combinations of the free functions whose gradients are orthonormal over the points.
+
+    Powers are all but dependent over a sublevel set that is narrow, or bent; their combinations are not, and
+    Gauss–Newton then gets on by the normal equations. Combinations that the points do not tell are left out.
+
+    Parameters
+    ----------
+    equation
+        At points.
+    free
+        Which functions are combined, as a mask; the others stay and come last.
+
+    Returns
+    -------
+    equation
+        In the k combinations and the functions that stay.
+    turned
+        Shape ``(m, k + s)``: the old coefficients are this times the new ones.
+    """
+    roots = equation.diffusion.root_at(equation.points)
+    stacked = np.einsum("nij,nim->njm", roots, equation.gradients[:, :, free], optimize=True)
+    scale = np.sqrt((stacked**2).sum(axis=(0, 1)))
+    scale = np.where(scale > 0, scale, 1.0)
+    upper = np.linalg.qr((stacked / scale).reshape(-1, stacked.shape[2]), mode="r")
+    _, sizes, right = np.linalg.svd(upper)
+    told = sizes > UNTOLD * sizes[0]
+    combined = right[told].T / sizes[told] / scale[:, None] * np.sqrt(len(equation.points))
+    m, k, stay = len(free), int(told.sum()), np.flatnonzero(~free)
+    turned = np.zeros((m, k + len(stay)))
+    turned[np.ix_(np.flatnonzero(free), np.arange(k))] = combined
+    turned[stay, k + np.arange(len(stay))] = 1.0
+    n, d = equation.points.shape
+    gradients = (equation.gradients.reshape(n * d, m) @ turned).reshape(n, d, -1)
+    return replace(equation, gradients=gradients), turned
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from siq.potential.bases import PowerBasis, power_basis
 from siq.potential.hamilton_jacobi import equation_at, gauss_newton
 from siq.potential.well import Well
 
+FIRST_SHARE = 0.05  # of a known depth: the first level
 GROWTH = 1.5  # of the level, from one fit to the next
 REACH = 0.25  # of the distance at which the level lies: how far new points may be from those of the last fit
 MOST_POINTS = 6000  # of one fit
@@ -44,6 +45,7 @@ def grow_well(
     *,
     degree: int,
     generator: np.random.Generator,
+    depth: float | None = None,
 ) -> Well:
     """V about an attractor up to its lowest saddle.
 
@@ -61,6 +63,9 @@ def grow_well(
         Highest power.
     generator
         Decides which points are used where there are too many.
+    depth
+        V at the lowest of the saddles, which then is the only one given, where the path of least action has
+        told it before; by default V itself has to find its lowest saddle.
 
     Raises
     ------
@@ -73,12 +78,8 @@ def grow_well(
     flat = basin.states.reshape(-1, basin.states.shape[2])
     offsets = flat - attractor.position
     quadratic = 0.5 * np.einsum("ni,ij,nj->n", offsets, hessian, offsets).reshape(basin.states.shape[:2])
-    basis = power_basis(
-        dynamics.symbols,
-        attractor.position,
-        extent * np.sqrt(2 * np.quantile(quadratic[:, 0], 0.5)),
-        degree=degree,
-    )
+    size = np.quantile(quadratic[:, 0], 0.5) if depth is None else depth
+    basis = power_basis(dynamics.symbols, attractor.position, extent * np.sqrt(2 * size), degree=degree)
     order = basis.exponents.sum(axis=1)
     free = order > 2
     coefficients = np.zeros(basis.size)
@@ -90,9 +91,12 @@ def grow_well(
     # The first level has points enough for all coefficients.
     reached = np.sort(basin.highest(values.reshape(basin.states.shape[:2]))[tuple(basin.chosen.T)])
     level = float(reached[min(4 * basis.size, len(reached) - 1)])
+    if depth is not None:
+        level = min(level, FIRST_SHARE * depth)
     return _grown(
         dynamics, basin, saddles, basis, coefficients, free=free, metric=hessian,
         level=level, fitted=np.zeros(0, dtype=int), generator=generator,
+        depth=depth,
     )  # fmt: skip
 
 
@@ -108,6 +112,7 @@ def _grown(
     level: float,
     fitted: np.ndarray,
     generator: np.random.Generator,
+    depth: float | None = None,
 ) -> Well:
     """V grown from a start, level by level, to its lowest saddle or to the end of the recorded region.
 
@@ -123,7 +128,7 @@ def _grown(
         The first one.
     fitted
         Rows of ``basin.chosen`` on which the start was fitted, as far as it was.
-    dynamics, basin, saddles, generator
+    dynamics, basin, saddles, generator, depth
         As for `grow_well`.
     """
     attractor = basis.center
@@ -157,8 +162,8 @@ def _grown(
         solution = gauss_newton(equation, coefficients, free=free, steps=steps, tolerance=tolerance)
         coefficients, residual = solution.coefficients, solution.residual
         values = along(coefficients)
-        recorded = _recorded(values, len(attractor))
-        limit = min(_lowest(basis.values(tops) @ coefficients, tops, points, width, level), recorded)
+        recorded = _recorded(basin.starts(values), len(attractor))
+        limit = depth or min(_lowest(basis.values(tops) @ coefficients, tops, points, width, level), recorded)
         if last and abs(limit - level) < SETTLED * level and len(fitted) <= (1 + SETTLED) * before:
             break
         if any(abs(limit - one) < REPEATED * level for one in ends):  # from here on in circles
@@ -167,13 +172,10 @@ def _grown(
             ends.append(level)
         last = GROWTH * level >= limit
         level = limit if last else GROWTH * level
-    saddle = None
-    if len(tops):
-        heights = basis.values(tops) @ coefficients
-        nearest = int(np.argmin(np.abs(heights - level)))
-        beside = _distances(tops[nearest : nearest + 1], points, width)[0] < CLOSE
-        if abs(heights[nearest] - level) < (4 if beside else 1) * AT_LEVEL * level:
-            saddle, level = tops[nearest], float(heights[nearest])
+    if depth is not None:
+        saddle = tops[0] if level == depth and residual < NO_SOLUTION else None
+    else:
+        saddle, level = _end(basis.values(tops) @ coefficients, tops, points, width, level)
     # A V that vanishes is a solution too, and the end of what starts far from any other.
     if not (np.isfinite(residual) and level > 0) or (saddle is None and level < (1 - SETTLED) * recorded):
         degree = int(basis.exponents.sum(axis=1).max())
@@ -182,6 +184,19 @@ def _grown(
             " saddle"
         )
     return Well(dynamics, attractor, basis, coefficients, level, saddle, residual, points)
+
+
+def _end(
+    heights: np.ndarray, tops: np.ndarray, points: np.ndarray, width: np.ndarray, level: float
+) -> tuple[np.ndarray | None, float]:
+    """The saddle at which growing has ended, with V there; None where it ended before one."""
+    if not len(tops):
+        return None, level
+    nearest = int(np.argmin(np.abs(heights - level)))
+    beside = _distances(tops[nearest : nearest + 1], points, width)[0] < CLOSE
+    if abs(heights[nearest] - level) < (4 if beside else 1) * AT_LEVEL * level:
+        return tops[nearest], float(heights[nearest])
+    return None, level
 
 
 def _too_few(attractor: np.ndarray, count: int, *, before: int, needed: int) -> str:
@@ -204,13 +219,13 @@ def _lowest(
     return float(heights[believed & (heights > 0)].min(initial=np.inf))
 
 
-def _recorded(values: np.ndarray, dimension: int) -> float:
-    """The level that recordings reach, of V along descents ``(n, k)``.
+def _recorded(starts: np.ndarray, dimension: int) -> float:
+    """The level that recordings reach, of V at the starts of descents, shape ``(n,)``.
 
     Below it there may be states to every side without a start; but of one state whatever lies below its
     highest start lies on the way down from it.
     """
-    return float(np.quantile(values[:, 0], HIGHEST if dimension > 1 else 1.0))
+    return float(np.quantile(starts, HIGHEST if dimension > 1 else 1.0))
 
 
 def _distances(tops: np.ndarray, points: np.ndarray, width: np.ndarray) -> np.ndarray:
@@ -255,7 +270,7 @@ def fit_well(
     flat = basin.states.reshape(-1, basin.states.shape[2])
     along = (potential(flat) - lowest).reshape(basin.states.shape[:2])
     tops = np.array([one.position for one in saddles]).reshape(-1, flat.shape[1])
-    highest = _recorded(along, flat.shape[1])
+    highest = _recorded(basin.starts(along), flat.shape[1])
     level = min(float((potential(tops) - lowest).min(initial=np.inf)), highest)
     failure: NumericalFailure | None = None
     for share in STARTS:

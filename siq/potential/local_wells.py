@@ -21,13 +21,19 @@ from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.phase_portrait import PhasePortrait
 from siq.errors import NumericalFailure
 from siq.potential.bases import affordable_degree
-from siq.potential.hamilton_jacobi import HamiltonJacobi, equation_at, gauss_newton
+from siq.potential.hamilton_jacobi import (
+    HamiltonJacobi,
+    equation_at,
+    gauss_newton,
+    relative_residuals,
+    robust,
+)
 from siq.potential.local_route import grow_well
+from siq.potential.raised_wells import Depth, raised_wells
 from siq.potential.well import TOLERANCE, DegreeTrial, Well
 
 STEP = 1.06  # of the level, from one fit to the next
 REWEIGHTINGS = 4
-STEEP = 3.0  # of the median residual: what is larger counts less and less
 FINEST = 1e-5  # residual below which nothing is an outlier
 HELD_OUT = 4  # every so manieth point is kept for choosing the degree
 
@@ -57,7 +63,13 @@ class WellOptions:
 
 
 def local_well(
-    dynamics: Dynamics, portrait: PhasePortrait, index: int, *, options: WellOptions, seed: int = 0
+    dynamics: Dynamics,
+    portrait: PhasePortrait,
+    index: int,
+    *,
+    options: WellOptions,
+    seed: int = 0,
+    depth: Depth | None = None,
 ) -> Well:
     """V about one attractor, of the lowest degree that no other betters by much.
 
@@ -73,6 +85,9 @@ def local_well(
         Degrees, reach and tolerance.
     seed
         Decides which points are used where there are too many.
+    depth
+        The lowest saddle with V there, where the path of least action has told it before, as it does for
+        given equations.
 
     Raises
     ------
@@ -82,17 +97,17 @@ def local_well(
     basin = portrait.basins[index]
     rows = np.arange(len(basin.chosen))
     elsewhere = states_elsewhere(portrait, index)
-    grown = _grown_wells(dynamics, portrait, index, options, seed)
-    # No formula tells V of the saddle as well as the finest does.
-    goal = options.reach * grown[-1].level
-    wells = [
-        replace(
-            extend_well(well, basin, goal=goal, rows=rows[rows % HELD_OUT != 0]),
-            tolerance=options.tolerance,
-            elsewhere=elsewhere,
+    kept = rows[rows % HELD_OUT != 0]
+    if depth is None:
+        grown = _grown_wells(dynamics, portrait, index, options, seed)
+        # No formula tells V of the saddle as well as the finest does.
+        goal = options.reach * grown[-1].level
+        extended = [extend_well(well, basin, goal=goal, rows=kept) for well in grown]
+    else:
+        extended = raised_wells(
+            dynamics, portrait.attractors[index], basin, depth, options=options, rows=kept, seed=seed
         )
-        for well in grown
-    ]
+    wells = [replace(well, tolerance=options.tolerance, elsewhere=elsewhere) for well in extended]
     trials = _trials(wells, basin.points(rows[rows % HELD_OUT == 0]))
     return replace(wells[best_trial(trials)], trials=trials)
 
@@ -178,30 +193,20 @@ def extend_well(well: Well, basin: Basin, *, goal: float, rows: np.ndarray | Non
         if level >= goal:
             break
         level = min(goal, STEP * level)
-    residual = float(np.median(_relative(equation, coefficients)))
+    residual = float(np.median(relative_residuals(equation, coefficients)))
     top = well.level
     if well.saddle is not None:  # a formula that goes on smoothly behind a kink is above V, never below
         top = min(top, float(well.basis.values(well.saddle[None])[0] @ coefficients))
     return replace(well, coefficients=coefficients, level=top, reach=goal, residual=residual, points=points)
 
 
-def _relative(equation: HamiltonJacobi, coefficients: np.ndarray) -> np.ndarray:
-    slope = equation.gradients @ coefficients
-    size = np.sqrt(equation.diffusion.steepness(equation.points, slope))
-    relative: np.ndarray = np.abs(equation.residual(coefficients)) / np.where(size > 0, size, np.inf)
-    return relative
-
-
 def _robust(
     equation: HamiltonJacobi, coefficients: np.ndarray, free: np.ndarray, *, rounds: int
 ) -> np.ndarray:
-    """Gauss–Newton with weights that fall with the square of what is left (Cauchy's)."""
+    """Gauss–Newton with weights that fall with what is left."""
     for _ in range(rounds):
-        rest = _relative(equation, coefficients)
-        scale = max(STEEP * float(np.median(rest)), FINEST)
-        weight = equation.weight / np.sqrt(1 + (rest / scale) ** 2)
-        solution = gauss_newton(replace(equation, weight=weight), coefficients, free=free, steps=6)
-        coefficients = solution.coefficients
+        weighted = robust(equation, coefficients, finest=FINEST)
+        coefficients = gauss_newton(weighted, coefficients, free=free, steps=6).coefficients
     return coefficients
 
 

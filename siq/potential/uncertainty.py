@@ -17,6 +17,7 @@ from collections.abc import Callable
 import numpy as np
 
 from siq.dynamics.equilibria import hessian_at
+from siq.identify.given_field import AnyField, GivenField
 from siq.identify.identified_field import IdentifiedField
 
 RELAXATIONS = 12.0  # times 1/slowest rate: e^-12 of V is left at the beginning of a path
@@ -28,7 +29,7 @@ UNKNOWN = 0.1  # share of the points whose error may stay unknown, at the rim of
 
 
 def potential_errors(
-    found: IdentifiedField,
+    found: AnyField,
     gradient: Callable[[np.ndarray], np.ndarray],
     attractor: np.ndarray,
     x: np.ndarray,
@@ -51,7 +52,7 @@ def potential_errors(
     numpy.ndarray
         Shape ``(n,)``; zero where f carries no noise, NaN where no ascending path comes from the attractor.
     """
-    if found.noise_free or not len(x):
+    if isinstance(found, GivenField) or found.noise_free or not len(x):
         return np.zeros(len(x))
     of_field, of_noise = potential_slopes(found, gradient, attractor, x)
     return np.asarray(np.sqrt(found.variance(of_field) + found.noise_variance(of_noise)))
@@ -112,7 +113,7 @@ def potential_slopes(
 
 
 def relative_error(
-    found: IdentifiedField,
+    found: AnyField,
     gradient: Callable[[np.ndarray], np.ndarray],
     attractor: np.ndarray,
     x: np.ndarray,
@@ -132,7 +133,7 @@ def relative_error(
     float
         Infinite where the errors of more than a tenth of the points cannot be told.
     """
-    if found.noise_free or not len(x):
+    if isinstance(found, GivenField) or found.noise_free or not len(x):
         return 0.0
     errors = potential_errors(found, gradient, attractor, x)
     known = np.isfinite(errors)

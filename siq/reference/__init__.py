@@ -4,6 +4,7 @@
 `hamiltonian`      which flow has the characteristics as its trajectories?
 `characteristics`  what is V along them?
 `sheets`           where do they start, and which of their points may be believed?
+`cubic_series`     the same to third powers, in many states
 `power_series`     what is V near an attractor, order by order?
 `mesh`             what is V on a mesh of two states, found without any ansatz?
 `fokker_planck`    how long do visits last, and where are states, whatever the barriers?

@@ -54,7 +54,7 @@ class HamiltonianFlow:
         x, p = self.points(y), 2 * self.level * q @ self.inverse
         force = self.dynamics.drift(x) @ self.inverse.T
         jacobian = self.inverse @ self.dynamics.jacobian(x) @ self.units
-        bend = np.einsum("nk,nkij->nij", p, self.dynamics.hessian(x))
+        bend = self.dynamics.bend(x, p)
         bend = self.units.T @ bend @ self.units / (2 * self.level)
         diffusion, turned = self.diffusion, jacobian
         if not self.constant:

@@ -16,6 +16,7 @@
 `rendering`              how does it become HTML?
 `settings`               what do figures and pages of a study depend on?
 `study_page`             what does the page of a study say, in which order?
+`equations_page`         and that of given equations?
 `inspection_section`     what is in the recordings, first of all?
 `study_sections`         and in each of its parts?
 `study_formulas`         which formulas?

@@ -58,7 +58,12 @@ def share_text(share: float) -> str:
 
 
 def certificate_badge(
-    certificate: Mapping[str, Any] | None, *, certified: int, runs: int, refusals: Mapping[str, str]
+    certificate: Mapping[str, Any] | None,
+    *,
+    certified: int,
+    runs: int,
+    refusals: Mapping[str, str],
+    given: bool = False,
 ) -> Badge:
     """The badge of a study.
 
@@ -70,19 +75,23 @@ def certificate_badge(
         How many runs are certified, of how many.
     refusals
         Why the others are not, by test.
+    given
+        Whether f was given as equations.
     """
     if certificate is None:
         return Badge("no formula", False, ["There is nothing that a certificate could be given for."])
     made = len(certificate.get("tests", {}))
     if not certificate["certified"]:
-        return Badge("not certified", False, _refused(certificate, certified, runs, refusals))
+        return Badge("not certified", False, _refused(certificate, certified, runs, refusals, given))
     error = certificate["stated_error"]
     within = "" if error is None else f" to within {share_text(error)} of its height"
     promise = [
         f"All {made} tests passed. One of them computes U once more, by a method that shares nothing with the"
         f" fit but f, and finds the same{within}.",
-        "This does not promise anything outside the recorded region, nor that all states that matter were"
-        " recorded.",
+        "This does not promise anything outside the domain, nor that these equations are those of nature."
+        if given
+        else "This does not promise anything outside the recorded region, nor that all states that matter"
+        " were recorded.",
     ]
     if runs > 1:
         promise.append(f"{certified} of {runs} runs are certified.")
@@ -90,7 +99,7 @@ def certificate_badge(
 
 
 def _refused(
-    certificate: Mapping[str, Any], certified: int, runs: int, refusals: Mapping[str, str]
+    certificate: Mapping[str, Any], certified: int, runs: int, refusals: Mapping[str, str], given: bool
 ) -> list[str]:
     failed = [name for name, test in certificate.get("tests", {}).items() if not test["passed"]]
     lines = []
@@ -100,14 +109,16 @@ def _refused(
     elif reason := str(certificate.get("reason") or "; ".join(refusals.values())):
         lines.append(f"{reason[0].upper()}{reason[1:]}.".replace("..", "."))
     tests = certificate.get("tests", {})
-    if tests.get("prediction", {}).get("passed"):
+    if given or tests.get("prediction", {}).get("passed"):
         lines.append(
             "Positions, depths and times above follow from f, along its most likely ways out. It is U as a"
             " formula"
             " that failed."
         )
     lines.append(
-        "A formula that fails a test may belong to another landscape that fits the recordings just as"
+        "Do not rely on the formula before you have checked it in another way."
+        if given
+        else "A formula that fails a test may belong to another landscape that fits the recordings just as"
         " well. Do not"
         " rely on it before you have checked it in another way."
     )

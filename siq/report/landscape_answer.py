@@ -37,11 +37,13 @@ def headline(data: Mapping[str, Any] | None, *, missing: str = "") -> str:
     if data is None or not data["wells"]:
         notes = [] if data is None else list(data["notes"])
         reason = missing or (notes[0] if notes else "")
-        return "No stable state was found in the recorded region" + (f": {reason}." if reason else ".")
+        region = "recorded region" if data is None else SaidLandscape(data).region
+        return f"No stable state was found in the {region}" + (f": {reason}." if reason else ".")
     said = SaidLandscape(data)
     wells = said.wells
     count = COUNTS[len(wells)] if len(wells) < len(COUNTS) else str(len(wells))
-    opening = f"The recordings show {count} stable state{'s' if len(wells) > 1 else ''}"
+    subject = "equations have" if said.given else "recordings show"
+    opening = f"The {subject} {count} stable state{'s' if len(wells) > 1 else ''}"
     if len(wells) == 1:
         return _alone(said, wells[0], opening)
     if len(wells) > LISTED:
@@ -61,7 +63,7 @@ def _alone(said: SaidLandscape, well: SaidWell, opening: str) -> str:
     fact = _facts(said, well)
     if fact:
         return f"{opening}, at {place_text(said, well)}: it {fact}."
-    text = f"{opening}, at {place_text(said, well)}, and no way out of it within the recorded region"
+    text = f"{opening}, at {place_text(said, well)}, and no way out of it within the {said.region}"
     if math.isfinite(well.known_up_to):
         text += f"; U is known up to {value_text(well.known_up_to, unit=said.energy_unit)} above it"
     return f"{text}."
@@ -194,8 +196,9 @@ def remarks(data: Mapping[str, Any] | None) -> list[str]:
         return []
     noise = said.noise
     if noise is None:
+        silent = "the equations do not say how strong it is" if said.given else "these recordings show none"
         return [
-            "How long a stable state lasts depends on the noise, and these recordings show none. Give its"
+            f"How long a stable state lasts depends on the noise, and {silent}. Give its"
             " strength ε, in the unit of U, as “landscape: {noise_intensities: [ε]}” in the study, and the"
             " times"
             " follow."
@@ -261,6 +264,9 @@ def _visits_remarks(said: SaidLandscape, deep: Sequence[SaidWell]) -> list[str]:
 def wells_table(data: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.DataFrame]:
     """The wells for a reader, a column for each, and the same as numbers, a row for each."""
     said = SaidLandscape(data)
+    share, led = "share_of_recorded_states", "recorded states"
+    if said.given:
+        share, led = "share_of_domain", "share of the domain"
     rows: dict[str, list[str]] = {}
     numbers = []
     for well in said.wells:
@@ -278,7 +284,7 @@ def wells_table(data: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.DataFrame]:
                 "depth_over_noise_error": ratio_error,
                 "mean_time": math.nan if mean is None else mean.value,
                 "mean_time_relative_error": math.nan if mean is None else mean.error,
-                "next": well.beyond or "", "share_of_recorded_states": well.basin,
+                "next": well.beyond or "", share: well.basin,
             }
         )  # fmt: skip
         for name, unit, value, error in zip(
@@ -302,10 +308,10 @@ def wells_table(data: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.DataFrame]:
                 "" if seen is None else foreseen_text(seen)
             )
         rows.setdefault("next well", []).append(well.beyond or "")
-        rows.setdefault("recorded states", []).append(f"{100 * well.basin:.0f} %")
+        rows.setdefault(led, []).append(f"{100 * well.basin:.0f} %")
     kept = {name: cells for name, cells in rows.items() if any(cells)}
     if len(said.wells) == 1:
-        kept.pop("recorded states", None)
+        kept.pop(led, None)
     names = [f"{well.name}" for well in said.wells]
     table = pd.DataFrame([[name, *cells] for name, cells in kept.items()], columns=["stable state", *names])
     if len(names) > LISTED + 1:  # as many columns would be too wide: a row for each

@@ -85,7 +85,7 @@ def _ways(said: SaidLandscape, file: str) -> ReportTable:
             [one for one in said.data["transitions"] if one["start"] == way["start"]].index(way)
         ]
         mean = None if said.noise is None or not known else exit_time(exit_, said.noise)
-        beyond = "out of the recorded region" if way["end"] is None else well_name(way["end"])
+        beyond = f"out of the {said.region}" if way["end"] is None else well_name(way["end"])
         rows.append(
             {
                 "way": f"{well_name(way['start'])} to {beyond}",
@@ -98,6 +98,8 @@ def _ways(said: SaidLandscape, file: str) -> ReportTable:
                 "to be known": "; ".join(way["notes"]),
             }
         )
+        if said.given:
+            del rows[-1]["the same by the path alone"]
         numbers.append(
             {
                 "start": well_name(way["start"]),
@@ -111,7 +113,9 @@ def _ways(said: SaidLandscape, file: str) -> ReportTable:
             }
         )  # fmt: skip
     explained = {
-        barrier: "by the formula of the well and the end of the way; its error is that of f, and the"
+        barrier: "the least action of the way, which needs no formula of U"
+        if said.given
+        else "by the formula of the well and the end of the way; its error is that of f, and the"
         " difference between formula and way",
         "the same by the path alone": "the least action of the way, without any formula of U",
         time: "prefactor · exp(ΔU/ε), until the next well is reached over this saddle alone",

@@ -116,6 +116,16 @@ class SaidLandscape:
         return f"{length}/{time}" if time else length
 
     @property
+    def given(self) -> bool:
+        """Whether f was given as equations, and not identified from recordings."""
+        return bool(self.data.get("given"))
+
+    @property
+    def region(self) -> str:
+        """What the landscape is of: where states were recorded, or the domain of the equations."""
+        return "domain" if self.given else "recorded region"
+
+    @property
     def noise(self) -> NoiseStrength | None:
         """That drives the system, None where nobody knows it."""
         noise = self.data.get("noise")

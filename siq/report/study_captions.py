@@ -157,6 +157,18 @@ OF_ONE_STATE = (
 )
 """What the first picture shows where there is one state: a curve, and no ways beside it."""
 
+OF_EQUATIONS = (
+    "The quasipotential U where it is known, with the stable states (letters), the saddles between them"
+    " (crosses), and the most likely ways from one to the other."
+)
+"""What it shows of given equations: nothing was recorded."""
+
+OF_ONE_EQUATION = (
+    "The quasipotential U where it is known; the stable states (letters), the saddles between them (crosses)"
+    " and the depth of each (arrows)."
+)
+"""The same of one state."""
+
 LEADING = ("quasipotential", "landscape")
 """Figures that a page can open with, the best first."""
 

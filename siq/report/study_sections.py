@@ -419,7 +419,7 @@ DECOMPOSITION = (
 
 def _printed(study: Study) -> dict[str, Any]:
     """The study as plain data; of recordings nothing is simulated."""
-    data = study.model_dump(mode="json")
+    data = study.model_dump(mode="json", by_alias=True)
     return data if study.recordings is None else data | {"simulation": None}
 
 

@@ -20,6 +20,7 @@ train                   which V and g do two networks find?
 regress                 which sparse formulas are these (the published method)?
 refine                  which V solves the Hamilton–Jacobi equation of f, and may it be believed?
 landscape               which wells, barriers and ways are there?
+equations               what landscape have equations alone?
 score                   how far is all this from exact answers, where these are known?
 overview                which landscape does the page open with?
 collect                 what do all runs say together?

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
@@ -29,6 +29,8 @@ from siq.landscape.options import LandscapeOptions
 from siq.networks.options import TrainingOptions
 from siq.networks.regression import RegressionOptions
 from siq.potential.refinement import RefinementOptions
+
+Entrance = Literal["trajectories", "equations"]
 
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"
 
@@ -88,6 +90,12 @@ class RecordingsOptions(BaseModel):
         return states
 
 
+OF_TRAJECTORIES = (
+    "recordings", "runs", "published", "simulation", "identification", "regression", "training", "invariant",
+)  # fmt: skip
+"""Keys of a study that equations have no use for."""
+
+
 class Study(BaseModel):
     """The schema of a study.
 
@@ -100,6 +108,9 @@ class Study(BaseModel):
     system
         Name of a system card, or path of one. Simulated, unless there are recordings; then it only lends
         its states, units, D and exact answers.
+    from
+        Where the landscape comes from, in Python `entrance`. ``trajectories``: recordings, or a simulation of
+        the system. ``equations``: the system's equations alone; nothing is simulated, identified or trained.
     recordings
         Measured trajectories in the place of a simulation.
     runs
@@ -123,11 +134,12 @@ class Study(BaseModel):
         the page shows.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
 
     name: str = Field(pattern=NAME)
     title: str = ""
     system: str | None = None
+    entrance: Annotated[Entrance, Field(alias="from")] = "trajectories"
     recordings: RecordingsOptions | None = None
     runs: Annotated[int, Field(ge=1, le=10_000)] = 1
     seed: Annotated[int, Field(ge=0)] = 0
@@ -166,14 +178,30 @@ class Study(BaseModel):
                 "'refinement.routes' names the network route, but no networks are asked for; add"
                 " 'training: {}', or leave the routes out"
             )
+        if self.entrance == "equations":
+            self._check_equations()
         if self.simulation.pair_step is not None and self.simulation.interval is not None:
             self.simulation.options()
         return self
 
+    def _check_equations(self) -> None:
+        """Whether a study of equations asks for what only trajectories can give."""
+        if self.system is None:
+            raise ValueError("'from: equations' needs equations; add 'system: NAME'")
+        if self.landscape is None:
+            raise ValueError(
+                "'from: equations' finds a landscape and nothing else; remove 'landscape: false'"
+            )
+        for key in OF_TRAJECTORIES:
+            if getattr(self, key) != type(self).model_fields[key].get_default():
+                raise ValueError(
+                    f"'{key}' belongs to studies of trajectories; remove it, or 'from: equations'"
+                )
+
 
 def completed(study: Study, system: Dynamics | None) -> Study:
     """A study with what follows from its system where it says nothing: how this is simulated."""
-    if system is None or study.recordings is not None:
+    if system is None or study.recordings is not None or study.entrance == "equations":
         return study
     return study.model_copy(update={"simulation": complete(study.simulation, system)})
 
@@ -284,33 +312,31 @@ def _with_landscape(path: Path) -> Dynamics:
     """The system of a card that can be simulated by itself, and has a landscape that we can work out."""
     document = read_document(path)
     system = build_system(document, validate(document, SystemCard))
+    if (fault := fault_for_landscape(system)) is not None:
+        keys, what, remedy = fault
+        raise InputError(document.file, document.place(keys), what, remedy)
+    return system
 
-    def refuse(keys: tuple[str, ...], fault: str, remedy: str) -> None:
-        raise InputError(document.file, document.place(keys), fault, remedy)
 
+def fault_for_landscape(system: Dynamics) -> tuple[tuple[str, ...], str, str] | None:
+    """Why no landscape of a system can be worked out: the place in its card, the fault and the remedy."""
     if not system.autonomous:
         key, what = ("inputs", "inputs") if system.inputs else ("equations", "time")
-        refuse(
-            (key,),
-            "a driven system has no quasipotential",
-            f"leave the {what} out, or use the card in a study of mismatch",
-        )
+        remedy = f"leave the {what} out, or use the card in a study of mismatch"
+        return (key,), "a driven system has no quasipotential", remedy
     for name, limits in zip(system.states, system.limits, strict=True):
         if np.isnan(limits).any():
-            refuse(
-                ("states", name),
-                f"the state '{name}' has no domain, in which a simulation could begin",
-                "add 'domain: [lower, upper]' to it",
-            )
+            what = f"the state '{name}' has no domain, in which a simulation could begin"
+            return ("states", name), what, "add 'domain: [lower, upper]' to it"
     if not system.diffusion.regular:
-        refuse(
-            ("diffusion",),
-            "the noise does not reach every state, and landscapes are worked out only where it does",
-            "give a positive definite matrix, or use the card in a study of mismatch",
-        )
+        what = "the noise does not reach every state, and landscapes are worked out only where it does"
+        return (
+            ("diffusion",), what, "give a positive definite matrix, or use the card in a study of mismatch"
+        )  # fmt: skip
     if (found := fault_over_domain(system)) is not None:
-        refuse(("equations", found[0]), f"the equation {found[1]}", "choose a domain in which it has a value")
-    return system
+        remedy = "choose a domain in which it has a value"
+        return ("equations", found[0]), f"the equation {found[1]}", remedy
+    return None
 
 
 def check_states(study: Study, states: Sequence[str], *, file: str) -> None:

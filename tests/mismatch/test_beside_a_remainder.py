@@ -21,7 +21,7 @@ from siq.mismatch.beside import beside_a_remainder
 from siq.mismatch.clusters import correlation_time_of
 from siq.mismatch.evidence import Missing
 from siq.mismatch.held_out import first_better
-from siq.mismatch.left_out import error_left_out, parts_left_out
+from siq.mismatch.left_out import errors_left_out, parts_left_out
 from siq.mismatch.nameless_models import Material, Model, runs_freely
 
 DECAY = Dynamics(
@@ -169,17 +169,19 @@ def test_every_row_is_left_out_once_and_never_fitted_then(count: int, samples: i
 def test_what_is_left_out_is_foreseen_up_to_noise_and_parameters_are_fitted_to_the_rest() -> None:
     data = decays(4, 60)
     fit, _ = recalibrate(DECAY, data)
-    right, values = error_left_out(fit, data, noise=fit.noise)
-    assert right is not None and values > 150
+    squares = errors_left_out(fit, data, noise=fit.noise)
+    assert squares is not None and len(squares) > 150
+    right = np.sqrt(squares.mean())
     # A fifth of each tells where it begins.
     spread = np.array([part.out.outputs[12:].std() for part in parts_left_out(data)])
     assert right == pytest.approx(np.sqrt(np.mean((0.01 / spread) ** 2)), rel=0.3)
     # From wrong parameters it ends the same, since they are fitted again, but where they may not be.
     off = replace(fit, model=fit.model.with_values(np.array([1.3])))
-    assert error_left_out(off, data, noise=fit.noise)[0] == pytest.approx(right, rel=1e-3)
+    again = errors_left_out(off, data, noise=fit.noise)
+    assert again is not None and np.sqrt(again.mean()) == pytest.approx(right, rel=1e-3)
     fixed = replace(off.model, parameters=(replace(off.model.parameters[0], fixed=True),))
-    wrong, _ = error_left_out(replace(off, model=fixed), data, noise=fit.noise)
-    assert wrong is not None and wrong > 2 * right
+    wrong = errors_left_out(replace(off, model=fixed), data, noise=fit.noise)
+    assert wrong is not None and np.sqrt(wrong.mean()) > 2 * right
 
 
 def test_a_model_that_runs_away_from_where_it_is_held_is_none() -> None:
@@ -190,17 +192,25 @@ def test_a_model_that_runs_away_from_where_it_is_held_is_none() -> None:
     assert not runs_freely(steeper, fit, data)
 
 
+def squares(draw: np.random.Generator, size: float) -> np.ndarray:
+    return size * draw.chisquare(1, 400)
+
+
 @pytest.mark.parametrize(
-    ("without", "errors", "place"),
+    ("without", "models", "certain", "place"),
     [
-        (1.0, [(0.99, 1000), (0.5, 1000), (0.1, 1000)], 1),  # the first by more than chance, not the least
-        (1.0, [(0.99, 1000)], None),
-        (1.0, [(None, 0), (0.8, 1000)], 1),  # one that runs away is none
-        (None, [(3.0, 1000)], 0),  # without, it runs away
-        (1.0, [], None),
+        (1.0, [0.95, 0.5, 0.1], False, 1),  # the first by more than chance, not the least
+        (1.0, [0.95], False, None),
+        (1.0, [0.95], True, 0),  # what is certain where it was found has to be better, by however little
+        (1.0, [1.2], True, None),
+        (1.0, [None, 0.5], False, 1),  # one that runs away is none
+        (None, [3.0], False, 0),  # without, it runs away
+        (1.0, [], False, None),
     ],
 )
-def test_the_likeliest_model_that_is_better_by_more_than_chance_is_adopted(
-    without: float | None, errors: list, place: int | None
+def test_the_likeliest_model_that_foresees_better_is_adopted(
+    without: float | None, models: list, certain: bool, place: int | None
 ) -> None:
-    assert first_better(without, errors) == place
+    draw = np.random.default_rng(1)
+    runs = [None if size is None else squares(draw, size) for size in (without, *models)]
+    assert first_better(runs[0], runs[1:], [certain] * len(models)) == place

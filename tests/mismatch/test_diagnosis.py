@@ -17,7 +17,7 @@ from siq.dynamics.cards import load_system
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.parametric import Signals
 from siq.errors import InputError, NumericalFailure
-from siq.mismatch import investigation, trials
+from siq.mismatch import held_out, investigation, trials
 from siq.mismatch.case import read_case
 from siq.mismatch.diagnosis import Diagnosis, solve_case
 from siq.mismatch.dictionary import standard_dictionary
@@ -221,6 +221,7 @@ def test_random_forces_are_no_noise_where_a_function_beside_them_is_likelier(
         return (Model((part,), search.recalibrated, 5.0),)
 
     monkeypatch.setattr(investigation, "models_of_the_nameless", models)
+    monkeypatch.setattr(held_out, "first_better", lambda *_: None)
     diagnosis = solved(tmp_path, recordings_of(nothing, drive=0.05, count=4), study={"held_out": ["r2"]})
     assert said(diagnosis)["verdict"] == "unexplained" and names(diagnosis) == []
     # It is located where the likeliest function stands.
@@ -301,7 +302,7 @@ def test_what_a_name_leaves_is_described_and_no_sample_of_a_test_chooses_it(
     # Whatever stands in the tests, the card is the same.
     case = diagnosis.case
     other = replace(case.kept, outputs=case.kept.outputs[::-1] + 0.3)
-    again = held_out_runs(diagnosis.investigation, case.learn, other, tests=study["tests"])
+    again = held_out_runs(diagnosis.investigation, case.learn, other, certain=3.0, tests=study["tests"])
     assert again.model == diagnosis.held_out.model
     assert again.errors.augmented != diagnosis.held_out.errors.augmented
 
@@ -423,3 +424,22 @@ def test_a_study_that_cannot_be_used_is_refused_in_a_sentence(
 def test_a_missing_column_is_told(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="u"):
         solved(tmp_path, recordings_of(nothing).drop(columns="u"))
+
+
+def test_a_name_that_misleads_on_recordings_held_out_is_withdrawn(tmp_path: Path) -> None:
+    def tilted(x: np.ndarray, v: np.ndarray, t: float) -> np.ndarray:
+        return np.where(np.arange(len(x)) % 4 == 2, 0.0, 0.4)  # r2 and r6 are level
+
+    table = recordings_of(tilted)
+    diagnosis = solved(tmp_path, table, study={"held_out": ["r2", "r6"]})
+    verdict = said(diagnosis)
+    assert verdict["verdict"] == "unexplained" and names(diagnosis) == []
+    assert verdict["description"]["misleading"] and verdict["description"]["by"][0]["name"] == "constant bias"
+    assert "looks like a constant bias in the equation of v" in verdict["sentence"]
+    assert "but recordings held out are foreseen worse with that" in verdict["sentence"]
+    assert any("stands in for something else" in line for line in verdict["words"]["left"])
+    # Nothing that was found is put into the card that would make it worse.
+    assert verdict["described"] == [] and verdict["fit"]["before"] < verdict["fit"]["augmented"]
+    # Held out otherwise, the same recordings show the bias and nothing against it.
+    diagnosis = solved(tmp_path, table[~table["recording"].isin(["r2", "r6"])], study={"held_out": ["r1"]})
+    assert said(diagnosis)["verdict"] == "missing physics"

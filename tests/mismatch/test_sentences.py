@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from siq.mismatch.candidates import PROCESS_NOISE
-from siq.mismatch.held_out import HeldOutErrors
+from siq.mismatch.held_out_errors import HeldOutErrors
 from siq.mismatch.investigation import MismatchVerdict
 from siq.mismatch.location import where_it_sits
 from siq.mismatch.sentences import sentence_of, words_of
@@ -64,7 +64,20 @@ def errors_of(draw: np.random.Generator) -> HeldOutErrors:
 
     before, recalibrated = error(), error()
     augmented = recalibrated if draw.random() < 0.3 else error()
-    return HeldOutErrors(before, recalibrated, augmented, floor, values=int(10 ** draw.uniform(1, 5)))
+    values = int(10 ** draw.uniform(1, 4))
+    runs = {"before": before, "recalibrated": recalibrated, "augmented": augmented}
+    return errors_with(runs, floor, draw.chisquare(1, values))
+
+
+def errors_with(
+    runs: dict[str, float | None], floor: float, shape: np.ndarray | float = 1.0
+) -> HeldOutErrors:
+    """Errors of given sizes, whose squares vary alike from value to value."""
+    alike = np.full(1000, 1.0) * shape if np.ndim(shape) == 0 else np.asarray(shape)
+    squares = {
+        name: None if error is None else error**2 * alike / alike.mean() for name, error in runs.items()
+    }
+    return HeldOutErrors.of(squares, noise_floor=floor)
 
 
 def statement_from(number: int, verdict: MismatchVerdict, **changes: Any) -> Statement:
@@ -141,19 +154,19 @@ def test_a_gain_is_said_only_where_the_held_out_error_falls(verdict):
         statement = statement_from(number, verdict)
         text, errors = sentence_of(statement, {}), statement.errors
         assert "nan" not in text and "None" not in text and "unknown" not in text
-        without = [each for each in (errors.before, errors.recalibrated) if each is not None]
         pair = {
-            MismatchVerdict.MISSING_PHYSICS: (min(without, default=None), errors.augmented),
-            MismatchVerdict.PARAMETER_SHIFT: (errors.before, errors.recalibrated),
+            MismatchVerdict.MISSING_PHYSICS: ("without", "augmented"),
+            MismatchVerdict.PARAMETER_SHIFT: ("before", "recalibrated"),
         }.get(verdict)
         falls = "falls from" in text
-        if pair is None or None in pair:
+        if pair is None or None in [errors.error(name) for name in pair]:
             assert not falls
             continue
         first, second = pair
-        noticeable = second < first * (1 - 1.96 / np.sqrt(2 * errors.values))
-        assert falls == noticeable
-        if falls:
+        by_chance = "no more than it may by chance" in text
+        assert falls == (errors.change(first, second) == "better" or by_chance)
+        assert not by_chance or errors.change(first, second) == "same"
+        if falls and not by_chance:
             *before, after, _noise = percentages(text.split("falls from")[1])
             assert after < min(before)
         elif errors.at_noise(first) and errors.change(first, second) != "worse":
@@ -163,7 +176,7 @@ def test_a_gain_is_said_only_where_the_held_out_error_falls(verdict):
 
 
 def test_missing_physics_without_a_gain_cannot_be_read_as_one():
-    same = HeldOutErrors(0.103, 0.103, 0.103, 0.020, values=1000)
+    same = errors_with({"before": 0.103, "recalibrated": 0.103, "augmented": 0.103}, 0.020)
     text = sentence_of(statement_from(3, MismatchVerdict.MISSING_PHYSICS, errors=same), {})
     assert "does not improve the prediction of recordings held out" in text
     assert text.count("10.3 %") == 2
@@ -202,7 +215,8 @@ def test_a_model_without_a_name_is_said_with_its_gain_or_that_nothing_was_gained
     part = StatedFunction(
         "a function of x", "a function of x in v", "spline", {}, {}, Evidence(90.0, -80.0, 0.0, 0.0), ("v",)
     )
-    errors = HeldOutErrors(0.5, 0.3, 0.05 if described else 0.31, 0.04, values=1000)
+    augmented = 0.05 if described else 0.31
+    errors = errors_with({"before": 0.5, "recalibrated": 0.3, "augmented": augmented}, 0.04)
     description = Description(0.0, (), 0.0, False)
     text = sentence_of(
         Statement(
@@ -223,7 +237,8 @@ def test_what_describes_a_rest_is_told_from_what_has_a_name():
         "a function of x", "a function of x in v", "spline", {}, {}, Evidence(90.0, -80.0, 0.0, 0.0), ("v",)
     )
     statement = statement_from(3, MismatchVerdict.MISSING_PHYSICS)
-    errors = HeldOutErrors(0.5, 0.3, 0.05, 0.04, values=1000, named=0.2)
+    runs = {"before": 0.5, "recalibrated": 0.3, "augmented": 0.05, "named": 0.2}
+    errors = errors_with(runs, 0.04)
     text = sentence_of(replace(statement, errors=errors, described=(part,)), {})
     named, rest = text.split("What is left has no name; a function of x in the equation of v describes it. ")
     assert percentages(named.split("falls from")[1])[:3] == [50.0, 30.0, 20.0]

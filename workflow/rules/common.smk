@@ -17,6 +17,7 @@ from siq.report.settings import (
 from siq.report.study_captions import CAPTIONS as STUDY_CAPTIONS
 from siq.report.study_captions import Part, figure_place
 from siq.steps.draw import DrawSettings
+from siq.steps.equations import EquationSettings
 from siq.steps.escapes import EscapesSettings
 from siq.steps.identify import IdentifySettings
 from siq.steps.invariant import InvariantSettings
@@ -309,7 +310,7 @@ def say_what_has_no_answer():
     pages = [
         Path(output)
         for job in workflow.dag.jobs
-        if job.rule.name in ("page", "mismatch_page")
+        if job.rule.name in ("page", "equations_page", "mismatch_page")
         for output in job.output
         if str(output).endswith("report.html")
     ]

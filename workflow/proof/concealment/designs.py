@@ -31,7 +31,12 @@ PROOF_FULL: Mapping[str, float] = {
     "withheld": 0.10,
 }
 NOISE_LEVELS = (40.0, 30.0, 20.0)
-ALWAYS_WITHHELD: Mapping[str, tuple[str, ...]] = {"predator_prey": ("Allee effect", "delayed response")}
+ALWAYS_WITHHELD: Mapping[str, tuple[str, ...]] = {
+    "predator_prey": ("Allee effect", "delayed response"),
+    # A stop beyond a gap is a backlash beside another stiffness.
+    "oscillator": ("backlash",),
+    "coupled_masses": ("backlash",),
+}
 """Entries of the dictionary that are, or contain, an effect that this generator calls withheld."""
 DECOYS = 0.15  # of the mechanical cases say "without hysteresis" though there is none
 

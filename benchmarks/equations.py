@@ -1,0 +1,58 @@
+"""The landscape of equations: certificates, errors, barriers and seconds, system by system.
+
+    .venv/bin/python benchmarks/equations.py [NAME ...]
+
+Known barriers of Maier and Stein's system: 0.5 for β = 1; 0.4831 and 0.3400 for 5 and 10, by least action.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ["OMP_NUM_THREADS"] = "1"
+
+import sys
+import time
+from pathlib import Path
+
+import sympy
+
+import siq
+
+X, Y = sympy.symbols("x y", real=True)
+SYSTEMS = Path(__file__).parents[1] / "config" / "systems"
+LATTICE = (-sympy.sin(X) - sympy.sin(Y) / 2, -sympy.sin(Y) + sympy.sin(X) / 2)
+CASES: dict[str, str | Path | siq.Dynamics] = {
+    "Maier–Stein, β = 1": SYSTEMS / "maier-stein.yaml",
+    "Maier–Stein, β = 5": SYSTEMS / "maier-stein-5.yaml",
+    "Maier–Stein, β = 10": SYSTEMS / "maier-stein-10.yaml",
+    "archetype, 3 states": SYSTEMS / "archetype3d.yaml",
+    "archetype, 4 states": SYSTEMS / "archetype4d.yaml",
+    "resonator": SYSTEMS / "resonator.yaml",
+    "consumer and resource": SYSTEMS / "consumer-resource.yaml",
+    "toggle switch": siq.Dynamics.of((X, Y), (3 / (1 + Y**2) - X, 3 / (1 + X**2) - Y), domain=[(0, 4)] * 2),
+    "steep toggle switch": siq.Dynamics.of(
+        (X, Y), (5 / (1 + Y**4) - X, 5 / (1 + X**4) - Y), domain=[(0, 6)] * 2
+    ),
+    "trigonometric": siq.Dynamics.of((X, Y), LATTICE, domain=[(-3.5, 8)] * 2),
+}
+
+
+def main(names: list[str]) -> None:
+    """Print one line for each system."""
+    for name, system in CASES.items():
+        if names and not any(one in name for one in names):
+            continue
+        started = time.perf_counter()
+        found = siq.Landscape.from_equations(system)
+        seconds = time.perf_counter() - started
+        certificate = found.certificate
+        assert certificate is not None
+        verdict = "certified" if certificate.certified else "refused"
+        barriers = ", ".join(f"{value:.7g}" for value in sorted(set(found.barriers()["barrier"].round(12))))
+        degrees = ", ".join("-" if well is None else str(well.degree) for well in found.wells)
+        print(f"| {name} | {verdict} | {certificate.error:.2g} | {degrees} | {barriers} | {seconds:.1f} |")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

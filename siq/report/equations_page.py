@@ -1,0 +1,220 @@
+"""The page of a study of equations: the answer first, then formulas, evidence, the landscape in full."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import yaml
+from markupsafe import Markup
+from matplotlib.figure import Figure
+
+from siq.dynamics.dynamics import Dynamics
+from siq.landscape.storage import StoredLandscape
+from siq.potential.symbolic import SymbolicDecomposition
+from siq.report.answer import Answer
+from siq.report.certificate_text import certificate_badge, tests_table
+from siq.report.drawn_landscape import DrawnLandscape, drawn_data
+from siq.report.formatting import formula_matrix_mathml, matrix_mathml
+from siq.report.landscape_answer import headline, remarks, wells_table
+from siq.report.landscape_tables import landscape_tables
+from siq.report.page import FormulaRow, ReportContent, ReportSection, ReportTable
+from siq.report.plots.landscape_curves import plot_degrees
+from siq.report.plots.quasipotential import quasipotential_figure
+from siq.report.study_captions import OF_EQUATIONS, OF_ONE_EQUATION, Part, figure_of, figures_of
+from siq.report.study_formulas import formula_rows
+from siq.steps.outcomes import Method, Status
+from siq.study.study import Study
+
+LEAD = "quasipotential"
+PRINTED = ("name", "title", "system", "from", "seed", "refinement", "certificate", "landscape")
+"""Keys of the study that equations have a use for."""
+
+METHOD = (
+    "Nothing was simulated, recorded or learned. Equilibria were sought by Newton's method over the whole"
+    " domain; the paths of least action lead from each stable state to the saddles next to it, and give the"
+    " barriers."
+    " U about each stable state solves the Hamilton–Jacobi equation of f, in powers up to the degree that its"
+    " residual asked for, and has to pass the tests of the certificate."
+)
+
+
+@dataclass(frozen=True)
+class EquationsResults:
+    """What a study of equations left behind.
+
+    Attributes
+    ----------
+    system
+        f and D.
+    stored
+        The landscape, None where there is none.
+    tables
+        ``landscape``, ``degrees``, ``certificates`` and ``outcomes``.
+    folder
+        Where they are.
+    images, vectors
+        The figures by name, as PNG and as SVG.
+    interactive
+        A view of U that can be turned, None where there is none.
+    """
+
+    system: Dynamics
+    stored: StoredLandscape | None
+    tables: Mapping[str, pd.DataFrame]
+    folder: Path
+    images: Mapping[str, bytes]
+    vectors: Mapping[str, bytes]
+    interactive: Markup | None = None
+
+    @property
+    def data(self) -> Mapping[str, Any] | None:
+        """The landscape as plain data."""
+        return None if self.stored is None else self.stored.data
+
+    @property
+    def certificate(self) -> Mapping[str, Any] | None:
+        """That of the formulas; None where there are none."""
+        return None if self.data is None else self.data.get("certificate")
+
+    @property
+    def formulas(self) -> int:
+        """Wells with a formula."""
+        return 0 if self.stored is None else sum(well is not None for well in self.stored.wells)
+
+
+def drawn_of(system: Dynamics, stored: StoredLandscape) -> DrawnLandscape:
+    """What is drawn of a landscape of equations."""
+    return drawn_data(stored.data, wells=stored.wells, dynamics=system)
+
+
+def equations_figures(
+    system: Dynamics, stored: StoredLandscape | None, degrees: pd.DataFrame
+) -> dict[str, Figure | None]:
+    """The figures of the page by name, None for one that has nothing to show."""
+    lead = None if stored is None else quasipotential_figure(drawn_of(system, stored))
+    return {LEAD: lead, "degrees": plot_degrees(degrees) if len(degrees) else None}
+
+
+def equations_page(
+    study: Study, results: EquationsResults, *, command: str, versions: Mapping[str, str]
+) -> ReportContent:
+    """All that the page says.
+
+    Parameters
+    ----------
+    study
+        What was asked.
+    results
+        What came of it.
+    command
+        How to make the page again.
+    versions
+        Of the programs that took part, by name.
+    """
+    data = results.data
+    table = figure = None
+    if data is not None and data["wells"]:
+        shown, numbers = wells_table(data)
+        table = ReportTable("Stable states, barriers and times.", shown, data=numbers, rows_named=True)
+    if LEAD in results.images:
+        caption = OF_ONE_EQUATION if results.system.dimension == 1 else OF_EQUATIONS
+        figure = figure_of(LEAD, results.images, results.vectors, beside_paper=False)
+        figure = replace(figure, caption=caption, alternative=caption)
+    sections = [
+        _formulas(results),
+        _evidence(results),
+        _landscape(study, results),
+        _workings(results),
+        ReportSection("How to run it again", listing=command),
+        _provenance(study, versions),
+    ]
+    return ReportContent(
+        title=study.title or results.system.title or study.name,
+        answer=answer_lines(results),
+        badge=certificate_badge(
+            results.certificate if results.formulas else None,
+            certified=int(_certified(results)), runs=1, refusals={}, given=True,
+        ),
+        figure=figure,
+        table=table,
+        interactive=results.interactive,
+        sections=[one for one in sections if one is not None],
+    )  # fmt: skip
+
+
+def answer_lines(results: EquationsResults) -> list[str]:
+    """The sentence, and what has to be known of it."""
+    if results.data is None:
+        reasons = [str(reason) for reason in results.tables["outcomes"]["reason"] if reason]
+        return [f"No landscape was found: {reasons[0] if reasons else 'there is no stable state'}."]
+    return [headline(results.data), *remarks(results.data)]
+
+
+def answer_of_equations(page: ReportContent, results: EquationsResults) -> Answer:
+    """The answer as plain data: a landscape by paths alone is one, too."""
+    failed = int((results.tables["outcomes"]["status"] == Status.FAILED).sum())
+    found = int(results.data is not None and bool(results.data["wells"]))
+    return Answer(page.title, page.answer[0], "all" if _certified(results) else "none", found, 1, failed)
+
+
+def _certified(results: EquationsResults) -> bool:
+    return results.certificate is not None and bool(results.certificate["certified"])
+
+
+def _formulas(results: EquationsResults) -> ReportSection:
+    system, stored = results.system, results.stored
+    wells = () if stored is None else tuple(well for well in stored.wells if well is not None)
+    places = [] if stored is None else [np.array(one["attractor"]) for one in stored.data["wells"]]
+    found = SymbolicDecomposition(system.symbols, None, (), system.formulas, wells)
+    rows = formula_rows(found, None, places=places)
+    rows[-1] = FormulaRow(
+        rows[-1].quantity, rows[-1].formula, "The vector field dx/dt without noise, as given."
+    )
+    noise = system.diffusion
+    typeset = (
+        matrix_mathml(noise.matrix.tolist()) if noise.constant else formula_matrix_mathml(noise.formulas)
+    )
+    rows.append(FormulaRow("D", typeset, "As given."))
+    return ReportSection("Formulas", formulas=rows)
+
+
+def _evidence(results: EquationsResults) -> ReportSection | None:
+    tests = tests_table(results.tables["certificates"], 0, Method.REFINED)
+    tables = []
+    if len(tests):
+        file = f"{results.folder}/certificates.csv"
+        tables = [ReportTable("The tests of the certificate.", tests, {}, file, rows_named=True)]
+    notes = (
+        [] if results.data is None else [f"{note[0].upper()}{note[1:]}." for note in results.data["notes"]]
+    )
+    if not tables and not notes:
+        return None
+    return ReportSection("How far it can be trusted", tables=tables, notes=notes)
+
+
+def _landscape(study: Study, results: EquationsResults) -> ReportSection | None:
+    noises = () if study.landscape is None else study.landscape.noise_intensities
+    found = landscape_tables(results.data, results.tables["landscape"], noises=noises, folder=results.folder)
+    return ReportSection("The landscape in full", tables=found) if found else None
+
+
+def _workings(results: EquationsResults) -> ReportSection:
+    images = {name: image for name, image in results.images.items() if name != LEAD}
+    figures = figures_of(Part.WORKINGS, images, results.vectors, beside_paper=False)
+    return ReportSection("The workings", [METHOD], figures=figures, folded=True)
+
+
+def _provenance(study: Study, versions: Mapping[str, str]) -> ReportSection:
+    named = ", ".join(f"{name} {version}" for name, version in versions.items())
+    machine = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"
+    data = study.model_dump(mode="json", by_alias=True)
+    printed = yaml.safe_dump({key: data[key] for key in PRINTED}, sort_keys=False, allow_unicode=True)
+    text = [f"{named}; {machine}, {os.cpu_count()} cores."]
+    return ReportSection("The study and the versions", text, listing=printed, folded=True)

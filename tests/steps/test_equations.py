@@ -1,0 +1,221 @@
+"""The landscape of given equations: exact families, known barriers, and that units do not matter."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import sympy
+from known_systems import (
+    KnownSystem,
+    archetype,
+    as_system,
+    double_well,
+    limit_cycle,
+    linear_system,
+    maier_stein,
+    potential_values,
+)
+
+from siq.dynamics.cards import load_system
+from siq.dynamics.dynamics import Dynamics
+from siq.errors import InputError
+from siq.landscape.landscape import Landscape
+from siq.landscape.options import LandscapeOptions
+from siq.landscape.refusal import NoLandscape
+from siq.reference.mesh import mesh_quasipotential
+from siq.steps.equations import EquationSettings
+
+X, Y = sympy.symbols("x y", real=True)
+SYSTEMS = Path(__file__).parents[2] / "config" / "systems"
+CARD = SYSTEMS / "consumer-resource.yaml"
+TOGGLE = Dynamics.of((X, Y), (3 / (1 + Y**2) - X, 3 / (1 + X**2) - Y), domain=[(0, 4), (0, 4)])
+
+
+def turned(dimension: int) -> KnownSystem:
+    """``f = (A - 1)∇Φ`` with a Φ of two wells that couples all states, and A constant and antisymmetric."""
+    symbols = sympy.symbols(f"x:{dimension}", real=True)
+    first, others = symbols[0], symbols[1:]
+    potential = (first**2 - 1) ** 2 / 4 + sum(
+        ((one - first / 3) ** 2 * (1 + first**2) / 2 for one in others), 0
+    )
+    turning = sympy.zeros(dimension)
+    for i in range(dimension):
+        for j in range(i):
+            turning[i, j], turning[j, i] = sympy.Rational(1 + i, 2), -sympy.Rational(1 + i, 2)
+    gradient = sympy.Matrix([potential.diff(one) for one in symbols])
+    equations = tuple((turning - sympy.eye(dimension)) * gradient)
+    attractors = np.outer([-1.0, 1.0], [1.0, *[1 / 3] * len(others)])
+    domain = np.array([[-1.8, 1.8]] * dimension)
+    return KnownSystem(
+        Dynamics.of(symbols, equations, domain=domain), sympy.expand(potential), attractors, domain
+    )
+
+
+def worst_error(known: KnownSystem, landscape: Landscape) -> float:
+    """Of V in all wells, over the depth."""
+    errors = []
+    for well in landscape.wells:
+        assert well is not None
+        exact = potential_values(known, well.points) - potential_values(known, well.attractor[None])
+        errors.append(float(np.abs(well.values(well.points) - exact).max() / well.level))
+    return max(errors)
+
+
+@pytest.mark.parametrize(
+    "known",
+    [
+        pytest.param(linear_system(2), id="linear"),
+        pytest.param(double_well(1), id="one state"),
+        pytest.param(double_well(2), id="gradient", marks=pytest.mark.slow),
+        pytest.param(turned(2), id="turned", marks=pytest.mark.slow),
+        pytest.param(turned(3), id="turned in three", marks=pytest.mark.slow),
+        pytest.param(archetype(3), id="archetype", marks=pytest.mark.slow),
+    ],
+)
+def test_v_of_exact_families_is_found_to_rounding_and_certified(known: KnownSystem) -> None:
+    landscape = Landscape.from_equations(as_system(known))
+    assert len(landscape.attractors) == len(known.attractors)
+    assert worst_error(known, landscape) < 1e-9
+    assert landscape.certificate is not None and landscape.certificate.certified
+    assert set(landscape.certificate.tests) == {"hamilton_jacobi", "branch", "characteristics", "error"}
+    for way in landscape.transitions:
+        start = known.attractors[way.start] if len(known.attractors) else np.zeros(1)
+        ends = np.stack([way.saddle.position, landscape.attractors[way.start].position, start])
+        height = potential_values(known, ends)
+        assert way.barrier == pytest.approx(2 * (height[0] - height[1]), rel=1e-5)
+
+
+@pytest.mark.slow
+def test_v_is_exact_in_four_states() -> None:
+    known = turned(4)
+    assert worst_error(known, Landscape.from_equations(as_system(known))) < 1e-8
+
+
+def test_maier_stein_without_a_caustic_has_its_barrier_and_its_v() -> None:
+    landscape = Landscape.from_equations(SYSTEMS / "maier-stein.yaml")
+    assert landscape.barriers()["barrier"].to_numpy() == pytest.approx([0.5, 0.5], rel=1e-6)
+    assert worst_error(maier_stein(1), landscape) < 1e-9
+    assert landscape.basins == pytest.approx([0.5, 0.5], abs=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("beta", "barrier"), [(5, 0.4831), (10, 0.3400)])
+def test_behind_a_caustic_the_path_tells_the_barrier_and_the_caustic_is_named(
+    beta: int, barrier: float
+) -> None:
+    landscape = Landscape.from_equations(SYSTEMS / f"maier-stein-{beta}.yaml")
+    assert landscape.barriers()["barrier"].to_numpy() == pytest.approx([barrier, barrier], abs=1e-4)
+    assert any("cross at a caustic" in note for note in landscape.notes)
+    certificate = landscape.certificate
+    assert certificate is not None and (not certificate.certified or certificate.error > 0.005)
+
+
+@pytest.mark.slow
+def test_a_rational_f_has_a_certified_v_and_its_wells_are_alike_where_they_have_to_be() -> None:
+    landscape = Landscape.from_equations(TOGGLE)
+    assert landscape.certificate is not None and landscape.certificate.certified
+    assert landscape.certificate.error < 0.001
+    one, two = landscape.barriers()["barrier"]
+    assert one == pytest.approx(two, rel=1e-5)
+    assert np.abs(landscape.heights).max() < 1e-5 * one
+    x = np.array([[0.5, 2.4], [0.35, 2.5], [0.8, 1.9]])
+    assert landscape.quasipotential(x) == pytest.approx(landscape.quasipotential(x[:, ::-1]), rel=2e-3)
+
+
+@pytest.mark.slow
+def test_the_consumer_and_its_resource_agree_with_a_mesh() -> None:
+    """Both barriers, and U in the well that is a focus, against a method that shares nothing but f."""
+    landscape = Landscape.from_equations(CARD)
+    assert landscape.certificate is not None and landscape.certificate.certified
+    system = load_system(CARD)
+    boxes = [[(0.8, 4.6), (2.2, 4.4)], [(4.0, 5.6), (3.9, 4.2)]]
+    for way, box in zip(landscape.transitions, boxes, strict=True):
+        start = landscape.attractors[way.start].position
+        well = landscape.potential(way.start)
+        mesh = mesh_quasipotential(
+            system.drift, start, hessian=well.hessians(start[None])[0], box=np.array(box, dtype=float),
+            shape=(400, 400), diffusion=system.diffusion, level=1.02 * well.level, stop_at_boundary=False,
+        )  # fmt: skip
+        height = 2 * float(mesh.evaluate(way.saddle.position[None])[0])
+        assert height == pytest.approx(way.barrier, rel=0.03)
+        x = well.points[well.believed(well.points) & (well.values(well.points) < 0.9 * well.level)]
+        on_mesh = mesh.evaluate(x)
+        known = np.isfinite(on_mesh)
+        difference = np.linalg.norm(well.values(x)[known] - on_mesh[known])
+        assert difference < 0.04 * np.linalg.norm(on_mesh[known])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("size", "rate"), [((1e-3, 40.0), 1.0), ((1.0, 1.0), 1e-4)])
+def test_units_of_states_and_of_time_change_nothing(size: tuple[float, float], rate: float) -> None:
+    known = double_well(2)
+    scaled = [symbol / s for symbol, s in zip(known.dynamics.symbols, size, strict=True)]
+    inserted = dict(zip(known.dynamics.symbols, scaled, strict=True))
+    equations = [
+        rate * s * f.subs(inserted, simultaneous=True)
+        for f, s in zip(known.dynamics.formulas, size, strict=True)
+    ]
+    factors = np.array(size)
+    system = Dynamics.of(
+        known.dynamics.symbols, equations, diffusion=rate * known.diffusion * np.outer(factors, factors),
+        domain=known.domain * factors[:, None],
+    )  # fmt: skip
+    plain, other = (Landscape.from_equations(one) for one in (as_system(known), system))
+    assert other.certificate is not None and other.certificate.certified
+    assert other.barriers()["barrier"].to_numpy() == pytest.approx(plain.barriers()["barrier"], rel=1e-4)
+    times = [
+        np.array([way.rate.prefactor for way in each.transitions if way.rate]) for each in (plain, other)
+    ]
+    assert times[1] * rate == pytest.approx(times[0], rel=0.01)
+
+
+@pytest.mark.slow
+def test_rotation_of_the_states_changes_no_barrier() -> None:
+    known, angle = double_well(2), 0.7
+    x, y = known.dynamics.symbols
+    c, s = np.cos(angle), np.sin(angle)
+    inserted = {x: c * x - s * y, y: s * x + c * y}
+    one, two = (f.subs(inserted, simultaneous=True) for f in known.dynamics.formulas)
+    turn = np.array([[c, s], [-s, c]])
+    system = Dynamics.of(
+        (x, y), (c * one + s * two, -s * one + c * two),
+        diffusion=turn @ known.diffusion @ turn.T, domain=[(-2.2, 2.2), (-2.2, 2.2)],
+    )  # fmt: skip
+    landscape = Landscape.from_equations(system)
+    assert landscape.certificate is not None and landscape.certificate.certified
+    plain = sorted(Landscape.from_equations(as_system(known)).barriers()["barrier"])
+    assert sorted(landscape.barriers()["barrier"]) == pytest.approx(plain, rel=1e-4)
+
+
+def test_a_way_out_of_the_domain_has_a_barrier() -> None:
+    """One well of two: the pass lies in the domain, and what is behind it does not."""
+    system = Dynamics.of((X, Y), (X - X**3, -Y), domain=[(-2, 0.3), (-1, 1)])
+    landscape = Landscape.from_equations(system)
+    (way,) = landscape.transitions
+    assert way.end is None and way.barrier == pytest.approx(0.5, rel=1e-5)
+    assert way.rate is not None and landscape.wells[0] is not None
+
+
+@pytest.mark.slow
+def test_escape_times_follow_where_the_noise_is_known() -> None:
+    options = LandscapeOptions(noise_intensities=(0.05,))
+    landscape = Landscape.from_equations(as_system(double_well(2)), EquationSettings(landscape=options))
+    assert np.isfinite(landscape.dwell_times()["mean_time"]).all()
+    assert "The equations have two stable states" in landscape.report()
+    assert "recorded" not in landscape.report()
+
+
+def test_systems_without_a_landscape_say_why() -> None:
+    cycle = as_system(limit_cycle())
+    with pytest.raises(NoLandscape, match="limit cycle of period"):
+        Landscape.from_equations(cycle)
+    with pytest.raises(InputError, match="no domain"):
+        Landscape.from_equations(replace(TOGGLE, domain=None))
+    with pytest.raises(InputError, match="divides by zero"):
+        Landscape.from_equations(Dynamics.of((X, Y), (1 / X, -Y), domain=[(-1, 1), (-1, 1)]))
+    singular = Dynamics.of((X, Y), (Y, -X), diffusion=np.diag([0.0, 1.0]), domain=[(-1, 1), (-1, 1)])
+    with pytest.raises(InputError, match="noise does not reach every state"):
+        Landscape.from_equations(singular)

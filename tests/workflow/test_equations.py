@@ -1,0 +1,53 @@
+"""A study from equations: one step, a page, tables of the contract; nothing is simulated."""
+
+import json
+
+import pandas as pd
+import pytest
+
+from siq.study.tables import COLUMNS
+
+pytestmark = [pytest.mark.workflow, pytest.mark.slow]
+
+CARD = """\
+name: wells
+title: Two wells
+states:
+  x: {unit: "1", domain: [-2, 2]}
+  y: {unit: "1", domain: [-2, 2]}
+equations: {x: "x - x**3", y: "-y"}
+diffusion: identity
+"""
+STUDY = """\
+name: mini
+system: wells.yaml
+from: equations
+landscape: {noise_intensities: [0.05]}
+"""
+
+
+def test_equations_alone_give_the_page(fresh_project):
+    fresh_project.path("wells.yaml").write_text(CARD)
+    fresh_project.path("study.yaml").write_text(STUDY)
+    fresh_project.make("results/mini/report.html")
+    results = fresh_project.path("results/mini")
+    for name in ("landscape", "degrees", "certificates", "outcomes"):
+        table = pd.read_parquet(results / "tables" / f"{name}.parquet")
+        assert list(table.columns) == list(COLUMNS[name]) and len(table)
+    landscape = pd.read_parquet(results / "tables" / "landscape.parquet")
+    ways = landscape[landscape["kind"] == "transition"]
+    assert ways["barrier"].to_numpy() == pytest.approx([0.5, 0.5], rel=1e-5)
+    assert ways["mean_time"].notna().all() and (ways["standard_error"] == 0).all()
+    answer = json.loads((results / "answer.json").read_text())
+    assert answer["certified"] == "all" and answer["sentence"].startswith("The equations have two stable")
+    page = (results / "report.html").read_text()
+    assert "Nothing was simulated" in page and "recorded states" not in page
+    assert not (results / "runs").exists()
+
+
+def test_what_only_trajectories_can_give_is_refused(fresh_project):
+    fresh_project.path("wells.yaml").write_text(CARD)
+    fresh_project.path("study.yaml").write_text(STUDY + "runs: 3\n")
+    done = fresh_project.run("-n", "results/mini/report.html")
+    assert done.returncode != 0
+    assert "'runs' belongs to studies of trajectories" in done.stdout
