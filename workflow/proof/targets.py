@@ -137,7 +137,9 @@ def targets_of(scores: pd.DataFrame) -> list[Target]:
             ),
         ]
     found.append(
-        share("withheld: “unexplained” among those detected", withheld["verdict"] == "unexplained", least=0.95)
+        share(
+            "withheld: “unexplained” among those detected", withheld["verdict"] == "unexplained", least=0.95
+        )
     )
     for name, some in (("mechanisms, Δχ² ≥ 100", strong), ("withheld, detected", withheld)):
         found += [
