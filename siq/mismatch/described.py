@@ -15,12 +15,14 @@ import numpy as np
 from siq.estimation.estimation import Fit
 from siq.estimation.measurements import Measurements
 from siq.estimation.process_noise import fit_with_and_without_process_noise
-from siq.mismatch.fitted_functions import FITTED, with_a_function
+from siq.mismatch.fitted_functions import with_a_function
+from siq.mismatch.likely_places import FITTED
 from siq.mismatch.nameless_models import MECHANISM, Material, Model, Part, runs_freely, weighed
 from siq.mismatch.search import Search, something_left
+from siq.mismatch.surfaces import SURFACE
 from siq.mismatch.trials import admissible
 
-MOST = 2  # functions that are put on top of each other: more are no description
+MOST = 2  # functions that are put on top of each other, of one coordinate each: more are no description
 
 
 def models_of_the_nameless(
@@ -47,6 +49,7 @@ def models_of_the_nameless(
         best is not None
         and best.fit.model.dimension == base.model.dimension
         and len(best.parts) < MOST
+        and best.parts[-1].kind != SURFACE
         and (functions is None or best.parts[0].kind == MECHANISM)
         and something_left(best.fit, data)
     ):

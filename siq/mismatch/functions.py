@@ -27,8 +27,8 @@ def with_formula(model: Dynamics, place: Place, terms: Sequence[Power]) -> Mecha
     """The simulation with a sum of terms in a place, whose coefficients are the amplitudes."""
     names = fresh_names("c", len(terms), model)
     formula = sympy.Add(*(symbol(name) * term.formula for name, term in zip(names, terms, strict=True)))
-    units = [_unit(place, model, term.first, term.second) for term in terms]
-    return _built(model, _without_factor(place), formula, names, units)
+    units = [unit_in(place, model, term.first, term.second) for term in terms]
+    return built(model, _without_factor(place), formula, names, units)
 
 
 def simplest(place: Place, terms: Sequence[Power]) -> tuple[Place, tuple[Power, ...]]:
@@ -54,8 +54,8 @@ def with_spline(model: Dynamics, place: Place, knots: np.ndarray) -> MechanismCa
     """
     names = fresh_names("f", len(knots), model)
     formula = spline(place.coordinate, knots, [symbol(name) for name in names])
-    units = [_unit(place, model, 0, int(len(place.words) > 1))] * len(names)
-    return _built(model, place, formula, names, units)
+    units = [unit_in(place, model, 0, int(len(place.words) > 1))] * len(names)
+    return built(model, place, formula, names, units)
 
 
 def spline(coordinate: sympy.Expr, knots: np.ndarray, values: Sequence[sympy.Expr]) -> sympy.Expr:
@@ -135,9 +135,10 @@ def second_coordinate(place: Place) -> sympy.Expr:
     return symbol(place.words[1])
 
 
-def _built(
+def built(
     model: Dynamics, place: Place, formula: sympy.Expr, names: Sequence[str], units: Sequence[str]
 ) -> MechanismCandidate:
+    """The simulation with a formula in a place, whose amplitudes have names and units."""
     added = {name: formula * factor for name, factor in place.equations}
     read = {name: formula * factor for name, factor in place.outputs}
     augmented = replace(
@@ -170,8 +171,8 @@ def _built(
     )
 
 
-def _unit(place: Place, model: Dynamics, first: int, second: int) -> str:
-    """Unit of the coefficient of a term with so many factors of either coordinate."""
+def unit_in(place: Place, model: Dynamics, first: int, second: int) -> str:
+    """Unit of the coefficient of a term with so many factors of either coordinate, in a place."""
     known = _units(model)
     units = {"_t": model.time_unit}
     if len(place.equations) > 1:  # of a rotating frame: the function is multiplied by the states themselves

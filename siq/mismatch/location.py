@@ -81,8 +81,8 @@ def locate(
 ) -> Location | None:
     """Say where a mismatch sits; None where there is none.
 
-    What has no name is sought in all equations by what they leave unexplained. That it is in a sensor instead
-    is told by the evidence: then the likeliest function stands in what is measured.
+    What has no name is where the model of it stands. Where nothing describes it, it is sought in all
+    equations by what they leave unexplained.
 
     Parameters
     ----------
@@ -101,8 +101,8 @@ def locate(
     if investigation.verdict is MismatchVerdict.MISSING_PHYSICS and named is not None:
         equations, coordinate = named.equations, named.coordinate
         outputs = _in_sensors(named)
-    elif outputs := _in_sensors(_first_part(investigation, described)):
-        equations, coordinate = (), "measurement"
+    elif first := _first_part(investigation, described):
+        equations, coordinate, outputs = first.equations, first.coordinate, _in_sensors(first)
     elif curves:
         equations, coordinate = most_telling(investigation.before, investigation.roles)
     else:

@@ -1,0 +1,92 @@
+"""Parts of a description: what is added to a simulation, fitted in earnest and judged."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+
+from siq.errors import NumericalFailure
+from siq.estimation.budget import BudgetSpent
+from siq.estimation.estimation import SUBSTEP_ERROR, Fit
+from siq.estimation.linearisation import substeps_needed
+from siq.estimation.process_noise import (
+    fit_with_and_without_process_noise,
+    fit_with_process_noise_as_needed,
+    simpler_fit,
+)
+from siq.mismatch.candidates import MechanismCandidate
+from siq.mismatch.function_places import (
+    Place,
+)
+from siq.mismatch.functions import FORMULA
+from siq.mismatch.nameless_models import Material, Part
+from siq.mismatch.trials import UNFORESEEN, TriedMechanism, judged
+
+LOGGER = logging.getLogger(__name__)
+
+
+def fitted_part(
+    candidate: MechanismCandidate,
+    level: float,
+    place: Place,
+    fit: Fit,
+    cost: float,
+    material: Material,
+    *,
+    kind: str = FORMULA,
+    knots: np.ndarray | None = None,
+) -> list[Part]:
+    """A function as part of a model, or nothing where it cannot be fitted.
+
+    Parameters
+    ----------
+    candidate
+        The simulation with the function.
+    level
+        Of random forces to begin with, as a multiple of those of the fit.
+    place
+        Where the function stands.
+    fit
+        The simulation without it.
+    cost
+        Logarithm of the number of functions that it was chosen among.
+    material
+        What models are made from.
+    kind, knots
+        See `siq.mismatch.nameless_models.Part`.
+    """
+    try:
+        material.budget.says(f"a {kind}: {candidate.label}")
+        trial = _fitted(candidate, level, fit, material)
+    except (*UNFORESEEN, BudgetSpent) as error:
+        LOGGER.info("%s as a %s cannot be fitted: %s", candidate.label, kind, error)
+        return []
+    return [Part(trial, kind, cost, place, knots)]
+
+
+def _fitted(candidate: MechanismCandidate, level: float, begin: Fit, material: Material) -> TriedMechanism:
+    """A function, fitted and judged against the fit without it.
+
+    Raises
+    ------
+    NumericalFailure
+        When the fit does not settle.
+    """
+    data, budget = material.data, material.budget
+    known = {each.name: each.value for each in begin.model.parameters}
+    values = np.array([known.get(each.name, 0.0) for each in candidate.model.parameters])
+    trial = simpler_fit(
+        *fit_with_and_without_process_noise(
+            candidate.model.with_values(values), data, begin, level=level, budget=budget
+        )
+    )
+    # A function may be steeper than the simulation, whose steps are then too long to follow it.
+    needed = substeps_needed(trial.model, data, trial.model.values, trial.x, tolerance=SUBSTEP_ERROR)
+    if trial.converged and needed > trial.substeps:
+        finer = replace(trial, substeps=needed)
+        trial = fit_with_process_noise_as_needed(trial.model, data, finer, budget=budget)
+    if not trial.converged:
+        raise NumericalFailure(trial.fault or "its fit does not settle")
+    return judged(trial, begin, data, candidate, blocks=material.blocks)
