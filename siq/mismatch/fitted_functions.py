@@ -18,7 +18,7 @@ from siq.dynamics.parametric import symbol
 from siq.estimation.estimation import Fit
 from siq.mismatch.fitted_parts import fitted_part
 from siq.mismatch.fitted_surfaces import with_surfaces
-from siq.mismatch.functions import SPLINE, simplest, with_formula, with_spline
+from siq.mismatch.functions import simplest, with_formula, with_spline
 from siq.mismatch.likely_places import FITTED, LikelyPlace, few_knots, few_powers, likely_places
 from siq.mismatch.nameless_models import Material, Model, Part, weighed
 from siq.mismatch.search import something_left
@@ -62,9 +62,7 @@ def with_a_function(before: tuple[Part, ...], fit: Fit, material: Material) -> l
         if (likely.place.targets, likely.place.words) in curved:
             for knots in few_knots(likely, fit, data):
                 candidate = with_spline(fit.model, likely.place, knots)
-                part = fitted_part(
-                    candidate, likely.level, likely.place, fit, cost, material, kind=SPLINE, knots=knots
-                )
+                part = fitted_part(candidate, likely.level, likely.place, fit, cost, material, knots=knots)
                 models += [Model((*before, each), each.trial.fit) for each in part]
     for best in weighed(models, fit, data)[:1]:
         if something_left(best.fit, data):

@@ -20,8 +20,9 @@ from siq.mismatch.candidates import MechanismCandidate
 from siq.mismatch.function_places import (
     Place,
 )
-from siq.mismatch.functions import FORMULA
+from siq.mismatch.functions import FORMULA, SPLINE
 from siq.mismatch.nameless_models import Material, Part
+from siq.mismatch.surfaces import SURFACE, Surface
 from siq.mismatch.trials import UNFORESEEN, TriedMechanism, judged
 
 LOGGER = logging.getLogger(__name__)
@@ -35,8 +36,8 @@ def fitted_part(
     cost: float,
     material: Material,
     *,
-    kind: str = FORMULA,
     knots: np.ndarray | None = None,
+    surface: Surface | None = None,
 ) -> list[Part]:
     """A function as part of a model, or nothing where it cannot be fitted.
 
@@ -54,16 +55,17 @@ def fitted_part(
         Logarithm of the number of functions that it was chosen among.
     material
         What models are made from.
-    kind, knots
+    knots, surface
         See `siq.mismatch.nameless_models.Part`.
     """
+    kind = SPLINE if knots is not None else FORMULA if surface is None else SURFACE
     try:
         material.budget.says(f"a {kind}: {candidate.label}")
         trial = _fitted(candidate, level, fit, material)
     except (*UNFORESEEN, BudgetSpent) as error:
         LOGGER.info("%s as a %s cannot be fitted: %s", candidate.label, kind, error)
         return []
-    return [Part(trial, kind, cost, place, knots)]
+    return [Part(trial, kind, cost, place, knots, surface)]
 
 
 def _fitted(candidate: MechanismCandidate, level: float, begin: Fit, material: Material) -> TriedMechanism:

@@ -18,7 +18,7 @@ from siq.mismatch.fitted_parts import fitted_part
 from siq.mismatch.likely_places import FITTED, LikelyPlace, independent
 from siq.mismatch.nameless_models import Material, Model, Part, weighed
 from siq.mismatch.screening import LEVELS, projected
-from siq.mismatch.surfaces import SURFACE, Surface, needed, response_with_surface, surfaces_in, with_surface
+from siq.mismatch.surfaces import Surface, needed, response_with_surface, surfaces_in, with_surface
 from siq.mismatch.trials import UNFORESEEN
 
 LOGGER = logging.getLogger(__name__)
@@ -74,7 +74,7 @@ def _grown(
         surface = more if surface is None else surface.with_bumps(more)
         price = len(surface.centres) * float(np.log(len(whole.centres)))  # each was chosen among so many
         candidate = with_surface(fit.model, surface)
-        parts = fitted_part(candidate, level, surface.place, fit, cost + price, material, kind=SURFACE)
+        parts = fitted_part(candidate, level, surface.place, fit, cost + price, material, surface=surface)
         if not parts:
             break
         found = Model((*before, parts[0]), parts[0].trial.fit)

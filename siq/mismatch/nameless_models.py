@@ -18,6 +18,7 @@ from siq.estimation.measurements import Measurements
 from siq.mismatch.evidence import correlation_time_left, log_evidence_of
 from siq.mismatch.function_places import Place
 from siq.mismatch.roles import Roles
+from siq.mismatch.surfaces import Surface
 from siq.mismatch.trials import TriedMechanism
 
 MECHANISM = "mechanism"
@@ -60,13 +61,15 @@ class Part:
     trial
         What was added, fitted and judged.
     kind
-        ``formula``, ``spline``, or ``mechanism``.
+        ``formula``, ``spline``, ``surface``, or ``mechanism``.
     cost
         Logarithm of the number of places, or mechanisms, that it was chosen among.
     place
         Where a function stands; None for a mechanism.
     knots
         Of a spline, shape ``(k,)``: the amplitudes are its values there.
+    surface
+        The bumps of a surface, of which the amplitudes are the heights.
     """
 
     trial: TriedMechanism
@@ -74,6 +77,7 @@ class Part:
     cost: float
     place: Place | None = None
     knots: np.ndarray | None = None
+    surface: Surface | None = None
 
 
 @dataclass(frozen=True)

@@ -2,16 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Literal
+
 import numpy as np
 
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.formulas import compile_values
 from siq.dynamics.parametric import symbol
 from siq.estimation.estimation import Fit
-from siq.mismatch.functions import SPLINE
+from siq.mismatch.functions import FORMULA, SPLINE
 from siq.mismatch.held_out import HeldOutRuns
 from siq.mismatch.nameless_models import MECHANISM, Part
-from siq.mismatch.statement import DescribedCurve, Estimate, Evidence, StatedFunction
+from siq.mismatch.statement import DescribedCurve, DescribedSurface, Estimate, Evidence, StatedFunction
+from siq.mismatch.surfaces import SURFACE
+
+GRID = 25  # places along either coordinate of a surface, for its figure
+_KINDS: Mapping[str, Literal["formula", "spline", "surface", "mechanism"]] = {
+    FORMULA: "formula",
+    SPLINE: "spline",
+    SURFACE: "surface",
+    MECHANISM: "mechanism",
+}
 
 
 def stated_functions(shown: HeldOutRuns, *, beside: tuple[str, ...] = ()) -> tuple[StatedFunction, ...]:
@@ -47,7 +59,7 @@ def _stated(part: Part, fit: Fit, beside: tuple[str, ...]) -> StatedFunction:
     return StatedFunction(
         name=candidate.name,
         label=candidate.label,
-        kind="mechanism" if part.kind == MECHANISM else "spline" if part.kind == SPLINE else "formula",
+        kind=_KINDS[part.kind],
         terms={name: str(formula) for name, formula in candidate.changes},
         parameters={
             name: Estimate(known[name].value, errors.get(name), known[name].unit) for name in candidate.new
@@ -59,6 +71,7 @@ def _stated(part: Part, fit: Fit, beside: tuple[str, ...]) -> StatedFunction:
         else (),
         coordinates=part.place.words if part.place is not None else tuple(candidate.coordinate.split(", ")),
         curve=curve_of(part, fit),
+        surface=surface_of(part, fit),
         beside=beside,
     )
 
@@ -66,22 +79,44 @@ def _stated(part: Part, fit: Fit, beside: tuple[str, ...]) -> StatedFunction:
 def curve_of(part: Part, fit: Fit) -> DescribedCurve | None:
     """A function of one coordinate at the knots of its place, with its standard errors.
 
-    None for a formula in two coordinates, and for a mechanism.
+    None for a formula in two coordinates, for a surface, and for a mechanism.
     """
     place = part.place
     if place is None or (part.kind != SPLINE and len(place.words) > 1):
         return None
     knots = place.knots if part.knots is None else part.knots
-    names = part.trial.candidate.amplitudes
-    free = [fit.model.parameters[each].name for each in fit.model.free]
-    rows = [free.index(name) for name in names]
-    weights = np.eye(len(names)) if part.kind == SPLINE else _terms(part, fit.model, knots)
-    values = weights @ fit.model.values[[fit.model.free[row] for row in rows]]
-    covariance = weights @ fit.covariance[np.ix_(rows, rows)] @ weights.T
-    errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    one_each = np.eye(len(part.trial.candidate.amplitudes))
+    values, errors = _summed(one_each if part.kind == SPLINE else _terms(part, fit.model, knots), part, fit)
     return DescribedCurve(
         place.words[0], tuple(map(float, knots)), tuple(map(float, values)), tuple(map(float, errors))
     )
+
+
+def surface_of(part: Part, fit: Fit) -> DescribedSurface | None:
+    """A surface on a grid that covers its bumps, with its standard errors; None for anything else."""
+    surface = part.surface
+    if surface is None:
+        return None
+    lower = (surface.centres - surface.widths).min(axis=0)
+    upper = (surface.centres + surface.widths).max(axis=0)
+    at = [np.linspace(*limits, GRID) for limits in zip(lower, upper, strict=True)]
+    courses = np.stack([each.ravel() for each in np.meshgrid(*at, indexing="ij")])
+    values, errors = _summed(surface.values(courses).T, part, fit)
+    first, second = (tuple(map(float, each)) for each in at)
+
+    def rows(flat: np.ndarray) -> tuple[tuple[float, ...], ...]:
+        return tuple(tuple(map(float, row)) for row in flat.reshape(GRID, GRID))
+
+    return DescribedSurface(surface.words, (first, second), rows(values), rows(errors))
+
+
+def _summed(weights: np.ndarray, part: Part, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
+    """Weighted sums ``(k,)`` of the amplitudes of a part, and their standard errors; weights ``(k, c)``."""
+    free = [fit.model.parameters[each].name for each in fit.model.free]
+    rows = [free.index(name) for name in part.trial.candidate.amplitudes]
+    values = weights @ fit.model.values[[fit.model.free[row] for row in rows]]
+    variances = np.einsum("kc,cd,kd->k", weights, fit.covariance[np.ix_(rows, rows)], weights)
+    return values, np.sqrt(np.maximum(variances, 0.0))
 
 
 def _terms(part: Part, model: Dynamics, knots: np.ndarray) -> np.ndarray:

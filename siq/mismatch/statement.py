@@ -134,6 +134,26 @@ class DescribedCurve:
 
 
 @dataclass(frozen=True)
+class DescribedSurface:
+    """A function of two coordinates on a grid, with its standard errors.
+
+    Attributes
+    ----------
+    coordinates
+        Of which it is a function.
+    at
+        The grid, along the first and along the second of them, in the units of the card.
+    value, standard_error
+        A row for each place along the first coordinate.
+    """
+
+    coordinates: tuple[str, str]
+    at: tuple[tuple[float, ...], tuple[float, ...]]
+    value: tuple[tuple[float, ...], ...]
+    standard_error: tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True)
 class StatedFunction:
     """A part of the model of what has no name.
 
@@ -142,8 +162,8 @@ class StatedFunction:
     name, label, terms, parameters, evidence, equations, beside
         As of `StatedMechanism`.
     kind
-        ``formula``: a sum of a few powers. ``spline``: a smooth curve through values. ``mechanism``: one of
-        the dictionary that is not certain enough for its name.
+        ``formula``: a sum of a few powers. ``spline``: a smooth curve through values. ``surface``: a
+        sum of Gaussian bumps. ``mechanism``: one of the dictionary that is not certain enough for its name.
     outputs
         What is measured otherwise, for a fault of the sensor.
     coordinates
@@ -151,11 +171,13 @@ class StatedFunction:
     curve
         Where it is a function of one coordinate, or a spline; a spline in two coordinates is the
         coefficient of the second.
+    surface
+        Where it is a surface.
     """
 
     name: str
     label: str
-    kind: Literal["formula", "spline", "mechanism"]
+    kind: Literal["formula", "spline", "surface", "mechanism"]
     terms: Mapping[str, str]
     parameters: Mapping[str, Estimate]
     evidence: Evidence
@@ -163,6 +185,7 @@ class StatedFunction:
     outputs: tuple[str, ...] = ()
     coordinates: tuple[str, ...] = ()
     curve: DescribedCurve | None = None
+    surface: DescribedSurface | None = None
     beside: tuple[str, ...] = ()
 
 

@@ -24,7 +24,10 @@ from siq.report.mismatch_findings import (
 )
 from siq.report.page import FormulaRow, ReportSection, ReportTable
 
-SPLINE = "a smooth curve (natural cubic spline)"
+SMOOTH = {
+    "spline": "a smooth curve (natural cubic spline)",
+    "surface": "a smooth surface (a sum of Gaussian bumps)",
+}
 CERTAIN = math.log(1e6)  # beyond which odds are not told
 CANDIDATES_SHOWN = 12
 RECORDINGS_LISTED = 12
@@ -117,9 +120,9 @@ def _described(findings: Findings) -> ReportSection | None:
         lines += [
             FormulaRow(
                 each["label"],
-                typeset(formula, findings.after, each["parameters"]) if each["kind"] != "spline" else SPLINE,
+                SMOOTH.get(each["kind"]) or typeset(formula, findings.after, each["parameters"]),
                 _of_what(name, known.get(each["name"]), findings),
-                whole=formula if each["kind"] == "spline" else None,
+                whole=formula if each["kind"] in SMOOTH else None,
             )
             for name, formula in each["terms"].items()
         ]
