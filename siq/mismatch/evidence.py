@@ -168,12 +168,38 @@ def evidence_of_function(
     freedom
         Degrees of freedom of the target.
     """
-    gram, overlap, total = columns.T @ columns, columns.T @ target, float(target @ target)
+    priors = [smooth_prior(knots, length) for length in LENGTHS]
+    return evidence_of_columns([columns] * len(priors), target, priors, freedom=freedom)
+
+
+def evidence_of_columns(
+    columns: Sequence[np.ndarray], target: np.ndarray, priors: Sequence[np.ndarray], *, freedom: float
+) -> float:
+    """Log-likelihood of columns with normal coefficients, averaged over their size and over several choices.
+
+    Parameters
+    ----------
+    columns
+        In units of noise, shape ``(n, k)`` each.
+    target
+        The innovations, shape ``(n,)``.
+    priors
+        Covariances of the coefficients but for their size, shape ``(k, k)`` each.
+    freedom
+        Degrees of freedom of the target.
+
+    Returns
+    -------
+    float
+        Over that of nothing; 0 where no column does anything.
+    """
+    total = float(target @ target)
     sizes = sizes_of_effects(total)
     values = []
-    for length in LENGTHS:
+    for own, prior in zip(columns, priors, strict=True):
+        gram, overlap = own.T @ own, own.T @ target
         # In the eigenvectors of what the recordings tell, the evidence is a sum for every size.
-        root = np.linalg.cholesky(smooth_prior(knots, length))
+        root = np.linalg.cholesky(prior)
         told, vectors = np.linalg.eigh(root.T @ gram @ root)
         told = np.maximum(told, 0.0)
         if not told.any():

@@ -1,19 +1,21 @@
 """Functions of two coordinates without a name, fitted: of which two, and how many bumps they need.
 
-They are asked for where something is left of the likeliest function of one coordinate: first with wide bumps
-on top of it, which is cheap, then in its stead and with bumps of all widths, again and again along the better
-trajectories of every fit.
+They are asked for where something is left of the likeliest function of one coordinate: first by
+the evidence of one on top of it, then fitted in its stead, again and again along the better trajectories of
+every fit.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from siq.estimation.estimation import Fit
-from siq.estimation.innovations import profile_likelihood, whiten
+from siq.estimation.innovations import Whitened, profile_likelihood, whiten
+from siq.mismatch.evidence import evidence_of_columns
 from siq.mismatch.fitted_parts import fitted_part
 from siq.mismatch.likely_places import FITTED, LikelyPlace, independent
 from siq.mismatch.nameless_models import Material, Model, Part, weighed
@@ -46,11 +48,11 @@ def with_surfaces(
     places = [each.place for each in ranked[:FITTED]]
     asked: list[tuple[float, Surface]] = []
     tried = 0
-    for wide, whole in surfaces_in(fit.model, data, fit.x, places):
+    for whole in surfaces_in(fit.model, data, fit.x, places):
         tried += 1
-        _, odds, _ = _needed(best, wide, (1.0,), material)
-        if odds > np.log(len(ranked) + tried):
-            asked.append((odds, whole))
+        evidence = _evidence(best, whole, material)
+        if evidence > np.log(len(ranked) + tried):
+            asked.append((evidence, whole))
     asked.sort(key=lambda each: -each[0])
     cost = float(np.log(max(len(ranked) + tried, 1)))
     models: list[Model] = []
@@ -67,10 +69,10 @@ def _grown(
     likeliest: Model | None = None
     current = fit
     for _ in range(ROUNDS):
-        levels = LEVELS if current.has_process_noise else (1.0,)
-        more, _, level = _needed(current, whole, levels, material)
-        if more is None:
+        asked = _needed(current, whole, material)
+        if asked is None:
             break
+        more, level = asked
         surface = more if surface is None else surface.with_bumps(more)
         price = len(surface.centres) * float(np.log(len(whole.centres)))  # each was chosen among so many
         candidate = with_surface(fit.model, surface)
@@ -84,29 +86,59 @@ def _grown(
     return [] if likeliest is None else [likeliest]
 
 
-def _needed(
-    fit: Fit, surface: Surface, levels: Sequence[float], material: Material
-) -> tuple[Surface | None, float, float]:
-    """The bumps that what a fit leaves asks for, the odds for them, and the level of random forces with them.
+@dataclass(frozen=True)
+class _Screened:
+    """What a fit leaves ``(n,)`` and what bumps do to it ``(n, b)``, at a level of random forces.
 
-    The odds are those of `siq.mismatch.surfaces.needed`. A better function needs less random forces, so that
-    the level is the one with which the recordings are likeliest.
+    The likelihood is that without the bumps.
+    """
+
+    level: float
+    left: np.ndarray
+    columns: np.ndarray
+    white: Whitened
+    freedom: int
+    likelihood: float
+
+
+def _screened(fit: Fit, surface: Surface, material: Material) -> Iterator[_Screened]:
+    """A surface on top of a fit, at each level of random forces at which it can be worked out.
+
+    A better function needs less random forces, so that the likelihoods with it and without it are compared
+    each at its best level.
     """
     data, parameters = material.data, len(fit.model.free)
-    best: tuple[Surface | None, float, float] = None, 0.0, levels[0]
-    likeliest = -np.inf
     response = response_with_surface(fit, data, surface)
-    for level in levels:
+    for level in LEVELS if fit.has_process_noise else (1.0,):
         try:
             white = whiten(response, data, fit.noise.scaled(level))
             left, columns = projected(white, parameters)
         except UNFORESEEN as error:
             LOGGER.info("no surface of %s can be screened: %s", " and ".join(surface.words), error)
             continue
-        chosen, odds = needed(left, columns, count=independent(left, columns, white, fit))
         freedom = white.degrees_of_freedom - parameters
-        likelihood = profile_likelihood(float(left @ left), freedom, white.log_determinant) + odds / 2
-        if likelihood > likeliest:
-            likeliest = likelihood
-            best = surface.some(chosen) if chosen else None, odds, level
-    return best
+        likelihood = profile_likelihood(float(left @ left), freedom, white.log_determinant)
+        yield _Screened(level, left, columns, white, freedom, likelihood)
+
+
+def _evidence(fit: Fit, surface: Surface, material: Material) -> float:
+    """Logarithm of the odds of bumps of any height for what a fit leaves."""
+    alone = along = -np.inf
+    for at in _screened(fit, surface, material):
+        prior = np.eye(at.columns.shape[1])
+        gain = evidence_of_columns([at.columns], at.left, [prior], freedom=at.freedom)
+        alone, along = max(alone, at.likelihood), max(along, at.likelihood + gain)
+    return along - alone if np.isfinite(alone) else -np.inf
+
+
+def _needed(fit: Fit, surface: Surface, material: Material) -> tuple[Surface, float] | None:
+    """The bumps that what a fit leaves asks for, and the level of random forces with them; None for none."""
+    alone = along = -np.inf
+    best: tuple[Surface, float] | None = None
+    for at in _screened(fit, surface, material):
+        count = independent(at.left, at.columns, at.white, fit)
+        chosen, odds = needed(at.left, at.columns, count=count)
+        alone = max(alone, at.likelihood)
+        if chosen and at.likelihood + odds > along:
+            along, best = at.likelihood + odds, (surface.some(chosen), at.level)
+    return best if along > alone else None

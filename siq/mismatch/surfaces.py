@@ -33,6 +33,7 @@ WIDTHS = (
     2 * LENGTHS[-1],
 )  # as shares of the range: those of functions of one coordinate, and wider
 MOST_CENTRES = 64  # an eighth of the range apart
+MOST_BUMPS = 40  # that are added at a time
 DISTINCT = 1e-3  # of a column, which the others have to leave of it
 
 
@@ -80,11 +81,8 @@ class Surface:
 
 def surfaces_in(
     model: Dynamics, data: Measurements, x: np.ndarray, likely: Sequence[Place]
-) -> Iterator[tuple[Surface, Surface]]:
+) -> Iterator[Surface]:
     """Surfaces in the equations of likely places, of their coordinates and one other each.
-
-    Each comes twice: with wide bumps, which tell at little cost whether anything depends on both coordinates,
-    and with all.
 
     Parameters
     ----------
@@ -111,30 +109,20 @@ def surfaces_in(
             ranges = np.ptp(both, axis=1)
             if not (np.isfinite(ranges).all() and (ranges > 0).all()):
                 continue
-            yield (
-                _with_bumps_of(place.targets[0], pair, both, WIDTHS[-2:-1], most=room),
-                _with_bumps_of(place.targets[0], pair, both, WIDTHS, most=room // len(WIDTHS)),
-            )
+            at = _spread_out(both / ranges[:, None], most=max(min(MOST_CENTRES, room // len(WIDTHS)), 1))
+            centres = np.tile(both[:, at].T, (len(WIDTHS), 1))
+            widths = np.repeat(WIDTHS, len(at))[:, None] * ranges
+            yield Surface(place.targets[0], pair, centres, widths)
 
 
-def _with_bumps_of(
-    target: str, words: tuple[str, str], courses: np.ndarray, sizes: Sequence[float], *, most: int
-) -> Surface:
-    """Bumps of some sizes that cover where two courses ``(2, n)`` lead."""
-    ranges = np.ptp(courses, axis=1)
-    at = _spread_out(courses / ranges[:, None], distance=min(sizes), most=max(min(MOST_CENTRES, most), 1))
-    centres = np.tile(courses[:, at].T, (len(sizes), 1))
-    return Surface(target, words, centres, np.repeat(sizes, len(at))[:, None] * ranges)
-
-
-def _spread_out(points: np.ndarray, *, distance: float, most: int) -> np.ndarray:
-    """Indices of points ``(2, n)`` that are at least so far from each other, the first in the middle."""
+def _spread_out(points: np.ndarray, *, most: int) -> np.ndarray:
+    """Indices of points ``(2, n)`` that are as far from each other as the narrowest bump is wide."""
     away = np.full(points.shape[1], np.inf)
     chosen = [int(np.argmin(((points - np.median(points, axis=1)[:, None]) ** 2).sum(axis=0)))]
     while len(chosen) < most:
         away = np.minimum(away, ((points - points[:, chosen[-1:]]) ** 2).sum(axis=0))
         farthest = int(np.argmax(away))
-        if away[farthest] < distance**2:
+        if away[farthest] < WIDTHS[0] ** 2:
             break
         chosen.append(farthest)
     return np.array(chosen)
@@ -177,10 +165,11 @@ def response_with_surface(fit: Fit, data: Measurements, surface: Surface) -> Lin
 
 
 def needed(left: np.ndarray, columns: np.ndarray, *, count: float) -> tuple[list[int], float]:
-    """Which columns are needed to explain what is left, and twice the logarithm of the odds for them.
+    """Which columns are needed to explain what is left, and the logarithm of the odds for them.
 
-    Each is added that explains most of what is left by then, as long as it earns its place (Chen and Chen,
-    Biometrika 95, 759 (2008): Schwarz's criterion, and the number of columns that it was chosen among).
+    Each is added that explains most of what is left by then, and so many are taken that the odds are highest.
+    A column has a price (Chen and Chen, Biometrika 95, 759 (2008): Schwarz's criterion, and the number of
+    columns that it was chosen among). One alone may not be worth it where several are.
 
     Parameters
     ----------
@@ -195,8 +184,8 @@ def needed(left: np.ndarray, columns: np.ndarray, *, count: float) -> tuple[list
     rest = columns / np.where(size > 0, size, 1.0)
     left, price = left.copy(), np.log(count) + 2 * np.log(max(columns.shape[1], 1))
     chosen: list[int] = []
-    odds = 0.0
-    while True:
+    odds = [0.0]
+    while len(chosen) < MOST_BUMPS:
         norms = (rest**2).sum(axis=0)
         open_ = norms > DISTINCT**2
         open_[chosen] = False
@@ -205,15 +194,16 @@ def needed(left: np.ndarray, columns: np.ndarray, *, count: float) -> tuple[list
         explained = np.where(open_, (rest.T @ left) ** 2 / np.where(open_, norms, 1.0), 0.0)
         best = int(np.argmax(explained))
         total = float(left @ left)
-        gain = float(count * np.log(total / max(total - explained[best], 1e-300))) - price
-        if gain <= 0:
+        gain = float(count * np.log(total / max(total - explained[best], 1e-300)))
+        if gain <= 1:  # no more than a column of noise explains
             break
         along = rest[:, best] / np.sqrt(norms[best])
         left -= along * (along @ left)
         rest -= np.outer(along, along @ rest)
         chosen.append(best)
-        odds += gain
-    return chosen, odds
+        odds.append(odds[-1] + (gain - price) / 2)
+    most = int(np.argmax(odds))
+    return chosen[:most], odds[most]
 
 
 def with_surface(model: Dynamics, surface: Surface) -> MechanismCandidate:

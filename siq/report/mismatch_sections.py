@@ -38,8 +38,8 @@ CAPTIONS = {
     " left out where they would fill it.",
     "map": "What is missing, over the two states along which most of it can be seen, averaged over cells;"
     " one panel for each equation. Grey: no recordings.",
-    "described": "What was added, as a function of one coordinate, with a band of 95 %. Dots: the values that"
-    " were fitted, or where a formula was evaluated.",
+    "described": "What was added, as a function of one coordinate with a band of 95 % (dots: the values that"
+    " were fitted, or where a formula was evaluated), or of two in colours (dotted: it may as well be zero).",
     "candidates": "How much each mechanism explains. Fitted: what was found, and what was fitted in its"
     " place. Grey bars are estimates for mechanisms that were not fitted.",
     "held_out": "Held-out recordings with all three simulations. For each recording above: the course in"
