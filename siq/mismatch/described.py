@@ -1,7 +1,8 @@
 """Described: a model of what has no name, from the place and the function that the recordings ask for.
 
 Functions (`siq.mismatch.fitted_functions`) compete with mechanisms that were found and are not certain enough
-for their names. What mechanisms with a name leave is described in the same way, on top of them.
+for their names. Where two functions of one coordinate leave something, it may be one of two coordinates.
+What mechanisms with a name leave is described by functions of one coordinate on top of them.
 """
 
 from __future__ import annotations
@@ -16,13 +17,13 @@ from siq.estimation.estimation import Fit
 from siq.estimation.measurements import Measurements
 from siq.estimation.process_noise import fit_with_and_without_process_noise
 from siq.mismatch.fitted_functions import with_a_function
+from siq.mismatch.fitted_surfaces import with_surfaces
 from siq.mismatch.likely_places import FITTED
 from siq.mismatch.nameless_models import MECHANISM, Material, Model, Part, runs_freely, weighed
 from siq.mismatch.search import Search, something_left
-from siq.mismatch.surfaces import SURFACE
 from siq.mismatch.trials import admissible
 
-MOST = 2  # functions that are put on top of each other, of one coordinate each: more are no description
+MOST = 2  # functions that are put on top of each other: more are no description
 
 
 def models_of_the_nameless(
@@ -49,11 +50,13 @@ def models_of_the_nameless(
         best is not None
         and best.fit.model.dimension == base.model.dimension
         and len(best.parts) < MOST
-        and best.parts[-1].kind != SURFACE
         and (functions is None or best.parts[0].kind == MECHANISM)
         and something_left(best.fit, data)
     ):
         models += with_a_function(best.parts, best.fit, material)
+        best = weighed(models, base, data)[0]
+        if functions is None and something_left(best.fit, data):
+            models += with_surfaces(base, best, models, material)
     return likeliest(models, base, data)
 
 

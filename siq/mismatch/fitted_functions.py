@@ -1,8 +1,7 @@
 """Functions without a name, fitted: in which places, with how many powers or knots.
 
 In the likeliest places (`siq.mismatch.likely_places`) a formula of a few powers and a spline are fitted in
-earnest. Where something is left of the best of them, it may depend on two coordinates, and surfaces are
-fitted, too (`siq.mismatch.fitted_surfaces`).
+earnest.
 """
 
 from __future__ import annotations
@@ -17,11 +16,9 @@ import sympy
 from siq.dynamics.parametric import symbol
 from siq.estimation.estimation import Fit
 from siq.mismatch.fitted_parts import fitted_part
-from siq.mismatch.fitted_surfaces import with_surfaces
 from siq.mismatch.functions import simplest, with_formula, with_spline
 from siq.mismatch.likely_places import FITTED, LikelyPlace, few_knots, few_powers, likely_places
 from siq.mismatch.nameless_models import Material, Model, Part, weighed
-from siq.mismatch.search import something_left
 from siq.mismatch.trials import UNFORESEEN
 
 LOGGER = logging.getLogger(__name__)
@@ -64,9 +61,6 @@ def with_a_function(before: tuple[Part, ...], fit: Fit, material: Material) -> l
                 candidate = with_spline(fit.model, likely.place, knots)
                 part = fitted_part(candidate, likely.level, likely.place, fit, cost, material, knots=knots)
                 models += [Model((*before, each), each.trial.fit) for each in part]
-    for best in weighed(models, fit, data)[:1]:
-        if something_left(best.fit, data):
-            models += with_surfaces(before, fit, best.fit, ranked, material)
     given = sum(part.cost for part in before)
     found = [replace(each, log_evidence=each.log_evidence + given) for each in weighed(models, fit, data)]
     for each in found:

@@ -1,8 +1,7 @@
 """Functions of two coordinates without a name, fitted: of which two, and how many bumps they need.
 
-They are asked for where something is left of the likeliest function of one coordinate: first by
-the evidence of one on top of it, then fitted in its stead, again and again along the better trajectories of
-every fit.
+They are asked for where something is left of the likeliest functions of one coordinate: first by the evidence
+of one on top of them, then fitted in their stead, again and again along the better trajectories of every fit.
 """
 
 from __future__ import annotations
@@ -17,8 +16,8 @@ from siq.estimation.estimation import Fit
 from siq.estimation.innovations import Whitened, profile_likelihood, whiten
 from siq.mismatch.evidence import evidence_of_columns
 from siq.mismatch.fitted_parts import fitted_part
-from siq.mismatch.likely_places import FITTED, LikelyPlace, independent
-from siq.mismatch.nameless_models import Material, Model, Part, weighed
+from siq.mismatch.likely_places import FITTED, independent
+from siq.mismatch.nameless_models import Material, Model, weighed
 from siq.mismatch.screening import LEVELS, projected
 from siq.mismatch.surfaces import Surface, needed, response_with_surface, surfaces_in, with_surface
 from siq.mismatch.trials import UNFORESEEN
@@ -27,43 +26,40 @@ LOGGER = logging.getLogger(__name__)
 ROUNDS = 4  # of fits, each along the trajectories of the one before: later ones add next to nothing
 
 
-def with_surfaces(
-    before: tuple[Part, ...], fit: Fit, best: Fit, ranked: Sequence[LikelyPlace], material: Material
-) -> list[Model]:
-    """Models with a smooth function of two coordinates more.
+def with_surfaces(fit: Fit, best: Model, models: Sequence[Model], material: Material) -> list[Model]:
+    """Models with a smooth function of two coordinates, or of one, in all its fineness.
 
     Parameters
     ----------
-    before, fit
-        What was added already, and the fit with it.
+    fit
+        Of the simulation without functions.
     best
-        The fit with the likeliest function of one coordinate, or of one times another, on top.
-    ranked
-        The likeliest places of such functions first.
+        The likeliest model with functions of one coordinate, or of one times another.
+    models
+        All of these, the likeliest first: surfaces are asked for where the first ones have their functions.
     material
         What models are made from.
     """
-    data = material.data
     material.budget.says("comparing functions of two coordinates")
-    places = [each.place for each in ranked[:FITTED]]
-    asked: list[tuple[float, Surface]] = []
+    parts = [part for model in models for part in model.parts if part.place is not None]
+    places = [part.place for part in parts if part.place is not None][:FITTED]
     tried = 0
-    for whole in surfaces_in(fit.model, data, fit.x, places):
+    asked: list[tuple[float, Surface]] = []
+    for whole in surfaces_in(fit.model, material.data, fit.x, places):
         tried += 1
-        evidence = _evidence(best, whole, material)
-        if evidence > np.log(len(ranked) + tried):
-            asked.append((evidence, whole))
-    asked.sort(key=lambda each: -each[0])
-    cost = float(np.log(max(len(ranked) + tried, 1)))
-    models: list[Model] = []
-    for _, whole in asked[:FITTED]:
-        models += _grown(before, fit, whole, cost, material)
-    return models
+        asked.append((_evidence(best.fit, whole, material), whole))
+    cost = float(np.logaddexp(max((part.cost for part in parts), default=0.0), np.log(max(tried, 1))))
+    asked = sorted((each for each in asked if each[0] > cost), key=lambda each: -each[0])
+    # What depends on one coordinate, and more finely than a spline has it, is not to pass for one of two.
+    alone = [each for each in asked if len(each[1].words) == 1][:1]
+    both = [each for each in asked if len(each[1].words) > 1][:FITTED]
+    found: list[Model] = []
+    for _, whole in (*alone, *both):
+        found += _grown(fit, whole, cost, material)
+    return found
 
 
-def _grown(
-    before: tuple[Part, ...], fit: Fit, whole: Surface, cost: float, material: Material
-) -> list[Model]:
+def _grown(fit: Fit, whole: Surface, cost: float, material: Material) -> list[Model]:
     """The likeliest model with a surface of some of the bumps; none where none can be fitted."""
     surface: Surface | None = None
     likeliest: Model | None = None
@@ -79,7 +75,7 @@ def _grown(
         parts = fitted_part(candidate, level, surface.place, fit, cost + price, material, surface=surface)
         if not parts:
             break
-        found = Model((*before, parts[0]), parts[0].trial.fit)
+        found = Model((parts[0],), parts[0].trial.fit)
         if likeliest is not None and weighed([likeliest, found], fit, material.data)[0].fit is likeliest.fit:
             break
         likeliest, current = found, found.fit

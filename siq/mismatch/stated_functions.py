@@ -79,27 +79,32 @@ def _stated(part: Part, fit: Fit, beside: tuple[str, ...]) -> StatedFunction:
 def curve_of(part: Part, fit: Fit) -> DescribedCurve | None:
     """A function of one coordinate at the knots of its place, with its standard errors.
 
-    None for a formula in two coordinates, for a surface, and for a mechanism.
+    None for a formula or a surface in two coordinates, and for a mechanism.
     """
     place = part.place
     if place is None or (part.kind != SPLINE and len(place.words) > 1):
         return None
     knots = place.knots if part.knots is None else part.knots
-    one_each = np.eye(len(part.trial.candidate.amplitudes))
-    values, errors = _summed(one_each if part.kind == SPLINE else _terms(part, fit.model, knots), part, fit)
+    if part.surface is not None:
+        lower, upper = part.surface.limits[:, 0]
+        knots = np.linspace(lower, upper, GRID)
+        weights = part.surface.values(knots[None]).T
+    elif part.kind == SPLINE:
+        weights = np.eye(len(part.trial.candidate.amplitudes))
+    else:
+        weights = _terms(part, fit.model, knots)
+    values, errors = _summed(weights, part, fit)
     return DescribedCurve(
         place.words[0], tuple(map(float, knots)), tuple(map(float, values)), tuple(map(float, errors))
     )
 
 
 def surface_of(part: Part, fit: Fit) -> DescribedSurface | None:
-    """A surface on a grid that covers its bumps, with its standard errors; None for anything else."""
+    """A surface of two coordinates on a grid that covers its bumps, with errors; None for anything else."""
     surface = part.surface
-    if surface is None:
+    if surface is None or len(surface.words) != 2:
         return None
-    lower = (surface.centres - surface.widths).min(axis=0)
-    upper = (surface.centres + surface.widths).max(axis=0)
-    at = [np.linspace(*limits, GRID) for limits in zip(lower, upper, strict=True)]
+    at = [np.linspace(lower, upper, GRID) for lower, upper in surface.limits.T]
     courses = np.stack([each.ravel() for each in np.meshgrid(*at, indexing="ij")])
     values, errors = _summed(surface.values(courses).T, part, fit)
     first, second = (tuple(map(float, each)) for each in at)
@@ -107,7 +112,7 @@ def surface_of(part: Part, fit: Fit) -> DescribedSurface | None:
     def rows(flat: np.ndarray) -> tuple[tuple[float, ...], ...]:
         return tuple(tuple(map(float, row)) for row in flat.reshape(GRID, GRID))
 
-    return DescribedSurface(surface.words, (first, second), rows(values), rows(errors))
+    return DescribedSurface((surface.words[0], surface.words[1]), (first, second), rows(values), rows(errors))
 
 
 def _summed(weights: np.ndarray, part: Part, fit: Fit) -> tuple[np.ndarray, np.ndarray]:

@@ -46,13 +46,13 @@ class Surface:
     target
         The state in whose equation it stands.
     words
-        The two coordinates: states or inputs.
+        Its coordinates, states or inputs: two, or a single one.
     centres, widths
-        Of the bumps, shapes ``(b, 2)``.
+        Of the bumps, shapes ``(b, c)``.
     """
 
     target: str
-    words: tuple[str, str]
+    words: tuple[str, ...]
     centres: np.ndarray
     widths: np.ndarray
 
@@ -62,8 +62,13 @@ class Surface:
         one = sympy.Integer(1)
         return Place(((self.target, one),), (), symbol(self.words[0]), self.words, np.empty(0))
 
+    @property
+    def limits(self) -> np.ndarray:
+        """Where it is not nearly zero, as far as it is known: lower and upper, shape ``(2, c)``."""
+        return np.stack([(self.centres - self.widths).min(axis=0), (self.centres + self.widths).max(axis=0)])
+
     def values(self, courses: np.ndarray) -> np.ndarray:
-        """Every bump along two courses ``(2, n)``, shape ``(b, n)``."""
+        """Every bump along courses ``(c, n)`` of the coordinates, shape ``(b, n)``."""
         away = (courses[None] - self.centres[:, :, None]) / self.widths[:, :, None]
         return np.exp(-0.5 * (away**2).sum(axis=1))
 
@@ -82,7 +87,7 @@ class Surface:
 def surfaces_in(
     model: Dynamics, data: Measurements, x: np.ndarray, likely: Sequence[Place]
 ) -> Iterator[Surface]:
-    """Surfaces in the equations of likely places, of their coordinates and one other each.
+    """Surfaces in the equations of likely places: of their coordinates, and of these and one other each.
 
     Parameters
     ----------
@@ -101,22 +106,22 @@ def surfaces_in(
     for place in likely:
         if len(place.equations) != 1:  # of a rotating frame, or in a sensor
             continue
-        for pair in itertools.combinations(names, 2):
-            if not set(pair) & set(place.words) or (place.targets, pair) in done:
+        for words in (*((name,) for name in names), *itertools.combinations(names, 2)):
+            if not set(words) & set(place.words) or (place.targets, words) in done:
                 continue
-            done.add((place.targets, pair))
-            both = np.stack([courses[name] for name in pair])
+            done.add((place.targets, words))
+            both = np.stack([courses[name] for name in words])
             ranges = np.ptp(both, axis=1)
             if not (np.isfinite(ranges).all() and (ranges > 0).all()):
                 continue
             at = _spread_out(both / ranges[:, None], most=max(min(MOST_CENTRES, room // len(WIDTHS)), 1))
             centres = np.tile(both[:, at].T, (len(WIDTHS), 1))
             widths = np.repeat(WIDTHS, len(at))[:, None] * ranges
-            yield Surface(place.targets[0], pair, centres, widths)
+            yield Surface(place.targets[0], words, centres, widths)
 
 
 def _spread_out(points: np.ndarray, *, most: int) -> np.ndarray:
-    """Indices of points ``(2, n)`` that are as far from each other as the narrowest bump is wide."""
+    """Indices of points ``(c, n)`` that are as far from each other as the narrowest bump is wide."""
     away = np.full(points.shape[1], np.inf)
     chosen = [int(np.argmin(((points - np.median(points, axis=1)[:, None]) ** 2).sum(axis=0)))]
     while len(chosen) < most:
@@ -209,12 +214,12 @@ def needed(left: np.ndarray, columns: np.ndarray, *, count: float) -> tuple[list
 def with_surface(model: Dynamics, surface: Surface) -> MechanismCandidate:
     """The simulation with a surface; the heights of its bumps are the amplitudes."""
     names = fresh_names("b", len(surface.centres), model)
-    first, second = (symbol(name) for name in surface.words)
+    coordinates = [symbol(name) for name in surface.words]
 
     def bump(centre: np.ndarray, width: np.ndarray) -> sympy.Expr:
         away = [
             ((z - sympy.Float(float(f"{at:.6g}"))) / sympy.Float(float(f"{wide:.6g}"))) ** 2
-            for z, at, wide in zip((first, second), centre, width, strict=True)
+            for z, at, wide in zip(coordinates, centre, width, strict=True)
         ]
         return sympy.exp(-sympy.Add(*away) / 2)
 

@@ -26,7 +26,7 @@ from siq.report.page import FormulaRow, ReportSection, ReportTable
 
 SMOOTH = {
     "spline": "a smooth curve (natural cubic spline)",
-    "surface": "a smooth surface (a sum of Gaussian bumps)",
+    "surface": "a smooth function (a sum of Gaussian bumps)",
 }
 CERTAIN = math.log(1e6)  # beyond which odds are not told
 CANDIDATES_SHOWN = 12
