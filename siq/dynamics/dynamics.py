@@ -204,7 +204,7 @@ class Dynamics:
         """The parameters' values, shape ``(p,)``."""
         return np.array([parameter.value for parameter in self.parameters], dtype=float)
 
-    @property
+    @cached_property
     def free(self) -> tuple[int, ...]:
         """Places of the parameters that may be recalibrated."""
         used = set().union(*(each.free_symbols for each in (*self.equations, *dict(self.outputs).values())))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ast
 import builtins
+import functools
 from collections.abc import Callable, Collection, Mapping, Sequence
 
 import numpy as np
@@ -50,6 +51,7 @@ CONSTANTS: Mapping[str, sympy.Expr] = {"pi": sympy.pi}
 LARGEST_EXPONENT = 32  # numerical: several such powers of states of the order of 10 stay doubles
 LARGEST_BASE = 1e9  # numerical: the same for numbers in formulas; (1e9)^32 = 1e288 is still a double
 LARGEST_VALUE = 1e300  # numerical: below the largest double, 1.8e308
+KEPT = 4096  # compiled formulas that are kept: each takes some kilobytes
 DIGITS = 17  # of decimal digits, that a double is read back exactly
 LONGEST_FORMULA = 20_000  # characters, a guard against files that are no formulas
 
@@ -250,6 +252,14 @@ def compile_values(
     callable
         Gives one value for each expression: an array, or a number where only numbers stand in it.
     """
+    return _compiled(tuple(expressions), tuple(variables), common)
+
+
+@functools.lru_cache(maxsize=KEPT)
+def _compiled(
+    expressions: tuple[sympy.Expr, ...], variables: tuple[sympy.Symbol, ...], common: bool
+) -> Callable[..., Sequence[np.ndarray | float]]:
+    """The same, once for the same formulas: a diagnosis asks for those of a hundred mechanisms ten times."""
     return sympy.lambdify(
         list(variables),
         list(expressions),
