@@ -30,7 +30,11 @@
 `naming`            which of the mechanisms found may be named?
 `functions`         what is a function without a name, as a formula?
 `nameless_models`   what is a model of what has no name, and how likely?
+`likely_places`     where is a function likeliest, and how fine does it have to be?
+`fitted_parts`      what does a part of a description explain, fitted in earnest?
 `fitted_functions`  which functions, with how many powers or knots, fit best?
+`surfaces`          what is a smooth function of two coordinates, as a sum of bumps?
+`fitted_surfaces`   of which two coordinates, with how many bumps?
 `beside`            is a mechanism likelier where a function models the rest?
 `described`         which of these models are candidates for the new card?
 `names`             what is named, and what models the rest?
