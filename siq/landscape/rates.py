@@ -48,6 +48,7 @@ from scipy.interpolate import CubicSpline
 
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.equilibria import classify, hessian_at
+from siq.dynamics.reach import measure_at
 from siq.errors import NumericalFailure
 from siq.landscape.paths import MinimumActionPath
 from siq.reference.cubic_series import cubic_series
@@ -166,7 +167,7 @@ def escape_rate(
 
 
 class _Frame:
-    """A path in units in which D at A, the distance from A to S, and the largest rate are one.
+    """A path in units in which D at A, or what stands in for it, the distance to S and the largest rate are one.
 
     ``x = A + units y``, and V is in units of `unit`. The points, with momenta and velocities, are those from
     close to A to the neighbourhood of S; `at_attractor` and `at_saddle` are the Hessians of V.
@@ -175,7 +176,7 @@ class _Frame:
     def __init__(self, dynamics: Dynamics, path: MinimumActionPath) -> None:
         start, end = path.points[0], path.points[-1]
         ends = np.stack([start, end])
-        at_start = dynamics.diffusion.frozen(start)
+        at_start = measure_at(dynamics, start).frozen(start)
         root, whitening = at_start.root, at_start.whitening
         distance = float(np.linalg.norm(whitening @ (end - start)))
         jacobians = whitening @ dynamics.jacobian(ends) @ root
@@ -193,6 +194,7 @@ class _Frame:
         self.stable = float(-saddle.eigenvalues[1:].real.max(initial=-np.inf)) / self.rate
         self.dynamics, self.start, self.units = dynamics, start, distance * root
         self.constant = dynamics.diffusion.constant
+        self.white = self.constant and dynamics.diffusion.regular  # then D is the unit matrix
         self.noise = dynamics.diffusion.in_units(start, self.units, distance**2)
         many = dynamics.dimension > MOST_STATES
         self.series = (
@@ -241,12 +243,12 @@ class _Frame:
 
     def velocity(self, y: np.ndarray, p: np.ndarray) -> np.ndarray:
         """``ẋ = f + 2Dp``."""
-        push = p if self.constant else np.einsum("nij,nj->ni", self.diffusion(y), p)
+        push = p if self.white else np.einsum("nij,nj->ni", self.diffusion(y), p)
         return self.dynamics.drift(self.start + y @ self.units.T) @ self.inverse.T / self.rate + 2 * push
 
     def diffusion(self, y: np.ndarray) -> np.ndarray:
         """D, ``(n, d, d)``."""
-        if self.constant:
+        if self.white:
             return np.broadcast_to(np.eye(y.shape[1]), (len(y), y.shape[1], y.shape[1]))
         return self.noise.at(y)
 
@@ -299,7 +301,8 @@ class _Frame:
 
     def inner_exponent(self) -> float:
         """∫ c dt from A to the first point y: with ``ẏ = By`` and ``c = b·y`` it is ``b·B⁻¹y``."""
-        flow = self.jacobian(np.zeros((1, len(self.end))))[0] + 2 * self.at_attractor
+        here = np.zeros((1, len(self.end)))
+        flow = self.jacobian(here)[0] + 2 * self.diffusion(here)[0] @ self.at_attractor
         y = np.linalg.solve(flow, self.points[0]) * np.array([[1.0], [-1.0]])
         p = self.series.gradient(self.start + y @ self.units.T) @ self.units / self.unit
         odd = self.rise(y, p, self.given(self.series.hessian, y))

@@ -17,6 +17,7 @@ import numpy as np
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.equilibria import Equilibrium, leads_back, neighbours
 from siq.dynamics.phase_portrait import PhasePortrait
+from siq.dynamics.reach import measure_at
 from siq.errors import NumericalFailure
 from siq.identify.diffusion import defined_states
 from siq.identify.given_field import AnyField, GivenField
@@ -303,8 +304,9 @@ def _along(path: MinimumActionPath, dynamics: Dynamics) -> tuple[np.ndarray, np.
     """States, momenta and times of the pieces of a path."""
     middle = (path.points[1:] + path.points[:-1]) / 2
     force = (path.momenta[1:] + path.momenta[:-1]) / 2
-    flow, move = dynamics.drift(middle), np.diff(path.points, axis=0)
-    speed, length = (np.sqrt(dynamics.diffusion.squared_speed(middle, one)) for one in (flow, move))
+    flow, move = dynamics.drift(middle) + 2 * dynamics.diffusion.push(middle, force), np.diff(path.points, axis=0)
+    measure = measure_at(dynamics, path.points[0])
+    speed, length = (np.sqrt(measure.squared_speed(middle, one)) for one in (flow, move))
     spent = np.where(speed > 0, length / np.where(speed > 0, speed, 1.0), 0.0)
     return middle, force, spent
 

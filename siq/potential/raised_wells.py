@@ -178,7 +178,9 @@ def _raised(
             raise NumericalFailure(
                 f"V about the attractor near {start.attractor.round(4)} is told by {len(used)} states alone"
             )
-        equation = equation_at(start.basis, basin.points(used), start.dynamics)
+        equation = equation_at(
+            start.basis, basin.points(used), start.dynamics, attractor=start.attractor
+        )
         last = level >= goal
         coefficients = _robust(equation, coefficients, free, rounds=REWEIGHTINGS if last else 1)
         if last:

@@ -83,7 +83,7 @@ def usable_system(system: str | Path | Dynamics) -> Dynamics:
         In one sentence, for a card that cannot be read and a system that has no landscape.
     """
     given = system if isinstance(system, Dynamics) else load_system(system)
-    if (fault := fault_for_landscape(given)) is not None:
+    if (fault := fault_for_landscape(given, directly=False)) is not None:
         keys, what, remedy = fault
         named = given.name or "the system" if isinstance(system, Dynamics) else system
         raise InputError(named, ".".join(keys), what, remedy)
