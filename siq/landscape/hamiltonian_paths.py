@@ -51,7 +51,7 @@ APPROACH, LAST = 0.1, 0.002  # of it: how far from S the end is at first, and in
 NEARER = 3.0  # by so much in one step
 ROUGH, FINE = 1e-3, 1e-6  # relative residuals of collocation, on the way and of the answer
 LONGEST = 0.3  # of the distance: step of the end; it is halved where Newton's method does not follow ...
-MOST_FAILURES = 4  # ... and a curve is given up after so many
+SHORTEST = 0.004  # ... and a curve given up below this: it leaves the well, or V is not smooth there
 BENDS, BEND = 4, 0.4  # curves beside the straight one, and how far they leave it, as a share of the distance
 APART, COMPARED = 0.03, 400  # of the distance, at so many times: solutions further apart are two
 CENTRAL = 0.005  # of the distance to the end: nearer to A points lie no closer together
@@ -181,6 +181,7 @@ class _Problem:
             cubic_series(dynamics, attractor) if many else quasipotential_series(dynamics, attractor, degree=4)
         )
         self.growth = self.flow.jacobian + 2 * self.flow.diffusion[0]  # of what leaves A: ẏ = (J + 2DM) y
+        self.fastest = float(np.abs(np.linalg.eigvals(self.growth)).max())
         self.unstable: float | None = None
         speed = np.abs(self.flow.inverse @ dynamics.drift(end[None])[0]).max()
         kind = classify(dynamics, end)
@@ -237,17 +238,23 @@ class _Problem:
         def at(place: float) -> np.ndarray:
             return np.array([np.interp(place, along, column) for column in curve.T])
 
-        solution: _Solution | None = self._solved(self._linear(at(0.0)), self._fixed(at(0.0)), ROUGH)
-        place, step, failed = 0.0, LONGEST, 0
+        solution = self._solved(self._linear(at(0.0)), self._fixed(at(0.0)), ROUGH)
+        before: tuple[_Solution, float] | None = None
+        place, step, failed = 0.0, LONGEST, False
         while solution is not None and place < along[-1]:
             ahead = min(place + step, along[-1])
-            moved = self._solved(self._longer(solution), self._fixed(at(ahead)), ROUGH)
+            guess = self._longer(solution)
+            if before is not None:
+                guess = _predicted(guess, before[0], (ahead - place) / (place - before[1]))
+            moved = self._solved(guess, self._fixed(at(ahead)), ROUGH)
             if moved is None:
-                step, failed = step / 2, failed + 1
-                if failed == MOST_FAILURES:
+                step, failed = step / 2, True
+                if step < SHORTEST:
                     return None
                 continue
-            solution, place, step = moved, ahead, min(1.5 * step, LONGEST)
+            before = solution, place
+            solution, place = moved, ahead
+            step, failed = (step if failed else min(1.5 * step, LONGEST)), False
         return solution
 
     def finished(self, solution: _Solution, tolerance: float) -> HamiltonianPath | None:
@@ -359,24 +366,24 @@ class _Problem:
 
     def _linear(self, last: np.ndarray) -> _Solution:
         """The way to a point close to A, were f linear: q = y there."""
-        fastest = np.abs(np.linalg.eigvals(self.growth)).max()
-        back = scipy.linalg.expm(-SPIRAL / fastest * self.growth)
+        back = scipy.linalg.expm(-SPIRAL / self.fastest * self.growth)
         y = [last]
         while np.linalg.norm(y[-1]) > START and len(y) < MOST_NODES:
             y.append(back @ y[-1])
         states = np.array(y[::-1])
-        times = SPIRAL / fastest * np.arange(1 - len(y), 1)
+        times = SPIRAL / self.fastest * np.arange(1 - len(y), 1)
         return _interpolated(times, np.concatenate([states, states], axis=1))
 
     def _longer(self, solution: _Solution) -> _Solution:
-        """The same, begun so close to A as the power series asks for."""
+        """The same at evenly spaced times, begun so close to A as the power series asks for."""
         first = solution.at(solution.times[:1])[: self.dimension, 0]
-        if not np.linalg.norm(first) > START:
-            return solution
-        before = self._linear(first)
-        times = np.r_[before.times[:-1] + solution.times[0], solution.times]
-        states = np.concatenate([before.at(before.times[:-1]), solution.at(solution.times)], axis=1)
-        return _interpolated(times, states.T)
+        if np.linalg.norm(first) > START:
+            before = self._linear(first)
+            times = np.r_[before.times[:-1] + solution.times[0], solution.times]
+            states = np.concatenate([before.at(before.times[:-1]), solution.at(solution.times)], axis=1)
+            solution = _interpolated(times, states.T)
+        count = int(-solution.times[0] * self.fastest / SPIRAL) + 2
+        return _Solution(solution.at, np.linspace(solution.times[0], 0.0, count))
 
     def _onward(self, solution: _Solution, distance: float) -> _Solution:
         """The same, continued by the linear equations to a distance from the saddle."""
@@ -467,6 +474,17 @@ class _Problem:
                 return False
             frame = new
         return True
+
+
+def _predicted(guess: _Solution, before: _Solution, share: float) -> _Solution:
+    """A solution moved on by a share of what it has moved from the one before, as far as both go back."""
+
+    def at(times: np.ndarray) -> np.ndarray:
+        own, common = guess.at(times), times >= before.times[0]
+        own[:, common] += share * (own[:, common] - before.at(times[common]))
+        return own
+
+    return _Solution(at, guess.times)
 
 
 def _interpolated(times: np.ndarray, states: np.ndarray) -> _Solution:
