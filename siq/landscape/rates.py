@@ -31,6 +31,10 @@ with ``G_ik = J_ik + 2 ((∂_k D)p)_i``, where the second equation, which the fi
 imposed: errors along the path grow. Where S attracts as fast as it repels, ``J W + W Jᵀ`` leaves M_S open,
 and it is taken from the end of the path.
 
+D may be singular, where noise acts on velocities alone: all of this holds as it stands, and for a damped particle
+λ is that of Kramers, ``√(γ²/4 + ω²) - γ/2``. But the law is that of spatial diffusion. Where damping is weak the
+rate is lower (`siq.landscape.turnover`).
+
 References
 ----------
 F. Bouchet and J. Reygner, Ann. Henri Poincaré 17 (2016) 3499.
@@ -51,6 +55,7 @@ from siq.dynamics.equilibria import classify, hessian_at
 from siq.dynamics.reach import measure_at
 from siq.errors import NumericalFailure
 from siq.landscape.paths import MinimumActionPath
+from siq.landscape.turnover import TurnLoss, turn_loss
 from siq.reference.cubic_series import cubic_series
 from siq.reference.power_series import quasipotential_series
 
@@ -81,12 +86,15 @@ class EscapeRate:
         ``∫ (∇·g + (∇·D)·p) dt`` along the path; zero if D is constant and g has no divergence there.
     notes
         What speaks against the law here without refuting it.
+    turn
+        What is lost of U in one turn about the well, where noise acts on some states only and they turn.
     """
 
     barrier: float
     prefactor: float
     exponent: float
     notes: tuple[str, ...] = ()
+    turn: TurnLoss | None = None
 
     def mean_time(self, intensity: float) -> float:
         """E[τ] for the noise intensity ε, with a relative error of O(ε/ΔU).
@@ -94,14 +102,22 @@ class EscapeRate:
         Raises
         ------
         NumericalFailure
-            When ε is not below the barrier: then nothing is to be escaped from.
+            When ε is not below the barrier: then nothing is to be escaped from. Or when damping is too weak for
+            ε: noise does not spread states before the saddle (`siq.landscape.turnover`).
         """
         if not 0 < intensity < self.barrier:
             raise NumericalFailure(
                 f"the escape law holds for ε far below the barrier of U, {self.barrier:.4g}, not for"
                 f" {intensity:.4g}"
             )
-        return float(self.prefactor * np.exp(self.barrier / intensity))
+        slower = 1.0 if self.turn is None else self.turn.factor(intensity)
+        if not np.isfinite(slower):
+            assert self.turn is not None
+            raise NumericalFailure(
+                f"damping is too weak for the escape law: in one turn U = {self.turn.own:.3g} is lost, and ε ="
+                f" {intensity:.4g} is not far below; simulate, or give a smaller ε"
+            )
+        return float(self.prefactor * np.exp(self.barrier / intensity) / slower)
 
 
 def mean_escape_time(rates: Sequence[EscapeRate], intensity: float) -> float:
@@ -114,6 +130,7 @@ def escape_rate(
     path: MinimumActionPath,
     *,
     hessian: Callable[[np.ndarray], np.ndarray] | None = None,
+    beyond: bool = True,
 ) -> EscapeRate:
     """The law of escape along a minimum action path from an attractor to a saddle.
 
@@ -126,6 +143,8 @@ def escape_rate(
         of 1e-4 the prefactor is good to a percent, with 1e-5 to a few thousandths.
     hessian
         ∇²V of a formula, points ``(n, d)`` to ``(n, d, d)``; by default it is integrated along the path.
+    beyond
+        Whether beyond the saddle lies another well; it matters where damping is weak.
 
     Returns
     -------
@@ -163,7 +182,12 @@ def escape_rate(
     at_saddle = frame.continued(curvatures) if frame.at_saddle is None else frame.at_saddle
     ratio = abs(np.linalg.det(at_saddle)) / np.linalg.det(frame.at_attractor)
     prefactor = 2 * np.pi / (frame.unstable * frame.rate) * np.sqrt(ratio) * np.exp(exponent)
-    return EscapeRate(path.action, float(prefactor), exponent, tuple(notes))
+    turn = turn_loss(dynamics, path, beyond=beyond)
+    if turn is not None and not turn.exact:
+        notes.append(f"states turn about the well, and the law holds for ε far below {turn.own:.3g}")
+    elif turn is not None and turn.own < path.action:
+        notes.append(f"one turn before the saddle loses U = {turn.own:.3g}: times by Mel'nikov and Meshkov")
+    return EscapeRate(path.action, float(prefactor), exponent, tuple(notes), turn)
 
 
 class _Frame:

@@ -95,11 +95,12 @@ class Transition:
     @property
     def exit(self) -> Exit:
         """What the time of this way out follows from."""
-        known, prefactor = self.prefactor_error, None if self.rate is None else self.rate.prefactor
+        known, rate = self.prefactor_error, self.rate
+        prefactor, turn = (None, None) if rate is None else (rate.prefactor, rate.turn)
         if known is None:
-            return Exit(self.barrier, self.error, prefactor, leverage=self.leverage)
+            return Exit(self.barrier, self.error, prefactor, leverage=self.leverage, turn=turn)
         return Exit(
-            self.barrier, self.error, prefactor, known.standard_error, known.covariance, self.leverage
+            self.barrier, self.error, prefactor, known.standard_error, known.covariance, self.leverage, turn
         )  # fmt: skip
 
 
@@ -231,7 +232,7 @@ def _transition(found: AnyField, way: WayOut, well: Well | None) -> Transition:
     try:
         if missing is not None:
             raise NumericalFailure(missing)
-        rate = escape_rate(found.dynamics, path.uphill)
+        rate = escape_rate(found.dynamics, path.uphill, beyond=way.end is not None)
         notes += rate.notes
         of_prefactor = prefactor_error(found, path.uphill)
     except (NumericalFailure, np.linalg.LinAlgError) as error:
