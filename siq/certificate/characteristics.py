@@ -297,6 +297,8 @@ def _fault(fan: Fan, values: np.ndarray, shown: str) -> str:
     elif (ends == End.CAUSTIC).any():
         lowest = 2 * float(fan.caustic_values.min())
         why = f"they cross at caustics from U = {lowest:.4g} on: record less far from the attractor"
+    elif (ends == End.LEVEL).mean() > 0.5:
+        why = "they draw together, its rates being too different: leave out the fastest states"
     else:
         why = "they leave the recorded states: record more of them about the attractor"
     return f"characteristics from the attractor {shown} give {len(values)} points to compare with, as {why}"
