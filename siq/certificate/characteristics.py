@@ -105,8 +105,8 @@ def follow_well(
     portrait, index
         Where to compare, and which attractor.
     depth
-        V at the lowest saddle, where it is known: higher up nothing is compared. Where curves bundle, none of a
-        few in search of it may come close.
+        V at the lowest saddle, where it is known: higher up nothing is compared. Where curves bundle, none
+        of a few in search of it may come close.
     seed
         Draws directions where there are more than two states, and thins the points.
 

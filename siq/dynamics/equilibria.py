@@ -235,8 +235,13 @@ def hessian_at(dynamics: Dynamics, equilibrium: np.ndarray) -> np.ndarray:
     # In units of the noise: where the states' units differ much, rounding would swallow the smaller ones.
     diffusion = dynamics.diffusion.frozen(equilibrium)  # p vanishes here, and with it what D's change does
     jacobian, scale = dynamics.jacobian(equilibrium[None])[0], diffusion.scale
+    if not diffusion.regular:  # the noise has no unit for a state that it does not act on, and f has one
+        pushed = np.diag(diffusion.matrix) > 0
+        own = scipy.linalg.matrix_balance(jacobian, permute=False, separate=True)[1][0]
+        if pushed.any():
+            scale = np.where(pushed, scale, own * np.exp(np.log(scale / own)[pushed].mean()))
     covariance = _covariance(jacobian, diffusion.matrix, scale)
-    if not diffusion.regular:  # the noise has no unit for a state that it does not act on
+    if not diffusion.regular:
         spread = np.sqrt(np.abs(np.diag(covariance)))
         scale = np.where(spread > 0, spread, scale)
         covariance = _covariance(jacobian, diffusion.matrix, scale)
@@ -244,11 +249,13 @@ def hessian_at(dynamics: Dynamics, equilibrium: np.ndarray) -> np.ndarray:
         least = int(np.argmin(np.abs(values)))
         if not abs(values[least]) > UNREACHED * np.abs(values).max():
             still = np.abs(vectors[:, least])
-            named = [name for name, size in zip(dynamics.states, still, strict=True) if size > 0.1 * still.max()]
+            named = [
+                name for name, size in zip(dynamics.states, still, strict=True) if size > 0.1 * still.max()
+            ]
             raise NumericalFailure(
                 f"the noise does not reach {' and '.join(named)} about the equilibrium"
-                f" {equilibrium.round(4).tolist()}: no quasipotential is finite there; give a diffusion that acts"
-                f" on {named[0]}, or leave out what no noise moves"
+                f" {equilibrium.round(4).tolist()}: no quasipotential is finite there; give a diffusion that"
+                f" acts on {named[0]}, or leave out what no noise moves"
             )
     hessian = np.linalg.inv(covariance / np.outer(scale, scale)) / np.outer(scale, scale)
     return (hessian + hessian.T) / 2

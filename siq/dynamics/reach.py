@@ -1,10 +1,10 @@
 """Does noise reach every state, and in which units are states measured that it does not reach directly?
 
-Noise that acts on velocities alone moves positions all the same: dx/dt = v. It *reaches* a state if it acts on
-it, or on a state that stands in its equation, or on one that stands in the equation of that one, and so on.
-About an equilibrium with Jacobian J this is Kalman's condition: the linear dynamics can be steered everywhere by
-D = σσᵀ if ``(σ, Jσ, J²σ, …)`` has full rank, and then, and only then, W of ``J W + W Jᵀ = -2D`` is regular
-(`siq.dynamics.equilibria.hessian_at`).
+Noise that acts on velocities alone moves positions all the same: dx/dt = v. It *reaches* a state if it acts
+on it, or on a state that stands in its equation, or on one that stands in the equation of that one, and so
+on. About an equilibrium with Jacobian J this is Kalman's condition: the linear dynamics can be steered
+everywhere by D = σσᵀ if ``(σ, Jσ, J²σ, …)`` has full rank, and then, and only then, W of ``J W + W Jᵀ =
+-2D`` is regular (`siq.dynamics.equilibria.hessian_at`).
 
 References
 ----------
@@ -17,7 +17,8 @@ import numpy as np
 
 from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.equilibria import hessian_at
+from siq.dynamics.equilibria import classify, hessian_at
+from siq.errors import NumericalFailure
 
 
 def unreached_states(dynamics: Dynamics) -> tuple[str, ...]:
@@ -32,7 +33,9 @@ def unreached_states(dynamics: Dynamics) -> tuple[str, ...]:
     ('w',)
     """
     rows = dynamics.diffusion.formulas
-    reached = {own for own, row in zip(dynamics.symbols, rows, strict=True) if any(entry != 0 for entry in row)}
+    reached = {
+        own for own, row in zip(dynamics.symbols, rows, strict=True) if any(entry != 0 for entry in row)
+    }
     while True:
         further = {
             own
@@ -41,7 +44,9 @@ def unreached_states(dynamics: Dynamics) -> tuple[str, ...]:
         }
         if not further:
             return tuple(
-                name for name, own in zip(dynamics.states, dynamics.symbols, strict=True) if own not in reached
+                name
+                for name, own in zip(dynamics.states, dynamics.symbols, strict=True)
+                if own not in reached
             )
         reached |= further
 
@@ -49,9 +54,9 @@ def unreached_states(dynamics: Dynamics) -> tuple[str, ...]:
 def measure_at(dynamics: Dynamics, attractor: np.ndarray) -> Diffusion:
     """In which metric speeds and slopes are measured about an attractor: D, or what stands in for it.
 
-    Where D has no inverse, ``|f|² = f·D⁻¹f`` has no meaning. In its place stands ``K = -(tr J / d) W``: the mean
-    rate of relaxation times the spread of states per noise. For ``f = -D∇V`` with relaxation as fast in every
-    direction it is D.
+    Where D has no inverse, ``|f|² = f·D⁻¹f`` has no meaning. In its place stands ``K = -(tr J / d) W``: the
+    mean rate of relaxation times the spread of states per noise. For ``f = -D∇V`` with relaxation as fast in
+    every direction it is D.
 
     Parameters
     ----------
@@ -63,9 +68,14 @@ def measure_at(dynamics: Dynamics, attractor: np.ndarray) -> Diffusion:
     Raises
     ------
     NumericalFailure
-        When noise does not reach every state about the attractor.
+        When noise does not reach every state about the attractor, or it is none.
     """
     if dynamics.diffusion.regular:
         return dynamics.diffusion
+    if classify(dynamics, attractor).kind != "attractor":
+        raise NumericalFailure(
+            f"{attractor.tolist()} is no stable equilibrium; where noise acts on some states only, speeds"
+            " have a measure about stable equilibria alone"
+        )
     relaxation = -float(np.trace(dynamics.jacobian(attractor[None])[0])) / dynamics.dimension
     return Diffusion(relaxation * np.linalg.inv(hessian_at(dynamics, attractor)))

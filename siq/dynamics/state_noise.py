@@ -170,8 +170,8 @@ class StateNoise(Diffusion):
     def positive_at(self, x: np.ndarray) -> np.ndarray:
         """Mask of the points ``(n, d)`` at which D is a covariance: shape ``(n,)``.
 
-        Far from the states that they were learned from formulas may be none. Where they leave no state out, D has
-        to be positive definite.
+        Far from the states that they were learned from formulas may be none. Where they leave no state out,
+        D has to be positive definite.
         """
         matrices = self.at(x)
         finite = np.isfinite(matrices).all(axis=(1, 2))

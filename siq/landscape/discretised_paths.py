@@ -75,8 +75,8 @@ class PathProblem:
     """Chains between two states, in units in which D at the start, their distance and ∂f/∂x are of size one.
 
     ``x = start + units y``. M is the Hessian of V at the start, None where that is no attractor; then the
-    first point of a chain is as fixed as the last. Where D has no inverse a `measure` stands in for it, and there
-    is no action of chains.
+    first point of a chain is as fixed as the last. Where D has no inverse a `measure` stands in for it, and
+    there is no action of chains.
     """
 
     def __init__(

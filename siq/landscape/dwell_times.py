@@ -4,8 +4,9 @@ A well is left over every one of its saddles, and the rates add. Over one saddle
 
     E[τ] = K exp(ΔU/ε)
 
-(`siq.landscape.rates`; longer where damping is weak, `siq.landscape.turnover`), from the well to the neighbourhood of the next attractor; the saddle itself is
-reached in half of it. The relative error of E[τ] has three parts:
+(`siq.landscape.rates`; longer where damping is weak, `siq.landscape.turnover`), from the well to the
+neighbourhood of the next attractor; the saddle itself is reached in half of it. The relative error of E[τ]
+has three parts:
 
 - from f: the standard errors of ΔU/ε and of ln K, which follow from the same f and err together
   (`siq.landscape.prefactor_errors`). Where that of K is not known it is taken to be relatively as uncertain

@@ -6,8 +6,8 @@ least action are still the solutions of
     ẋ = f + 2Dp,    ṗ_k = -(Jᵀp)_k - p·(∂_k D)p,    V̇ = p·Dp,
 
 which leave the attractor A where ``p = ∇V``, V being its power series there, and come to the saddle S along
-what the linearised equations attract to ``(S, 0)``: with w the left eigenvector of J at S to its unstable rate
-λ, and r the right ones to the others,
+what the linearised equations attract to ``(S, 0)``: with w the left eigenvector of J at S to its unstable
+rate λ, and r the right ones to the others,
 
     p·r = 0,    V_S - V = λ (w·(x - S))² / (2 w·Dw).
 
@@ -74,6 +74,9 @@ class HamiltonianPath:
         Shape ``(n, d)``, in the states' units, from the attractor to the end.
     values
         Shape ``(n,)``: V, not U, up to each point.
+    times
+        Shape ``(n,)``: zero at the last point of the solution; infinite at equilibria, where it does not
+        come to.
     error
         By how much V at the end differs from that of the mesh before.
     residual
@@ -85,6 +88,7 @@ class HamiltonianPath:
     points: np.ndarray
     momenta: np.ndarray
     values: np.ndarray
+    times: np.ndarray
     error: float
     residual: float
     smooth: bool
@@ -178,7 +182,9 @@ class _Problem:
         self.end = self.flow.inverse @ offset
         many = self.dimension > MOST_STATES
         self.series = (
-            cubic_series(dynamics, attractor) if many else quasipotential_series(dynamics, attractor, degree=4)
+            cubic_series(dynamics, attractor)
+            if many
+            else quasipotential_series(dynamics, attractor, degree=4)
         )
         self.growth = self.flow.jacobian + 2 * self.flow.diffusion[0]  # of what leaves A: ẏ = (J + 2DM) y
         self.fastest = float(np.abs(np.linalg.eigvals(self.growth)).max())
@@ -198,10 +204,15 @@ class _Problem:
         self.push = float(self.left @ self.noise @ self.left)
         if not self.push > 0:
             raise NumericalFailure(f"the noise does not move states across the saddle {end.tolist()}")
-        # ẏ = J (y - S) + 2Dq has a solution that decays as q does, which is where paths come from.
-        shifted = jacobian + self.unstable * np.eye(self.dimension)
-        pushed = 2 * self.unstable / self.push * self.noise @ self.left
-        self.arrival = np.linalg.lstsq(shifted, pushed, rcond=None)[0]
+        # Where paths come from: ẏ = J (y - S) + 2Dq with q = -λ/(w·Dw) w e^(-λt), since they were far from
+        # S. What other directions gather meanwhile is ∫ e^((J + λ)t) dt of what q gives them, resonant or
+        # not.
+        d = self.dimension
+        given = -2 * self.unstable / self.push * self.noise @ self.left
+        given -= self.right * (self.left @ given)
+        block = np.zeros((d + 1, d + 1))
+        block[:d, :d], block[:d, d] = jacobian + self.unstable * np.eye(d), given
+        self.arrival = self.right + scipy.linalg.expm(-np.log(APPROACH) / self.unstable * block)[:d, d]
 
     def curves(self, beside: np.ndarray | None, further: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Along which the end is moved to where paths come from: straight, and bent to some sides."""
@@ -275,6 +286,7 @@ class _Problem:
         rough = None if ended is None else self._solved(self._longer(ended), last, ROUGH / 10)
         if rough is None:
             return None
+        fine: _Solution | None = None
         value = self._values(rough)[-1]
         for fineness in (FINE, FINE / 10, FINE / 100):
             fine = self._solved(rough, last, fineness)
@@ -283,7 +295,7 @@ class _Problem:
             before, value, rough = value, self._values(fine)[-1], fine
             if abs(value - before) <= tolerance * value:
                 break
-        return self._path(fine, abs(value - before))
+        return self._path(rough, abs(value - before))
 
     def _rates(self, z: np.ndarray) -> np.ndarray:
         y, q, _ = self.flow.velocities(z[: self.dimension].T, z[self.dimension :].T)
@@ -292,12 +304,12 @@ class _Problem:
     def _matrices(self, z: np.ndarray) -> np.ndarray:
         turned, noise, bend = self.flow.linear(z[: self.dimension].T, z[self.dimension :].T)
         top = np.concatenate([turned, 2 * noise], axis=2)
-        return np.concatenate([top, np.concatenate([-bend, -turned.transpose(0, 2, 1)], axis=2)], axis=1).transpose(
-            1, 2, 0
-        )
+        return np.concatenate(
+            [top, np.concatenate([-bend, -turned.transpose(0, 2, 1)], axis=2)], axis=1
+        ).transpose(1, 2, 0)
 
     def _slope(self, y: np.ndarray) -> np.ndarray:
-        """q of the power series at points, ``(n, d)``."""
+        """Q of the power series at points, ``(n, d)``."""
         return np.asarray(self.series.gradient(self.flow.points(y)) @ self.flow.units / (2 * self.flow.level))
 
     def _curvature(self, y: np.ndarray) -> np.ndarray:
@@ -309,7 +321,7 @@ class _Problem:
         return np.eye(self.dimension, 2 * self.dimension), last
 
     def _at_saddle(self, solution: _Solution) -> tuple[np.ndarray, np.ndarray]:
-        """The conditions at the saddle, as close to it as a solution ends: one more than there are unknowns."""
+        """The conditions at the saddle, as close to it as a solution ends: one more than unknowns."""
         d, rate = self.dimension, self.unstable
         assert rate is not None
         matrix = np.zeros((d + 1, 2 * d))
@@ -409,12 +421,14 @@ class _Problem:
         return _interpolated(times - times[-1], rows)
 
     def _values(self, solution: _Solution) -> np.ndarray:
-        """v at the nodes of the mesh, and at the end: the last one twice if that is where the mesh ends."""
+        """V at the nodes of the mesh, and at the end: the last one twice if that is where the mesh ends."""
         length = np.diff(solution.times)
         total = np.zeros(len(length))
         for place, weight in zip(*GAUSS, strict=True):
             z = solution.at(solution.times[:-1] + (1 + place) / 2 * length).T
-            total += weight / 2 * length * self.flow.velocities(z[:, : self.dimension], z[:, self.dimension :])[2]
+            total += (
+                weight / 2 * length * self.flow.velocities(z[:, : self.dimension], z[:, self.dimension :])[2]
+            )
         first, final = (solution.at(solution.times[[place]])[: self.dimension].T for place in (0, -1))
         begin = 0.0  # of the power series, v = 2 ∫ q·dy from A on
         for place, weight in zip(*GAUSS, strict=True):
@@ -430,7 +444,8 @@ class _Problem:
         d, flow = self.dimension, self.flow
         z = solution.at(solution.times).T
         velocity = np.linalg.norm(self._rates(z.T)[:d].T, axis=1)
-        # About A the path may wind: points lie as close as their distance from it, and from the end, asks for.
+        # About A the path may wind: points lie as close as their distance from it, and from the end, asks
+        # for.
         pace = velocity / (np.linalg.norm(z[:, :d], axis=1) + CENTRAL)
         measure = np.r_[0.0, np.cumsum((pace[1:] + pace[:-1]) / 2 * np.diff(solution.times))]
         count = int(np.clip(measure[-1] / TURN, FEWEST, MOST))
@@ -444,23 +459,22 @@ class _Problem:
         force = flow.dynamics.drift(flow.points(y)) @ flow.inverse.T
         drift, push = np.sum(q * force, axis=1), self.flow.velocities(y, q)[2] / 2
         residual = float(np.abs(drift + push).max() / (np.abs(drift) + push).max())
+        times = np.r_[-np.inf, times]
         if self.unstable is not None:
-            y, q = np.vstack([y, self.end]), np.vstack([q, np.zeros(d)])
+            y, q, times = np.vstack([y, self.end]), np.vstack([q, np.zeros(d)]), np.append(times, np.inf)
         else:
             values = values[:-1]
         y, q, values = np.vstack([np.zeros(d), y]), np.vstack([np.zeros(d), q]), np.r_[0.0, values]
         return HamiltonianPath(
-            flow.points(y), 2 * flow.level * q @ flow.inverse, flow.level * values, flow.level * error,
-            residual, self._smooth(solution),
+            flow.points(y), 2 * flow.level * q @ flow.inverse, flow.level * values, times,
+            flow.level * error, residual, self._smooth(solution),
         )  # fmt: skip
 
     def _smooth(self, solution: _Solution) -> bool:
         """Whether no neighbour crosses the path, by the tangents of those that leave A beside it."""
         d, times = self.dimension, solution.times
         middles = (times[1:] + times[:-1]) / 2
-        at_nodes, between = (
-            self._matrices(solution.at(t)).transpose(2, 0, 1) for t in (times, middles)
-        )
+        at_nodes, between = (self._matrices(solution.at(t)).transpose(2, 0, 1) for t in (times, middles))
         first = solution.at(times[:1])[:d].T
         frame = np.linalg.qr(np.concatenate([np.eye(d), self._curvature(first)[0]]))[0]
         for index, step in enumerate(np.diff(times)):

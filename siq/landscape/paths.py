@@ -12,8 +12,8 @@ points are moved across the chain by Newton's method. It is damped with the acti
 frozen at ``|Δφ|/|f|``, which is never below S: a large step for paths that wind about an attractor, where a
 gradient would be useless. About an attractor the chain begins on a small ellipsoid, on which V is ``½ y·My``.
 
-Where D has no inverse, as noise acts on some states only, a curve has no action that could be made minimal, and
-Hamilton's equations are solved instead (`siq.landscape.hamiltonian_paths`).
+Where D has no inverse, as noise acts on some states only, a curve has no action that could be made minimal,
+and Hamilton's equations are solved instead (`siq.landscape.hamiltonian_paths`).
 
 References
 ----------

@@ -31,9 +31,9 @@ with ``G_ik = J_ik + 2 ((∂_k D)p)_i``, where the second equation, which the fi
 imposed: errors along the path grow. Where S attracts as fast as it repels, ``J W + W Jᵀ`` leaves M_S open,
 and it is taken from the end of the path.
 
-D may be singular, where noise acts on velocities alone: all of this holds as it stands, and for a damped particle
-λ is that of Kramers, ``√(γ²/4 + ω²) - γ/2``. But the law is that of spatial diffusion. Where damping is weak the
-rate is lower (`siq.landscape.turnover`).
+D may be singular, where noise acts on velocities alone: all of this holds as it stands, and for a damped
+particle λ is that of Kramers, ``√(γ²/4 + ω²) - γ/2``. But the law is that of spatial diffusion. Where
+damping is weak the rate is lower (`siq.landscape.turnover`).
 
 References
 ----------
@@ -102,8 +102,8 @@ class EscapeRate:
         Raises
         ------
         NumericalFailure
-            When ε is not below the barrier: then nothing is to be escaped from. Or when damping is too weak for
-            ε: noise does not spread states before the saddle (`siq.landscape.turnover`).
+            When ε is not below the barrier: then nothing is to be escaped from. Or when damping is too weak
+            for ε: noise does not spread states before the saddle (`siq.landscape.turnover`).
         """
         if not 0 < intensity < self.barrier:
             raise NumericalFailure(
@@ -114,8 +114,8 @@ class EscapeRate:
         if not np.isfinite(slower):
             assert self.turn is not None
             raise NumericalFailure(
-                f"damping is too weak for the escape law: in one turn U = {self.turn.own:.3g} is lost, and ε ="
-                f" {intensity:.4g} is not far below; simulate, or give a smaller ε"
+                f"damping is too weak for the escape law: in one turn U = {self.turn.own:.3g} is lost, and"
+                f" ε = {intensity:.4g} is not far below; simulate, or give a smaller ε"
             )
         return float(self.prefactor * np.exp(self.barrier / intensity) / slower)
 
@@ -191,10 +191,11 @@ def escape_rate(
 
 
 class _Frame:
-    """A path in units in which D at A, or what stands in for it, the distance to S and the largest rate are one.
+    """A path in units in which D at A, the distance from A to S, and the largest rate are one.
 
-    ``x = A + units y``, and V is in units of `unit`. The points, with momenta and velocities, are those from
-    close to A to the neighbourhood of S; `at_attractor` and `at_saddle` are the Hessians of V.
+    A D without inverse is replaced there by what stands in for it (`siq.dynamics.reach.measure_at`). ``x = A
+    + units y``, and V is in units of `unit`. The points, with momenta and velocities, are those from close
+    to A to the neighbourhood of S; `at_attractor` and `at_saddle` are the Hessians of V.
     """
 
     def __init__(self, dynamics: Dynamics, path: MinimumActionPath) -> None:

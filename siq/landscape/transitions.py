@@ -305,7 +305,10 @@ def _along(path: MinimumActionPath, dynamics: Dynamics) -> tuple[np.ndarray, np.
     """States, momenta and times of the pieces of a path."""
     middle = (path.points[1:] + path.points[:-1]) / 2
     force = (path.momenta[1:] + path.momenta[:-1]) / 2
-    flow, move = dynamics.drift(middle) + 2 * dynamics.diffusion.push(middle, force), np.diff(path.points, axis=0)
+    flow, move = (
+        dynamics.drift(middle) + 2 * dynamics.diffusion.push(middle, force),
+        np.diff(path.points, axis=0),
+    )
     measure = measure_at(dynamics, path.points[0])
     speed, length = (np.sqrt(measure.squared_speed(middle, one)) for one in (flow, move))
     spent = np.where(speed > 0, length / np.where(speed > 0, speed, 1.0), 0.0)

@@ -1,16 +1,17 @@
 """Does noise have the time to spread states before the saddle? Escapes of what turns about its well.
 
-The law of Eyring, Kramers and Langer takes states about the saddle to be those of the stationary density. Where
-friction is weak they are not: what turns at the height of the saddle comes back to it after one turn, having lost
-ΔU_turn by friction, and leaves the well before noise has replaced it. The law holds if ``ΔU_turn ≫ ε``.
+The law of Eyring, Kramers and Langer takes states about the saddle to be those of the stationary density.
+Where friction is weak they are not: what turns at the height of the saddle comes back to it after one turn,
+having lost ΔU_turn by friction, and leaves the well before noise has replaced it. The law holds if ``ΔU_turn
+≫ ε``.
 
-For a damped particle in one dimension, ``dx = c v dt``, ``dv = (F(x) - γ v) dt + √(εD) dW``, the rate is known for
-any friction. That of Kramers is multiplied by
+For a damped particle in one dimension, ``dx = c v dt``, ``dv = (F(x) - γ v) dt + √(εD) dW``, the rate is
+known for any friction. That of Kramers is multiplied by
 
     Υ(δ) = exp(∫ ln(1 - exp(-δ (y² + ¼))) / (y² + ¼) dy/2π),    δ = ΔU_turn/ε,
 
-if what has left does not come back, and by ``Υ(δ₁)Υ(δ₂)/Υ(δ₁ + δ₂)`` if beyond the saddle lies a second well. The
-loss is that of an orbit without friction at the height of the saddle, ``ΔU_turn = 2γ²/D ∮ v² dt``.
+if what has left does not come back, and by ``Υ(δ₁)Υ(δ₂)/Υ(δ₁ + δ₂)`` if beyond the saddle lies a second
+well. The loss is that of an orbit without friction at the height of the saddle, ``ΔU_turn = 2γ²/D ∮ v² dt``.
 
 References
 ----------
@@ -31,7 +32,9 @@ from siq.dynamics.dynamics import Dynamics
 from siq.errors import NumericalFailure
 from siq.landscape.paths import MinimumActionPath
 
-KNOWN = 0.9  # Υ below which the law of many degrees of freedom is refused: it would be off by more than a tenth
+KNOWN = (
+    0.9  # Υ below which the law of many degrees of freedom is refused: it would be off by more than a tenth
+)
 RETURNED = 0.5  # of the farthest distance from the saddle: a path that has come back so close has made a turn
 SEARCHED = 2000  # steps in search of the turning point beyond the saddle
 FARTHEST = 20.0  # distances from the saddle to the attractor, up to which it is sought
@@ -146,7 +149,9 @@ def _loss(particle: _Particle, saddle: np.ndarray, towards: np.ndarray) -> float
     places = top + step * np.linspace(0, FARTHEST, SEARCHED * int(FARTHEST) + 1)
     forces = np.broadcast_to(np.asarray(force(places), dtype=float), places.shape)
     # The height of the potential above the saddle, by Simpson's rule on pairs of steps.
-    work = np.r_[0.0, np.cumsum((forces[:-2:2] + 4 * forces[1:-1:2] + forces[2::2]) / 6)] * 2 * (places[1] - top)
+    work = (
+        np.r_[0.0, np.cumsum((forces[:-2:2] + 4 * forces[1:-1:2] + forces[2::2]) / 6)] * 2 * (places[1] - top)
+    )
     height, places = -work, places[::2]
     higher = np.flatnonzero(height[1:] > 0)
     if not len(higher) or higher[0] == 0:

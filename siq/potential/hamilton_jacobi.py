@@ -178,7 +178,9 @@ def equation_at(
     measure = noise if attractor is None else measure_at(dynamics, attractor)
     speed = np.sqrt(measure.squared_speed(x, flow))
     moving = speed > 1e-9 * speed.max()
-    return HamiltonJacobi(x[moving], basis.gradients(x[moving]), flow[moving], noise, 1 / speed[moving], measure)
+    return HamiltonJacobi(
+        x[moving], basis.gradients(x[moving]), flow[moving], noise, 1 / speed[moving], measure
+    )
 
 
 def gauss_newton(

@@ -161,7 +161,7 @@ def _raised(
     *,
     by_path: bool = True,
 ) -> Well:
-    """A formula fitted from 0.9 of the depth to its reach, level by level; at first on the path, or as it is."""
+    """A formula fitted from 0.9 of the depth to its reach, level by level; begun on the path, or not."""
     goal, level = reach * depth.value, min(0.9 * start.level, reach * depth.value)
     shape, flat = basin.states.shape[:2], basin.states.reshape(-1, basin.states.shape[2])
     functions = start.basis.values(flat)
@@ -191,9 +191,7 @@ def _raised(
             raise NumericalFailure(
                 f"V about the attractor near {start.attractor.round(4)} is told by {len(used)} states alone"
             )
-        equation = equation_at(
-            start.basis, basin.points(used), start.dynamics, attractor=start.attractor
-        )
+        equation = equation_at(start.basis, basin.points(used), start.dynamics, attractor=start.attractor)
         last = level >= goal
         coefficients = _robust(equation, coefficients, free, rounds=REWEIGHTINGS if last else 1)
         if last:

@@ -74,7 +74,7 @@ class HamiltonianFlow:
         return force + 2 * push, pulled, 2 * np.sum(q * push, axis=1)
 
     def linear(self, y: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """G, D and the matrix before X in Ṗ, of the linearised flow at positions and momenta: ``(n, d, d)``."""
+        """G, D and the matrix before X in Ṗ, at positions and momenta: ``(n, d, d)`` each."""
         x, p = self.points(y), 2 * self.level * q @ self.inverse
         turned = self.inverse @ self.dynamics.jacobian(x) @ self.units
         bend = self.units.T @ self.dynamics.bend(x, p) @ self.units / (2 * self.level)

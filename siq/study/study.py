@@ -342,11 +342,17 @@ def fault_for_landscape(system: Dynamics, *, directly: bool) -> tuple[tuple[str,
             return ("states", name), what, "add 'domain: [lower, upper]' to it"
     if directly and not system.diffusion.regular:
         what = "the noise does not reach every state directly, as it has to where f comes from trajectories"
-        remedy = "give a positive definite matrix, or ask for the landscape of these equations: 'from: equations'"
+        remedy = (
+            "give a positive definite matrix, or ask for the landscape of these equations: 'from: equations'"
+        )
         return ("diffusion",), what, remedy
     if still := unreached_states(system):
         what = f"the noise does not reach {' and '.join(still)}, neither directly nor by way of other states"
-        return ("diffusion",), what, f"let it act on {still[0]} or on a state in its equation, or leave it out"
+        return (
+            ("diffusion",),
+            what,
+            f"let it act on {still[0]} or on a state in its equation, or leave it out",
+        )
     if (found := fault_over_domain(system)) is not None:
         remedy = "choose a domain in which it has a value"
         return ("equations", found[0]), f"the equation {found[1]}", remedy
