@@ -49,7 +49,7 @@ START = 0.003  # of it: where solutions begin, and the power series errs by its 
 MOST_STATES = 8  # for a series of degree 4; beyond, of degree 3
 APPROACH, LAST = 0.1, 0.002  # of it: how far from S the end is at first, and in the answer
 NEARER = 3.0  # by so much in one step
-ROUGH, FINE = 1e-3, 1e-6  # relative residuals of collocation, on the way and of the answer
+ROUGH, SWITCHED, FINE = 1e-3, 1e-5, 1e-6  # relative residuals of collocation, on the way and of the answer
 LONGEST = 0.3  # of the distance: step of the end; it is halved where Newton's method does not follow ...
 SHORTEST = 0.004  # ... and a curve given up below this: it leaves the well, or V is not smooth there
 BENDS, BEND = 4, 0.4  # curves beside the straight one, and how far they leave it, as a share of the distance
@@ -135,19 +135,22 @@ def hamiltonian_paths(
             " sought from stable equilibria alone"
         )
     problem = _Problem(dynamics, attractor, end)
-    solutions: list[_Solution] = []
     found: list[HamiltonianPath] = []
-    for curve in problem.curves(beside, curves):
-        solution = problem.followed(curve)
-        if solution is None or any(not _apart(solution, one, problem.dimension) for one in solutions):
-            continue
-        solutions.append(solution)
-        path = problem.finished(solution, tolerance)
-        if path is not None:
-            found.append(path)
-    if not found and (way := problem.way_down(beside)) is not None and (solution := problem.followed(way)):
-        path = problem.finished(solution, tolerance)
-        found += [] if path is None else [path]
+    for last in problem.lasts(beside):
+        solutions: list[_Solution] = []
+        for curve in problem.curves(last, curves):
+            solution = problem.followed(curve)
+            if solution is None or any(not _apart(solution, one, problem.dimension) for one in solutions):
+                continue
+            solutions.append(solution)
+            path = problem.finished(solution, tolerance)
+            found += [] if path is None else [path]
+        way = None if found else problem.way_down(beside, last)
+        if way is not None and (solution := problem.followed(way)) is not None:
+            path = problem.finished(solution, tolerance)
+            found += [] if path is None else [path]
+        if found:
+            break
     if not found:
         raise NumericalFailure(
             f"no solution of Hamilton's equations was found from {attractor.tolist()} to {end.tolist()}"
@@ -204,41 +207,46 @@ class _Problem:
         self.push = float(self.left @ self.noise @ self.left)
         if not self.push > 0:
             raise NumericalFailure(f"the noise does not move states across the saddle {end.tolist()}")
-        # Where paths come from: ẏ = J (y - S) + 2Dq with q = -λ/(w·Dw) w e^(-λt), since they were far from
-        # S. What other directions gather meanwhile is ∫ e^((J + λ)t) dt of what q gives them, resonant or
-        # not.
+        # Where paths come from: ẏ = J (y - S) + 2Dq with q = -λ/(w·Dw) w e^(-λt). What other directions
+        # gather meanwhile is ∫ e^((J + λ)t) dt of what q gives them: since ever, where that is finite, or
+        # since the path was far from S, where they decay about as fast as q.
         d = self.dimension
         given = -2 * self.unstable / self.push * self.noise @ self.left
         given -= self.right * (self.left @ given)
         block = np.zeros((d + 1, d + 1))
         block[:d, :d], block[:d, d] = jacobian + self.unstable * np.eye(d), given
-        self.arrival = self.right + scipy.linalg.expm(-np.log(APPROACH) / self.unstable * block)[:d, d]
+        since_ever = self.right - np.linalg.lstsq(block[:d, :d], given, rcond=None)[0]
+        lately = self.right + scipy.linalg.expm(-np.log(APPROACH) / self.unstable * block)[:d, d]
+        self.arrivals = [since_ever, lately]
 
-    def curves(self, beside: np.ndarray | None, further: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Along which the end is moved to where paths come from: straight, and bent to some sides."""
-        last = self.end if self.unstable is None else self._before(beside)
+    def lasts(self, beside: np.ndarray | None) -> list[np.ndarray]:
+        """Where the end is moved to: itself, or states before the saddle, one of which will do."""
+        return [self.end] if self.unstable is None else [self._before(beside, one) for one in self.arrivals]
+
+    def curves(self, last: np.ndarray, further: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Along which the end is moved: straight, and bent to some sides."""
         share = np.linspace(0, 1, 201)[:, None]
         straight = share * last
         across = np.linalg.svd(last[None])[2][1 : BENDS // 2 + 1]
         bent = [straight + BEND * side * np.sin(np.pi * share) * way for way in across for side in (1, -1)]
         return [straight, *bent, *((one - self.flow.center) @ self.flow.inverse.T for one in further)]
 
-    def way_down(self, beside: np.ndarray | None) -> np.ndarray | None:
+    def way_down(self, beside: np.ndarray | None, last: np.ndarray) -> np.ndarray | None:
         """The way down taken backwards: V falls along it, so that it crosses no ridge, but it may wind."""
         if beside is None or self.unstable is None:
             return None
         down = (beside - self.flow.center) @ self.flow.inverse.T
         far = down[np.linalg.norm(down - self.end, axis=1) >= APPROACH]
-        return np.vstack([far[::-1], self._before(beside)])
+        return np.vstack([far[::-1], last])
 
-    def _before(self, beside: np.ndarray | None) -> np.ndarray:
-        """A state before the saddle, on the side of A, at which paths arrive that come along w."""
+    def _before(self, beside: np.ndarray | None, arrival: np.ndarray) -> np.ndarray:
+        """A state before the saddle, on the side of A."""
         side = np.sign(self.left @ -self.end)
         if beside is not None:
             down = (beside - self.flow.center) @ self.flow.inverse.T
             far = np.flatnonzero(np.linalg.norm(down - self.end, axis=1) >= APPROACH)
             side = np.sign(self.left @ (down[far[0]] - self.end))
-        return np.asarray(self.end + side * APPROACH * self.arrival / np.linalg.norm(self.arrival))
+        return np.asarray(self.end + side * APPROACH * arrival / np.linalg.norm(arrival))
 
     def followed(self, curve: np.ndarray) -> _Solution | None:
         """The solution at the end of a curve, None where one of the steps fails."""
@@ -274,7 +282,13 @@ class _Problem:
             ended: _Solution | None = solution
             last = self._fixed(self.end)
         else:
-            ended = self._solved(solution, self._at_saddle(solution), ROUGH)
+            # What winds has to be known better than on the way, or H is not zero where the condition changes.
+            known = self._solved(
+                solution, self._fixed(solution.at(np.zeros(1))[: self.dimension, 0]), SWITCHED
+            )
+            if known is None:
+                return None
+            ended = self._solved(known, self._at_saddle(known), SWITCHED)
             distance = APPROACH
             while ended is not None and distance > LAST:
                 distance /= NEARER
