@@ -21,6 +21,21 @@ import siq
 
 X, Y = sympy.symbols("x y", real=True)
 SYSTEMS = Path(__file__).parents[1] / "config" / "systems"
+U, V = sympy.symbols("u v", real=True)
+TILT = sympy.Rational(1, 10)
+
+
+def particles(count: int, friction: float) -> siq.Dynamics:
+    """Damped particles that a double well couples; D = 1/2 on every velocity, so that V is 2γ(v²/2 + Φ)."""
+    x, v = sympy.symbols(f"x:{count}", real=True), sympy.symbols(f"v:{count}", real=True)
+    well = (x[0] ** 2 - 1) ** 2 / 4 - TILT * x[0]
+    for one, other in zip(x[1:], x, strict=False):
+        well += 0.7 * one**2 + 0.4 * one * other + 0.3 * one * x[0] ** 2
+    forces = [-friction * speed - well.diff(place) for place, speed in zip(x, v, strict=True)]
+    noise = [[0.5 * (i == j >= count) for j in range(2 * count)] for i in range(2 * count)]
+    return siq.Dynamics.of((*x, *v), (*v, *forces), diffusion=noise, domain=[(-2, 2)] * (2 * count))
+
+
 LATTICE = (-sympy.sin(X) - sympy.sin(Y) / 2, -sympy.sin(Y) + sympy.sin(X) / 2)
 CASES: dict[str, str | Path | siq.Dynamics] = {
     "Maier–Stein, β = 1": SYSTEMS / "maier-stein.yaml",
@@ -35,6 +50,20 @@ CASES: dict[str, str | Path | siq.Dynamics] = {
         (X, Y), (5 / (1 + Y**4) - X, 5 / (1 + X**4) - Y), domain=[(0, 6)] * 2
     ),
     "trigonometric": siq.Dynamics.of((X, Y), LATTICE, domain=[(-3.5, 8)] * 2),
+    "particle, damping 0.5": particles(1, 0.5),
+    "particle, damping 0.1": particles(1, 0.1),
+    "two particles": particles(2, 1.0),
+    "three particles": particles(3, 1.0),
+    "particle with nonlinear damping": SYSTEMS / "duffing.yaml",
+    "noise on the velocity that grows with x²": siq.Dynamics.of(
+        (X, V), (V, X - X**3 + TILT - V), diffusion=[[0, 0], [0, 1 + X**2 / 2]], domain=[(-2, 2)] * 2
+    ),
+    "coloured noise, τ = 1": siq.Dynamics.of(
+        (X, U), (X - X**3 + TILT + U, -U), diffusion=[[0, 0], [0, 1]], domain=[(-2, 2)] * 2
+    ),
+    "coloured noise, τ = 0.1": siq.Dynamics.of(
+        (X, U), (X - X**3 + U, -10 * U), diffusion=[[0, 0], [0, 100]], domain=[(-2, 2), (-5, 5)]
+    ),
 }
 
 

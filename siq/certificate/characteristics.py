@@ -83,14 +83,19 @@ class Reference:
         return self.points[kept], self.values[kept]
 
 
-def references_about(dynamics: Dynamics, portrait: PhasePortrait, *, seed: int = 0) -> tuple[Reference, ...]:
-    """V by characteristics about every attractor of a phase portrait."""
+def references_about(
+    dynamics: Dynamics, portrait: PhasePortrait, *, depths: Sequence[float] | None = None, seed: int = 0
+) -> tuple[Reference, ...]:
+    """V by characteristics about every attractor of a phase portrait; see `follow_well` for the depths."""
+    known = [np.inf] * len(portrait.attractors) if depths is None else depths
     return tuple(
-        follow_well(dynamics, portrait, index, seed=seed) for index in range(len(portrait.attractors))
+        follow_well(dynamics, portrait, index, depth=depth, seed=seed) for index, depth in enumerate(known)
     )
 
 
-def follow_well(dynamics: Dynamics, portrait: PhasePortrait, index: int, *, seed: int = 0) -> Reference:
+def follow_well(
+    dynamics: Dynamics, portrait: PhasePortrait, index: int, *, depth: float = np.inf, seed: int = 0
+) -> Reference:
     """V by characteristics about one attractor, as far as they may be believed.
 
     Parameters
@@ -99,6 +104,9 @@ def follow_well(dynamics: Dynamics, portrait: PhasePortrait, index: int, *, seed
         f, twice differentiable, and D.
     portrait, index
         Where to compare, and which attractor.
+    depth
+        V at the lowest saddle, where it is known: higher up nothing is compared. Where curves bundle, none
+        of a few in search of it may come close.
     seed
         Draws directions where there are more than two states, and thins the points.
 
@@ -112,7 +120,7 @@ def follow_well(dynamics: Dynamics, portrait: PhasePortrait, index: int, *, seed
     shown = np.array2string(attractor, precision=4, suppress_small=True, separator=", ")
     region = basin_region(portrait, index)
     try:
-        level = _level(dynamics, portrait, index, region, seed)
+        level = min(_level(dynamics, portrait, index, region, seed), depth)
         fan = _fan(dynamics, portrait, attractor, SHARE * level, seed, count=CURVES, most=MOST, rounds=3)
     except (NumericalFailure, ValueError, np.linalg.LinAlgError) as failure:
         fault = f"characteristics cannot be followed from the attractor {shown}: {failure}"
@@ -289,6 +297,8 @@ def _fault(fan: Fan, values: np.ndarray, shown: str) -> str:
     elif (ends == End.CAUSTIC).any():
         lowest = 2 * float(fan.caustic_values.min())
         why = f"they cross at caustics from U = {lowest:.4g} on: record less far from the attractor"
+    elif (ends == End.LEVEL).mean() > 0.5:
+        why = "they draw together, its rates being too different: leave out the fastest states"
     else:
         why = "they leave the recorded states: record more of them about the attractor"
     return f"characteristics from the attractor {shown} give {len(values)} points to compare with, as {why}"

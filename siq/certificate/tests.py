@@ -36,6 +36,7 @@ from pydantic.dataclasses import dataclass
 
 from siq.certificate.error_bound import SAFETY, residual_integral
 from siq.dynamics.equilibria import Equilibrium, hessian_at
+from siq.dynamics.reach import measure_at
 from siq.identify.given_field import AnyField, GivenField
 from siq.identify.identified_field import IdentifiedField
 from siq.numerics.measured_text import place_text
@@ -170,13 +171,16 @@ def check_hamilton_jacobi(candidate: Candidate, found: AnyField, *, limit: float
     """
     flow, gradient = found.dynamics.drift(candidate.points), candidate.gradients(candidate.points)
     down = found.diffusion.push(candidate.points, gradient)
-    slope = np.sqrt(np.maximum((gradient * down).sum(axis=1), 0))
-    speed = np.sqrt(found.diffusion.squared_speed(candidate.points, flow))
+    measure = found.diffusion
+    if candidate.attractors:
+        measure = measure_at(found.dynamics, candidate.attractors[0].position)
+    slope = np.sqrt(np.maximum(measure.steepness(candidate.points, gradient), 0))
+    speed, fall = (np.sqrt(measure.squared_speed(candidate.points, one)) for one in (flow, down))
     # Where V falls it falls by f: a V that hardly varies while states move is no potential.
     if not np.isfinite(slope).all() or np.median(slope / np.where(speed > 0, speed, np.inf)) < 1e-6:
         return Verdict(np.inf, limit, False, "∇V vanishes, or is not finite, on the held-out points")
     residual = np.abs((gradient * (flow + down)).sum(axis=1))
-    size = slope * (speed + slope)
+    size = slope * (speed + fall)
     value = float(np.sqrt(np.mean((residual / np.where(size > 0, size, 1.0)) ** 2)))
     allowed = limit + STANDARD_ERRORS * _relative_error_of_drift(found, candidate.points)
     reason = "" if value <= allowed else "V does not solve the Hamilton–Jacobi equation of f"

@@ -14,6 +14,7 @@
 `simulation`          which trajectories does it have?
 `sampling`            how is it simulated where nobody says it?
 `equilibria`          where does it rest, and where do its trajectories end?
+`reach`               does noise reach every state, be it by way of others?
 `recurrence`          where does what comes to rest nowhere lead: to a cycle, or to chaos?
 `basins`              which recorded points lead to an attractor?
 `phase_portrait`      which attractors are there, and which saddles next to each?

@@ -142,8 +142,9 @@ class SystemCard(_CardPart):
         D of ``dx = f dt + √ε D^(1/2) dW``: ``identity``, the diagonal as a list, or the whole matrix as a
         list of rows, in squared units of the states per unit of time. An entry is a number, or a formula of
         the states and parameters in the sense of Itô, such as ``[1 + 0.8*x, 1]``; parameters count with the
-        values of the card. A zero says that no noise reaches a state; where a landscape is asked for, it has
-        to reach every state.
+        values of the card. A zero says that no noise acts on a state. Where a landscape is asked for, noise
+        has to act on every state if f comes from trajectories, and to reach it at least by way of other
+        states if the equations are given.
     exact
         Exact answers, where they are known.
     """

@@ -252,8 +252,8 @@ class Diffusion(NoiseField):
         return np.broadcast_to(self.whitening, (len(x), *self.matrix.shape))
 
     def positive_at(self, x: np.ndarray) -> np.ndarray:
-        """Mask of the points ``(n, d)`` at which D is positive definite: shape ``(n,)``."""
-        return np.full(len(x), bool(np.linalg.eigvalsh(self.matrix)[0] > 0))
+        """Mask of the points ``(n, d)`` at which D is a covariance: shape ``(n,)``; here everywhere."""
+        return np.full(len(x), True)
 
     def precision_at(self, x: np.ndarray) -> np.ndarray:
         """D⁻¹ at points: ``(n, d)`` to ``(n, d, d)``; raises as `precision`."""

@@ -27,6 +27,7 @@ UNSETTLED_TIMES = 25.0  # ... or times to cross the box where there is no attrac
 MOST_STEPS = 3000
 SPACING = 0.04  # of the recorded box: longest step
 ACCURACY = 1e-7  # of the recorded box: local error of a step
+UNREACHED = 1e-12  # numerical, of the largest eigenvalue of W in units of its diagonal: rounding
 ARRIVED = 1e-4  # of the recorded box: trajectories so close to an attractor end there
 
 
@@ -224,16 +225,47 @@ def hessian_at(dynamics: Dynamics, equilibrium: np.ndarray) -> np.ndarray:
     """M, the Hessian of V at an equilibrium: ``M = W⁻¹`` with ``J W + W Jᵀ = -2D``, shape ``(d, d)``.
 
     It follows from f near the equilibrium alone, and at an attractor is what tells the true V from false
-    solutions of the Hamilton–Jacobi equation.
+    solutions of the Hamilton–Jacobi equation. D may be singular, if the noise reaches every state through J.
+
+    Raises
+    ------
+    NumericalFailure
+        Where it does not: W is singular then.
     """
     # In units of the noise: where the states' units differ much, rounding would swallow the smaller ones.
     diffusion = dynamics.diffusion.frozen(equilibrium)  # p vanishes here, and with it what D's change does
-    scale = diffusion.scale
-    jacobian = dynamics.jacobian(equilibrium[None])[0] * scale / scale[:, None]
-    noise = diffusion.matrix / np.outer(scale, scale)
-    covariance = scipy.linalg.solve_continuous_lyapunov(jacobian, -2 * noise)
-    hessian = np.linalg.inv(covariance) / np.outer(scale, scale)
+    jacobian, scale = dynamics.jacobian(equilibrium[None])[0], diffusion.scale
+    if not diffusion.regular:  # the noise has no unit for a state that it does not act on, and f has one
+        pushed = np.diag(diffusion.matrix) > 0
+        own = scipy.linalg.matrix_balance(jacobian, permute=False, separate=True)[1][0]
+        if pushed.any():
+            scale = np.where(pushed, scale, own * np.exp(np.log(scale / own)[pushed].mean()))
+    covariance = _covariance(jacobian, diffusion.matrix, scale)
+    if not diffusion.regular:
+        spread = np.sqrt(np.abs(np.diag(covariance)))
+        scale = np.where(spread > 0, spread, scale)
+        covariance = _covariance(jacobian, diffusion.matrix, scale)
+        values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+        least = int(np.argmin(np.abs(values)))
+        if not abs(values[least]) > UNREACHED * np.abs(values).max():
+            still = np.abs(vectors[:, least])
+            named = [
+                name for name, size in zip(dynamics.states, still, strict=True) if size > 0.1 * still.max()
+            ]
+            raise NumericalFailure(
+                f"the noise does not reach {' and '.join(named)} about the equilibrium"
+                f" {equilibrium.round(4).tolist()}: no quasipotential is finite there; give a diffusion that"
+                f" acts on {named[0]}, or leave out what no noise moves"
+            )
+    hessian = np.linalg.inv(covariance / np.outer(scale, scale)) / np.outer(scale, scale)
     return (hessian + hessian.T) / 2
+
+
+def _covariance(jacobian: np.ndarray, diffusion: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """W of ``J W + W Jᵀ = -2D``, solved in units of the scales."""
+    own = np.outer(scale, scale)
+    found = scipy.linalg.solve_continuous_lyapunov(jacobian * scale / scale[:, None], -2 * diffusion / own)
+    return np.asarray((found + found.T) / 2 * own)
 
 
 def follow(

@@ -168,15 +168,16 @@ class StateNoise(Diffusion):
         return np.linalg.inv(self.root_at(x))
 
     def positive_at(self, x: np.ndarray) -> np.ndarray:
-        """Mask of the points ``(n, d)`` at which D is positive definite: shape ``(n,)``.
+        """Mask of the points ``(n, d)`` at which D is a covariance: shape ``(n,)``.
 
-        Far from the states that they were learned from formulas may be no covariance.
+        Far from the states that they were learned from formulas may be none. Where they leave no state out,
+        D has to be positive definite.
         """
         matrices = self.at(x)
         finite = np.isfinite(matrices).all(axis=(1, 2))
-        return np.asarray(
-            finite & (np.linalg.eigvalsh(np.where(finite[:, None, None], matrices, 0.0))[:, 0] > 0)
-        )
+        values = np.linalg.eigvalsh(np.where(finite[:, None, None], matrices, 0.0))
+        least = 0.0 if self.regular else -1e-12 * np.abs(values).max(axis=1)  # rounding
+        return np.asarray(finite & (values[:, 0] > least))
 
     def precision_at(self, x: np.ndarray) -> np.ndarray:
         """D⁻¹ at points: ``(n, d)`` to ``(n, d, d)``; raises as `root_at`."""

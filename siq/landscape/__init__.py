@@ -4,6 +4,8 @@
 `options`                 what is asked?
 `paths`                   which path leads from an attractor to a saddle at least action?
 `discretised_paths`       what is the action of a chain of points, and how is it made minimal?
+`hamiltonian_paths`       and which paths are most likely where noise acts on some states only?
+`turnover`                do states that turn about a well leave it as the law of escape says?
 `rates`                   how often is a well left, prefactor included?
 `prefactor_errors`        how sure is that prefactor?
 `dwell_times`             how long does a well last, and how sure is that?

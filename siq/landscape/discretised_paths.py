@@ -14,6 +14,7 @@ import scipy.linalg
 from scipy.interpolate import Akima1DInterpolator
 from scipy.spatial import cKDTree
 
+from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.equilibria import classify, hessian_at
 from siq.errors import NumericalFailure
@@ -74,11 +75,14 @@ class PathProblem:
     """Chains between two states, in units in which D at the start, their distance and ∂f/∂x are of size one.
 
     ``x = start + units y``. M is the Hessian of V at the start, None where that is no attractor; then the
-    first point of a chain is as fixed as the last.
+    first point of a chain is as fixed as the last. Where D has no inverse a `measure` stands in for it, and
+    there is no action of chains.
     """
 
-    def __init__(self, dynamics: Dynamics, start: np.ndarray, end: np.ndarray) -> None:
-        noise = dynamics.diffusion.frozen(start)
+    def __init__(
+        self, dynamics: Dynamics, start: np.ndarray, end: np.ndarray, *, measure: Diffusion | None = None
+    ) -> None:
+        noise = dynamics.diffusion.frozen(start) if measure is None else measure
         distance = float(np.linalg.norm(noise.whitening @ (end - start)))
         if not distance > 0:
             raise ValueError(f"the path is to end where it starts, at {start.tolist()}")

@@ -4,8 +4,9 @@ A well is left over every one of its saddles, and the rates add. Over one saddle
 
     E[τ] = K exp(ΔU/ε)
 
-(`siq.landscape.rates`), from the well to the neighbourhood of the next attractor; the saddle itself is
-reached in half of it. The relative error of E[τ] has three parts:
+(`siq.landscape.rates`; longer where damping is weak, `siq.landscape.turnover`), from the well to the
+neighbourhood of the next attractor; the saddle itself is reached in half of it. The relative error of E[τ]
+has three parts:
 
 - from f: the standard errors of ΔU/ε and of ln K, which follow from the same f and err together
   (`siq.landscape.prefactor_errors`). Where that of K is not known it is taken to be relatively as uncertain
@@ -22,6 +23,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+
+from siq.landscape.turnover import TurnLoss
 
 FEWEST = 3.0  # ΔU/ε: the law's own error is a third there; below it gives no more than an order of magnitude
 
@@ -57,6 +60,8 @@ class Exit:
         Standard error of ln K, None where not known, and its covariance with ΔU.
     leverage
         Relative standard error of ΔU/ε from an estimated D over that of ε.
+    turn
+        What is lost of U in one turn about the well, where that matters (`siq.landscape.turnover`).
     """
 
     barrier: float
@@ -65,6 +70,7 @@ class Exit:
     prefactor_error: float | None = None
     covariance: float = 0.0
     leverage: float = 1.0
+    turn: TurnLoss | None = None
 
 
 @dataclass(frozen=True)
@@ -114,7 +120,8 @@ def exit_time(way: Exit, noise: NoiseStrength) -> MeanTime | None:
     height = way.barrier / noise.intensity
     relative = way.standard_error / way.barrier
     with np.errstate(over="ignore"):
-        value = float(way.prefactor * np.exp(height))
+        slower = 1.0 if way.turn is None else way.turn.factor(noise.intensity)
+        value = float(way.prefactor * np.exp(height) / slower)
     if not np.isfinite(value):
         return None
     of_prefactor = relative if way.prefactor_error is None else way.prefactor_error

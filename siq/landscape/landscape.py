@@ -184,7 +184,7 @@ class Landscape:
         ------
         InputError
             For a card that cannot be read, or a system that has no quasipotential: driven, without a domain,
-            or with noise that does not reach every state.
+            or with a state that noise does not even reach by way of others.
         NoLandscape
             When there is no stable equilibrium in the domain. It says why.
 

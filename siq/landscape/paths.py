@@ -12,6 +12,9 @@ points are moved across the chain by Newton's method. It is damped with the acti
 frozen at ``|Δφ|/|f|``, which is never below S: a large step for paths that wind about an attractor, where a
 gradient would be useless. About an attractor the chain begins on a small ellipsoid, on which V is ``½ y·My``.
 
+Where D has no inverse, as noise acts on some states only, a curve has no action that could be made minimal,
+and Hamilton's equations are solved instead (`siq.landscape.hamiltonian_paths`).
+
 References
 ----------
 M. Heymann and E. Vanden-Eijnden, Comm. Pure Appl. Math. 61 (2008) 1052: the geometric action.
@@ -26,6 +29,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from siq.dynamics.dynamics import Dynamics
+from siq.dynamics.reach import measure_at
 from siq.errors import NumericalFailure
 from siq.landscape.discretised_paths import (
     MOST_NODES,
@@ -35,7 +39,9 @@ from siq.landscape.discretised_paths import (
     evenly,
     rivals_of,
 )
+from siq.landscape.hamiltonian_paths import hamiltonian_paths
 
+FOLLOWED = 4000  # points of a way down that Hamilton's equations are told, which may wind
 TURN = 0.15  # radian from one segment of the first chain to the next
 UNSTABLE_START = 1e-4  # of the distance: where the way down from a saddle starts
 ARRIVED = 1e-3  # of the distance: where it ends
@@ -142,9 +148,12 @@ def minimum_action_path(
     ValueError
         When start and end are one.
     NumericalFailure
-        When no first guess has a finite action.
+        When no first guess has a finite action, or Hamilton's equations have no solution that was found.
     """
-    problem = PathProblem(dynamics, np.asarray(start, dtype=float), np.asarray(end, dtype=float))
+    start, end = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
+    if not dynamics.diffusion.regular:
+        return _by_hamilton(dynamics, start, end, tolerance, initial or ())
+    problem = PathProblem(dynamics, start, end)
     own, turning = problem.guesses()
     guesses = own if initial is None else [problem.scaled(np.asarray(one, dtype=float)) for one in initial]
     count = min(max(nodes, int(turning / TURN)), MOST_NODES // 4)
@@ -183,6 +192,29 @@ def minimum_action_path(
     )
 
 
+def _by_hamilton(
+    dynamics: Dynamics, start: np.ndarray, end: np.ndarray, tolerance: float, curves: Sequence[np.ndarray]
+) -> MinimumActionPath:
+    """The path where noise acts on some states only."""
+    try:
+        beside: np.ndarray | None = descent(dynamics, end, start, FOLLOWED)
+    except NumericalFailure:  # the end is no saddle, or one from which f leads elsewhere
+        beside = None
+    found = hamiltonian_paths(dynamics, start, end, beside=beside, tolerance=tolerance, curves=curves)
+    best = found[0]
+    known = best.error <= tolerance * best.values[-1]
+    return MinimumActionPath(
+        points=best.points,
+        momenta=best.momenta,
+        values=2 * best.values,
+        action=best.action,
+        error=2 * best.error,
+        residual=best.residual,
+        converged=best.smooth and known and best.action <= min(one.action for one in found),
+        rivals=tuple(one.action for one in found[1:] if one.smooth),
+    )
+
+
 def transition_path(
     dynamics: Dynamics,
     attractor: np.ndarray,
@@ -216,7 +248,8 @@ def transition_path(
 
 def descent(dynamics: Dynamics, saddle: np.ndarray, target: np.ndarray, nodes: int) -> np.ndarray:
     """The trajectory of f from a saddle to an attractor, in evenly spaced points."""
-    problem = PathProblem(dynamics, saddle, target)
+    measure = None if dynamics.diffusion.regular else measure_at(dynamics, target)
+    problem = PathProblem(dynamics, saddle, target, measure=measure)
     values, vectors = np.linalg.eig(problem.jacobian(np.zeros((1, dynamics.dimension)))[0])
     if (values.real > 0).sum() != 1:
         raise NumericalFailure(f"{saddle.tolist()} is no saddle with one unstable direction")

@@ -31,6 +31,10 @@ with ``G_ik = J_ik + 2 ((∂_k D)p)_i``, where the second equation, which the fi
 imposed: errors along the path grow. Where S attracts as fast as it repels, ``J W + W Jᵀ`` leaves M_S open,
 and it is taken from the end of the path.
 
+D may be singular, where noise acts on velocities alone: all of this holds as it stands, and for a damped
+particle λ is that of Kramers, ``√(γ²/4 + ω²) - γ/2``. But the law is that of spatial diffusion. Where
+damping is weak the rate is lower (`siq.landscape.turnover`).
+
 References
 ----------
 F. Bouchet and J. Reygner, Ann. Henri Poincaré 17 (2016) 3499.
@@ -48,8 +52,10 @@ from scipy.interpolate import CubicSpline
 
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.equilibria import classify, hessian_at
+from siq.dynamics.reach import measure_at
 from siq.errors import NumericalFailure
 from siq.landscape.paths import MinimumActionPath
+from siq.landscape.turnover import TurnLoss, turn_loss
 from siq.reference.cubic_series import cubic_series
 from siq.reference.power_series import quasipotential_series
 
@@ -80,12 +86,15 @@ class EscapeRate:
         ``∫ (∇·g + (∇·D)·p) dt`` along the path; zero if D is constant and g has no divergence there.
     notes
         What speaks against the law here without refuting it.
+    turn
+        What is lost of U in one turn about the well, where noise acts on some states only and they turn.
     """
 
     barrier: float
     prefactor: float
     exponent: float
     notes: tuple[str, ...] = ()
+    turn: TurnLoss | None = None
 
     def mean_time(self, intensity: float) -> float:
         """E[τ] for the noise intensity ε, with a relative error of O(ε/ΔU).
@@ -93,14 +102,22 @@ class EscapeRate:
         Raises
         ------
         NumericalFailure
-            When ε is not below the barrier: then nothing is to be escaped from.
+            When ε is not below the barrier: then nothing is to be escaped from. Or when damping is too weak
+            for ε: noise does not spread states before the saddle (`siq.landscape.turnover`).
         """
         if not 0 < intensity < self.barrier:
             raise NumericalFailure(
                 f"the escape law holds for ε far below the barrier of U, {self.barrier:.4g}, not for"
                 f" {intensity:.4g}"
             )
-        return float(self.prefactor * np.exp(self.barrier / intensity))
+        slower = 1.0 if self.turn is None else self.turn.factor(intensity)
+        if not np.isfinite(slower):
+            assert self.turn is not None
+            raise NumericalFailure(
+                f"damping is too weak for the escape law: in one turn U = {self.turn.own:.3g} is lost, and"
+                f" ε = {intensity:.4g} is not far below; simulate, or give a smaller ε"
+            )
+        return float(self.prefactor * np.exp(self.barrier / intensity) / slower)
 
 
 def mean_escape_time(rates: Sequence[EscapeRate], intensity: float) -> float:
@@ -113,6 +130,7 @@ def escape_rate(
     path: MinimumActionPath,
     *,
     hessian: Callable[[np.ndarray], np.ndarray] | None = None,
+    beyond: bool = True,
 ) -> EscapeRate:
     """The law of escape along a minimum action path from an attractor to a saddle.
 
@@ -125,6 +143,8 @@ def escape_rate(
         of 1e-4 the prefactor is good to a percent, with 1e-5 to a few thousandths.
     hessian
         ∇²V of a formula, points ``(n, d)`` to ``(n, d, d)``; by default it is integrated along the path.
+    beyond
+        Whether beyond the saddle lies another well; it matters where damping is weak.
 
     Returns
     -------
@@ -162,20 +182,26 @@ def escape_rate(
     at_saddle = frame.continued(curvatures) if frame.at_saddle is None else frame.at_saddle
     ratio = abs(np.linalg.det(at_saddle)) / np.linalg.det(frame.at_attractor)
     prefactor = 2 * np.pi / (frame.unstable * frame.rate) * np.sqrt(ratio) * np.exp(exponent)
-    return EscapeRate(path.action, float(prefactor), exponent, tuple(notes))
+    turn = turn_loss(dynamics, path, beyond=beyond)
+    if turn is not None and not turn.exact:
+        notes.append(f"states turn about the well, and the law holds for ε far below {turn.own:.3g}")
+    elif turn is not None and turn.own < path.action:
+        notes.append(f"one turn before the saddle loses U = {turn.own:.3g}: times by Mel'nikov and Meshkov")
+    return EscapeRate(path.action, float(prefactor), exponent, tuple(notes), turn)
 
 
 class _Frame:
     """A path in units in which D at A, the distance from A to S, and the largest rate are one.
 
-    ``x = A + units y``, and V is in units of `unit`. The points, with momenta and velocities, are those from
-    close to A to the neighbourhood of S; `at_attractor` and `at_saddle` are the Hessians of V.
+    A D without inverse is replaced there by what stands in for it (`siq.dynamics.reach.measure_at`). ``x = A
+    + units y``, and V is in units of `unit`. The points, with momenta and velocities, are those from close
+    to A to the neighbourhood of S; `at_attractor` and `at_saddle` are the Hessians of V.
     """
 
     def __init__(self, dynamics: Dynamics, path: MinimumActionPath) -> None:
         start, end = path.points[0], path.points[-1]
         ends = np.stack([start, end])
-        at_start = dynamics.diffusion.frozen(start)
+        at_start = measure_at(dynamics, start).frozen(start)
         root, whitening = at_start.root, at_start.whitening
         distance = float(np.linalg.norm(whitening @ (end - start)))
         jacobians = whitening @ dynamics.jacobian(ends) @ root
@@ -193,6 +219,7 @@ class _Frame:
         self.stable = float(-saddle.eigenvalues[1:].real.max(initial=-np.inf)) / self.rate
         self.dynamics, self.start, self.units = dynamics, start, distance * root
         self.constant = dynamics.diffusion.constant
+        self.white = self.constant and dynamics.diffusion.regular  # then D is the unit matrix
         self.noise = dynamics.diffusion.in_units(start, self.units, distance**2)
         many = dynamics.dimension > MOST_STATES
         self.series = (
@@ -241,12 +268,12 @@ class _Frame:
 
     def velocity(self, y: np.ndarray, p: np.ndarray) -> np.ndarray:
         """``ẋ = f + 2Dp``."""
-        push = p if self.constant else np.einsum("nij,nj->ni", self.diffusion(y), p)
+        push = p if self.white else np.einsum("nij,nj->ni", self.diffusion(y), p)
         return self.dynamics.drift(self.start + y @ self.units.T) @ self.inverse.T / self.rate + 2 * push
 
     def diffusion(self, y: np.ndarray) -> np.ndarray:
         """D, ``(n, d, d)``."""
-        if self.constant:
+        if self.white:
             return np.broadcast_to(np.eye(y.shape[1]), (len(y), y.shape[1], y.shape[1]))
         return self.noise.at(y)
 
@@ -299,7 +326,8 @@ class _Frame:
 
     def inner_exponent(self) -> float:
         """∫ c dt from A to the first point y: with ``ẏ = By`` and ``c = b·y`` it is ``b·B⁻¹y``."""
-        flow = self.jacobian(np.zeros((1, len(self.end))))[0] + 2 * self.at_attractor
+        here = np.zeros((1, len(self.end)))
+        flow = self.jacobian(here)[0] + 2 * self.diffusion(here)[0] @ self.at_attractor
         y = np.linalg.solve(flow, self.points[0]) * np.array([[1.0], [-1.0]])
         p = self.series.gradient(self.start + y @ self.units.T) @ self.units / self.unit
         odd = self.rise(y, p, self.given(self.series.hessian, y))

@@ -144,6 +144,7 @@ def _transition(one: Transition) -> dict[str, Any]:
         "by_rivals": _number(one.by_rivals),
         "minimum_action": None if path is None else path.uphill.action,
         "prefactor": None if rate is None else rate.prefactor,
+        "turn": None if rate is None or rate.turn is None else asdict(rate.turn),
         "prefactor_error": None if one.prefactor_error is None else one.prefactor_error.standard_error,
         "prefactor_covariance": 0.0 if one.prefactor_error is None else one.prefactor_error.covariance,
         "noise_leverage": one.leverage,

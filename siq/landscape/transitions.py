@@ -17,6 +17,7 @@ import numpy as np
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.equilibria import Equilibrium, leads_back, neighbours
 from siq.dynamics.phase_portrait import PhasePortrait
+from siq.dynamics.reach import measure_at
 from siq.errors import NumericalFailure
 from siq.identify.diffusion import defined_states
 from siq.identify.given_field import AnyField, GivenField
@@ -94,11 +95,12 @@ class Transition:
     @property
     def exit(self) -> Exit:
         """What the time of this way out follows from."""
-        known, prefactor = self.prefactor_error, None if self.rate is None else self.rate.prefactor
+        known, rate = self.prefactor_error, self.rate
+        prefactor, turn = (None, None) if rate is None else (rate.prefactor, rate.turn)
         if known is None:
-            return Exit(self.barrier, self.error, prefactor, leverage=self.leverage)
+            return Exit(self.barrier, self.error, prefactor, leverage=self.leverage, turn=turn)
         return Exit(
-            self.barrier, self.error, prefactor, known.standard_error, known.covariance, self.leverage
+            self.barrier, self.error, prefactor, known.standard_error, known.covariance, self.leverage, turn
         )  # fmt: skip
 
 
@@ -230,7 +232,7 @@ def _transition(found: AnyField, way: WayOut, well: Well | None) -> Transition:
     try:
         if missing is not None:
             raise NumericalFailure(missing)
-        rate = escape_rate(found.dynamics, path.uphill)
+        rate = escape_rate(found.dynamics, path.uphill, beyond=way.end is not None)
         notes += rate.notes
         of_prefactor = prefactor_error(found, path.uphill)
     except (NumericalFailure, np.linalg.LinAlgError) as error:
@@ -303,8 +305,12 @@ def _along(path: MinimumActionPath, dynamics: Dynamics) -> tuple[np.ndarray, np.
     """States, momenta and times of the pieces of a path."""
     middle = (path.points[1:] + path.points[:-1]) / 2
     force = (path.momenta[1:] + path.momenta[:-1]) / 2
-    flow, move = dynamics.drift(middle), np.diff(path.points, axis=0)
-    speed, length = (np.sqrt(dynamics.diffusion.squared_speed(middle, one)) for one in (flow, move))
+    flow, move = (
+        dynamics.drift(middle) + 2 * dynamics.diffusion.push(middle, force),
+        np.diff(path.points, axis=0),
+    )
+    measure = measure_at(dynamics, path.points[0])
+    speed, length = (np.sqrt(measure.squared_speed(middle, one)) for one in (flow, move))
     spent = np.where(speed > 0, length / np.where(speed > 0, speed, 1.0), 0.0)
     return middle, force, spent
 

@@ -70,7 +70,7 @@ def obstacle(models: Sequence[Dynamics]) -> str:
             " from another state; 'diffusion' with a zero there would say what does drive the system."
         )
     if not models[0].diffusion.regular:
-        return "The noise does not reach every state; landscapes are worked out only where it does."
+        return "The noise does not reach every state directly; landscapes are compared only where it does."
     if len({model.dimension for model in models}) > 1:
         return "What was left out has states of its own, so that the two landscapes lie in different spaces."
     return ""

@@ -14,6 +14,7 @@ import scipy.linalg
 
 from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.dynamics import Dynamics
+from siq.dynamics.reach import measure_at
 from siq.potential.bases import Basis
 
 VANISHING = 1e-8  # of f: where D∇V is smaller, Gauss–Newton is on its way to V = 0, which is a solution, too
@@ -39,6 +40,8 @@ class HamiltonJacobi:
         D.
     weight
         Shape ``(n,)``: one over ∣f∣ in the metric of the noise, so that fast regions do not rule.
+    measure
+        That metric: D, or what stands in for a D without inverse (`siq.dynamics.reach.measure_at`).
     """
 
     points: np.ndarray
@@ -46,6 +49,7 @@ class HamiltonJacobi:
     flow: np.ndarray
     diffusion: Diffusion
     weight: np.ndarray
+    measure: Diffusion
 
     def residual(self, coefficients: np.ndarray) -> np.ndarray:
         """Weighted ``∇V·(f + D∇V)``, shape ``(n,)``."""
@@ -67,16 +71,16 @@ class HamiltonJacobi:
     def size(self, coefficients: np.ndarray) -> float:
         """Rms of ∇V over the points, in the metric of the noise."""
         gradient = self.slopes(coefficients)
-        return float(np.sqrt(self.diffusion.steepness(self.points, gradient).mean()))
+        return float(np.sqrt(self.measure.steepness(self.points, gradient).mean()))
 
     def size_jacobian(self, coefficients: np.ndarray) -> np.ndarray:
         """Derivative of the size, which must not be zero, by the coefficients, shape ``(m,)``."""
-        along = self.diffusion.push(self.points, self.slopes(coefficients))
+        along = self.measure.push(self.points, self.slopes(coefficients))
         return np.einsum("nd,ndm->m", along, self.gradients) / (len(along) * self.size(coefficients))
 
     def sizes(self) -> np.ndarray:
         """Rms of each function's gradient over the points, in the metric of the noise: shape ``(m,)``."""
-        steepness = self.diffusion.steepness(self.points, self.gradients.transpose(0, 2, 1))
+        steepness = self.measure.steepness(self.points, self.gradients.transpose(0, 2, 1))
         return np.sqrt(np.asarray(steepness.mean(axis=0)))
 
     def restricted(self, rows: np.ndarray) -> HamiltonJacobi:
@@ -87,7 +91,7 @@ class HamiltonJacobi:
 def relative_residuals(equation: HamiltonJacobi, coefficients: np.ndarray) -> np.ndarray:
     """``∣∇V·(f + D∇V)∣ / (∣∇V∣ ∣f∣)`` at the points, shape ``(n,)``."""
     slope = equation.slopes(coefficients)
-    size = np.sqrt(equation.diffusion.steepness(equation.points, slope))
+    size = np.sqrt(equation.measure.steepness(equation.points, slope))
     return np.asarray(np.abs(equation.residual(coefficients)) / np.where(size > 0, size, np.inf))
 
 
@@ -126,7 +130,7 @@ def orthonormalised(equation: HamiltonJacobi, free: np.ndarray) -> tuple[Hamilto
     turned
         Shape ``(m, k + s)``: the old coefficients are this times the new ones.
     """
-    roots = equation.diffusion.root_at(equation.points)
+    roots = equation.measure.root_at(equation.points)
     stacked = np.einsum("nij,nim->njm", roots, equation.gradients[:, :, free], optimize=True)
     scale = np.sqrt((stacked**2).sum(axis=(0, 1)))
     scale = np.where(scale > 0, scale, 1.0)
@@ -163,12 +167,20 @@ class Solution:
     converged: bool
 
 
-def equation_at(basis: Basis, x: np.ndarray, dynamics: Dynamics) -> HamiltonJacobi:
-    """The equation at those of some points, shape ``(n, d)``, where f does not vanish."""
+def equation_at(
+    basis: Basis, x: np.ndarray, dynamics: Dynamics, *, attractor: np.ndarray | None = None
+) -> HamiltonJacobi:
+    """The equation at those of some points, shape ``(n, d)``, where f does not vanish.
+
+    Where D has no inverse, the attractor, shape ``(d,)``, tells in which metric that is seen.
+    """
     flow, noise = dynamics.drift(x), dynamics.diffusion
-    speed = np.sqrt(noise.squared_speed(x, flow))
+    measure = noise if attractor is None else measure_at(dynamics, attractor)
+    speed = np.sqrt(measure.squared_speed(x, flow))
     moving = speed > 1e-9 * speed.max()
-    return HamiltonJacobi(x[moving], basis.gradients(x[moving]), flow[moving], noise, 1 / speed[moving])
+    return HamiltonJacobi(
+        x[moving], basis.gradients(x[moving]), flow[moving], noise, 1 / speed[moving], measure
+    )
 
 
 def gauss_newton(
@@ -253,7 +265,7 @@ def _least_squares(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
 def relative_residual(equation: HamiltonJacobi, coefficients: np.ndarray) -> float:
     """Rms of the weighted residual over rms of ∇V; infinite for V = 0, or all but 0."""
     gradient = equation.slopes(coefficients)
-    squared = equation.diffusion.steepness(equation.points, gradient)
+    squared = equation.measure.steepness(equation.points, gradient)
     if not np.sqrt((equation.weight**2 * squared).mean()) > VANISHING:
         return np.inf
     return float(np.sqrt((equation.residual(coefficients) ** 2).mean() / squared.mean()))

@@ -157,7 +157,7 @@ def _grown(
         points = basin.points(rows)
         if len(points) < 2 * basis.size:
             raise NumericalFailure(_too_few(attractor, len(points), before=before, needed=2 * basis.size))
-        equation = equation_at(basis, points, dynamics)
+        equation = equation_at(basis, points, dynamics, attractor=attractor)
         steps, tolerance = (40, 1e-13) if last else (8, ON_THE_WAY)
         solution = gauss_newton(equation, coefficients, free=free, steps=steps, tolerance=tolerance)
         coefficients, residual = solution.coefficients, solution.residual

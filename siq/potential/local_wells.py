@@ -187,7 +187,7 @@ def extend_well(well: Well, basin: Basin, *, goal: float, rows: np.ndarray | Non
     while True:
         along = (functions @ coefficients).reshape(basin.states.shape[:2])
         points = basin.points(np.intersect1d(basin.below(along, level), allowed))
-        equation = equation_at(well.basis, points, well.dynamics)
+        equation = equation_at(well.basis, points, well.dynamics, attractor=well.attractor)
         # On the way up one round keeps the formula close enough to be taken further.
         coefficients = _robust(equation, coefficients, free, rounds=REWEIGHTINGS if level >= goal else 1)
         if level >= goal:

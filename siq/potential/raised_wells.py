@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from siq.dynamics.basins import Basin
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.equilibria import Equilibrium, hessian_at
+from siq.dynamics.reach import measure_at
 from siq.errors import NumericalFailure
 from siq.potential.bases import affordable_degree, power_basis
 from siq.potential.hamilton_jacobi import (
@@ -122,6 +123,9 @@ def raised_wells(
                     depth=depth.value,
                 )  # fmt: skip
             well = _raised(start, basin, depth, options.reach, rows, generator)
+            if wells and not well.residual < WORSE * wells[-1].residual:  # the path may start it too far off
+                again = _raised(start, basin, depth, options.reach, rows, generator, by_path=False)
+                well = min(well, again, key=lambda one: one.residual)
         except NumericalFailure as error:  # of one degree: another may do
             failure = error
             continue
@@ -148,9 +152,16 @@ def _embedded(well: Well, degree: int) -> Well:
 
 
 def _raised(
-    start: Well, basin: Basin, depth: Depth, reach: float, rows: np.ndarray, generator: np.random.Generator
+    start: Well,
+    basin: Basin,
+    depth: Depth,
+    reach: float,
+    rows: np.ndarray,
+    generator: np.random.Generator,
+    *,
+    by_path: bool = True,
 ) -> Well:
-    """A formula fitted from 0.9 of the depth to its reach, level by level."""
+    """A formula fitted from 0.9 of the depth to its reach, level by level; begun on the path, or not."""
     goal, level = reach * depth.value, min(0.9 * start.level, reach * depth.value)
     shape, flat = basin.states.shape[:2], basin.states.reshape(-1, basin.states.shape[2])
     functions = start.basis.values(flat)
@@ -163,7 +174,9 @@ def _raised(
     way = depth.points @ metric
     distance, nearest = cKDTree(way).query(places)
     beside = np.where(distance < BESIDE * np.sqrt(2 * depth.value), depth.values[nearest], np.inf)
-    coefficients = _towards_path(start, basin.points(fitted), depth, free)
+    coefficients = start.coefficients
+    if by_path:
+        coefficients = _towards_path(start, basin.points(fitted), depth, free)
     while True:
         along = (functions @ coefficients).reshape(shape)
         chosen = np.intersect1d(basin.below(along, level), basin.below(before, RUNAWAY * level))
@@ -178,7 +191,7 @@ def _raised(
             raise NumericalFailure(
                 f"V about the attractor near {start.attractor.round(4)} is told by {len(used)} states alone"
             )
-        equation = equation_at(start.basis, basin.points(used), start.dynamics)
+        equation = equation_at(start.basis, basin.points(used), start.dynamics, attractor=start.attractor)
         last = level >= goal
         coefficients = _robust(equation, coefficients, free, rounds=REWEIGHTINGS if last else 1)
         if last:
@@ -198,7 +211,7 @@ def _towards_path(well: Well, x: np.ndarray, depth: Depth, free: np.ndarray) -> 
 
     They are but a start: what is fitted from there is the equation alone.
     """
-    noise = well.dynamics.diffusion
+    noise = measure_at(well.dynamics, well.attractor)
     rising = (depth.values > PATH_FROM * depth.value) & (depth.values < PATH_TO * depth.value)
     where, slopes = depth.points[rising], depth.slopes[rising]
     if not len(where) or not len(x):

@@ -14,9 +14,11 @@ import numpy as np
 import sympy
 from scipy.spatial import cKDTree
 
+from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.exports import Formula, as_latex, as_sympy, as_text
 from siq.dynamics.formulas import DIGITS
+from siq.dynamics.reach import measure_at
 from siq.dynamics.source_code import c_source, julia_source, numpy_source
 from siq.potential.bases import PowerBasis
 
@@ -166,7 +168,12 @@ class Well:
     def _terms(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         slope, flow, noise = self.gradients(x), self.dynamics.drift(x), self.dynamics.diffusion
         numerator = np.abs((slope * (flow + noise.push(x, slope))).sum(axis=1))
-        return numerator, np.sqrt(noise.steepness(x, slope) * noise.squared_speed(x, flow))
+        measure = self._measure
+        return numerator, np.sqrt(measure.steepness(x, slope) * measure.squared_speed(x, flow))
+
+    @cached_property
+    def _measure(self) -> Diffusion:
+        return measure_at(self.dynamics, self.attractor)
 
     @cached_property
     def _size(self) -> float:

@@ -285,7 +285,7 @@ class _Run:
         x = self.flow.points(y)
         reason[np.any((x < self.box[:, 0]) | (x > self.box[:, 1]), axis=1)] = End.BOX
         reason[v >= 1] = End.LEVEL
-        reason[_turned(self.flow.parts(before)[3], tangents)] = End.CAUSTIC
+        reason[crossed(self.flow.parts(before)[3], tangents)] = End.CAUSTIC
         return reason
 
     def _locate(self, before: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -301,7 +301,7 @@ class _Run:
         return state, self._reason(before, final)
 
 
-def _turned(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+def crossed(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """Whether X has become singular between two tangent frames, ``(n, d, d)``.
 
     The eigenvalues of ``X_after X_before⁻¹`` start at 1, and can come to lie on the negative axis only

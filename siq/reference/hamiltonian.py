@@ -51,26 +51,42 @@ class HamiltonianFlow:
     def rates(self, state: np.ndarray) -> np.ndarray:
         """Time derivative of rows."""
         y, q, _, x_tangents, p_tangents = self.parts(state)
-        x, p = self.points(y), 2 * self.level * q @ self.inverse
-        force = self.dynamics.drift(x) @ self.inverse.T
-        jacobian = self.inverse @ self.dynamics.jacobian(x) @ self.units
-        bend = self.dynamics.bend(x, p)
-        bend = self.units.T @ bend @ self.units / (2 * self.level)
-        diffusion, turned = self.diffusion, jacobian
-        if not self.constant:
-            diffusion, turned = self.noise.at(y), jacobian + 2 * self.noise.turn(y, q)
-            bend = bend + self.noise.bend(y, q)
-        push = (diffusion @ q[:, :, None])[:, :, 0]
+        turned, diffusion, bend = self.linear(y, q)
         new = np.empty_like(state)
         y_rate, q_rate, v_rate, x_rate, p_rate = self.parts(new)
-        y_rate[...] = force + 2 * push
-        q_rate[...] = -(jacobian.transpose(0, 2, 1) @ q[:, :, None])[:, :, 0]
-        if not self.constant:
-            q_rate -= self.noise.pull(y, q)
-        v_rate[...] = 2 * np.sum(q * push, axis=1)
+        y_rate[...], q_rate[...], v_rate[...] = self.velocities(y, q, turned)
         x_rate[...] = turned @ x_tangents + 2 * diffusion @ p_tangents
         p_rate[...] = -turned.transpose(0, 2, 1) @ p_tangents - bend @ x_tangents
         return new
+
+    def velocities(
+        self, y: np.ndarray, q: np.ndarray, turned: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """ẏ, q̇ and v̇ at positions and momenta ``(n, d)``; `turned` is that of `linear`, where it is known."""
+        force = self.dynamics.drift(self.points(y)) @ self.inverse.T
+        push = (self.at(y) @ q[:, :, None])[:, :, 0]
+        if turned is None:
+            turned = self.inverse @ self.dynamics.jacobian(self.points(y)) @ self.units
+            turned = turned if self.constant else turned + 2 * self.noise.turn(y, q)
+        pulled = -(turned.transpose(0, 2, 1) @ q[:, :, None])[:, :, 0]
+        if not self.constant:  # of which the turn has twice as much
+            pulled += self.noise.pull(y, q)
+        return force + 2 * push, pulled, 2 * np.sum(q * push, axis=1)
+
+    def linear(self, y: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """G, D and the matrix before X in Ṗ, at positions and momenta: ``(n, d, d)`` each."""
+        x, p = self.points(y), 2 * self.level * q @ self.inverse
+        turned = self.inverse @ self.dynamics.jacobian(x) @ self.units
+        bend = self.units.T @ self.dynamics.bend(x, p) @ self.units / (2 * self.level)
+        if self.constant:
+            return turned, self.at(y), bend
+        return turned + 2 * self.noise.turn(y, q), self.at(y), bend + self.noise.bend(y, q)
+
+    def at(self, y: np.ndarray) -> np.ndarray:
+        """D at positions, ``(n, d, d)``."""
+        if self.constant:
+            return np.broadcast_to(self.diffusion, (len(y), self.dimension, self.dimension))
+        return self.noise.at(y)
 
     def points(self, y: np.ndarray) -> np.ndarray:
         """Points in the states' units."""

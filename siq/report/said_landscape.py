@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from siq.landscape.dwell_times import Exit, MeanTime, NoiseStrength, dwell_time
+from siq.landscape.turnover import TurnLoss
 from siq.numerics.measured_text import squared
 
 NOTHING = 1e-6  # of the size of a state
@@ -162,6 +163,7 @@ class SaidLandscape:
                 way.get("prefactor_error"),
                 way.get("prefactor_covariance", 0.0),
                 way.get("noise_leverage", 1.0),
+                TurnLoss(**way["turn"]) if way.get("turn") else None,
             )
             for way in self.data["transitions"]
             if way["start"] == well

@@ -83,7 +83,7 @@ def usable_system(system: str | Path | Dynamics) -> Dynamics:
         In one sentence, for a card that cannot be read and a system that has no landscape.
     """
     given = system if isinstance(system, Dynamics) else load_system(system)
-    if (fault := fault_for_landscape(given)) is not None:
+    if (fault := fault_for_landscape(given, directly=False)) is not None:
         keys, what, remedy = fault
         named = given.name or "the system" if isinstance(system, Dynamics) else system
         raise InputError(named, ".".join(keys), what, remedy)
@@ -124,7 +124,9 @@ def landscape_of_equations(system: Dynamics, settings: EquationSettings) -> Land
         sought = [well for well in wells if well is not None]
         certificate = certify_given_wells(
             sought, found, portrait, _unseen(system, sought, draw), options=settings.certificate,
-            references=references_about(system, portrait, seed=settings.seed), seed=settings.seed,
+            references=references_about(
+                system, portrait, depths=_depths(portrait, ways), seed=settings.seed
+            ), seed=settings.seed,
         )  # fmt: skip
         notes += caustics_below(system, sought, portrait, certificate.error, seed=settings.seed)
     noises = settings.landscape.noise_intensities
@@ -192,6 +194,12 @@ def _lowest(ways: list[WayOut], index: int) -> WayOut | None:
     """The lowest way out of a well, None where there is none."""
     mine = [way for way in ways if way.start == index and way.path is not None]
     return min(mine, key=lambda way: way.path.uphill.action if way.path else np.inf, default=None)
+
+
+def _depths(portrait: PhasePortrait, ways: list[WayOut]) -> list[float]:
+    """V at the lowest saddle of each well; infinite where no way out of it is known."""
+    lowest = [_lowest(ways, index) for index in range(len(portrait.attractors))]
+    return [np.inf if way is None or way.path is None else way.path.uphill.action / 2 for way in lowest]
 
 
 def _along_paths(

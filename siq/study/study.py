@@ -20,6 +20,7 @@ from siq.dynamics.cards import DiffusionEntry, Name, SystemCard, build_system, r
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.formulas import FormulaError
 from siq.dynamics.parametric import symbol
+from siq.dynamics.reach import unreached_states
 from siq.dynamics.sampling import SimulationEntry, complete, fault_over_domain
 from siq.errors import InputError
 from siq.files.documents import read_document, validate
@@ -294,7 +295,10 @@ def load_study_system(study: Study, *, file: str, systems: Path) -> Dynamics | N
         When the card is missing or refused, inputs or the time drive the system, or the study's library or D
         does not fit the states.
     """
-    system = None if study.system is None else _with_landscape(system_path(study.system, systems=systems))
+    directly = study.entrance != "equations"
+    system = None
+    if study.system is not None:
+        system = _with_landscape(system_path(study.system, systems=systems), directly=directly)
     states = system.states if system is not None else None
     if study.recordings is not None and study.recordings.states is not None:
         if system is not None and study.recordings.states != system.states:
@@ -308,18 +312,26 @@ def load_study_system(study: Study, *, file: str, systems: Path) -> Dynamics | N
     return system
 
 
-def _with_landscape(path: Path) -> Dynamics:
+def _with_landscape(path: Path, *, directly: bool) -> Dynamics:
     """The system of a card that can be simulated by itself, and has a landscape that we can work out."""
     document = read_document(path)
     system = build_system(document, validate(document, SystemCard))
-    if (fault := fault_for_landscape(system)) is not None:
+    if (fault := fault_for_landscape(system, directly=directly)) is not None:
         keys, what, remedy = fault
         raise InputError(document.file, document.place(keys), what, remedy)
     return system
 
 
-def fault_for_landscape(system: Dynamics) -> tuple[tuple[str, ...], str, str] | None:
-    """Why no landscape of a system can be worked out: the place in its card, the fault and the remedy."""
+def fault_for_landscape(system: Dynamics, *, directly: bool) -> tuple[tuple[str, ...], str, str] | None:
+    """Why no landscape of a system can be worked out: the place in its card, the fault and the remedy.
+
+    Parameters
+    ----------
+    system
+        As its card says.
+    directly
+        Whether noise has to act on every state, as trajectories ask for, or may reach it by way of others.
+    """
     if not system.autonomous:
         key, what = ("inputs", "inputs") if system.inputs else ("equations", "time")
         remedy = f"leave the {what} out, or use the card in a study of mismatch"
@@ -328,11 +340,19 @@ def fault_for_landscape(system: Dynamics) -> tuple[tuple[str, ...], str, str] | 
         if np.isnan(limits).any():
             what = f"the state '{name}' has no domain, in which a simulation could begin"
             return ("states", name), what, "add 'domain: [lower, upper]' to it"
-    if not system.diffusion.regular:
-        what = "the noise does not reach every state, and landscapes are worked out only where it does"
+    if directly and not system.diffusion.regular:
+        what = "the noise does not reach every state directly, as it has to where f comes from trajectories"
+        remedy = (
+            "give a positive definite matrix, or ask for the landscape of these equations: 'from: equations'"
+        )
+        return ("diffusion",), what, remedy
+    if still := unreached_states(system):
+        what = f"the noise does not reach {' and '.join(still)}, neither directly nor by way of other states"
         return (
-            ("diffusion",), what, "give a positive definite matrix, or use the card in a study of mismatch"
-        )  # fmt: skip
+            ("diffusion",),
+            what,
+            f"let it act on {still[0]} or on a state in its equation, or leave it out",
+        )
     if (found := fault_over_domain(system)) is not None:
         remedy = "choose a domain in which it has a value"
         return ("equations", found[0]), f"the equation {found[1]}", remedy

@@ -24,11 +24,12 @@ from siq.dynamics.dynamics import Dynamics
 from siq.errors import InputError
 from siq.landscape.landscape import Landscape
 from siq.landscape.options import LandscapeOptions
+from siq.landscape.paths import minimum_action_path
 from siq.landscape.refusal import NoLandscape
 from siq.reference.mesh import mesh_quasipotential
 from siq.steps.equations import EquationSettings
 
-X, Y = sympy.symbols("x y", real=True)
+X, Y, Z = sympy.symbols("x y z", real=True)
 SYSTEMS = Path(__file__).parents[2] / "config" / "systems"
 CARD = SYSTEMS / "consumer-resource.yaml"
 TOGGLE = Dynamics.of((X, Y), (3 / (1 + Y**2) - X, 3 / (1 + X**2) - Y), domain=[(0, 4), (0, 4)])
@@ -216,6 +217,55 @@ def test_systems_without_a_landscape_say_why() -> None:
         Landscape.from_equations(replace(TOGGLE, domain=None))
     with pytest.raises(InputError, match="divides by zero"):
         Landscape.from_equations(Dynamics.of((X, Y), (1 / X, -Y), domain=[(-1, 1), (-1, 1)]))
-    singular = Dynamics.of((X, Y), (Y, -X), diffusion=np.diag([0.0, 1.0]), domain=[(-1, 1), (-1, 1)])
-    with pytest.raises(InputError, match="noise does not reach every state"):
-        Landscape.from_equations(singular)
+    apart = Dynamics.of((X, Y), (X - X**3, X - Y), diffusion=np.diag([0.0, 1.0]), domain=[(-2, 2)] * 2)
+    with pytest.raises(InputError, match=r"does not reach x, neither directly .* let it act on x"):
+        Landscape.from_equations(apart)
+    alike = Dynamics.of(
+        (X, Y, Z), (Z - X, Z - Y, -Z), diffusion=np.diag([0.0, 0.0, 1.0]), domain=[(-1, 1)] * 3
+    )
+    with pytest.raises(NoLandscape, match="does not reach x and y about the equilibrium"):
+        Landscape.from_equations(alike)
+
+
+def test_a_damped_particle_has_its_energy_as_a_formula() -> None:
+    """Noise on the velocity alone: V = (γ/D)(v²/2 + Φ), with one well, which is left over its only saddle."""
+    friction, noise = 1.5, 0.5
+    system = Dynamics.of(
+        (X, Y), (Y, X**2 - X - friction * Y), diffusion=np.diag([0.0, noise]), domain=[(-1, 1.8), (-1.2, 1.2)]
+    )
+    landscape = Landscape.from_equations(system)
+    assert landscape.certificate is not None and landscape.certificate.certified
+    assert landscape.certificate.error < 1e-6
+    (way,) = landscape.transitions
+    assert way.end is None and way.barrier == pytest.approx(2 * friction / noise / 6, rel=1e-6)
+    well = landscape.potential()
+    x = well.inside
+    energy = friction / noise * (x[:, 1] ** 2 / 2 + x[:, 0] ** 2 / 2 - x[:, 0] ** 3 / 3)
+    np.testing.assert_allclose(well.values(x), energy, atol=1e-10)
+    # Kramers, with both frequencies 1: half of what reaches the saddle in the mean comes back.
+    across = np.sqrt(friction**2 / 4 + 1) - friction / 2
+    mean = landscape.dwell_times(noise=0.1)["mean_time"][0]
+    assert mean == pytest.approx(2 * np.pi / across * np.exp(way.barrier / 0.1), rel=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["friction", "coloured", "state noise"])
+def test_formulas_hold_where_noise_acts_on_one_state_and_nothing_is_conserved(case: str) -> None:
+    """Characteristics certify them, and they agree with paths solved for by themselves."""
+    cases = {
+        "friction": ((Y, X - X**3 + 0.1 - (0.5 + X**2) * Y), [[0, 0], [0, 1]]),
+        "coloured": ((X - X**3 + 0.1 + Y, -2 * Y), [[0, 0], [0, 4]]),
+        "state noise": ((Y, X - X**3 + 0.1 - Y), [[0, 0], [0, 1 + X**2 / 2]]),
+    }
+    equations, noise = cases[case]
+    system = Dynamics.of((X, Y), equations, diffusion=noise, domain=[(-2, 2), (-2, 2)])
+    landscape = Landscape.from_equations(system)
+    assert landscape.certificate is not None and landscape.certificate.certified
+    for way in landscape.transitions:
+        assert way.path is not None and way.path.uphill.converged
+        well = landscape.potential(way.start)
+        points = well.inside[:: len(well.inside) // 5]
+        for end in points[np.abs(points - well.attractor).max(axis=1) > 0.1]:
+            path = minimum_action_path(system, well.attractor, end)
+            error = max(landscape.certificate.error, 1e-5) * well.level
+            assert well.values(end[None])[0] == pytest.approx(path.action / 2, abs=2 * error)

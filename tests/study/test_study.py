@@ -163,6 +163,18 @@ def test_a_diffusion_that_does_not_fit_the_recorded_states_is_refused(write: Wri
         check_system(path)
 
 
+def test_noise_may_reach_a_state_by_way_of_others_where_equations_are_all_that_is_asked(write: Write) -> None:
+    states = "{x: {domain: [-2, 2]}, v: {domain: [-2, 2]}}"
+    text = f"name: s\nstates: {states}\nequations: {{x: v, v: x - x**3 - v}}\ndiffusion: [[0, 0], [0, 1]]\n"
+    card = write(text, "s.yaml")
+    check_system(write(f"name: s\nsystem: {card}\nfrom: equations\n", "given.yaml"))
+    with pytest.raises(InputError, match=r"directly, as it has to .* 'from: equations'"):
+        check_system(write(f"name: s\nsystem: {card}\n"))
+    card = write(text.replace("x: v,", "x: x - x**3,"), "s.yaml")
+    with pytest.raises(InputError, match="does not reach x, neither"):
+        check_system(write(f"name: s\nsystem: {card}\nfrom: equations\n", "given.yaml"))
+
+
 @pytest.mark.parametrize(
     ("states", "further", "place", "fault"),
     [
