@@ -381,8 +381,16 @@ def test_a_mechanism_that_overflows_ends_itself_and_not_the_diagnosis(tmp_path: 
     assert all(each.reason for each in diagnosis.statement.not_fitted)
 
 
-@pytest.mark.parametrize("error", [ValueError("array must not contain infs or NaNs"), ZeroDivisionError(),
-                                   FloatingPointError(), np.linalg.LinAlgError("SVD")])  # fmt: skip
+@pytest.mark.parametrize(
+    "error",
+    [
+        ValueError("array must not contain infs or NaNs"),
+        *[
+            pytest.param(one, marks=pytest.mark.slow)
+            for one in (ZeroDivisionError(), FloatingPointError(), np.linalg.LinAlgError("SVD"))
+        ],
+    ],
+)
 def test_a_candidate_whose_fit_fails_unforeseen_is_recorded_with_the_reason(
     error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

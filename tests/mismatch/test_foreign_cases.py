@@ -30,8 +30,8 @@ SMALL: dict[str, Callable[[], ForeignCase]] = {
     "falling ball, drag": lambda: falling_ball(0.03),
     "falling ball, gravity free": lambda: falling_ball(0.3, fixed=False),
     "falling ball, linear drag": lambda: falling_ball(0.3, linear=True),
-    "polynomial on the brink": lambda: polynomial_on_the_brink(samples=80, recordings=4),
-    "eight states": lambda: chain_of_masses(samples=300, recordings=3),
+    "polynomial on the brink": lambda: polynomial_on_the_brink(samples=60, recordings=3),
+    "eight states": lambda: chain_of_masses(samples=150, recordings=3),
 }
 LARGE: dict[str, Callable[[], ForeignCase]] = {
     "motor axis, one recording": lambda: motor_axis(recordings=1),
