@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
+import sympy
 from pydantic import ConfigDict, TypeAdapter
 from pydantic.dataclasses import dataclass
 
@@ -121,7 +122,14 @@ def with_parameters(system: str | Path | Dynamics, names: Sequence[str], values:
         }
         return usable_system(build_system(document, card.model_copy(update={"parameters": entries})))
     replaced = np.array([changed.get(each.name, each.value) for each in system.parameters], dtype=float)
-    return usable_system(system.with_values(replaced))
+    at_values = system.with_values(replaced)
+    for name, formula in zip(system.states, at_values.formulas, strict=True):
+        if formula.has(sympy.zoo, sympy.nan, sympy.oo):
+            raise InputError(
+                system.name or "the system", f"equations.{name}", f"the equation of {name} has no value",
+                "leave this value of the parameter out",
+            )  # fmt: skip
+    return usable_system(at_values)
 
 
 def point_at(

@@ -95,8 +95,12 @@ def card_beside_sweep(wildcards):
 def points_of_sweep(wildcards):
     """Input function: a file for every point of a sweep."""
     swept = study_of(wildcards).study.sweep
-    names = [] if swept is None else [point_name(swept.names, one) for one in swept.points]
-    return expand("results/{study}/sweep/{point}.json", study=wildcards.study, point=names)
+    names = (
+        [] if swept is None else [point_name(swept.names, one) for one in swept.points]
+    )
+    return expand(
+        "results/{study}/sweep/{point}.json", study=wildcards.study, point=names
+    )
 
 
 def with_sweep(name):
