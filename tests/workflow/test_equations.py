@@ -51,3 +51,39 @@ def test_what_only_trajectories_can_give_is_refused(fresh_project):
     done = fresh_project.run("-n", "results/mini/report.html")
     assert done.returncode != 0
     assert "'runs' belongs to studies of trajectories" in done.stdout
+
+
+SWEEP = "sweep: {{parameter: h, from: {first}, to: {last}, step: 0.25}}\n"
+
+
+def test_another_range_computes_new_points_only(fresh_project):
+    tilted = CARD.replace("equations: {x:", "parameters: {h: {value: 0}}\nequations: {x:")
+    tilted = tilted.replace("x - x**3", "h + x - x**3")
+    fresh_project.path("wells.yaml").write_text(tilted)
+    fresh_project.path("study.yaml").write_text(STUDY + SWEEP.format(first=0, last=0.25))
+    fresh_project.make("results/mini/report.html")
+    points = fresh_project.path("results/mini/sweep")
+    assert sorted(path.name for path in points.iterdir()) == ["h=0.25.json", "h=0.json"]
+    before = {path.name: path.stat().st_mtime_ns for path in points.iterdir()}
+    fresh_project.path("study.yaml").write_text(STUDY + SWEEP.format(first=0, last=0.5))
+    fresh_project.path("wells.yaml").write_text(tilted.replace("h: {value: 0}", "h: {value: 0.1}"))
+    fresh_project.make("results/mini/report.html")
+    after = {path.name: path.stat().st_mtime_ns for path in points.iterdir()}
+    assert before.items() < after.items() and set(after) == {"h=0.25.json", "h=0.json", "h=0.5.json"}
+    tables = {
+        name: pd.read_parquet(fresh_project.path(f"results/mini/tables/{name}.parquet"))
+        for name in ("sweep", "sweep_ways", "branches", "bifurcations")
+    }
+    for name, table in tables.items():
+        assert list(table.columns) == list(COLUMNS[name]) and len(table)
+    assert tables["bifurcations"]["value"].to_numpy() == pytest.approx([2 / 27**0.5], abs=1e-9)
+    page = fresh_project.path("results/mini/report.html").read_text()
+    assert "Against h" in page and "fold at h = 0.3849" in page
+    assert fresh_project.path("results/mini/figures/sweep.svg").exists()
+
+
+def test_a_parameter_that_the_card_has_not_is_refused(fresh_project):
+    fresh_project.path("wells.yaml").write_text(CARD)
+    fresh_project.path("study.yaml").write_text(STUDY + SWEEP.format(first=0, last=1))
+    done = fresh_project.run("-n", "results/mini/report.html")
+    assert done.returncode != 0 and "has no parameter 'h'" in done.stdout

@@ -102,10 +102,8 @@ def _draw_branches(axes: Axes, branches: pd.DataFrame, bifurcations: pd.DataFram
         for first, last in pairwise(ends):
             some = rows.iloc[first : last + 1]
             well = int(rows["well"].iloc[first])
-            style = {"color": GREY, "linestyle": "--", "linewidth": 0.8}
-            if well >= 0:
-                style = {"color": _look(well)[0], "linestyle": "-", "linewidth": 1.6}
-            axes.plot(some["value"], some["state"], **style)
+            colour, line, width = (_look(well)[0], "-", 1.6) if well >= 0 else (GREY, "--", 0.8)
+            axes.plot(some["value"], some["state"], color=colour, linestyle=line, linewidth=width)
     for kind, marker in BIFURCATIONS.items():
         rows = bifurcations[bifurcations["kind"] == kind]
         at = [ast.literal_eval(text)[place] for text in rows["position"]]
@@ -113,8 +111,9 @@ def _draw_branches(axes: Axes, branches: pd.DataFrame, bifurcations: pd.DataFram
 
 
 def _draw_wells(axes: Axes, table: pd.DataFrame, name: str) -> None:
-    for well, rows in table[table["well"] >= 0].groupby("well"):
-        colour, marker, style = _look(int(well))
+    for well in sorted({int(one) for one in table["well"] if one >= 0}):
+        rows = table[table["well"] == well]
+        colour, marker, style = _look(well)
         axes.plot(
             rows["value"], rows[name], color=colour, linestyle=style, marker=marker, markersize=3,
             linewidth=1.2,
@@ -142,9 +141,8 @@ def _handles(table: pd.DataFrame, branches: pd.DataFrame, bifurcations: pd.DataF
 def _map(table: pd.DataFrame, parameters: Sequence[str], units: Mapping[str, str]) -> Figure:
     """How many wells there are, and the lowest barrier among them, against two parameters."""
     known = table.assign(one=(table["well"] >= 0).astype(float))
-    keys = {"index": "second_value", "columns": "value"}
-    count = known.pivot_table(values="one", aggfunc="sum", **keys)
-    lowest = table.pivot_table(values="barrier", aggfunc="min", dropna=False, **keys).reindex_like(count)
+    grid = known.groupby(["second_value", "value"])
+    count, lowest = grid["one"].sum().unstack(), grid["barrier"].min().unstack()
     figure = Figure(figsize=(COLUMN_WIDTH, 2.6 * PANEL))
     panels = figure.subplots(2, 1, sharex=True)
     for axes, values, label in zip(
