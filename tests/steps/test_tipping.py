@@ -1,12 +1,14 @@
 """Probabilities of having tipped: closed forms, a simulation, and where they are not to be believed."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
 import sympy
 
 from siq.dynamics.dynamics import Dynamics
-from siq.steps.sweep import Sweep, sweep
+from siq.steps.sweep import ALONE, Sweep, sweep
 from siq.steps.tipping import probability_of_tipping
 from siq.study.tables import as_table
 
@@ -24,8 +26,9 @@ def made(barrier, *, values, prefactor=4.0, relaxation=2.0, ways=1) -> Sweep:
     branches = [
         {"branch": 0, "well": 0, "value": value, "position": "[0.0]", "unstable": 0} for value in values
     ]
+    wells = [{"value": value, "well": 0, "barrier": barrier(value), "note": ""} for value in values]
     return Sweep(
-        ("h",), ("x",), as_table("sweep", []), as_table("sweep_ways", rows),
+        ("h",), ("x",), as_table("sweep", wells), as_table("sweep_ways", rows),
         as_table("branches", pd.DataFrame(branches).assign(growth=-1.0, frequency=0.0)),
         as_table("bifurcations", []),
     )  # fmt: skip
@@ -49,10 +52,34 @@ def test_a_barrier_that_falls_evenly_gives_the_closed_form(ways):
 def test_what_is_not_to_be_believed_is_said():
     found = made(lambda h: 0.5 - h, values=np.linspace(0, 0.4, 5))
     slow = probability_of_tipping(found, lambda t: 1e-4 * t, np.array([0, 3000, 3900]), well=0, noise=NOISE)
-    assert list(slow["valid"]) == [True, True, False]
+    assert list(slow["valid"]) == [False, True, False]  # at the first time nothing has been collected
     assert "below 3 times the noise" in slow["note"].iloc[-1]
     fast = probability_of_tipping(found, lambda t: 0.1 * t, np.array([0, 1.0]), well=0, noise=NOISE)
-    assert not fast["valid"].any() and "faster than the well relaxes" in fast["note"].iloc[0]
+    assert not fast["valid"].any() and "faster than the well relaxes" in fast["note"].iloc[-1]
+    beyond = probability_of_tipping(found, lambda t: 0.1 - t, np.array([0, 0.01, 0.5]), well=0, noise=NOISE)
+    assert "knows no rate" in beyond["note"].iloc[-1] and np.isnan(beyond["rate"].iloc[-1])
+
+
+def test_where_no_law_holds_the_last_rate_is_kept_and_never_believed():
+    found = made(lambda h: 0.5 - h, values=np.linspace(0, 0.48, 9))
+    told = probability_of_tipping(
+        found, lambda t: 0.4 + 1e-4 * t, np.arange(0, 800.0, 100), well=0, noise=NOISE
+    )
+    assert told["rate"].iloc[-1] == pytest.approx(np.exp(-0.08 / NOISE) / 4, rel=1e-9)
+    assert told["law_error"].iloc[-1] == 1 and not told["valid"].any()
+    with pytest.raises(ValueError, match="above the noise"):
+        probability_of_tipping(found, lambda t: 0 * t, np.array([0, 1.0]), well=0, noise=1.0)
+
+
+def test_a_well_without_a_way_out_is_not_left():
+    found = made(lambda h: 0.5 - h, values=[0.2, 0.3, 0.4])
+    alone = pd.DataFrame([{"value": value, "well": 0, "note": ALONE} for value in (0.0, 0.1)])
+    found = replace(found, table=as_table("sweep", pd.concat([alone, found.table], ignore_index=True)))
+    told = probability_of_tipping(
+        found, lambda t: 1e-4 * t, np.array([0, 1000.0, 3000.0]), well=0, noise=NOISE
+    )
+    assert list(told["probability"][:2]) == [0, 0] and list(told["rate"][:2] > 0) == [False, False]
+    assert told["probability"].iloc[-1] > 0 and told["valid"].iloc[-1]
 
 
 def test_a_well_that_has_ended_has_been_left():
@@ -63,7 +90,7 @@ def test_a_well_that_has_ended_has_been_left():
     times = np.array([0, fold - 1e-3, fold + 1e-3]) * 1e-3
     told = probability_of_tipping(found, lambda t: 1e3 * t, times, well=0, noise=1e-3)
     assert told["probability"].iloc[1] < 0.5 and told["probability"].iloc[2] == 1
-    assert "the well has ended" in told["note"].iloc[2] and not told["valid"].iloc[1:].any()
+    assert told["note"].iloc[2] == "the well has ended" and not told["valid"].iloc[2]
 
 
 @pytest.mark.parametrize(
@@ -101,6 +128,8 @@ def test_walkers_tip_as_often_as_is_said():
         if (k + 1) % round(end / step / 4) == 0:
             counted.append(left.mean())
     share, expected = np.array(counted), told["probability"].to_numpy()
-    error = np.hypot(np.sqrt(share * (1 - share) / 4000), expected * told["law_error"].to_numpy())
-    assert told["valid"].all() and share[-1] > 0.1
+    error = np.hypot(
+        np.sqrt(share * (1 - share) / 4000), expected * told["error"].replace(np.inf, 1).to_numpy()
+    )
+    assert told["valid"].iloc[1:].all() and share[-1] > 0.1
     assert (np.abs(share - expected) <= 2 * error).all()
