@@ -7,13 +7,13 @@ As long as the parameter changes slowly, a well is left at the rate r of the mom
 with barrier ΔU and prefactor K of every way out, between the values of a sweep by monotone interpolation. Two
 things are asked of that, and both are said for every time:
 
-- *the law*: of r the leading order for small ε is known, with a relative error of about ε/ΔU. Where a barrier is
-  not above the noise there is no law; the next rate of which there is one is kept, with an error of one;
+- *the law*: of r the leading order for small ε is known, with a relative error of about ε/ΔU. Where a barrier
+  is not above the noise there is no law; the next rate of which there is one is kept, with an error of one;
 - *the drift*: noise leads out of the well along a path that takes some relaxation times of the well. While
   one passes, r changes by the share ``|d ln r/dt|/relaxation``, which r of the moment does not know of.
 
-Both count as far as the integral has collected r with them. Where its error reaches a third, P is no more than an
-order of magnitude, and `valid` is False. A well that has ended, as at a fold, has been left.
+Both count as far as the integral has collected r with them. Where its error reaches a third, P is no more
+than an order of magnitude, and `valid` is False. A well that has ended, as at a fold, has been left.
 
 References
 ----------
