@@ -34,7 +34,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MOST_PARAMETERS = 2
-ALONE = "no way leads out of this well"
+ALONE = "it is the only stable state, and no way leads out of it"
+UNKNOWN = "no way out was found"
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -281,8 +282,10 @@ def _exits(point: SweptPoint, index: int, number: Sequence[int], noise: float | 
     mine = [way for way in point.ways if way.start == index]
     known = [way for way in mine if way.barrier is not None]
     if not known:
-        note = "; ".join(dict.fromkeys(way.note for way in mine if way.note)) or ALONE
-        return {"note": note}
+        # Beside a limit cycle, or another well, it can be left although nobody knows how.
+        alone = len(point.wells) == 1 and not point.notes and not mine
+        told = "; ".join(dict.fromkeys(way.note for way in mine if way.note))
+        return {"note": ALONE if alone else told or "; ".join(point.notes) or UNKNOWN}
     lowest = min(known, key=lambda way: np.inf if way.barrier is None else way.barrier)
     notes = [way.note for way in mine if way.note]
     time = dwell_time([way.as_exit() for way in mine], None if noise is None else NoiseStrength(noise))

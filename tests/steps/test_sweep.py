@@ -8,7 +8,7 @@ from siq.dynamics.cards import load_system
 from siq.dynamics.dynamics import Dynamics
 from siq.errors import InputError
 from siq.landscape.landscape import Landscape
-from siq.steps.sweep import Sweep, collected, sweep
+from siq.steps.sweep import ALONE, Sweep, collected, sweep
 from siq.steps.sweep_points import PointSettings, point_at, read_point, with_parameters, write_point
 
 h, a, x, y = sympy.symbols("h a x y", real=True)
@@ -121,3 +121,15 @@ def test_a_point_is_read_as_it_was_written(tmp_path):
     assert read_point(tmp_path / "h=0.2.json") == point
     again = collected(cusp(), ("h",), [point], noise=0.04)
     assert len(again.table) == 2 and len(again.ways) == 2
+
+
+def test_beside_a_limit_cycle_nobody_says_that_a_well_is_never_left():
+    """r' = r (r² - 1) (4 - r²), about a focus: an unstable cycle parts it from a stable one."""
+    r = x**2 + y**2
+    ring = Dynamics.of(
+        (x, y), (x * (r - a) * (4 - r) - y, y * (r - a) * (4 - r) + x), domain=[(-3, 3), (-3, 3)],
+        parameters={a: 1.0},
+    )  # fmt: skip
+    row = sweep(ring, "a", [1.0]).table.iloc[0]
+    assert row["well"] == 0 and "limit cycle" in row["note"] and row["note"] != ALONE
+    assert sweep(cusp(), "h", [0.5]).table["note"].iloc[0] == ALONE
