@@ -20,6 +20,7 @@ from pydantic.dataclasses import dataclass
 from siq.dynamics.cards import load_system
 from siq.dynamics.continuation import Branches, ParameterFamily, follow_branches
 from siq.dynamics.dynamics import Dynamics
+from siq.dynamics.phase_portrait import UNSETTLED
 from siq.errors import InputError, suggestion
 from siq.landscape.dwell_times import NoiseStrength, dwell_time
 from siq.landscape.ensembles import shares_by_rates
@@ -266,7 +267,8 @@ def _weights(point: SweptPoint, noise: float | None) -> np.ndarray:
     count = len(point.wells)
     between = [way for way in point.ways if way.end is not None]
     known = noise is not None and all(way.barrier is not None and noise < way.barrier for way in between)
-    if noise is None or not known:
+    # What leads elsewhere has a share of the time, too.
+    if noise is None or not known or point.settled < 1 - UNSETTLED:
         return np.full(count, np.nan)
     if count == 1:
         return np.ones(1)

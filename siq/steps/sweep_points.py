@@ -74,6 +74,8 @@ class SweptPoint:
         All that were found, the unstable ones too.
     wells, ways
         Attractors and the ways out of them.
+    settled
+        Share of the states of the domain from which f leads to one of the wells.
     reason
         Why there is no landscape, in words; empty where there is one.
     notes
@@ -84,6 +86,7 @@ class SweptPoint:
     equilibria: tuple[tuple[float, ...], ...]
     wells: tuple[SweptWell, ...] = ()
     ways: tuple[SweptWay, ...] = ()
+    settled: float = 0.0
     reason: str = ""
     notes: tuple[str, ...] = ()
 
@@ -153,6 +156,7 @@ def point_at(
             for one in found.attractors
         ),
         tuple(map(_as_way, found.transitions)),
+        settled=float(found.basins.sum()),
         notes=found.notes,
     )
 

@@ -57,7 +57,9 @@ def answered(case: ForeignCase, folder: Path, **allowance: float) -> Diagnosis:
     return found
 
 
-@pytest.mark.parametrize("name", SMALL)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name == "eight states" else name for name in SMALL]
+)
 def test_there_is_an_answer(name: str, tmp_path: Path) -> None:
     found = answered(SMALL[name](), tmp_path)
     assert found.verdict.mismatch and not found.statement.partial

@@ -7,7 +7,7 @@ import pytest
 
 from siq.study.tables import COLUMNS
 
-pytestmark = [pytest.mark.workflow, pytest.mark.slow]
+pytestmark = pytest.mark.workflow
 
 CARD = """\
 name: wells
@@ -26,6 +26,7 @@ landscape: {noise_intensities: [0.05]}
 """
 
 
+@pytest.mark.slow
 def test_equations_alone_give_the_page(fresh_project):
     fresh_project.path("wells.yaml").write_text(CARD)
     fresh_project.path("study.yaml").write_text(STUDY)
@@ -45,6 +46,7 @@ def test_equations_alone_give_the_page(fresh_project):
     assert not (results / "runs").exists()
 
 
+@pytest.mark.slow
 def test_what_only_trajectories_can_give_is_refused(fresh_project):
     fresh_project.path("wells.yaml").write_text(CARD)
     fresh_project.path("study.yaml").write_text(STUDY + "runs: 3\n")
@@ -53,20 +55,25 @@ def test_what_only_trajectories_can_give_is_refused(fresh_project):
     assert "'runs' belongs to studies of trajectories" in done.stdout
 
 
+def tilted(value: float = 0) -> str:
+    """The card with a parameter h that tilts its wells."""
+    card = CARD.replace("equations: {x:", f"parameters: {{h: {{value: {value}}}}}\nequations: {{x:")
+    return card.replace("x - x**3", "h + x - x**3")
+
+
 SWEEP = "sweep: {{parameter: h, from: {first}, to: {last}, step: 0.25}}\n"
 
 
+@pytest.mark.slow
 def test_another_range_computes_new_points_only(fresh_project):
-    tilted = CARD.replace("equations: {x:", "parameters: {h: {value: 0}}\nequations: {x:")
-    tilted = tilted.replace("x - x**3", "h + x - x**3")
-    fresh_project.path("wells.yaml").write_text(tilted)
+    fresh_project.path("wells.yaml").write_text(tilted())
     fresh_project.path("study.yaml").write_text(STUDY + SWEEP.format(first=0, last=0.25))
     fresh_project.make("results/mini/report.html")
     points = fresh_project.path("results/mini/sweep")
     assert sorted(path.name for path in points.iterdir()) == ["h=0.25.json", "h=0.json"]
     before = {path.name: path.stat().st_mtime_ns for path in points.iterdir()}
     fresh_project.path("study.yaml").write_text(STUDY + SWEEP.format(first=0, last=0.5))
-    fresh_project.path("wells.yaml").write_text(tilted.replace("h: {value: 0}", "h: {value: 0.1}"))
+    fresh_project.path("wells.yaml").write_text(tilted(0.1))
     fresh_project.make("results/mini/report.html")
     after = {path.name: path.stat().st_mtime_ns for path in points.iterdir()}
     assert before.items() < after.items() and set(after) == {"h=0.25.json", "h=0.json", "h=0.5.json"}
@@ -82,8 +89,22 @@ def test_another_range_computes_new_points_only(fresh_project):
     assert fresh_project.path("results/mini/figures/sweep.svg").exists()
 
 
+@pytest.mark.slow
 def test_a_parameter_that_the_card_has_not_is_refused(fresh_project):
     fresh_project.path("wells.yaml").write_text(CARD)
     fresh_project.path("study.yaml").write_text(STUDY + SWEEP.format(first=0, last=1))
     done = fresh_project.run("-n", "results/mini/report.html")
     assert done.returncode != 0 and "has no parameter 'h'" in done.stdout
+
+
+def test_a_sweep_is_planned_as_a_job_for_each_value(fresh_project):
+    fresh_project.path("wells.yaml").write_text(tilted())
+    fresh_project.path("study.yaml").write_text(STUDY + SWEEP.format(first=0, last=0.5))
+    planned = fresh_project.make("-n", "results/mini/report.html").partition("Job stats:")[2]
+    jobs = {line.split()[0]: line.split()[-1] for line in planned.partition("total")[0].splitlines() if line}
+    assert (jobs["sweep_point"], jobs["sweep"], jobs["equations"], jobs["equations_page"]) == (
+        "3",
+        "1",
+        "1",
+        "1",
+    )

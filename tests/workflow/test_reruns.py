@@ -55,7 +55,13 @@ def test_only_what_depends_on_a_change_runs_again(finished, tmp_path):
     assert would_run(project, regression, change=lambda: append(regression)) == {"regress", "refine"}
     steps = would_run(project, study, change=lambda: project.write_study(runs=2, steps=130))
     assert steps == {"train", "regress", "refine"}
-    # And what a plan says, a run does.
+    threshold = would_run(project, study, change=lambda: project.write_study(runs=2, threshold=0.2))
+    assert threshold == {"regress", "refine"}
+
+
+@pytest.mark.slow
+def test_what_a_plan_says_a_run_does(finished, tmp_path):
+    project = finished.copied(tmp_path / "project")
     before = project.modified(DATA, NETWORKS, MODEL)
     project.write_study(runs=2, threshold=0.2)
     project.make(MODEL)
