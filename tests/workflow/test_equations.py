@@ -1,6 +1,7 @@
 """A study from equations: one step, a page, tables of the contract; nothing is simulated."""
 
 import json
+import re
 
 import pandas as pd
 import pytest
@@ -101,10 +102,5 @@ def test_a_sweep_is_planned_as_a_job_for_each_value(fresh_project):
     fresh_project.path("wells.yaml").write_text(tilted())
     fresh_project.path("study.yaml").write_text(STUDY + SWEEP.format(first=0, last=0.5))
     planned = fresh_project.make("-n", "results/mini/report.html").partition("Job stats:")[2]
-    jobs = {line.split()[0]: line.split()[-1] for line in planned.partition("total")[0].splitlines() if line}
-    assert (jobs["sweep_point"], jobs["sweep"], jobs["equations"], jobs["equations_page"]) == (
-        "3",
-        "1",
-        "1",
-        "1",
-    )
+    for rule, count in (("sweep_point", 3), ("sweep", 1), ("equations", 1), ("equations_page", 1)):
+        assert re.search(rf"^{rule} +{count}$", planned, flags=re.MULTILINE), planned
