@@ -18,7 +18,9 @@
 `basins`              which recorded points lead to an attractor?
 `phase_portrait`      which attractors are there, and which saddles next to each?
 `equilibrium_search`  where do given equations rest in their domain?
-`continuation`        and where when a parameter changes: where do equilibria fold, or begin to oscillate?
+`continuation`        and where when a parameter changes?
+`bifurcations`        where do equilibria fold, begin to oscillate, or meet others?
+`parameter_family`    what is f against one of its parameters?
 `edge_tracking`       which saddle lies between two attractors, in many states?
 `many_states`         and which attractors and saddles have equations of many states?
 `domain_portrait`     and which attractors, saddles and basins have they?

@@ -18,8 +18,9 @@ import pandas as pd
 from pydantic.dataclasses import dataclass
 
 from siq.dynamics.cards import load_system
-from siq.dynamics.continuation import Branches, ParameterFamily, follow_branches
+from siq.dynamics.continuation import Branches, follow_branches
 from siq.dynamics.dynamics import Dynamics
+from siq.dynamics.parameter_family import ParameterFamily
 from siq.dynamics.phase_portrait import UNSETTLED
 from siq.errors import InputError, suggestion
 from siq.landscape.dwell_times import NoiseStrength, dwell_time

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from siq.dynamics.continuation import Branch, Branches, ParameterFamily, place_on
+from siq.dynamics.continuation import Branch, Branches, place_on
+from siq.dynamics.parameter_family import ParameterFamily
 from siq.steps.sweep_points import SweptPoint
 
 DIGITS = 10  # of positions in tables

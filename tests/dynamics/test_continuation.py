@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import sympy
 
-from siq.dynamics.continuation import ParameterFamily, follow_branches, place_on
+from siq.dynamics.continuation import follow_branches, place_on
 from siq.dynamics.dynamics import Dynamics
+from siq.dynamics.parameter_family import ParameterFamily
 
 x, y, z, k, mu = sympy.symbols("x y z k mu", real=True)
 
