@@ -42,6 +42,8 @@ if TYPE_CHECKING:
     from siq.report.plots.wells import plot_paths, plot_wells
     from siq.steps.equations import EquationSettings
     from siq.steps.pipeline import PipelineSettings
+    from siq.steps.sweep import Sweep, sweep
+    from siq.steps.tipping import probability_of_tipping
     from siq.study.study import Study, load_study
 
     __version__: str
@@ -63,6 +65,7 @@ __all__ = [
     "RegressionOptions",
     "SimulationOptions",
     "Study",
+    "Sweep",
     "SymbolicDecomposition",
     "TrainingOptions",
     "candidate_library",
@@ -77,6 +80,7 @@ __all__ = [
     "plot_quasipotential",
     "plot_residuals",
     "plot_wells",
+    "probability_of_tipping",
     "read_case",
     "read_model",
     "read_recordings",
@@ -84,6 +88,7 @@ __all__ = [
     "snapshot_pairs",
     "solve_case",
     "sparse_decomposition",
+    "sweep",
     "train",
     "write_recordings",
 ]
@@ -105,6 +110,7 @@ _MODULES = {
     "RegressionOptions": "siq.networks.regression",
     "SimulationOptions": "siq.dynamics.simulation",
     "Study": "siq.study.study",
+    "Sweep": "siq.steps.sweep",
     "SymbolicDecomposition": "siq.potential.symbolic",
     "TrainingOptions": "siq.networks.options",
     "candidate_library": "siq.identify.library",
@@ -119,6 +125,7 @@ _MODULES = {
     "plot_quasipotential": "siq.report.plots.quasipotential",
     "plot_residuals": "siq.report.plots.residuals",
     "plot_wells": "siq.report.plots.wells",
+    "probability_of_tipping": "siq.steps.tipping",
     "read_case": "siq.mismatch.case",
     "read_model": "siq.potential.storage",
     "read_recordings": "siq.data.recordings",
@@ -126,6 +133,7 @@ _MODULES = {
     "snapshot_pairs": "siq.data.recordings",
     "solve_case": "siq.mismatch.diagnosis",
     "sparse_decomposition": "siq.networks.regression",
+    "sweep": "siq.steps.sweep",
     "train": "siq.networks.training",
     "write_recordings": "siq.data.recordings",
 }

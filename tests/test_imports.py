@@ -49,6 +49,7 @@ UPWARDS: frozenset[tuple[str, str]] = frozenset(
         ("siq.landscape.landscape", "siq.steps.outcomes"),
         ("siq.landscape.landscape", "siq.steps.pipeline"),
         ("siq.mismatch.diagnosis", "siq.report.diagnosis_report"),
+        ("siq.steps.sweep", "siq.report.plots.sweep"),
     }
 )
 

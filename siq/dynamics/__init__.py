@@ -1,6 +1,6 @@
 """What does a system do? Its drift and noise as one object, from a formula to a trajectory.
 
-====================  =====================================================================
+====================  ================================================================================
 `dynamics`            which drift, noise, inputs and outputs has a system?
 `diffusion`           what does its noise do to momenta and velocities?
 `state_noise`         and if it is stronger here than there, by a formula of the states?
@@ -19,10 +19,13 @@
 `basins`              which recorded points lead to an attractor?
 `phase_portrait`      which attractors are there, and which saddles next to each?
 `equilibrium_search`  where do given equations rest in their domain?
+`continuation`        and where when a parameter changes?
+`bifurcations`        where do equilibria fold, begin to oscillate, or meet others?
+`parameter_family`    what is f against one of its parameters?
 `edge_tracking`       which saddle lies between two attractors, in many states?
 `many_states`         and which attractors and saddles have equations of many states?
 `domain_portrait`     and which attractors, saddles and basins have they?
-====================  =====================================================================
+====================  ================================================================================
 
 Imports `siq.data` and what it may import.
 """

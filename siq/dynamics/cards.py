@@ -275,12 +275,15 @@ def build_system(document: Document, card: SystemCard) -> Dynamics:
     outputs = card.outputs if card.outputs is not None else {name: name for name in card.states}
     parse = _parser(document, card)
     numbers = {symbol(name): exact_number(entry.value) for name, entry in card.parameters.items()}
+    of_noise: set[str] = set()
+
+    def inserted(text: Formula) -> sympy.Expr:
+        formula = parse(("diffusion",), text)
+        of_noise.update(each.name for each in formula.free_symbols & set(numbers))
+        return formula.xreplace(numbers)
+
     try:
-        diffusion = read_diffusion(
-            card.diffusion,
-            [symbol(name) for name in card.states],
-            lambda text: parse(("diffusion",), text).xreplace(numbers),
-        )
+        diffusion = read_diffusion(card.diffusion, [symbol(name) for name in card.states], inserted)
     except ValueError as error:
         fault, remedy = str(error).split("; ", 1)
         raise InputError(document.file, document.place(("diffusion",)), fault, remedy) from None
@@ -298,6 +301,7 @@ def build_system(document: Document, card: SystemCard) -> Dynamics:
         ),
         equations=tuple(parse(("equations", name), card.equations[name]) for name in card.states),
         outputs=tuple((name, parse(("outputs", name), text)) for name, text in outputs.items()),
+        parameters_of_noise=tuple(sorted(of_noise)),
     )
 
 

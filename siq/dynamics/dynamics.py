@@ -11,7 +11,7 @@ takes components, signals and the values of the parameters (`siq.dynamics.parame
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -87,6 +87,8 @@ class Dynamics:
     edges
         Arguments of ``sign`` in f and the widths over which the jump is spread when f is evaluated, so that
         an integrator can follow it: ``sign(e)`` is taken as ``tanh(e/w)``. The formulas keep the sign.
+    parameters_of_noise
+        Names of the parameters of a card that stand in D, where they count with the card's values.
 
     Raises
     ------
@@ -117,6 +119,7 @@ class Dynamics:
     covariance: np.ndarray | None = None
     outputs: tuple[tuple[str, sympy.Expr], ...] = ()
     edges: tuple[tuple[sympy.Expr, float], ...] = ()
+    parameters_of_noise: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         d = len(self.states)
@@ -141,6 +144,7 @@ class Dynamics:
         *,
         diffusion: Diffusion | np.ndarray | Sequence[Sequence[sympy.Expr | float]] | None = None,
         domain: Sequence[Sequence[float]] | np.ndarray | None = None,
+        parameters: Mapping[sympy.Symbol, float] | None = None,
     ) -> Dynamics:
         """Dynamics of formulas alone, with D = 1 unless another is given.
 
@@ -154,6 +158,8 @@ class Dynamics:
             D, as `Diffusion`, as a matrix ``(d, d)``, or as rows of formulas.
         domain
             Two limits a state, where somebody says them.
+        parameters
+            Real symbols of f that may take other values, with the values that they have.
         """
         if diffusion is None:
             diffusion = Diffusion.identity(len(symbols))
@@ -163,7 +169,8 @@ class Dynamics:
             diffusion = state_noise(symbols, diffusion)
         names, formulas = tuple(each.name for each in symbols), tuple(map(sympy.sympify, equations))
         box = None if domain is None else np.asarray(domain, dtype=float)
-        return cls(names, formulas, diffusion, domain=box)
+        named = tuple(Parameter(each.name, float(value)) for each, value in (parameters or {}).items())
+        return cls(names, formulas, diffusion, domain=box, parameters=named)
 
     @property
     def dimension(self) -> int:

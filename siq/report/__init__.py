@@ -17,6 +17,7 @@
 `settings`               what do figures and pages of a study depend on?
 `study_page`             what does the page of a study say, in which order?
 `equations_page`         and that of given equations?
+`sweep_section`          and what does it say of a control parameter?
 `inspection_section`     what is in the recordings, first of all?
 `study_sections`         and in each of its parts?
 `study_formulas`         which formulas?

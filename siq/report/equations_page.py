@@ -29,11 +29,12 @@ from siq.report.plots.landscape_curves import plot_degrees
 from siq.report.plots.quasipotential import quasipotential_figure
 from siq.report.study_captions import OF_EQUATIONS, OF_ONE_EQUATION, Part, figure_of, figures_of
 from siq.report.study_formulas import formula_rows
+from siq.report.sweep_section import FIGURE, sweep_figure, sweep_section
 from siq.steps.outcomes import Method, Status
 from siq.study.study import Study
 
 LEAD = "quasipotential"
-PRINTED = ("name", "title", "system", "from", "seed", "refinement", "certificate", "landscape")
+PRINTED = ("name", "title", "system", "from", "seed", "refinement", "certificate", "landscape", "sweep")
 """Keys of the study that equations have a use for."""
 
 METHOD = (
@@ -56,7 +57,7 @@ class EquationsResults:
     stored
         The landscape, None where there is none.
     tables
-        ``landscape``, ``degrees``, ``certificates`` and ``outcomes``.
+        ``landscape``, ``degrees``, ``certificates`` and ``outcomes``; those of a sweep where there is one.
     folder
         Where they are.
     images, vectors
@@ -95,11 +96,16 @@ def drawn_of(system: Dynamics, stored: StoredLandscape) -> DrawnLandscape:
 
 
 def equations_figures(
-    system: Dynamics, stored: StoredLandscape | None, degrees: pd.DataFrame
+    system: Dynamics, stored: StoredLandscape | None, tables: Mapping[str, pd.DataFrame], study: Study
 ) -> dict[str, Figure | None]:
     """The figures of the page by name, None for one that has nothing to show."""
     lead = None if stored is None else quasipotential_figure(drawn_of(system, stored))
-    return {LEAD: lead, "degrees": plot_degrees(degrees) if len(degrees) else None}
+    degrees = tables["degrees"]
+    return {
+        LEAD: lead,
+        "degrees": plot_degrees(degrees) if len(degrees) else None,
+        FIGURE: None if study.sweep is None else sweep_figure(system, study.sweep, tables),
+    }
 
 
 def equations_page(
@@ -131,6 +137,7 @@ def equations_page(
         _formulas(results),
         _evidence(results),
         _landscape(study, results),
+        _sweep(study, results),
         _workings(results),
         ReportSection("How to run it again", listing=command),
         _provenance(study, versions),
@@ -203,6 +210,15 @@ def _landscape(study: Study, results: EquationsResults) -> ReportSection | None:
     noises = () if study.landscape is None else study.landscape.noise_intensities
     found = landscape_tables(results.data, results.tables["landscape"], noises=noises, folder=results.folder)
     return ReportSection("The landscape in full", tables=found) if found else None
+
+
+def _sweep(study: Study, results: EquationsResults) -> ReportSection | None:
+    if study.sweep is None:
+        return None
+    return sweep_section(
+        results.system, study.sweep, results.tables, folder=results.folder, images=results.images,
+        vectors=results.vectors,
+    )  # fmt: skip
 
 
 def _workings(results: EquationsResults) -> ReportSection:

@@ -93,6 +93,13 @@ CAPTIONS: Mapping[str, Caption] = {
         " that took no"
         " part in the fit, against their number of terms. The ring marks the degree that was chosen.",
     ),
+    "sweep": Caption(
+        Part.LANDSCAPE,
+        "Equilibria against the parameter, stable ones as lines of the colour of their well, and where they"
+        " begin and end; below, the lowest barrier of each stable state, and, for the noise that the study"
+        " gives, how long each lasts and its share of time in the long run. Against two parameters, maps of"
+        " the number of stable states and of the lowest barrier.",
+    ),
     "error_distribution": Caption(
         Part.RUNS, "Relative error of the coefficients of U, one dot for each run and method.", "Fig. 3"
     ),

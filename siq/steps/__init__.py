@@ -21,6 +21,10 @@ regress                 which sparse formulas are these (the published method)?
 refine                  which V solves the Hamilton–Jacobi equation of f, and may it be believed?
 landscape               which wells, barriers and ways are there?
 equations               what landscape have equations alone?
+sweep_points            which wells and ways have they at other values of their parameters?
+sweep_wells             which of their attractors are one and the same well?
+sweep                   and what is seen against a control parameter, or two?
+tipping                 how likely has a well been left while the parameter drifts?
 score                   how far is all this from exact answers, where these are known?
 overview                which landscape does the page open with?
 collect                 what do all runs say together?

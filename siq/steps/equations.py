@@ -90,8 +90,20 @@ def usable_system(system: str | Path | Dynamics) -> Dynamics:
     return given
 
 
-def landscape_of_equations(system: Dynamics, settings: EquationSettings) -> Landscape:
+def landscape_of_equations(
+    system: Dynamics, settings: EquationSettings, *, formulas: bool = True
+) -> Landscape:
     """Wells, ways out and U of a system that `usable_system` has let pass.
+
+    Parameters
+    ----------
+    system
+        f and D with the domain.
+    settings
+        Of all steps.
+    formulas
+        Whether U is written as a formula. Barriers and times follow from the paths alone, which takes a small
+        part of the time.
 
     Raises
     ------
@@ -111,12 +123,12 @@ def landscape_of_equations(system: Dynamics, settings: EquationSettings) -> Land
     ways = ways_out(system, portrait, beyond_region=True)
     wells: list[Well | None] = [None] * len(portrait.attractors)
     certificate = None
-    if many:
+    if many and formulas:
         notes.append(
             f"powers of {system.dimension} states are too many to write V in: barriers and times follow from"
             " the paths of least action, which need f alone"
         )
-    else:
+    elif formulas:
         portrait = _along_paths(system, portrait, ways, draw)
         wells = [
             _well(system, portrait, ways, index, settings, notes) for index in range(len(portrait.attractors))

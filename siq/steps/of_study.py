@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from siq.certificate.tests import PredictionLimits
+from siq.dynamics.cards import SystemCard
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.sampling import complete
 from siq.dynamics.simulation import SimulationOptions
 from siq.dynamics.state_noise import diffusion_rows_of
+from siq.files.documents import read_document, validate
 from siq.potential.refinement import RefinementOptions
 from siq.steps.outcomes import METHODS, Method
 from siq.steps.settings import Sampling, StateSpace
@@ -104,6 +107,16 @@ def settings_of(cls: type[Settings], study: Study, system: Dynamics | None) -> S
     parts = StudyParts(study, system)
     named = {field.name: parts.part(field.name) for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
     return cls(**named)
+
+
+def card_content_beside(card: str | None, names: Sequence[str]) -> list[Any] | None:
+    """What a sweep takes from a card, as plain data: all but titles and the values of what is swept."""
+    if card is None:
+        return None
+    said = validate(read_document(card), SystemCard)
+    values = {name: entry.value for name, entry in said.parameters.items() if name not in names}
+    states = {name: entry.domain for name, entry in said.states.items()}
+    return [states, said.equations, said.diffusion, values, list(said.parameters)]
 
 
 def card_content(system: Dynamics | None) -> list[Any] | None:

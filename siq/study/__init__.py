@@ -2,6 +2,7 @@
 
 ==============  ===========================================================
 `study`         what does a study ask, with which parameters at every step?
+`sweep`         which values does a study give a control parameter?
 `scoring`       how close are the formulas to exact answers?
 `published`     what did somebody publish, as formulas and on a mesh?
 `reproduction`  which numbers has a publication, and what are ours?

@@ -22,7 +22,7 @@ from siq.dynamics.formulas import FormulaError
 from siq.dynamics.parametric import symbol
 from siq.dynamics.reach import unreached_states
 from siq.dynamics.sampling import SimulationEntry, complete, fault_over_domain
-from siq.errors import InputError
+from siq.errors import InputError, suggestion
 from siq.files.documents import read_document, validate
 from siq.identify.identification import IdentificationOptions
 from siq.identify.library import candidate_library
@@ -30,6 +30,7 @@ from siq.landscape.options import LandscapeOptions
 from siq.networks.options import TrainingOptions
 from siq.networks.regression import RegressionOptions
 from siq.potential.refinement import RefinementOptions
+from siq.study.sweep import SweepOptions
 
 Entrance = Literal["trajectories", "equations"]
 
@@ -133,6 +134,8 @@ class Study(BaseModel):
         How the landscape is found: equilibria, a formula for each well, barriers, paths and escape times;
         by default with the options' own defaults. ``false`` finds none, but for the run that
         the page shows.
+    sweep
+        A control parameter against which the landscape of equations is found, too, or two of them.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
@@ -153,6 +156,7 @@ class Study(BaseModel):
     certificate: CertificateOptions = CertificateOptions()
     invariant: tuple[Annotated[float, Field(gt=0)], ...] = ()
     landscape: LandscapeOptions | None = LandscapeOptions()
+    sweep: SweepOptions | None = None
 
     @field_validator("training", "landscape", mode="before")
     @classmethod
@@ -181,6 +185,8 @@ class Study(BaseModel):
             )
         if self.entrance == "equations":
             self._check_equations()
+        elif self.sweep is not None:
+            raise ValueError("'sweep' belongs to studies of equations; add 'from: equations', or remove it")
         if self.simulation.pair_step is not None and self.simulation.interval is not None:
             self.simulation.options()
         return self
@@ -309,7 +315,26 @@ def load_study_system(study: Study, *, file: str, systems: Path) -> Dynamics | N
         states = study.recordings.states
     if states is not None:
         check_states(study, states, file=file)
+    if study.sweep is not None and system is not None:
+        check_sweep(study.sweep, system, file=file)
     return system
+
+
+def check_sweep(sweep: SweepOptions, system: Dynamics, *, file: str) -> None:
+    """Whether a system has the parameters that a study sweeps.
+
+    Raises
+    ------
+    InputError
+        When it has not.
+    """
+    known = [each.name for each in system.parameters]
+    places = ("sweep.parameter", "sweep.second.parameter")
+    for name, place in zip(sweep.names, places, strict=False):
+        if name not in known:
+            otherwise = f"use one of {', '.join(known)}" if known else "write it on the card as a parameter"
+            fault = f"the card of '{system.name}' has no parameter '{name}'"
+            raise InputError(file, place, fault, suggestion(name, known, otherwise=otherwise))
 
 
 def _with_landscape(path: Path, *, directly: bool) -> Dynamics:

@@ -153,9 +153,12 @@ TRUE = {
     "Maier-Stein": maier_stein(1),
     **{f"polynomial, draw {seed}": polynomial_system(2, seed=seed) for seed in range(2)},
 }
+LARGE = ("polynomial, draw 1", "archetype in 4 dimensions")  # each has a smaller one of its kind beside it
 
 
-@pytest.mark.parametrize("name", TRUE)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name in LARGE else name for name in TRUE]
+)
 def test_the_true_solution_is_certified(name: str) -> None:
     known = TRUE[name]
     certificate = certified(known, known.potential)
@@ -344,7 +347,10 @@ def in_basis(basis: LibraryBasis, own: np.ndarray, points: np.ndarray, portrait:
 
 @pytest.mark.parametrize(
     ("dimension", "rotation", "seed"),
-    [(2, 0.0, 0), (2, 0.3, 1), (2, 6.0, 0), (3, 0.0, 0), (3, 6.0, 0), (4, 0.0, 0), (4, 0.5, 1)],
+    [
+        *[(2, 0.0, 0), (2, 0.3, 1), (2, 6.0, 0), (3, 0.0, 0)],
+        *[pytest.param(*one, marks=pytest.mark.slow) for one in ((3, 6.0, 0), (4, 0.0, 0), (4, 0.5, 1))],
+    ],
 )
 def test_every_other_invariant_subspace_is_refused(dimension: int, rotation: float, seed: int) -> None:
     known = linear_system(dimension, seed=seed, rotation=rotation)
@@ -391,7 +397,7 @@ def test_every_other_invariant_subspace_is_refused(dimension: int, rotation: flo
 # -------------------------------------------------------------------- what Gauss–Newton makes of bad starts
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_network_trained_for_too_short_ends_in_an_exact_false_solution(seed: int) -> None:
     known = archetype(3)
     found, points = exact_field(known, 5), uniform_points(known, 400, share=0.7)
@@ -624,7 +630,9 @@ def fan_of(beta: float, level: float) -> Fan:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(("beta", "barrier"), [(5, 0.4831), (10, 0.34004)])
+@pytest.mark.parametrize(
+    ("beta", "barrier"), [(5, 0.4831), pytest.param(10, 0.34004, marks=pytest.mark.slow)]
+)
 def test_the_error_that_is_stated_lies_above_the_true_one(beta: float, barrier: float) -> None:
     known = maier_stein(beta)
     setting = portrait_of(known, 400)

@@ -151,7 +151,7 @@ def test_a_barrier_is_put_together_where_the_formula_ends() -> None:
     assert barrier == pytest.approx(exact + share * barrier * (1 - 1 / 1.1), rel=1e-3)
 
 
-@pytest.mark.parametrize("name", ["double well", "sheared archetype"])
+@pytest.mark.parametrize("name", ["double well", pytest.param("sheared archetype", marks=pytest.mark.slow)])
 def test_standard_errors_follow_from_small_changes_of_f(name: str) -> None:
     known = SYSTEMS[name]
     found = exact_field(known, 3)

@@ -230,7 +230,7 @@ def test_random_forces_are_no_noise_where_a_function_beside_them_is_likelier(
 
 
 def test_random_forces_that_follow_the_motion_are_not_those_of_surroundings(tmp_path: Path) -> None:
-    diagnosis = solved(tmp_path, recordings_of(nothing, drive=0.03, fading=True))
+    diagnosis = solved(tmp_path, recordings_of(nothing, count=6, drive=0.03, fading=True))
     assert said(diagnosis)["verdict"] == "unexplained"
     assert any("hidden state" in remark for remark in said(diagnosis)["remarks"])
     # No function foresees them: the card stays as it was, and this is said.
@@ -381,8 +381,16 @@ def test_a_mechanism_that_overflows_ends_itself_and_not_the_diagnosis(tmp_path: 
     assert all(each.reason for each in diagnosis.statement.not_fitted)
 
 
-@pytest.mark.parametrize("error", [ValueError("array must not contain infs or NaNs"), ZeroDivisionError(),
-                                   FloatingPointError(), np.linalg.LinAlgError("SVD")])  # fmt: skip
+@pytest.mark.parametrize(
+    "error",
+    [
+        ValueError("array must not contain infs or NaNs"),
+        *[
+            pytest.param(one, marks=pytest.mark.slow)
+            for one in (ZeroDivisionError(), FloatingPointError(), np.linalg.LinAlgError("SVD"))
+        ],
+    ],
+)
 def test_a_candidate_whose_fit_fails_unforeseen_is_recorded_with_the_reason(
     error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -76,7 +76,10 @@ def test_a_linear_system_in_six_dimensions() -> None:
     assert_exact(known, grown(known, portrait_of(known, 150, share=0.7), 0, degree=2))
 
 
-@pytest.mark.parametrize(("dimension", "seed"), [(2, 0), (2, 1), (2, 2), (3, 0)])
+@pytest.mark.parametrize(
+    ("dimension", "seed"),
+    [(2, 0), *[pytest.param(*one, marks=pytest.mark.slow) for one in ((2, 1), (2, 2), (3, 0))]],
+)
 def test_random_polynomials_are_found_in_every_well(dimension: int, seed: int) -> None:
     known = polynomial_system(dimension, seed=seed)
     found = portrait_of(known, 250 if dimension == 2 else 120, share=0.6)

@@ -380,7 +380,11 @@ def in_other_units(known: KnownSystem, scale: np.ndarray, speed: float, noise: f
 # The identity as D with states in thousandths, as in the resonator, is the last case: V is of order 1e-7.
 @pytest.mark.parametrize(
     ("scale", "speed", "noise"),
-    [([1e-3, 1e-3], 1e-4, 1.0), ([1e-3, 1e2], 7.0, 1.0), ([1e-3, 1e-3], 1.0, 1e6)],
+    [
+        pytest.param([1e-3, 1e-3], 1e-4, 1.0, marks=pytest.mark.slow),
+        ([1e-3, 1e2], 7.0, 1.0),
+        ([1e-3, 1e-3], 1.0, 1e6),
+    ],
 )
 def test_units_change_neither_the_residual_nor_the_degree(
     scale: list[float], speed: float, noise: float

@@ -189,7 +189,9 @@ def test_why_a_check_could_not_be_prepared_is_the_reason(
     assert said.reason.endswith("could not be prepared: the attractors cannot be told apart")
 
 
-@pytest.mark.parametrize("routes", [None, ("local", "network"), ("network",)])
+@pytest.mark.parametrize(
+    "routes", [None, pytest.param(("local", "network"), marks=pytest.mark.slow), ("network",)]
+)
 def test_why_a_training_failed_is_what_refinement_says_first(
     recordings: Recordings, analysis: Analysis, routes: tuple[str, ...] | None
 ) -> None:

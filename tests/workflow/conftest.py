@@ -55,6 +55,10 @@ class Project:
     def path(self, name: str) -> Path:
         return self.folder / name
 
+    def copied(self, folder: Path) -> Project:
+        """The same with all that it has made, to be changed."""
+        return Project(Path(shutil.copytree(self.folder, folder)))
+
     def start(self, *arguments: str, study: str = "study.yaml") -> subprocess.Popen[str]:
         # The profile's longer span would only let each of these short workflows end later.
         span = ("--max-jobs-per-timespan", "100/1s")

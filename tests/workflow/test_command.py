@@ -7,9 +7,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
+import pandas as pd
 import pytest
-
-from siq.cli.examples import double_well_recordings
 
 pytestmark = pytest.mark.workflow
 ROOT = Path(__file__).resolve().parents[2]
@@ -26,24 +26,52 @@ def siq(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_a_study_becomes_a_page_in_the_folder_in_which_one_works(tmp_path: Path) -> None:
+def two_wells() -> str:
+    """Recordings of ``dx/dt = x - x³, dy/dt = -y`` as a CSV file, by its solution."""
+    t, starts = np.linspace(0, 3, 61), np.random.default_rng(0).uniform(-1.5, 1.5, (60, 2))
+    rows = ["recording,t,x,y"]
+    for k, (first, second) in enumerate(starts):
+        x = first / np.sqrt(first**2 + (1 - first**2) * np.exp(-2 * t))
+        y = second * np.exp(-t)
+        rows += [
+            f"r{k},{at:.2f},{one!r},{two!r}" for at, one, two in zip(t, x.tolist(), y.tolist(), strict=True)
+        ]
+    return "\n".join(rows) + "\n"
+
+
+def test_recordings_become_a_page_in_the_folder_in_which_one_works(tmp_path: Path) -> None:
+    """Without a card and without networks, from a study beside the recordings."""
     work, data = tmp_path / "work", tmp_path / "my data"
     for folder in (work, data, work / "workflow", work / "config"):
         folder.mkdir()
     (work / "workflow" / "__init__.py").write_text("raise RuntimeError('another workflow')\n")
     (work / "config" / "config.yaml").write_text("samples: samples.tsv\n")
-    (data / "traps.csv").write_text(double_well_recordings(2, 4000))
-    (data / "study.yaml").write_text("name: traps\nrecordings: {file: traps.csv}\nlandscape: false\n")
+    (data / "wells.csv").write_text(two_wells())
+    (data / "study.yaml").write_text("name: wells\nrecordings: {file: wells.csv}\n")
     done = siq(
         work, "run", "../my data/study.yaml", "--cores", "2", "--", "--max-jobs-per-timespan", "100/1s"
     )
     assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[-1] == "The page to read: results/traps/report.html"
-    assert (work / "results" / "traps" / "report.html").is_file()
-    assert sorted(path.name for path in data.iterdir()) == ["study.yaml", "traps.csv"]
+    assert done.stdout.splitlines()[-1] == "The page to read: results/wells/report.html"
+    assert (work / "results" / "wells" / "report.html").is_file()
+    assert sorted(path.name for path in data.iterdir()) == ["study.yaml", "wells.csv"]
     assert "Reason:" not in done.stderr and len(done.stderr.splitlines()) < 10
     again = siq(work, "run", "../my data/study.yaml", "--dry-run")
     assert again.stdout == "Nothing would run: all is up to date.\n", again.stderr
+    results = work / "results" / "wells"
+    page = (results / "report.html").read_text(encoding="utf-8")
+    assert "The recordings show two stable states" in page
+    assert '<th scope="col">exact' not in page.lower()  # nobody knows it
+    landscape = pd.read_parquet(results / "tables" / "landscape.parquet")
+    assert list(landscape["kind"]) == ["attractor", "saddle", "attractor", "transition", "transition"]
+    ways = landscape[landscape["kind"] == "transition"]
+    np.testing.assert_allclose(ways["barrier"], 0.5, atol=1e-4)  # of U = x⁴/2 - x² + y² + 1/2
+    np.testing.assert_allclose(ways["minimum_action"], 0.5, atol=1e-4)
+    assert not (results / "tables" / "escape.parquet").exists()
+    # Nobody asked for networks, and nothing says that they failed.
+    assert not (results / "training").exists() and "published method" not in page
+    outcomes = pd.read_parquet(results / "tables" / "outcomes.parquet")
+    assert not set(outcomes["step"]) & {"train", "regress"}
 
 
 def test_a_job_that_refuses_its_input_is_heard_and_nothing_else(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from siq.errors import InputError
 from siq.study.tables import read_table
 from workflow.cases import CARD, STUDY, Cases
 
@@ -78,21 +79,22 @@ def test_a_folder_of_cases_is_diagnosed(fresh_project, tmp_path):
     assert (results / "verdict.json").stat().st_mtime_ns == before
 
 
+def test_who_asks_for_such_a_benchmark_is_told_what_to_get(monkeypatch):
+    monkeypatch.delenv("SIQ_RECORDINGS", raising=False)
+    with pytest.raises(InputError, match="SIQ_RECORDINGS"):
+        Cases({"mismatch": ["silverbox"]}).raw_file("silverbox")
+
+
+def test_no_folder_is_told_with_its_remedy():
+    with pytest.raises(InputError, match="--config, cases: no folder is given; write --config cases=DIR"):
+        Cases({}).in_folder()
+
+
 @pytest.mark.workflow
-@pytest.mark.parametrize(
-    ("arguments", "parts"),
-    [
-        ([], ("--config, cases: no folder is given", "cases=DIR")),
-        (["cases=nowhere"], ("nowhere: there is no such folder",)),
-        (["cases=."], (".: no folder in it is a case", "system.yaml")),
-        (["cases=broken"], ("broken/a/system.yaml, line 12 (equations.v)", "'kappa' is not declared")),
-    ],
-    ids=["no folder", "no such folder", "no case", "bad card"],
-)
-def test_a_bad_folder_is_told_in_one_sentence(fresh_project, arguments, parts):
+def test_a_bad_folder_is_told_in_one_sentence(fresh_project):
     write_case(fresh_project.path("broken") / "a", card=CARD_TEXT.replace("-k*x", "-kappa*x"))
-    config = ["--config", *arguments] if arguments else []
-    done = fresh_project.run("diagnose", *config, study="config/config.yaml")
+    parts = ("broken/a/system.yaml, line 12 (equations.v)", "'kappa' is not declared")
+    done = fresh_project.run("diagnose", "--config", "cases=broken", study="config/config.yaml")
     assert done.returncode != 0
     assert "Traceback" not in done.stdout
     assert not fresh_project.path("results").exists()
@@ -107,9 +109,6 @@ def test_a_benchmark_that_was_not_downloaded_is_told_and_the_rest_runs(fresh_pro
     done = fresh_project.run("mismatch", "--dry-run", study="config/config.yaml")
     assert done.returncode == 0, done.stdout[-2000:]
     assert "get SNLS80mV.csv of the Silverbox from nonlinearbenchmark.org" in done.stdout
-    asked = fresh_project.run("results/mismatch/silverbox/report.html", "-n", study="config/config.yaml")
-    assert asked.returncode != 0
-    assert "SIQ_RECORDINGS" in asked.stdout and "Traceback" not in asked.stdout
 
 
 @pytest.mark.parametrize(
@@ -129,6 +128,21 @@ def test_a_bad_case_is_told_with_its_file_place_and_remedy(tmp_path, files, stud
         (folder / STUDY).write_text(study)
     with pytest.raises(ValueError) as refused:
         Cases({"cases": str(tmp_path)}).in_folder()
+    for part in parts:
+        assert part in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("folder", "parts"),
+    [
+        ("nowhere", ("nowhere: there is no such folder",)),
+        (".", (".: no folder in it is a case", "system.yaml")),
+    ],
+)
+def test_a_folder_without_cases_is_told_with_its_remedy(tmp_path, monkeypatch, folder, parts):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError) as refused:
+        Cases({"cases": folder}).in_folder()
     for part in parts:
         assert part in str(refused.value)
 

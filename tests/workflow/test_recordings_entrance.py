@@ -1,9 +1,7 @@
-"""Recordings in the place of a simulation: the same data, the same answer."""
+"""Recordings in the place of a simulation: the same data, the same answer. See also `test_command`."""
 
 import shutil
 
-import numpy as np
-import pandas as pd
 import pytest
 
 pytestmark = pytest.mark.workflow
@@ -43,23 +41,3 @@ def test_both_entrances_give_the_same_answer_on_the_same_data(fresh_project, fin
     measured, resampled = (project.path(model).read_text() for model in models)
     assert measured == finished.path("results/mini/runs/000/model.json").read_text()
     assert measured != resampled
-
-
-def test_recordings_without_a_card_are_enough(fresh_project, finished):
-    project = fresh_project
-    shutil.copy(finished.path("results/mini/runs/000/recordings.parquet"), project.path("measured.parquet"))
-    project.path("study.yaml").write_text("name: measured\nrecordings: {file: measured.parquet}\n")
-    project.make("results/measured/report.html")
-    page = project.path("results/measured/report.html").read_text(encoding="utf-8")
-    assert "The recordings show two stable states" in page
-    assert '<th scope="col">exact' not in page.lower()  # nobody knows it
-    landscape = pd.read_parquet(project.path("results/measured/tables/landscape.parquet"))
-    assert list(landscape["kind"]) == ["attractor", "saddle", "attractor", "transition", "transition"]
-    ways = landscape[landscape["kind"] == "transition"]
-    np.testing.assert_allclose(ways["barrier"], 1.0, atol=1e-4)  # of U = x⁴ - 2x² + y² + z² + 1
-    np.testing.assert_allclose(ways["minimum_action"], 1.0, atol=1e-4)
-    assert not project.path("results/measured/tables/escape.parquet").exists()
-    # Nobody asked for networks, and nothing says that they failed.
-    assert not project.path("results/measured/training").exists() and "published method" not in page
-    outcomes = pd.read_parquet(project.path("results/measured/tables/outcomes.parquet"))
-    assert not set(outcomes["step"]) & {"train", "regress"}

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -22,55 +23,86 @@ NETWORKS = "results/mini/training/000-000/networks.npz"
 MODEL = "results/mini/runs/000/model.json"
 
 
-def changed(project, edit):
-    """Which of data, networks and model an edit makes again."""
-    before = project.modified(DATA, NETWORKS, MODEL)
-    edit()
-    project.make(MODEL)
-    return [new != old for new, old in zip(project.modified(DATA, NETWORKS, MODEL), before, strict=True)]
-
-
 def append(path, text="\n# edited\n"):
     path.write_text(path.read_text() + text)
 
 
-def test_only_what_depends_on_a_change_runs_again(fresh_project):
-    project = fresh_project
-    project.write_study()
+def would_run(project, *paths, change):
+    """The rules that would make the model of a run again if files had changed; they are put back."""
+    before = [(path, path.read_text(), path.stat()) for path in paths]
+    change()
+    planned = project.make("--dry-run", MODEL)
+    for path, text, seen in before:
+        path.write_text(text)
+        os.utime(path, ns=(seen.st_atime_ns, seen.st_mtime_ns))
+    table = planned.partition("Job stats:")[2].partition("total")[0]
+    return {line.split()[0] for line in table.splitlines() if line and line.split()[-1].isdigit()}
+
+
+def test_only_what_depends_on_a_change_runs_again(finished, tmp_path):
+    project = finished.copied(tmp_path / "project")
+    study, card = project.path("study.yaml"), project.path("config/systems/archetype3d.yaml")
+    regression = project.path("siq/networks/regression.py")
+    dynamics = project.path("siq/dynamics/simulation.py")
+    page = project.path("siq/report/sentences.py")
+
+    def what_no_model_depends_on():
+        append(page)
+        card.write_text(card.read_text().replace("Archetypal model", "Renamed model"))
+        os.utime(dynamics)
+
+    assert would_run(project, page, card, dynamics, change=what_no_model_depends_on) == set()
+    assert would_run(project, regression, change=lambda: append(regression)) == {"regress", "refine"}
+    steps = would_run(project, study, change=lambda: project.write_study(runs=2, steps=130))
+    assert steps == {"train", "regress", "refine"}
+    threshold = would_run(project, study, change=lambda: project.write_study(runs=2, threshold=0.2))
+    assert threshold == {"regress", "refine"}
+
+
+@pytest.mark.slow
+def test_what_a_plan_says_a_run_does(finished, tmp_path):
+    project = finished.copied(tmp_path / "project")
+    before = project.modified(DATA, NETWORKS, MODEL)
+    project.write_study(runs=2, threshold=0.2)
     project.make(MODEL)
-    assert changed(project, lambda: project.write_study(threshold=0.2)) == [False, False, True]
-    assert changed(project, lambda: append(project.path("siq/networks/regression.py"))) == [
-        False,
-        False,
-        True,
-    ]
-    assert changed(project, lambda: append(project.path("siq/report/sentences.py"))) == [False, False, False]
-    card = project.path("config/systems/archetype3d.yaml")
-    renamed = card.read_text().replace("Archetypal model", "Renamed model")
-    assert changed(project, lambda: card.write_text(renamed)) == [False, False, False]
-    assert changed(project, lambda: os.utime(project.path("siq/dynamics/simulation.py"))) == [
-        False,
-        False,
-        False,
-    ]
-    assert changed(project, lambda: project.write_study(threshold=0.2, steps=130)) == [False, True, True]
+    after = project.modified(DATA, NETWORKS, MODEL)
+    assert [new != old for new, old in zip(after, before, strict=True)] == [False, False, True]
 
 
-# The libraries are imported once; each script then runs in a fork that says which files of ours it loaded.
+# Each file is loaded once, and what it imports while it is loaded is noted: a script has loaded its own
+# imports and, from one to the next, those of what it imports.
 IMPORTS = """
-import json, os, pathlib, runpy, sys
-import matplotlib.pyplot, numpy, pandas, pysindy, scipy, sympy, torch
-root = pathlib.Path(sys.argv[1])
+import builtins, importlib, json, pathlib, runpy, sys
+root, usual = pathlib.Path(sys.argv[1]), builtins.__import__
+imported = {}
+
+def noted(name, given=None, local=None, members=(), level=0):
+    found = usual(name, given, local, members, level)
+    whole = (given or {}).get("__package__") if level else name
+    parts = [whole] if not level else [f"{whole}.{name}".rstrip(".")]
+    parts += [f"{parts[0]}.{each}" for each in members or ()]
+    imported.setdefault((given or {}).get("__file__"), []).extend(parts)
+    return found
+
+def files(name):
+    parts = name.split(".")
+    modules = [sys.modules.get(".".join(parts[: k + 1])) for k in range(len(parts))]
+    return [module.__file__ for module in modules if getattr(module, "__file__", None)]
+
+def loaded_by(file):
+    seen, waiting = set(), [file]
+    while waiting:
+        file = waiting.pop()
+        if file not in seen and pathlib.Path(file).is_relative_to(root):
+            seen.add(file)
+            waiting += [each for name in imported.get(file, ()) for each in files(name)]
+    return sorted(str(pathlib.Path(file).relative_to(root)) for file in seen)
+
+builtins.__import__ = noted
 for script in sys.argv[2:]:
-    if os.fork() == 0:
-        runpy.run_path(str(root / "workflow" / "scripts" / script), run_name="imported")
-        files = {getattr(module, "__file__", None) for module in list(sys.modules.values())}
-        ours = [pathlib.Path(file).resolve() for file in files if file]
-        ours = [str(file.relative_to(root)) for file in ours if file.is_relative_to(root)]
-        print(json.dumps([script, ours]), flush=True)
-        os._exit(0)
-    if os.wait()[1]:
-        sys.exit(f"{script} cannot be imported")
+    path = str(root / "workflow" / "scripts" / script)
+    runpy.run_path(path, run_name="imported")
+    print(json.dumps([script, loaded_by(path)]), flush=True)
 """
 
 
@@ -106,10 +138,14 @@ def wait_for(pattern, process, *, within, seconds=120):
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
-def test_an_interrupted_workflow_resumes_and_gives_the_same_tables(fresh_project, finished, how):
-    project = fresh_project
-    project.write_study(runs=2)
-    process = project.start("results/mini/report.html")
+def test_an_interrupted_workflow_resumes_and_gives_the_same_tables(finished, tmp_path, how):
+    """Interrupted while it trains one of two runs; the other has ended."""
+    project = finished.copied(tmp_path / "project")
+    for folder in ("training/000-000", "tables"):
+        shutil.rmtree(project.path(f"results/mini/{folder}"))
+    for name in ("regression", "model"):
+        project.path(f"results/mini/runs/000/{name}.json").unlink()
+    process = project.start("results/mini/tables/summary.parquet")
     wait_for("results/mini/training/000-000/kept-*.npz", process, within=project.folder)
     os.killpg(process.pid, how)
     process.communicate(timeout=60)
@@ -126,7 +162,7 @@ def test_an_interrupted_workflow_resumes_and_gives_the_same_tables(fresh_project
 def test_a_second_snakemake_waits_for_nobody_and_says_so(fresh_project):
     project = fresh_project
     project.write_study()
-    process = project.start(NETWORKS)
+    process = project.start(DATA)
     wait_for("results/mini/logs/000/draw.log", process, within=project.folder)
     # Held where it is, or on a busy machine it may have ended before the second has begun.
     process.send_signal(signal.SIGSTOP)

@@ -23,13 +23,16 @@ from siq.steps.identify import IdentifySettings
 from siq.steps.invariant import InvariantSettings
 from siq.steps.landscape import LandscapeSettings
 from siq.steps.landscape_errors import LandscapeErrorsSettings
-from siq.steps.of_study import card_content
+from siq.steps.of_study import card_content, card_content_beside
 from siq.steps.reference import ReferenceSettings
 from siq.steps.refine import RefineSettings
 from siq.steps.regress import RegressSettings
 from siq.steps.score import ScoreSettings
+from siq.steps.sweep import SweepSettings
+from siq.steps.sweep_points import PointSettings
 from siq.steps.train import TrainSettings
 from siq.study.study import load_published
+from siq.study.sweep import point_name
 from workflow.code_digest import code_digest
 from workflow.places import BASE, config_path, find_file
 from workflow.settings import Studies, prepare_environment
@@ -80,6 +83,34 @@ def settings_of(cls):
 def card_says(wildcards):
     """Params function: what a simulation takes from the card, so that another title reruns nothing."""
     return card_content(study_of(wildcards).system)
+
+
+def card_beside_sweep(wildcards):
+    """Params function: the same but for the values of what is swept, which each point has of its own."""
+    study = study_of(wildcards)
+    swept = study.study.sweep
+    return card_content_beside(study.card(), () if swept is None else swept.names)
+
+
+def points_of_sweep(wildcards):
+    """Input function: a file for every point of a sweep."""
+    swept = study_of(wildcards).study.sweep
+    names = (
+        [] if swept is None else [point_name(swept.names, one) for one in swept.points]
+    )
+    return expand(
+        "results/{study}/sweep/{point}.json", study=wildcards.study, point=names
+    )
+
+
+def with_sweep(name):
+    """Input function: a table of studies that sweep a parameter, none for others."""
+
+    def files(wildcards):
+        swept = study_of(wildcards).study.sweep is not None
+        return f"results/{wildcards.study}/tables/{name}.parquet" if swept else []
+
+    return files
 
 
 def exact_answer(wildcards):

@@ -41,6 +41,9 @@ rule equations_page:
         degrees="results/{study}/tables/degrees.parquet",
         certificates="results/{study}/tables/certificates.parquet",
         outcomes="results/{study}/tables/outcomes.parquet",
+        sweep=with_sweep("sweep"),
+        branches=with_sweep("branches"),
+        bifurcations=with_sweep("bifurcations"),
     output:
         html=report(
             "results/{study}/report.html",

@@ -25,6 +25,7 @@ from siq.report.interactive import interactive_view
 from siq.report.page import render_report
 from siq.report.plots import save_figure
 from siq.report.settings import PageSettings
+from siq.report.sweep_section import TABLES
 from siq.study.tables import read_table
 from step import job
 
@@ -34,9 +35,11 @@ if __name__ == "__main__":
         stored = read_landscape(now.input.quasipotential, dynamics=system)
         names = ("landscape", "degrees", "certificates", "outcomes")
         tables = {name: read_table(now.input[name]) for name in names}
+        tables |= {name: read_table(path) for name in TABLES if (path := now.given(name)) is not None}
+        study = now.settings(PageSettings).study
         drawn = Path(now.output.figures)
         drawn.mkdir(parents=True, exist_ok=True)
-        for name, figure in equations_figures(system, stored, tables["degrees"]).items():
+        for name, figure in equations_figures(system, stored, tables, study).items():
             if figure is not None:
                 save_figure(figure, drawn / name)
         view = None
@@ -52,7 +55,6 @@ if __name__ == "__main__":
             interactive=view,
         )
         versions = {"siq": siq.__version__} | {name: version(name) for name in ("numpy", "snakemake")}
-        study = now.settings(PageSettings).study
         page = equations_page(study, results, command=now.params.command, versions=versions)
         with whole_file(now.output.html) as partial:
             partial.write_text(render_report(page), encoding="utf-8")

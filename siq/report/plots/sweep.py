@@ -1,0 +1,162 @@
+"""A control parameter: where wells begin and end, how deep they are, how long they last."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from siq.report.plots.landscape_curves import COLOURS, LINE_STYLES, MARKERS
+from siq.report.plots.style import (
+    BLACK,
+    COLUMN_WIDTH,
+    GREY,
+    axis_label,
+    drawn_in_style,
+    energy_label,
+    unit_label,
+)
+from siq.report.said_landscape import well_name
+
+BIFURCATIONS = {"fold": "o", "Hopf": "s", "branch point": "D"}
+PANEL = 2.2  # inches
+
+
+@drawn_in_style
+def plot_sweep(
+    table: pd.DataFrame,
+    branches: pd.DataFrame,
+    bifurcations: pd.DataFrame,
+    *,
+    parameters: Sequence[str],
+    states: Sequence[str],
+    units: Mapping[str, str] | None = None,
+    state: str | None = None,
+) -> Figure:
+    """Draw a sweep.
+
+    Parameters
+    ----------
+    table, branches, bifurcations
+        As `siq.Sweep` has them.
+    parameters, states
+        Their names.
+    units
+        By name; of the time as ``t``.
+    state
+        Which state is drawn above; by default the first.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Of one parameter: equilibria, stable ones as lines of their well's colour and unstable ones dashed,
+        with folds, Hopf points and branch points; below it the lowest barrier of every well, and, where the
+        noise is known, how long each lasts and its share of time in the long run. Of two: maps of the number
+        of wells and of the lowest barrier.
+    """
+    units = units or {}
+    if len(parameters) > 1:
+        return _map(table, parameters, units)
+    place = 0 if state is None else list(states).index(state)
+    columns = [name for name in ("barrier", "mean_time", "weight") if np.isfinite(table[name]).any()]
+    figure = Figure(figsize=(COLUMN_WIDTH, PANEL * (1.2 + len(columns))))
+    rows = figure.subplots(
+        1 + len(columns), 1, sharex=True, squeeze=False, height_ratios=[1.2, *[1] * len(columns)]
+    )[:, 0]
+    _draw_branches(rows[0], branches, bifurcations, place)
+    rows[0].set_ylabel(axis_label(states[place], units.get(states[place], "1")))
+    labels = {
+        "barrier": energy_label("", what="barrier ΔU"),
+        "mean_time": "mean time "
+        + ("(time units)" if units.get("t", "1") in ("1", "") else unit_label(units["t"])),
+        "weight": "share of time",
+    }
+    for axes, name in zip(rows[1:], columns, strict=True):
+        _draw_wells(axes, table, name)
+        axes.set_ylabel(labels[name])
+        for value in bifurcations["value"]:
+            axes.axvline(value, color=GREY, linewidth=0.5, linestyle=":")
+    if "mean_time" in columns:
+        rows[1 + columns.index("mean_time")].set_yscale("log")
+    rows[-1].set_xlabel(axis_label(parameters[0], units.get(parameters[0], "1")))
+    figure.legend(handles=_handles(table, branches, bifurcations), loc="outside upper center", ncols=3)
+    return figure
+
+
+def _look(well: int) -> tuple[str, str, str]:
+    return COLOURS[well % len(COLOURS)], MARKERS[well % len(MARKERS)], LINE_STYLES[well % len(LINE_STYLES)]
+
+
+def _draw_branches(axes: Axes, branches: pd.DataFrame, bifurcations: pd.DataFrame, place: int) -> None:
+    positions = np.array([ast.literal_eval(text)[place] for text in branches["position"]], dtype=float)
+    for _, rows in branches.assign(state=positions).groupby("branch"):
+        # Neighbouring stretches share a point, or a gap would part them.
+        change = np.flatnonzero(np.diff(rows["well"].to_numpy())) + 1
+        ends = [0, *change, len(rows)]
+        for first, last in pairwise(ends):
+            some = rows.iloc[first : last + 1]
+            well = int(rows["well"].iloc[first])
+            colour, line, width = (_look(well)[0], "-", 1.6) if well >= 0 else (GREY, "--", 0.8)
+            axes.plot(some["value"], some["state"], color=colour, linestyle=line, linewidth=width)
+    for kind, marker in BIFURCATIONS.items():
+        rows = bifurcations[bifurcations["kind"] == kind]
+        at = [ast.literal_eval(text)[place] for text in rows["position"]]
+        axes.plot(rows["value"], at, linestyle="none", marker=marker, markersize=4.5, color=BLACK)
+
+
+def _draw_wells(axes: Axes, table: pd.DataFrame, name: str) -> None:
+    for well in sorted({int(one) for one in table["well"] if one >= 0}):
+        rows = table[table["well"] == well]
+        colour, marker, style = _look(well)
+        axes.plot(
+            rows["value"], rows[name], color=colour, linestyle=style, marker=marker, markersize=3,
+            linewidth=1.2,
+        )  # fmt: skip
+
+
+def _handles(table: pd.DataFrame, branches: pd.DataFrame, bifurcations: pd.DataFrame) -> list[Line2D]:
+    wells = sorted({int(well) for well in table["well"] if well >= 0})
+    handles = []
+    for well in wells:
+        colour, marker, style = _look(well)
+        handles.append(
+            Line2D([], [], color=colour, marker=marker, linestyle=style, markersize=3, label=well_name(well))
+        )
+    if (branches["well"] < 0).any():
+        handles.append(Line2D([], [], color=GREY, linestyle="--", linewidth=0.8, label="unstable"))
+    handles += [
+        Line2D([], [], color=BLACK, linestyle="none", marker=marker, markersize=4.5, label=kind)
+        for kind, marker in BIFURCATIONS.items()
+        if (bifurcations["kind"] == kind).any()
+    ]
+    return handles
+
+
+def _map(table: pd.DataFrame, parameters: Sequence[str], units: Mapping[str, str]) -> Figure:
+    """How many wells there are, and the lowest barrier among them, against two parameters."""
+    known = table.assign(one=(table["well"] >= 0).astype(float))
+    grid = known.groupby(["second_value", "value"])
+    count, lowest = grid["one"].sum().unstack(), grid["barrier"].min().unstack()
+    figure = Figure(figsize=(COLUMN_WIDTH, 2.6 * PANEL))
+    panels = figure.subplots(2, 1, sharex=True)
+    for axes, values, label in zip(
+        panels,
+        (count, lowest),
+        ("number of stable states", energy_label("", what="lowest barrier ΔU")),
+        strict=True,
+    ):
+        drawn = axes.pcolormesh(
+            values.columns, values.index, values.to_numpy(float), shading="nearest", cmap="cividis"
+        )
+        bar = figure.colorbar(drawn, ax=axes, label=label)
+        if values is count:
+            bar.set_ticks(sorted(set(count.to_numpy().ravel())))
+        axes.set_ylabel(axis_label(parameters[1], units.get(parameters[1], "1")))
+    panels[-1].set_xlabel(axis_label(parameters[0], units.get(parameters[0], "1")))
+    return figure

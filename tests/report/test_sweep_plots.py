@@ -1,0 +1,68 @@
+"""The figure of a sweep and its section of the page: what was found is drawn, and said."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import sympy
+
+from siq.dynamics.dynamics import Dynamics
+from siq.report.plots.sweep import plot_sweep
+from siq.report.sweep_section import sweep_figure, sweep_section
+from siq.steps.sweep import Sweep, sweep
+from siq.study.sweep import SweepOptions
+
+h, a, x = sympy.symbols("h a x", real=True)
+CUSP = Dynamics.of((x,), (h + a * x - x**3,), domain=[(-2, 2)], parameters={h: 0.0, a: 1.0})
+VALUES = [-0.5, 0.0, 0.2]
+
+
+@pytest.fixture(scope="module")
+def found() -> Sweep:
+    return sweep(CUSP, "h", VALUES, noise=0.04)
+
+
+def tables_of(found: Sweep) -> dict:
+    return {"sweep": found.table, "branches": found.branches, "bifurcations": found.bifurcations}
+
+
+def test_one_panel_for_equilibria_and_one_for_each_quantity_that_is_known(found):
+    above, *below = found.plot().axes
+    assert [axes.get_ylabel() for axes in below] == [
+        "barrier ΔU (unit of ε)", "mean time (time units)", "share of time",
+    ]  # fmt: skip
+    drawn = np.concatenate([line.get_ydata() for line in above.lines])
+    assert drawn.min() < -1.1 and drawn.max() > 1.08
+    assert below[-1].get_xlabel() == "$h$" and below[1].get_yscale() == "log"
+    quiet = sweep(CUSP, "h", VALUES)
+    assert len(quiet.plot().axes) == 2
+
+
+def test_two_parameters_are_a_map():
+    found = sweep(CUSP, "h", [0.0, 0.1], second=("a", [-0.5, 1.0]))
+    count, lowest = (axes.collections[0].get_array().reshape(2, 2) for axes in found.plot().axes[:2])
+    assert count.tolist() == [[1, 1], [2, 2]]
+    assert lowest[1, 0] == pytest.approx(0.5, rel=1e-4) and np.isnan(np.ma.filled(lowest, np.nan)[0, 0])
+
+
+def test_a_state_that_is_named_is_drawn(found):
+    axes = plot_sweep(
+        found.table, found.branches, found.bifurcations, parameters=("h",), states=("x",), state="x",
+        units={"x": "nM", "h": "1/s"},
+    ).axes  # fmt: skip
+    assert axes[0].get_ylabel() == "$x$ (nM)" and axes[-1].get_xlabel() == "$h$ (1/s)"
+
+
+def test_the_section_says_where_wells_end_and_what_was_not_found(found):
+    options = SweepOptions.model_validate({"parameter": "h", "values": VALUES})
+    table = found.table.assign(note=found.table["note"])
+    table.loc[table["value"] == -0.5, ["well", "note"]] = [-1, "it was too far"]
+    tables = tables_of(found) | {"sweep": table}
+    section = sweep_section(CUSP, options, tables, folder=Path("results/s/tables"), images={}, vectors={})
+    assert section.heading == "Against h"
+    assert "h has 3 values from -0.5 to 0.2: 3 landscapes" in section.text[0]
+    assert "fold at h = -0.3849" in section.text[1]
+    assert "No landscape at h = -0.5: it was too far." in section.notes
+    (shown,) = section.tables
+    assert list(shown.frame["what"]) == ["fold"]
+    assert len(sweep_figure(CUSP, options, tables).axes) == 4
