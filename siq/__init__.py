@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from siq.networks.training import train
     from siq.potential.storage import read_model
     from siq.potential.symbolic import SymbolicDecomposition
+    from siq.reference.system_table import reference_table
+    from siq.reference.systems import reference_systems
     from siq.report.plots.barriers import plot_barriers
     from siq.report.plots.diagnosis import plot_diagnosis
     from siq.report.plots.quasipotential import plot_quasipotential
@@ -84,6 +86,8 @@ __all__ = [
     "read_case",
     "read_model",
     "read_recordings",
+    "reference_systems",
+    "reference_table",
     "simulate_snapshots",
     "snapshot_pairs",
     "solve_case",
@@ -129,6 +133,8 @@ _MODULES = {
     "read_case": "siq.mismatch.case",
     "read_model": "siq.potential.storage",
     "read_recordings": "siq.data.recordings",
+    "reference_systems": "siq.reference.systems",
+    "reference_table": "siq.reference.system_table",
     "simulate_snapshots": "siq.dynamics.simulation",
     "snapshot_pairs": "siq.data.recordings",
     "solve_case": "siq.mismatch.diagnosis",

@@ -9,6 +9,9 @@
 `mesh`             what is V on a mesh of two states, found without any ansatz?
 `fokker_planck`    how long do visits last, and where are states, whatever the barriers?
 `escapes`          how long does an escape take in a simulation?
+`systems`          of which systems is the landscape known? (`siq.reference_systems`)
+`known_barriers`   how high are their barriers, and how is that known?
+`system_table`     all of it as a table (`siq.reference_table`)
 =================  ===============================================================
 
 Imports `siq.estimation` and what it may import; uses `siq.dynamics` only.

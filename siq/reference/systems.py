@@ -1,0 +1,276 @@
+"""Reference systems: whose quasipotential is known, and how well.
+
+The noise is ``dX = f dt + √ε σ dW`` in the sense of Itô, with ``D = σσᵀ``; U is the quasipotential, so that
+states are found with a density that goes as ``exp(-U/ε)`` and are left after times that go as ``exp(ΔU/ε)``.
+U solves ``f·∇U + ½ ∇U·D∇U = 0``. Other texts have ``√(2ε) dW``: their ε is half of this one, and their V is
+U/2.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.optimize
+import sympy
+
+from siq.dynamics.dynamics import Dynamics
+from siq.reference.known_barriers import DOUBLY_COMPUTED, KnownBarrier, barrier_of
+
+X, Y, Z, V = sympy.symbols("x y z v", real=True)
+HALF, TENTH = sympy.Rational(1, 2), sympy.Rational(1, 10)
+
+
+@dataclass(frozen=True)
+class ReferenceSystem:
+    """A system, and what is known of its landscape.
+
+    Attributes
+    ----------
+    name, about
+        In a word, and in a sentence.
+    source
+        Where it comes from.
+    dynamics
+        f, D and the domain.
+    quasipotential
+        U as a formula that holds in the whole domain, up to a constant; None where nobody knows one.
+    barriers
+        Between attractors, known exactly or by two methods.
+    """
+
+    name: str
+    about: str
+    source: str
+    dynamics: Dynamics
+    quasipotential: sympy.Expr | None
+    barriers: tuple[KnownBarrier, ...]
+
+
+def reference_systems() -> dict[str, ReferenceSystem]:
+    """Every system whose landscape is known exactly, or was computed by two methods, by name.
+
+    Returns
+    -------
+    dict
+        New objects at every call.
+
+    Examples
+    --------
+    >>> import siq
+    >>> systems = siq.reference_systems()
+    >>> systems["maier-stein"].quasipotential
+    x**4/2 - x**2 + y**2*(x**2 + 1) + 1/2
+    >>> systems["maier-stein"].barriers[0].value
+    0.5
+    """
+    return {name: build(name) for name, build in _BUILDERS.items()}
+
+
+def _exact(
+    name: str,
+    about: str,
+    source: str,
+    dynamics: Dynamics,
+    quasipotential: sympy.Expr,
+    ways: tuple[tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]], ...] = (),
+) -> ReferenceSystem:
+    """A system whose U is a formula; ways are attractor, saddle and the attractor behind it, about where."""
+    barriers = tuple(
+        barrier_of(dynamics, quasipotential, *(_settled(dynamics, place) for place in way)) for way in ways
+    )
+    return ReferenceSystem(name, about, source, dynamics, quasipotential, barriers)
+
+
+def _settled(dynamics: Dynamics, place: tuple[float, ...]) -> np.ndarray:
+    """The equilibrium near a place, shape ``(d,)``, to rounding."""
+    found = scipy.optimize.root(
+        lambda x: dynamics.drift(x[None])[0],
+        np.array(place, dtype=float),
+        jac=lambda x: dynamics.jacobian(x[None])[0],
+        tol=1e-14,
+    )
+    return np.asarray(found.x)
+
+
+def _linear(name: str) -> ReferenceSystem:
+    hessian = sympy.Matrix([[2, 1], [1, 3]]) / 2
+    noise = sympy.Matrix([[2, HALF], [HALF, 1]])
+    turning = sympy.Matrix([[0, -3], [3, 0]])
+    states = sympy.Matrix([X, Y])
+    field = (turning - noise) * hessian * states
+    dynamics = Dynamics.of(
+        (X, Y), tuple(map(sympy.expand, field)), diffusion=_numbers(noise), domain=[(-2, 2)] * 2
+    )
+    potential = sympy.expand((states.T * hessian * states)[0])
+    return _exact(
+        name, "A linear system that turns, with a full D.", "Lyapunov's equation", dynamics, potential
+    )
+
+
+def _double_well(name: str) -> ReferenceSystem:
+    potential = (X**2 - 1) ** 2 / 2 - X / 5
+    dynamics = Dynamics.of((X,), (X - X**3 + TENTH,), domain=[(-2, 2)])
+    ways = (((-1.0,), (0.0,), (1.0,)), ((1.0,), (0.0,), (-1.0,)))
+    return _exact(
+        name,
+        "A tilted double well of one state.",
+        "Kramers, Physica 7, 284 (1940)",
+        dynamics,
+        potential,
+        ways,
+    )
+
+
+def _growing_noise(name: str) -> ReferenceSystem:
+    potential = X**2 - 2 * sympy.log(1 + X**2)
+    dynamics = Dynamics.of((X,), (X - X**3,), diffusion=[[1 + X**2]], domain=[(-2, 2)])
+    ways = (((-1.0,), (0.0,), (1.0,)),)
+    return _exact(
+        name, "A double well whose noise grows with the state.", "U' = -2f/D", dynamics, potential, ways
+    )
+
+
+def _archetype(name: str) -> ReferenceSystem:
+    potential = (X**2 - 1) ** 2 + Y**2 + Z**2
+    slope = [potential.diff(each) / 2 for each in (X, Y, Z)]
+    field = (-slope[0] - slope[1] - slope[2], -slope[1] + slope[0], -slope[2] + slope[0])
+    dynamics = Dynamics.of(
+        (X, Y, Z), tuple(map(sympy.expand, field)), domain=[(-2, 2), (-1.5, 1.5), (-1.5, 1.5)]
+    )
+    ways = (((-1.0, 0.0, 0.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0)),)
+    return _exact(
+        name, "Two wells of three states with a circulation.",
+        "the archetype of the paper that siq implements", dynamics, potential, ways,
+    )  # fmt: skip
+
+
+def _maier_stein(beta: int) -> Dynamics:
+    return Dynamics.of((X, Y), (X - X**3 - beta * X * Y**2, -(1 + X**2) * Y), domain=[(-2, 2), (-1, 1)])
+
+
+def _maier_stein_exact(name: str) -> ReferenceSystem:
+    potential = X**4 / 2 - X**2 + (1 + X**2) * Y**2 + HALF
+    ways = (((-1.0, 0.0), (0.0, 0.0), (1.0, 0.0)),)
+    return _exact(
+        name, "Maier and Stein's system with β = 1, where its drift has a potential.",
+        "Maier and Stein, Phys. Rev. Lett. 71, 1783 (1993)", _maier_stein(1), potential, ways,
+    )  # fmt: skip
+
+
+def _maier_stein_computed(beta: int) -> Callable[[str], ReferenceSystem]:
+    def build(name: str) -> ReferenceSystem:
+        return ReferenceSystem(
+            name,
+            f"Maier and Stein's system with β = {beta}: paths leave the axis, and U has a kink on it.",
+            "Maier and Stein, Phys. Rev. Lett. 71, 1783 (1993)",
+            _maier_stein(beta),
+            None,
+            DOUBLY_COMPUTED[name],
+        )
+
+    return build
+
+
+def _consumer_resource(name: str) -> ReferenceSystem:
+    alpha, beta, gamma, mu = (
+        sympy.Rational(*each) for each in ((154, 100), (1014, 100), (476, 1000), (112509, 1000000))
+    )
+    eaten = X**2 * Y / (1 + X**2)
+    return ReferenceSystem(
+        name,
+        "A consumer with a resource; predation levels off (Holling's type III).",
+        "Collie and Spencer (1994), as Moore et al., The R Journal 8, 19 (2016) take it, with D = 1",
+        Dynamics.of(
+            (X, Y), (alpha * X * (1 - X / beta) - eaten, gamma * eaten - mu * Y**2), domain=[(0, 8)] * 2
+        ),
+        None,
+        DOUBLY_COMPUTED[name],
+    )
+
+
+def _toggle(name: str) -> ReferenceSystem:
+    return ReferenceSystem(
+        name,
+        "Two genes that switch each other off, with D = 1.",
+        "Gardner, Cantor and Collins, Nature 403, 339 (2000)",
+        Dynamics.of((X, Y), (3 / (1 + Y**2) - X, 3 / (1 + X**2) - Y), domain=[(0, 4)] * 2),
+        None,
+        DOUBLY_COMPUTED[name],
+    )
+
+
+def _chain(name: str) -> ReferenceSystem:
+    count = 10
+    states = sympy.symbols(f"x:{count}", real=True)
+    well = sum(((s**2 - 1) ** 2 / 4 for s in states), sympy.S.Zero)
+    potential = well + sum((HALF * (a - b) ** 2 for a, b in itertools.pairwise(states)), sympy.S.Zero)
+    slope = [potential.diff(s) for s in states]
+    field = [-each for each in slope]
+    for place in range(count - 1):
+        field[place] += slope[place + 1]
+        field[place + 1] -= slope[place]
+    dynamics = Dynamics.of(states, tuple(map(sympy.expand, field)), domain=[(-2, 2)] * count)
+    return _exact(
+        name, "Ten bistable units in a row that turn about each other: f = (A - 1)∇Φ, U = 2Φ.",
+        "any f = (A - 1)∇Φ with A constant and antisymmetric", dynamics, 2 * potential,
+    )  # fmt: skip
+
+
+def _particle(name: str) -> ReferenceSystem:
+    place = (X**2 - 1) ** 2 / 4 - X / 10
+    friction = HALF
+    dynamics = Dynamics.of(
+        (X, V),
+        (V, sympy.expand(-place.diff(X) - friction * V)),
+        diffusion=[[0, 0], [0, 1]],
+        domain=[(-2, 2)] * 2,
+    )
+    ways = (((-1.0, 0.0), (0.0, 0.0), (1.0, 0.0)), ((1.0, 0.0), (0.0, 0.0), (-1.0, 0.0)))
+    potential = 2 * friction * (V**2 / 2 + place)
+    return _exact(
+        name, "A damped particle in a tilted double well, with noise on its velocity alone.",
+        "Kramers, Physica 7, 284 (1940)", dynamics, potential, ways,
+    )  # fmt: skip
+
+
+def _point_and_cycle(name: str) -> ReferenceSystem:
+    inner, outer, turns = sympy.Rational(1, 4), sympy.S.One, 2
+    square = X**2 + Y**2
+    half = square**3 / 6 - (inner + outer) * square**2 / 4 + inner * outer * square / 2
+    field = (-half.diff(X) - turns * Y, -half.diff(Y) + turns * X)
+    dynamics = Dynamics.of((X, Y), tuple(map(sympy.expand, field)), domain=[(-1.5, 1.5)] * 2)
+    value = float(2 * half.subs({X: HALF, Y: 0}))
+    beyond = value - float(2 * half.subs({X: 1, Y: 0}))
+    origin, edge, circle = np.zeros(2), np.array([0.5, 0.0]), np.array([1.0, 0.0])
+    how = "exact; any point of the circles"
+    barriers = (
+        KnownBarrier(origin, edge, circle, value, 0.0, np.nan, how),
+        KnownBarrier(circle, edge, origin, beyond, 0.0, np.nan, how),
+    )
+    return ReferenceSystem(
+        name, "A stable point within a stable limit cycle, and an unstable cycle between them.",
+        "V' = r(r² - a²)(r² - b²) with a turn", dynamics, 2 * half, barriers,
+    )  # fmt: skip
+
+
+_BUILDERS: Mapping[str, Callable[[str], ReferenceSystem]] = {
+    "linear": _linear,
+    "double-well": _double_well,
+    "growing-noise": _growing_noise,
+    "archetype": _archetype,
+    "maier-stein": _maier_stein_exact,
+    "maier-stein-5": _maier_stein_computed(5),
+    "maier-stein-10": _maier_stein_computed(10),
+    "consumer-resource": _consumer_resource,
+    "toggle": _toggle,
+    "chain": _chain,
+    "particle": _particle,
+    "point-and-cycle": _point_and_cycle,
+}
+
+
+def _numbers(matrix: sympy.Matrix) -> np.ndarray:
+    return np.array(matrix.tolist(), dtype=float)
