@@ -22,9 +22,10 @@ from siq.report.answer import Answer
 from siq.report.certificate_text import certificate_badge, tests_table
 from siq.report.drawn_landscape import DrawnLandscape, drawn_data
 from siq.report.formatting import formula_matrix_mathml, matrix_mathml
+from siq.report.invariant_tables import invariant_tables
 from siq.report.landscape_answer import headline, remarks, wells_table
 from siq.report.landscape_tables import landscape_tables
-from siq.report.page import FormulaRow, ReportContent, ReportSection, ReportTable
+from siq.report.page import FormulaRow, ReportContent, ReportFigure, ReportSection, ReportTable
 from siq.report.plots.landscape_curves import plot_degrees
 from siq.report.plots.quasipotential import quasipotential_figure
 from siq.report.study_captions import OF_EQUATIONS, OF_ONE_EQUATION, Part, figure_of, figures_of
@@ -34,15 +35,28 @@ from siq.steps.outcomes import Method, Status
 from siq.study.study import Study
 
 LEAD = "quasipotential"
-PRINTED = ("name", "title", "system", "from", "seed", "refinement", "certificate", "landscape", "sweep")
+DENSITY = "invariant"
+PRINTED = (
+    "name",
+    "title",
+    "system",
+    "from",
+    "seed",
+    "refinement",
+    "certificate",
+    "landscape",
+    "invariant",
+    "sweep",
+)
 """Keys of the study that equations have a use for."""
 
 METHOD = (
-    "Nothing was simulated, recorded or learned. Equilibria were sought by Newton's method over the whole"
+    "Nothing was recorded or learned. Equilibria were sought by Newton's method over the whole"
     " domain; the paths of least action lead from each stable state to the saddles next to it, and give the"
     " barriers."
     " U about each stable state solves the Hamilton–Jacobi equation of f, in powers up to the degree that its"
-    " residual asked for, and has to pass the tests of the certificate."
+    " residual asked for, and has to pass the tests of the certificate. A simulation serves"
+    " for comparison with the invariant distribution alone, where this was asked for."
 )
 
 
@@ -208,8 +222,22 @@ def _evidence(results: EquationsResults) -> ReportSection | None:
 
 def _landscape(study: Study, results: EquationsResults) -> ReportSection | None:
     noises = () if study.landscape is None else study.landscape.noise_intensities
-    found = landscape_tables(results.data, results.tables["landscape"], noises=noises, folder=results.folder)
-    return ReportSection("The landscape in full", tables=found) if found else None
+    tables, folder = results.tables, results.folder
+    found = landscape_tables(results.data, tables["landscape"], noises=noises, folder=folder)
+    figures: list[ReportFigure] = []
+    notes = []
+    if "invariant" in tables:
+        found += invariant_tables(tables["invariant"], tables["well_shares"], folder)
+        images = {name: image for name, image in results.images.items() if name == DENSITY}
+        figures = figures_of(Part.LANDSCAPE, images, results.vectors, beside_paper=False)
+        if tables["invariant"].empty:
+            notes = [
+                "The invariant distribution was asked for, and U is not known as a formula in enough of the"
+                " domain to say it."
+            ]
+    return (
+        ReportSection("The landscape in full", tables=found, figures=figures, notes=notes) if found else None
+    )
 
 
 def _sweep(study: Study, results: EquationsResults) -> ReportSection | None:
@@ -222,7 +250,7 @@ def _sweep(study: Study, results: EquationsResults) -> ReportSection | None:
 
 
 def _workings(results: EquationsResults) -> ReportSection:
-    images = {name: image for name, image in results.images.items() if name != LEAD}
+    images = {name: image for name, image in results.images.items() if name not in (LEAD, DENSITY)}
     figures = figures_of(Part.WORKINGS, images, results.vectors, beside_paper=False)
     return ReportSection("The workings", [METHOD], figures=figures, folded=True)
 

@@ -93,7 +93,7 @@ class RecordingsOptions(BaseModel):
 
 
 OF_TRAJECTORIES = (
-    "recordings", "runs", "published", "simulation", "identification", "regression", "training", "invariant",
+    "recordings", "runs", "published", "simulation", "identification", "regression", "training",
 )  # fmt: skip
 """Keys of a study that equations have no use for."""
 

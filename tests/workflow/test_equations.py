@@ -3,6 +3,7 @@
 import json
 import re
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -30,10 +31,10 @@ landscape: {noise_intensities: [0.05]}
 @pytest.mark.slow
 def test_equations_alone_give_the_page(fresh_project):
     fresh_project.path("wells.yaml").write_text(CARD)
-    fresh_project.path("study.yaml").write_text(STUDY)
+    fresh_project.path("study.yaml").write_text(STUDY + "invariant: [0.1]\n")
     fresh_project.make("results/mini/report.html")
     results = fresh_project.path("results/mini")
-    for name in ("landscape", "degrees", "certificates", "outcomes"):
+    for name in ("landscape", "degrees", "certificates", "outcomes", "invariant", "well_shares"):
         table = pd.read_parquet(results / "tables" / f"{name}.parquet")
         assert list(table.columns) == list(COLUMNS[name]) and len(table)
     landscape = pd.read_parquet(results / "tables" / "landscape.parquet")
@@ -43,7 +44,14 @@ def test_equations_alone_give_the_page(fresh_project):
     answer = json.loads((results / "answer.json").read_text())
     assert answer["certified"] == "all" and answer["sentence"].startswith("The equations have two stable")
     page = (results / "report.html").read_text()
-    assert "Nothing was simulated" in page and "recorded states" not in page
+    density = pd.read_parquet(results / "tables" / "invariant.parquet").iloc[0]
+    # U = (x² - 1)²/2 + y²: the quadrature over the domain, and a long simulation of the card.
+    x = np.linspace(-2, 2, 4001)
+    exact = np.trapezoid(np.exp(-((x**2 - 1) ** 2) / 0.2), x) * np.sqrt(0.1 * np.pi)
+    assert density["quadrature"] == pytest.approx(exact, rel=0.01)  # where U is known
+    assert density["simulated_distance"] < 3 * density["sampling_floor"]
+    assert "The wells' shares" in page and (results / "figures" / "invariant.svg").exists()
+    assert "Nothing was recorded or learned" in page and "recorded states" not in page
     assert not (results / "runs").exists()
 
 
@@ -100,7 +108,15 @@ def test_a_parameter_that_the_card_has_not_is_refused(fresh_project):
 
 def test_a_sweep_is_planned_as_a_job_for_each_value(fresh_project):
     fresh_project.path("wells.yaml").write_text(tilted())
-    fresh_project.path("study.yaml").write_text(STUDY + SWEEP.format(first=0, last=0.5))
+    fresh_project.path("study.yaml").write_text(
+        STUDY + SWEEP.format(first=0, last=0.5) + "invariant: [0.1]\n"
+    )
     planned = fresh_project.make("-n", "results/mini/report.html").partition("Job stats:")[2]
-    for rule, count in (("sweep_point", 3), ("sweep", 1), ("equations", 1), ("equations_page", 1)):
+    for rule, count in (
+        ("sweep_point", 3),
+        ("sweep", 1),
+        ("equations", 1),
+        ("equations_invariant", 1),
+        ("equations_page", 1),
+    ):
         assert re.search(rf"^{rule} +{count}$", planned, flags=re.MULTILINE), planned

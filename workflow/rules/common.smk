@@ -113,6 +113,19 @@ def with_sweep(name):
     return files
 
 
+def with_invariant(path):
+    """Input function: a file of studies of equations that ask for the invariant distribution, none for others."""
+
+    def files(wildcards):
+        return (
+            path.format(study=wildcards.study)
+            if study_of(wildcards).study.invariant
+            else []
+        )
+
+    return files
+
+
 def exact_answer(wildcards):
     """Params function: the card's exact answer, which scoring alone depends on."""
     return study_of(wildcards).exact()

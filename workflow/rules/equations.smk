@@ -3,6 +3,7 @@
 
 ruleorder: equations > collect
 ruleorder: equations_page > page
+ruleorder: equations_invariant > invariant
 
 
 rule equations:
@@ -33,6 +34,33 @@ rule equations:
         "../scripts/equations.py"
 
 
+rule equations_invariant:
+    input:
+        card=card_if_any,
+        quasipotential="results/{study}/quasipotential.json",
+    output:
+        table="results/{study}/tables/invariant.parquet",
+        shares="results/{study}/tables/well_shares.parquet",
+        drawn=directory("results/{study}/drawn/invariant"),
+    log:
+        "results/{study}/logs/invariant.log",
+    benchmark:
+        "results/{study}/benchmarks/invariant.tsv"
+    wildcard_constraints:
+        study=STUDIES.pattern_of("equations"),
+    conda:
+        "../envs/siq.yaml"
+    threads: 1
+    params:
+        code=code("equations_invariant.py"),
+        settings=settings_of(InvariantSettings),
+        card=card_says,
+    message:
+        "{wildcards.study}: computing the invariant distribution"
+    script:
+        "../scripts/equations_invariant.py"
+
+
 rule equations_page:
     input:
         card=card_if_any,
@@ -44,6 +72,9 @@ rule equations_page:
         sweep=with_sweep("sweep"),
         branches=with_sweep("branches"),
         bifurcations=with_sweep("bifurcations"),
+        invariant=with_invariant("results/{study}/tables/invariant.parquet"),
+        well_shares=with_invariant("results/{study}/tables/well_shares.parquet"),
+        density=with_invariant("results/{study}/drawn/invariant"),
     output:
         html=report(
             "results/{study}/report.html",

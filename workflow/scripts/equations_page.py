@@ -4,6 +4,7 @@ from workflow.warm import run_warm
 
 run_warm()
 
+import shutil
 from importlib.metadata import version
 from pathlib import Path
 
@@ -35,13 +36,16 @@ if __name__ == "__main__":
         stored = read_landscape(now.input.quasipotential, dynamics=system)
         names = ("landscape", "degrees", "certificates", "outcomes")
         tables = {name: read_table(now.input[name]) for name in names}
-        tables |= {name: read_table(path) for name in TABLES if (path := now.given(name)) is not None}
+        asked = (*TABLES, "invariant", "well_shares")
+        tables |= {name: read_table(path) for name in asked if (path := now.given(name)) is not None}
         study = now.settings(PageSettings).study
         drawn = Path(now.output.figures)
         drawn.mkdir(parents=True, exist_ok=True)
         for name, figure in equations_figures(system, stored, tables, study).items():
             if figure is not None:
                 save_figure(figure, drawn / name)
+        if (density := now.given("density")) is not None:
+            shutil.copytree(density, drawn, dirs_exist_ok=True)
         view = None
         if stored is not None and system.dimension > 2:
             view = Markup(interactive_view(drawn_of(system, stored)))
