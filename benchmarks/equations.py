@@ -50,6 +50,10 @@ CASES: dict[str, str | Path | siq.Dynamics] = {
         (X, Y), (5 / (1 + Y**4) - X, 5 / (1 + X**4) - Y), domain=[(0, 6)] * 2
     ),
     "trigonometric": siq.Dynamics.of((X, Y), LATTICE, domain=[(-3.5, 8)] * 2),
+    "Schlögl": SYSTEMS / "schloegl.yaml",
+    "spruce budworm": SYSTEMS / "budworm.yaml",
+    "overturning circulation": SYSTEMS / "stommel.yaml",
+    "FitzHugh–Nagumo": SYSTEMS / "fitzhugh-nagumo.yaml",
     "particle, damping 0.5": particles(1, 0.5),
     "particle, damping 0.1": particles(1, 0.1),
     "two particles": particles(2, 1.0),

@@ -107,12 +107,17 @@ def _computed(
 
 _LOW, _PASS, _HIGH = (1.40491203, 2.80807973), (4.20080731, 4.00388242), (4.90395384, 4.06187119)
 _ON, _OFF, _EVEN = (2.61803399, 0.38196601), (0.38196601, 2.61803399), (1.21341166, 1.21341166)
+_UP, _DOWN = (0.81649658, 0.27216553), (-0.81649658, -0.27216553)
 DOUBLY_COMPUTED: Mapping[str, tuple[KnownBarrier, ...]] = {
     "maier-stein-5": (_computed((-1.0, 0.0), (0.0, 0.0), (1.0, 0.0), 0.4830697094, 1e-9),),
     "maier-stein-10": (_computed((-1.0, 0.0), (0.0, 0.0), (1.0, 0.0), 0.3400414034, 1e-9),),
     "consumer-resource": (
         _computed(_LOW, _PASS, _HIGH, 0.0122596486, 1e-9),
         _computed(_HIGH, _PASS, _LOW, 0.0018932179, 1e-9),
+    ),
+    "fitzhugh-nagumo": (
+        _computed(_UP, (0.0, 0.0), _DOWN, 0.1788869290, 1e-9),
+        _computed(_DOWN, (0.0, 0.0), _UP, 0.1788869290, 1e-9),
     ),
     "toggle": (
         _computed(_ON, _EVEN, _OFF, 0.1767588206, 1e-9),

@@ -202,6 +202,17 @@ def _toggle(name: str) -> ReferenceSystem:
     )
 
 
+def _fitzhugh_nagumo(name: str) -> ReferenceSystem:
+    return ReferenceSystem(
+        name,
+        "FitzHugh and Nagumo's system where it is bistable, with D = 1.",
+        "FitzHugh, Biophysical Journal 1, 445 (1961)",
+        Dynamics.of((X, Y), (X - X**3 - Y, X - 3 * Y), domain=[(-1.5, 1.5), (-0.8, 0.8)]),
+        None,
+        DOUBLY_COMPUTED[name],
+    )
+
+
 def _chain(name: str) -> ReferenceSystem:
     count = 10
     states = sympy.symbols(f"x:{count}", real=True)
@@ -266,6 +277,7 @@ _BUILDERS: Mapping[str, Callable[[str], ReferenceSystem]] = {
     "maier-stein-10": _maier_stein_computed(10),
     "consumer-resource": _consumer_resource,
     "toggle": _toggle,
+    "fitzhugh-nagumo": _fitzhugh_nagumo,
     "chain": _chain,
     "particle": _particle,
     "point-and-cycle": _point_and_cycle,

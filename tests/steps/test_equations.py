@@ -18,6 +18,7 @@ from known_systems import (
     maier_stein,
     potential_values,
 )
+from scipy.integrate import quad
 
 from siq.dynamics.cards import load_system
 from siq.dynamics.dynamics import Dynamics
@@ -27,7 +28,7 @@ from siq.landscape.options import LandscapeOptions
 from siq.landscape.paths import minimum_action_path
 from siq.landscape.refusal import NoLandscape
 from siq.reference.mesh import mesh_quasipotential
-from siq.steps.equations import EquationSettings
+from siq.steps.equations import EquationSettings, landscape_of_equations
 
 X, Y, Z = sympy.symbols("x y z", real=True)
 SYSTEMS = Path(__file__).parents[2] / "config" / "systems"
@@ -269,3 +270,20 @@ def test_formulas_hold_where_noise_acts_on_one_state_and_nothing_is_conserved(ca
             path = minimum_action_path(system, well.attractor, end)
             error = max(landscape.certificate.error, 1e-5) * well.level
             assert well.values(end[None])[0] == pytest.approx(path.action / 2, abs=2 * error)
+
+
+@pytest.mark.parametrize("name", ["schloegl", "budworm", "stommel"])
+def test_barriers_of_textbook_systems_of_one_state_are_those_of_a_quadrature(name: str) -> None:
+    """``ΔU = -∫ 2f/D dx`` from the attractor to the threshold, with the D(x) of chemistry in one of them."""
+    system = load_system(SYSTEMS / f"{name}.yaml")
+    landscape = landscape_of_equations(system, EquationSettings(), formulas=False)
+    assert len(landscape.attractors) == 2
+
+    def slope(x: float) -> float:
+        at = np.array([[x]])
+        return float(-2 * system.drift(at)[0, 0] / system.diffusion.at(at)[0, 0, 0])
+
+    for way in landscape.transitions:
+        start = landscape.attractors[way.start].position[0]
+        exact, _ = quad(slope, start, way.saddle.position[0], epsabs=1e-13)
+        assert way.barrier == pytest.approx(exact, rel=1e-7)
