@@ -32,9 +32,7 @@ from siq.dynamics.dynamics import Dynamics
 from siq.errors import NumericalFailure
 from siq.landscape.paths import MinimumActionPath
 
-KNOWN = (
-    0.9  # Υ below which the law of many degrees of freedom is refused: it would be off by more than a tenth
-)
+KNOWN = 0.9  # Υ below which the law of many degrees of freedom is refused: it is off by more than a tenth
 RETURNED = 0.5  # of the farthest distance from the saddle: a path that has come back so close has made a turn
 SEARCHED = 2000  # steps in search of the turning point beyond the saddle
 FARTHEST = 20.0  # distances from the saddle to the attractor, up to which it is sought
@@ -66,7 +64,7 @@ class TurnLoss:
         >>> round(TurnLoss(1.0, exact=True).factor(0.01), 3)
         1.0
         >>> round(TurnLoss(1.0, 1.0, exact=True).factor(1.0), 3)
-        0.348
+        0.306
         """
         own = depopulation(self.own / intensity)
         if not self.exact:

@@ -68,7 +68,8 @@ def test_whole_trajectories_end_where_steps_at_all_samples_do() -> None:
         substeps=strict.substeps,
     )  # fmt: skip
     np.testing.assert_allclose(again.model.values, strict.model.values, rtol=0.02)
-    assert again.sum_of_squares == pytest.approx(strict.sum_of_squares, abs=0.5)
+    # Either may stop short along what is hardly told, by as much as a machine's rounding decides.
+    assert again.sum_of_squares == pytest.approx(strict.sum_of_squares, rel=0.02)
 
 
 def test_nothing_is_expected_of_fixed_parameters_and_of_zeros() -> None:
