@@ -11,9 +11,11 @@ J. D. Skufca, J. A. Yorke, B. Eckhardt, Phys. Rev. Lett. 96 (2006) 174101: edge 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
+import scipy.optimize
 
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.equilibria import Equilibrium, classify, distinct_roots, follow
@@ -25,6 +27,8 @@ ROUNDS = 40
 BENT = 0.05  # of the box, by which the first way leaves the straight line, where symmetry may hold it
 MOST_STEPS = 20_000  # of integration, until two states have come apart
 ACCURACY = 1e-9  # of the box: local error of a step
+ASIDE = (0.02, 0.05, 0.1)  # of the box: where saddles beside a root with two unstable directions are sought
+LEVENBERG_STEPS = 200
 BESIDE = 0.2  # of the box: so close to the edge a root of f has to be its saddle
 
 
@@ -53,7 +57,8 @@ def edge_saddle(
     width = np.ptp(box, axis=1)
 
     def ends(x: np.ndarray) -> np.ndarray:
-        return follow(dynamics, x, attractors, box=box, states=2).ends
+        # Where a front has to cross a chain, states are still on their way after any relaxation time.
+        return follow(dynamics, x, attractors, box=box, states=2, patience=dynamics.dimension).ends
 
     def bracket(way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         other = np.flatnonzero(ends(way[1:-1]) != one)
@@ -78,11 +83,45 @@ def edge_saddle(
 
 
 def _saddle_near(dynamics: Dynamics, x: np.ndarray, box: np.ndarray, width: np.ndarray) -> Equilibrium | None:
-    for place in distinct_roots(dynamics, x[None], box=box, margin=0.0):
-        one = classify(dynamics, place)
-        if one.kind == "saddle" and one.unstable == 1 and (np.abs(place - x) / width).max() < BESIDE:
-            return one
+    """The saddle with one unstable direction beside a state of the edge; None where none is found.
+
+    A front in a long chain may stand at every site: then the edge hardly moves, and the root next to it may
+    have a second direction that is all but neutral. Along this lie the saddles on either side.
+    """
+
+    def beside(start: np.ndarray) -> Equilibrium | None:
+        for place in _roots_near(dynamics, start, box, width):
+            if (np.abs(place - x) / width).max() < BESIDE:
+                return classify(dynamics, place)
+        return None
+
+    one = beside(x)
+    if one is None or one.unstable == 1:
+        return one if one is not None and one.kind == "saddle" else None
+    values, vectors = np.linalg.eig(dynamics.jacobian(one.position[None])[0] * width / width[:, None])
+    weakest = np.argmin(np.where(values.real > 0, values.real, np.inf))
+    along = vectors[:, weakest].real
+    along *= width / np.abs(along).max()
+    for size, sign in itertools.product(ASIDE, (1, -1)):
+        other = beside(one.position + sign * size * along)
+        if other is not None and other.kind == "saddle" and other.unstable == 1:
+            return other
     return None
+
+
+def _roots_near(dynamics: Dynamics, x: np.ndarray, box: np.ndarray, width: np.ndarray) -> list[np.ndarray]:
+    """Where Newton's method comes from a state, or else Levenberg and Marquardt's, which may not run away."""
+    found = distinct_roots(dynamics, x[None], box=box, margin=0.0)
+    if found:
+        return found
+    solved = scipy.optimize.root(
+        lambda share: dynamics.drift((share * width)[None])[0] / width,
+        x / width,
+        jac=lambda share: dynamics.jacobian((share * width)[None])[0] * width / width[:, None],
+        method="lm",
+        options={"xtol": 1e-12, "ftol": 1e-12, "maxiter": LEVENBERG_STEPS},
+    )
+    return distinct_roots(dynamics, (solved.x * width)[None], box=box, margin=0.0)
 
 
 def _apart(dynamics: Dynamics, pair: np.ndarray, width: np.ndarray) -> np.ndarray | None:

@@ -275,6 +275,7 @@ def follow(
     *,
     box: np.ndarray,
     states: int = 48,
+    patience: int = 1,
 ) -> Descents:
     """Follow f from some points to the attractors.
 
@@ -290,6 +291,9 @@ def follow(
         Shape ``(d, 2)``: the recorded region. What leaves a box of three times this size has escaped.
     states
         States kept along each trajectory, about evenly spread.
+    patience
+        How many times longer than usual trajectories are followed: what spreads from one state to the next
+        takes as long in each.
 
     Raises
     ------
@@ -304,13 +308,13 @@ def follow(
     )
     if not slowest > 0:
         raise NumericalFailure("f is zero at most of the states: nothing moves, and there is no landscape")
-    horizon = (SLOWEST_TIMES if rates else UNSETTLED_TIMES) / slowest
+    horizon = patience * (SLOWEST_TIMES if rates else UNSETTLED_TIMES) / slowest
     count = len(starts)
     x, times, steps = starts.copy(), np.zeros(count), np.full(count, 0.01 / slowest)
     ends, escaped = np.full(count, -1), np.zeros(count, dtype=bool)
     passed, whose = [starts], [np.arange(count)]
     running = np.arange(count)
-    for _ in range(MOST_STEPS):
+    for _ in range(patience * MOST_STEPS):
         speed = np.abs(dynamics.drift(x[running]) / width).max(axis=1)
         step = np.minimum(steps[running], np.minimum(0.5 / slowest, SPACING / np.maximum(speed, 1e-300)))
         with np.errstate(over="ignore", invalid="ignore"):
