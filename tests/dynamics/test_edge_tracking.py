@@ -9,8 +9,8 @@ import pytest
 import sympy
 
 from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.edge_tracking import edge_saddle
-from siq.dynamics.equilibria import classify
+from siq.dynamics.edge_tracking import _saddle_near, edge_saddle
+from siq.dynamics.equilibria import classify, follow
 from siq.landscape.landscape import Landscape
 
 
@@ -64,3 +64,24 @@ def test_a_chain_of_ten_has_exact_barriers_and_prefactors() -> None:
         exact = 2 * np.pi / rate * np.sqrt(abs(determinants[0]) / determinants[1])
         assert way.rate is not None and way.rate.prefactor == pytest.approx(exact, rel=0.01)
         assert way.path is not None and way.path.uphill.residual < 1e-4
+
+
+def test_a_front_that_crosses_a_long_chain_is_followed_until_it_has_arrived() -> None:
+    system, _ = chain(24, coupling=2.0, tilt=0.03)
+    low, _, high = np.sort(np.roots([1, 0, -1, 0.03]).real)
+    attractors = [classify(system, np.full(24, value)) for value in (low, high)]
+    front = np.where(np.arange(24) < 6, low, high)[None]
+    box = system.box
+    assert follow(system, front, attractors, box=box, states=2).ends[0] == -1  # still on its way
+    assert follow(system, front, attractors, box=box, states=2, patience=24).ends[0] == 0
+
+
+@pytest.mark.parametrize("centre", [11.5, 12.0])
+def test_a_root_between_two_sites_leads_to_the_saddle_beside_it(centre: float) -> None:
+    """A droplet in a long chain is a saddle between sites, and one with two unstable directions on a site."""
+    system, _ = chain(24, coupling=2.0)
+    low, _, high = np.sort(np.roots([1, 0, -1, 0.1]).real)
+    droplet = high - 0.75 * (high - low) * np.exp(-(((np.arange(24) - centre) / 2.5) ** 2))
+    found = _saddle_near(system, droplet, system.box, np.ptp(system.box, axis=1))
+    assert found is not None and found.kind == "saddle" and found.unstable == 1
+    assert np.abs(system.drift(found.position[None])).max() < 1e-9
