@@ -114,13 +114,14 @@ def _roots_near(dynamics: Dynamics, x: np.ndarray, box: np.ndarray, width: np.nd
     found = distinct_roots(dynamics, x[None], box=box, margin=0.0)
     if found:
         return found
-    solved = scipy.optimize.root(
-        lambda share: dynamics.drift((share * width)[None])[0] / width,
-        x / width,
-        jac=lambda share: dynamics.jacobian((share * width)[None])[0] * width / width[:, None],
-        method="lm",
-        options={"xtol": 1e-12, "ftol": 1e-12, "maxiter": LEVENBERG_STEPS},
-    )
+    with np.errstate(all="ignore"):  # a step may lead to where f is beyond all numbers, and is taken back
+        solved = scipy.optimize.root(
+            lambda share: dynamics.drift((share * width)[None])[0] / width,
+            x / width,
+            jac=lambda share: dynamics.jacobian((share * width)[None])[0] * width / width[:, None],
+            method="lm",
+            options={"xtol": 1e-12, "ftol": 1e-12, "maxiter": LEVENBERG_STEPS},
+        )
     return distinct_roots(dynamics, (solved.x * width)[None], box=box, margin=0.0)
 
 
@@ -129,7 +130,8 @@ def _apart(dynamics: Dynamics, pair: np.ndarray, width: np.ndarray) -> np.ndarra
     speed = float(np.abs(dynamics.drift(pair) / width).max())
     step = 1e-3 / max(speed, 1e-300)
     for _ in range(MOST_STEPS):
-        moved, error = dormand_prince_step(dynamics.drift, pair, np.full(2, step))
+        with np.errstate(over="ignore", invalid="ignore"):  # a step that is too long is taken again
+            moved, error = dormand_prince_step(dynamics.drift, pair, np.full(2, step))
         relative = np.abs(error / width).max(axis=1) / ACCURACY
         if relative.max() <= 1:
             pair = moved

@@ -378,4 +378,4 @@ def _sides(
     for vector in vectors[:, values.real > 0].T:
         direction = vector.real / np.abs(vector.real / width).max()
         starts += [saddle.position + 1e-3 * direction, saddle.position - 1e-3 * direction]
-    return follow(dynamics, np.array(starts), attractors, box=box).ends
+    return follow(dynamics, np.array(starts), attractors, box=box, patience=dynamics.dimension).ends
