@@ -134,6 +134,11 @@ class PathProblem:
         """
         return FLAT if isinstance(self.begin, Tube) or self.finish is not None else 0.0
 
+    @property
+    def fine(self) -> float:
+        """Share of S that a step must still gain: of tubes, the third order that their cost leaves out."""
+        return START_SHARE**1.5 if self.flat > 0 else FINE
+
     def scaled(self, x: np.ndarray) -> np.ndarray:
         """Points in the units of the problem, from its start to its end."""
         y = (x - self.start) @ self.inverse.T
@@ -309,7 +314,7 @@ class PathProblem:
         action, shift, spacings, kicks = self.action(y), 1.0, 0, 0
         for _ in range(STEPS):
             across = _Across(self, y)
-            resting = (COARSE if first else FINE) * action + np.finfo(float).eps * across.effort
+            resting = (COARSE if first else self.fine) * action + np.finfo(float).eps * across.effort
             gained, expected = 0.0, np.inf
             while shift < LARGEST_SHIFT:
                 step = across.step(shift)
