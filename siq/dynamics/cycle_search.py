@@ -149,9 +149,7 @@ def cycles_between(
         return ends_of(dynamics, x, attractors, cycles, box=box)
 
     places = [one.position for one in (*attractors, *cycles)]
-    pairs = [
-        pair for pair in itertools.combinations(range(len(places)), 2) if max(pair) >= len(attractors)
-    ]
+    pairs = [pair for pair in itertools.combinations(range(len(places)), 2) if max(pair) >= len(attractors)]
     found: list[Cycle] = []
     for one, two in pairs[:MOST_PAIRS]:
         cycle = _edge_cycle(dynamics, one, (places[one], places[two]), ends, box, generator)

@@ -216,9 +216,7 @@ def hessians_along(dynamics: Dynamics, cycle: Cycle, *, reaching: bool = False) 
     return np.asarray(rows.transpose(0, 2, 1) @ np.linalg.inv(covariances) @ rows) / np.outer(scale, scale)
 
 
-def unstable_direction(
-    dynamics: Dynamics, cycle: Cycle, place: int = 0, *, scale: np.ndarray
-) -> np.ndarray:
+def unstable_direction(dynamics: Dynamics, cycle: Cycle, place: int = 0, *, scale: np.ndarray) -> np.ndarray:
     """At one of the points of an unstable cycle, a displacement that grows: shape ``(d,)``, of one scale."""
     _, flows, _ = _parts(dynamics, cycle.points, cycle.period / len(cycle.points), scale)
     rows = _across(dynamics.drift(cycle.points) / scale)

@@ -89,6 +89,12 @@ class Transition:
     by_rivals: float = 0.0
 
     @property
+    def place(self) -> np.ndarray:
+        """Where the path ends: at the saddle, or at a state of the unstable cycle. Shape ``(d,)``."""
+        over_cycle = isinstance(self.saddle, Cycle) and self.path is not None
+        return self.path.uphill.points[-1] if over_cycle and self.path else self.saddle.position
+
+    @property
     def error(self) -> float:
         """Standard error of the barrier: from f, and by how much the formula and the path alone differ."""
         if self.path is None:
@@ -166,9 +172,7 @@ def ways_out(dynamics: Dynamics, portrait: PhasePortrait, *, beyond_region: bool
             end = min(beyond)
             try:
                 if max(index, end) >= points:
-                    path = way_about_cycles(
-                        dynamics, portrait, index, saddle, end, tolerance=PATH_TOLERANCE
-                    )
+                    path = way_about_cycles(dynamics, portrait, index, saddle, end, tolerance=PATH_TOLERANCE)
                     ways.append(WayOut(index, end, saddle, path))
                     continue
                 attractor = portrait.attractors[index]

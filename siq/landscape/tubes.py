@@ -117,13 +117,17 @@ class Bowl:
         """Of the cost at one point, shape ``(d,)``."""
         return np.asarray(2 * self.hessian @ y)
 
-    def curvature(self, y: np.ndarray) -> np.ndarray:  # noqa: ARG002
+    def curvature(self, y: np.ndarray) -> np.ndarray:
         """Second derivatives of the cost, shape ``(d, d)``."""
         return 2 * self.hessian
 
 
 def first_guesses(
-    dynamics: Dynamics, start: np.ndarray | Cycle, end: np.ndarray | Cycle, hessians: np.ndarray, unit: np.ndarray
+    dynamics: Dynamics,
+    start: np.ndarray | Cycle,
+    end: np.ndarray | Cycle,
+    hessians: np.ndarray,
+    unit: np.ndarray,
 ) -> list[np.ndarray]:
     """Curves from beside a start to an end, by rising action.
 
