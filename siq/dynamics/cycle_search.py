@@ -1,8 +1,8 @@
 """Which cycles has a system: stable ones, as trajectories end on them, and unstable ones, which part basins?
 
-Stable cycles are where trajectories end that come to rest nowhere. In two states unstable cycles are where they come
-from: the same, backwards in time. In more states a cycle that parts two basins attracts along their boundary, and
-is found by tracking that (`siq.dynamics.edge_tracking`).
+Stable cycles are where trajectories end that come to rest nowhere. In two states unstable cycles are where
+they come from: the same, backwards in time. In more states a cycle that parts two basins attracts along
+their boundary, and is found by tracking that (`siq.dynamics.edge_tracking`).
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ def cycles_between(
     def ends(x: np.ndarray) -> np.ndarray:
         return ends_of(dynamics, x, attractors, cycles, box=box)
 
-    places = [one.position for one in (*attractors, *cycles)]
+    places = [*(one.position for one in attractors), *(one.position for one in cycles)]
     pairs = [pair for pair in itertools.combinations(range(len(places)), 2) if max(pair) >= len(attractors)]
     found: list[Cycle] = []
     for one, two in pairs[:MOST_PAIRS]:
@@ -177,7 +177,7 @@ def _edge_cycle(
         pair, passed, along = tracked
         times += (times[-1] + passed).tolist()
         states += list(along)
-        pair = bisected(*pair, one, ends, width=width)
+        pair = bisected(pair[0], pair[1], one, ends, width=width)
         if number >= QUIET_ROUNDS:
             cycle = _closed(dynamics, np.array(times), np.array(states), box)
             if cycle is not None and cycle.unstable == 1:

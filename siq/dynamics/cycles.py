@@ -6,19 +6,21 @@ An orbit is closed by multiple shooting: with `φ_h` for the flow over one of n 
 
 is solved by Newton's method for all x_k and the period, which works for unstable orbits as for stable ones.
 
-V is zero along a stable cycle, and so is ∇V. Across it noise spreads states as the linearised flow tells. Let the
-rows of `L_k` span what is across f at x_k, `P_k = ∂φ_h/∂x`, `R_k = L_{k+1} P_k L_kᵀ`, and W_k the covariance that
-noise adds in one part. Displacements `ξ = L (x - x_k)` then have the periodic covariance
+V is zero along a stable cycle, and so is ∇V. Across it noise spreads states as the linearised flow tells.
+Let the rows of `L_k` span what is across f at x_k, `P_k = ∂φ_h/∂x`, `R_k = L_{k+1} P_k L_kᵀ`, and W_k the
+covariance that noise adds in one part. Displacements `ξ = L (x - x_k)` then have the periodic covariance
 
     C_{k+1} = R_k C_k R_kᵀ + L_{k+1} W_k L_{k+1}ᵀ,    C_n = C_0,
 
-the periodic equation of Lyapunov in discrete time, and the Hessian of V is `L_kᵀ C_k⁻¹ L_k`. Of an unstable cycle the
-same backwards in time, over its unstable directions, is the Hessian of what it costs to reach the cycle.
+the periodic equation of Lyapunov in discrete time, and the Hessian of V is `L_kᵀ C_k⁻¹ L_k`. Of an unstable
+cycle the same backwards in time, over its unstable directions, is the Hessian of what it costs to reach the
+cycle.
 
 References
 ----------
-R. Graham, T. Tél, Phys. Rev. A 31 (1985) 1109: V in the limit of weak noise, limit cycles among its attractors.
-S. Bittanti, P. Colaneri, Periodic Systems, Springer 2009, chapter 4: the periodic equation of Lyapunov.
+R. Graham, T. Tél, Phys. Rev. A 31 (1985) 1109: V in the limit of weak noise, limit cycles among its
+attractors. S. Bittanti, P. Colaneri, Periodic Systems, Springer 2009, chapter 4: the periodic equation of
+Lyapunov.
 """
 
 from __future__ import annotations
@@ -54,8 +56,8 @@ class Cycle:
     period
         In units of time.
     multipliers
-        Shape ``(d - 1,)``, by falling size: by what a small displacement across the orbit has been multiplied after
-        one period. The multiplier 1 of a displacement along it is left out.
+        Shape ``(d - 1,)``, by falling size: by what a small displacement across the orbit has been
+        multiplied after one period. The multiplier 1 of a displacement along it is left out.
     """
 
     points: np.ndarray
@@ -180,8 +182,8 @@ def hessians_along(dynamics: Dynamics, cycle: Cycle, *, reaching: bool = False) 
     cycle
         The orbit.
     reaching
-        Of an unstable cycle: half the Hessian of the least action of a path that ends on it is taken, as V is half
-        of U. It is zero for displacements that f brings back by itself.
+        Of an unstable cycle: half the Hessian of the least action of a path that ends on it is taken, as V
+        is half of U. It is zero for displacements that f brings back by itself.
 
     Returns
     -------
@@ -233,7 +235,7 @@ def _reduced(rows: np.ndarray, flows: np.ndarray) -> np.ndarray:
 
 
 def _unstable_rows(across: np.ndarray, flows: np.ndarray, count: int) -> np.ndarray:
-    """Rows that see unstable displacements alone, shape ``(n, count, d)``: backwards all others fade from them."""
+    """Rows that see unstable displacements alone, shape ``(n, count, d)``: backwards others fade."""
     last = across[0, :count]
     for _ in range(MOST_ROUNDS):
         rows, current = np.empty((len(flows), count, across.shape[2])), last
@@ -264,7 +266,7 @@ def _periodic(steps: np.ndarray, spread: np.ndarray) -> np.ndarray:
 def _parts(
     dynamics: Dynamics, x: np.ndarray, time: float, scale: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """From each point after a time: the state ``(n, d)``, ``∂φ/∂x`` and the covariance of noise ``(n, d, d)``."""
+    """After a time: states ``(n, d)``, their slopes ``∂φ/∂x``, the covariance of noise ``(n, d, d)``."""
     n, d = x.shape
     unit = np.concatenate([scale, np.ones(d * d), np.outer(scale, scale).ravel()])
 

@@ -64,7 +64,7 @@ def edge_saddle(
         tracked = apart_of(dynamics, pair, width)
         if tracked is None:
             return None
-        pair = bisected(*tracked[0], one, ends, width=width)
+        pair = bisected(tracked[0][0], tracked[0][1], one, ends, width=width)
     return None
 
 
@@ -120,8 +120,8 @@ def apart_of(
     Returns
     -------
     tuple
-        The two states, shape ``(2, d)``; the times that have passed at each step, ``(n,)``, and their middles there,
-        ``(n, d)``.
+        The two states, shape ``(2, d)``; the times that have passed at each step, ``(n,)``, and their
+        middles there, ``(n, d)``.
     """
     speed = float(np.abs(dynamics.drift(pair) / width).max())
     step, now = 1e-3 / max(speed, 1e-300), 0.0

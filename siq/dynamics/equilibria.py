@@ -350,7 +350,7 @@ def follow(
 def settled_on(
     x: np.ndarray, cycles: Sequence[Cycle], *, box: np.ndarray, distance: float = NEXT_TO
 ) -> np.ndarray:
-    """The first of some cycles next to which each state lies, -1 where it lies next to none: shape ``(n,)``."""
+    """The first of some cycles next to which each state lies, -1 where there is none: shape ``(n,)``."""
     width = np.ptp(box, axis=1)
     near = np.full(len(x), -1)
     for index, one in enumerate(cycles):
@@ -366,7 +366,7 @@ def neighbours(
     box: np.ndarray,
     cycles: Sequence[Cycle] = (),
 ) -> set[int]:
-    """The attractors that lie below a saddle, on either side of its unstable directions; cycles after points."""
+    """The attractors below a saddle, on either side of its unstable directions; cycles after points."""
     return {int(end) for end in _sides(dynamics, saddle, attractors, box=box, cycles=cycles) if end >= 0}
 
 

@@ -188,7 +188,7 @@ class _Motion:
         end = way.y_events[0][0]
         return end[:d], end[d:], float(way.t_events[0][0]) + away
 
-    def _cycle(self, places: Sequence[np.ndarray], times: np.ndarray) -> float | None:
+    def _cycle(self, places: Sequence[np.ndarray], times: np.ndarray) -> tuple[np.ndarray, float] | None:
         """A state and the period of a stable periodic orbit close by, None where there is none."""
         # Backwards from the last place, where a trajectory is closest to the cycle on which it ends.
         away = np.array([np.linalg.norm(place - places[-1]) for place in places[-2 : -2 - LONGEST : -1]])

@@ -1,7 +1,7 @@
 """Ways out of wells that begin on a cycle, lead over one, or end on one.
 
-A cycle is an attractor as a point is: a path may leave it at any phase. What parts two basins may be a saddle, or an
-unstable cycle, on which the path ends at any phase, too. From there f leads on.
+A cycle is an attractor as a point is: a path may leave it at any phase. What parts two basins may be a
+saddle, or an unstable cycle, on which the path ends at any phase, too. From there f leads on.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ POINTS = 200  # of a way down
 
 
 def both_sides(dynamics: Dynamics, cycle: Cycle, portrait: PhasePortrait) -> np.ndarray:
-    """Where f leads from both sides of an unstable cycle: two attractors, cycles after points; -1 elsewhere."""
+    """Where f leads from both sides of an unstable cycle: numbers of attractors, -1 elsewhere."""
     starts = _beside(dynamics, cycle, 0, portrait.box)
     return ends_of(dynamics, starts, portrait.attractors, portrait.cycles, box=portrait.box)
 
@@ -47,7 +47,8 @@ def way_about_cycles(
     portrait
         What is stable.
     start, end
-        Numbers of attractors, of cycles after those of points; the end is None where f leads out of the region.
+        Numbers of attractors, of cycles after those of points; the end is None where f leads out of the
+        region.
     over
         The saddle, or the unstable cycle.
     tolerance
@@ -58,7 +59,7 @@ def way_about_cycles(
     NumericalFailure
         When there is no such path that could be found.
     """
-    settled = [*(one.position for one in portrait.attractors), *portrait.cycles]
+    settled: list[np.ndarray | Cycle] = [*(one.position for one in portrait.attractors), *portrait.cycles]
     last = over if isinstance(over, Cycle) else over.position
     uphill = minimum_action_path(dynamics, settled[start], last, tolerance=tolerance)
     if end is None:

@@ -54,8 +54,8 @@ class Landscape:
     Main attributes
     ---------------
     attractors
-        Those that recorded states lead to, in the order of everything below. Limit cycles follow after points; of
-        equations alone.
+        Those that recorded states lead to, in the order of everything below. Limit cycles follow after
+        points; of equations alone.
     wells
         V about each attractor, None where none was found.
     transitions
@@ -436,7 +436,8 @@ def assembled(
     noise: NoiseStrength | None,
 ) -> Landscape:
     """The landscape of what was found; the arguments are those of `Landscape` and of `find_landscape`."""
-    ends, settled = portrait.descents.ends, (*portrait.attractors, *portrait.cycles)
+    ends = portrait.descents.ends
+    settled: tuple[Equilibrium | Cycle, ...] = (*portrait.attractors, *portrait.cycles)
     return Landscape(
         found.dynamics,
         portrait.equilibria,

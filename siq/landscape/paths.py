@@ -126,8 +126,8 @@ def minimum_action_path(
     dynamics
         f, twice differentiable.
     start
-        Shape ``(d,)``: mostly an attractor, to rounding. Or a stable cycle, at any phase of which the path may
-        begin.
+        Shape ``(d,)``: mostly an attractor, to rounding. Or a stable cycle, at any phase of which the path
+        may begin.
     end
         Shape ``(d,)``: mostly a saddle, but any state will do. Where the path has to cross a saddle, it is
         found faster and better in two parts: see `transition_path`. Or an unstable cycle.

@@ -219,7 +219,7 @@ def _way_beyond(dynamics: Dynamics, portrait: PhasePortrait, index: int, saddle:
     """The way over a saddle from which f leads out of the region; none where it leads back on both sides."""
     if leads_back(dynamics, saddle, portrait.attractors, box=portrait.box, cycles=portrait.cycles):
         return []
-    settled = [*(one.position for one in portrait.attractors), *portrait.cycles]
+    settled: list[np.ndarray | Cycle] = [*(one.position for one in portrait.attractors), *portrait.cycles]
     try:
         uphill = minimum_action_path(dynamics, settled[index], saddle.position, tolerance=PATH_TOLERANCE)
     except NumericalFailure as error:

@@ -1,9 +1,10 @@
 """Where paths of least action leave a cycle, or arrive at one: on a thin tube around it.
 
-Along a stable cycle V is zero, and a path may wind on it at no cost for as long as it likes: it has no first state.
-It is followed from a tube on, on which V is ``½ ρ·Hρ``, ρ being the offset from the next state of the cycle and H
-the curvature of V there (`siq.dynamics.cycles.hessians_along`). A path to an unstable cycle winds on it in the end;
-from a tube on what is left of its action is ``ρ·Hρ``, with the curvature of what it costs to reach the cycle.
+Along a stable cycle V is zero, and a path may wind on it at no cost for as long as it likes: it has no first
+state. It is followed from a tube on, on which V is ``½ ρ·Hρ``, ρ being the offset from the next state of the
+cycle and H the curvature of V there (`siq.dynamics.cycles.hessians_along`). A path to an unstable cycle
+winds on it in the end; from a tube on what is left of its action is ``ρ·Hρ``, with the curvature of what it
+costs to reach the cycle.
 
 First guesses are trajectories of Hamilton's equations that start on all sides of a small tube, or of a small
 ellipsoid, with the momentum ``p = Hρ``. One of them passes close to

@@ -253,6 +253,7 @@ def drawn_data(
         np.array(attractors),
         *cycles,
         *parting,
+        *(way.uphill for way in ways if cycles or parting),  # such ways wind, and leave their wells
         *(way.saddle[None] for way in ways),
         *(well.points for _, well in known),
     ]

@@ -141,7 +141,7 @@ def _parting(said: SaidLandscape, file: str) -> ReportTable:
     for one in said.data["parting"]:
         points = np.array(one["points"])
         reach = [range_text(*ends) for ends in zip(points.min(axis=0), points.max(axis=0), strict=True)]
-        multipliers = [_rate(*value) for value in one["multipliers"]]
+        multipliers = ", ".join(_rate(*value) for value in one["multipliers"])
         rows.append(
             dict(zip(said.states, reach, strict=True))
             | {

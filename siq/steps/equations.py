@@ -199,18 +199,18 @@ def _about_cycles(system: Dynamics, portrait: PhasePortrait) -> list[str]:
     notes = []
     if portrait.cycles and portrait.attractors:
         notes.append(
-            "about a limit cycle U is not written as a formula: barriers out of it and into it are the actions"
-            " of paths, and the certificate is of the other attractors"
+            "about a limit cycle U is not written as a formula: barriers out of it and into it are the"
+            " actions of paths, and the certificate is of the other attractors"
         )
     elif portrait.cycles:
         notes.append(
-            "about a limit cycle U is not written as a formula, and there is nothing to certify: its barriers are"
-            " the actions of paths"
+            "about a limit cycle U is not written as a formula, and there is nothing to certify: its"
+            " barriers are the actions of paths"
         )
     if portrait.cycles and not system.diffusion.regular:
         notes.append(
-            "paths from and to cycles are found where noise acts on every state: here it acts on some only, and"
-            " the barriers of cycles are not known"
+            "paths from and to cycles are found where noise acts on every state: here it acts on some only,"
+            " and the barriers of cycles are not known"
         )
     elif portrait.cycles and system.dimension > 2:
         notes.append(

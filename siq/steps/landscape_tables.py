@@ -18,7 +18,7 @@ def place(position: np.ndarray) -> str:
 
 
 def landscape_rows(run: int, found: Landscape, remark: str | None = None) -> pd.DataFrame:
-    """One row for each equilibrium, each cycle and each way out of a well; `remark` is of what all barriers hang on.
+    """One row for each equilibrium, cycle and way out; `remark` is of what all barriers hang on.
 
     Mean times are for the noise of the landscape: of an attractor the time in its well, of a transition that
     over its saddle alone; the error is that of data and law together.

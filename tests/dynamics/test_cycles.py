@@ -15,7 +15,7 @@ INNER, OUTER, TURN = 0.6, 1.0, 2.0
 
 
 def rings(*, axis: bool) -> Dynamics:
-    """dV/dr = r(r² - a²)(r² - b²) and a rotation: a point, an unstable cycle and a stable one; with z²/2 beside."""
+    """dV/dr = r(r² - a²)(r² - b²) and a rotation: a point and two cycles; with z²/2 beside."""
     radius = x**2 + y**2
     slope = (radius - sympy.Rational(9, 25)) * (radius - 1)
     flat = (-x * slope - 2 * y, -y * slope + 2 * x)
@@ -51,7 +51,7 @@ def test_circles_have_their_period_and_multipliers(radius: float, axis: bool) ->
 @pytest.mark.parametrize("axis", [False, True])
 @pytest.mark.parametrize("radius", [INNER, OUTER])
 def test_v_has_its_curvature_across_a_cycle(radius: float, axis: bool) -> None:
-    """Of a stable cycle that of V; of an unstable one that of what is left to climb, and nothing along the axis."""
+    """Of a stable cycle that of V; of an unstable one of what is left to climb, none along the axis."""
     cycle = around(radius, axis=axis)
     found = hessians_along(rings(axis=axis), cycle, reaching=radius == INNER)
     exact = np.zeros_like(found)

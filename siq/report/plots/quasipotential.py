@@ -325,7 +325,7 @@ def draw_equilibria(axes: Axes, landscape: DrawnLandscape, shown: tuple[int, int
     marks = [(one, SADDLE) for one in landscape.saddles] + [(one, WELL) for one in landscape.wells]
     for lines, drawn_as in ((landscape.cycles, CYCLE), (landscape.parting, PARTING)):
         for line in lines:
-            axes.plot(*line[:, list(shown)].T, zorder=2.5, **drawn_as)
+            axes.plot(*line[:, list(shown)].T, zorder=3.2, **drawn_as)
     for one, style in marks:
         place = one.position[list(shown)]
         if one.kind != "cycle":
