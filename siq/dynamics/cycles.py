@@ -45,7 +45,7 @@ MOST_ROUNDS = 100  # numerical: of the power iteration for unstable directions
 SETTLED = 1e-9  # numerical: its accuracy, of integrals to 1e-11
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Cycle:
     """A periodic orbit of f.
 
@@ -63,6 +63,10 @@ class Cycle:
     points: np.ndarray
     period: float
     multipliers: np.ndarray
+
+    def __repr__(self) -> str:
+        """One line: its points are some hundred numbers."""
+        return f"<Cycle of period {self.period:.6g}, multipliers {self.multipliers.round(4).tolist()}>"
 
     @property
     def unstable(self) -> int:

@@ -104,7 +104,7 @@ def grow_well(
 def _grown(
     dynamics: Dynamics,
     basin: Basin,
-    saddles: Sequence[Equilibrium],
+    saddles: Sequence[Equilibrium | Cycle],
     basis: PowerBasis,
     coefficients: np.ndarray,
     *,
