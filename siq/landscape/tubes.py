@@ -26,14 +26,15 @@ from siq.numerics.integration import dormand_prince_step, next_step
 FINER = 8  # places between two points of a cycle, from which the closest one is sought
 NEWTON_STEPS = 4  # from there: the error is squared in each
 AWAY = 3e-4  # of the distance to be gone: how far from an attractor first guesses start
-PHASES, SIDES = 24, 4  # of first guesses; sides for each state beyond the second
+PHASES, SIDES = 48, 2  # of first guesses; sides for each state beyond the second
 POINTS_OF_TWO = 96  # around a point
 MOST_STEPS = 4000
 ACCURACY = 1e-6  # numerical, of the distance: of one step of a first guess
 LONGEST_STEP = 0.03  # of the distance, or of the size of the cycle
 GONE = 6.0  # distances: what is so far away does not come back
 CLOSE = 0.05  # of the distance: so close to the end a first guess counts as having arrived
-CHOSEN = 3  # first guesses that are tried
+PASSED = 0.3  # of the distance: and so close as one that has passed it by
+CHOSEN = 2  # first guesses of either kind that are tried
 UNLIKE = 0.02  # share of the action by which two of them differ
 
 
@@ -156,16 +157,18 @@ def first_guesses(
         nearest = int(arrived + np.argmin(away[arrived : arrived + (left[0] if len(left) else len(away))]))
         curve = way[: nearest + 1] if isinstance(end, Cycle) else np.vstack([way[: nearest + 1], end])
         if nearest > 0:
-            found.append((max(float(away[nearest]), CLOSE), float(action[nearest]), curve))
-    found.sort(key=lambda one: one[:2])
+            found.append((float(away[nearest]), float(action[nearest]), curve))
+    found.sort(key=lambda one: one[1])
+    least = min((one[0] for one in found), default=np.inf)
     chosen: list[tuple[float, float, np.ndarray]] = []
-    for one in found:
-        if chosen and one[0] > max(CLOSE, chosen[0][0]):  # it has not come as close
-            break
-        if all(abs(one[1] - other[1]) > UNLIKE * abs(other[1]) for other in chosen):
-            chosen.append(one)
-        if len(chosen) == CHOSEN:
-            break
+    # A lower path may have passed the end by further than one that is not the lowest.
+    for close in (max(CLOSE, least), max(PASSED, least)):
+        new: list[tuple[float, float, np.ndarray]] = []
+        for one in found:
+            known = any(abs(one[1] - other[1]) <= UNLIKE * abs(other[1]) for other in (*chosen, *new))
+            if one[0] <= close and not known and len(new) < CHOSEN:
+                new.append(one)
+        chosen += new
     return [curve for _, _, curve in chosen]
 
 

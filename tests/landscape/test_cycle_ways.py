@@ -1,0 +1,122 @@
+"""Barriers out of limit cycles and into them, against exact ones and against the mesh."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import sympy
+
+from siq.dynamics.cycles import Cycle, closed_orbit
+from siq.dynamics.dynamics import Dynamics
+from siq.errors import NumericalFailure
+from siq.landscape.landscape import Landscape
+from siq.landscape.paths import MinimumActionPath, minimum_action_path
+
+x, y, z = (sympy.Symbol(name, real=True) for name in "xyz")
+INNER, OUTER = 0.6, 1.0
+
+
+def rings(turn: float, *, axis: bool = False) -> Dynamics:
+    """dV/dr = r(r² - a²)(r² - b²) and a rotation: a point, an unstable cycle, a stable one; with z²/2 beside."""
+    radius = x**2 + y**2
+    slope = (radius - sympy.Rational(9, 25)) * (radius - 1)
+    flat = (-x * slope - turn * y, -y * slope + turn * x)
+    if axis:
+        return Dynamics.of((x, y, z), (*flat, -z), domain=[(-1.8, 1.8), (-1.8, 1.8), (-1, 1)])
+    return Dynamics.of((x, y), flat, domain=[(-1.8, 1.8)] * 2)
+
+
+def height(radius: float) -> float:
+    """U = 2V of the rings, zero at the point."""
+    a, b = INNER**2, OUTER**2
+    return 2 * (radius**6 / 6 - (a + b) * radius**4 / 4 + a * b * radius**2 / 2)
+
+
+def ring(system: Dynamics, radius: float, turn: float) -> Cycle:
+    phase = np.linspace(0, 2 * np.pi, 256, endpoint=False)
+    guess = radius * np.stack([np.cos(phase), np.sin(phase)], axis=1)
+    guess = np.column_stack([guess, np.zeros((256, system.dimension - 2))])
+    return closed_orbit(system, guess, 2 * np.pi / turn, scale=np.full(system.dimension, 2.0))
+
+
+def out_of(turn: float, *, axis: bool = False) -> MinimumActionPath:
+    system = rings(turn, axis=axis)
+    return minimum_action_path(system, *(ring(system, radius, turn) for radius in (OUTER, INNER)))
+
+
+def into(turn: float, *, axis: bool = False) -> MinimumActionPath:
+    system = rings(turn, axis=axis)
+    return minimum_action_path(system, np.zeros(system.dimension), ring(system, INNER, turn))
+
+
+def loop(turn: float, *, half: float = 0.08, strength: int = 20) -> tuple[Dynamics, float]:
+    """V = k (h - c)²/2 with h = (x² + y²)/2 - x³/3, and a field along its levels; the barrier is exact.
+
+    The cycle is h = c, and the saddle of h at (1, 0), where it is 1/6, is one of V.
+    """
+    level = (x**2 + y**2) / 2 - x**3 / 3
+    potential = strength * (level - sympy.Rational(str(half))) ** 2 / 2
+    field = (
+        -potential.diff(x) + turn * level.diff(y),
+        -potential.diff(y) - turn * level.diff(x),
+    )
+    system = Dynamics.of((x, y), field, domain=[(-0.7, 1.3), (-0.7, 0.7)])
+    return system, strength * (1 / 6 - half) ** 2
+
+
+def test_the_barriers_of_rings_are_exact() -> None:
+    """Every phase is as good as any other, which no minimisation may mind."""
+    found = out_of(2.0)
+    assert found.converged
+    assert found.action == pytest.approx(height(INNER) - height(OUTER), rel=2e-4)
+    np.testing.assert_allclose(np.linalg.norm(found.points[[0, -1]], axis=1), [OUTER, INNER], rtol=1e-8)
+    assert found.values[0] == 0 and found.values[-1] == found.action
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("axis", [False, True])
+@pytest.mark.parametrize("turn", [0.2, 2.0, 20.0])
+def test_both_barriers_of_rings_are_exact_however_fast_they_turn(turn: float, axis: bool) -> None:
+    for found, exact in (
+        (into(turn, axis=axis), height(INNER)), (out_of(turn, axis=axis), height(INNER) - height(OUTER)),
+    ):  # fmt: skip
+        assert found.converged
+        assert found.action == pytest.approx(exact, rel=5e-4)
+
+
+@pytest.mark.parametrize("turn", [1.0, 6.0])
+def test_the_way_out_of_a_cycle_over_a_saddle_is_exact(turn: float) -> None:
+    system, exact = loop(turn)
+    landscape = Landscape.from_equations(system)
+    (cycle,), (way,) = landscape.cycles, landscape.transitions
+    assert cycle.stable and cycle is landscape.attractors[0]
+    assert way.barrier == pytest.approx(exact, rel=1e-6)
+    assert way.end is None and way.path is not None and way.path.uphill.converged
+    assert way.rate is None and any("no law is implemented" in note for note in way.notes)
+    assert np.isnan(landscape.dwell_times(noise=exact / 10)["mean_time"]).all()
+    assert "one attractor, a limit cycle of period" in landscape.report()
+    assert landscape.certificate is None and any("not written as a formula" in one for one in landscape.notes)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("axis", [False, True])
+def test_a_point_and_a_cycle_make_a_landscape(axis: bool) -> None:
+    landscape = Landscape.from_equations(rings(2.0, axis=axis))
+    assert [one.kind for one in landscape.attractors] == ["attractor", "cycle"]
+    (parting,) = landscape.parting
+    assert parting.unstable == 1 and parting.period == pytest.approx(np.pi, rel=1e-9)
+    barriers = landscape.barriers().set_index("start").sort_index()
+    assert barriers["end"].tolist() == [1, 0]
+    exact = [height(INNER), height(INNER) - height(OUTER)]
+    np.testing.assert_allclose(barriers["barrier"], exact, rtol=1e-4)
+    np.testing.assert_allclose(landscape.heights, [height(OUTER) * 0, height(OUTER)] - min(0, height(OUTER)), atol=1e-5)
+    # About the point there is a formula, and it is certified; about the cycle there is none, which is said.
+    assert landscape.certificate is not None and landscape.certificate.certified
+    assert landscape.wells[0] is not None and landscape.wells[1] is None
+    assert landscape.basins.sum() == pytest.approx(1)
+
+
+def test_noise_on_some_states_only_is_refused_in_words() -> None:
+    system = Dynamics.of((x, y), rings(2.0).formulas, diffusion=np.diag([0.0, 1.0]))
+    with pytest.raises(NumericalFailure, match="noise on every state"):
+        minimum_action_path(system, np.zeros(2), ring(system, INNER, 2.0))
