@@ -146,7 +146,7 @@ def _parting(said: SaidLandscape, file: str) -> ReportTable:
             dict(zip(said.states, reach, strict=True))
             | {
                 f"period{unit}": value_text(one["period"], digits=4),
-                "Floquet multipliers": ", ".join(multipliers),
+                "Floquet multipliers": multipliers,
             }
         )
     return ReportTable("Unstable cycles, which part basins.", pd.DataFrame(rows), {}, file)

@@ -209,10 +209,19 @@ def test_escape_times_follow_where_the_noise_is_known() -> None:
     assert "recorded" not in landscape.report()
 
 
+def test_a_limit_cycle_is_an_attractor_without_a_formula() -> None:
+    landscape = Landscape.from_equations(as_system(limit_cycle()))
+    (cycle,) = landscape.cycles
+    assert cycle.period == pytest.approx(np.pi, rel=1e-9)
+    assert cycle.multipliers == pytest.approx(np.exp(-2 * np.pi), rel=1e-7)
+    assert landscape.transitions == () and landscape.wells == (None,)
+    assert "no way out of it within the domain" in landscape.report()
+
+
 def test_systems_without_a_landscape_say_why() -> None:
-    cycle = as_system(limit_cycle())
-    with pytest.raises(NoLandscape, match="limit cycle of period"):
-        Landscape.from_equations(cycle)
+    chaos = Dynamics.of((X, Y), (Y, X - X**3), domain=[(0.2, 0.6), (0.5, 0.9)])
+    with pytest.raises(NoLandscape, match="no stable equilibrium"):
+        Landscape.from_equations(chaos)
     with pytest.raises(InputError, match="no domain"):
         Landscape.from_equations(replace(TOGGLE, domain=None))
     with pytest.raises(InputError, match="divides by zero"):
