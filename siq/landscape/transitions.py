@@ -196,7 +196,7 @@ def _ways_over_cycles(dynamics: Dynamics, portrait: PhasePortrait) -> list[WayOu
         for start, beyond in (sides, sides[::-1]):
             if start < 0:
                 continue
-            end, note = (None, OUTWARDS) if beyond < 0 else (beyond, "")
+            end, note = (None, OUTWARDS.replace("saddle", "unstable cycle")) if beyond < 0 else (beyond, "")
             try:
                 path = way_about_cycles(dynamics, portrait, start, cycle, end, tolerance=PATH_TOLERANCE)
                 ways.append(WayOut(start, end, cycle, path, note))

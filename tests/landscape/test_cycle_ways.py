@@ -192,6 +192,20 @@ def lowest_crossing(system: Dynamics, cycle: Cycle) -> float:
     return min(levels)
 
 
+def test_an_unstable_cycle_alone_bounds_a_well() -> None:
+    """V = a²r²/2 - r⁴/4 and a rotation: beyond r = a all states run away."""
+    radius, slope = x**2 + y**2, sympy.Rational(1, 2)
+    field = (-x * (slope - radius) - y, -y * (slope - radius) + x)
+    landscape = Landscape.from_equations(Dynamics.of((x, y), field, domain=[(-1, 1)] * 2))
+    (way,) = landscape.transitions
+    assert way.end is None and way.barrier == pytest.approx(1 / 8, rel=1e-4)
+    assert (
+        isinstance(way.saddle, Cycle)
+        and way.notes[0] == "behind the unstable cycle f leads out of the region"
+    )
+    assert np.linalg.norm(way.place) == pytest.approx(np.sqrt(0.5), rel=1e-6)
+
+
 def test_noise_on_some_states_only_is_refused_in_words() -> None:
     system = Dynamics.of((x, y), rings(2.0).formulas, diffusion=np.diag([0.0, 1.0]))
     with pytest.raises(NumericalFailure, match="noise on every state"):
