@@ -16,6 +16,8 @@
 `equilibria`          where does it rest, and where do its trajectories end?
 `reach`               does noise reach every state, be it by way of others?
 `recurrence`          where does what comes to rest nowhere lead: to a cycle, or to chaos?
+`cycles`              which period and multipliers has a cycle, and how is V curved across it?
+`cycle_search`        which cycles are there, stable ones and those that part basins?
 `basins`              which recorded points lead to an attractor?
 `phase_portrait`      which attractors are there, and which saddles next to each?
 `equilibrium_search`  where do given equations rest in their domain?

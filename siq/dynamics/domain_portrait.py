@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from siq.dynamics.basins import Basin, Focus, basin_of
+from siq.dynamics.cycle_search import cycles_between, cycles_left, cycles_reached
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.equilibria import Descents, Equilibrium, follow, hessian_at
 from siq.dynamics.equilibrium_search import all_equilibria, spread_evenly
@@ -64,7 +65,14 @@ def domain_portrait(dynamics: Dynamics, *, seed: int = 0) -> PhasePortrait:
     stable = [one for one in search.equilibria if one.kind == "attractor"]
     descents = _left(dynamics, follow(dynamics, points, stable, box=box), box=box, rate=rate)
     attractors, descents = reached_attractors(stable, descents)
-    around = saddles_beside(dynamics, search.equilibria, attractors, box=box)
+    cycles, descents = cycles_reached(dynamics, descents, first=len(attractors), box=box, rate=rate)
+    if d == 2:
+        parting = cycles_left(dynamics, search.equilibria, box=box, generator=generator)
+    elif cycles:
+        parting = cycles_between(dynamics, attractors, cycles, box=box, generator=generator)
+    else:
+        parting = ()
+    around = saddles_beside(dynamics, search.equilibria, attractors, box=box, cycles=cycles)
     # Over a saddle with several unstable directions no way is lowest.
     passes = tuple(tuple(one for one in saddles if one.unstable == 1) for saddles in around)
     basins: list[Basin] = []
@@ -84,7 +92,7 @@ def domain_portrait(dynamics: Dynamics, *, seed: int = 0) -> PhasePortrait:
     return PhasePortrait(
         points, box, search.equilibria, tuple(attractors), passes, tuple(basins), descents,
         recurrence_beyond(dynamics, descents, box=box, rate=rate),
-        harmless, (*search.notes, *notes),
+        harmless, (*search.notes, *notes), cycles, parting,
     )  # fmt: skip
 
 

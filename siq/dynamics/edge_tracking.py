@@ -12,7 +12,7 @@ J. D. Skufca, J. A. Yorke, B. Eckhardt, Phys. Rev. Lett. 96 (2006) 174101: edge 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import scipy.optimize
@@ -60,26 +60,53 @@ def edge_saddle(
         # Where a front has to cross a chain, states are still on their way after any relaxation time.
         return follow(dynamics, x, attractors, box=box, states=2, patience=dynamics.dimension).ends
 
-    def bracket(way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        other = np.flatnonzero(ends(way[1:-1]) != one)
-        last = int(other[0]) if len(other) else len(way) - 2
-        return way[last], way[last + 1]
-
     start, end = attractors[one].position, attractors[two].position
-    share = np.linspace(0, 1, SECTIONS + 2)[:, None]
-    bend = BENT * width * generator.standard_normal(len(width))
-    low, high = bracket(start + share * (end - start) + np.sin(np.pi * share) * bend)
+    pair = bisected(start, end, one, ends, width=width, generator=generator)
     for _ in range(ROUNDS):
-        while (np.abs(high - low) / width).max() > CLOSE:
-            low, high = bracket(low + share * (high - low))
-        found = _saddle_near(dynamics, (low + high) / 2, box, width)
+        found = _saddle_near(dynamics, pair.mean(axis=0), box, width)
         if found is not None:
             return found
-        pair = _apart(dynamics, np.stack([low, high]), width)
-        if pair is None:
+        tracked = apart_of(dynamics, pair, width)
+        if tracked is None:
             return None
-        low, high = pair
+        pair = bisected(tracked[0][0], tracked[0][1], one, ends, width=width)
     return None
+
+
+def bisected(
+    low: np.ndarray,
+    high: np.ndarray,
+    one: int,
+    ends: Callable[[np.ndarray], np.ndarray],
+    *,
+    width: np.ndarray,
+    generator: np.random.Generator | None = None,
+) -> np.ndarray:
+    """Two states on either side of the boundary of a basin that all but agree, shape ``(2, d)``.
+
+    Parameters
+    ----------
+    low, high
+        Shape ``(d,)``: a state within the basin, and one beyond it.
+    one
+        The number of the basin.
+    ends
+        At which attractor each of some states ends.
+    width
+        Shape ``(d,)``: of the domain.
+    generator
+        Bends the way between both; without it, it is straight.
+    """
+    share = np.linspace(0, 1, SECTIONS + 2)[:, None]
+    bend = np.zeros(len(width)) if generator is None else BENT * width * generator.standard_normal(len(width))
+    way = low + share * (high - low) + np.sin(np.pi * share) * bend
+    while True:
+        other = np.flatnonzero(ends(way[1:-1]) != one)
+        last = int(other[0]) if len(other) else len(way) - 2
+        low, high = way[last], way[last + 1]
+        if (np.abs(high - low) / width).max() <= CLOSE:
+            return np.stack([low, high])
+        way = low + share * (high - low)
 
 
 def _saddle_near(dynamics: Dynamics, x: np.ndarray, box: np.ndarray, width: np.ndarray) -> Equilibrium | None:
@@ -125,17 +152,29 @@ def _roots_near(dynamics: Dynamics, x: np.ndarray, box: np.ndarray, width: np.nd
     return distinct_roots(dynamics, (solved.x * width)[None], box=box, margin=0.0)
 
 
-def _apart(dynamics: Dynamics, pair: np.ndarray, width: np.ndarray) -> np.ndarray | None:
-    """Two states followed for the same time until they have come apart; None where they do not."""
+def apart_of(
+    dynamics: Dynamics, pair: np.ndarray, width: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Two states followed for the same time until they have come apart; None where they do not.
+
+    Returns
+    -------
+    tuple
+        The two states, shape ``(2, d)``; the times that have passed at each step, ``(n,)``, and their
+        middles there, ``(n, d)``.
+    """
     speed = float(np.abs(dynamics.drift(pair) / width).max())
-    step = 1e-3 / max(speed, 1e-300)
+    step, now = 1e-3 / max(speed, 1e-300), 0.0
+    times, middles = [], []
     for _ in range(MOST_STEPS):
         with np.errstate(over="ignore", invalid="ignore"):  # a step that is too long is taken again
             moved, error = dormand_prince_step(dynamics.drift, pair, np.full(2, step))
         relative = np.abs(error / width).max(axis=1) / ACCURACY
         if relative.max() <= 1:
-            pair = moved
+            pair, now = moved, now + step
+            times.append(now)
+            middles.append(pair.mean(axis=0))
             if (np.abs(pair[1] - pair[0]) / width).max() > APART:
-                return pair
+                return pair, np.array(times), np.array(middles)
         step = float(next_step(np.full(2, step), relative).min())
     return None

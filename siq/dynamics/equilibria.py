@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 import scipy.linalg
 
+from siq.dynamics.cycles import Cycle
 from siq.dynamics.dynamics import Dynamics
 from siq.errors import NumericalFailure
 from siq.numerics.integration import dormand_prince_step, next_step
@@ -28,6 +29,9 @@ MOST_STEPS = 3000
 SPACING = 0.04  # of the recorded box: longest step
 ACCURACY = 1e-7  # of the recorded box: local error of a step
 UNREACHED = 1e-12  # numerical, of the largest eigenvalue of W in units of its diagonal: rounding
+NEXT_TO = 0.02  # of the domain: a trajectory that has been followed for long is so close to its cycle
+ARRIVED_ON = 1e-3  # of the domain: and one so close to a cycle stays with it
+ASKED = 10  # steps after which trajectories are asked whether they are on a cycle
 ARRIVED = 1e-4  # of the recorded box: trajectories so close to an attractor end there
 
 
@@ -276,6 +280,7 @@ def follow(
     box: np.ndarray,
     states: int = 48,
     patience: int = 1,
+    cycles: Sequence[Cycle] = (),
 ) -> Descents:
     """Follow f from some points to the attractors.
 
@@ -294,6 +299,8 @@ def follow(
     patience
         How many times longer than usual trajectories are followed: what spreads from one state to the next
         takes as long in each.
+    cycles
+        Stable cycles on which trajectories may end, too: their numbers follow on those of the attractors.
 
     Raises
     ------
@@ -314,7 +321,7 @@ def follow(
     ends, escaped = np.full(count, -1), np.zeros(count, dtype=bool)
     passed, whose = [starts], [np.arange(count)]
     running = np.arange(count)
-    for _ in range(patience * MOST_STEPS):
+    for number in range(patience * MOST_STEPS):
         speed = np.abs(dynamics.drift(x[running]) / width).max(axis=1)
         step = np.minimum(steps[running], np.minimum(0.5 / slowest, SPACING / np.maximum(speed, 1e-300)))
         with np.errstate(over="ignore", invalid="ignore"):
@@ -331,6 +338,9 @@ def follow(
         whose.append(on)
         for index, one in enumerate(attractors):
             ends[on[np.abs((moved - one.position) / width).max(axis=1) < ARRIVED]] = index
+        if cycles and number % ASKED == 0:
+            near = settled_on(moved, cycles, box=box, distance=ARRIVED_ON)
+            ends[on[near >= 0]] = len(attractors) + near[near >= 0]
         running = running[~escaped[running] & (ends[running] < 0) & (times[running] < horizon)]
         if not len(running):
             break
@@ -341,15 +351,27 @@ def follow(
     return Descents(np.concatenate(passed)[order][kept], ends, escaped)
 
 
+def settled_on(
+    x: np.ndarray, cycles: Sequence[Cycle], *, box: np.ndarray, distance: float = NEXT_TO
+) -> np.ndarray:
+    """The first of some cycles next to which each state lies, -1 where there is none: shape ``(n,)``."""
+    width = np.ptp(box, axis=1)
+    near = np.full(len(x), -1)
+    for index, one in enumerate(cycles):
+        near[(near < 0) & (one.distances(x, scale=width) < distance)] = index
+    return near
+
+
 def neighbours(
     dynamics: Dynamics,
     saddle: Equilibrium,
     attractors: Sequence[Equilibrium],
     *,
     box: np.ndarray,
+    cycles: Sequence[Cycle] = (),
 ) -> set[int]:
-    """The attractors that lie below a saddle, on either side of its unstable directions."""
-    return {int(end) for end in _sides(dynamics, saddle, attractors, box=box) if end >= 0}
+    """The attractors below a saddle, on either side of its unstable directions; cycles after points."""
+    return {int(end) for end in _sides(dynamics, saddle, attractors, box=box, cycles=cycles) if end >= 0}
 
 
 def leads_back(
@@ -358,9 +380,10 @@ def leads_back(
     attractors: Sequence[Equilibrium],
     *,
     box: np.ndarray,
+    cycles: Sequence[Cycle] = (),
 ) -> bool:
     """Whether f leads from all sides of a saddle to one and the same attractor: it parts no wells."""
-    ends = _sides(dynamics, saddle, attractors, box=box)
+    ends = _sides(dynamics, saddle, attractors, box=box, cycles=cycles)
     return bool(ends[0] >= 0 and (ends == ends[0]).all())
 
 
@@ -370,12 +393,27 @@ def _sides(
     attractors: Sequence[Equilibrium],
     *,
     box: np.ndarray,
+    cycles: Sequence[Cycle],
 ) -> np.ndarray:
-    """Where f leads from both sides of each unstable direction of a saddle: attractors, or -1."""
+    """Where f leads from both sides of each unstable direction of a saddle: attractors, cycles, or -1."""
     values, vectors = np.linalg.eig(dynamics.jacobian(saddle.position[None])[0])
     width = box[:, 1] - box[:, 0]
     starts = []
     for vector in vectors[:, values.real > 0].T:
         direction = vector.real / np.abs(vector.real / width).max()
         starts += [saddle.position + 1e-3 * direction, saddle.position - 1e-3 * direction]
-    return follow(dynamics, np.array(starts), attractors, box=box, patience=dynamics.dimension).ends
+    return ends_of(dynamics, np.array(starts), attractors, cycles, box=box)
+
+
+def ends_of(
+    dynamics: Dynamics,
+    starts: np.ndarray,
+    attractors: Sequence[Equilibrium],
+    cycles: Sequence[Cycle],
+    *,
+    box: np.ndarray,
+) -> np.ndarray:
+    """Where f leads from some states: the number of an attractor, or of a cycle after these; -1 elsewhere."""
+    ways = follow(dynamics, starts, attractors, box=box, states=2, cycles=cycles, patience=dynamics.dimension)
+    near = settled_on(ways.paths[:, -1], cycles, box=box)
+    return np.where((ways.ends < 0) & ~ways.escaped & (near >= 0), len(attractors) + near, ways.ends)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from siq.dynamics.basins import Basin, basin_of
+from siq.dynamics.cycles import Cycle
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.equilibria import Descents, Equilibrium, find_equilibria, follow, neighbours, rate_of
 from siq.dynamics.recurrence import Recurrence, recurrence_of
@@ -38,7 +39,7 @@ class PhasePortrait:
     attractors
         Those that are stable and that recorded points lead to.
     saddles
-        For each attractor, the saddles next to it.
+        For each attractor, and each of the cycles after these, the saddles next to it.
     basins
         For each attractor, what leads to it.
     descents
@@ -49,6 +50,11 @@ class PhasePortrait:
         Degenerate equilibria that take no part in the landscape.
     notes
         What is not known, in words.
+    cycles
+        Stable cycles that states of the domain lead to. In `descents` their numbers follow on those of the
+        attractors.
+    parting
+        Unstable cycles, which part basins.
     """
 
     points: np.ndarray
@@ -61,6 +67,8 @@ class PhasePortrait:
     recurrence: Recurrence | None = None
     harmless: tuple[Equilibrium, ...] = ()
     notes: tuple[str, ...] = ()
+    cycles: tuple[Cycle, ...] = ()
+    parting: tuple[Cycle, ...] = ()
 
     @property
     def unsettled(self) -> float:
@@ -74,11 +82,11 @@ class PhasePortrait:
             place = np.array2string(degenerate[0].position, precision=4)
             return f"the equilibrium at {place} is neither stable nor unstable to first order"
         ends = "there is another attractor" if self.recurrence is None else self.recurrence.sentence()
-        if not self.attractors and self.unsettled <= UNSETTLED:
+        if not (self.attractors or self.cycles) and self.unsettled <= UNSETTLED:
             return "f has no stable equilibrium in the recorded region"
         if self.unsettled <= UNSETTLED:
             return None
-        if not self.attractors:
+        if not (self.attractors or self.cycles):
             return f"no recorded state comes to rest at a stable equilibrium: {ends}"
         return f"{self.unsettled:.0%} of the recorded states lead to no equilibrium: {ends}"
 
@@ -143,12 +151,13 @@ def saddles_beside(
     attractors: Sequence[Equilibrium],
     *,
     box: np.ndarray,
+    cycles: Sequence[Cycle] = (),
 ) -> tuple[tuple[Equilibrium, ...], ...]:
-    """For each attractor, the saddles next to it."""
-    around: list[list[Equilibrium]] = [[] for _ in attractors]
+    """For each attractor, and each cycle after these, the saddles next to it."""
+    around: list[list[Equilibrium]] = [[] for _ in (*attractors, *cycles)]
     for one in equilibria:
         if one.kind == "saddle":
-            for index in neighbours(dynamics, one, attractors, box=box):
+            for index in neighbours(dynamics, one, attractors, box=box, cycles=cycles):
                 around[index].append(one)
     return tuple(tuple(saddles) for saddles in around)
 

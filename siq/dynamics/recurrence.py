@@ -13,7 +13,7 @@ differences grow from return to return, at the rate of the largest Lyapunov expo
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -53,11 +53,14 @@ class Recurrence:
     exponent
         Mean rate at which small differences grow, per unit of time: the largest Lyapunov exponent. NaN where
         it was not asked for.
+    place
+        A state on the cycle, shape ``(d,)``; None of anything else.
     """
 
     kind: Kind
     period: float = float("nan")
     exponent: float = float("nan")
+    place: np.ndarray | None = field(default=None, compare=False)
 
     def sentence(self) -> str:
         """In words that follow a colon."""
@@ -148,8 +151,8 @@ class _Motion:
             growth.append(np.log(size))
             times.append(time)
             places.append(state)
-            if len(places) in LOOKED and (period := self._cycle(places, np.cumsum(times))) is not None:
-                return Recurrence("cycle", period)
+            if len(places) in LOOKED and (found := self._cycle(places, np.cumsum(times))) is not None:
+                return Recurrence("cycle", found[1], place=found[0] * self.width)
         if not places:
             return Recurrence("none")
         exponent = float(np.sum(growth) / np.sum(times))
@@ -185,14 +188,14 @@ class _Motion:
         end = way.y_events[0][0]
         return end[:d], end[d:], float(way.t_events[0][0]) + away
 
-    def _cycle(self, places: Sequence[np.ndarray], times: np.ndarray) -> float | None:
-        """The period of a stable periodic orbit close by, None where there is none."""
+    def _cycle(self, places: Sequence[np.ndarray], times: np.ndarray) -> tuple[np.ndarray, float] | None:
+        """A state and the period of a stable periodic orbit close by, None where there is none."""
         # Backwards from the last place, where a trajectory is closest to the cycle on which it ends.
         away = np.array([np.linalg.norm(place - places[-1]) for place in places[-2 : -2 - LONGEST : -1]])
         first = int(np.flatnonzero(away <= max(CLOSE * away.min(), SAME))[0])
         return self._closed(places[-1], float(times[-1] - times[-2 - first]))
 
-    def _closed(self, base: np.ndarray, period: float) -> float | None:
+    def _closed(self, base: np.ndarray, period: float) -> tuple[np.ndarray, float] | None:
         d, x, longest, widest = self.dimension, base, 2 * period, np.inf
         across = self.drift(base)
         for _ in range(NEWTON_STEPS):
@@ -203,7 +206,7 @@ class _Motion:
             gap = end - x
             away = float(np.abs(gap).max())
             if away < CLOSED:
-                return period if self._stable(monodromy) else None
+                return (x, period) if self._stable(monodromy) else None
             if away > widest:
                 return None
             widest = min(widest, LOST * away)

@@ -5,6 +5,8 @@
 `paths`                   which path leads from an attractor to a saddle at least action?
 `discretised_paths`       what is the action of a chain of points, and how is it made minimal?
 `hamiltonian_paths`       and which paths are most likely where noise acts on some states only?
+`tubes`                   where does a path leave a cycle, or arrive at one?
+`cycle_ways`              which ways lead out of cycles, over cycles, and into them?
 `turnover`                do states that turn about a well leave it as the law of escape says?
 `rates`                   how often is a well left, prefactor included?
 `prefactor_errors`        how sure is that prefactor?

@@ -11,13 +11,16 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
+from scipy.integrate import solve_ivp
 from scipy.interpolate import Akima1DInterpolator
 from scipy.spatial import cKDTree
 
+from siq.dynamics.cycles import Cycle, hessians_along
 from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.equilibria import classify, hessian_at
 from siq.errors import NumericalFailure
+from siq.landscape.tubes import Bowl, Tube
 
 START_SHARE = 1e-6  # of the action: U on the ellipsoid where a chain begins
 CENTRAL = 0.005  # of the distance to the end: nearer to the attractor points lie no closer together
@@ -29,10 +32,12 @@ SMALLEST_SHIFT, LARGEST_SHIFT = 1e-3, 1e12  # of Newton's matrix
 LEAST_GAIN, GOOD_GAIN = 0.05, 0.7  # of what a step promised: it is taken; the next one is bolder
 STEPS, RESPACINGS, MOST_KICKS = 150, 40, 3
 UNEVEN = 1.6  # longest to shortest segment at which a chain is spaced anew
+FLAT = 1e-3  # of the upper bound of S: numerical, above the error of tubes, below what parts two minima
 COARSE, FINE = 1e-7, 1e-12  # share of S that a step must still gain, for first guesses and for the answer
 MOST_NODES = 60_000  # numerical, a guard on memory: 60 000 blocks of d × d
 NO_ACTION = 1e-7  # of ∫|f||φ'|ds: less is a path without noise
 APART = 0.03  # of the distance: minima further apart are two
+MOST_TURNS, STEPS_OF_A_TURN = 300, 64  # of a path from or to a cycle, within linear dynamics
 SPIRAL_STEP = 0.15  # of the shortest time of the linear dynamics
 
 
@@ -77,11 +82,20 @@ class PathProblem:
     ``x = start + units y``. M is the Hessian of V at the start, None where that is no attractor; then the
     first point of a chain is as fixed as the last. Where D has no inverse a `measure` stands in for it, and
     there is no action of chains.
+
+    The start may be a stable cycle, and the end an unstable one: a chain begins and ends on thin tubes then.
     """
 
     def __init__(
-        self, dynamics: Dynamics, start: np.ndarray, end: np.ndarray, *, measure: Diffusion | None = None
+        self,
+        dynamics: Dynamics,
+        start: np.ndarray | Cycle,
+        end: np.ndarray | Cycle,
+        *,
+        measure: Diffusion | None = None,
     ) -> None:
+        around, onto = (one if isinstance(one, Cycle) else None for one in (start, end))
+        start, end = _closest_states(start, end)
         noise = dynamics.diffusion.frozen(start) if measure is None else measure
         distance = float(np.linalg.norm(noise.whitening @ (end - start)))
         if not distance > 0:
@@ -95,15 +109,44 @@ class PathProblem:
         self.unit = distance**2 * self.rate  # of the action
         self.end = self.inverse @ (end - start)
         self.hessian: np.ndarray | None = None
+        self.begin: Bowl | Tube | None = None
+        self.finish: Tube | None = None
+        if onto is not None:
+            self.finish = self._tube(onto, hessians_along(dynamics, onto, reaching=True))
+        if around is not None:
+            self.begin = self._tube(around, hessians_along(dynamics, around))
+            return
         resting = np.linalg.norm(self.force(np.zeros((1, len(start))))) < AT_REST
         if resting and classify(dynamics, start).kind == "attractor":
             hessian = hessian_at(dynamics, start)
             self.hessian = self.units.T @ hessian @ self.units / self.unit
+            self.begin = Bowl(self.hessian)
+
+    def _tube(self, cycle: Cycle, hessians: np.ndarray) -> Tube:
+        points = (cycle.points - self.start) @ self.inverse.T
+        return Tube(points, self.units.T @ hessians @ self.units / self.unit, cycle.period * self.rate)
+
+    @property
+    def flat(self) -> float:
+        """By how much of the upper bound S may fail to curve upwards at a minimum.
+
+        About cycles any phase may be as good as any other.
+        """
+        return FLAT if isinstance(self.begin, Tube) or self.finish is not None else 0.0
+
+    @property
+    def fine(self) -> float:
+        """Share of S that a step must still gain: of tubes, the third order that their cost leaves out."""
+        return START_SHARE**1.5 if self.flat > 0 else FINE
 
     def scaled(self, x: np.ndarray) -> np.ndarray:
         """Points in the units of the problem, from its start to its end."""
-        inner = (x[1:-1] - self.start) @ self.inverse.T
-        return np.vstack([np.zeros_like(self.end), inner, self.end])
+        y = (x - self.start) @ self.inverse.T
+        if not isinstance(self.begin, Tube):
+            y[0] = 0.0
+        if self.finish is None:
+            y[-1] = self.end
+        return np.asarray(y)
 
     def unscaled(self, y: np.ndarray) -> np.ndarray:
         """Points in the states' units."""
@@ -140,13 +183,18 @@ class PathProblem:
 
     def level(self, y: np.ndarray) -> np.ndarray:
         """The action from the start to points close to it, ``y·My``; zero without M."""
-        return np.zeros(len(y)) if self.hessian is None else np.einsum("ni,ij,nj->n", y, self.hessian, y)
+        return np.zeros(len(y)) if self.begin is None else self.begin.level(y)
+
+    def remaining(self, y: np.ndarray) -> float:
+        """The action from a point close to the end to that."""
+        return 0.0 if self.finish is None else float(self.finish.level(y[None])[0])
 
     def action(self, y: np.ndarray) -> float:
         """S of a chain; infinite where it leads through states at which D is not positive."""
         with np.errstate(all="ignore"):  # a trial may run away
             try:
-                return float(self.level(y[:1])[0] + self.segments(y).actions.sum())
+                inner = float(self.segments(y).actions.sum())
+                return float(self.level(y[:1])[0]) + inner + self.remaining(y[-1])
             except NumericalFailure:
                 return np.inf
 
@@ -185,6 +233,29 @@ class PathProblem:
             y.append(back @ y[-1])
         return np.array(y[::-1])
 
+    def _winding(self, tube: Tube, last: np.ndarray, level: float, sense: float) -> np.ndarray:
+        """The way by linear dynamics from a point onwards to a tube, or back to where it left one.
+
+        ``ẏ = F + 2Dp`` with ``p`` as the quadratic cost has it, with or against time.
+        """
+
+        def rates(_: float, y: np.ndarray) -> np.ndarray:
+            slope, force = tube.slope(y), self.force(y[None])[0]
+            push = slope if self.constant else self.noise.at(y[None])[0] @ slope
+            return np.asarray(sense * force - push)
+
+        def arrives(_: float, y: np.ndarray) -> float:
+            return float(tube.level(y[None])[0] - level)
+
+        arrives.terminal = True  # type: ignore[attr-defined]
+        if not arrives(0.0, last) > 0:
+            return np.zeros((0, len(last)))
+        way = solve_ivp(
+            rates, (0.0, MOST_TURNS * tube.period), last, rtol=1e-4, atol=1e-6,
+            max_step=tube.period / STEPS_OF_A_TURN, events=arrives,
+        )  # fmt: skip
+        return np.asarray(way.y[:, 1:].T)
+
     def spaced(self, y: np.ndarray, count: int, level: float) -> np.ndarray:
         """A chain along another one, which begins where the level is as given and is spaced for accuracy.
 
@@ -194,13 +265,20 @@ class PathProblem:
         y = y[np.append(np.linalg.norm(np.diff(y, axis=0), axis=1) > 1e-14, True)]
         if self.hessian is not None and self.level(y[:1])[0] > level > 0:
             y = np.vstack([self._spiral(y[0], level / self.level(y[:1])[0]), y])
+        if level > 0 and isinstance(self.begin, Tube):
+            y = np.vstack([self._winding(self.begin, y[0], level, -1.0)[::-1], y])
+        if level > 0 and self.finish is not None:
+            y = np.vstack([y, self._winding(self.finish, y[-1], level, 1.0)])
         length = np.r_[0, np.cumsum(np.linalg.norm(np.diff(y, axis=0), axis=1))]
         curve = Akima1DInterpolator(length, y)
         dense = np.interp(np.arange(0, len(y) - 0.95, 0.1), np.arange(len(y)), length)
         y = curve(dense)
-        if self.hessian is not None:
+        if self.begin is not None:
             first = max(int(np.flatnonzero(self.level(y) <= level).max(initial=0)), 0)
             dense, y = dense[first:], y[first:]
+        if self.finish is not None:
+            beyond = np.flatnonzero(self.finish.level(y) > level).max(initial=len(y) - 3) + 2
+            dense, y = dense[:beyond], y[:beyond]
         measure = np.r_[0, np.cumsum(self._measure(y))]
         return curve(np.interp(np.linspace(0, measure[-1], count), measure, dense))
 
@@ -236,7 +314,7 @@ class PathProblem:
         action, shift, spacings, kicks = self.action(y), 1.0, 0, 0
         for _ in range(STEPS):
             across = _Across(self, y)
-            resting = (COARSE if first else FINE) * action + np.finfo(float).eps * across.effort
+            resting = (COARSE if first else self.fine) * action + np.finfo(float).eps * across.effort
             gained, expected = 0.0, np.inf
             while shift < LARGEST_SHIFT:
                 step = across.step(shift)
@@ -253,12 +331,12 @@ class PathProblem:
                 y, action = new, action - gained
             if expected > resting:
                 shift *= 0.2 if gained > GOOD_GAIN * expected else 1.0
-                shift = shift if shift > 1e-8 else 0.0
+                shift = max(shift if shift > 1e-8 else 0.0, self.flat)
                 measure = self._measure(y)
                 if first and spacings < RESPACINGS and measure.max() > UNEVEN * measure.min():
                     y = self.spaced(y, count, level)
                     action, spacings = self.action(y), spacings + 1
-            elif across.step(0.0) is None:
+            elif across.step(self.flat) is None:
                 if not first or kicks == MOST_KICKS:
                     break
                 kicks += 1
@@ -269,7 +347,7 @@ class PathProblem:
             elif shift <= SMALLEST_SHIFT:
                 return DiscretisedPath(y, action, True)
             else:
-                shift = 0.0
+                shift = self.flat
         return DiscretisedPath(y, action, False)
 
     def nodes(self, chain: DiscretisedPath) -> np.ndarray:
@@ -285,8 +363,8 @@ class PathProblem:
         turn = times / 2 * change
         p = np.empty_like(y)
         p[1:-1] = (middle[1:] + turn[1:] + middle[:-1] - turn[:-1]) / 2
-        p[0] = middle[0] + turn[0] if self.hessian is None else self.hessian @ y[0]
-        p[-1] = middle[-1] - turn[-1]
+        p[0] = middle[0] + turn[0] if self.begin is None else self.begin.slope(y[0]) / 2
+        p[-1] = middle[-1] - turn[-1] if self.finish is None else -self.finish.slope(y[-1]) / 2
         values = self.level(y[:1]) + np.r_[0.0, np.cumsum(parts.actions)]
         return np.column_stack([y, p, values])
 
@@ -311,8 +389,16 @@ class PathProblem:
         if not self.residual(nodes) < self.residual(second):
             nodes = second
             nodes[:, -1] *= action / max(fine.action, np.finfo(float).tiny)
+        d, ends = self.end.size, np.zeros((2, nodes.shape[1]))
+        if self.finish is not None:
+            ends[1, :d] = self.finish.closest(nodes[-1:, :d])[0]
+            nodes[-1, -1] = action - self.remaining(nodes[-1, :d])
+            nodes = np.vstack([nodes, ends[1:]])
         nodes[-1, -1] = action
-        return nodes if self.hessian is None else np.vstack([np.zeros_like(nodes[:1]), nodes])
+        if self.begin is None:
+            return nodes
+        ends[0, :d] = self.begin.closest(nodes[:1, :d])[0]
+        return np.vstack([ends[:1], nodes])
 
 
 class _Across:
@@ -327,7 +413,7 @@ class _Across:
     def __init__(self, problem: PathProblem, y: np.ndarray) -> None:
         parts, dimension = problem.segments(y), y.shape[1]
         self.y, self.effort = y, float(np.sum(parts.speed * parts.length))
-        self.range = slice(1 if problem.hessian is None else 0, -1)
+        self.range = slice(1 if problem.begin is None else 0, -1 if problem.finish is None else None)
         times = (parts.length / parts.speed)[:, None, None]
         metric, middles, jacobian = parts.metric, parts.middles, problem.jacobian(parts.middles)
         force, forward = (_of(metric, part) for part in (parts.force, parts.forward))
@@ -354,14 +440,23 @@ class _Across:
             frozen.mixed - share * _outer(longer, slower),
             frozen.forward - share * _outer(longer, longer),
         )
-        first = np.zeros((dimension, dimension))
-        if problem.hessian is not None:
-            slope[0] += 2 * problem.hessian @ y[0]
-            first = 2 * problem.hessian
-        self.normal = _normals(y)[self.range]
+        first, last = np.zeros((2, dimension, dimension))
+        if problem.begin is not None:
+            slope[0] += problem.begin.slope(y[0])
+            first = problem.begin.curvature(y[0])
+        if problem.finish is not None:
+            slope[-1] += problem.finish.slope(y[-1])
+            last = problem.finish.curvature(y[-1])
+        self.problem = problem
+        normal = _normals(y)
+        if isinstance(problem.begin, Tube):  # along the tube, on which the chain begins, and ends
+            normal[0] = np.linalg.svd(problem.begin.slope(y[0])[None])[2][1:].T
+        if problem.finish is not None:
+            normal[-1] = np.linalg.svd(problem.finish.slope(y[-1])[None])[2][1:].T
+        self.normal = normal[self.range]
         self.slope = np.einsum("nij,ni->nj", self.normal, slope[self.range]).ravel()
-        self.exact = exact.banded(self.normal, self.range.start, first)
-        self.frozen = frozen.banded(self.normal, self.range.start, first)
+        self.exact = exact.banded(self.normal, self.range.start, (first, last))
+        self.frozen = frozen.banded(self.normal, self.range.start, (first, last))
 
     def step(self, shift: float) -> np.ndarray | None:
         """Newton's step with a shift; None where the matrix is not positive definite."""
@@ -377,6 +472,10 @@ class _Across:
         """The chain after a step."""
         y = self.y.copy()
         y[self.range] += np.einsum("nij,nj->ni", self.normal, step.reshape(len(self.normal), -1))
+        if isinstance(begin := self.problem.begin, Tube):
+            y[0] = begin.onto(y[0], float(begin.level(self.y[:1])[0]))
+        if (finish := self.problem.finish) is not None:
+            y[-1] = finish.onto(y[-1], float(finish.level(self.y[-1:])[0]))
         return y
 
     def kicks(self) -> list[np.ndarray]:
@@ -394,18 +493,19 @@ class _Blocks:
     mixed: np.ndarray  # difference before middle
     forward: np.ndarray
 
-    def banded(self, normal: np.ndarray, start: int, first: np.ndarray) -> np.ndarray:
+    def banded(self, normal: np.ndarray, start: int, ends: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
         """The matrix of the moves ``normal`` from point `start` on, in the lower form of scipy's solvers.
 
-        `first` is added to the block of the first point.
+        `ends` are added to the blocks of the first point and of the last.
         """
         count, _, m = normal.shape
         transposed = self.mixed.transpose(0, 2, 1)
         both = (self.mixed + transposed) / 2
-        diagonal = np.zeros((len(self.middle) + 1, *first.shape))
+        diagonal = np.zeros((len(self.middle) + 1, *ends[0].shape))
         diagonal[1:] += self.middle / 4 + self.forward + both
         diagonal[:-1] += self.middle / 4 + self.forward - both
-        diagonal[0] += first
+        diagonal[0] += ends[0]
+        diagonal[-1] += ends[1]
         # Row of the next point, column of this one.
         below = self.middle / 4 - self.forward + (self.mixed - transposed) / 2
         turned = normal.transpose(0, 2, 1)
@@ -418,6 +518,14 @@ class _Blocks:
             for row in range(m):
                 matrix[m + row - column, column::m][: count - 1] = below[:, row, column]
         return matrix
+
+
+def _closest_states(start: np.ndarray | Cycle, end: np.ndarray | Cycle) -> tuple[np.ndarray, np.ndarray]:
+    """Of two states or cycles, the two states that are closest to each other."""
+    one, two = (each.points if isinstance(each, Cycle) else each[None] for each in (start, end))
+    away = np.linalg.norm(one[:, None] - two, axis=2)
+    row, column = np.unravel_index(int(np.argmin(away)), away.shape)
+    return one[row], two[column]
 
 
 def _of(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:

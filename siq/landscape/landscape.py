@@ -16,6 +16,7 @@ from siq.data.inspection import seen_states
 from siq.data.record_states import RecordStates
 from siq.data.recordings import Recordings, recordings_of
 from siq.data.selection import joined
+from siq.dynamics.cycles import Cycle
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.equilibria import Equilibrium
 from siq.dynamics.phase_portrait import PhasePortrait
@@ -53,7 +54,8 @@ class Landscape:
     Main attributes
     ---------------
     attractors
-        Those that recorded states lead to, in the order of everything below.
+        Those that recorded states lead to, in the order of everything below. Limit cycles follow after
+        points; of equations alone.
     wells
         V about each attractor, None where none was found.
     transitions
@@ -74,7 +76,7 @@ class Landscape:
 
     Notes
     -----
-        What could not be done, in words; limit cycles among it.
+        What could not be done, in words.
     position_errors
         Standard error of each attractor's position, shape ``(k, d)``; None where not known.
     noise
@@ -89,11 +91,13 @@ class Landscape:
         nothing is known of them, or several wells are certified.
     given
         Whether f was given as equations: the region is their domain then, and nothing of f is uncertain.
+    parting
+        Unstable cycles, which part wells.
     """
 
     dynamics: Dynamics
     equilibria: tuple[Equilibrium, ...]
-    attractors: tuple[Equilibrium, ...]
+    attractors: tuple[Equilibrium | Cycle, ...]
     basins: np.ndarray
     wells: tuple[Well | None, ...]
     transitions: tuple[Transition, ...]
@@ -106,6 +110,7 @@ class Landscape:
     visits: tuple[VisitTest, ...] = ()
     seen: RecordStates | None = None
     given: bool = False
+    parting: tuple[Cycle, ...] = ()
 
     @classmethod
     def from_recordings(
@@ -204,6 +209,11 @@ class Landscape:
         from siq.steps.equations import EquationSettings, landscape_of_equations, usable_system
 
         return landscape_of_equations(usable_system(system), settings or EquationSettings())
+
+    @property
+    def cycles(self) -> tuple[Cycle, ...]:
+        """The stable limit cycles among the attractors, with period and Floquet multipliers."""
+        return tuple(one for one in self.attractors if isinstance(one, Cycle))
 
     def in_units(self, units: Sequence[str], *, time: str = "1") -> Landscape:
         """The same with the units of the states and of the time said; nothing is converted."""
@@ -427,20 +437,22 @@ def assembled(
 ) -> Landscape:
     """The landscape of what was found; the arguments are those of `Landscape` and of `find_landscape`."""
     ends = portrait.descents.ends
+    settled: tuple[Equilibrium | Cycle, ...] = (*portrait.attractors, *portrait.cycles)
     return Landscape(
         found.dynamics,
         portrait.equilibria,
-        portrait.attractors,
-        np.array([float((ends == index).mean()) for index in range(len(portrait.attractors))]),
+        settled,
+        np.array([float((ends == index).mean()) for index in range(len(settled))]),
         tuple(wells),
         tuple(ways),
-        _heights(len(portrait.attractors), ways, notes),
+        _heights(len(settled), ways, notes),
         tuple(notes),
         certificate,
-        np.array([position_standard_errors(found, one.position) for one in portrait.attractors]),
+        np.array([position_standard_errors(found, one.position) for one in settled]),
         noise,
         None if isinstance(found, GivenField) else found,
         given=isinstance(found, GivenField),
+        parting=portrait.parting,
     )
 
 

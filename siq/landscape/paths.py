@@ -28,6 +28,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from siq.dynamics.cycles import Cycle, hessians_along
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.reach import measure_at
 from siq.errors import NumericalFailure
@@ -40,6 +41,7 @@ from siq.landscape.discretised_paths import (
     rivals_of,
 )
 from siq.landscape.hamiltonian_paths import hamiltonian_paths
+from siq.landscape.tubes import first_guesses
 
 FOLLOWED = 4000  # points of a way down that Hamilton's equations are told, which may wind
 TURN = 0.15  # radian from one segment of the first chain to the next
@@ -110,8 +112,8 @@ class TransitionPath:
 
 def minimum_action_path(
     dynamics: Dynamics,
-    start: np.ndarray,
-    end: np.ndarray,
+    start: np.ndarray | Cycle,
+    end: np.ndarray | Cycle,
     *,
     nodes: int = 100,
     tolerance: float = 1e-4,
@@ -124,10 +126,11 @@ def minimum_action_path(
     dynamics
         f, twice differentiable.
     start
-        Shape ``(d,)``: mostly an attractor, to rounding.
+        Shape ``(d,)``: mostly an attractor, to rounding. Or a stable cycle, at any phase of which the path
+        may begin.
     end
         Shape ``(d,)``: mostly a saddle, but any state will do. Where the path has to cross a saddle, it is
-        found faster and better in two parts: see `transition_path`.
+        found faster and better in two parts: see `transition_path`. Or an unstable cycle.
     nodes
         Points of the first chain. It has more where the path winds; and their number is doubled until the
         action is known.
@@ -150,11 +153,13 @@ def minimum_action_path(
     NumericalFailure
         When no first guess has a finite action, or Hamilton's equations have no solution that was found.
     """
-    start, end = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
+    start, end = (one if isinstance(one, Cycle) else np.asarray(one, dtype=float) for one in (start, end))
     if not dynamics.diffusion.regular:
+        if isinstance(start, Cycle) or isinstance(end, Cycle):
+            raise NumericalFailure("paths from and to cycles need noise on every state of its own")
         return _by_hamilton(dynamics, start, end, tolerance, initial or ())
     problem = PathProblem(dynamics, start, end)
-    own, turning = problem.guesses()
+    own, turning = problem.guesses() if problem.flat == 0 else _about_cycles(problem, start, end)
     guesses = own if initial is None else [problem.scaled(np.asarray(one, dtype=float)) for one in initial]
     count = min(max(nodes, int(turning / TURN)), MOST_NODES // 4)
     chains: list[DiscretisedPath] = []
@@ -166,7 +171,10 @@ def minimum_action_path(
         if np.isfinite(chain.action):
             chains.append(chain)
     if not chains:
-        raise NumericalFailure(f"no path from {problem.start.tolist()} to {end} has a finite action")
+        last = problem.unscaled(problem.end[None])[0]
+        raise NumericalFailure(
+            f"no path from {problem.start.tolist()} to {last.tolist()} was found that has a finite action"
+        )
     chains.sort(key=lambda one: one.action)
     fine, known = problem.descend(chains[0].points, count, chains[0].action), False
     while not known and 2 * len(fine.points) < MOST_NODES:
@@ -190,6 +198,28 @@ def minimum_action_path(
         converged=fine.minimum and known,
         rivals=tuple(float(problem.unit * line[-1, -1] * share) for share in shares),
     )
+
+
+def _about_cycles(
+    problem: PathProblem, start: np.ndarray | Cycle, end: np.ndarray | Cycle
+) -> tuple[list[np.ndarray], float]:
+    """First chains from or to a cycle, and by how many radian the one that turns most does."""
+    dynamics = problem.dynamics
+    if isinstance(start, Cycle):
+        hessians = hessians_along(dynamics, start)
+    elif problem.hessian is not None:
+        hessians = problem.inverse.T @ problem.hessian @ problem.inverse * problem.unit
+    else:
+        raise NumericalFailure("a path to a cycle has to begin at an attractor")
+    chains = [problem.scaled(one) for one in first_guesses(dynamics, start, end, hessians, problem.units)]
+    return chains, max((_turning(chain) for chain in chains), default=0.0)
+
+
+def _turning(chain: np.ndarray) -> float:
+    """By how many radian a chain turns."""
+    forward = np.diff(evenly(chain, FOLLOWED), axis=0)
+    forward /= np.maximum(np.linalg.norm(forward, axis=1, keepdims=True), np.finfo(float).tiny)
+    return float(np.arccos(np.clip(np.sum(forward[1:] * forward[:-1], axis=1), -1, 1)).sum())
 
 
 def _by_hamilton(

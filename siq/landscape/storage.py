@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from siq.dynamics.cycles import Cycle
 from siq.dynamics.dynamics import Dynamics
 from siq.errors import InputError
 from siq.files.whole import whole_file
@@ -79,6 +80,7 @@ def landscape_data(landscape: Landscape, *, dynamics: Dynamics) -> dict[str, Any
                 "height": _number(height),
                 "V": None if well is None else _formula(well),
             }
+            | ({"cycle": _cycle(attractor)} if isinstance(attractor, Cycle) else {})
             for index, (attractor, basin, height, well) in enumerate(
                 zip(landscape.attractors, landscape.basins, landscape.heights, landscape.wells, strict=True)
             )
@@ -89,12 +91,21 @@ def landscape_data(landscape: Landscape, *, dynamics: Dynamics) -> dict[str, Any
     } | _of_given(landscape)
 
 
+def _cycle(one: Cycle) -> dict[str, Any]:
+    return {
+        "period": one.period,
+        "multipliers": [[value.real, value.imag] for value in one.multipliers.astype(complex).tolist()],
+        "points": _rounded(one.points),
+    }
+
+
 def _of_given(landscape: Landscape) -> dict[str, Any]:
     """What a landscape of equations has beside: no other file could hold its certificate."""
     if not landscape.given:
         return {}
     certificate = landscape.certificate
-    return {"given": True, "certificate": None if certificate is None else certificate.as_data()}
+    cycles = {"parting": [_cycle(one) for one in landscape.parting]} if landscape.parting else {}
+    return {"given": True, "certificate": None if certificate is None else certificate.as_data()} | cycles
 
 
 def _visits(one: VisitTest) -> dict[str, Any]:
@@ -136,7 +147,7 @@ def _transition(one: Transition) -> dict[str, Any]:
     return {
         "start": one.start,
         "end": one.end,
-        "saddle": one.saddle.position.tolist(),
+        "saddle": one.place.tolist(),
         "barrier": _number(one.barrier),
         "formula_share": _number(one.formula_share),
         "standard_error": _number(one.standard_error),
@@ -152,7 +163,7 @@ def _transition(one: Transition) -> dict[str, Any]:
         "uphill": None if path is None else path.uphill.points.tolist(),
         "downhill": None if path is None else path.downhill.tolist(),
         "notes": list(one.notes),
-    }
+    } | ({"over_cycle": one.saddle.period} if isinstance(one.saddle, Cycle) else {})
 
 
 def read_landscape(path: str | Path, *, dynamics: Dynamics) -> StoredLandscape | None:

@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from siq.dynamics.cycles import Cycle
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.equilibria import Equilibrium, leads_back, neighbours
 from siq.dynamics.phase_portrait import PhasePortrait
@@ -21,6 +22,7 @@ from siq.dynamics.reach import measure_at
 from siq.errors import NumericalFailure
 from siq.identify.diffusion import defined_states
 from siq.identify.given_field import AnyField, GivenField
+from siq.landscape.cycle_ways import both_sides, way_about_cycles
 from siq.landscape.dwell_times import Exit
 from siq.landscape.paths import (
     MinimumActionPath,
@@ -39,6 +41,7 @@ WORTH_A_WORD = 0.5  # of its standard error, by which rival terms move a barrier
 DIFFERENT = 0.02  # share of a barrier by which two ways to it may differ without a word
 FEW_STATES = 8  # up to which first guesses of a path bend to all sides
 GUESSED = 200  # points of one that is a way down taken backwards
+OUTWARDS = "behind the saddle f leads out of the region"
 PATH_TOLERANCE = 1e-5  # of the action; prefactors follow the end of the path and need more than barriers
 
 
@@ -51,7 +54,7 @@ class Transition:
     start, end
         Indices of the attractors; `end` is None where the saddle leads back, or out of the recorded region.
     saddle
-        The saddle.
+        The saddle, or the unstable cycle.
     path
         The path of least action and the way down, None where none was found.
     barrier
@@ -74,7 +77,7 @@ class Transition:
 
     start: int
     end: int | None
-    saddle: Equilibrium
+    saddle: Equilibrium | Cycle
     path: TransitionPath | None
     barrier: float
     formula_share: float
@@ -84,6 +87,12 @@ class Transition:
     prefactor_error: PrefactorError | None = None
     leverage: float = 1.0
     by_rivals: float = 0.0
+
+    @property
+    def place(self) -> np.ndarray:
+        """Where the path ends: at the saddle, or at a state of the unstable cycle. Shape ``(d,)``."""
+        over_cycle = isinstance(self.saddle, Cycle) and self.path is not None
+        return self.path.uphill.points[-1] if over_cycle and self.path else self.saddle.position
 
     @property
     def error(self) -> float:
@@ -116,13 +125,21 @@ class WayOut:
         None where none was found.
     note
         Why not, in words.
+    from_cycle
+        Whether the attractor is a cycle.
     """
 
     start: int
     end: int | None
-    saddle: Equilibrium
+    saddle: Equilibrium | Cycle
     path: TransitionPath | None
     note: str = ""
+    from_cycle: bool = False
+
+    @property
+    def about_cycles(self) -> bool:
+        """Whether the path begins on a cycle, or leads over one."""
+        return self.from_cycle or isinstance(self.saddle, Cycle)
 
 
 def ways_out(dynamics: Dynamics, portrait: PhasePortrait, *, beyond_region: bool = False) -> list[WayOut]:
@@ -138,10 +155,13 @@ def ways_out(dynamics: Dynamics, portrait: PhasePortrait, *, beyond_region: bool
         Whether a saddle behind which lies no attractor of the region is a way out, too: of a given f the
         path up to it is as good as any other. Of an identified one nothing is known beyond.
     """
-    ways = []
-    for index, attractor in enumerate(portrait.attractors):
+    ways = _ways_over_cycles(dynamics, portrait)
+    points = len(portrait.attractors)
+    for index in range(points + len(portrait.cycles)):
         for saddle in portrait.saddles[index]:
-            beyond = neighbours(dynamics, saddle, portrait.attractors, box=portrait.box) - {index}
+            beyond = neighbours(
+                dynamics, saddle, portrait.attractors, box=portrait.box, cycles=portrait.cycles
+            ) - {index}
             if not beyond and beyond_region:
                 ways += _way_beyond(dynamics, portrait, index, saddle)
                 continue
@@ -151,6 +171,11 @@ def ways_out(dynamics: Dynamics, portrait: PhasePortrait, *, beyond_region: bool
                 continue
             end = min(beyond)
             try:
+                if max(index, end) >= points:
+                    path = way_about_cycles(dynamics, portrait, index, saddle, end, tolerance=PATH_TOLERANCE)
+                    ways.append(WayOut(index, end, saddle, path))
+                    continue
+                attractor = portrait.attractors[index]
                 path = transition_path(
                     dynamics, attractor.position, saddle.position, portrait.attractors[end].position,
                     tolerance=PATH_TOLERANCE, initial=_first_guesses(dynamics, attractor, saddle),
@@ -158,6 +183,25 @@ def ways_out(dynamics: Dynamics, portrait: PhasePortrait, *, beyond_region: bool
                 ways.append(WayOut(index, end, saddle, path))
             except NumericalFailure as error:
                 ways.append(WayOut(index, end, saddle, None, str(error)))
+    return [replace(way, from_cycle=way.start >= points) for way in ways]
+
+
+def _ways_over_cycles(dynamics: Dynamics, portrait: PhasePortrait) -> list[WayOut]:
+    """The ways over unstable cycles, from both sides of each."""
+    ways = []
+    for cycle in portrait.parting:
+        sides = [int(one) for one in both_sides(dynamics, cycle, portrait)]
+        if sides[0] == sides[1]:
+            continue
+        for start, beyond in (sides, sides[::-1]):
+            if start < 0:
+                continue
+            end, note = (None, OUTWARDS.replace("saddle", "unstable cycle")) if beyond < 0 else (beyond, "")
+            try:
+                path = way_about_cycles(dynamics, portrait, start, cycle, end, tolerance=PATH_TOLERANCE)
+                ways.append(WayOut(start, end, cycle, path, note))
+            except NumericalFailure as error:
+                ways.append(WayOut(start, end, cycle, None, str(error)))
     return ways
 
 
@@ -173,16 +217,14 @@ def _first_guesses(
 
 def _way_beyond(dynamics: Dynamics, portrait: PhasePortrait, index: int, saddle: Equilibrium) -> list[WayOut]:
     """The way over a saddle from which f leads out of the region; none where it leads back on both sides."""
-    if leads_back(dynamics, saddle, portrait.attractors, box=portrait.box):
+    if leads_back(dynamics, saddle, portrait.attractors, box=portrait.box, cycles=portrait.cycles):
         return []
+    settled: list[np.ndarray | Cycle] = [*(one.position for one in portrait.attractors), *portrait.cycles]
     try:
-        uphill = minimum_action_path(
-            dynamics, portrait.attractors[index].position, saddle.position, tolerance=PATH_TOLERANCE
-        )
+        uphill = minimum_action_path(dynamics, settled[index], saddle.position, tolerance=PATH_TOLERANCE)
     except NumericalFailure as error:
         return [WayOut(index, None, saddle, None, str(error))]
-    note = "behind the saddle f leads out of the region"
-    return [WayOut(index, None, saddle, TransitionPath(uphill, saddle.position[None]), note)]
+    return [WayOut(index, None, saddle, TransitionPath(uphill, saddle.position[None]), OUTWARDS)]
 
 
 def missing_diffusion(dynamics: Dynamics) -> str | None:
@@ -230,6 +272,8 @@ def _transition(found: AnyField, way: WayOut, well: Well | None) -> Transition:
     rate, missing = None, missing_diffusion(found.dynamics)
     of_prefactor: PrefactorError | None = None
     try:
+        if way.about_cycles:
+            raise NumericalFailure("no law is implemented for ways that begin or end on a cycle")
         if missing is not None:
             raise NumericalFailure(missing)
         rate = escape_rate(found.dynamics, path.uphill, beyond=way.end is not None)

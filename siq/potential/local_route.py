@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from siq.dynamics.basins import Basin
+from siq.dynamics.cycles import Cycle
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.equilibria import Equilibrium, hessian_at
 from siq.errors import NumericalFailure
@@ -41,7 +42,7 @@ def grow_well(
     dynamics: Dynamics,
     attractor: Equilibrium,
     basin: Basin,
-    saddles: Sequence[Equilibrium],
+    saddles: Sequence[Equilibrium | Cycle],
     *,
     degree: int,
     generator: np.random.Generator,
@@ -103,7 +104,7 @@ def grow_well(
 def _grown(
     dynamics: Dynamics,
     basin: Basin,
-    saddles: Sequence[Equilibrium],
+    saddles: Sequence[Equilibrium | Cycle],
     basis: PowerBasis,
     coefficients: np.ndarray,
     *,

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from siq.dynamics.basins import Basin
+from siq.dynamics.cycles import Cycle
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.equilibria import Equilibrium, hessian_at
 from siq.dynamics.reach import measure_at
@@ -56,14 +57,14 @@ class Depth:
     Attributes
     ----------
     saddle
-        That saddle.
+        That saddle, or the unstable cycle that bounds the well.
     points
         Along the path, shape ``(n, d)``.
     values, slopes
         V and ∇V there, shape ``(n,)`` and ``(n, d)``.
     """
 
-    saddle: Equilibrium
+    saddle: Equilibrium | Cycle
     points: np.ndarray
     values: np.ndarray
     slopes: np.ndarray

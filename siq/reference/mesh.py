@@ -34,6 +34,7 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from siq.dynamics.diffusion import Diffusion
 from siq.errors import NumericalFailure
@@ -207,6 +208,83 @@ def mesh_quasipotential(
         published = max(round(10 + 4 * (math.log2(max(shape)) - 7)), 2)
         reach = published if as_published else min(math.ceil(STRAIGHT_REACH + turning / 2), FARTHEST)
 
+    x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1) - attractor
+    start = np.einsum("abi,ij,abj->ab", x, hessian, x) / 2
+    begin = np.where(start <= rim, start, np.inf)
+    return _marched(
+        drift,
+        attractor,
+        begin,
+        axes,
+        box,
+        diffusion,
+        reach,
+        level,
+        stop_at_boundary,
+        refined=not as_published,
+    )
+
+
+def mesh_quasipotential_of_cycle(
+    drift: Callable[[np.ndarray], np.ndarray],
+    points: np.ndarray,
+    *,
+    hessians: np.ndarray,
+    box: np.ndarray,
+    shape: tuple[int, int],
+    diffusion: Diffusion,
+    reach: int,
+    stop_at_boundary: bool = True,
+) -> MeshQuasipotential:
+    """V with respect to a stable limit cycle, on a mesh.
+
+    Parameters
+    ----------
+    drift, box, shape, diffusion, reach, stop_at_boundary
+        As for `mesh_quasipotential`.
+    points
+        Shape ``(n, 2)``: states along the cycle, closer to each other than mesh widths.
+    hessians
+        Shape ``(n, 2, 2)``: the Hessian of V (not of U) there. Within a few mesh widths of the cycle V is
+        ``½ (x - x_k)·H_k (x - x_k)``, x_k being the next of the points.
+
+    Raises
+    ------
+    ValueError
+        When D is not the same everywhere.
+    NumericalFailure
+        When f is not finite everywhere in the box.
+    """
+    if not diffusion.constant:
+        raise ValueError("the mesh knows only a D that is the same everywhere; use characteristics instead")
+    axes = tuple(np.linspace(low, high, count) for (low, high), count in zip(box, shape, strict=True))
+    widths = (box[:, 1] - box[:, 0]) / (np.array(shape) - 1)
+    x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    away, which = cKDTree(points / widths).query(x / widths)
+    offset = x - points[which]
+    start = np.einsum("ni,nij,nj->n", offset, hessians[which], offset) / 2
+    begin = np.where(away <= START, start, np.inf).reshape(shape)
+    return _marched(
+        drift, points[0], begin, axes, box, diffusion, reach, None, stop_at_boundary, refined=True
+    )
+
+
+def _marched(
+    drift: Callable[[np.ndarray], np.ndarray],
+    attractor: np.ndarray,
+    begin: np.ndarray,
+    axes: tuple[np.ndarray, ...],
+    box: np.ndarray,
+    diffusion: Diffusion,
+    reach: int,
+    level: float | None,
+    stop_at_boundary: bool,
+    *,
+    refined: bool,
+) -> MeshQuasipotential:
+    """V on the mesh from where it is known, `begin` being infinite elsewhere."""
+    shape = begin.shape
+    widths = (box[:, 1] - box[:, 0]) / (np.array(shape) - 1)
     root = _root(diffusion) * widths
     small = math.frexp(np.abs(root).max())[1]
     root = np.ldexp(root, -small)
@@ -214,19 +292,17 @@ def mesh_quasipotential(
     fast = math.frexp(np.abs(flow).max())[1]
     flow = np.ldexp(flow, -fast)
     unit = math.ldexp(0.5, 2 * small + fast)  # V of one unit of U within the mesh
-    x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1) - attractor
-    start = np.einsum("abi,ij,abj->ab", x, hessian, x) / 2
-    values = np.where(start <= rim, start / unit, np.inf)
-
+    known = np.isfinite(begin)
+    values = begin / unit
     mesh = _Mesh(
         values=values,
-        status=np.where(start <= rim, FRONT, UNKNOWN).astype(np.int8),
+        status=np.where(known, FRONT, UNKNOWN).astype(np.int8),
         lowest=np.full(shape, np.inf),
         source=np.full(shape, -1),
         drift=flow,
         root=root,
         reach=reach,
-        refined=not as_published,
+        refined=refined,
     )
     heap = _Heap(np.empty(values.size, dtype=int), np.empty(values.size, dtype=int), np.zeros(1, dtype=int))
     stop, highest = _march(mesh, heap, math.inf if level is None else level / unit, stop_at_boundary)

@@ -38,7 +38,7 @@ class DrawnPoint:
     Attributes
     ----------
     kind
-        ``attractor``, ``saddle``, ``repeller`` or ``degenerate``.
+        ``attractor``, ``cycle``, ``saddle``, ``repeller`` or ``degenerate``.
     position
         Shape ``(d,)``.
     height
@@ -109,6 +109,10 @@ class DrawnLandscape:
         f and D.
     matched
         Whether U is known over all wells; otherwise each well is drawn from its own bottom.
+    cycles
+        Stable limit cycles, each of shape ``(n, d)`` and closed.
+    parting
+        Unstable ones, likewise.
     """
 
     names: tuple[str, ...]
@@ -123,6 +127,8 @@ class DrawnLandscape:
     formulas: tuple[Well | None, ...] = ()
     dynamics: Dynamics | None = None
     matched: bool = True
+    cycles: tuple[np.ndarray, ...] = ()
+    parting: tuple[np.ndarray, ...] = ()
 
     @property
     def saddles(self) -> tuple[DrawnPoint, ...]:
@@ -241,7 +247,16 @@ def drawn_data(
         return least_over_wells(np.stack([lift + 2 * well.known_values(x) for lift, well in known]))
 
     ways = tuple(_way(one, dynamics.dimension) for one in data["transitions"])
-    seen = [np.array(attractors), *(way.saddle[None] for way in ways), *(well.points for _, well in known)]
+    cycles = tuple(_closed(one["cycle"]) for one in data["wells"] if "cycle" in one)
+    parting = tuple(_closed(one) for one in data.get("parting", []))
+    seen = [
+        np.array(attractors),
+        *cycles,
+        *parting,
+        *(way.uphill for way in ways if cycles or parting),  # such ways wind, and leave their wells
+        *(way.saddle[None] for way in ways),
+        *(well.points for _, well in known),
+    ]
     if points is not None and (single is not None or not any(map(len, seen))):
         seen.append(points)
     if not any(map(len, seen)):
@@ -252,8 +267,8 @@ def drawn_data(
         units=units,
         potential=of_wells if single is None else single,
         wells=tuple(
-            DrawnPoint("attractor", place, float(lift), well_name(index))
-            for index, (place, lift) in enumerate(zip(attractors, lifts, strict=True))
+            DrawnPoint("cycle" if "cycle" in one else "attractor", place, float(lift), well_name(index))
+            for index, (place, lift, one) in enumerate(zip(attractors, lifts, data["wells"], strict=True))
         ),
         others=_others(data, ways, lifts),
         ways=ways,
@@ -266,7 +281,14 @@ def drawn_data(
         formulas=tuple(wells),
         dynamics=dynamics,
         matched=matched,
+        cycles=cycles,
+        parting=parting,
     )
+
+
+def _closed(cycle: Mapping[str, Any]) -> np.ndarray:
+    points = np.array(cycle["points"], dtype=float)
+    return np.vstack([points, points[:1]])
 
 
 def _everywhere(formula: SymbolicDecomposition | None, points: np.ndarray | None) -> Potential | None:

@@ -43,17 +43,18 @@ def headline(data: Mapping[str, Any] | None, *, missing: str = "") -> str:
     wells = said.wells
     count = COUNTS[len(wells)] if len(wells) < len(COUNTS) else str(len(wells))
     subject = "equations have" if said.given else "recordings show"
-    opening = f"The {subject} {count} stable state{'s' if len(wells) > 1 else ''}"
+    kind = "attractor" if any(well.cycle is not None for well in wells) else "stable state"
+    opening = f"The {subject} {count} {kind}{'s' if len(wells) > 1 else ''}"
     if len(wells) == 1:
         return _alone(said, wells[0], opening)
     if len(wells) > LISTED:
         return _many(said, opening)
     facts = [_facts(said, well) for well in wells]
     if len(set(facts)) == 1 and facts[0]:
-        places = _listed([f"{well.name} at {place_text(said, well)}" for well in wells])
+        places = _listed([f"{well.name} {_where(said, well)}" for well in wells])
         return f"{opening}, {places}; each {facts[0]}."
     told = [
-        f"{well.name} at {place_text(said, well)} {fact or 'has no barrier that could be found'}"
+        f"{well.name} {_where(said, well)} {fact or 'has no barrier that could be found'}"
         for well, fact in zip(wells, facts, strict=True)
     ]
     return f"{opening}: {_listed(told, last='; and ', between='; ')}."
@@ -62,8 +63,8 @@ def headline(data: Mapping[str, Any] | None, *, missing: str = "") -> str:
 def _alone(said: SaidLandscape, well: SaidWell, opening: str) -> str:
     fact = _facts(said, well)
     if fact:
-        return f"{opening}, at {place_text(said, well)}: it {fact}."
-    text = f"{opening}, at {place_text(said, well)}, and no way out of it within the {said.region}"
+        return f"{opening}, {_where(said, well)}: it {fact}."
+    text = f"{opening}, {_where(said, well)}, and no way out of it within the {said.region}"
     if math.isfinite(well.known_up_to):
         text += f"; U is known up to {value_text(well.known_up_to, unit=said.energy_unit)} above it"
     return f"{text}."
@@ -74,7 +75,7 @@ def _many(said: SaidLandscape, opening: str) -> str:
     if not known:
         return f"{opening}, and no barrier between them could be found."
     deepest, shallowest = (pick(known, key=lambda well: well.depth) for pick in (max, min))
-    text = f"{opening}: the deepest, {deepest.name} at {place_text(said, deepest)}, {_facts(said, deepest)}"
+    text = f"{opening}: the deepest, {deepest.name} {_where(said, deepest)}, {_facts(said, deepest)}"
     return f"{text}; the shallowest, {shallowest.name}, {_facts(said, shallowest)}."
 
 
@@ -149,6 +150,15 @@ def time_text(mean: MeanTime, unit: str, *, decorated: bool = True) -> str:
     return text if mean.complete else f"at most {text}"
 
 
+def _where(said: SaidLandscape, well: SaidWell) -> str:
+    """``at (x, y) = (0, 0)``; of a cycle its period."""
+    if well.cycle is None:
+        return f"at {place_text(said, well)}"
+    unit = said.time_unit if unit_text(said.time_unit) else ""
+    text = f"a limit cycle of period\u00a0{value_text(well.period, unit=unit, digits=4)}"
+    return text if len(said.wells) == 1 else f"({text})"
+
+
 def place_text(said: SaidLandscape, well: SaidWell) -> str:
     """Where a well is: ``x = −0.996 ± 0.005 nm``, ``(x, y) = (−0.50, 0.00) µm``."""
     names, units = said.states, said.units
@@ -195,6 +205,9 @@ def remarks(data: Mapping[str, Any] | None) -> list[str]:
     if not deep:
         return []
     noise = said.noise
+    laws = any(way["prefactor"] is not None for way in data["transitions"])
+    if noise is None and not laws and any(well.cycle is not None for well in said.wells):
+        return []  # no noise would make times of these barriers
     if noise is None:
         silent = "the equations do not say how strong it is" if said.given else "these recordings show none"
         return [
@@ -291,6 +304,18 @@ def wells_table(data: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.DataFrame]:
             said.states, said.units, well.position, well.position_errors, strict=True
         ):
             rows.setdefault(_headed(name, unit), []).append(value_text(value, error))
+        if well.cycle is not None:
+            for name, unit, low, high in zip(
+                said.states, said.units, well.cycle.min(axis=0), well.cycle.max(axis=0), strict=True
+            ):
+                rows[_headed(name, unit)][-1] = range_text(low, high)
+        if any(each.cycle is not None for each in said.wells):
+            rows.setdefault(_headed("period", said.time_unit), []).append(
+                "" if well.cycle is None else value_text(well.period, digits=4)
+            )
+            rows.setdefault("Floquet multipliers", []).append(
+                ", ".join(_multiplier(one) for one in well.multipliers)
+            )
         deep = math.isfinite(well.depth)
         rows.setdefault(_headed("depth ΔU", said.energy_unit), []).append(
             value_text(well.depth, well.depth_error) if deep else ""
@@ -317,6 +342,13 @@ def wells_table(data: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.DataFrame]:
     if len(names) > LISTED + 1:  # as many columns would be too wide: a row for each
         table = pd.DataFrame({"stable state": names} | kept)
     return table, pd.DataFrame(numbers).dropna(axis=1, how="all")
+
+
+def _multiplier(value: complex) -> str:
+    real = value_text(value.real)
+    return (
+        real if not value.imag else f"{real} {'−' if value.imag < 0 else '+'} {value_text(abs(value.imag))} i"
+    )
 
 
 def _headed(name: str, unit: str) -> str:

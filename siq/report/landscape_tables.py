@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from siq.landscape.dwell_times import NoiseStrength, exit_time
-from siq.numerics.measured_text import unit_text, value_text
+from siq.numerics.measured_text import range_text, unit_text, value_text
 from siq.report.landscape_answer import time_text
 from siq.report.page import ReportTable
 from siq.report.said_landscape import SaidLandscape, well_name
@@ -66,6 +66,8 @@ def landscape_tables(
         if overview["transitions"]:
             tables.append(_ways(said, file))
         tables.append(_equilibria(said, file))
+        if overview.get("parting"):
+            tables.append(_parting(said, file))
         if noises and any(way["prefactor"] is not None for way in overview["transitions"]):
             tables.append(_times(said, noises))
     if len(landscape) and landscape["run"].nunique() > 1:
@@ -89,7 +91,7 @@ def _ways(said: SaidLandscape, file: str) -> ReportTable:
         rows.append(
             {
                 "way": f"{well_name(way['start'])} to {beyond}",
-                "over the saddle at": _place(said, way["saddle"]),
+                "over the saddle at": _place(said, way["saddle"]) + _of_cycle(said, way),
                 barrier: value_text(exit_.barrier, exit_.standard_error) if known else "",
                 "the same by the path alone": value_text(way["minimum_action"])
                 if way["minimum_action"] is not None
@@ -124,6 +126,30 @@ def _ways(said: SaidLandscape, file: str) -> ReportTable:
         "Every way out of every well.", pd.DataFrame(rows), explained, file, data=pd.DataFrame(numbers),
         rows_named=True,
     )  # fmt: skip
+
+
+def _of_cycle(said: SaidLandscape, way: Mapping[str, Any]) -> str:
+    if "over_cycle" not in way:
+        return ""
+    return f", on an unstable cycle of period {value_text(way['over_cycle'], unit=said.time_unit, digits=4)}"
+
+
+def _parting(said: SaidLandscape, file: str) -> ReportTable:
+    """The unstable cycles, a row for each."""
+    unit = f" ({unit_text(said.time_unit)})" if unit_text(said.time_unit) else ""
+    rows = []
+    for one in said.data["parting"]:
+        points = np.array(one["points"])
+        reach = [range_text(*ends) for ends in zip(points.min(axis=0), points.max(axis=0), strict=True)]
+        multipliers = ", ".join(_rate(*value) for value in one["multipliers"])
+        rows.append(
+            dict(zip(said.states, reach, strict=True))
+            | {
+                f"period{unit}": value_text(one["period"], digits=4),
+                "Floquet multipliers": multipliers,
+            }
+        )
+    return ReportTable("Unstable cycles, which part basins.", pd.DataFrame(rows), {}, file)
 
 
 def _place(said: SaidLandscape, position: Sequence[float]) -> str:

@@ -40,7 +40,9 @@ def _opening(landscape: Landscape) -> list[str]:
         [headline(data), *remarks(data)], data, landscape.seen,
         certified=certificate is not None and bool(certificate["certified"]),
     )  # fmt: skip
-    return [answer, certificate_line(certificate), *further]
+    written = certificate is not None or any(well is not None for well in landscape.wells)
+    verdict = certificate_line(certificate) if written else "U is not written as a formula."
+    return [answer, verdict, *further]
 
 
 def _tables(landscape: Landscape) -> list[tuple[str, pd.DataFrame]]:

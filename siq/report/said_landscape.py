@@ -66,6 +66,12 @@ class SaidWell:
         Relative standard error of ΔU/ε from an estimated D over that of ε.
     visits
         How long visits to it last, None where this was not compared.
+    cycle
+        Of a limit cycle, its states, shape ``(n, d)``; None of a point.
+    period
+        Of a limit cycle, NaN of a point.
+    multipliers
+        Its Floquet multipliers.
     """
 
     name: str
@@ -79,6 +85,9 @@ class SaidWell:
     time: MeanTime | None
     leverage: float = 1.0
     visits: SaidVisits | None = None
+    cycle: np.ndarray | None = None
+    period: float = math.nan
+    multipliers: tuple[complex, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -137,6 +146,7 @@ class SaidLandscape:
         """How large each state becomes, shape ``(d,)``: what is 10⁻⁶ of it, with its error, reads as zero."""
         places = [one["position"] for one in self.data["equilibria"]]
         places += [one["attractor"] for one in self.data["wells"]]
+        places += [place for one in self.data["wells"] if "cycle" in one for place in one["cycle"]["points"]]
         for one in self.data["wells"]:
             places += (one.get("V") or {}).get("points", [])
         return np.abs(np.array(places, dtype=float).reshape(-1, len(self.states))).max(axis=0, initial=0.0)
@@ -182,7 +192,7 @@ class SaidLandscape:
         errors = one.get("standard_errors")
         known = np.full(len(place), np.nan) if errors is None else np.array([_float(each) for each in errors])
         place, known = self.settled(place, known)
-        formula = one.get("V")
+        formula, cycle = one.get("V"), one.get("cycle")
         return SaidWell(
             well_name(index),
             place,
@@ -195,6 +205,9 @@ class SaidLandscape:
             self.dwell_time(index, self.noise),
             1.0 if lowest is None else lowest.get("noise_leverage", 1.0),
             self._visits(index),
+            None if cycle is None else np.array(cycle["points"]),
+            math.nan if cycle is None else float(cycle["period"]),
+            () if cycle is None else tuple(complex(*value) for value in cycle["multipliers"]),
         )
 
     def _visits(self, well: int) -> SaidVisits | None:

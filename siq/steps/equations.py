@@ -117,13 +117,16 @@ def landscape_of_equations(
     except NumericalFailure as error:
         raise NoLandscape(str(error), None, system) from None
     fault = portrait.fault()
-    if not portrait.attractors:
+    if not (portrait.attractors or portrait.cycles):
         raise NoLandscape(fault or "f has no stable equilibrium in the domain", None, system)
     found, notes = GivenField(system), [*([] if fault is None else [fault]), *portrait.notes]
+    notes += _about_cycles(system, portrait)
     ways = ways_out(system, portrait, beyond_region=True)
     wells: list[Well | None] = [None] * len(portrait.attractors)
     certificate = None
-    if many and formulas:
+    if not portrait.attractors:
+        pass
+    elif many and formulas:
         notes.append(
             f"powers of {system.dimension} states are too many to write V in: barriers and times follow from"
             " the paths of least action, which need f alone"
@@ -141,6 +144,7 @@ def landscape_of_equations(
             ), seed=settings.seed,
         )  # fmt: skip
         notes += caustics_below(system, sought, portrait, certificate.error, seed=settings.seed)
+    wells += [None] * len(portrait.cycles)
     noises = settings.landscape.noise_intensities
     return assembled(
         found, portrait, wells, transitions(found, ways, wells), notes, certificate=certificate,
@@ -200,6 +204,32 @@ def write(found: FoundOfEquations, *, quasipotential: str | Path, tables: Mappin
         )
     for name, path in tables.items():
         write_table(path, rows[name])
+
+
+def _about_cycles(system: Dynamics, portrait: PhasePortrait) -> list[str]:
+    """What has to be known of a landscape with limit cycles, in words."""
+    notes = []
+    if portrait.cycles and portrait.attractors:
+        notes.append(
+            "about a limit cycle U is not written as a formula: barriers out of it and into it are the"
+            " actions of paths, and the certificate is of the other attractors"
+        )
+    elif portrait.cycles:
+        notes.append(
+            "about a limit cycle U is not written as a formula, and there is nothing to certify: its"
+            " barriers are the actions of paths"
+        )
+    if portrait.cycles and not system.diffusion.regular:
+        notes.append(
+            "paths from and to cycles are found where noise acts on every state: here it acts on some only,"
+            " and the barriers of cycles are not known"
+        )
+    elif portrait.cycles and system.dimension > 2:
+        notes.append(
+            "unstable cycles that part basins were sought by following boundaries between attractors; nothing"
+            " proves that none was missed"
+        )
+    return notes
 
 
 def _lowest(ways: list[WayOut], index: int) -> WayOut | None:

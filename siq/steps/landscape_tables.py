@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
+from siq.dynamics.cycles import Cycle
 from siq.landscape.dwell_times import MeanTime, dwell_time, exit_time
 from siq.landscape.landscape import Landscape
 from siq.potential.local_wells import best_trial
@@ -17,7 +18,7 @@ def place(position: np.ndarray) -> str:
 
 
 def landscape_rows(run: int, found: Landscape, remark: str | None = None) -> pd.DataFrame:
-    """One row for each equilibrium and each way out of a well; `remark` is of what all barriers hang on.
+    """One row for each equilibrium, cycle and way out; `remark` is of what all barriers hang on.
 
     Mean times are for the noise of the landscape: of an attractor the time in its well, of a transition that
     over its saddle alone; the error is that of data and law together.
@@ -32,9 +33,7 @@ def landscape_rows(run: int, found: Landscape, remark: str | None = None) -> pd.
     rows: list[dict[str, object]] = []
     for one in found.equilibria:
         index = heights.get(place(one.position))
-        eigenvalues = ", ".join(
-            f"{value.real:.4g}" + (f"{value.imag:+.4g}i" if value.imag else "") for value in one.eigenvalues
-        )
+        eigenvalues = ", ".join(_complex(value) for value in one.eigenvalues)
         rows.append(
             {
                 "run": run,
@@ -47,6 +46,7 @@ def landscape_rows(run: int, found: Landscape, remark: str | None = None) -> pd.
             }
             | ({} if index is None else _time(found, dwell_time(found.exits(index), found.noise)))
         )
+    rows += [_cycle_row(run, found, one, names, tops) for one in (*found.cycles, *found.parting)]
     for way in found.transitions:
         beyond = "outside" if way.end is None else names[way.end]
         rows.append(
@@ -54,7 +54,7 @@ def landscape_rows(run: int, found: Landscape, remark: str | None = None) -> pd.
                 "run": run,
                 "item": f"{names[way.start]} to {beyond}",
                 "kind": "transition",
-                "position": place(way.saddle.position),
+                "position": place(way.place),
                 "U": found.heights[way.start] + way.barrier,
                 "barrier": way.barrier,
                 "standard_error": way.standard_error,
@@ -67,6 +67,28 @@ def landscape_rows(run: int, found: Landscape, remark: str | None = None) -> pd.
             | _time(found, None if noise is None else exit_time(way.exit, noise))
         )
     return as_table("landscape", rows)
+
+
+def _cycle_row(
+    run: int, found: Landscape, one: Cycle, names: list[str], tops: dict[str, float]
+) -> dict[str, object]:
+    """Of a cycle, one of its states, the Floquet exponents, and a note with period and multipliers."""
+    index = next((at for at, other in enumerate(found.attractors) if other is one), None)
+    multipliers = ", ".join(_complex(value) for value in one.multipliers)
+    return {
+        "run": run,
+        "item": "" if index is None else names[index],
+        "kind": one.kind,
+        "position": place(one.position),
+        "eigenvalues": ", ".join(_complex(value) for value in one.eigenvalues),
+        "U": tops.get(place(one.position), np.nan) if index is None else found.heights[index],
+        "basin": np.nan if index is None else found.basins[index],
+        "note": f"period {one.period:.8g}, Floquet multipliers {multipliers}",
+    }
+
+
+def _complex(value: complex) -> str:
+    return f"{value.real:.4g}" + (f"{value.imag:+.4g}i" if value.imag else "")
 
 
 def _time(found: Landscape, mean: MeanTime | None) -> dict[str, object]:

@@ -21,14 +21,18 @@ from known_systems import (
 from scipy.integrate import quad
 
 from siq.dynamics.cards import load_system
+from siq.dynamics.cycles import hessians_along
 from siq.dynamics.dynamics import Dynamics
 from siq.errors import InputError
 from siq.landscape.landscape import Landscape
 from siq.landscape.options import LandscapeOptions
 from siq.landscape.paths import minimum_action_path
 from siq.landscape.refusal import NoLandscape
+from siq.landscape.storage import landscape_data
 from siq.reference.mesh import mesh_quasipotential
+from siq.report.drawn_landscape import drawn
 from siq.steps.equations import EquationSettings, landscape_of_equations
+from siq.steps.landscape_tables import landscape_rows
 
 X, Y, Z = sympy.symbols("x y z", real=True)
 SYSTEMS = Path(__file__).parents[2] / "config" / "systems"
@@ -210,10 +214,29 @@ def test_escape_times_follow_where_the_noise_is_known() -> None:
     assert "recorded" not in landscape.report()
 
 
+def test_a_limit_cycle_is_an_attractor_without_a_formula() -> None:
+    landscape = Landscape.from_equations(as_system(limit_cycle()))
+    (cycle,) = landscape.cycles
+    assert cycle.period == pytest.approx(np.pi, rel=1e-9)
+    assert cycle.multipliers == pytest.approx(np.exp(-2 * np.pi), rel=1e-7)
+    assert landscape.transitions == () and landscape.wells == (None,)
+    assert "no way out of it within the domain" in landscape.report()
+    # V = (r² - 1)²/4 has the curvature 2 across the circle.
+    across = cycle.points / np.linalg.norm(cycle.points, axis=1, keepdims=True)
+    curvature = np.einsum("ni,nij,nj->n", across, hessians_along(landscape.dynamics, cycle), across)
+    np.testing.assert_allclose(curvature, 2, rtol=1e-7)
+    rows = landscape_rows(0, landscape).set_index("kind")
+    assert rows.loc["cycle", "item"] == "A1" and rows.loc["cycle", "note"].startswith("period 3.1415927")
+    (stored,) = landscape_data(landscape, dynamics=landscape.dynamics)["wells"]
+    assert stored["cycle"]["period"] == cycle.period and len(stored["cycle"]["points"]) == len(cycle.points)
+    (line,) = drawn(landscape).cycles
+    np.testing.assert_allclose(np.linalg.norm(line, axis=1), 1, rtol=1e-6)
+
+
 def test_systems_without_a_landscape_say_why() -> None:
-    cycle = as_system(limit_cycle())
-    with pytest.raises(NoLandscape, match="limit cycle of period"):
-        Landscape.from_equations(cycle)
+    chaos = Dynamics.of((X, Y), (Y, X - X**3), domain=[(0.2, 0.6), (0.5, 0.9)])
+    with pytest.raises(NoLandscape, match="no stable equilibrium"):
+        Landscape.from_equations(chaos)
     with pytest.raises(InputError, match="no domain"):
         Landscape.from_equations(replace(TOGGLE, domain=None))
     with pytest.raises(InputError, match="divides by zero"):

@@ -53,6 +53,8 @@ WELL: dict[str, Any] = {
 SADDLE: dict[str, Any] = {
     "marker": "X", "markersize": 8, "markerfacecolor": "white", "markeredgecolor": BLACK, "linestyle": "none",
 }  # fmt: skip
+CYCLE: dict[str, Any] = {"color": ORANGE, "linewidth": 2.6}
+PARTING: dict[str, Any] = {"color": BLACK, "linewidth": 1.2, "linestyle": (0, (1, 1.2))}
 RECORDED: dict[str, Any] = {
     "marker": ".", "markersize": 2.5, "color": "#222222", "alpha": 0.35, "markeredgewidth": 0,
     "linestyle": "none",
@@ -135,7 +137,7 @@ def quasipotential_figure(
     figure = Figure(figsize=(WIDTH, 3.6 if one else 4.5))
     axes = figure.add_subplot()
     handles = draw_quasipotential(axes, landscape, states=states, view=view)
-    if not any(np.isfinite(_values_in(landscape))):
+    if not any(np.isfinite(_values_in(landscape))) and not landscape.cycles:
         return None
     figure.legend(handles=handles, loc="outside lower center", ncols=2)
     return figure
@@ -321,9 +323,13 @@ def draw_equilibria(axes: Axes, landscape: DrawnLandscape, shown: tuple[int, int
     """Draw wells with their letters, and passes."""
     low, high = landscape.box[list(shown)].T
     marks = [(one, SADDLE) for one in landscape.saddles] + [(one, WELL) for one in landscape.wells]
+    for lines, drawn_as in ((landscape.cycles, CYCLE), (landscape.parting, PARTING)):
+        for line in lines:
+            axes.plot(*line[:, list(shown)].T, zorder=3.2, **drawn_as)
     for one, style in marks:
         place = one.position[list(shown)]
-        axes.plot(*place, zorder=4, **style)
+        if one.kind != "cycle":
+            axes.plot(*place, zorder=4, **style)
         if one.label:
             upward = 1 if (place[1] - low[1]) < 0.8 * (high[1] - low[1]) else -1
             axes.annotate(
@@ -335,7 +341,10 @@ def draw_equilibria(axes: Axes, landscape: DrawnLandscape, shown: tuple[int, int
 
 
 def _names_of_marks(landscape: DrawnLandscape) -> list[Any]:
-    handles = [Line2D([], [], label="stable state", **WELL)] if landscape.wells else []
+    points = any(one.kind != "cycle" for one in landscape.wells)
+    handles = [Line2D([], [], label="stable state", **WELL)] if points else []
+    handles += [Line2D([], [], label="limit cycle", **CYCLE)] if landscape.cycles else []
+    handles += [Line2D([], [], label="unstable cycle", **PARTING)] if landscape.parting else []
     return handles + ([Line2D([], [], label="saddle", **SADDLE)] if landscape.saddles else [])
 
 
