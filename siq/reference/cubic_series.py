@@ -4,9 +4,10 @@ With ``V = ½ yᵀMy + ⅙ T(y, y, y)``, y = x - A, the third powers of the Hami
 
     T(y, y, By) = -(My)·F(y, y) - 2 (My)ᵀ(∂D·y)(My),    B = J + 2DM,
 
-F being the second derivatives of f. In the eigenvectors of B this is diagonal: ``T_ijk (λ_i + λ_j + λ_k)/3``
-is the symmetric part of the right side. So it takes d⁴ operations, where a power series of degree 3 as in
-`siq.reference.power_series` solves equations with d³/6 unknowns.
+F being the second derivatives of f. In Schur's form of B, which is triangular, each T_i follows from those
+before it by Sylvester's equation. So it takes d⁴ operations, where a power series of degree 3 as in
+`siq.reference.power_series` solves equations with d³/6 unknowns. Eigenvectors would do, too, but those of a
+long chain that turns are all but parallel.
 """
 
 from __future__ import annotations
@@ -14,12 +15,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg
 
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.equilibria import hessian_at
-from siq.errors import NumericalFailure
-
-DEFECTIVE = 1e8  # condition of the eigenvectors: B has too few of them
 
 
 @dataclass(frozen=True)
@@ -41,26 +40,22 @@ class CubicSeries:
 
 
 def cubic_series(dynamics: Dynamics, attractor: np.ndarray) -> CubicSeries:
-    """V about an attractor, shape ``(d,)``, to its third powers.
-
-    Raises
-    ------
-    NumericalFailure
-        Where the linearisation has too few eigenvectors.
-    """
+    """V about an attractor, shape ``(d,)``, to its third powers."""
     place = attractor[None]
     square, noise = hessian_at(dynamics, attractor), dynamics.diffusion
     flow = dynamics.jacobian(place)[0] + 2 * noise.at(place)[0] @ square
     known = np.einsum("ai,ijk->ajk", square, dynamics.hessian(place)[0])
     if not noise.constant:
         known = known + 2 * np.einsum("ai,ijk,jb->abk", square, noise.derivatives(place)[0], square)
-    values, vectors = np.linalg.eig(flow)
-    if not np.linalg.cond(vectors) < DEFECTIVE:
-        raise NumericalFailure("the linearisation about the attractor has too few eigenvectors for ∇³V")
-    turned = np.einsum("abc,ai,bj,ck->ijk", known, vectors, vectors, vectors, optimize=True)
     orders = [(0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)]
-    symmetric = sum(turned.transpose(order) for order in orders) / 6
-    cube = -3 * symmetric / (values[:, None, None] + values[None, :, None] + values[None, None, :])
-    back = np.linalg.inv(vectors)
-    whole = np.einsum("ijk,ia,jb,kc->abc", cube, back, back, back, optimize=True)
+    symmetric = sum(known.transpose(order) for order in orders) / 6
+    triangle, unitary = scipy.linalg.schur(flow, output="complex")
+    turned = -3 * np.einsum("abc,ai,bj,ck->ijk", symmetric, unitary, unitary, unitary, optimize=True)
+    one = np.eye(len(flow))
+    cube = np.zeros_like(turned)
+    for i in range(len(flow)):
+        rest = turned[i] - np.einsum("m,mjk->jk", triangle[:i, i], cube[:i])
+        cube[i] = scipy.linalg.solve_sylvester(triangle.T + triangle[i, i] * one, triangle, rest)
+    back = unitary.conj()
+    whole = np.einsum("ijk,ai,bj,ck->abc", cube, back, back, back, optimize=True)
     return CubicSeries(attractor, square, np.ascontiguousarray(whole.real))
