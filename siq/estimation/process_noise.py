@@ -13,6 +13,7 @@ from siq.estimation.estimation import Fit, fit_by_multiple_shooting
 from siq.estimation.innovations import Noise
 from siq.estimation.jumps import EDGE_SUBSTEPS, jumps_of, spread_edges
 from siq.estimation.measurements import Measurements
+from siq.estimation.noise import log_likelihood
 from siq.estimation.trajectories import fit_trajectories
 
 THRESHOLD = 1e-4  # probability by chance, below which random forces are believed
@@ -122,7 +123,23 @@ def fit_with_and_without_process_noise(
     # Where f jumps, steps of all samples at once go to and fro.
     ways = (as_trajectories, at_all_samples) if jumps_of(model) else (at_all_samples, as_trajectories)
     strict = ways[0]()
-    return loose, strict if strict.converged else better_of(strict, ways[1]())
+    if not strict.converged:
+        strict = better_of(strict, ways[1]())
+    vanished = None if start is None else without_idle_forces(start, data)
+    return loose, strict if vanished is None else better_of(vanished, strict)
+
+
+def without_idle_forces(fit: Fit, data: Measurements) -> Fit | None:
+    """A fit without its random forces, where these do nothing in it; None where they do something.
+
+    Their intensities may have gone towards zero. The fit without them has then been found already, and may be
+    likelier than the one that another way of fitting ends in.
+    """
+    still = fit.noise.without_process()
+    with_them, alone = (log_likelihood(fit.linearisation, data, noise) for noise in (fit.noise, still))
+    if not 2 * (with_them - alone) <= least_to_believe(fit.noise):
+        return None
+    return replace(fit, noise=still, log_likelihood=fit.log_likelihood - (with_them - alone))
 
 
 def better_of(one: Fit, other: Fit) -> Fit:

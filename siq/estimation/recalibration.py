@@ -13,7 +13,12 @@ from siq.estimation.innovations import Noise
 from siq.estimation.linearisation import Grid
 from siq.estimation.measurements import Measurements
 from siq.estimation.noise import first_noise
-from siq.estimation.process_noise import better_of, fit_with_and_without_process_noise, simpler_fit
+from siq.estimation.process_noise import (
+    better_of,
+    fit_with_and_without_process_noise,
+    simpler_fit,
+    without_idle_forces,
+)
 from siq.estimation.trajectories import fit_trajectories, run
 
 FAINT = 1e-4  # process noise, relative to the motion, from which a fit without any is loosened
@@ -68,4 +73,8 @@ def recalibrate(model: Dynamics, data: Measurements, *, budget: Budget | None = 
         substeps=strict.substeps,
         budget=budget,
     )
-    return simpler_fit(again if again.converged else None, strict), strict
+    if not again.converged:
+        return strict, strict
+    idle = without_idle_forces(again, data)
+    strict = strict if idle is None else better_of(idle, strict)
+    return simpler_fit(again, strict), strict
