@@ -17,9 +17,7 @@ from siq.estimation.process_noise import (
     simpler_fit,
 )
 from siq.mismatch.candidates import MechanismCandidate
-from siq.mismatch.function_places import (
-    Place,
-)
+from siq.mismatch.function_places import Place
 from siq.mismatch.functions import FORMULA, SPLINE
 from siq.mismatch.nameless_models import Material, Part
 from siq.mismatch.surfaces import SURFACE, Surface

@@ -23,7 +23,7 @@ from siq.mismatch.surfaces import Surface, needed, response_with_surface, surfac
 from siq.mismatch.trials import UNFORESEEN
 
 LOGGER = logging.getLogger(__name__)
-ROUNDS = 4  # of fits, each along the trajectories of the one before: later ones add next to nothing
+ROUNDS = 4  # of fits, each along the trajectories of the one before: a choice
 
 
 def with_surfaces(fit: Fit, best: Model, models: Sequence[Model], material: Material) -> list[Model]:
@@ -41,14 +41,14 @@ def with_surfaces(fit: Fit, best: Model, models: Sequence[Model], material: Mate
         What models are made from.
     """
     material.budget.says("comparing functions of two coordinates")
-    parts = [part for model in models for part in model.parts if part.place is not None]
-    places = [part.place for part in parts if part.place is not None][:FITTED]
-    tried = 0
-    asked: list[tuple[float, Surface]] = []
-    for whole in surfaces_in(fit.model, material.data, fit.x, places):
-        tried += 1
-        asked.append((_evidence(best.fit, whole, material), whole))
-    cost = float(np.logaddexp(max((part.cost for part in parts), default=0.0), np.log(max(tried, 1))))
+    known = [(part.place, part.cost) for model in models for part in model.parts if part.place is not None]
+    places = [place for place, _ in known[:FITTED]]
+    asked = [
+        (_evidence(best.fit, whole, material), whole)
+        for whole in surfaces_in(fit.model, material.data, fit.x, places)
+    ]
+    before = max((cost for _, cost in known), default=0.0)
+    cost = float(np.logaddexp(before, np.log(max(len(asked), 1))))
     asked = sorted((each for each in asked if each[0] > cost), key=lambda each: -each[0])
     # What depends on one coordinate, and more finely than a spline has it, is not to pass for one of two.
     alone = [each for each in asked if len(each[1].words) == 1][:1]

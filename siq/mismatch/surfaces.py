@@ -28,12 +28,10 @@ from siq.mismatch.screening import probe_response
 from siq.mismatch.structure import SUBSTEPS
 
 SURFACE = "surface"
-WIDTHS = (
-    *LENGTHS,
-    2 * LENGTHS[-1],
-)  # as shares of the range: those of functions of one coordinate, and wider
-MOST_CENTRES = 64  # an eighth of the range apart
-MOST_BUMPS = 40  # that are added at a time
+# As shares of the range: those of functions of one coordinate, and one that is wider.
+WIDTHS = (*LENGTHS, 2 * LENGTHS[-1])
+MOST_CENTRES = 64  # so many lie an eighth of the range apart, if the recordings have been everywhere
+MOST_BUMPS = 40  # that are added at a time: a guard on the time of a fit
 DISTINCT = 1e-3  # of a column, which the others have to leave of it
 
 

@@ -84,6 +84,11 @@ def _exact(
     return ReferenceSystem(name, about, source, dynamics, quasipotential, barriers)
 
 
+def _computed(name: str, about: str, source: str, dynamics: Dynamics) -> ReferenceSystem:
+    """A system of which nobody knows a formula of U, and two methods the barriers."""
+    return ReferenceSystem(name, about, source, dynamics, None, DOUBLY_COMPUTED[name])
+
+
 def _settled(dynamics: Dynamics, place: tuple[float, ...]) -> np.ndarray:
     """The equilibrium near a place, shape ``(d,)``, to rounding."""
     found = scipy.optimize.root(
@@ -162,13 +167,11 @@ def _maier_stein_exact(name: str) -> ReferenceSystem:
 
 def _maier_stein_computed(beta: int) -> Callable[[str], ReferenceSystem]:
     def build(name: str) -> ReferenceSystem:
-        return ReferenceSystem(
+        return _computed(
             name,
             f"Maier and Stein's system with β = {beta}: paths leave the axis, and U has a kink on it.",
             "Maier and Stein, Phys. Rev. Lett. 71, 1783 (1993)",
             _maier_stein(beta),
-            None,
-            DOUBLY_COMPUTED[name],
         )
 
     return build
@@ -179,37 +182,31 @@ def _consumer_resource(name: str) -> ReferenceSystem:
         sympy.Rational(*each) for each in ((154, 100), (1014, 100), (476, 1000), (112509, 1000000))
     )
     eaten = X**2 * Y / (1 + X**2)
-    return ReferenceSystem(
+    return _computed(
         name,
         "A consumer with a resource; predation levels off (Holling's type III).",
         "Collie and Spencer (1994), as Moore et al., The R Journal 8, 19 (2016) take it, with D = 1",
         Dynamics.of(
             (X, Y), (alpha * X * (1 - X / beta) - eaten, gamma * eaten - mu * Y**2), domain=[(0, 8)] * 2
         ),
-        None,
-        DOUBLY_COMPUTED[name],
     )
 
 
 def _toggle(name: str) -> ReferenceSystem:
-    return ReferenceSystem(
+    return _computed(
         name,
         "Two genes that switch each other off, with D = 1.",
         "Gardner, Cantor and Collins, Nature 403, 339 (2000)",
         Dynamics.of((X, Y), (3 / (1 + Y**2) - X, 3 / (1 + X**2) - Y), domain=[(0, 4)] * 2),
-        None,
-        DOUBLY_COMPUTED[name],
     )
 
 
 def _fitzhugh_nagumo(name: str) -> ReferenceSystem:
-    return ReferenceSystem(
+    return _computed(
         name,
         "FitzHugh and Nagumo's system where it is bistable, with D = 1.",
         "FitzHugh, Biophysical Journal 1, 445 (1961)",
         Dynamics.of((X, Y), (X - X**3 - Y, X - 3 * Y), domain=[(-1.5, 1.5), (-0.8, 0.8)]),
-        None,
-        DOUBLY_COMPUTED[name],
     )
 
 

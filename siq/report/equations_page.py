@@ -233,7 +233,7 @@ def _landscape(study: Study, results: EquationsResults) -> ReportSection | None:
         if tables["invariant"].empty:
             notes = [
                 "The invariant distribution was asked for, and U is not known as a formula in enough of the"
-                " domain to say it."
+                " domain to say it. Higher degrees under refinement, or a narrower domain, may tell it."
             ]
     return (
         ReportSection("The landscape in full", tables=found, figures=figures, notes=notes) if found else None

@@ -52,13 +52,13 @@ rule equations_invariant:
         "../envs/siq.yaml"
     threads: 1
     params:
-        code=code("equations_invariant.py"),
+        code=code("invariant.py"),
         settings=settings_of(InvariantSettings),
         card=card_says,
     message:
         "{wildcards.study}: computing the invariant distribution"
     script:
-        "../scripts/equations_invariant.py"
+        "../scripts/invariant.py"
 
 
 rule equations_page:

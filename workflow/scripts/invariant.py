@@ -7,6 +7,7 @@ run_warm()
 from pathlib import Path
 
 from siq.dynamics.cards import load_system
+from siq.landscape.storage import read_landscape
 from siq.report.plots import plot_invariant_distribution, save_figure
 from siq.steps import invariant
 from siq.steps.landscapes import first_stored
@@ -18,7 +19,13 @@ from step import Job, job
 
 
 def shown_in(now: Job) -> invariant.Shown | None:
-    """What the invariant distribution follows from: see `siq.steps.invariant.run`."""
+    """What the invariant distribution follows from: see `siq.steps.invariant.run`.
+
+    Equations have one landscape, and nothing else that could be shown.
+    """
+    if (landscape := now.given("quasipotential")) is not None:
+        stored = read_landscape(landscape, dynamics=load_system(now.input.card))
+        return None if stored is None else invariant.LandscapeShown(0, stored)
     models = ModelFiles(tuple(now.input.models))
     shown = shown_formula(read_table(now.input.rrmse), models)
     if shown.run is None or shown.method == Method.REGRESSION:
