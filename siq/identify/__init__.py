@@ -13,6 +13,9 @@
 `diffusion`             which D, where nobody gave it?
 `random_forces`         how strong are the random forces behind residuals of a whole step?
 `noisy_sensor`          which f do recordings show whose sensor is noisy?
+`filtered_terms`        which terms does the likelihood of a filter ask for?
+`hidden_velocities`     which f(x, v) do recordings of positions alone show?
+`velocities`            how are velocities told that nobody measured?
 `seen_states`           how do samples show the states?
 `filtered_states`       what does such an f say of held-out recordings, and of the states themselves?
 `exposure`              what does a sample tell that is a mean over its step?

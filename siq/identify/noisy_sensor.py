@@ -12,30 +12,27 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from siq.data.labels import sources
 from siq.data.recordings import Recordings
 from siq.dynamics.diffusion import Diffusion
 from siq.errors import NumericalFailure
 from siq.estimation.estimation import Fit, fit_by_filter
-from siq.estimation.innovations import Noise, Whitened, solve, whiten
+from siq.estimation.innovations import Noise, whiten
 from siq.estimation.measurements import Measurements
 from siq.estimation.noise import log_likelihood
 from siq.estimation.noise_uncertainty import NoiseUncertainty, noise_uncertainty
 from siq.estimation.process_noise import process_noise_needed
+from siq.identify.filtered_terms import FilteredTerms, neighbours
 from siq.identify.flow import FlowMap
 from siq.identify.flow_regression import positive
 from siq.identify.identified_field import IdentifiedField
 from siq.identify.library import CandidateLibrary
 from siq.identify.noise_beside_sensor import FilteredNoise, formula_noise, left_open, noise_by_state
-from siq.identify.rival_terms import rivals_of_all
-from siq.identify.seen_states import View, settled
-from siq.identify.selection import Equation, best_support, critical_values, weakest_term
-from siq.identify.stability import blocks_of, stability, triangles
+from siq.identify.seen_states import View
+from siq.identify.selection import critical_values
 from siq.identify.weighted_regression import with_formula
 
 NOISE_ROUNDS = 2  # of D by the trajectories of f, and f by the weights of D
 ROUNDS = 8  # of the fit of a whole library, which only chooses terms
-LAGS = (1, 2, 3)  # steps over which innovations are compared: what remembers at all remembers so long
 WITHOUT = 1e-6  # of a sensor's variance: as good as none
 NUMBERS = 4e8  # of the derivatives by all coefficients at all samples: 3 GB
 
@@ -113,9 +110,9 @@ def identify_by_likelihood(
     """
     view = View(library, diffusion, exposure)
     data = view.measured(recordings, pair_step)
-    q, d = library.size, library.dimension
+    d = library.dimension
     critical = critical_values(library, false_terms=false_terms)
-    everything = np.array([(i, k) for i in range(d) for k in range(q)])
+    everything = view.everything
     if data.outputs.size * len(everything) > NUMBERS:
         raise NumericalFailure(
             f"{len(everything)} coefficients and {len(data.t)} samples with a noisy sensor are too much for"
@@ -139,64 +136,30 @@ def identify_by_likelihood(
         )  # fmt: skip
         if whole.fault:
             raise NumericalFailure(f"the likelihood beside sensor noise cannot be worked out: {whole.fault}")
-    white = whiten(whole.linearisation, data, whole.noise)
-    values = whole.model.values
-    goal = white.innovations + white.columns @ (values - _last_change(whole, white))
-    # Whitened values stand one behind the other, all states of a sample together.
-    parts = triangles(white.columns, goal, np.repeat(blocks_of(sources(data.labels)[data.recording]), d))
-    triangle = np.asarray(np.linalg.qr(np.concatenate(parts), mode="r"))
-    # In units of the innovations' errors; all equations at once, since a filter couples them.
-    equations = Equation(triangle[:, :-1], triangle[:, -1], 1.0, np.tile(critical, d))
-    chosen = list(best_support(equations))
-    support = everything[chosen]
+    terms = FilteredTerms.along(view, data, whole, np.tile(critical, d))
+    chosen = terms.chosen()
     for component, name in enumerate(library.states):
-        if component not in support[:, 0]:
+        if component not in everything[chosen, 0]:
             raise NumericalFailure(f"no term of the equation of {name} is significant; record longer")
-    # Where functions are nearly alike, those that stay take over what the others did: all begin anew.
-    fit = settled(
-        view, support, data, whole.noise, values=equations.fitted(chosen)[chosen], x=whole.linearised_at
-    )
-    while (weak := _weakest(fit, support, critical)) is not None:
-        support, chosen = np.delete(support, weak, axis=0), np.delete(chosen, weak).tolist()
-        fit = settled(
-            view, support, data, fit.noise, values=equations.fitted(chosen)[chosen], x=fit.linearised_at
-        )
+    fit, support, chosen = terms.settled(chosen, whole.noise, x=whole.linearised_at)
     if by_state:
         one = _with_formula(view, support, fit, data, false_terms=false_terms, probability=chance)
     else:
-        fit = _without_forces(fit, data)
+        fit = without_needless_forces(fit, data)
         one = _as_field(view, support, fit, data, noise_uncertainty(fit, data))
         if one.found.noise_rate.any():
             one = replace(one, found=replace(one.found, constant_noise=seen.constant.formula))
-    places = (support[:, 0] * q + support[:, 1]).tolist()
-    (shares,) = stability(
-        parts,
-        lambda drawn: [Equation(drawn[:, :-1], drawn[:, -1], 1.0, equations.critical)],
-        [places],
-        generator=generator,
-    )
-    field = replace(one.found, rivals=rivals_of_all(equations, support, dimension=d), stability=shares)
-    return replace(one, found=field)
+    shares = terms.stability(chosen, generator=generator)
+    return replace(one, found=replace(one.found, rivals=terms.rivals(chosen), stability=shares))
 
 
-def _without_forces(fit: Fit, data: Measurements) -> Fit:
+def without_needless_forces(fit: Fit, data: Measurements) -> Fit:
     """The fit of trajectories that no random force drives, unless the recordings speak against it."""
     strict = fit_by_filter(
         fit.model, data, x=fit.x, noise=fit.noise.without_process(), estimate_process=False,
         substeps=fit.substeps,
     )  # fmt: skip
     return fit if process_noise_needed(fit, strict) else strict
-
-
-def _last_change(fit: Fit, white: Whitened) -> np.ndarray:
-    """What the estimates are beyond the values at which a fit was linearised."""
-    change = solve(white.columns, white.innovations)[0]
-    return change if fit.converged else 0 * change
-
-
-def _weakest(fit: Fit, support: np.ndarray, critical: np.ndarray) -> int | None:
-    strength = np.abs(fit.model.values) / fit.standard_errors / critical[support[:, 1]]
-    return weakest_term(strength, support)
 
 
 def _as_field(
@@ -224,7 +187,7 @@ def _as_field(
         FlowMap(fit.substeps),
         view.diffusion,
     )
-    correlation, score = _neighbours(whiten(fit.linearisation, data, fit.noise), data)
+    correlation, score = neighbours(whiten(fit.linearisation, data, fit.noise), data)
     without = replace(fit.noise, measurement=fit.noise.measurement * WITHOUT)
     alone = replace(data, sensor_noise=None)
     best = log_likelihood(fit.linearisation, alone, fit.noise)
@@ -293,19 +256,3 @@ def _with_formula(
     slopes = own.formula.strength_slopes(states)
     error = float(np.sqrt(slopes @ own.formula.covariance @ slopes))
     return replace(one, found=with_formula(one.found, own.formula, states), intensity_error=error)
-
-
-def _neighbours(white: Whitened, data: Measurements) -> tuple[float, float]:
-    """Strongest correlation of near innovations over outputs and lags, and in standard errors."""
-    measured = white.known.reshape(len(data.t), -1).any(axis=1)
-    innovations, recording = white.innovations.reshape(len(data.t), -1)[measured], data.recording[measured]
-    found: list[tuple[float, float, float]] = []
-    for lag in LAGS:
-        rows = np.flatnonzero(recording[lag:] == recording[:-lag])
-        first, second = innovations[rows], innovations[rows + lag]
-        product = first * second
-        size = np.sqrt((first**2).mean(axis=0) * (second**2).mean(axis=0))
-        scores = product.sum(axis=0) / np.sqrt((product**2).sum(axis=0))
-        found += zip(np.abs(scores), product.mean(axis=0) / size, scores, strict=True)
-    _, correlation, score = max(found)
-    return float(correlation), float(score)

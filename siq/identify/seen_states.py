@@ -18,19 +18,48 @@ from siq.identify.exposure import exposed, exposed_measurements, exposed_noise, 
 from siq.identify.identified_field import IdentifiedField, field_dynamics
 from siq.identify.library import CandidateLibrary
 from siq.identify.noise_beside_sensor import formula_noise
+from siq.identify.velocities import force_noise, seen_positions, smoothed_motion, without_definitions
 
 
 @dataclass(frozen=True)
 class View:
-    """How samples show the states: as they are, or as means over an exposure before them."""
+    """How samples show the states: as they are, or as means over an exposure before them.
+
+    Attributes
+    ----------
+    library, diffusion
+        Of f.
+    exposure
+        The time over which a sample is a mean, None where it is none.
+    hidden
+        Whether the second half of the states are velocities, of which samples show nothing
+        (`siq.identify.velocities`).
+    """
 
     library: CandidateLibrary
     diffusion: Diffusion
     exposure: float | None
+    hidden: bool = False
+
+    @property
+    def everything(self) -> np.ndarray:
+        """Component and term of every coefficient that is not known beforehand, shape ``(p, 2)``."""
+        d = self.library.dimension
+        return np.array(
+            [(i, k) for i in range(d // 2 if self.hidden else 0, d) for k in range(self.library.size)]
+        )
+
+    def unknown(self, found: IdentifiedField) -> tuple[np.ndarray, np.ndarray]:
+        """The terms of an identified f that are fitted, and their coefficients."""
+        if not self.hidden:
+            return found.support, found.values
+        return without_definitions(self.library, found.support, found.values)
 
     def model(self, support: np.ndarray, values: np.ndarray) -> Dynamics:
         """Dynamics with the coefficients of a support as parameters, as they are measured."""
         plain = field_dynamics(self.library, support, values, diffusion=self.diffusion)
+        if self.hidden:
+            return seen_positions(plain)
         return plain if self.exposure is None else exposed(plain, self.exposure)
 
     def measured(self, recordings: Recordings, pair_step: float | None) -> Measurements:
@@ -53,6 +82,8 @@ class View:
         unknown = np.isnan(data.outputs).any(axis=1)
         rows = np.arange(len(unknown))
         values = data.outputs[rows + unknown]  # never two in a row, nor at an end
+        if self.hidden:
+            return smoothed_motion(data, self.library.states[: self.library.dimension // 2])[0]
         return values if self.exposure is None else np.column_stack([values, values])
 
 
@@ -60,7 +91,9 @@ def noise_of(found: IdentifiedField, sensor: np.ndarray) -> Noise:
     """Both noises of an identified f, with the variance of each state's sensor."""
     if found.noise is not None:
         return formula_noise(found.noise, sensor)
-    rate = found.noise_rate
+    rate, half = found.noise_rate, len(sensor)
+    if half < len(rate):
+        return force_noise(sensor, rate[half:, half:])
     if not rate.any():
         return Noise(sensor, np.zeros(len(rate)))
     size = np.sqrt(np.diag(rate))
