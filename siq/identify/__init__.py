@@ -15,6 +15,7 @@
 `noisy_sensor`          which f do recordings show whose sensor is noisy?
 `filtered_terms`        which terms does the likelihood of a filter ask for?
 `hidden_velocities`     which f(x, v) do recordings of positions alone show?
+`inertia`               do positions have inertia: is velocity a state of its own?
 `velocities`            how are velocities told that nobody measured?
 `seen_states`           how do samples show the states?
 `filtered_states`       what does such an f say of held-out recordings, and of the states themselves?

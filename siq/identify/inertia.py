@@ -1,0 +1,300 @@
+"""Do recorded positions have inertia: is velocity a state of its own, and how fast does friction stop it?
+
+Two models of the same positions, with the same functions F and an error of the sensor each:
+
+    dx = F(x) dt + noise                               overdamped
+    dx = v dt,  dv = γ (F(x) - v) dt + noise           with inertia; the first is its limit γ → ∞
+
+Their log-likelihoods are compared at Schwarz's price, half of ln n for each parameter and first state. The
+error of the difference is that of a sum over blocks of the record, as in Vuong's test of models that are both
+an approximation. Where inertia is not seen, what is known is from which γ on it would have been.
+
+References
+----------
+Q. H. Vuong, Likelihood ratio tests for model selection and non-nested hypotheses, Econometrica 57 (1989) 307.
+G. Schwarz, Estimating the dimension of a model, Ann. Statist. 6 (1978) 461.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+
+import numpy as np
+import sympy
+
+from siq.data.recordings import Recordings
+from siq.dynamics.diffusion import Diffusion
+from siq.dynamics.dynamics import Dynamics, Parameter
+from siq.dynamics.parametric import symbol
+from siq.errors import NumericalFailure
+from siq.estimation.estimation import Fit, fit_by_filter
+from siq.estimation.innovations import Noise, whiten
+from siq.estimation.linearisation import Linearisation
+from siq.estimation.measurements import Measurements
+from siq.identify.library import CandidateLibrary, candidate_library
+from siq.identify.seen_states import unbroken
+from siq.identify.velocities import force_noise, seen_positions, smoothed_motion, velocity_names
+
+BLOCKS = 40  # of the record: the error of a sum of so many is known to a tenth
+INTERVAL = 1.96  # standard errors: of 95 % of a normal distribution
+DROP = INTERVAL**2 / 2  # of a log-likelihood, at the ends of such an interval
+SLIGHT = 0.1  # relaxation over friction, below which x alone is the state to within a tenth
+SEARCHED = 6  # numerical: halvings of the logarithm of γ, to 2 % of a factor of four
+FASTEST = 10.0  # γ times the step, beyond which velocities are forgotten between samples to exp(-10)
+
+
+@dataclass(frozen=True)
+class InertiaTest:
+    """What recordings of one position say of its inertia.
+
+    Attributes
+    ----------
+    gain, gain_error
+        Log-likelihood of the model with inertia over that without, at Schwarz's price, and its standard
+        error from blocks of the record.
+    friction, friction_error
+        γ and its standard error. Where inertia is not seen γ is a lower limit of 95 %, without an error.
+    relaxation
+        How fast x relaxes in the stiffest well if there is no inertia, ``-F'(x)``; 0 where there is no well.
+    frequency, frequency_error
+        ω of that well with inertia, ``√(-γ F'(x))``, and its standard error.
+    step
+        Time between samples.
+    """
+
+    gain: float
+    gain_error: float
+    friction: float
+    friction_error: float | None
+    relaxation: float
+    frequency: float
+    frequency_error: float
+    step: float
+
+    @property
+    def seen(self) -> bool:
+        """Whether the record speaks for inertia, by more than its error."""
+        return self.gain > INTERVAL * self.gain_error and self.gain > 0
+
+    @property
+    def overdamped(self) -> bool:
+        """Whether inertia is slight enough to be left out: it is not seen, and would have been."""
+        return not self.seen and self.relaxation <= SLIGHT * self.friction
+
+    @property
+    def undecided(self) -> bool:
+        """Whether the record cannot tell."""
+        return not (self.seen or self.overdamped)
+
+    def sentence(self, unit: str = "") -> str:
+        """The answer in words, with its figures."""
+        time = f" {unit}" if unit else ""
+        rate = f" per {unit}" if unit else ""
+        if self.seen:
+            damped = self.friction / (2 * self.frequency) if self.frequency > 0 else np.inf
+            kind = "it swings in its well" if damped < 1 else "it creeps back into its well without a swing"
+            assert self.friction_error is not None
+            swing = f", ω = {self.frequency:.3g} ± {self.frequency_error:.1g}" if self.frequency > 0 else ""
+            return (
+                f"the position has inertia: the log-likelihood with a velocity is larger by {self.gain:.4g} ±"
+                f" {self.gain_error:.2g}, γ = {self.friction:.3g} ± {self.friction_error:.1g}{swing}{rate}"
+                f" (γΔt = {self.friction * self.step:.2g}); {kind}"
+            )
+        if self.overdamped:
+            return (
+                f"no inertia is seen: with a velocity the log-likelihood changes by {self.gain:.3g} ±"
+                f" {self.gain_error:.2g}, and γ is above {self.friction:.3g}{rate}, while wells relax with"
+                f" {self.relaxation:.3g}{rate}"
+            )
+        needed = 1 / max(self.relaxation / SLIGHT, 1e-300)
+        return (
+            "whether the position has inertia cannot be told: with a velocity the log-likelihood changes by"
+            f" {self.gain:.3g} ± {self.gain_error:.2g}, and γ may be anything above"
+            f" {self.friction:.3g}{rate}, while wells relax with {self.relaxation:.3g}{rate}; a step of at"
+            f" most {needed:.2g}{time}, or a less noisy sensor at a short step, would tell"
+        )
+
+
+def inertia_test(recordings: Recordings, *, degree: int = 5, pair_step: float | None = None) -> InertiaTest:
+    """Ask recordings of one position whether it has inertia.
+
+    Parameters
+    ----------
+    recordings
+        Of one position.
+    degree
+        Highest power of x in F.
+    pair_step
+        Longest time between samples that still belong together.
+
+    Raises
+    ------
+    NumericalFailure
+        Where one of the models cannot be fitted, or there is more than one position.
+    """
+    if len(recordings.names) != 1:
+        raise NumericalFailure("the test of inertia is of one position; select one column")
+    data = unbroken(recordings, pair_step=pair_step)
+    library = candidate_library(recordings.names, degree=degree)
+    step = float(np.median(np.diff(data.t)[data.begins]))
+    x, noise = smoothed_motion(data, recordings.names)
+    without = _without_inertia(library, data)
+    places = np.linspace(*np.quantile(data.outputs, (0.01, 0.99)), 400)[:, None]
+    relaxation, _ = _stiffest(library, without.model.values, without.covariance, places)
+    models = _Inertia(library, data, x, noise, without, step)
+    best = models.free()
+    price = np.log(len(data.t)) / 2 * (1 + len(data.labels))  # γ, and a first velocity of each record
+    if best is None:
+        strongest = models.with_friction(FASTEST / step)
+        gain = strongest.log_likelihood - without.log_likelihood - price
+        error = _error(strongest, without, data)
+        limit = models.least_friction(strongest.log_likelihood, FASTEST / step)
+        return InertiaTest(gain, error, limit, None, relaxation, np.nan, np.nan, step)
+    gain, error = best.log_likelihood - without.log_likelihood - price, _error(best, without, data)
+    friction, friction_error = best.model.values[-1], best.standard_errors[-1]
+    stiffness, its_error = _stiffest(library, best.model.values[:-1], best.covariance[:-1, :-1], places)
+    frequency = float(np.sqrt(stiffness))
+    frequency_error = its_error / (2 * frequency) if frequency > 0 else np.nan
+    test = InertiaTest(
+        gain, error, float(friction), float(friction_error), relaxation, frequency, frequency_error, step
+    )
+    if test.seen:
+        return test
+    limit = models.least_friction(best.log_likelihood, float(friction))
+    return replace(test, friction=limit, friction_error=None)
+
+
+def _without_inertia(library: CandidateLibrary, data: Measurements) -> Fit:
+    names, force = _force(library)
+    model = Dynamics(
+        library.states, (force,), Diffusion.identity(1),
+        parameters=tuple(Parameter(name, 0.0) for name in names),
+    )  # fmt: skip
+    begins = data.begins
+    moved = ((data.outputs[begins + 1] - data.outputs[begins]) ** 2).mean(axis=0)
+    step = float(np.diff(data.t)[begins].mean())
+    fit = fit_by_filter(
+        model, data, x=data.outputs, noise=Noise(0.1 * moved, moved / step), closure=False
+    )  # fmt: skip
+    if fit.fault:
+        raise NumericalFailure(f"the model without inertia cannot be fitted: {fit.fault}")
+    return fit
+
+
+@dataclass(frozen=True)
+class _Inertia:
+    """Fits of the model with inertia, beginning with the smoothed motion."""
+
+    library: CandidateLibrary
+    data: Measurements
+    x: np.ndarray
+    noise: Noise
+    without: Fit
+    step: float
+
+    @cached_property
+    def _with_force(self) -> Dynamics:
+        """With γF in terms of its own, and γ behind their coefficients."""
+        return self._model(lambda force, v, friction: force - friction * v, fixed=False)
+
+    @cached_property
+    def _with_speed(self) -> Dynamics:
+        """With γ as it is given: F is that of the model without inertia."""
+        return self._model(lambda force, v, friction: friction * (force - v), fixed=True)
+
+    def free(self) -> Fit | None:
+        """With γ free; None where it does not settle at a γ that samples could show."""
+        fit = fit_by_filter(self._with_force, self.data, x=self.x, noise=self.noise, closure=False)
+        usable = fit.converged and not fit.fault and 0 < fit.model.values[-1] < FASTEST / self.step
+        return fit if usable else None
+
+    def with_friction(self, friction: float) -> Fit:
+        """With γ given, beginning with F and the noise of the model without inertia."""
+        model = self._with_speed.with_values(np.append(self.without.model.values, friction))
+        rate = friction**2 * np.diag(self.without.noise.process)
+        return fit_by_filter(
+            model, self.data, x=self.x, noise=force_noise(self.without.noise.measurement, rate),
+            closure=False,
+        )  # fmt: skip
+
+    def least_friction(self, best: float, highest: float) -> float:
+        """From which γ on, below a given one, the likelihood is within 95 % of the best."""
+        low, high = highest, highest
+        while best - self.with_friction(low).log_likelihood < DROP:
+            low, high = low / 4, low
+            if low * self.step < 1e-6:  # no γ is excluded
+                return 0.0
+        for _ in range(SEARCHED):
+            middle = float(np.sqrt(low * high))
+            if best - self.with_friction(middle).log_likelihood < DROP:
+                high = middle
+            else:
+                low = middle
+        return high
+
+    def _model(
+        self, rate: Callable[[sympy.Expr, sympy.Symbol, sympy.Symbol], sympy.Expr], *, fixed: bool
+    ) -> Dynamics:
+        states = (*self.library.states, *velocity_names(self.library.states))
+        names, force = _force(self.library)
+        friction = "friction" + "_" * max(map(len, states))  # no state is called so
+        parameters = (*(Parameter(name, 0.0) for name in names), Parameter(friction, 0.0, fixed=fixed))
+        equation = rate(force, symbol(states[1]), symbol(friction))
+        return seen_positions(
+            Dynamics(states, (sympy.S.Zero, equation), Diffusion.identity(2), parameters=parameters)
+        )
+
+
+def _force(library: CandidateLibrary) -> tuple[list[str], sympy.Expr]:
+    """F in all functions of a library, and the names of its coefficients."""
+    names = [f"c{place}_{'_'.join(library.states)}" for place in range(library.size)]
+    terms = zip(names, library.terms, strict=True)
+    return names, sympy.Add(*(symbol(name) * term for name, term in terms))
+
+
+def _stiffest(
+    library: CandidateLibrary, values: np.ndarray, covariance: np.ndarray, places: np.ndarray
+) -> tuple[float, float]:
+    """``-F'`` where F falls through zero most steeply, with its standard error; zeros where it never does."""
+    force = library.evaluate(places) @ values
+    falling = np.flatnonzero((force[:-1] > 0) & (force[1:] <= 0))
+    if not len(falling):
+        return 0.0, 0.0
+    share = force[falling] / (force[falling] - force[falling + 1])
+    wells = places[falling] + share[:, None] * (places[falling + 1] - places[falling])
+    # ∂F/∂c at the well, where the well itself moves with F.
+    slopes = np.einsum("nk,kj->nj", library.evaluate(wells), library.derivatives[:, 0, :])
+    bends = np.einsum("nk,kj->nj", slopes, library.derivatives[:, 0, :])
+    steep = slopes @ values
+    one = int(np.argmin(steep))
+    changed = slopes[one] - (bends[one] @ values) / steep[one] * library.evaluate(wells)[one]
+    return float(-steep[one]), float(np.sqrt(max(changed @ covariance @ changed, 0.0)))
+
+
+def _error(one: Fit, other: Fit, data: Measurements) -> float:
+    """Standard error of the difference of two log-likelihoods, from blocks of the record."""
+    length = max(len(data.t) // BLOCKS, 2)
+    differences = []
+    for begin, end in zip(data.first[:-1], data.first[1:], strict=True):
+        count = max(round((end - begin) / length), 1)
+        bounds = np.linspace(begin, end, count + 1).astype(int)
+        for low, high in itertools.pairwise(bounds):
+            differences.append(_of_block(one, data, low, high) - _of_block(other, data, low, high))
+    if len(differences) < 2:
+        return np.inf
+    return float(np.std(differences, ddof=1) * np.sqrt(len(differences)))
+
+
+def _of_block(fit: Fit, data: Measurements, low: int, high: int) -> float:
+    """Log-likelihood of a part of a record, its first state unknown."""
+    rows = slice(low, high)
+    along = {each.name: getattr(fit.linearisation, each.name)[rows] for each in fields(Linearisation)}
+    part = replace(
+        data, labels=("block",), first=np.array([0, high - low]), t=data.t[rows], outputs=data.outputs[rows],
+        courses=((),),
+    )  # fmt: skip
+    white = whiten(Linearisation(**along), part, fit.noise)
+    return white.log_likelihood(float(white.innovations @ white.innovations))
