@@ -59,6 +59,9 @@ class IdentificationOptions:
         residuals are the integrator's error and not random.
     pairs
         Most pairs used where the data carry no noise; with noise all are.
+    hidden_velocities
+        Whether the recorded states are positions whose velocities were not recorded. These are states then,
+        too, called ``v_x`` for a position x, and f says how forces change them.
     """
 
     degree: Annotated[int, Field(ge=1, le=12)] = 5
@@ -66,6 +69,7 @@ class IdentificationOptions:
     false_terms: Annotated[float, Field(gt=0, lt=0.5)] = 0.02
     precision: Annotated[float, Field(gt=0, lt=0.1)] = 1e-7
     pairs: Annotated[int, Field(ge=100)] = 8_000
+    hidden_velocities: bool = False
 
 
 def identify_vector_field(

@@ -62,6 +62,11 @@ class FieldRecord:
         return deviations**2
 
     @property
+    def hidden_velocities(self) -> bool:
+        """Whether half of the states are velocities that were not recorded."""
+        return len(self.noise.get("measurement", ())) * 2 == self.found.library.dimension
+
+    @property
     def exposure(self) -> float | None:
         """The step over which each sample was taken as a mean; None where as the state itself."""
         given = self.noise.get("exposure")

@@ -47,6 +47,7 @@ from siq.steps.identify_beside_sensor import (
     units_of_states,
 )
 from siq.steps.identify_from_earlier import record_from_earlier
+from siq.steps.identify_hidden import advice_on_inertia, hidden_record, with_inertia_asked
 from siq.steps.outcomes import Outcome, Status, Step, read_outcomes, write_outcomes
 from siq.steps.settings import STRICT, Sampling, StateSpace
 
@@ -79,9 +80,14 @@ def run(settings: IdentifySettings, recordings: Recordings | None, *, number: in
         return Identified(None, Outcome(number, Step.IDENTIFY, Status.SKIPPED, reason))
     try:
         record = _identified(settings, recordings, number)
+        if not settings.identification.hidden_velocities:
+            record = with_inertia_asked(record, recordings, pair_step=settings.sampling.pair_step)
     except (NumericalFailure, np.linalg.LinAlgError) as error:
         rounding = rounding_text(recordings, coarse=True)
         reason = str(error) if rounding is None else f"{error}; mind that {rounding}"
+        if not settings.identification.hidden_velocities:
+            advice = advice_on_inertia(recordings, pair_step=settings.sampling.pair_step)
+            reason = reason if advice is None else f"{reason}; {advice}"
         return Identified(None, Outcome(number, Step.IDENTIFY, Status.FAILED, reason))
     if record.prediction["passed"]:
         notes = [note for note in (record.diffusion_source.note, record.noise.get("note")) if note]
@@ -94,6 +100,11 @@ def run(settings: IdentifySettings, recordings: Recordings | None, *, number: in
 
 def _identified(settings: IdentifySettings, recordings: Recordings, number: int) -> FieldRecord:
     options, sampling = settings.identification, settings.sampling
+    if options.hidden_velocities:
+        return hidden_record(
+            recordings, seed=settings.seed, number=number, space=settings.space, sampling=sampling,
+            options=options, limits=settings.prediction,
+        )  # fmt: skip
     held = held_out_recordings(recordings, generator=generator(settings.seed, number, Purpose.HOLD_OUT))
     held_out = select_recordings(recordings, np.flatnonzero(held))
     training = select_recordings(recordings, np.flatnonzero(~held))

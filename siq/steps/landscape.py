@@ -14,6 +14,7 @@ from siq.certificate.certify import Certificate
 from siq.data.recordings import Recordings, snapshot_pairs
 from siq.dynamics.phase_portrait import evenly_spread, phase_portrait
 from siq.errors import NumericalFailure
+from siq.identify.filtered_states import of_all_states
 from siq.identify.storage import FieldRecord
 from siq.landscape.dwell_times import NoiseStrength
 from siq.landscape.landscape import Landscape, find_landscape
@@ -70,6 +71,7 @@ def run(
     if recordings is None or record is None:
         reason = "no vector field was identified"
         return FoundLandscape(None, record, Outcome(number, Step.LANDSCAPE, Status.SKIPPED, reason))
+    recordings = of_all_states(recordings, record, pair_step=settings.sampling.pair_step)
     x = snapshot_pairs(recordings, pair_step=settings.sampling.pair_step).x0
     draw = generator(settings.seed, number, Purpose.LANDSCAPE)
     points = x[evenly_spread(x, generator=draw)]

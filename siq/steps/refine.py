@@ -33,7 +33,7 @@ from siq.data.held_out import held_out_recordings
 from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
 from siq.dynamics.phase_portrait import PhasePortrait, evenly_spread, phase_portrait
 from siq.errors import NumericalFailure
-from siq.identify.filtered_states import filtered_recordings
+from siq.identify.filtered_states import filtered_recordings, of_all_states
 from siq.identify.identified_field import IdentifiedField
 from siq.identify.lagged_pairs import coarse_pairs
 from siq.identify.storage import FieldRecord
@@ -204,6 +204,8 @@ class Ground:
                 pair_step=settings.sampling.pair_step,
                 exposure=record.exposure,
             )
+        elif record.hidden_velocities:
+            recordings = of_all_states(recordings, record, pair_step=settings.sampling.pair_step)
         pairs = snapshot_pairs(recordings, pair_step=settings.sampling.pair_step)
         held, x = mask[pairs.recording], pairs.x0
         draw = generator(settings.seed, self.number, Purpose.REFINE)

@@ -26,6 +26,7 @@ from siq.errors import InputError, suggestion
 from siq.files.documents import read_document, validate
 from siq.identify.identification import IdentificationOptions
 from siq.identify.library import candidate_library
+from siq.identify.velocities import velocity_names
 from siq.landscape.options import LandscapeOptions
 from siq.networks.options import TrainingOptions
 from siq.networks.regression import RegressionOptions
@@ -405,7 +406,9 @@ def check_states(study: Study, states: Sequence[str], *, file: str) -> None:
         ("regression", study.regression.functions),
     ):
         try:
-            candidate_library(states, degree=1, further=functions)
+            hidden = step == "identification" and study.identification.hidden_velocities
+            known = (*states, *velocity_names(states)) if hidden else states
+            candidate_library(known, degree=1, further=functions)
         except FormulaError as error:
             raise InputError(file, f"{step}.functions", error.fault, error.remedy) from None
 
