@@ -35,6 +35,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from siq.certificate.error_bound import SAFETY, residual_integral
+from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.equilibria import Equilibrium, hessian_at
 from siq.dynamics.reach import measure_at
 from siq.identify.given_field import AnyField, GivenField
@@ -158,7 +159,7 @@ def check_identity(candidate: Candidate, found: IdentifiedField, *, limit: float
     built = candidate.circulatory(x) - noise.push(x, candidate.gradients(x))
     squares = noise.squared_speed(x, flow - built).mean()
     value = float(np.sqrt(squares / noise.squared_speed(x, flow).mean()))
-    allowed = limit + STANDARD_ERRORS * _relative_error_of_drift(found, x)
+    allowed = limit + STANDARD_ERRORS * _relative_error_of_drift(found, x, noise)
     return Verdict(
         value, allowed, bool(value <= allowed), "" if value <= allowed else "V and g do not make up f"
     )
@@ -182,7 +183,7 @@ def check_hamilton_jacobi(candidate: Candidate, found: AnyField, *, limit: float
     residual = np.abs((gradient * (flow + down)).sum(axis=1))
     size = slope * (speed + fall)
     value = float(np.sqrt(np.mean((residual / np.where(size > 0, size, 1.0)) ** 2)))
-    allowed = limit + STANDARD_ERRORS * _relative_error_of_drift(found, candidate.points)
+    allowed = limit + STANDARD_ERRORS * _relative_error_of_drift(found, candidate.points, measure)
     reason = "" if value <= allowed else "V does not solve the Hamilton–Jacobi equation of f"
     return Verdict(value, allowed, value <= allowed, reason)
 
@@ -340,19 +341,19 @@ def check_prediction(
     return Verdict(value, limit, True)
 
 
-def _relative_error_of_drift(found: AnyField, points: np.ndarray) -> float:
-    """Rms over points of the standard error of f, over rms of f."""
+def _relative_error_of_drift(found: AnyField, points: np.ndarray, measure: Diffusion) -> float:
+    """Rms over points of the standard error of f, over rms of f, speeds being measured by D or by another."""
     if isinstance(found, GivenField) or found.noise_free:
         return 0.0
     components, functions = found.support.T
     terms = found.library.evaluate(points)[:, functions]
-    if found.diffusion.constant:
-        weighted = found.diffusion.precision[np.ix_(components, components)] * found.covariance
+    if measure.constant:
+        weighted = measure.precision[np.ix_(components, components)] * found.covariance
         total = np.einsum("np,pr,nr->n", terms, weighted, terms).mean()
     else:
-        precision = found.diffusion.precision_at(points)[:, components[:, None], components]
+        precision = measure.precision_at(points)[:, components[:, None], components]
         total = np.einsum("np,npr,pr,nr->n", terms, precision, found.covariance, terms, optimize=True).mean()
-    return float(np.sqrt(total / found.diffusion.squared_speed(points, found.dynamics.drift(points)).mean()))
+    return float(np.sqrt(total / measure.squared_speed(points, found.dynamics.drift(points)).mean()))
 
 
 def _hessian_error(found: IdentifiedField, one: Equilibrium, root: np.ndarray, seed: int) -> float:

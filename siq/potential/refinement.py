@@ -41,6 +41,7 @@ Route = Literal["network", "local"]
 
 IMPLAUSIBLE = 1e-4  # a probability below which no orthogonal fit is believed
 NETWORK_DEGREE = 8  # highest power of a well by the network route, whose start knows no more
+ON_SOME = "noise acts on some states only: V has one formula for each well, and none over all of them"
 ELSEWHERE = "where D depends on the state no single formula is sought: each well has its own"
 FIT_POINTS = 400  # where ∇V·g is asked to vanish in a joint fit
 
@@ -206,6 +207,9 @@ def refine(
         network_wells = wells
     if not found.diffusion.constant:  # g = f + D∇V would need functions that no library has
         notes.append(ELSEWHERE)
+        return _without_formula(found, library, best, wells, network_wells, routes, notes)
+    if not found.diffusion.regular:  # the equation of Hamilton and Jacobi is weighed by its inverse
+        notes.append(ON_SOME)
         return _without_formula(found, library, best, wells, network_wells, routes, notes)
     if network_wells and not _good(best, limit):
         # Refined one by one, the wells may turn out to share one formula. All of them together make the
