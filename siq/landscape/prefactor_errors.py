@@ -97,7 +97,8 @@ def covariance_axes(covariance: np.ndarray, draw: np.random.Generator) -> Sequen
     """
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
-    count = len(covariance)
+    root = root[:, root.any(axis=0)]  # what is known exactly, as in dx/dt = v, has no axis
+    count = root.shape[1]
     if count <= MOST_AXES:
         return list(root.T)
     turned = np.linalg.qr(draw.standard_normal((count, MOST_AXES)))[0]
