@@ -1,6 +1,6 @@
 """Are barriers right, and their errors, where positions alone were recorded?
 
-    python -m benchmarks.hidden_velocities [--seeds 100] [--certified 100] [--folder results/hidden_velocities]
+    python -m benchmarks.hidden_velocities [--seeds 100] [--certified 100] [--folder FOLDER]
 
 A hundred laboratories record a damped particle in a double well, ``dv = (x - x³ - γv) dt + √ε dW``, by its
 position with an error of the sensor: eight records of 20,000 samples each, begun in both wells. Velocities
@@ -213,7 +213,7 @@ def summary(particle: Particle, found: Sequence[dict[str, object]], best: float)
     return "\n".join(
         [
             f"laboratories: {len(found)}, with two wells: {len(usable)}",
-            f"certified: {int(certified.sum())} of {sum('certified' in one for one in found)} that were asked",
+            f"certified: {int(certified.sum())} of {sum('certified' in one for one in found)} asked",
             f"exactly the true terms: {true}",
             f"barrier {particle.barrier:.4g}, Cramér-Rao bound {best:.4g}",
             f"mean error: {errors.mean() / best:+.2f} bounds",

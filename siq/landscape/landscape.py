@@ -114,7 +114,11 @@ class Landscape:
 
     @classmethod
     def from_recordings(
-        cls, recordings: str | Path | Recordings | pd.DataFrame, settings: PipelineSettings | None = None
+        cls,
+        recordings: str | Path | Recordings | pd.DataFrame,
+        settings: PipelineSettings | None = None,
+        *,
+        hidden_velocities: bool = False,
     ) -> Landscape:
         r"""The landscape that recordings show: f identified, V refined and certified, transitions found.
 
@@ -126,6 +130,9 @@ class Landscape:
         settings
             Of all steps; see `siq.steps.pipeline.PipelineSettings`. By default V comes from f alone, without
             networks.
+        hidden_velocities
+            Whether the recorded states are positions whose velocities were not recorded, as
+            ``identification.hidden_velocities`` of the settings.
 
         Raises
         ------
@@ -157,6 +164,10 @@ class Landscape:
         from siq.steps.pipeline import PipelineSettings, analyse
 
         settings, trajectories = settings or PipelineSettings(), recordings_of(recordings)
+        if hidden_velocities:
+            settings = replace(
+                settings, identification=replace(settings.identification, hidden_velocities=True)
+            )
         analysis = analyse(trajectories, settings)
         found = None if analysis.landscape is None else analysis.landscape.landscape
         certified = found is not None and found.certificate is not None and found.certificate.certified
@@ -164,13 +175,7 @@ class Landscape:
         seen = None if whole else seen_states(joined(trajectories))
         if found is None:
             raise NoLandscape(why_no_landscape(analysis.outcomes), seen, analysis.dynamics)
-        found = replace(found, seen=seen)
-        units = tuple(
-            unit or settings.space.unit(name, unknown="1")
-            for name, unit in zip(trajectories.names, trajectories.units, strict=True)
-        )
-        time = trajectories.time_unit or settings.space.unit("t", unknown="1")
-        return found.in_units(units, time=time)
+        return replace(found, seen=seen)
 
     @classmethod
     def from_equations(

@@ -63,6 +63,12 @@ class PipelineSettings:
     certificate: CertificateOptions = CertificateOptions()
     landscape: LandscapeOptions | None = LandscapeOptions()
 
+    def __post_init__(self) -> None:
+        if self.training is not None and self.identification.hidden_velocities:
+            raise ValueError(
+                "networks know recorded states only, and velocities are hidden; leave 'training' out"
+            )
+
     @property
     def prediction(self) -> PredictionLimits:
         """The certificate's limits for f."""

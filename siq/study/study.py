@@ -179,6 +179,11 @@ class Study(BaseModel):
             raise ValueError("the study names no data; add 'system: NAME' or 'recordings: {file: ...}'")
         if self.system is not None and self.recordings is not None and self.recordings.diffusion is not None:
             raise ValueError("the diffusion is the system's; remove 'recordings.diffusion'")
+        if self.identification.hidden_velocities and (self.recordings is None or self.training is not None):
+            raise ValueError(
+                "'identification.hidden_velocities' is of recordings, and networks know recorded states only;"
+                " remove it, or give 'recordings' and leave 'training' out"
+            )
         if self.training is None and "network" in (self.refinement.routes or ()):
             raise ValueError(
                 "'refinement.routes' names the network route, but no networks are asked for; add"
