@@ -129,7 +129,7 @@ def filtered_recordings(
     )
     if not view.hidden:
         return seen
-    per_time = [None if unit is None else f"({unit})/({seen.time_unit or 1})" for unit in seen.units]
+    per_time = [None if unit is None else _per(unit, seen.time_unit or "1") for unit in seen.units]
     return replace(
         seen,
         names=found.library.states,
@@ -137,3 +137,9 @@ def filtered_recordings(
         headings=(*seen.titles, *found.library.states[len(sensor) :]) if seen.headings else (),
         values=follow.linearised_at.copy(),
     )
+
+
+def _per(unit: str, time: str) -> str:
+    """The unit of a velocity; what is no single symbol stands in brackets."""
+    one, other = (each if each.replace("²", "").isalnum() else f"({each})" for each in (unit, time))
+    return f"{one}/{other}"

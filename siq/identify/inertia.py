@@ -104,13 +104,13 @@ class InertiaTest:
             assert self.friction_error is not None
             swing = f", ω = {self.frequency:.3g} ± {self.frequency_error:.1g}" if self.frequency > 0 else ""
             return (
-                f"the position has inertia: the log-likelihood with a velocity is larger by {self.gain:.4g} ±"
-                f" {self.gain_error:.2g}, γ = {self.friction:.3g} ± {self.friction_error:.1g}{swing}{rate}"
+                f"the position has inertia: the log-likelihood with a velocity is larger by {self.gain:.0f} ±"
+                f" {self.gain_error:.0f}, γ = {self.friction:.3g} ± {self.friction_error:.1g}{swing}{rate}"
                 f" (γΔt = {self.friction * self.step:.2g}); {kind}"
             )
         if self.overdamped:
             return (
-                f"no inertia is seen: with a velocity the log-likelihood changes by {self.gain:.3g} ±"
+                f"no inertia is seen: with a velocity the log-likelihood changes by {self.gain:.0f} ±"
                 f" {self.gain_error:.2g}, and γ is above {self.friction:.3g}{rate}, while wells relax with"
                 f" {self.relaxation:.3g}{rate}"
             )

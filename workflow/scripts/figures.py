@@ -15,7 +15,7 @@ from siq.report.interactive import interactive_view
 from siq.report.plots import save_figure
 from siq.report.settings import FiguresSettings
 from siq.report.study_figures import PicturedRun, StudyTables, leading_figures, study_figures, what_is_shown
-from siq.steps.files import read_run
+from siq.steps.files import read_run, read_states
 from siq.steps.landscapes import first_stored
 from siq.steps.outcomes import Method
 from siq.steps.shown import ModelFiles, shown_formula
@@ -40,7 +40,7 @@ if __name__ == "__main__":
         trained = (source.networks[run], source.blocks[run]) if source.networks else (None, None)
         shown = replace(
             shown,
-            recordings=read_run(source.recordings[run]),
+            recordings=read_states(source.recordings[run], source.every_field[run]),
             networks=read_trained(*trained, number=run).networks,
             exact=None if card is None else exact_answer(card),
         )
@@ -57,7 +57,8 @@ if __name__ == "__main__":
         if record is not None and recorded is not None:
             dynamics, own = record.found.dynamics, models.formulas(first).get(Method.REFINED)
             stored = read_landscape(source.overview, dynamics=dynamics)
-            picture = PicturedRun(overview, stored, own, dynamics, recorded)
+            states = read_states(source.recordings[first], source.every_field[first]) or recorded
+            picture = PicturedRun(overview, stored, own, dynamics, states)
             figures |= leading_figures(picture)
             view = interactive_view(picture.drawn()) if dynamics.dimension > 2 else None
         drawn = Path(now.params.folder)

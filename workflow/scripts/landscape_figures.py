@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pandas as pd
 
-from siq.data.recordings import read_recordings
 from siq.landscape.reference import read_reference
 from siq.potential.storage import read_model
 from siq.report.landscape_figures import LandscapeComparisons, LandscapeRun, landscape_figures
 from siq.report.plots.saving import save_figure
 from siq.report.settings import LandscapeFiguresSettings
+from siq.steps.files import read_states
 from siq.steps.landscapes import first_stored
 from siq.steps.trained import read_trained
 from siq.study.published import mesh_potential
@@ -30,7 +30,7 @@ if __name__ == "__main__":
             trained = (source.networks[run], source.training[run]) if source.networks else (None, None)
             shown = LandscapeRun(
                 stored,
-                read_recordings(source.recordings[run]),
+                read_states(source.recordings[run], source.fields[run]),
                 read_model(source.models[run])[0],
                 read_trained(*trained, number=run).networks,
             )
