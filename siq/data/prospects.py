@@ -143,8 +143,8 @@ def memory_prospects(memory: MarkovLag, *, time_unit: str | None) -> list[str]:
         )
     if memory.kind == "hidden":
         said.append(
-            "Formulas of what was recorded will be refused: record the missing state (if it is a velocity, set"
-            " 'identification.hidden_velocities'), or record longer, so"
+            "Formulas of what was recorded will be refused: record the missing state (if it is a velocity,"
+            " set 'identification.hidden_velocities'), or record longer, so"
             " that the memory can be told from the motion."
         )
     if np.isfinite(memory.relaxation) and memory.step > COARSE * memory.relaxation:

@@ -111,13 +111,13 @@ class InertiaTest:
         if self.overdamped:
             return (
                 f"no inertia is seen: with a velocity the log-likelihood changes by {self.gain:.0f} ±"
-                f" {self.gain_error:.2g}, and γ is above {self.friction:.3g}{rate}, while wells relax with"
+                f" {self.gain_error:.0f}, and γ is above {self.friction:.3g}{rate}, while wells relax with"
                 f" {self.relaxation:.3g}{rate}"
             )
         needed = 1 / max(self.relaxation / SLIGHT, 1e-300)
         return (
             "whether the position has inertia cannot be told: with a velocity the log-likelihood changes by"
-            f" {self.gain:.3g} ± {self.gain_error:.2g}, and γ may be anything above"
+            f" {self.gain:.0f} ± {self.gain_error:.0f}, and γ may be anything above"
             f" {self.friction:.3g}{rate}, while wells relax with {self.relaxation:.3g}{rate}; a step of at"
             f" most {needed:.2g}{time}, or a less noisy sensor at a short step, would tell"
         )
@@ -147,7 +147,8 @@ def inertia_test(recordings: Recordings, *, degree: int = 5, pair_step: float | 
     step = float(np.median(np.diff(data.t)[data.begins]))
     x, noise = smoothed_motion(data, recordings.names)
     without = _without_inertia(library, data)
-    places = np.linspace(*np.quantile(data.outputs, (0.01, 0.99)), 400)[:, None]
+    low, high = np.quantile(data.outputs, (0.01, 0.99))
+    places = np.linspace(low, high, 400)[:, None]
     relaxation, _ = _stiffest(library, without.model.values, without.covariance, places)
     models = _Inertia(library, data, x, noise, without, step)
     best = models.free()

@@ -16,6 +16,7 @@ draw                    which trajectories has a run?
 identify                which f do its pairs show, and does it predict recordings that were held out?
 identify_beside_sensor  the same, where the sensor is noisy: when, and what is kept of it?
 identify_from_earlier   the same, where the recordings remember: which samples tell, and what is kept?
+identify_hidden         and where they are positions whose velocities were not recorded?
 train                   which V and g do two networks find?
 regress                 which sparse formulas are these (the published method)?
 refine                  which V solves the Hamilton–Jacobi equation of f, and may it be believed?

@@ -28,9 +28,11 @@ if __name__ == "__main__":
         if found is not None:
             run, stored = found
             trained = (source.networks[run], source.training[run]) if source.networks else (None, None)
+            states = read_states(source.recordings[run], source.fields[run])
+            assert states is not None  # a landscape was found
             shown = LandscapeRun(
                 stored,
-                read_states(source.recordings[run], source.fields[run]),
+                states,
                 read_model(source.models[run])[0],
                 read_trained(*trained, number=run).networks,
             )
