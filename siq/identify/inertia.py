@@ -42,6 +42,7 @@ BLOCKS = 40  # of the record: the error of a sum of so many is known to a tenth
 INTERVAL = 1.96  # standard errors: of 95 % of a normal distribution
 DROP = INTERVAL**2 / 2  # of a log-likelihood, at the ends of such an interval
 SLIGHT = 0.1  # relaxation over friction, below which x alone is the state to within a tenth
+PLACES = 400  # numerical: at which F is looked at in search of wells
 SEARCHED = 6  # numerical: halvings of the logarithm of γ, to 2 % of a factor of four
 FASTEST = 10.0  # γ times the step, beyond which velocities are forgotten between samples to exp(-10)
 
@@ -140,37 +141,28 @@ def inertia_test(recordings: Recordings, *, degree: int = 5, pair_step: float | 
     NumericalFailure
         Where one of the models cannot be fitted, or there is more than one position.
     """
-    if len(recordings.names) != 1:
-        raise NumericalFailure("the test of inertia is of one position; select one column")
-    data = unbroken(recordings, pair_step=pair_step)
-    library = candidate_library(recordings.names, degree=degree)
-    step = float(np.median(np.diff(data.t)[data.begins]))
-    x, noise = smoothed_motion(data, recordings.names)
-    without = _without_inertia(library, data)
-    low, high = np.quantile(data.outputs, (0.01, 0.99))
-    places = np.linspace(low, high, 400)[:, None]
-    relaxation, _ = _stiffest(library, without.model.values, without.covariance, places)
-    models = _Inertia(library, data, x, noise, without, step)
-    best = models.free()
-    price = np.log(len(data.t)) / 2 * (1 + len(data.labels))  # γ, and a first velocity of each record
-    if best is None:
-        strongest = models.with_friction(FASTEST / step)
-        gain = strongest.log_likelihood - without.log_likelihood - price
-        error = _error(strongest, without, data)
-        limit = models.least_friction(strongest.log_likelihood, FASTEST / step)
-        return InertiaTest(gain, error, limit, None, relaxation, np.nan, np.nan, step)
-    gain, error = best.log_likelihood - without.log_likelihood - price, _error(best, without, data)
-    friction, friction_error = best.model.values[-1], best.standard_errors[-1]
-    stiffness, its_error = _stiffest(library, best.model.values[:-1], best.covariance[:-1, :-1], places)
-    frequency = float(np.sqrt(stiffness))
-    frequency_error = its_error / (2 * frequency) if frequency > 0 else np.nan
-    test = InertiaTest(
-        gain, error, float(friction), float(friction_error), relaxation, frequency, frequency_error, step
-    )
-    if test.seen:
+    models = _Inertia.of(recordings, degree, pair_step)
+    test = models.free_test()
+    if test is not None and test.seen:
         return test
-    limit = models.least_friction(best.log_likelihood, float(friction))
-    return replace(test, friction=limit, friction_error=None)
+    if test is None:  # the samples show no γ
+        fastest = FASTEST / models.step
+        fit = models.with_friction(fastest)
+        limit = models.least_friction(fit.log_likelihood, fastest)
+        return InertiaTest(*models.compared(fit), limit, None, models.relaxation, np.nan, np.nan, models.step)
+    best = models.without.log_likelihood + test.gain + models.price
+    return replace(test, friction=models.least_friction(best, test.friction), friction_error=None)
+
+
+def seen_inertia(
+    recordings: Recordings, *, degree: int = 5, pair_step: float | None = None
+) -> InertiaTest | None:
+    """The test where inertia is seen, and None elsewhere: without the search for a limit of γ.
+
+    The arguments, and what is raised, are those of `inertia_test`.
+    """
+    test = _Inertia.of(recordings, degree, pair_step).free_test()
+    return test if test is not None and test.seen else None
 
 
 def _without_inertia(library: CandidateLibrary, data: Measurements) -> Fit:
@@ -198,8 +190,56 @@ class _Inertia:
     data: Measurements
     x: np.ndarray
     noise: Noise
-    without: Fit
     step: float
+
+    @classmethod
+    def of(cls, recordings: Recordings, degree: int, pair_step: float | None) -> _Inertia:
+        """The models of recordings of one position."""
+        if len(recordings.names) != 1:
+            raise NumericalFailure("the test of inertia is of one position; select one column")
+        data = unbroken(recordings, pair_step=pair_step)
+        library = candidate_library(recordings.names, degree=degree)
+        step = float(np.median(np.diff(data.t)[data.begins]))
+        return cls(library, data, *smoothed_motion(data, recordings.names), step)
+
+    @cached_property
+    def without(self) -> Fit:
+        """The model without inertia."""
+        return _without_inertia(self.library, self.data)
+
+    @property
+    def price(self) -> float:
+        """Schwarz's, of γ and of a first velocity of each record."""
+        return float(np.log(len(self.data.t)) / 2 * (1 + len(self.data.labels)))
+
+    @cached_property
+    def places(self) -> np.ndarray:
+        """At which wells are sought, shape ``(n, 1)``."""
+        low, high = np.quantile(self.data.outputs, (0.01, 0.99))
+        return np.linspace(low, high, PLACES)[:, None]
+
+    @property
+    def relaxation(self) -> float:
+        """In the stiffest well of the model without inertia."""
+        return _stiffest(self.library, self.without.model.values, self.without.covariance, self.places)[0]
+
+    def compared(self, fit: Fit) -> tuple[float, float]:
+        """Log-likelihood of a fit over that without inertia, at its price, and the error of that."""
+        gain = fit.log_likelihood - self.without.log_likelihood - self.price
+        return gain, _error(fit, self.without, self.data)
+
+    def free_test(self) -> InertiaTest | None:
+        """The test with the γ that fits best; None where samples show none."""
+        best = self.free()
+        if best is None:
+            return None
+        values, covariance = best.model.values[:-1], best.covariance[:-1, :-1]
+        stiffness, error = _stiffest(self.library, values, covariance, self.places)
+        frequency = float(np.sqrt(stiffness))
+        return InertiaTest(
+            *self.compared(best), float(best.model.values[-1]), float(best.standard_errors[-1]),
+            self.relaxation, frequency, error / (2 * frequency) if frequency > 0 else np.nan, self.step,
+        )  # fmt: skip
 
     @cached_property
     def _with_force(self) -> Dynamics:

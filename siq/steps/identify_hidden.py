@@ -15,7 +15,7 @@ from siq.identify.diffusion import DiffusionSource
 from siq.identify.filtered_states import evidence
 from siq.identify.hidden_velocities import HiddenMotion, identify_hidden_motion
 from siq.identify.identification import IdentificationOptions
-from siq.identify.inertia import inertia_test
+from siq.identify.inertia import seen_inertia
 from siq.identify.residuals import LARGE, SIGNIFICANT
 from siq.identify.seen_states import View
 from siq.identify.storage import FieldRecord, field_library
@@ -130,10 +130,10 @@ def advice_on_inertia(recordings: Recordings, *, pair_step: float | None) -> str
     if len(recordings.names) != 1:
         return None
     try:
-        test = inertia_test(recordings, pair_step=pair_step)
+        test = seen_inertia(recordings, pair_step=pair_step)
     except (NumericalFailure, np.linalg.LinAlgError):
         return None
-    if not test.needs_velocity:
+    if test is None or not test.needs_velocity:
         return None
     return (
         f"{test.sentence(recordings.time_unit or '')}: set 'identification.hidden_velocities: true', in"
