@@ -20,11 +20,12 @@ from siq.identify.library import candidate_library
 from siq.identify.seen_states import unbroken
 from siq.identify.storage import read_field, write_field
 from siq.identify.velocities import smoothed_motion, velocity_names
+from siq.landscape.landscape import Landscape
 from siq.landscape.prefactor_errors import covariance_axes
 from siq.landscape.transitions import barrier_uncertainty, ways_out
 from siq.steps import identify
 from siq.steps.outcomes import Status
-from siq.steps.pipeline import PipelineSettings, analyse
+from siq.steps.pipeline import PipelineSettings
 from siq.steps.settings import StateSpace
 
 FRICTION, SENSOR = 0.3, 0.02
@@ -61,7 +62,9 @@ def test_positions_alone_show_the_force_and_both_noises() -> None:
 def test_the_filter_knows_the_velocities() -> None:
     done, recordings, velocities = identified()
     assert done.record is not None
-    states = of_all_states(recordings, done.record, pair_step=None)
+    measured = replace(recordings, units=("µm",), time_unit="s")
+    states = of_all_states(measured, done.record, pair_step=None)
+    assert states.units == ("µm", "µm/s")
     assert states.names == ("x", "v_x")
     error = states.values[:, 1] - velocities
     assert error.std() < 0.4 * velocities.std() and abs(error.mean()) < 0.02 * velocities.std()
@@ -167,10 +170,11 @@ def test_the_errors_cover() -> None:
 
 @pytest.mark.slow
 def test_the_landscape_is_certified_and_right() -> None:
-    analysis = analyse(particle(5, samples=4000)[0], SETTINGS)
-    assert analysis.refined.certificate is not None and analysis.refined.certificate.certified
-    assert analysis.landscape is not None and analysis.landscape.landscape is not None
-    barriers = analysis.landscape.landscape.barriers()
+    settings = PipelineSettings(identification=IdentificationOptions(degree=3))
+    found = Landscape.from_recordings(particle(5, samples=4000)[0], settings, hidden_velocities=True)
+    assert found.certificate is not None and found.certificate.certified
+    barriers = found.barriers()
     assert len(barriers) == 2
     assert (abs(barriers["barrier"] - FRICTION / 2) < 3 * barriers["standard_error"]).all()
-    assert analysis.landscape.landscape.dynamics.states == ("x", "v_x")
+    assert found.dynamics.states == ("x", "v_x") and found.dynamics.units == ("1", "1")
+    assert (found.dwell_times()["mean_time"] > 0).all()

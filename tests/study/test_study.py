@@ -151,6 +151,15 @@ def test_a_library_function_of_an_unknown_state_is_refused_before_any_job(write:
         check_system(path)
 
 
+def test_hidden_velocities_are_states_of_the_library_and_of_recordings_only(write: Write) -> None:
+    hidden = "identification: {hidden_velocities: true, functions: ['x*v_x/(1 + x**2)']}\n"
+    recorded = "name: alone\nrecordings: {file: x.csv, states: [x]}\n"
+    path = write(recorded + hidden)
+    load_study_system(load_study(path), file=str(path), systems=CONFIG / "systems")
+    assert "hidden_velocities" in str(refusal(write(recorded + hidden + "training: {}\n")))
+    assert "hidden_velocities" in str(refusal(write("name: alone\nsystem: duffing\n" + hidden)))
+
+
 def test_states_other_than_those_of_the_system_are_refused(write: Write) -> None:
     path = write("name: s\nsystem: archetype3d\nrecordings: {file: a.csv, states: [x, y]}\n")
     with pytest.raises(InputError, match="not those of the system 'archetype3d'; name x, y, z"):
