@@ -17,7 +17,7 @@ from siq.dynamics.dynamics import Dynamics
 
 @dataclass(frozen=True)
 class Expectations:
-    """What is expected of the free parameters of a model: combinations of them are normal, each with unit width.
+    """What is expected of the free parameters of a model: some combinations of them are normal, of unit width.
 
     Attributes
     ----------
@@ -34,6 +34,7 @@ class Expectations:
     def of(cls, model: Dynamics) -> Expectations:
         """Those of a model's free parameters, each by itself, and of several together."""
         free = {model.parameters[place].name: column for column, place in enumerate(model.free)}
+        values = {each.name: each.value for each in model.parameters}
         rows, middle = [np.zeros((0, len(free)))], [np.zeros(0)]
         for name, column in free.items():
             expected = model.parameters[model.free[column]].expected
@@ -47,7 +48,7 @@ class Expectations:
                 rows.append(np.zeros((len(each.roots), len(free))))
                 rows[-1][:, [free[each.names[place]] for place in mine]] = each.roots[:, mine]
                 known = [
-                    0.0 if name in free else model.values[model.names.index(name)] for name in each.names
+                    0.0 if name in free else values[name] for name in each.names
                 ]
                 middle.append(-each.roots @ np.array(known))
         return cls(np.concatenate(rows), np.concatenate(middle))

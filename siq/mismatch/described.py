@@ -1,8 +1,8 @@
 """Described: a model of what has no name, from the place and the function that the recordings ask for.
 
 Functions (`siq.mismatch.fitted_functions`) compete with mechanisms that were found and are not certain enough
-for their names. Where a function of one coordinate leaves something, it may be one of two coordinates, or there
-may be another.
+for their names. Where a function of one coordinate leaves something, it may be one of two coordinates, or
+there may be another.
 What mechanisms with a name leave is described by functions of one coordinate on top of them.
 """
 

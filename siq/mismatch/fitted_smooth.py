@@ -1,8 +1,8 @@
-"""Smooth functions without a name, fitted: as smooth as the recordings ask for, and of which two coordinates.
+"""Smooth functions without a name, fitted: as smooth as the recordings ask for, of one coordinate or of two.
 
-What a fit leaves says how smooth a function is along the trajectories of that fit. Those with the function are
-better, and say it better; so it is asked for again. Functions of two coordinates are asked for where something is
-left of the likeliest functions of one.
+What a fit leaves says how smooth a function is, along the trajectories of that fit. Those with the function
+are better, and say it better; so it is asked for again. Functions of two coordinates are asked for where
+something is left of the likeliest functions of one.
 """
 
 from __future__ import annotations
@@ -87,8 +87,8 @@ def with_surfaces(fit: Fit, models: Sequence[Model], material: Material) -> list
     fit
         Of the simulation without functions.
     models
-        Those with functions of one coordinate, or of one times another, the likeliest first: one of two is asked
-        for where the first ones have theirs.
+        Those with functions of one coordinate, or of one times another, the likeliest first: one of two is
+        asked for where the first ones have theirs.
     material
         What models are made from.
     """

@@ -2,10 +2,11 @@
 
 A smooth function could be anything. All that is expected of it is that its values are alike where its
 coordinates are, and know nothing of each other far apart: a normal process with the covariance
-``s² exp(-½ Σ ((z_i - z'_i)/ℓ_i)²)`` (Rasmussen and Williams, Gaussian Processes for Machine Learning, MIT Press
-2006). It is written as a sum of Gaussian bumps as wide as the lengths ℓ, which stand closely where the recordings
-have been; what is expected of their heights is what makes the sum such a process there (Quiñonero-Candela and
-Rasmussen, J. Mach. Learn. Res. 6, 1939 (2005)). A length or so beyond, the function goes to zero.
+``s² exp(-½ Σ ((z_i - z'_i)/ℓ_i)²)`` (Rasmussen and Williams, Gaussian Processes for Machine Learning, MIT
+Press 2006). It is written as a sum of Gaussian bumps as wide as the lengths ℓ, which stand closely where the
+recordings have been; what is expected of their heights is what makes the sum such a process there
+(Quiñonero-Candela and Rasmussen, J. Mach. Learn. Res. 6, 1939 (2005)). A length or so beyond, the function
+goes to zero.
 
 Lengths and size are taken from the recordings (`siq.mismatch.smoothness`).
 """
