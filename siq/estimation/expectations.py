@@ -17,7 +17,7 @@ from siq.dynamics.dynamics import Dynamics
 
 @dataclass(frozen=True)
 class Expectations:
-    """What is expected of the free parameters of a model: some combinations of them are normal, of unit width.
+    """What is expected of the free parameters of a model: combinations of them are normal, of unit width.
 
     Attributes
     ----------
@@ -47,9 +47,7 @@ class Expectations:
             if mine:
                 rows.append(np.zeros((len(each.roots), len(free))))
                 rows[-1][:, [free[each.names[place]] for place in mine]] = each.roots[:, mine]
-                known = [
-                    0.0 if name in free else values[name] for name in each.names
-                ]
+                known = [0.0 if name in free else values[name] for name in each.names]
                 middle.append(-each.roots @ np.array(known))
         return cls(np.concatenate(rows), np.concatenate(middle))
 

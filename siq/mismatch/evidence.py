@@ -289,10 +289,12 @@ def log_evidence_of(fit: Fit, data: Measurements, *, correlated: float = 1.0) ->
     variances = int((fit.noise.process > 0).sum())
     count = max(float(white.known.sum()) / correlated, 2.0)
     price = 0.5 * (basis.shape[1] + variances) * np.log(count)
-    for each in fit.model.expected_together:
-        own = white.columns[:, [names.index(name) for name in each.names]]
+    if smooth:
+        together = fit.model.expected_together
+        own = white.columns[:, [names.index(name) for each in together for name in each.names]]
         own = own - basis @ (basis.T @ own)
-        told = np.linalg.svd(scipy.linalg.solve(each.roots.T, own.T), compute_uv=False) ** 2
+        roots = scipy.linalg.block_diag(*(each.roots for each in together))
+        told = np.linalg.svd(scipy.linalg.solve(roots.T, own.T), compute_uv=False) ** 2
         price += 0.5 * float(np.log1p(told / correlated).sum())
     return float(fit.log_likelihood / correlated - price)
 

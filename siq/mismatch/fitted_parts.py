@@ -20,7 +20,7 @@ from siq.mismatch.candidates import MechanismCandidate
 from siq.mismatch.function_places import Place
 from siq.mismatch.functions import FORMULA
 from siq.mismatch.nameless_models import Material, Part
-from siq.mismatch.smooth_functions import SmoothFunction
+from siq.mismatch.smooth_functions import Smooth
 from siq.mismatch.trials import UNFORESEEN, TriedMechanism, judged
 
 LOGGER = logging.getLogger(__name__)
@@ -34,7 +34,7 @@ def fitted_part(
     cost: float,
     material: Material,
     *,
-    smooth: SmoothFunction | None = None,
+    smooth: Smooth | None = None,
     begin: Fit | None = None,
 ) -> list[Part]:
     """A function as part of a model, or nothing where it cannot be fitted.
@@ -80,7 +80,9 @@ def _fitted(
     """
     data, budget = material.data, material.budget
     known = {each.name: each.value for each in begin.model.parameters}
-    known |= dict.fromkeys(candidate.amplitudes, 0.0)
+    known |= {
+        each.name: each.value for each in candidate.model.parameters if each.name in candidate.amplitudes
+    }
     values = np.array([known.get(each.name, 0.0) for each in candidate.model.parameters])
     if not begin.has_process_noise:  # a function that was nearly right may not be followed by another
         begin = replace(begin, noise=replace(begin.noise, process=fit.noise.process))

@@ -18,11 +18,19 @@ from siq.mismatch.fitted_parts import fitted_part
 from siq.mismatch.function_places import coordinates_of
 from siq.mismatch.likely_places import FITTED
 from siq.mismatch.nameless_models import Material, Model, Part, weighed
-from siq.mismatch.smooth_functions import Ground, ground_of_two, smooth_function, with_smooth_function
-from siq.mismatch.smoothness import smoothness_of
+from siq.mismatch.search import something_left
+from siq.mismatch.smooth_functions import (
+    Ground,
+    Smooth,
+    ground_of_two,
+    smooth_function,
+    with_smooth_function,
+)
+from siq.mismatch.smoothness import likeliest_product, smoothness_of
 
 LOGGER = logging.getLogger(__name__)
 ROUNDS = 4  # of fits, each along the trajectories of the one before: a choice
+WORTH = 1.0  # of a logarithm of odds, below which another round is not worth its time
 
 
 def with_a_smooth_function(
@@ -33,6 +41,7 @@ def with_a_smooth_function(
     material: Material,
     *,
     like: Model | None = None,
+    product: bool = False,
 ) -> list[Model]:
     """The likeliest model with a smooth function on a ground; none where none can be fitted.
 
@@ -48,34 +57,41 @@ def with_a_smooth_function(
         What models are made from.
     like
         A model with a function in its stead that explains a part, if there is one.
+    product
+        Whether it is to be a product of two functions of one coordinate each.
     """
     data = material.data
     if not ground.usable:
         return []
     likeliest: Model | None = None
-    current = fit if like is None else like.fit
-    known = () if like is None else like.parts[-1].trial.candidate.amplitudes
+    current, known = (fit, None) if like is None else (like.fit, like.parts[-1])
     for _ in range(ROUNDS):
         here = ground.along(current.model, data, current.x)
         asked = smoothness_of(current, data, here, known=known)
         if asked is None:
             break
-        function = smooth_function(here, asked.shares, deviation=asked.deviation)
+        function: Smooth = (
+            likeliest_product(asked, here)
+            if product
+            else smooth_function(here, asked.shares, deviation=asked.deviation)
+        )
         candidate = with_smooth_function(fit.model, function)
         price = cost + float(np.log(asked.considered))
         parts = fitted_part(
-            candidate, asked.level, ground.place, fit, price, material, smooth=function, begin=current
+            candidate, asked.told.level, ground.place, fit, price, material, smooth=function, begin=current
         )
         if not parts:
             break
         found = Model((*before, parts[0]), parts[0].trial.fit)
         LOGGER.info(
-            "%s over %s of the range: log-likelihood %.1f",
-            candidate.label, " and ".join(f"{share:g}" for share in asked.shares), found.fit.log_likelihood,
+            "%s, %d bumps: log-likelihood %.1f",
+            candidate.label, function.width, found.fit.log_likelihood,
         )  # fmt: skip
-        if likeliest is not None and weighed([likeliest, found], fit, data)[0].fit is likeliest.fit:
-            break
-        likeliest, current, known = found, found.fit, candidate.amplitudes
+        if likeliest is not None:
+            both = {id(each.fit): each.log_evidence for each in weighed([likeliest, found], fit, data)}
+            if both[id(found.fit)] < both[id(likeliest.fit)] + WORTH:
+                break
+        likeliest, current, known = found, found.fit, parts[0]
     return [] if likeliest is None else [likeliest]
 
 
@@ -97,8 +113,7 @@ def with_surfaces(fit: Fit, models: Sequence[Model], material: Material) -> list
     asked: list[tuple[float, Ground, Model]] = []
     for model, ground in _grounds(fit, models, material):
         if ground.usable:
-            known = model.parts[-1].trial.candidate.amplitudes
-            smooth = smoothness_of(model.fit, data, ground, known=known, alike=True)
+            smooth = smoothness_of(model.fit, data, ground, known=model.parts[-1], alike=True)
             if smooth is not None:
                 asked.append((smooth.log_evidence, ground, model))
     before = max((part.cost for model in models for part in model.parts), default=0.0)
@@ -106,7 +121,11 @@ def with_surfaces(fit: Fit, models: Sequence[Model], material: Material) -> list
     ranked = sorted((each for each in asked if each[0] > cost), key=lambda each: -each[0])
     found: list[Model] = []
     for _, ground, model in ranked[:FITTED]:
-        found += with_a_smooth_function((), fit, ground, cost, material, like=model)
+        for product in (True, False):
+            some = with_a_smooth_function((), fit, ground, cost, material, like=model, product=product)
+            found += some
+            if some and not something_left(some[0].fit, data):
+                break
     return found
 
 

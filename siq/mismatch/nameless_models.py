@@ -16,7 +16,7 @@ from siq.estimation.measurements import Measurements
 from siq.mismatch.evidence import correlation_time_left, log_evidence_of
 from siq.mismatch.function_places import Place
 from siq.mismatch.roles import Roles
-from siq.mismatch.smooth_functions import SmoothFunction
+from siq.mismatch.smooth_functions import Smooth
 from siq.mismatch.trials import TriedMechanism
 
 MECHANISM = "mechanism"
@@ -72,7 +72,7 @@ class Part:
     kind: str
     cost: float
     place: Place | None = None
-    smooth: SmoothFunction | None = None
+    smooth: Smooth | None = None
 
 
 @dataclass(frozen=True)

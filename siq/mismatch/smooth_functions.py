@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 import scipy.linalg
@@ -67,6 +68,46 @@ class Ground:
     def along(self, model: Dynamics, data: Measurements, x: np.ndarray) -> Ground:
         """The same ground where the recordings have been by other states, shape ``(n, d)``."""
         return replace(self, courses=_courses(self.coordinates, model, data, x))
+
+
+class Smooth(Protocol):
+    """A smooth function with its bumps; see `SmoothFunction`."""
+
+    @property
+    def ground(self) -> Ground:
+        """Where it stands."""
+
+    @property
+    def kind(self) -> str:
+        """What it looks like."""
+
+    @property
+    def width(self) -> int:
+        """The number of bumps."""
+
+    @property
+    def linear(self) -> int:
+        """In how many of its heights, the first ones, it is linear if the others are given."""
+
+    @property
+    def begin(self) -> np.ndarray:
+        """Heights to begin with."""
+
+    @property
+    def limits(self) -> np.ndarray:
+        """Where the recordings have been."""
+
+    def along(self, heights: np.ndarray, courses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The function along courses, and its derivatives by the heights."""
+
+    def formula(self, heights: tuple[sympy.Expr, ...]) -> sympy.Expr:
+        """As a formula, heights being symbols."""
+
+    def expected(self, names: tuple[str, ...]) -> tuple[JointExpectation, ...]:
+        """What is expected of the heights."""
+
+    def units(self, whole: str) -> tuple[str, ...]:
+        """Of the heights, of a function with a unit."""
 
 
 def ground_of(place: Place, model: Dynamics, data: Measurements, x: np.ndarray) -> Ground:
@@ -148,6 +189,42 @@ class SmoothFunction:
         """The number of bumps."""
         return len(self.centres)
 
+    @property
+    def linear(self) -> int:
+        """In how many of its heights it is linear: in all of them."""
+        return self.width
+
+    @property
+    def begin(self) -> np.ndarray:
+        """Heights to begin with, shape ``(b,)``."""
+        return np.zeros(self.width)
+
+    def along(self, heights: np.ndarray, courses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The function along courses ``(c, n)``, ``(n,)``, and its derivatives by the heights, ``(n, b)``."""
+        values = self.values(courses)
+        return heights @ values, values.T
+
+    def formula(self, heights: tuple[sympy.Expr, ...]) -> sympy.Expr:
+        """The sum of its bumps, heights being symbols."""
+        return sympy.Add(
+            *(height * self._bump(centre) for height, centre in zip(heights, self.centres, strict=True))
+        )
+
+    def _bump(self, centre: np.ndarray) -> sympy.Expr:
+        away = [
+            ((z - _number(at)) / _number(length)) ** 2
+            for z, at, length in zip(self.coordinates, centre, self.lengths, strict=True)
+        ]
+        return sympy.exp(-sympy.Add(*away) / 2)
+
+    def units(self, whole: str) -> tuple[str, ...]:
+        """Of the heights, of a function with a unit."""
+        return (whole,) * self.width
+
+    def expected(self, names: tuple[str, ...]) -> tuple[JointExpectation, ...]:
+        """What is expected of the heights, by their names."""
+        return (JointExpectation(names, self.triangle.T / self.deviation),)
+
     def values(self, courses: np.ndarray) -> np.ndarray:
         """Every bump along courses ``(c, n)`` of the coordinates, shape ``(b, n)``."""
         return np.exp(-0.5 * _squares(courses.T / self.lengths, self.centres / self.lengths)).T
@@ -156,11 +233,6 @@ class SmoothFunction:
     def triangle(self) -> np.ndarray:
         """Lower triangle L of the process's covariance at the centres over s², shape ``(b, b)``."""
         return triangle_of(self.centres, self.lengths)
-
-    @property
-    def roots(self) -> np.ndarray:
-        """What of the heights is standard normal, ``Lᵀ/s``, shape ``(b, b)``."""
-        return self.triangle.T / self.deviation
 
     def heights_of(self, values: np.ndarray) -> np.ndarray:
         """The heights with which it has given values ``(b,)`` at its centres."""
@@ -212,27 +284,18 @@ def spread_out(points: np.ndarray, *, apart: float, most: int | None = None) -> 
     return np.array(chosen)
 
 
-def with_smooth_function(model: Dynamics, function: SmoothFunction) -> MechanismCandidate:
-    """The simulation with a smooth function; the heights of its bumps are the amplitudes."""
-    ground = function.ground
-    names = fresh_names("b", function.width, model)
-
-    def bump(centre: np.ndarray) -> sympy.Expr:
-        away = [
-            ((z - _number(at)) / _number(length)) ** 2
-            for z, at, length in zip(ground.coordinates, centre, function.lengths, strict=True)
-        ]
-        return sympy.exp(-sympy.Add(*away) / 2)
-
-    formula = sympy.Add(
-        *(symbol(name) * bump(centre) for name, centre in zip(names, function.centres, strict=True))
-    )
-    factors = len(ground.place.words) - len(ground.words)
-    units = [unit_in(ground.place, model, 0, factors)] * len(names)
-    candidate = built(model, ground.place, formula, names, units)
-    expected = JointExpectation(tuple(names), function.roots)
-    together = (*candidate.model.expected_together, expected)
-    return replace(candidate, model=replace(candidate.model, expected_together=together))
+def with_smooth_function(model: Dynamics, function: Smooth) -> MechanismCandidate:
+    """The simulation with a smooth function, as it begins; the heights of its bumps are the amplitudes."""
+    place = function.ground.place
+    names = tuple(fresh_names("b", function.width, model))
+    factors = len(place.words) - len(function.ground.words)
+    units = function.units(unit_in(place, model, 0, factors))
+    candidate = built(model, place, function.formula(tuple(map(symbol, names))), names, units)
+    together = (*candidate.model.expected_together, *function.expected(names))
+    known = dict(zip(names, function.begin, strict=True))
+    values = [known.get(each.name, each.value) for each in candidate.model.parameters]
+    begun = replace(candidate.model, expected_together=together).with_values(np.array(values))
+    return replace(candidate, model=begun)
 
 
 def triangle_of(points: np.ndarray, lengths: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,6 +21,8 @@ from siq.estimation.linearisation import Grid
 from siq.estimation.measurements import Measurements
 from siq.mismatch.evidence import evidences_by_size
 from siq.mismatch.function_places import NUMBERS, PlaceColumns
+from siq.mismatch.nameless_models import Part
+from siq.mismatch.product_functions import ProductFunction, product_of
 from siq.mismatch.screening import LEVELS, probe_response, projected
 from siq.mismatch.smooth_functions import Ground, SmoothFunction, smooth_function, triangle_of
 from siq.mismatch.structure import SUBSTEPS
@@ -29,6 +31,34 @@ from siq.mismatch.trials import UNFORESEEN
 LOGGER = logging.getLogger(__name__)
 SHARES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0)  # of the range; over twice of it a function is a parabola
 MOST_BUMPS = 100  # a guard on the time of a fit
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a fit leaves says of a function's values, at a level of random forces.
+
+    Attributes
+    ----------
+    level
+        Relative to the random forces of the fit.
+    fine
+        The function, with bumps as narrow as any.
+    gram, overlap
+        Of what a unit of each bump does to the innovations, with each other and with the innovations; shapes
+        ``(b, b)`` and ``(b,)``.
+    total, freedom
+        Sum of squares of the innovations, and degrees of freedom.
+    likelihood
+        Logarithm, without the function.
+    """
+
+    level: float
+    fine: SmoothFunction
+    gram: np.ndarray
+    overlap: np.ndarray
+    total: float
+    freedom: int
+    likelihood: float
 
 
 @dataclass(frozen=True)
@@ -41,8 +71,10 @@ class Smoothness:
         Its lengths, as shares of the ranges of its coordinates.
     deviation
         Its size.
-    level
-        Of random forces, relative to those of the fit, at which it is likeliest.
+    told
+        What the recordings tell, at the level of random forces at which it is likeliest.
+    noise
+        Variance of the innovations then, in units of what the fit takes for it.
     log_evidence
         Logarithm of the odds for such a function, over none, each at its best level; averaged over all
         lengths and sizes.
@@ -52,13 +84,14 @@ class Smoothness:
 
     shares: tuple[float, ...]
     deviation: float
-    level: float
+    told: Told
+    noise: float
     log_evidence: float
     considered: int
 
 
 def smoothness_of(
-    fit: Fit, data: Measurements, ground: Ground, *, known: Sequence[str] = (), alike: bool = False
+    fit: Fit, data: Measurements, ground: Ground, *, known: Part | None = None, alike: bool = False
 ) -> Smoothness | None:
     """The likeliest smoothness of a function on top of a fit; None where it cannot be worked out.
 
@@ -69,53 +102,78 @@ def smoothness_of(
     ground
         Where the function stands.
     known
-        Parameters of the fit that are a first description of this function, in whose stead it comes.
+        A part of the fit that is a first description of this function, in whose stead it comes.
     alike
         Whether both lengths are the same share of the range.
     """
     least, fine = _finest(ground, data, fit.model)
-    grid = Grid(data, fit.substeps if known else min(fit.substeps, SUBSTEPS))
-    response = probe_response(fit.model, grid, fit, PlaceColumns(fit.model, grid, [fine]))
     some = [share for share in SHARES if share >= least]
-    dimension = len(ground.words)
-    choices = [(each,) * dimension for each in some]
+    choices = [(each,) * len(ground.words) for each in some]
     if not alike:
-        choices = list(itertools.product(some, repeat=dimension))
+        choices = list(itertools.product(some, repeat=len(ground.words)))
     # What processes of these lengths have for values at the finest bumps, as heights of these.
     shapes = [fine.heights_of(triangle_of(fine.centres, np.array(each) * ground.ranges)) for each in choices]
     alone = -np.inf
     values: list[np.ndarray] = []
-    best: tuple[float, Smoothness] | None = None
-    for level in LEVELS if fit.has_process_noise else (1.0,):
-        try:
-            white = whiten(response, data, fit.noise.scaled(level))
-            left, columns = projected(*_without(white, fit, known))
-        except UNFORESEEN as error:
-            LOGGER.info("no function of %s can be screened: %s", " and ".join(ground.words), error)
-            continue
-        freedom = white.degrees_of_freedom - len(fit.model.free) + len(known)
-        total = float(left @ left)
-        base = profile_likelihood(total, freedom, white.log_determinant)
-        alone = max(alone, base)
-        gram, overlap = columns.T @ columns, columns.T @ left
+    highest, best = -np.inf, None
+    for told in _told(fit, data, fine, known):
+        alone = max(alone, told.likelihood)
         for shares, shape in zip(choices, shapes, strict=True):
             gained, scale, rest = evidences_by_size(
-                shape.T @ gram @ shape, shape.T @ overlap, total, freedom=freedom
+                shape.T @ told.gram @ shape, shape.T @ told.overlap, told.total, freedom=told.freedom
             )
-            values.append(base + gained)
+            values.append(told.likelihood + gained)
             place = int(np.argmax(gained))
-            if best is None or base + gained[place] > best[0]:
+            if values[-1][place] > highest:
                 # The scale of the noise was at its best, too, and the size is one in units of it.
-                deviation = float(np.sqrt(scale[place] * rest[place] / freedom))
-                best = (
-                    base + gained[place],
-                    Smoothness(shares, deviation, level, 0.0, len(gained) * len(choices)),
-                )
-    if best is None or not best[1].deviation > 0:
+                highest, noise = values[-1][place], float(rest[place] / told.freedom)
+                deviation = float(np.sqrt(scale[place] * noise))
+                best = Smoothness(shares, deviation, told, noise, 0.0, len(gained) * len(choices))
+    if best is None or not best.deviation > 0:
         return None
     whole = np.concatenate(values)
     mean = float(np.logaddexp.reduce(whole) - np.log(len(whole)))
-    return replace(best[1], log_evidence=mean - alone)
+    return replace(best, log_evidence=mean - alone)
+
+
+def likeliest_product(asked: Smoothness, ground: Ground) -> ProductFunction:
+    """The likeliest product of two functions, where a function of two coordinates is asked for.
+
+    Parameters
+    ----------
+    asked
+        What the recordings say of a function of both.
+    ground
+        Where it stands.
+    """
+    told = asked.told
+    by_value = told.fine.heights_of(told.fine.heights_of(told.gram).T)
+    _, product = product_of(
+        ground,
+        SHARES,
+        points=told.fine.centres,
+        gram=(by_value + by_value.T) / (2 * asked.noise),
+        overlap=told.fine.heights_of(told.overlap) / asked.noise,
+        deviation=asked.deviation,
+    )
+    return product
+
+
+def _told(fit: Fit, data: Measurements, fine: SmoothFunction, known: Part | None) -> Iterator[Told]:
+    """What is told at each level of random forces at which it can be worked out."""
+    grid = Grid(data, fit.substeps if known else min(fit.substeps, SUBSTEPS))
+    response = probe_response(fit.model, grid, fit, PlaceColumns(fit.model, grid, [fine]))
+    for level in LEVELS if fit.has_process_noise else (1.0,):
+        try:
+            white = whiten(response, data, fit.noise.scaled(level))
+            white, parameters = _without(white, fit, known)
+            left, columns = projected(white, parameters)
+        except UNFORESEEN as error:
+            LOGGER.info("no function of %s can be screened: %s", " and ".join(fine.ground.words), error)
+            continue
+        total, freedom = float(left @ left), white.degrees_of_freedom - parameters
+        likelihood = profile_likelihood(total, freedom, white.log_determinant)
+        yield Told(level, fine, columns.T @ columns, columns.T @ left, total, freedom, likelihood)
 
 
 def _finest(ground: Ground, data: Measurements, model: Dynamics) -> tuple[float, SmoothFunction]:
@@ -129,11 +187,13 @@ def _finest(ground: Ground, data: Measurements, model: Dynamics) -> tuple[float,
     return SHARES[-1], smooth_function(ground, (SHARES[-1],) * len(ground.words), most=most)
 
 
-def _without(white: Whitened, fit: Fit, known: Sequence[str]) -> tuple[Whitened, int]:
-    """Innovations as if parameters were zero that are no longer there, and the number of the others."""
+def _without(white: Whitened, fit: Fit, known: Part | None) -> tuple[Whitened, int]:
+    """Innovations as if a part were not there, its columns left out, and the number of parameters left."""
     names = [fit.model.parameters[place].name for place in fit.model.free]
-    mine = [names.index(name) for name in known]
-    values = fit.model.values[[fit.model.free[place] for place in mine]]
+    amplitudes = () if known is None else known.trial.candidate.amplitudes
+    mine = [names.index(name) for name in amplitudes]
+    linear = mine if known is None or known.smooth is None else mine[: known.smooth.linear]
+    values = fit.model.values[[fit.model.free[place] for place in linear]]
     others = np.delete(white.columns, mine, axis=1)
-    innovations = white.innovations + white.columns[:, mine] @ values
+    innovations = white.innovations + white.columns[:, linear] @ values
     return replace(white, innovations=innovations, columns=others), len(names) - len(mine)

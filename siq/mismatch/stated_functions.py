@@ -14,7 +14,7 @@ from siq.estimation.estimation import Fit
 from siq.mismatch.functions import FORMULA
 from siq.mismatch.held_out import HeldOutRuns
 from siq.mismatch.nameless_models import MECHANISM, Part
-from siq.mismatch.smooth_functions import CURVE, SURFACE
+from siq.mismatch.smooth_functions import CURVE, SURFACE, Smooth
 from siq.mismatch.statement import DescribedCurve, DescribedSurface, Estimate, Evidence, StatedFunction
 
 GRID = 25  # places along either coordinate of a surface, for its figure
@@ -87,11 +87,11 @@ def curve_of(part: Part, fit: Fit) -> DescribedCurve | None:
     if smooth is not None:
         lower, upper = smooth.limits[:, 0]
         knots = np.linspace(lower, upper, GRID)
-        weights = smooth.values(knots[None]).T
+        values, errors = _along(smooth, part, fit, knots[None])
     else:
         knots = place.knots
         weights = _terms(part, fit.model, knots)
-    values, errors = _summed(weights, part, fit)
+        values, errors = weights @ _amplitudes(part, fit), _errors(weights, part, fit)
     return DescribedCurve(
         place.words[0], tuple(map(float, knots)), tuple(map(float, values)), tuple(map(float, errors))
     )
@@ -104,7 +104,7 @@ def surface_of(part: Part, fit: Fit) -> DescribedSurface | None:
         return None
     at = [np.linspace(lower, upper, GRID) for lower, upper in smooth.limits.T]
     courses = np.stack([each.ravel() for each in np.meshgrid(*at, indexing="ij")])
-    values, errors = _summed(smooth.values(courses).T, part, fit)
+    values, errors = _along(smooth, part, fit, courses)
     first, second = (tuple(map(float, each)) for each in at)
 
     def rows(flat: np.ndarray) -> tuple[tuple[float, ...], ...]:
@@ -114,13 +114,23 @@ def surface_of(part: Part, fit: Fit) -> DescribedSurface | None:
     return DescribedSurface((words[0], words[1]), (first, second), rows(values), rows(errors))
 
 
-def _summed(weights: np.ndarray, part: Part, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted sums ``(k,)`` of the amplitudes of a part, and their standard errors; weights ``(k, c)``."""
+def _along(smooth: Smooth, part: Part, fit: Fit, courses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A smooth function along courses ``(c, k)`` of its coordinates, and its standard errors, ``(k,)``."""
+    values, derivatives = smooth.along(_amplitudes(part, fit), courses)
+    return values, _errors(derivatives, part, fit)
+
+
+def _amplitudes(part: Part, fit: Fit) -> np.ndarray:
+    known = {each.name: each.value for each in fit.model.parameters}
+    return np.array([known[name] for name in part.trial.candidate.amplitudes])
+
+
+def _errors(weights: np.ndarray, part: Part, fit: Fit) -> np.ndarray:
+    """Standard errors of weighted sums ``(k, c)`` of the amplitudes of a part, shape ``(k,)``."""
     free = [fit.model.parameters[each].name for each in fit.model.free]
     rows = [free.index(name) for name in part.trial.candidate.amplitudes]
-    values = weights @ fit.model.values[[fit.model.free[row] for row in rows]]
     variances = np.einsum("kc,cd,kd->k", weights, fit.covariance[np.ix_(rows, rows)], weights)
-    return values, np.sqrt(np.maximum(variances, 0.0))
+    return np.sqrt(np.maximum(variances, 0.0))
 
 
 def _terms(part: Part, model: Dynamics, knots: np.ndarray) -> np.ndarray:
