@@ -18,6 +18,7 @@ import scipy.linalg
 import sympy
 
 from siq.dynamics.dynamics import JointExpectation
+from siq.errors import NumericalFailure
 from siq.mismatch.smooth_functions import SURFACE, Ground, SmoothFunction, smooth_function
 
 TURNS = 30  # at most, of working out one factor after the other
@@ -91,7 +92,7 @@ def product_of(
     gram: np.ndarray,
     overlap: np.ndarray,
     deviation: float,
-) -> tuple[float, ProductFunction]:
+) -> ProductFunction:
     """The likeliest product, whose lengths may be any of several.
 
     Parameters
@@ -107,12 +108,6 @@ def product_of(
         innovations: shapes ``(z, z)`` and ``(z,)``.
     deviation
         The size that is expected of the product.
-
-    Returns
-    -------
-    float, ProductFunction
-        Logarithm of the likelihood, averaged over all products with these lengths (Laplace's approximation),
-        over that of none; and the product.
     """
     grounds = [
         Ground(ground.place, (ground.coordinates[side],), (ground.words[side],), ground.courses[side, None])
@@ -124,24 +119,28 @@ def product_of(
         along = [(each.triangle, each.values(points[:, side, None].T)) for each in functions]
         independent = [scipy.linalg.solve_triangular(*each, lower=True) for each in along]
         bases.append(list(zip(functions, independent, strict=True)))
-    best: tuple[float, ProductFunction] | None = None
+    highest, best = -np.inf, None
     for (one, first), (other, second) in itertools.product(*bases):
         evidence, f, g = _in_turns(first, deviation * second, gram, overlap)
-        if best is None or evidence > best[0]:
+        if evidence > highest:
             heights = [
                 scipy.linalg.solve_triangular(function.triangle, values, lower=True, trans="T")
                 for function, values in ((one, f), (other, deviation * g))
             ]
-            second_factor = replace(other, deviation=deviation)
-            best = evidence, ProductFunction(ground, one, second_factor, np.concatenate(heights))
-    assert best is not None
+            sized = replace(other, deviation=deviation)
+            highest, best = evidence, ProductFunction(ground, one, sized, np.concatenate(heights))
+    if best is None:
+        raise NumericalFailure("no product of two functions has an evidence that is a number")
     return best
 
 
 def _in_turns(
     first: np.ndarray, second: np.ndarray, gram: np.ndarray, overlap: np.ndarray
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """Evidence and independent coefficients of two factors, given what each has at points ``(b, z)``."""
+    """Evidence and independent coefficients of two factors, given what each has at points ``(b, z)``.
+
+    The evidence is averaged over all that the factors could be (Laplace's approximation).
+    """
     g = np.linalg.lstsq(second.T, np.full(second.shape[1], np.sqrt((second**2).sum(axis=0).mean())))[0]
     f, before = np.zeros(len(first)), np.inf
     for _ in range(TURNS):

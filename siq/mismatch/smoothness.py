@@ -148,7 +148,7 @@ def likeliest_product(asked: Smoothness, ground: Ground) -> ProductFunction:
     """
     told = asked.told
     by_value = told.fine.heights_of(told.fine.heights_of(told.gram).T)
-    _, product = product_of(
+    return product_of(
         ground,
         SHARES,
         points=told.fine.centres,
@@ -156,7 +156,6 @@ def likeliest_product(asked: Smoothness, ground: Ground) -> ProductFunction:
         overlap=told.fine.heights_of(told.overlap) / asked.noise,
         deviation=asked.deviation,
     )
-    return product
 
 
 def _told(fit: Fit, data: Measurements, fine: SmoothFunction, known: Part | None) -> Iterator[Told]:
