@@ -1,8 +1,7 @@
 """Described: a model of what has no name, from the place and the function that the recordings ask for.
 
 Functions (`siq.mismatch.fitted_functions`) compete with mechanisms that were found and are not certain enough
-for their names. Where a function of one coordinate leaves something, it may be one of two coordinates, or
-there may be another.
+for their names. A function may be one of two coordinates, and where it leaves something there may be another.
 What mechanisms with a name leave is described by functions of one coordinate on top of them.
 """
 
@@ -47,14 +46,9 @@ def models_of_the_nameless(
         models.append(Model(parts_of(search, material.considered), search.fit))
     models = weighed(models, base, data)
     best = models[0] if models else None
-    if (
-        best is not None
-        and functions is None
-        and best.parts[0].kind != MECHANISM
-        and something_left(best.fit, data)
-    ):
+    if functions is None and (best is None or best.parts[0].kind != MECHANISM):
         models = weighed([*models, *with_surfaces(base, models, material)], base, data)
-        best = models[0]
+        best = models[0] if models else None
     if (
         best is not None
         and best.fit.model.dimension == base.model.dimension

@@ -1,8 +1,8 @@
 """Smooth functions without a name, fitted: as smooth as the recordings ask for, of one coordinate or of two.
 
 What a fit leaves says how smooth a function is, along the trajectories of that fit. Those with the function
-are better, and say it better; so it is asked for again. Functions of two coordinates are asked for where
-something is left of the likeliest functions of one.
+are better, and say it better; so it is asked for again. Functions of two coordinates are fitted where they
+are likelier than the likeliest functions of one, along the trajectories of these.
 """
 
 from __future__ import annotations
@@ -13,20 +13,23 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from siq.dynamics.dynamics import Dynamics
 from siq.estimation.estimation import Fit
 from siq.mismatch.fitted_parts import fitted_part
-from siq.mismatch.function_places import coordinates_of
-from siq.mismatch.likely_places import FITTED
+from siq.mismatch.function_places import Place, coordinates_of
+from siq.mismatch.likely_places import FITTED, likely_places
 from siq.mismatch.nameless_models import Material, Model, Part, weighed
 from siq.mismatch.search import something_left
 from siq.mismatch.smooth_functions import (
     Ground,
     Smooth,
+    ground_of,
     ground_of_two,
     smooth_function,
     with_smooth_function,
 )
 from siq.mismatch.smoothness import likeliest_product, smoothness_of
+from siq.mismatch.trials import UNFORESEEN
 
 LOGGER = logging.getLogger(__name__)
 ROUNDS = 4  # of fits, each along the trajectories of the one before: a choice
@@ -96,7 +99,7 @@ def with_a_smooth_function(
 
 
 def with_surfaces(fit: Fit, models: Sequence[Model], material: Material) -> list[Model]:
-    """Models with a smooth function of two coordinates.
+    """Models with a smooth function of two coordinates, where the recordings tell both.
 
     Parameters
     ----------
@@ -104,41 +107,64 @@ def with_surfaces(fit: Fit, models: Sequence[Model], material: Material) -> list
         Of the simulation without functions.
     models
         Those with functions of one coordinate, or of one times another, the likeliest first: one of two is
-        asked for where the first ones have theirs.
+        asked for where the first ones have theirs, and has to be likelier there.
     material
         What models are made from.
     """
     material.budget.says("comparing functions of two coordinates")
     data = material.data
-    asked: list[tuple[float, Ground, Model]] = []
-    for model, ground in _grounds(fit, models, material):
-        if ground.usable:
-            smooth = smoothness_of(model.fit, data, ground, known=model.parts[-1], alike=True)
-            if smooth is not None:
-                asked.append((smooth.log_evidence, ground, model))
-    before = max((part.cost for model in models for part in model.parts), default=0.0)
-    cost = float(np.logaddexp(before, np.log(max(len(asked), 1))))
+    begins = _begins(fit, models, material)
+    asked: list[tuple[float, Ground, Model | None]] = []
+    done = set()
+    for place, like in begins:
+        current, known = (fit, None) if like is None else (like.fit, like.parts[-1])
+        alone = 0.0
+        if known is not None:
+            one = smoothness_of(current, data, ground_of(place, current.model, data, current.x), known=known)
+            alone = -np.inf if one is None else one.log_evidence
+        for words in _pairs(fit.model, place):
+            if (place.targets, words) in done:
+                continue
+            done.add((place.targets, words))
+            ground = ground_of_two(place.targets[0], words, current.model, data, current.x)
+            if not ground.usable:
+                continue
+            both = smoothness_of(current, data, ground, known=known, alike=True)
+            if both is not None:
+                asked.append((both.log_evidence - alone, ground, like))
+    cost = float(np.log(max(len(asked), 1)))
     ranked = sorted((each for each in asked if each[0] > cost), key=lambda each: -each[0])
+    price = max((part.cost for model in models for part in model.parts), default=0.0) + cost
     found: list[Model] = []
-    for _, ground, model in ranked[:FITTED]:
+    for _, ground, like in ranked[:FITTED]:
         for product in (True, False):
-            some = with_a_smooth_function((), fit, ground, cost, material, like=model, product=product)
+            some = with_a_smooth_function((), fit, ground, price, material, like=like, product=product)
             found += some
             if some and not something_left(some[0].fit, data):
                 break
     return found
 
 
-def _grounds(fit: Fit, models: Sequence[Model], material: Material) -> Iterator[tuple[Model, Ground]]:
-    """A coordinate of each of the likeliest functions and any other, with the model of the function."""
-    done = set()
-    names = [name for name in coordinates_of(fit.model) if name != "t"]
-    single = [each for each in models if len(each.parts) == 1 and each.parts[0].place is not None]
-    for model in single[:FITTED]:
-        place = model.parts[0].place
-        if place is None or len(place.equations) != 1:  # of a rotating frame, or in a sensor
-            continue
-        for words in itertools.combinations(names, 2):
-            if set(words) & set(place.words) and (place.targets, words) not in done:
-                done.add((place.targets, words))
-                yield model, ground_of_two(place.targets[0], words, fit.model, material.data, model.fit.x)
+def _begins(fit: Fit, models: Sequence[Model], material: Material) -> list[tuple[Place, Model | None]]:
+    """Where functions of two coordinates are asked for, and the models that have one of one there.
+
+    Where there are none, one of two may tell so little of either coordinate alone.
+    """
+    single = [each for each in models if len(each.parts) == 1]
+    known = [(each.parts[0].place, each) for each in single[:FITTED]]
+    found: list[tuple[Place, Model | None]] = [(place, each) for place, each in known if place is not None]
+    if not single:
+        try:
+            likely = likely_places(fit, material.data, material.roles)
+        except UNFORESEEN as error:
+            LOGGER.info("no function can be screened: %s", error)
+            return []
+        found = [(each.place, None) for each in likely[:FITTED]]
+    # Not in a rotating frame, nor in a sensor.
+    return [(place, model) for place, model in found if len(place.equations) == 1]
+
+
+def _pairs(model: Dynamics, place: Place) -> Iterator[tuple[str, str]]:
+    """A coordinate of a place, and any other state or input."""
+    names = [name for name in coordinates_of(model) if name != "t"]
+    return (each for each in itertools.combinations(names, 2) if set(each) & set(place.words))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -66,9 +66,10 @@ def held_out_runs(
 
     Of several models of what has no name the likeliest is adopted that makes the prediction better than it is
     without: than that of the mechanisms with a name, where there are any, or else of the simulation. What is
-    not certain where it was found has to be better by more than appears by chance. Where
-    all recordings are tests of somebody else, each part of those to learn from is left out in turn, and the
-    model is adopted that foresees them best (`siq.mismatch.left_out`).
+    not certain where it was found has to be better by more than appears by chance; one of fewer coordinates
+    that foresees no worse takes its place. Where all recordings are tests of somebody else, each part of
+    those to learn from is left out in turn, and the model is adopted that foresees them best
+    (`siq.mismatch.left_out`).
 
     Parameters
     ----------
@@ -116,10 +117,13 @@ def held_out_runs(
         without = [errors_of(each, some) for each in ((plain,) if named else (card, recalibrated))]
         known = [each for each in without if each is not None]
         least = min(known, key=np.mean, default=None)
-        errors = (errors_of(fit, some) for _, fit in choices)
+        errors = [errors_of(fit, some) for _, fit in choices]
         # Beside random forces a free run is off by them, and what a function does to that may be chance.
         sure = [model.log_evidence >= certain and not model.fit.has_process_noise for model, _ in choices]
         adopted = first_better(least, errors, sure)
+        if adopted is not None:
+            sizes = [np.inf if each is None else float(each.mean()) for each in errors]
+            adopted = simplest_of(sizes, [model.coordinates for model, _ in choices], adopted)
     elif choices:
         alone = errors_left_out(plain if named else search.recalibrated, learned, noise=noise)
         left_out = [errors_left_out(fit, learned, noise=noise) for _, fit in choices]
@@ -152,6 +156,24 @@ def held_out_runs(
         described_fit=fit if described is not None else None,
         adopted=adopted is not None,
     )
+
+
+def simplest_of(errors: Sequence[float], coordinates: Sequence[int], likeliest: int) -> int:
+    """The place of the model of fewest coordinates that foresees no worse than the likeliest one.
+
+    Errors of a sensor's clock, for one, grow with the motion, and look like functions of more than there is.
+
+    Parameters
+    ----------
+    errors
+        Of each model, on recordings held out.
+    coordinates
+        How many each depends on.
+    likeliest
+        The place of the one to begin with.
+    """
+    known = [place for place, error in enumerate(errors) if error <= errors[likeliest]]
+    return min(known, key=lambda place: (coordinates[place], place != likeliest, place))
 
 
 def first_better(

@@ -97,6 +97,11 @@ class Model:
     exact: Fit | None = None
 
     @property
+    def coordinates(self) -> int:
+        """On how many coordinates the parts depend, each by itself."""
+        return sum(1 if part.place is None else len(part.place.words) for part in self.parts)
+
+    @property
     def cost(self) -> float:
         """Logarithm of how many combinations of parts this one was chosen among."""
         return sum(part.cost for part in self.parts)
