@@ -85,6 +85,7 @@ class Budget:
     _begun: float = field(default=0.0, init=False)
     _exempt: int = field(default=0, init=False)
     _kept: float = field(default=0.0, init=False)
+    _limit: float = field(default=float("inf"), init=False)
 
     def __post_init__(self) -> None:
         self._begun = self.clock()
@@ -102,7 +103,7 @@ class Budget:
     @property
     def exhausted_by(self) -> Literal["work", "clock"] | None:
         """What ran out, if something did."""
-        if self.spent >= self.work * (1 - self._kept):
+        if self.spent >= min(self.work * (1 - self._kept), self._limit):
             return "work"
         return "clock" if self.elapsed >= self.seconds else None
 
@@ -136,6 +137,17 @@ class Budget:
             yield
         finally:
             self._kept = before
+
+    @contextmanager
+    def part(self, share: float) -> Iterator[None]:
+        """Work that may take a share of what is left, and no more: one fit does not take all of it."""
+        before = self._limit
+        left = min(self.work * (1 - self._kept), before) - self.spent
+        self._limit = self.spent + share * max(left, 0.0)
+        try:
+            yield
+        finally:
+            self._limit = before
 
     def account(self) -> Account:
         """What was spent until now, as a verdict records it."""

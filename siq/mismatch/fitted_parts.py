@@ -24,6 +24,7 @@ from siq.mismatch.smooth_functions import Smooth
 from siq.mismatch.trials import UNFORESEEN, TriedMechanism, judged
 
 LOGGER = logging.getLogger(__name__)
+LARGEST_PART = 0.25  # of the work left, that a single fit may take: a choice
 
 
 def fitted_part(
@@ -61,7 +62,8 @@ def fitted_part(
     kind = FORMULA if smooth is None else smooth.kind
     try:
         material.budget.says(f"a {kind}: {candidate.label}")
-        trial = _fitted(candidate, level, begin or fit, fit, material)
+        with material.budget.part(LARGEST_PART):
+            trial = _fitted(candidate, level, begin or fit, fit, material)
     except (*UNFORESEEN, BudgetSpent) as error:
         LOGGER.info("%s as a %s cannot be fitted: %s", candidate.label, kind, error)
         return []

@@ -66,7 +66,8 @@ def held_out_runs(
 
     Of several models of what has no name the likeliest is adopted that makes the prediction better than it is
     without: than that of the mechanisms with a name, where there are any, or else of the simulation. What is
-    not certain where it was found has to be better by more than appears by chance; one of fewer coordinates
+    not certain where it was found has to be better by more than appears by chance, what is certain better
+    than the simulation fitted alike; one of fewer coordinates
     that foresees no worse takes its place. Where all recordings are tests of somebody else, each part of
     those to learn from is left out in turn, and the model is adopted that foresees them best
     (`siq.mismatch.left_out`).
@@ -118,9 +119,15 @@ def held_out_runs(
         known = [each for each in without if each is not None]
         least = min(known, key=np.mean, default=None)
         errors = [errors_of(fit, some) for _, fit in choices]
-        # Beside random forces a free run is off by them, and what a function does to that may be chance.
-        sure = [model.log_evidence >= certain and not model.fit.has_process_noise for model, _ in choices]
-        adopted = first_better(least, errors, sure)
+        # A card whose values are right foresees well, and tells nothing of a function whose fit had to find
+        # them, too. Beside random forces a free run is off by these, and a little may be chance.
+        fitted_alone = np.inf if without[-1] is None else float(without[-1].mean())
+        lowest = np.inf if least is None else float(least.mean())
+        limits = [
+            0.0 if model.log_evidence < certain else lowest if model.fit.has_process_noise else fitted_alone
+            for model, _ in choices
+        ]
+        adopted = first_better(least, errors, limits)
         if adopted is not None:
             sizes = [np.inf if each is None else float(each.mean()) for each in errors]
             adopted = simplest_of(sizes, [model.coordinates for model, _ in choices], adopted)
@@ -130,7 +137,7 @@ def held_out_runs(
         sizes = [np.inf if each is None else float(each.mean()) for each in left_out]
         LOGGER.info("parts left out: mean squared errors %s with models of what has no name", sizes)
         best = int(np.argmin(sizes))
-        adopted = best if first_better(alone, [left_out[best]], [False]) == 0 else None
+        adopted = best if first_better(alone, [left_out[best]], [0.0]) == 0 else None
     described, fit = (None, plain) if named or not choices else choices[0]
     if adopted is not None:
         described, fit = choices[adopted]
@@ -177,7 +184,7 @@ def simplest_of(errors: Sequence[float], coordinates: Sequence[int], likeliest: 
 
 
 def first_better(
-    without: np.ndarray | None, models: Iterable[np.ndarray | None], certain: Iterable[bool]
+    without: np.ndarray | None, models: Iterable[np.ndarray | None], limits: Iterable[float]
 ) -> int | None:
     """The place of the first of several models that foresees better than without it; None where none does.
 
@@ -187,15 +194,15 @@ def first_better(
         Squared errors without any of the models, shape ``(values,)``; None where it ran away.
     models
         Those of each model, the likeliest first.
-    certain
-        Whether recordings that it was found in leave no doubt of it. Others have to be better by more than
-        appears by chance.
+    limits
+        Mean squared errors below which a model need only be no worse than without it, by more than appears
+        by chance; zero for one that has to be better by more than that.
     """
-    for place, (squares, known) in enumerate(zip(models, certain, strict=True)):
+    before = None if without is None else in_blocks(without)
+    for place, (squares, limit) in enumerate(zip(models, limits, strict=True)):
         if squares is None:
             continue
-        if without is None or (known and squares.mean() < without.mean()):
-            return place
-        if change_between(in_blocks(without), in_blocks(squares)) == "better":
+        change = change_between(before, in_blocks(squares))
+        if change == "better" or (change == "same" and squares.mean() < limit):
             return place
     return None
