@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import sympy
+from siq.mismatch.surfaces import Surface, needed, with_surface
 
 from siq.dynamics.dynamics import Diffusion, Dynamics
 from siq.dynamics.parametric import Signals
 from siq.mismatch.diagnosis import solve_case
-from siq.mismatch.surfaces import Surface, needed, with_surface
 from siq.report.plots.described import plot_described
 from tests.mismatch.foreign_cases import ForeignCase, course, table_of
 
