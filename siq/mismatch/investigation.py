@@ -173,6 +173,9 @@ def investigate(
     with budget.exempt():
         recalibrated, least_squares = recalibrate(model, data, budget=budget)
     found = search(model, data, recalibrated, candidates, options=options, budget=budget)
+    recalibrated = found.recalibrated  # from where a mechanism led it, if that is better
+    if not (recalibrated.has_process_noise or recalibrated.log_likelihood < least_squares.log_likelihood):
+        least_squares = recalibrated
     found, by_each = remainders(model, data, found, roles)
     left = by_each[-1]
     exact: Fit | None = None
