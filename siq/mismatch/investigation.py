@@ -23,10 +23,10 @@ from siq.mismatch.dictionary import Mechanism
 from siq.mismatch.nameless_models import Material, Model
 from siq.mismatch.names import names_of
 from siq.mismatch.naming import Naming
-from siq.mismatch.remainder import Remainder, what_is_left
+from siq.mismatch.remainder import STRUCTURED, Remainder, what_is_left
 from siq.mismatch.roles import Roles, roles_of
 from siq.mismatch.rounded import explained_by_rounding
-from siq.mismatch.search import Search, search
+from siq.mismatch.search import LEFT, Search, search
 from siq.mismatch.search_options import SearchOptions
 from siq.mismatch.steadiness import unsteadiness
 from siq.mismatch.structure import Structure
@@ -197,7 +197,9 @@ def investigate(
     if doubtful or verdict is MismatchVerdict.UNEXPLAINED:
         budget.says("asking whether the sensors' steps explain it")
         with budget.exempt():
-            rounded = explained_by_rounding(model, data, least_squares, roles, budget=budget)
+            # What a mechanism has found already has to be gone more clearly.
+            least = LEFT if tried else STRUCTURED
+            rounded = explained_by_rounding(model, data, least_squares, roles, least=least, budget=budget)
     if rounded is not None:
         found = replace(found, recalibrated=rounded.fit, found=(), fit=rounded.fit)
         left, least_squares, naming, models, exact = rounded.left, rounded.fit, None, (), None

@@ -28,7 +28,7 @@ from siq.estimation.noise import first_noise
 from siq.estimation.process_noise import process_noise_needed
 from siq.estimation.recalibration import FAINT
 from siq.mismatch.places import lattice_step
-from siq.mismatch.remainder import Remainder, what_is_left
+from siq.mismatch.remainder import STRUCTURED, Remainder, what_is_left
 from siq.mismatch.roles import Roles
 
 ROUNDS = 30  # of fits at most
@@ -56,7 +56,13 @@ class Unrounded:
 
 
 def explained_by_rounding(
-    model: Dynamics, data: Measurements, strict: Fit, roles: Roles, *, budget: Budget | None = None
+    model: Dynamics,
+    data: Measurements,
+    strict: Fit,
+    roles: Roles,
+    *,
+    least: float = STRUCTURED,
+    budget: Budget | None = None,
 ) -> Unrounded | None:
     """The fit to the values that were rounded, if it leaves noise; None where it does not, or nothing rounds.
 
@@ -68,10 +74,13 @@ def explained_by_rounding(
         Its fit without process noise.
     roles
         Of the simulation's states.
+    least
+        Probability of structure by chance, below which it is no noise.
     budget
         Charged for every evaluation.
     """
     steps = steps_of(data)
+    # What rounding does under noise half as wide as a step is white (Widrow and Kollár 2008), and fitted.
     coarse = steps > np.sqrt(strict.noise.measurement)
     if not (strict.converged and coarse.any()):
         return None
@@ -98,7 +107,7 @@ def explained_by_rounding(
         left = what_is_left(model, values, fit, fit, roles)
     except NumericalFailure:
         return None
-    if left.structured:
+    if left.after.p_value < least:
         return None
     names = tuple(name for name, wide in zip(model.output_names, coarse, strict=True) if wide)
     return Unrounded(replace(strict, model=fit.model, x=fit.x), left, names)
