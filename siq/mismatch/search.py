@@ -203,7 +203,7 @@ def better_without(
     least: float,
     budget: Budget,
 ) -> Fit | None:
-    """The simulation alone, fitted from where a mechanism led it, if that is likelier than before.
+    """The simulation alone, fitted from where a mechanism led it, if that explains as much as with it.
 
     A mechanism may seem to explain much only because its fit found parameters of the simulation that its own
     fit had missed. Nothing is called missing before the simulation has begun there, too.
@@ -217,7 +217,7 @@ def better_without(
     model, data
         The simulation without mechanisms, and the recordings.
     least
-        Twice the increase of the log-likelihood, below which it is the same fit.
+        Twice the difference of log-likelihoods, within which explanations cannot be told apart.
     budget
         Charged for the fit; None is the answer where it is spent.
     """
@@ -231,7 +231,7 @@ def better_without(
     except (*UNFORESEEN, BudgetSpent):
         return None
     gained = 2 * (again.log_likelihood - current.log_likelihood)
-    return again if again.converged and gained > least else None
+    return again if again.converged and gained > max(least, trial.delta_chi2 - least) else None
 
 
 def _once_more(candidate: MechanismCandidate, found: MechanismCandidate) -> bool:
