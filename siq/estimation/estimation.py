@@ -233,12 +233,15 @@ def _gauss_newton(
         change, _ = solve(columns, innovations, least=shooting.resolution)
         explained = white.columns @ change
         left = white.innovations - explained
-        # A shortened step leaves much of what is foreseen undone, and the forecast unchanged.
+        settled = SETTLED * len(left) * max(1.0, (left**2).sum() / len(left))
+        # A shortened step leaves much of what is foreseen undone, and the forecast unchanged. So does a whole
+        # one where effects are so curved that steps go to and fro: the states in hand have to be as likely
+        # as the forecast is, since it is they that the likelihood is of.
         if (
             before is not None
             and whole
-            and ((left - before) ** 2).sum() < SETTLED * len(left) * max(1.0, (left**2).sum() / len(left))
-            and (not shooting.filtered or explained @ explained < FINE)
+            and ((left - before) ** 2).sum() < settled
+            and explained @ explained < (FINE if shooting.filtered else settled)
         ):
             if settled_noise:
                 converged = True
