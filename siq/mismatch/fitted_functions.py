@@ -53,7 +53,8 @@ def with_a_function(before: tuple[Part, ...], fit: Fit, material: Material) -> l
     if not ranked:
         return []
     models = _formulas(before, fit, ranked, cost, material)
-    curved = {(ranked[0].place.targets, ranked[0].place.words)}
+    alone = next((each for each in ranked if len(each.place.words) == 1), ranked[0])
+    curved = {(each.place.targets, each.place.words) for each in (ranked[0], alone)}
     for best in weighed(models, fit, data)[:1]:
         if best.parts[-1].place is not None:
             curved.add((best.parts[-1].place.targets, best.parts[-1].place.words))

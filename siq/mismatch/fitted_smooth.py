@@ -28,7 +28,7 @@ from siq.mismatch.smooth_functions import (
     smooth_function,
     with_smooth_function,
 )
-from siq.mismatch.smoothness import likeliest_product, smoothness_of
+from siq.mismatch.smoothness import Smoothness, likeliest_product, smoothness_of
 from siq.mismatch.trials import UNFORESEEN
 
 LOGGER = logging.getLogger(__name__)
@@ -73,16 +73,17 @@ def with_a_smooth_function(
         asked = smoothness_of(current, data, here, known=known)
         if asked is None:
             break
-        function: Smooth = (
-            likeliest_product(asked, here)
-            if product
-            else smooth_function(here, asked.shares, deviation=asked.deviation)
-        )
-        candidate = with_smooth_function(fit.model, function)
         price = cost + float(np.log(asked.considered))
-        parts = fitted_part(
-            candidate, asked.told.level, ground.place, fit, price, material, smooth=function, begin=current
-        )
+        parts: list[Part] = []
+        # What promises to be rough and to need hardly any random forces may be what no fit can follow.
+        for times, level in ((1.0, asked.told.level), (2.0, 1.0)):
+            if parts:
+                break
+            function = _function(asked, here, product=product, times=times)
+            candidate = with_smooth_function(fit.model, function)
+            parts = fitted_part(
+                candidate, level, ground.place, fit, price, material, smooth=function, begin=current
+            )
         if not parts:
             break
         found = Model((*before, parts[0]), parts[0].trial.fit)
@@ -96,6 +97,14 @@ def with_a_smooth_function(
                 break
         likeliest, current, known = found, found.fit, parts[0]
     return [] if likeliest is None else [likeliest]
+
+
+def _function(asked: Smoothness, ground: Ground, *, product: bool, times: float) -> Smooth:
+    """The function that is asked for, its lengths multiplied."""
+    if product:
+        return likeliest_product(asked, ground, times=times)
+    shares = tuple(times * share for share in asked.shares)
+    return smooth_function(ground, shares, deviation=asked.deviation)
 
 
 def with_surfaces(fit: Fit, models: Sequence[Model], material: Material) -> list[Model]:

@@ -30,7 +30,9 @@ from siq.mismatch.function_places import Place
 from siq.mismatch.functions import built, fresh_names, unit_in
 
 CURVE, SURFACE = "curve", "surface"
-APART = 0.5  # lengths between neighbours in one coordinate, where the error of a sum of bumps is below 1e-6
+# Lengths between neighbours: a sum of bumps then has the variance of the process to 1e-5, that of two
+# coordinates to 4 %.
+APART = 0.5
 ROUNDING = 1e-6  # numerical: of the process's variance, added to it at every bump
 
 

@@ -136,7 +136,7 @@ def smoothness_of(
     return replace(best, log_evidence=mean - alone)
 
 
-def likeliest_product(asked: Smoothness, ground: Ground) -> ProductFunction:
+def likeliest_product(asked: Smoothness, ground: Ground, *, times: float = 1.0) -> ProductFunction:
     """The likeliest product of two functions, where a function of two coordinates is asked for.
 
     Parameters
@@ -145,12 +145,14 @@ def likeliest_product(asked: Smoothness, ground: Ground) -> ProductFunction:
         What the recordings say of a function of both.
     ground
         Where it stands.
+    times
+        Factor on the lengths to choose among.
     """
     told = asked.told
     by_value = told.fine.heights_of(told.fine.heights_of(told.gram).T)
     return product_of(
         ground,
-        SHARES,
+        tuple(times * share for share in SHARES),
         points=told.fine.centres,
         gram=(by_value + by_value.T) / (2 * asked.noise),
         overlap=told.fine.heights_of(told.overlap) / asked.noise,

@@ -2,57 +2,172 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
+import scipy.stats
 import sympy
-from siq.mismatch.surfaces import Surface, needed, with_surface
 
 from siq.dynamics.dynamics import Diffusion, Dynamics
-from siq.dynamics.parametric import Signals
+from siq.dynamics.parametric import TIME, Signals
+from siq.estimation.budget import Budget, BudgetSpent
+from siq.estimation.estimation import fit_by_multiple_shooting
+from siq.estimation.innovations import Noise
+from siq.estimation.measurements import Measurements
 from siq.mismatch.diagnosis import solve_case
+from siq.mismatch.evidence import evidences_by_size, log_evidence_of
+from siq.mismatch.function_places import Place
+from siq.mismatch.held_out import simplest_of
+from siq.mismatch.product_functions import ProductFunction, product_of
+from siq.mismatch.smooth_functions import (
+    Ground,
+    Smooth,
+    smooth_function,
+    triangle_of,
+    with_smooth_function,
+)
+from siq.mismatch.smoothness import SHARES
 from siq.report.plots.described import plot_described
 from tests.mismatch.foreign_cases import ForeignCase, course, table_of
 
-CENTRES = np.array([[0.0, 0.0], [1.0, 0.5], [-0.5, 2.0]])
-WIDTHS = np.array([[1.0, 2.0], [0.5, 0.5], [2.0, 1.0]])
+X, V = sympy.symbols("x v", real=True)
+ONE = sympy.Integer(1)
+MODEL = Dynamics(("x", "v"), (V, -X), Diffusion.identity(2))
 
 
-def test_a_surface_is_the_sum_of_its_bumps() -> None:
-    x, v = sympy.symbols("x v", real=True)
-    model = Dynamics(("x", "v"), (v, -x), Diffusion.identity(2))
-    surface = Surface("v", ("x", "v"), CENTRES, WIDTHS)
-    candidate = with_surface(model, surface)
+def ground(*coordinates: sympy.Symbol, count: int = 400) -> Ground:
+    """Where a function of some coordinates stands, and recordings that have been everywhere."""
+    courses = np.random.default_rng(3).uniform(-1, 3, size=(len(coordinates), count))
+    words = tuple(map(str, coordinates))
+    place = Place((("v", ONE),), (), coordinates[0], words, np.empty(0))
+    return Ground(place, coordinates, words, courses)
+
+
+def product() -> ProductFunction:
+    first, second = (smooth_function(ground(z), (0.25,)) for z in (X, V))
+    return ProductFunction(ground(X, V), first, second, np.ones(first.width + second.width))
+
+
+@pytest.mark.parametrize("function", [smooth_function(ground(X, V), (0.25, 0.5)), product()])
+def test_a_formula_says_what_the_function_does(function: Smooth) -> None:
+    candidate = with_smooth_function(MODEL, function)
     assert candidate.equations == ("v",) and candidate.coordinate == "x, v"
-    heights = np.array([0.7, -1.3, 2.0])
+    heights = np.random.default_rng(1).normal(size=function.width)
     known = dict(zip(candidate.amplitudes, heights, strict=True))
     values = np.array([known.get(each.name, each.value) for each in candidate.model.parameters])
     states = np.random.default_rng(3).normal(size=(2, 40))
     empty = np.zeros((0, 40))
     rates = candidate.model.functions.rates(states, Signals(empty, empty, empty, np.zeros(40)), values)
-    np.testing.assert_allclose(rates[1] + states[0], heights @ surface.values(states), rtol=1e-5)
+    found, derivatives = function.along(heights, states)
+    np.testing.assert_allclose(rates[1] + states[0], found, rtol=1e-4, atol=1e-4)
     np.testing.assert_array_equal(rates[0], states[1])
+    for place, moved in enumerate(1e-6 * np.eye(function.width)):
+        slope = (function.along(heights + moved, states)[0] - found) / 1e-6
+        np.testing.assert_allclose(slope, derivatives[:, place], atol=1e-4)
 
 
-def test_bumps_of_two_surfaces_are_taken_once() -> None:
-    surface = Surface("v", ("x", "v"), CENTRES, WIDTHS)
-    both = surface.some([2, 0]).with_bumps(surface.some([0, 1]))
-    np.testing.assert_array_equal(both.centres, CENTRES[[2, 0, 1]])
-    np.testing.assert_array_equal(both.widths, WIDTHS[[2, 0, 1]])
+@pytest.mark.parametrize(("where", "shares"), [(ground(X), (0.25,)), (ground(X, V), (0.5, 0.25))])
+def test_a_sum_of_bumps_is_the_process_where_the_recordings_have_been(
+    where: Ground, shares: tuple[float, ...]
+) -> None:
+    function = smooth_function(where, shares, deviation=1.7)
+    (expected,) = function.expected(tuple(f"b{k}" for k in range(function.width)))
+    along = np.linalg.solve(expected.roots.T, function.values(where.courses))
+    scaled = where.courses / function.lengths[:, None]
+    away = ((scaled[:, :, None] - scaled[:, None, :]) ** 2).sum(axis=0)
+    np.testing.assert_allclose(along.T @ along, 1.7**2 * np.exp(-0.5 * away), atol=0.05 * 1.7**2)
 
 
-def test_columns_are_taken_as_long_as_they_earn_their_place() -> None:
-    rng = np.random.default_rng(5)
-    columns = rng.normal(size=(400, 60))
-    left = 3.0 * columns[:, 17] - 2.0 * columns[:, 4] + rng.normal(size=400)
-    chosen, odds = needed(left, columns, count=400)
-    assert chosen == [17, 4] and odds > 100
+def test_a_length_beyond_the_recordings_a_function_is_zero() -> None:
+    function = smooth_function(ground(X), (0.125,))
+    heights = function.heights_of(np.ones(function.width))
+    values, _ = function.along(heights, np.array([[1.0, 2.9, 3.5, 5.0]]))
+    np.testing.assert_allclose(values[:2], 1.0, atol=0.03)
+    assert 0.5 < values[2] < 0.9 and abs(values[3]) < 0.01
 
 
-def test_noise_asks_for_next_to_nothing() -> None:
-    rng = np.random.default_rng(6)
-    found = [len(needed(rng.normal(size=300), rng.normal(size=(300, 80)), count=300)[0]) for _ in range(100)]
-    assert np.mean(found) < 0.05
+def test_length_and_size_of_a_function_are_told() -> None:
+    """Of functions that are such processes, over lengths from a sixteenth of the range to half of it."""
+    draw = np.random.default_rng(7)
+    where, noise, found = ground(X), 0.05, []
+    fine = smooth_function(where, (1 / 32,))
+    for share in np.repeat([1 / 16, 1 / 8, 1 / 4, 1 / 2], 5):
+        heights = fine.heights_of(
+            triangle_of(fine.centres, share * where.ranges) @ draw.normal(size=fine.width)
+        )
+        left = fine.along(heights, where.courses)[0] / noise + draw.normal(size=400)
+        told = []
+        for each in SHARES:
+            function = smooth_function(where, (each,))
+            along = np.linalg.solve(function.triangle, function.values(where.courses)).T / noise
+            total = float(left @ left)
+            odds, variance, rest = evidences_by_size(along.T @ along, along.T @ left, total, freedom=400)
+            best = int(np.argmax(odds))
+            told.append((odds[best], each / share, np.sqrt(variance[best] * rest[best] / 400)))
+        found.append(max(told)[1:])
+    ratios, sizes = np.array(found).T
+    assert (np.abs(np.log2(ratios)) <= 1).all() and (ratios == 1).mean() >= 0.75
+    assert 0.5 < np.exp(np.log(sizes).mean()) < 2.0
+
+
+def test_a_product_is_told_where_both_coordinates_were_never_large_at_a_time() -> None:
+    draw = np.random.default_rng(5)
+    x, y = draw.uniform(-1, 3, size=(2, 600))
+    seen = (x < 1) | (y < 1)
+    where = replace(ground(X, V), courses=np.stack([x, y])[:, seen])
+
+    def true(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return np.tanh(2 * x - 2) * np.exp(-((y - 1.5) ** 2))
+
+    told = true(*where.courses) + 0.02 * draw.normal(size=seen.sum())
+    weights = np.eye(len(told)) / 0.02**2
+    found = product_of(
+        where, SHARES, points=where.courses.T, gram=weights, overlap=weights @ told, deviation=1.0
+    )
+    corner = draw.uniform(1.2, 2.8, size=(2, 200))
+    values, _ = found.along(found.begin, corner)
+    np.testing.assert_allclose(values, true(*corner), atol=0.08)
+
+
+def test_evidence_of_parameters_expected_together_is_the_marginal_likelihood() -> None:
+    """Exact for a linear model with normal errors: log N(y; 0, ΦKΦᵀ + σ²)."""
+    t, noise = np.arange(0, 8, 0.1), 0.1**2
+    place = Place((), (("y", ONE),), TIME, ("t",), np.empty(0))
+    function = smooth_function(Ground(place, (TIME,), ("t",), t[None]), (0.125,), deviation=0.8)
+    still = Dynamics(("y",), (sympy.Integer(0),), Diffusion.identity(1))
+    along = 0.8 * np.linalg.solve(function.triangle, function.values(t[None]))
+    exact = [along.T @ along + noise * np.eye(len(t)), noise * np.eye(len(t))]
+    y = np.random.default_rng(2).multivariate_normal(np.zeros(len(t)), exact[0])
+    data = Measurements(("r",), np.array([0, len(t)]), t, y[:, None], ((),), sensor_noise=np.array([noise]))
+    found = []
+    for model in (with_smooth_function(still, function).model, still):
+        fit = fit_by_multiple_shooting(
+            model, data, x=np.zeros((len(t), 1)), noise=Noise(np.array([noise]), np.zeros(1)),
+            estimate_process=False, substeps=1,
+        )  # fmt: skip
+        found.append(log_evidence_of(fit, data))
+    # The first state is a constant of any size; what is the same for both does not count.
+    wide = [scipy.stats.multivariate_normal(np.zeros(len(t)), each + 1e4).logpdf(y) for each in exact]
+    constant = [np.log(np.linalg.solve(each, np.ones(len(t))).sum()) / 2 for each in exact]
+    wanted = wide[0] + constant[0] - wide[1] - constant[1]
+    assert found[0] - found[1] == pytest.approx(wanted, abs=0.02 * abs(wanted))
+
+
+def test_the_model_of_fewest_coordinates_is_taken_that_foresees_no_worse() -> None:
+    assert simplest_of([1.0, 0.9, 1.1], [2, 1, 1], 0) == 1
+    assert simplest_of([1.0, 1.1, 1.2], [2, 1, 1], 0) == 0
+    assert simplest_of([1.0, 0.5], [1, 1], 0) == 0  # the likeliest of as many
+
+
+def test_a_fit_takes_no_more_than_its_part_of_the_budget() -> None:
+    budget = Budget(work=100.0)
+    with pytest.raises(BudgetSpent), budget.part(0.25):
+        for _ in range(100):
+            budget.charge(1.0)
+    assert budget.spent == 25
+    budget.charge(1.0)  # what comes after has the rest
 
 
 CARD = {
