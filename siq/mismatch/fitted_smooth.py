@@ -150,7 +150,7 @@ def with_surfaces(fit: Fit, models: Sequence[Model], material: Material) -> list
             some = with_a_smooth_function((), fit, ground, price, material, like=like, product=product)
             found += some
             if some and not something_left(some[0].fit, data):
-                break
+                return found  # nothing is left for a surface, nor for a less likely pair
     return found
 
 
