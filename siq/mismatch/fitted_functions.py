@@ -6,6 +6,7 @@ in earnest.
 
 from __future__ import annotations
 
+import itertools
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
@@ -53,15 +54,10 @@ def with_a_function(before: tuple[Part, ...], fit: Fit, material: Material) -> l
     if not ranked:
         return []
     models = _formulas(before, fit, ranked, cost, material)
-    alone = next((each for each in ranked if len(each.place.words) == 1), ranked[0])
-    curved = {(each.place.targets, each.place.words) for each in (ranked[0], alone)}
-    for best in weighed(models, fit, data)[:1]:
-        if best.parts[-1].place is not None:
-            curved.add((best.parts[-1].place.targets, best.parts[-1].place.words))
-    for likely in ranked:
-        if (likely.place.targets, likely.place.words) in curved:
-            ground = ground_of(likely.place, fit.model, data, fit.x)
-            models += with_a_smooth_function(before, fit, ground, cost, material)
+    alone = (each for each in ranked if len(each.place.words) == 1)
+    for likely in {id(each): each for each in (*ranked[:FITTED], *itertools.islice(alone, 1))}.values():
+        ground = ground_of(likely.place, fit.model, data, fit.x)
+        models += with_a_smooth_function(before, fit, ground, cost, material)
     given = sum(part.cost for part in before)
     found = [replace(each, log_evidence=each.log_evidence + given) for each in weighed(models, fit, data)]
     for each in found:
