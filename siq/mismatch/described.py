@@ -46,7 +46,7 @@ def models_of_the_nameless(
         models.append(Model(parts_of(search, material.considered), search.fit))
     models = weighed(models, base, data)
     best = models[0] if models else None
-    if functions is None and (best is None or best.parts[0].kind != MECHANISM):
+    if functions is None:
         models = weighed([*models, *with_surfaces(base, models, material)], base, data)
         best = models[0] if models else None
     if (
