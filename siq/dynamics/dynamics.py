@@ -48,6 +48,22 @@ class Parameter:
     expected: float | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class JointExpectation:
+    """What is expected of several parameters together: ``roots @ values`` are standard normal.
+
+    Attributes
+    ----------
+    names
+        Of the parameters.
+    roots
+        Shape ``(r, k)``; the inverse of their covariance is ``roots.T @ roots``.
+    """
+
+    names: tuple[str, ...]
+    roots: np.ndarray
+
+
 COMPILED = ("functions", "delays", "_lags")
 """What a dynamics works out once, and what does not depend on its parameters' values."""
 
@@ -89,6 +105,8 @@ class Dynamics:
         an integrator can follow it: ``sign(e)`` is taken as ``tanh(e/w)``. The formulas keep the sign.
     parameters_of_noise
         Names of the parameters of a card that stand in D, where they count with the card's values.
+    expected_together
+        What is expected of several parameters at a time.
 
     Raises
     ------
@@ -120,6 +138,7 @@ class Dynamics:
     outputs: tuple[tuple[str, sympy.Expr], ...] = ()
     edges: tuple[tuple[sympy.Expr, float], ...] = ()
     parameters_of_noise: tuple[str, ...] = ()
+    expected_together: tuple[JointExpectation, ...] = ()
 
     def __post_init__(self) -> None:
         d = len(self.states)

@@ -26,7 +26,7 @@ from siq.estimation.expectations import Expectations
 from siq.estimation.innovations import Noise, solve, whiten
 from siq.estimation.linearisation import Grid, Linearisation, linearise, substeps_needed
 from siq.estimation.measurements import Measurements
-from siq.estimation.noise import noise_along
+from siq.estimation.noise import Priors, noise_along
 from siq.estimation.shooting import INEXACT, Iterate, Shooting, changed
 
 SUBSTEP_ERROR = 3e-6  # of the spread of a state: far below what any sensor resolves
@@ -65,7 +65,8 @@ class Fit:
         Of the whitened innovations, and of what is expected of parameters: about `degrees_of_freedom` where
         the model is right.
     degrees_of_freedom
-        Measured values less initial states and free parameters.
+        Measured values, and what is expected of several parameters together, less initial states and free
+        parameters.
     substeps
         Runge–Kutta steps between samples.
     converged
@@ -221,6 +222,7 @@ def _gauss_newton(
         if iteration in (0, 2) or settled_noise:
             noise = noise_along(
                 now.along, data, noise, estimate_process,
+                priors=Priors(expected, now.values[list(shooting.model.free)]),
                 charge=shooting.charge, coarse=not settled_noise,
             )  # fmt: skip
         shooting.charge()
@@ -231,12 +233,15 @@ def _gauss_newton(
         change, _ = solve(columns, innovations, least=shooting.resolution)
         explained = white.columns @ change
         left = white.innovations - explained
-        # A shortened step leaves much of what is foreseen undone, and the forecast unchanged.
+        settled = SETTLED * len(left) * max(1.0, (left**2).sum() / len(left))
+        # A shortened step leaves much of what is foreseen undone, and the forecast unchanged. So does a whole
+        # one where effects are so curved that steps go to and fro: the states in hand have to be as likely
+        # as the forecast is, since it is they that the likelihood is of.
         if (
             before is not None
             and whole
-            and ((left - before) ** 2).sum() < SETTLED * len(left) * max(1.0, (left**2).sum() / len(left))
-            and (not shooting.filtered or explained @ explained < FINE)
+            and ((left - before) ** 2).sum() < settled
+            and explained @ explained < (FINE if shooting.filtered else settled)
         ):
             if settled_noise:
                 converged = True
@@ -280,7 +285,8 @@ def fit_of_states(
     if not at.along.finite:
         return _failed(model, at, noise, substeps, RUNS_AWAY)
     try:
-        noise = noise_along(at.along, data, noise, estimate_process=False)
+        priors = Priors(Expectations.of(model), model.values[list(model.free)])
+        noise = noise_along(at.along, data, noise, estimate_process=False, priors=priors)
         return _fit_at(
             model, data, at, noise=noise, substeps=substeps, converged=converged, resolution=INEXACT
         )
@@ -305,6 +311,7 @@ def _fit_at(
     change, covariance = solve(columns, innovations, least=resolution)
     # The last change is below the errors. The likelihood is that of the states in hand, not of a forecast.
     total = float(innovations @ innovations)
+    together = sum(len(each.roots) for each in model.expected_together)
     return Fit(
         model=model.with_values(changed(at.values, model.free, change if converged else 0 * change)),
         covariance=covariance,
@@ -315,7 +322,7 @@ def _fit_at(
         linearisation=at.along,
         log_likelihood=white.log_likelihood(total),
         sum_of_squares=total,
-        degrees_of_freedom=white.degrees_of_freedom - len(model.free),
+        degrees_of_freedom=white.degrees_of_freedom + together - len(model.free),
         substeps=substeps,
         converged=converged,
     )

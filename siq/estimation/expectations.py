@@ -17,42 +17,51 @@ from siq.dynamics.dynamics import Dynamics
 
 @dataclass(frozen=True)
 class Expectations:
-    """What is expected of the free parameters of a model.
+    """What is expected of the free parameters of a model: combinations of them are normal, of unit width.
 
     Attributes
     ----------
-    values
-        Expected, shape ``(p,)``; NaN where nothing is.
+    rows
+        The combinations, shape ``(r, p)``.
+    middle
+        What is expected of each, shape ``(r,)``.
     """
 
-    values: np.ndarray
+    rows: np.ndarray
+    middle: np.ndarray
 
     @classmethod
     def of(cls, model: Dynamics) -> Expectations:
-        """Those of a model's free parameters."""
-        expected = [model.parameters[place].expected for place in model.free]
-        return cls(np.array([np.nan if each is None else each for each in expected], dtype=float))
-
-    @property
-    def weights(self) -> np.ndarray:
-        """One over the size of each, zero where nothing is expected, shape ``(p,)``."""
-        known = np.isfinite(self.values) & (self.values != 0)
-        return np.where(known, 1.0 / np.where(known, np.abs(self.values), 1.0), 0.0)
+        """Those of a model's free parameters, each by itself, and of several together."""
+        free = {model.parameters[place].name: column for column, place in enumerate(model.free)}
+        values = {each.name: each.value for each in model.parameters}
+        rows, middle = [np.zeros((0, len(free)))], [np.zeros(0)]
+        for name, column in free.items():
+            expected = model.parameters[model.free[column]].expected
+            if expected:
+                rows.append(np.zeros((1, len(free))))
+                rows[-1][0, free[name]] = 1 / abs(expected)
+                middle.append(np.array([np.sign(expected)]))
+        for each in model.expected_together:
+            mine = [place for place, name in enumerate(each.names) if name in free]
+            if mine:
+                rows.append(np.zeros((len(each.roots), len(free))))
+                rows[-1][:, [free[each.names[place]] for place in mine]] = each.roots[:, mine]
+                known = [0.0 if name in free else values[name] for name in each.names]
+                middle.append(-each.roots @ np.array(known))
+        return cls(np.concatenate(rows), np.concatenate(middle))
 
     def deviations(self, values: np.ndarray) -> np.ndarray:
-        """How far values ``(p,)`` of the free parameters fall short, in units of what may be, ``(p,)``."""
-        return np.where(self.weights > 0, (np.nan_to_num(self.values) - values) * self.weights, 0.0)
+        """How far values ``(p,)`` of the free parameters fall short, in units of what may be, ``(r,)``."""
+        return self.middle - self.rows @ values
 
     def beside(
         self, columns: np.ndarray, innovations: np.ndarray, values: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Columns ``(n, p)`` and innovations ``(n,)`` with one row more for each parameter."""
-        if not self.weights.any():
+        """Columns ``(n, p)`` and innovations ``(n,)`` with one row more for each expectation."""
+        if not len(self.rows):
             return columns, innovations
-        return (
-            np.concatenate([columns, np.diag(self.weights)]),
-            np.concatenate([innovations, self.deviations(values)]),
-        )
+        return np.concatenate([columns, self.rows]), np.concatenate([innovations, self.deviations(values)])
 
 
 def with_expectations(model: Dynamics) -> Dynamics:

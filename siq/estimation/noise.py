@@ -13,7 +13,8 @@ import numpy as np
 import scipy.optimize
 
 from siq.dynamics.dynamics import Dynamics
-from siq.estimation.innovations import Noise, solve, whiten, with_parameters_changed
+from siq.estimation.expectations import Expectations
+from siq.estimation.innovations import Noise, Whitened, solve, whiten, with_parameters_changed
 from siq.estimation.linearisation import Linearisation
 from siq.estimation.measurements import Measurements
 from siq.estimation.stretches import Stretches
@@ -107,11 +108,40 @@ def noise_coordinates(data: Measurements, origin: Noise) -> NoiseCoordinates:
     return NoiseCoordinates(origin, known if data.sensor_noise is None else np.isfinite(data.sensor_noise))
 
 
+@dataclass(frozen=True)
+class Priors:
+    """What is expected of parameters, and where they are.
+
+    Attributes
+    ----------
+    expected
+        Of the free ones.
+    values
+        Of these, shape ``(p,)``.
+    """
+
+    expected: Expectations
+    values: np.ndarray
+
+    @classmethod
+    def none(cls, white: Whitened) -> Priors:
+        """Those of parameters of which nothing is expected."""
+        count = white.columns.shape[1]
+        return cls(Expectations(np.zeros((0, count)), np.zeros(0)), np.zeros(count))
+
+    def best(self, white: Whitened) -> tuple[np.ndarray, float]:
+        """The likeliest change of the parameters, shape ``(p,)``, and how many of them the data tell."""
+        change, covariance = solve(*self.expected.beside(white.columns, white.innovations, self.values))
+        rows = self.expected.rows
+        return change, len(change) - float(np.einsum("rp,pq,rq->", rows, covariance, rows))
+
+
 def estimate_noise(
     linearisation: Linearisation,
     data: Measurements,
     start: Noise,
     *,
+    priors: Priors | None = None,
     charge: Callable[[float], None] | None = None,
     coarse: bool = False,
 ) -> Noise:
@@ -128,6 +158,8 @@ def estimate_noise(
         The measurements.
     start
         Where the search begins. A process noise that is zero stays so.
+    priors
+        What is expected of the parameters.
     charge
         Called before each evaluation of the likelihood, with the share of the samples that it is for.
     coarse
@@ -136,7 +168,8 @@ def estimate_noise(
     coordinates = noise_coordinates(data, start)
     driven, outputs = coordinates.driven, len(start.measurement)
     white = whiten(linearisation, data, start)
-    linearisation = with_parameters_changed(linearisation, solve(white.columns, white.innovations)[0])
+    change, _ = (priors or Priors.none(white)).best(white)
+    linearisation = with_parameters_changed(linearisation, change)
 
     whole = Stretches(data.first, linearisation, np.append(np.diff(data.t), 0.0))
     some = whole.some(MANY)
@@ -261,21 +294,22 @@ def noise_along(
     noise: Noise,
     estimate_process: bool,
     *,
+    priors: Priors | None = None,
     charge: Callable[[float], None] | None = None,
     coarse: bool = False,
 ) -> Noise:
     """The noise along the trajectories in hand, the process noise only where it is to be estimated, too."""
     if estimate_process and (noise.process > 0).any():
-        return estimate_noise(linearisation, data, noise, charge=charge, coarse=coarse)
+        return estimate_noise(linearisation, data, noise, priors=priors, charge=charge, coarse=coarse)
     driven = bool((noise.process > 0).any())
     if driven and data.sensor_noise is not None:
         return noise
     white = whiten(linearisation, data, noise)
-    change, _ = solve(white.columns, white.innovations)
+    change, told = (priors or Priors.none(white)).best(white)
     left = (white.innovations - white.columns @ change).reshape(len(data.t), -1)
     known = white.known.reshape(left.shape)
     # Each output has its share of the initial states and parameters.
-    share = (white.degrees_of_freedom - len(change)) / known.sum()
+    share = (white.degrees_of_freedom - told) / known.sum()
     factor = (left**2).sum(axis=0) / np.maximum(known.sum(axis=0) * share, 1.0)
     if driven:  # one scale for both, since only their ratio is given
         factor = np.full_like(factor, (left**2).sum() / (known.sum() * share))

@@ -10,7 +10,7 @@ import scipy.stats
 from siq.dynamics.dynamics import Dynamics
 from siq.estimation.budget import COMPILATION, Budget
 from siq.estimation.estimation import Fit, fit_by_multiple_shooting
-from siq.estimation.innovations import Noise
+from siq.estimation.innovations import Noise, with_parameters_changed
 from siq.estimation.jumps import EDGE_SUBSTEPS, jumps_of, spread_edges
 from siq.estimation.measurements import Measurements
 from siq.estimation.noise import log_likelihood
@@ -136,7 +136,8 @@ def without_idle_forces(fit: Fit, data: Measurements) -> Fit | None:
     likelier than the one that another way of fitting ends in.
     """
     still = fit.noise.without_process()
-    with_them, alone = (log_likelihood(fit.linearisation, data, noise) for noise in (fit.noise, still))
+    held = with_parameters_changed(fit.linearisation, np.zeros(len(fit.model.free)))
+    with_them, alone = (log_likelihood(held, data, noise) for noise in (fit.noise, still))
     if not 2 * (with_them - alone) <= least_to_believe(fit.noise):
         return None
     return replace(fit, noise=still, log_likelihood=fit.log_likelihood - (with_them - alone))

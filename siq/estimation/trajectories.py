@@ -246,8 +246,8 @@ class NormalEquations:
         """The same with what is expected of the parameters, which are at `values`, shape ``(p,)``."""
         return replace(
             self,
-            shared=self.shared + np.diag(expected.weights**2),
-            shared_target=self.shared_target + expected.weights * expected.deviations(values),
+            shared=self.shared + expected.rows.T @ expected.rows,
+            shared_target=self.shared_target + expected.rows.T @ expected.deviations(values),
         )
 
     def step(self, damping: float) -> tuple[np.ndarray, np.ndarray, float]:

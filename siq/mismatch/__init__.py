@@ -23,6 +23,7 @@
 `search`            which mechanisms are found?
 `structure`         along which coordinates is something missing?
 `remainder`         what do the mechanisms leave?
+`rounded`           do the steps in which sensors read explain it?
 `steadiness`        are random forces those of surroundings?
 `function_places`   where may a function without a name stand?
 `evidence`          is a mechanism likelier than such a function?

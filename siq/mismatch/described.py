@@ -1,7 +1,7 @@
 """Described: a model of what has no name, from the place and the function that the recordings ask for.
 
 Functions (`siq.mismatch.fitted_functions`) compete with mechanisms that were found and are not certain enough
-for their names. Where two functions of one coordinate leave something, it may be one of two coordinates.
+for their names. A function may be one of two coordinates, and where it leaves something there may be another.
 What mechanisms with a name leave is described by functions of one coordinate on top of them.
 """
 
@@ -17,7 +17,7 @@ from siq.estimation.estimation import Fit
 from siq.estimation.measurements import Measurements
 from siq.estimation.process_noise import fit_with_and_without_process_noise
 from siq.mismatch.fitted_functions import with_a_function
-from siq.mismatch.fitted_surfaces import with_surfaces
+from siq.mismatch.fitted_smooth import with_surfaces
 from siq.mismatch.likely_places import FITTED
 from siq.mismatch.nameless_models import MECHANISM, Material, Model, Part, runs_freely, weighed
 from siq.mismatch.search import Search, something_left
@@ -46,6 +46,9 @@ def models_of_the_nameless(
         models.append(Model(parts_of(search, material.considered), search.fit))
     models = weighed(models, base, data)
     best = models[0] if models else None
+    if functions is None:
+        models = weighed([*models, *with_surfaces(base, models, material)], base, data)
+        best = models[0] if models else None
     if (
         best is not None
         and best.fit.model.dimension == base.model.dimension
@@ -54,9 +57,6 @@ def models_of_the_nameless(
         and something_left(best.fit, data)
     ):
         models += with_a_function(best.parts, best.fit, material)
-        best = weighed(models, base, data)[0]
-        if functions is None and something_left(best.fit, data):
-            models += with_surfaces(base, best, models, material)
     return likeliest(models, base, data)
 
 

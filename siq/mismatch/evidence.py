@@ -18,6 +18,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+import scipy.linalg
 import scipy.special
 
 from siq.dynamics.dynamics import Dynamics
@@ -168,48 +169,44 @@ def evidence_of_function(
     freedom
         Degrees of freedom of the target.
     """
-    priors = [smooth_prior(knots, length) for length in LENGTHS]
-    return evidence_of_columns([columns] * len(priors), target, priors, freedom=freedom)
+    total = float(target @ target)
+    values = []
+    for length in LENGTHS:
+        along = columns @ np.linalg.cholesky(smooth_prior(knots, length))
+        values.append(evidences_by_size(along.T @ along, along.T @ target, total, freedom=freedom)[0])
+    return float(scipy.special.logsumexp(values) - np.log(np.size(values)))
 
 
-def evidence_of_columns(
-    columns: Sequence[np.ndarray], target: np.ndarray, priors: Sequence[np.ndarray], *, freedom: float
-) -> float:
-    """Log-likelihood of columns with normal coefficients, averaged over their size and over several choices.
+def evidences_by_size(
+    gram: np.ndarray, overlap: np.ndarray, total: float, *, freedom: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Log-likelihood of columns with independent normal coefficients, for every size of these.
 
     Parameters
     ----------
-    columns
-        In units of noise, shape ``(n, k)`` each.
-    target
-        The innovations, shape ``(n,)``.
-    priors
-        Covariances of the coefficients but for their size, shape ``(k, k)`` each.
-    freedom
-        Degrees of freedom of the target.
+    gram, overlap
+        Of the columns with each other and with the target, in units of noise; shapes ``(k, k)`` and ``(k,)``.
+    total, freedom
+        Sum of squares of the target, and its degrees of freedom; see `log_evidence`.
 
     Returns
     -------
-    float
-        Over that of nothing; 0 where no column does anything.
+    gained, variance, rest
+        Shape ``(s,)`` each: over that of nothing; of the coefficients, in units of the noise as it is with
+        the columns; and the sum of squares then. All zero where no column does anything.
     """
-    total = float(target @ target)
+    # In the eigenvectors of what the recordings tell, the evidence is a sum for every size.
+    told, vectors = np.linalg.eigh(gram)
+    told = np.maximum(told, 0.0)
     sizes = sizes_of_effects(total)
-    values = []
-    for own, prior in zip(columns, priors, strict=True):
-        gram, overlap = own.T @ own, own.T @ target
-        # In the eigenvectors of what the recordings tell, the evidence is a sum for every size.
-        root = np.linalg.cholesky(prior)
-        told, vectors = np.linalg.eigh(root.T @ gram @ root)
-        told = np.maximum(told, 0.0)
-        if not told.any():
-            continue
-        seen = (vectors.T @ (root.T @ overlap)) ** 2
-        scale = sizes[:, None] / told.sum()
-        explained = (scale * seen / (1 + scale * told)).sum(axis=1)
-        left = np.maximum(total - explained, 1e-12 * total)
-        values.append(-0.5 * np.log1p(scale * told).sum(axis=1) - 0.5 * freedom * np.log(left / total))
-    return float(scipy.special.logsumexp(values) - np.log(np.size(values))) if values else 0.0
+    if not told.any():
+        return np.zeros(len(sizes)), np.zeros(len(sizes)), np.full(len(sizes), total)
+    seen = (vectors.T @ overlap) ** 2
+    scale = sizes[:, None] / told.sum()
+    explained = (scale * seen / (1 + scale * told)).sum(axis=1)
+    left = np.maximum(total - explained, 1e-12 * total)
+    gained = -0.5 * np.log1p(scale * told).sum(axis=1) - 0.5 * freedom * np.log(left / total)
+    return gained, scale[:, 0], left
 
 
 def averaged_evidence(
@@ -273,7 +270,9 @@ def log_evidence_of(fit: Fit, data: Measurements, *, correlated: float = 1.0) ->
 
     Schwarz's approximation of the marginal likelihood, -½ k log n, with random forces counted as
     parameters, so that explanations with and without them can be compared. What the recordings do not tell
-    of the parameters does not count.
+    of the parameters does not count. Of parameters of which something is expected together, such as the
+    heights of a smooth function, the likelihood is averaged over that (Laplace's approximation,
+    -½ log det(1 + K G)): a hundred of them may count as three.
 
     Parameters
     ----------
@@ -284,10 +283,20 @@ def log_evidence_of(fit: Fit, data: Measurements, *, correlated: float = 1.0) ->
         (`correlation_time_left`): log L/τ - ½ k log(n/τ).
     """
     white = whiten(fit.linearisation, data, fit.noise)
-    told = orthonormal(white.columns).shape[1]
+    names = [fit.model.parameters[place].name for place in fit.model.free]
+    smooth = {name for each in fit.model.expected_together for name in each.names}
+    basis = orthonormal(white.columns[:, [name not in smooth for name in names]])
     variances = int((fit.noise.process > 0).sum())
     count = max(float(white.known.sum()) / correlated, 2.0)
-    return float(fit.log_likelihood / correlated - 0.5 * (told + variances) * np.log(count))
+    price = 0.5 * (basis.shape[1] + variances) * np.log(count)
+    if smooth:
+        together = fit.model.expected_together
+        own = white.columns[:, [names.index(name) for each in together for name in each.names]]
+        own = own - basis @ (basis.T @ own)
+        roots = scipy.linalg.block_diag(*(each.roots for each in together))
+        told = np.linalg.svd(scipy.linalg.solve(roots.T, own.T), compute_uv=False) ** 2
+        price += 0.5 * float(np.log1p(told / correlated).sum())
+    return float(fit.log_likelihood / correlated - price)
 
 
 def correlation_time_left(fits: Sequence[Fit], data: Measurements) -> float:

@@ -1,11 +1,12 @@
-"""Functions without a name, fitted: in which places, with how many powers or knots.
+"""Functions of one coordinate without a name, fitted: in which places, with which powers, or how smooth.
 
-In the likeliest places (`siq.mismatch.likely_places`) a formula of a few powers and a spline are fitted in
-earnest.
+In the likeliest places (`siq.mismatch.likely_places`) a formula of a few powers and a smooth curve are fitted
+in earnest.
 """
 
 from __future__ import annotations
 
+import itertools
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,9 +17,11 @@ import sympy
 from siq.dynamics.parametric import symbol
 from siq.estimation.estimation import Fit
 from siq.mismatch.fitted_parts import fitted_part
-from siq.mismatch.functions import simplest, with_formula, with_spline
-from siq.mismatch.likely_places import FITTED, LikelyPlace, few_knots, few_powers, likely_places
+from siq.mismatch.fitted_smooth import with_a_smooth_function
+from siq.mismatch.functions import simplest, with_formula
+from siq.mismatch.likely_places import FITTED, LikelyPlace, few_powers, likely_places
 from siq.mismatch.nameless_models import Material, Model, Part, weighed
+from siq.mismatch.smooth_functions import ground_of
 from siq.mismatch.trials import UNFORESEEN
 
 LOGGER = logging.getLogger(__name__)
@@ -51,16 +54,10 @@ def with_a_function(before: tuple[Part, ...], fit: Fit, material: Material) -> l
     if not ranked:
         return []
     models = _formulas(before, fit, ranked, cost, material)
-    curved = {(ranked[0].place.targets, ranked[0].place.words)}
-    for best in weighed(models, fit, data)[:1]:
-        if best.parts[-1].place is not None:
-            curved.add((best.parts[-1].place.targets, best.parts[-1].place.words))
-    for likely in ranked:
-        if (likely.place.targets, likely.place.words) in curved:
-            for knots in few_knots(likely, fit, data):
-                candidate = with_spline(fit.model, likely.place, knots)
-                part = fitted_part(candidate, likely.level, likely.place, fit, cost, material, knots=knots)
-                models += [Model((*before, each), each.trial.fit) for each in part]
+    alone = (each for each in ranked if len(each.place.words) == 1)
+    for likely in {id(each): each for each in (*ranked[:FITTED], *itertools.islice(alone, 1))}.values():
+        ground = ground_of(likely.place, fit.model, data, fit.x)
+        models += with_a_smooth_function(before, fit, ground, cost, material)
     given = sum(part.cost for part in before)
     found = [replace(each, log_evidence=each.log_evidence + given) for each in weighed(models, fit, data)]
     for each in found:

@@ -18,12 +18,13 @@ from siq.estimation.process_noise import (
 )
 from siq.mismatch.candidates import MechanismCandidate
 from siq.mismatch.function_places import Place
-from siq.mismatch.functions import FORMULA, SPLINE
+from siq.mismatch.functions import FORMULA
 from siq.mismatch.nameless_models import Material, Part
-from siq.mismatch.surfaces import SURFACE, Surface
+from siq.mismatch.smooth_functions import Smooth
 from siq.mismatch.trials import UNFORESEEN, TriedMechanism, judged
 
 LOGGER = logging.getLogger(__name__)
+LARGEST_PART = 0.25  # of the work left, that a single fit may take: a choice
 
 
 def fitted_part(
@@ -34,8 +35,8 @@ def fitted_part(
     cost: float,
     material: Material,
     *,
-    knots: np.ndarray | None = None,
-    surface: Surface | None = None,
+    smooth: Smooth | None = None,
+    begin: Fit | None = None,
 ) -> list[Part]:
     """A function as part of a model, or nothing where it cannot be fitted.
 
@@ -53,21 +54,26 @@ def fitted_part(
         Logarithm of the number of functions that it was chosen among.
     material
         What models are made from.
-    knots, surface
+    smooth
         See `siq.mismatch.nameless_models.Part`.
+    begin
+        Where the fit begins, if it is not the simulation without the function.
     """
-    kind = SPLINE if knots is not None else FORMULA if surface is None else SURFACE
+    kind = FORMULA if smooth is None else smooth.kind
     try:
         material.budget.says(f"a {kind}: {candidate.label}")
-        trial = _fitted(candidate, level, fit, material)
+        with material.budget.part(LARGEST_PART):
+            trial = _fitted(candidate, level, begin or fit, fit, material)
     except (*UNFORESEEN, BudgetSpent) as error:
         LOGGER.info("%s as a %s cannot be fitted: %s", candidate.label, kind, error)
         return []
-    return [Part(trial, kind, cost, place, knots, surface)]
+    return [Part(trial, kind, cost, place, smooth)]
 
 
-def _fitted(candidate: MechanismCandidate, level: float, begin: Fit, material: Material) -> TriedMechanism:
-    """A function, fitted and judged against the fit without it.
+def _fitted(
+    candidate: MechanismCandidate, level: float, begin: Fit, fit: Fit, material: Material
+) -> TriedMechanism:
+    """A function, fitted from a fit on, and judged against the fit without it.
 
     Raises
     ------
@@ -76,7 +82,12 @@ def _fitted(candidate: MechanismCandidate, level: float, begin: Fit, material: M
     """
     data, budget = material.data, material.budget
     known = {each.name: each.value for each in begin.model.parameters}
+    known |= {
+        each.name: each.value for each in candidate.model.parameters if each.name in candidate.amplitudes
+    }
     values = np.array([known.get(each.name, 0.0) for each in candidate.model.parameters])
+    if not begin.has_process_noise:  # a function that was nearly right may not be followed by another
+        begin = replace(begin, noise=replace(begin.noise, process=fit.noise.process))
     trial = simpler_fit(
         *fit_with_and_without_process_noise(
             candidate.model.with_values(values), data, begin, level=level, budget=budget
@@ -89,4 +100,4 @@ def _fitted(candidate: MechanismCandidate, level: float, begin: Fit, material: M
         trial = fit_with_process_noise_as_needed(trial.model, data, finer, budget=budget)
     if not trial.converged:
         raise NumericalFailure(trial.fault or "its fit does not settle")
-    return judged(trial, begin, data, candidate, blocks=material.blocks)
+    return judged(trial, fit, data, candidate, blocks=material.blocks)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 import scipy.interpolate
@@ -51,22 +52,59 @@ class Place:
     knots: np.ndarray
 
     @property
+    def coordinates(self) -> tuple[sympy.Expr, ...]:
+        """What it is a function of: a single coordinate."""
+        return (self.coordinate,)
+
+    @property
+    def width(self) -> int:
+        """The number of its values."""
+        return len(self.knots)
+
+    def values(self, courses: np.ndarray) -> np.ndarray:
+        """What a unit at each knot does along courses ``(1, n)`` of the coordinate, shape ``(k, n)``."""
+        return cardinal_splines(self.knots, courses[0])
+
+    @property
     def targets(self) -> tuple[str, ...]:
         """Names of the states or outputs that it changes."""
         return tuple(name for name, _ in (*self.equations, *self.outputs))
 
 
-class PlaceColumns:
-    """Splines in many places, as `siq.estimation.linearisation.linearise` wants them."""
+class PlacedFunction(Protocol):
+    """A function with linear parameters, such as values at knots, in a place; see `Place`."""
 
-    def __init__(self, model: Dynamics, grid: Grid, places: Sequence[Place]) -> None:
+    @property
+    def equations(self) -> tuple[tuple[str, sympy.Expr], ...]:
+        """What it is multiplied by in each equation."""
+
+    @property
+    def outputs(self) -> tuple[tuple[str, sympy.Expr], ...]:
+        """What it is multiplied by in each output."""
+
+    @property
+    def coordinates(self) -> tuple[sympy.Expr, ...]:
+        """What it is a function of."""
+
+    @property
+    def width(self) -> int:
+        """The number of its parameters."""
+
+    def values(self, courses: np.ndarray) -> np.ndarray:
+        """What a unit of each does along courses ``(c, n)`` of the coordinates, shape ``(width, n)``."""
+
+
+class PlaceColumns:
+    """Functions in many places, as `siq.estimation.linearisation.linearise` wants them."""
+
+    def __init__(self, model: Dynamics, grid: Grid, places: Sequence[PlacedFunction]) -> None:
         self._model, self._grid, self._places = model, grid, places
-        self.width = sum(len(each.knots) for each in places)
+        self.width = sum(each.width for each in places)
         names = (*model.states, *(entry.name for entry in model.inputs), "t")
         arguments = [symbol(name) for name in names]
         self._compiled = [
             compile_values(
-                [each.coordinate, *(factor for _, factor in (*each.equations, *each.outputs))],
+                [*each.coordinates, *(factor for _, factor in (*each.equations, *each.outputs))],
                 arguments,
                 common=False,
             )
@@ -86,12 +124,13 @@ class PlaceColumns:
         result = np.zeros((len(names), self.width, x.shape[1]))
         begin = 0
         for place, compiled in zip(self._places, self._compiled, strict=True):
-            end = begin + len(place.knots)
+            end = begin + place.width
             targets = place.outputs if measured else place.equations
             if targets:
-                course, *factors = compiled(*x, *signals.inputs, signals.t)
-                values = cardinal_splines(place.knots, np.broadcast_to(course, x.shape[1]))
-                for (name, _), factor in zip(targets, factors, strict=True):
+                known = compiled(*x, *signals.inputs, signals.t)
+                courses = [np.broadcast_to(each, x.shape[1]) for each in known[: len(place.coordinates)]]
+                values = place.values(np.stack(courses))
+                for (name, _), factor in zip(targets, known[len(place.coordinates) :], strict=True):
                     result[names.index(name), begin:end] = values * factor
             begin = end
         return result

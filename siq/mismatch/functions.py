@@ -1,4 +1,4 @@
-"""Functions without a name, as formulas: sums of powers, and splines through values at knots."""
+"""Functions without a name, as formulas: sums of powers. And how any function is built into a simulation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from siq.mismatch.candidates import MechanismCandidate
 from siq.mismatch.function_places import Place
 from siq.mismatch.units import unit_of
 
-FORMULA, SPLINE = "formula", "spline"
+FORMULA = "formula"
 
 
 def described_name(place: Place) -> str:
@@ -45,48 +45,6 @@ def _without_factor(place: Place) -> Place:
     """The same place, but that a function is not multiplied by the second coordinate."""
     factor = second_coordinate(place)
     return replace(place, equations=tuple((name, each / factor) for name, each in place.equations))
-
-
-def with_spline(model: Dynamics, place: Place, knots: np.ndarray) -> MechanismCandidate:
-    """The simulation with a natural cubic spline in a place; its values at the knots are the amplitudes.
-
-    Beyond the first and the last knot it goes on along straight lines.
-    """
-    names = fresh_names("f", len(knots), model)
-    formula = spline(place.coordinate, knots, [symbol(name) for name in names])
-    units = [unit_in(place, model, 0, int(len(place.words) > 1))] * len(names)
-    return built(model, place, formula, names, units)
-
-
-def spline(coordinate: sympy.Expr, knots: np.ndarray, values: Sequence[sympy.Expr]) -> sympy.Expr:
-    """A natural cubic spline through values at knots: ``a + b z + Σ w |z - z_k|³``, ``Σ w = Σ w z_k = 0``.
-
-    Parameters
-    ----------
-    coordinate
-        Of which it is a function.
-    knots
-        Shape ``(k,)``, rising.
-    values
-        At the knots.
-    """
-    middle, width = float((knots[0] + knots[-1]) / 2), float(np.ptp(knots) / 2)
-    z = (knots - middle) / width
-    count = len(z)
-    system = np.zeros((count + 2, count + 2))
-    system[:count, :count] = np.abs(np.subtract.outer(z, z)) ** 3
-    system[:count, count], system[:count, count + 1] = 1.0, z
-    system[count, :count], system[count + 1, :count] = 1.0, z
-    solved = np.linalg.solve(system, np.eye(count + 2)[:, :count])
-    at = (coordinate - sympy.Float(middle, 17)) / sympy.Float(width, 17)
-    bent = [sympy.Abs(at - sympy.Float(place, 17)) ** 3 for place in z]
-    parts = [*bent, sympy.Integer(1), at]
-    return sympy.Add(
-        *(
-            part * sympy.Add(*(sympy.Float(w, 17) * value for w, value in zip(weights, values, strict=True)))
-            for part, weights in zip(parts, solved, strict=True)
-        )
-    )
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -66,9 +66,11 @@ def held_out_runs(
 
     Of several models of what has no name the likeliest is adopted that makes the prediction better than it is
     without: than that of the mechanisms with a name, where there are any, or else of the simulation. What is
-    not certain where it was found has to be better by more than appears by chance. Where
-    all recordings are tests of somebody else, each part of those to learn from is left out in turn, and the
-    model is adopted that foresees them best (`siq.mismatch.left_out`).
+    not certain where it was found has to be better by more than appears by chance, what is certain better
+    than the simulation fitted alike; one of fewer coordinates
+    that foresees no worse takes its place. Where all recordings are tests of somebody else, each part of
+    those to learn from is left out in turn, and the model is adopted that foresees them best
+    (`siq.mismatch.left_out`).
 
     Parameters
     ----------
@@ -116,17 +118,26 @@ def held_out_runs(
         without = [errors_of(each, some) for each in ((plain,) if named else (card, recalibrated))]
         known = [each for each in without if each is not None]
         least = min(known, key=np.mean, default=None)
-        errors = (errors_of(fit, some) for _, fit in choices)
-        # Beside random forces a free run is off by them, and what a function does to that may be chance.
-        sure = [model.log_evidence >= certain and not model.fit.has_process_noise for model, _ in choices]
-        adopted = first_better(least, errors, sure)
+        errors = [errors_of(fit, some) for _, fit in choices]
+        # A card whose values are right foresees well, and tells nothing of a function whose fit had to find
+        # them, too. Beside random forces a free run is off by these, and a little may be chance.
+        fitted_alone = np.inf if without[-1] is None else float(without[-1].mean())
+        lowest = np.inf if least is None else float(least.mean())
+        limits = [
+            0.0 if model.log_evidence < certain else lowest if model.fit.has_process_noise else fitted_alone
+            for model, _ in choices
+        ]
+        adopted = first_better(least, errors, limits)
+        if adopted is not None:
+            sizes = [np.inf if each is None else float(each.mean()) for each in errors]
+            adopted = simplest_of(sizes, [model.coordinates for model, _ in choices], adopted)
     elif choices:
         alone = errors_left_out(plain if named else search.recalibrated, learned, noise=noise)
         left_out = [errors_left_out(fit, learned, noise=noise) for _, fit in choices]
         sizes = [np.inf if each is None else float(each.mean()) for each in left_out]
         LOGGER.info("parts left out: mean squared errors %s with models of what has no name", sizes)
         best = int(np.argmin(sizes))
-        adopted = best if first_better(alone, [left_out[best]], [False]) == 0 else None
+        adopted = best if first_better(alone, [left_out[best]], [0.0]) == 0 else None
     described, fit = (None, plain) if named or not choices else choices[0]
     if adopted is not None:
         described, fit = choices[adopted]
@@ -154,8 +165,26 @@ def held_out_runs(
     )
 
 
+def simplest_of(errors: Sequence[float], coordinates: Sequence[int], likeliest: int) -> int:
+    """The place of the model of fewest coordinates that foresees no worse than the likeliest one.
+
+    Errors of a sensor's clock, for one, grow with the motion, and look like functions of more than there is.
+
+    Parameters
+    ----------
+    errors
+        Of each model, on recordings held out.
+    coordinates
+        How many each depends on.
+    likeliest
+        The place of the one to begin with.
+    """
+    known = [place for place, error in enumerate(errors) if error <= errors[likeliest]]
+    return min(known, key=lambda place: (coordinates[place], place != likeliest, place))
+
+
 def first_better(
-    without: np.ndarray | None, models: Iterable[np.ndarray | None], certain: Iterable[bool]
+    without: np.ndarray | None, models: Iterable[np.ndarray | None], limits: Iterable[float]
 ) -> int | None:
     """The place of the first of several models that foresees better than without it; None where none does.
 
@@ -165,15 +194,15 @@ def first_better(
         Squared errors without any of the models, shape ``(values,)``; None where it ran away.
     models
         Those of each model, the likeliest first.
-    certain
-        Whether recordings that it was found in leave no doubt of it. Others have to be better by more than
-        appears by chance.
+    limits
+        Mean squared errors below which a model need only be no worse than without it, by more than appears
+        by chance; zero for one that has to be better by more than that.
     """
-    for place, (squares, known) in enumerate(zip(models, certain, strict=True)):
+    before = None if without is None else in_blocks(without)
+    for place, (squares, limit) in enumerate(zip(models, limits, strict=True)):
         if squares is None:
             continue
-        if without is None or (known and squares.mean() < without.mean()):
-            return place
-        if change_between(in_blocks(without), in_blocks(squares)) == "better":
+        change = change_between(before, in_blocks(squares))
+        if change == "better" or (change == "same" and squares.mean() < limit):
             return place
     return None

@@ -23,9 +23,11 @@ from siq.mismatch.dictionary import Mechanism
 from siq.mismatch.nameless_models import Material, Model
 from siq.mismatch.names import names_of
 from siq.mismatch.naming import Naming
-from siq.mismatch.remainder import Remainder, what_is_left
+from siq.mismatch.remainder import STRUCTURED, Remainder, what_is_left
 from siq.mismatch.roles import Roles, roles_of
-from siq.mismatch.search import Search, search
+from siq.mismatch.rounded import explained_by_rounding
+from siq.mismatch.search import LEFT, Search, search
+from siq.mismatch.search_options import SearchOptions
 from siq.mismatch.steadiness import unsteadiness
 from siq.mismatch.structure import Structure
 from siq.mismatch.study import MismatchStudy
@@ -46,6 +48,7 @@ class MismatchVerdict(StrEnum):
         return self in (MismatchVerdict.MISSING_PHYSICS, MismatchVerdict.UNEXPLAINED)
 
 
+ROUNDED = "What is left looks like noise once the steps are allowed for in which {} was recorded."
 GROWING = "Random forces would explain it only if they grew with the motion; a hidden state is more likely."
 
 
@@ -170,15 +173,18 @@ def investigate(
     with budget.exempt():
         recalibrated, least_squares = recalibrate(model, data, budget=budget)
     found = search(model, data, recalibrated, candidates, options=options, budget=budget)
+    recalibrated = found.recalibrated  # from where a mechanism led it, if that is better
+    if not (recalibrated.has_process_noise or recalibrated.log_likelihood < least_squares.log_likelihood):
+        least_squares = recalibrated
     found, by_each = remainders(model, data, found, roles)
     left = by_each[-1]
-    p_shift = shift_probability(model, recalibrated)
     exact: Fit | None = None
     naming: Naming | None = None
     models: tuple[Model, ...] = ()
     verdict, remarks = MismatchVerdict.NO_MISMATCH, tuple[str, ...]()
     material = Material(data, roles, study.degree, options.blocks, len(candidates), budget)
-    if found.found:
+    tried = bool(found.found)
+    if tried:
         names = names_of(
             found, by_each, model, material, candidates,
             options=options, generator=np.random.default_rng(seed),
@@ -186,21 +192,25 @@ def investigate(
         naming, models, exact, remarks = names.naming, names.models, names.exact, names.remarks
         found, left = naming.search, naming.left
         verdict = MismatchVerdict.MISSING_PHYSICS if names.given else MismatchVerdict.UNEXPLAINED
-    elif found.fit.has_process_noise:
-        steady = unsteadiness(found.fit, data) < 2 * options.least_log_odds
-        knows_noise = any(form.noise for mechanism in dictionary for form in mechanism.forms)
-        verdict, remarks = MismatchVerdict.UNEXPLAINED, () if steady else (GROWING,)
-        if knows_noise and steady and not left.doubtful:
-            # Random forces explain any recordings. They are named where nothing else is likelier, neither a
-            # function instead of them nor one beside what is left of them: noise does not know where a system
-            # is, so that no function of the states takes a part of it over.
-            models = models_of_the_nameless(found, material)
-            if not models or models[0].log_evidence < options.least_log_odds:
-                verdict, models = MismatchVerdict.MISSING_PHYSICS, ()
-    elif left.structured:
+    rounded = None
+    doubtful = not tried and (found.fit.has_process_noise or left.structured)
+    if doubtful or verdict is MismatchVerdict.UNEXPLAINED:
+        budget.says("asking whether the sensors' steps explain it")
+        with budget.exempt():
+            # What a mechanism has found already has to be gone more clearly.
+            least = LEFT if tried else STRUCTURED
+            rounded = explained_by_rounding(model, data, least_squares, roles, least=least, budget=budget)
+    if rounded is not None:
+        found = replace(found, recalibrated=rounded.fit, found=(), fit=rounded.fit)
+        left, least_squares, naming, models, exact = rounded.left, rounded.fit, None, (), None
+        remarks = (ROUNDED.format(", ".join(rounded.outputs)),)
+    p_shift = shift_probability(model, found.recalibrated)
+    if rounded is not None or not (tried or doubtful):
+        verdict = quiet_verdict(p_shift, options)
+    elif not tried and found.fit.has_process_noise:
+        verdict, models, remarks = driven(found, left, material, dictionary, options)
+    elif not tried:
         verdict = MismatchVerdict.UNEXPLAINED
-    elif p_shift < options.false_alarms:
-        verdict = MismatchVerdict.PARAMETER_SHIFT
     if verdict is MismatchVerdict.UNEXPLAINED and not (models or found.found):
         models = models_of_the_nameless(found, material)
     budget.says("working out how well parameters are known")
@@ -225,6 +235,39 @@ def investigate(
         models=models,
         account=budget.account(),
     )
+
+
+def driven(
+    found: Search,
+    left: Remainder,
+    material: Material,
+    dictionary: Sequence[Mechanism],
+    options: SearchOptions,
+) -> tuple[MismatchVerdict, tuple[Model, ...], tuple[str, ...]]:
+    """The verdict where random forces are needed and no mechanism was found, with models and remarks.
+
+    Random forces explain any recordings. They are named where nothing else is likelier, neither a function
+    instead of them nor one beside what is left of them: noise does not know where a system is, so that no
+    function of the states takes a part of it over.
+
+    Parameters
+    ----------
+    found, left
+        The search, and what its fit leaves.
+    material, options
+        What functions without a name are fitted with, and what a name takes.
+    dictionary
+        Random forces are named only where an entry of it knows them.
+    """
+    steady = unsteadiness(found.fit, material.data) < 2 * options.least_log_odds
+    remarks = () if steady else (GROWING,)
+    knows_noise = any(form.noise for mechanism in dictionary for form in mechanism.forms)
+    if not (knows_noise and steady) or left.doubtful:
+        return MismatchVerdict.UNEXPLAINED, (), remarks
+    models = models_of_the_nameless(found, material)
+    if not models or models[0].log_evidence < options.least_log_odds:
+        return MismatchVerdict.MISSING_PHYSICS, (), remarks
+    return MismatchVerdict.UNEXPLAINED, models, remarks
 
 
 def remainders(
@@ -261,6 +304,12 @@ def considered(
         monomials = generic_candidates(model, roles, degree=study.degree, named=candidates)
         candidates += [each for each in monomials if each.coordinate != "constant"]
     return candidates
+
+
+def quiet_verdict(p_shift: float, options: SearchOptions) -> MismatchVerdict:
+    """The verdict where nothing is missing, by the probability that the card's parameters are right."""
+    shifted = p_shift < options.false_alarms
+    return MismatchVerdict.PARAMETER_SHIFT if shifted else MismatchVerdict.NO_MISMATCH
 
 
 def shift_probability(model: Dynamics, recalibrated: Fit) -> float:

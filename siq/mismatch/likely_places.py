@@ -1,4 +1,4 @@
-"""Likely places: where a smooth function without a name is most likely to stand, and how fine it has to be.
+"""Likely places: where a smooth function without a name is most likely to stand, and which powers it needs.
 
 Smooth functions are compared in all places by their evidence (`siq.mismatch.evidence`), along the
 trajectories of a fit and at several levels of random forces, as mechanisms are screened.
@@ -20,7 +20,6 @@ from siq.mismatch.clusters import correlation_time_of
 from siq.mismatch.evidence import evidence_of_function, orthonormal
 from siq.mismatch.function_places import (
     Place,
-    cardinal_splines,
     linearised_with_places,
     places_in,
     products_in,
@@ -85,27 +84,6 @@ def _compared(fit: Fit, data: Measurements, places: Sequence[Place]) -> list[Lik
                     found[id(place)] = LikelyPlace(place, value, level)
     ranked = sorted(found.values(), key=lambda each: -each.log_evidence)
     return [replace(each, log_evidence=each.log_evidence - alone) for each in ranked]
-
-
-def few_knots(likely: LikelyPlace, fit: Fit, data: Measurements) -> list[np.ndarray]:
-    """The knots that a spline needs, as many as earn their place (Schwarz), and the next finer ones.
-
-    Errors count as correlated as the finest spline leaves them (`siq.mismatch.evidence`).
-    """
-    knots = likely.place.knots
-    response, _ = next(iter(linearised_with_places(fit, data, [likely.place])))
-    white = whiten(response, data, fit.noise.scaled(likely.level))
-    left, columns = projected(white, len(fit.model.free))
-    count = independent(left, columns, white, fit)
-    choices, costs = [], []
-    for number in sorted({min(each, len(knots)) for each in (4, 5, 7, 9, 13, len(knots))}):
-        some = knots[np.linspace(0, len(knots) - 1, number).round().astype(int)]
-        own = orthonormal(columns @ cardinal_splines(some, knots).T)
-        sum_of = max(float(((left - own @ (own.T @ left)) ** 2).sum()), 1e-300)
-        choices.append(some)
-        costs.append(count * np.log(sum_of) + own.shape[1] * np.log(count))
-    best = int(np.argmin(costs))
-    return choices[best : best + 2]
 
 
 def few_powers(likely: LikelyPlace, fit: Fit, data: Measurements, *, degree: int) -> tuple[Power, ...]:

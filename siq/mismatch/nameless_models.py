@@ -9,8 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-
 from siq.estimation.budget import Budget
 from siq.estimation.estimation import Fit
 from siq.estimation.free_runs import UsualStates, free_run, normalised_rms
@@ -18,7 +16,7 @@ from siq.estimation.measurements import Measurements
 from siq.mismatch.evidence import correlation_time_left, log_evidence_of
 from siq.mismatch.function_places import Place
 from siq.mismatch.roles import Roles
-from siq.mismatch.surfaces import Surface
+from siq.mismatch.smooth_functions import Smooth
 from siq.mismatch.trials import TriedMechanism
 
 MECHANISM = "mechanism"
@@ -61,23 +59,20 @@ class Part:
     trial
         What was added, fitted and judged.
     kind
-        ``formula``, ``spline``, ``surface``, or ``mechanism``.
+        ``formula``, ``curve``, ``surface``, or ``mechanism``.
     cost
         Logarithm of the number of places, or mechanisms, that it was chosen among.
     place
         Where a function stands; None for a mechanism.
-    knots
-        Of a spline, shape ``(k,)``: the amplitudes are its values there.
-    surface
-        The bumps of a surface, of which the amplitudes are the heights.
+    smooth
+        What a curve or a surface is made of: the amplitudes are the heights of its bumps.
     """
 
     trial: TriedMechanism
     kind: str
     cost: float
     place: Place | None = None
-    knots: np.ndarray | None = None
-    surface: Surface | None = None
+    smooth: Smooth | None = None
 
 
 @dataclass(frozen=True)
@@ -100,6 +95,11 @@ class Model:
     fit: Fit
     log_evidence: float = float("nan")
     exact: Fit | None = None
+
+    @property
+    def coordinates(self) -> int:
+        """On how many coordinates the parts depend, each by itself."""
+        return sum(1 if part.place is None else len(part.place.words) for part in self.parts)
 
     @property
     def cost(self) -> float:

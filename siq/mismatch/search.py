@@ -11,12 +11,13 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import sympy
 
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.parametric import symbol
 from siq.errors import NumericalFailure
-from siq.estimation.budget import Budget
+from siq.estimation.budget import Budget, BudgetSpent
 from siq.estimation.estimation import Fit
 from siq.estimation.measurements import Measurements
 from siq.estimation.process_noise import fit_with_process_noise_as_needed
@@ -28,6 +29,7 @@ from siq.mismatch.screening import Screened
 from siq.mismatch.search_options import SearchOptions
 from siq.mismatch.structure import structure_of
 from siq.mismatch.trials import (
+    UNFORESEEN,
     TriedMechanism,
     UntriedMechanism,
     fit_most_promising,
@@ -122,8 +124,10 @@ def _extended(
 
     Where recordings are few, what is still missing may make all errors so large that the best candidate does
     not stand the clustered test alone. It is then taken on trial, once: another is looked for on top of it,
-    and both count as found if both stand the test together.
+    and both count as found if both stand the test together. Where a mechanism leads to better parameters of
+    the simulation itself, the search begins anew from there, once.
     """
+    begun_anew = False
     while True:
         found, current = progress.found, progress.fit
         base = current.model
@@ -162,6 +166,13 @@ def _extended(
         chance = 5 * options.false_alarms / max(len(remaining), 1)
         stands = accepted(trials, len(screened), chance, options=options)
         best = accepted(trials, len(screened), 1.0, options=options)
+        if not (found or begun_anew) and best is not None:
+            begun_anew = True
+            better = better_without(best.best, current, model, data, least=options.same, budget=budget)
+            if better is not None:
+                LOGGER.info("%s led to better parameters, without it", best.best.candidate.label)
+                progress = replace(progress, recalibrated=better, fit=better, fruitless=frozenset())
+                continue
         if (
             on_trial
             and len(found) + 1 < options.mechanisms
@@ -181,6 +192,46 @@ def _extended(
             return progress
         LOGGER.info("found %s, chi2 better by %.1f", stands.best.candidate.label, stands.best.delta_chi2)
         progress = _with(progress, stands)
+
+
+def better_without(
+    trial: TriedMechanism,
+    current: Fit,
+    model: Dynamics,
+    data: Measurements,
+    *,
+    least: float,
+    budget: Budget,
+) -> Fit | None:
+    """The simulation alone, fitted from where a mechanism led it, if that explains as much as with it.
+
+    A mechanism may seem to explain much only because its fit found parameters of the simulation that its own
+    fit had missed. Nothing is called missing before the simulation has begun there, too.
+
+    Parameters
+    ----------
+    trial
+        The mechanism.
+    current
+        The fit that it is held against.
+    model, data
+        The simulation without mechanisms, and the recordings.
+    least
+        Twice the difference of log-likelihoods, within which explanations cannot be told apart.
+    budget
+        Charged for the fit; None is the answer where it is spent.
+    """
+    fit = trial.fit
+    known = {each.name: each.value for each in fit.model.parameters}
+    begun = model.with_values(np.array([known[each.name] for each in model.parameters]))
+    d = model.dimension
+    begin = replace(fit, noise=replace(fit.noise, process=fit.noise.process[:d]))
+    try:
+        again = fit_with_process_noise_as_needed(begun, data, begin, x=fit.x[:, :d], budget=budget)
+    except (*UNFORESEEN, BudgetSpent):
+        return None
+    gained = 2 * (again.log_likelihood - current.log_likelihood)
+    return again if again.converged and gained > max(least, trial.delta_chi2 - least) else None
 
 
 def _once_more(candidate: MechanismCandidate, found: MechanismCandidate) -> bool:

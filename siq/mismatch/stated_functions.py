@@ -11,16 +11,16 @@ from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.formulas import compile_values
 from siq.dynamics.parametric import symbol
 from siq.estimation.estimation import Fit
-from siq.mismatch.functions import FORMULA, SPLINE
+from siq.mismatch.functions import FORMULA
 from siq.mismatch.held_out import HeldOutRuns
 from siq.mismatch.nameless_models import MECHANISM, Part
+from siq.mismatch.smooth_functions import CURVE, SURFACE, Smooth
 from siq.mismatch.statement import DescribedCurve, DescribedSurface, Estimate, Evidence, StatedFunction
-from siq.mismatch.surfaces import SURFACE
 
 GRID = 25  # places along either coordinate of a surface, for its figure
-_KINDS: Mapping[str, Literal["formula", "spline", "surface", "mechanism"]] = {
+_KINDS: Mapping[str, Literal["formula", "curve", "surface", "mechanism"]] = {
     FORMULA: "formula",
-    SPLINE: "spline",
+    CURVE: "curve",
     SURFACE: "surface",
     MECHANISM: "mechanism",
 }
@@ -79,49 +79,58 @@ def _stated(part: Part, fit: Fit, beside: tuple[str, ...]) -> StatedFunction:
 def curve_of(part: Part, fit: Fit) -> DescribedCurve | None:
     """A function of one coordinate at the knots of its place, with its standard errors.
 
-    None for a formula or a surface in two coordinates, and for a mechanism.
+    None for a formula in two coordinates, for a surface, and for a mechanism.
     """
-    place = part.place
-    if place is None or (part.kind != SPLINE and len(place.words) > 1):
+    place, smooth = part.place, part.smooth
+    if place is None or (part.kind != CURVE and len(place.words) > 1):
         return None
-    knots = place.knots if part.knots is None else part.knots
-    if part.surface is not None:
-        lower, upper = part.surface.limits[:, 0]
+    if smooth is not None:
+        lower, upper = smooth.limits[:, 0]
         knots = np.linspace(lower, upper, GRID)
-        weights = part.surface.values(knots[None]).T
-    elif part.kind == SPLINE:
-        weights = np.eye(len(part.trial.candidate.amplitudes))
+        values, errors = _along(smooth, part, fit, knots[None])
     else:
+        knots = place.knots
         weights = _terms(part, fit.model, knots)
-    values, errors = _summed(weights, part, fit)
+        values, errors = weights @ _amplitudes(part, fit), _errors(weights, part, fit)
     return DescribedCurve(
         place.words[0], tuple(map(float, knots)), tuple(map(float, values)), tuple(map(float, errors))
     )
 
 
 def surface_of(part: Part, fit: Fit) -> DescribedSurface | None:
-    """A surface of two coordinates on a grid that covers its bumps, with errors; None for anything else."""
-    surface = part.surface
-    if surface is None or len(surface.words) != 2:
+    """A surface on a grid that covers the recordings, with its standard errors; None for anything else."""
+    smooth = part.smooth
+    if smooth is None or part.kind != SURFACE:
         return None
-    at = [np.linspace(lower, upper, GRID) for lower, upper in surface.limits.T]
+    at = [np.linspace(lower, upper, GRID) for lower, upper in smooth.limits.T]
     courses = np.stack([each.ravel() for each in np.meshgrid(*at, indexing="ij")])
-    values, errors = _summed(surface.values(courses).T, part, fit)
+    values, errors = _along(smooth, part, fit, courses)
     first, second = (tuple(map(float, each)) for each in at)
 
     def rows(flat: np.ndarray) -> tuple[tuple[float, ...], ...]:
         return tuple(tuple(map(float, row)) for row in flat.reshape(GRID, GRID))
 
-    return DescribedSurface((surface.words[0], surface.words[1]), (first, second), rows(values), rows(errors))
+    words = smooth.ground.words
+    return DescribedSurface((words[0], words[1]), (first, second), rows(values), rows(errors))
 
 
-def _summed(weights: np.ndarray, part: Part, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted sums ``(k,)`` of the amplitudes of a part, and their standard errors; weights ``(k, c)``."""
+def _along(smooth: Smooth, part: Part, fit: Fit, courses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A smooth function along courses ``(c, k)`` of its coordinates, and its standard errors, ``(k,)``."""
+    values, derivatives = smooth.along(_amplitudes(part, fit), courses)
+    return values, _errors(derivatives, part, fit)
+
+
+def _amplitudes(part: Part, fit: Fit) -> np.ndarray:
+    known = {each.name: each.value for each in fit.model.parameters}
+    return np.array([known[name] for name in part.trial.candidate.amplitudes])
+
+
+def _errors(weights: np.ndarray, part: Part, fit: Fit) -> np.ndarray:
+    """Standard errors of weighted sums ``(k, c)`` of the amplitudes of a part, shape ``(k,)``."""
     free = [fit.model.parameters[each].name for each in fit.model.free]
     rows = [free.index(name) for name in part.trial.candidate.amplitudes]
-    values = weights @ fit.model.values[[fit.model.free[row] for row in rows]]
     variances = np.einsum("kc,cd,kd->k", weights, fit.covariance[np.ix_(rows, rows)], weights)
-    return values, np.sqrt(np.maximum(variances, 0.0))
+    return np.sqrt(np.maximum(variances, 0.0))
 
 
 def _terms(part: Part, model: Dynamics, knots: np.ndarray) -> np.ndarray:

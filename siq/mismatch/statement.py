@@ -162,22 +162,23 @@ class StatedFunction:
     name, label, terms, parameters, evidence, equations, beside
         As of `StatedMechanism`.
     kind
-        ``formula``: a sum of a few powers. ``spline``: a smooth curve through values. ``surface``: a
-        sum of Gaussian bumps. ``mechanism``: one of the dictionary that is not certain enough for its name.
+        ``formula``: a sum of a few powers. ``curve``, ``surface``: a smooth function of one coordinate, or of
+        two, as a sum of Gaussian bumps. ``mechanism``: one of the dictionary that is not certain enough for
+        its name.
     outputs
         What is measured otherwise, for a fault of the sensor.
     coordinates
         What it depends on.
     curve
-        Where it is a function of one coordinate, or a spline; a spline in two coordinates is the
-        coefficient of the second.
+        Where it is a function of one coordinate, or a curve; a curve in two coordinates is the coefficient of
+        the second.
     surface
         Where it is a surface.
     """
 
     name: str
     label: str
-    kind: Literal["formula", "spline", "surface", "mechanism"]
+    kind: Literal["formula", "curve", "surface", "mechanism"]
     terms: Mapping[str, str]
     parameters: Mapping[str, Estimate]
     evidence: Evidence

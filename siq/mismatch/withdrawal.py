@@ -8,15 +8,21 @@ it, by more than appears by chance, it keeps no name.
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import replace
 
 from siq.estimation.budget import Budget
 from siq.mismatch.case import Comparison
 from siq.mismatch.described import models_of_the_nameless
 from siq.mismatch.held_out import HeldOutRuns
-from siq.mismatch.investigation import Investigation, MismatchVerdict
-from siq.mismatch.nameless_models import Material
+from siq.mismatch.investigation import Investigation, MismatchVerdict, quiet_verdict
+from siq.mismatch.nameless_models import Material, Model
+from siq.mismatch.remainder import what_is_left
 
+REFUTED = (
+    "It would be explained a little better with {}. The prediction of recordings held out becomes worse with"
+    " that, and nothing else speaks of a mismatch, so that it is taken for chance."
+)
 LOGGER = logging.getLogger(__name__)
 
 
@@ -35,8 +41,35 @@ def misleads(found: Investigation, shown: HeldOutRuns) -> bool:
     return named and shown.errors.change("without", "augmented") == "worse"
 
 
+def anything_else(found: Investigation, models: Sequence[Model], case: Comparison) -> bool:
+    """Whether anything but mechanisms that recordings held out refute speaks of a mismatch.
+
+    Random forces that are needed do, and so does structure that the recalibrated simulation leaves, or a
+    function without a name that is certain by the odds that a name takes.
+
+    Parameters
+    ----------
+    found
+        What was found.
+    models
+        Of what has no name, the likeliest first.
+    case
+        The recordings and the settings.
+    """
+    recalibrated = found.search.recalibrated
+    if recalibrated.has_process_noise:
+        return True
+    functions = [each for each in models if all(part.kind != "mechanism" for part in each.parts)]
+    if any(each.log_evidence >= case.settings.search.least_log_odds for each in functions):
+        return True
+    return what_is_left(found.model, case.learn, recalibrated, recalibrated, found.roles).structured
+
+
 def withdrawn(found: Investigation, case: Comparison, budget: Budget) -> Investigation:
     """An investigation without its names, and with models of what has none.
+
+    Where nothing else speaks of a mismatch there is none: evidence that recordings held out refute is no
+    evidence.
 
     Parameters
     ----------
@@ -54,6 +87,16 @@ def withdrawn(found: Investigation, case: Comparison, budget: Budget) -> Investi
         case.learn, found.roles, settings.degree, settings.search.blocks, len(found.candidates), budget
     )
     models = models_of_the_nameless(found.search, material)
+    if not anything_else(found, models, case):
+        recalibrated = found.search.recalibrated
+        return replace(
+            found,
+            verdict=quiet_verdict(found.p_shift, settings.search),
+            search=replace(found.search, found=(), fit=recalibrated),
+            naming=None,
+            remarks=(*found.remarks, REFUTED.format(" and ".join(names))),
+            account=budget.account(),
+        )
     return replace(
         found, verdict=MismatchVerdict.UNEXPLAINED, models=models, withdrawn=True, account=budget.account()
     )

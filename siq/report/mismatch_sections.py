@@ -25,8 +25,8 @@ from siq.report.mismatch_findings import (
 from siq.report.page import FormulaRow, ReportSection, ReportTable
 
 SMOOTH = {
-    "spline": "a smooth curve (natural cubic spline)",
-    "surface": "a smooth function (a sum of Gaussian bumps)",
+    "curve": "a smooth curve (a sum of Gaussian bumps)",
+    "surface": "a smooth function of two coordinates (sums of Gaussian bumps)",
 }
 CERTAIN = math.log(1e6)  # beyond which odds are not told
 CANDIDATES_SHOWN = 12

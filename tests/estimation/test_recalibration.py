@@ -1,4 +1,4 @@
-"""Recalibration where steps at all samples at once lead away."""
+"""Recalibration where steps at all samples at once lead away, elsewhere, or to and fro."""
 
 from __future__ import annotations
 
@@ -12,12 +12,16 @@ import sympy
 
 from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.dynamics import Dynamics, Parameter
-from siq.estimation import recalibration
-from siq.estimation.estimation import Fit
+from siq.estimation import estimation, recalibration
+from siq.estimation.estimation import Fit, fit_by_multiple_shooting
+from siq.estimation.innovations import Noise
+from siq.estimation.measurements import Measurements
+from siq.estimation.shooting import Iterate, Shooting
 from siq.mismatch.study import measurements_of
 
 
-def test_a_fit_that_leads_away_is_made_again_by_damped_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+def decays() -> tuple[Dynamics, Measurements]:
+    """Three decays at a rate of 0.7, and a simulation that has it at 1."""
     n, r = sympy.symbols("n r", real=True)
     decay = Dynamics(("n",), (-r * n,), Diffusion.identity(1), parameters=(Parameter("r", 1.0),))
     t, generator = np.arange(0, 4, 0.1), np.random.default_rng(3)
@@ -30,6 +34,11 @@ def test_a_fit_that_leads_away_is_made_again_by_damped_steps(monkeypatch: pytest
         ),
         decay,
     )
+    return decay, data
+
+
+def test_a_fit_that_leads_away_is_made_again_by_damped_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    decay, data = decays()
     shooting = recalibration.fit_by_multiple_shooting
 
     def led_away(model: Dynamics, *given: Any, **named: Any) -> Fit:
@@ -41,3 +50,36 @@ def test_a_fit_that_leads_away_is_made_again_by_damped_steps(monkeypatch: pytest
     assert fit.converged and exact.converged and not fit.has_process_noise
     assert fit.model.values == pytest.approx([0.7], abs=0.01)
     assert np.sqrt(fit.noise.measurement) == pytest.approx([0.01], rel=0.2)
+
+
+def test_of_two_basins_the_likelier_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    decay, data = decays()
+    from_states_of_the_recordings = recalibration.fit_with_and_without_process_noise
+
+    def elsewhere(model: Dynamics, *given: Any, **named: Any) -> tuple[Fit | None, Fit]:
+        _, fit = from_states_of_the_recordings(model, *given, **named)
+        far = replace(fit, model=model.with_values(np.array([9.0])), log_likelihood=fit.log_likelihood - 40)
+        return None, far
+
+    monkeypatch.setattr(recalibration, "fit_with_and_without_process_noise", elsewhere)
+    fit, exact = recalibration.recalibrate(decay, data)
+    assert not fit.has_process_noise
+    assert [fit.model.values[0], exact.model.values[0]] == pytest.approx([0.7, 0.7], abs=0.01)
+
+
+def test_a_fit_has_not_settled_while_it_foresees_more_than_it_has() -> None:
+    decay, data = decays()
+    x = data.outputs.copy()
+    noise = Noise(np.array([1e-4]), np.zeros(1))
+    fit = fit_by_multiple_shooting(decay, data, x=x, noise=noise, estimate_process=False)
+    assert fit.converged
+
+    def idle(self: Shooting, now: Iterate, change: np.ndarray, noise: Noise) -> tuple[Iterate, float]:
+        return now, 1.0  # a whole step that does nothing of what it promised
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Shooting, "stepped", idle)
+        patch.setattr(estimation, "_stands_still", lambda totals: False)
+        stuck = fit_by_multiple_shooting(decay, data, x=x, noise=noise, estimate_process=False)
+        settled = fit_by_multiple_shooting(fit.model, data, x=fit.x, noise=noise, estimate_process=False)
+    assert not stuck.converged and settled.converged

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import scipy.interpolate
 import sympy
 
 from siq.dynamics.diffusion import Diffusion
@@ -13,7 +12,7 @@ from siq.dynamics.formulas import compile_values
 from siq.dynamics.parametric import symbol
 from siq.mismatch.evidence import evidence_of_function, log_evidence, orthonormal, smooth_prior
 from siq.mismatch.function_places import Place
-from siq.mismatch.functions import Power, fresh_names, powers, simplest, spline, with_formula, with_spline
+from siq.mismatch.functions import Power, fresh_names, powers, simplest, with_formula
 from siq.mismatch.matches import best_shares
 from siq.mismatch.search_options import SearchOptions
 
@@ -87,18 +86,6 @@ def test_odds_of_a_name_follow_from_how_many_may_be_wrong() -> None:
     assert wrong / (wrong + right) == pytest.approx(0.05)
 
 
-def test_a_spline_is_the_natural_one_and_goes_on_straight() -> None:
-    values = np.array([0.3, -1.0, 2.0, 0.5, 0.0, 1.0])
-    x = symbol("x")
-    formula = spline(x, KNOTS, [sympy.Float(value) for value in values])
-    at = np.linspace(-4, 6, 201)
-    found = compile_values([formula], [x], common=False)(at)[0]
-    within = (at >= KNOTS[0]) & (at <= KNOTS[-1])
-    known = scipy.interpolate.CubicSpline(KNOTS, values, bc_type="natural")
-    np.testing.assert_allclose(found[within], known(at[within]), atol=1e-9)
-    np.testing.assert_allclose(np.diff(found[at > KNOTS[-1]], 2), 0.0, atol=1e-9)
-
-
 def place(*words: str) -> Place:
     factor = symbol(words[1]) if len(words) > 1 else sympy.Integer(1)
     return Place((("v", factor),), (), symbol(words[0]), words, KNOTS)
@@ -120,15 +107,6 @@ def test_coefficients_of_formulas_have_units(words: tuple[str, ...], terms: str,
     assert candidate.model.equations[1] - OSCILLATOR.equations[1] == wanted
     assert candidate.model.parameters[-1].unit == unit
     assert candidate.changes == (("v", wanted),)
-
-
-def test_a_spline_stands_where_it_is_put_and_is_linear_in_its_values() -> None:
-    candidate = with_spline(OSCILLATOR, place("x", "v"), KNOTS)
-    added = candidate.model.equations[1] - OSCILLATOR.equations[1]
-    assert len(candidate.amplitudes) == len(KNOTS)
-    at = {symbol("x"): KNOTS[2], symbol("v"): 2.0}
-    for number, name in enumerate(candidate.amplitudes):
-        assert float(added.diff(symbol(name)).subs(at)) == pytest.approx(2.0 * (number == 2), abs=1e-9)
 
 
 def test_a_formula_without_its_first_coordinate_is_one_of_the_second() -> None:

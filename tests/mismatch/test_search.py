@@ -13,6 +13,7 @@ import sympy
 from siq.data.recordings import Recordings
 from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.dynamics import Dynamics, Parameter
+from siq.estimation.budget import Budget
 from siq.estimation.estimation import Fit
 from siq.estimation.measurements import Measurements, measurements
 from siq.estimation.recalibration import recalibrate
@@ -24,7 +25,7 @@ from siq.mismatch.names import named_or_not
 from siq.mismatch.naming import Naming, naming_of
 from siq.mismatch.remainder import Remainder
 from siq.mismatch.roles import Roles
-from siq.mismatch.search import Found, Search, _once_more, accepted
+from siq.mismatch.search import Found, Search, _once_more, accepted, better_without
 from siq.mismatch.search_options import SearchOptions
 from siq.mismatch.structure import Curve, Direction, Structure
 from siq.mismatch.trials import TriedMechanism
@@ -266,3 +267,21 @@ def test_of_equals_the_one_that_all_recordings_ask_for_where_white_errors_mean_l
     found = accepted(trials, 50, 1e-4, options=SearchOptions())
     assert found is not None and found.best.candidate.name == expected
     assert {each.candidate.name for each in found.indistinguishable} == {"better", "steadier"} - {expected}
+
+
+def test_nothing_is_missing_where_its_fit_only_found_better_parameters(decaying: Dynamics) -> None:
+    _, data = fit_with_errors(decaying, 0.01 * autoregressive(0.0, 400))
+    x, c = sympy.symbols("x c", real=True)
+    wider = replace(
+        decaying,
+        equations=(decaying.equations[0] - c * x**2,),
+        parameters=(*decaying.parameters, Parameter("c", 0.0)),
+    )
+    right, with_c = recalibrate(decaying, data)[0], recalibrate(wider, data)[0]
+    trial = TriedMechanism(SimpleNamespace(label="c"), with_c, 80.0, -70.0, 1e-9, 1e-9)
+    missed = replace(
+        right, model=right.model.with_values(np.array([9.0])), log_likelihood=right.log_likelihood - 40
+    )
+    found = better_without(trial, missed, decaying, data, least=10.0, budget=Budget())
+    assert found is not None and found.model.values == pytest.approx(right.model.values, rel=1e-3)
+    assert better_without(trial, right, decaying, data, least=10.0, budget=Budget()) is None

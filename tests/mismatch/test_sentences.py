@@ -213,7 +213,7 @@ def test_all_of_it_is_never_said_of_what_is_not_explained():
 @pytest.mark.parametrize("described", [False, True])
 def test_a_model_without_a_name_is_said_with_its_gain_or_that_nothing_was_gained(described):
     part = StatedFunction(
-        "a function of x", "a function of x in v", "spline", {}, {}, Evidence(90.0, -80.0, 0.0, 0.0), ("v",)
+        "a function of x", "a function of x in v", "curve", {}, {}, Evidence(90.0, -80.0, 0.0, 0.0), ("v",)
     )
     augmented = 0.05 if described else 0.31
     errors = errors_with({"before": 0.5, "recalibrated": 0.3, "augmented": augmented}, 0.04)
@@ -234,7 +234,7 @@ def test_a_model_without_a_name_is_said_with_its_gain_or_that_nothing_was_gained
 
 def test_what_describes_a_rest_is_told_from_what_has_a_name():
     part = StatedFunction(
-        "a function of x", "a function of x in v", "spline", {}, {}, Evidence(90.0, -80.0, 0.0, 0.0), ("v",)
+        "a function of x", "a function of x in v", "curve", {}, {}, Evidence(90.0, -80.0, 0.0, 0.0), ("v",)
     )
     statement = statement_from(3, MismatchVerdict.MISSING_PHYSICS)
     runs = {"before": 0.5, "recalibrated": 0.3, "augmented": 0.05, "named": 0.2}

@@ -12,12 +12,16 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+import sympy
 import yaml
 from scipy.integrate import solve_ivp
 
 from siq.dynamics.cards import load_system
-from siq.dynamics.parametric import Signals
+from siq.dynamics.diffusion import Diffusion
+from siq.dynamics.dynamics import Dynamics, Parameter
+from siq.dynamics.parametric import Signals, symbol
 from siq.mismatch.case import Comparison, read_case
+from siq.mismatch.study import measurements_of
 from siq.report.plots.foreign_proof import plot_foreign_proof
 from workflow.proof.batches import write_batch
 from workflow.proof.concealment.designs import draw_cases as draw_others
@@ -320,6 +324,23 @@ def test_the_integrator_crosses_gaps(oracle: TrueSimulation) -> None:
     fewer = replace(data, first=first, t=data.t[kept], outputs=data.outputs[kept])
     states = Integrator(fit.model, fewer).run(fit.model.values, fit.starts)
     assert np.allclose(states, whole[kept], rtol=1e-4, atol=1e-5 * np.abs(whole).max())
+
+
+def test_the_integrator_knows_the_time() -> None:
+    x, c, time = symbol("x"), symbol("c"), symbol("t")
+    model = Dynamics(
+        ("x",), (sympy.cos(time),), Diffusion.identity(1),
+        parameters=(Parameter("c", 0.3),), outputs=(("y", x + c * time),),
+    )  # fmt: skip
+    t = 5 + np.arange(0, 4, 0.1)
+    table = pd.DataFrame({"recording": "r01", "t": t, "y": np.zeros(len(t))})
+    integrator = Integrator(model, measurements_of(table, model))
+    states = integrator.run(model.values, np.sin(t[:1])[:, None])
+    np.testing.assert_allclose(states[:, 0], np.sin(t), atol=1e-6)
+    measured = integrator.outputs(states, model.values)[:, 0]
+    np.testing.assert_allclose(measured, np.sin(t) + 0.3 * t, atol=1e-6)
+    _, by_parameters = integrator.output_slopes(model.values, states)
+    np.testing.assert_allclose(by_parameters[:, 0, 0], t, rtol=1e-5)
 
 
 def test_a_place_is_told_by_less_than_the_effect_itself(stepped: Written, oracle: TrueSimulation) -> None:

@@ -17,7 +17,7 @@ FIT = {"before": 0.5, "recalibrated": 0.1, "augmented": 0.02, "noise_floor": 0.0
         ("missing physics", ["process noise"], [], 0.1),
         ("parameter shift", [], [], 0.1),
         ("unexplained", [], [], 0.1),
-        ("unexplained", [], [{"kind": "spline"}], 0.02),
+        ("unexplained", [], [{"kind": "curve"}], 0.02),
         ("no mismatch", [], [], 0.5),
     ],
 )

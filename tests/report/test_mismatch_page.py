@@ -269,7 +269,7 @@ def test_the_page_begins_with_the_largest_difference(runaway, recording, before)
 
 
 DESCRIBED = {
-    "name": "a function of x", "label": "a function of x in v", "kind": "spline",
+    "name": "a function of x", "label": "a function of x in v", "kind": "curve",
     "terms": {"v": "f_1*Abs(x)**3 + f_2"},
     "parameters": {"f_1": {"estimate": 0.2, "standard_error": 0.1, "unit": "mm/s**2"}},
     "evidence": {"delta_chi2": 90.0, "delta_bic": -80.0, "p_white": 0.0, "p_cluster": 0.0},

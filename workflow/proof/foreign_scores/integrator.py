@@ -53,7 +53,8 @@ class Integrator:
 
     def __init__(self, model: Dynamics, data: Measurements) -> None:
         self.model, self.data = model, data
-        names = [*model.states, *(each.name for each in model.inputs), *(p.name for p in model.parameters)]
+        inputs = [each.name for each in model.inputs]
+        names = [*model.states, *inputs, "t", *(each.name for each in model.parameters)]
         arguments = [symbol(name) for name in names]
         self._rates = compile_values(list(model.equations), arguments)
         self._outputs = compile_values([formula for _, formula in model.outputs], arguments)
@@ -61,41 +62,48 @@ class Integrator:
         length = data.t[self.begins + 1] - data.t[self.begins]
         self._steps = STEPS * np.maximum(np.round(length / np.median(length)), 1).astype(int)
         self._h = length / self._steps
-        self._u = self._inputs()
-        self.at_samples = self._inputs_at(data.t, data.recording)
+        self._signals = self._signals_of_steps()
+        self._at_samples = self._signals_at(data.t, data.recording)
         # Intervals by how many lie before them in their recordings.
         within = self.begins - data.first[data.recording[self.begins]]
         self.layers = [np.flatnonzero(within == k) for k in range(int(within.max()) + 1)]
 
-    def _inputs_at(self, t: np.ndarray, recording: np.ndarray) -> np.ndarray:
-        values = np.empty((len(self.model.inputs), len(t)))
+    @property
+    def inputs(self) -> np.ndarray:
+        """Inputs at the samples, shape ``(inputs, n)``."""
+        return self._at_samples[:-1]
+
+    def _signals_at(self, t: np.ndarray, recording: np.ndarray) -> np.ndarray:
+        """Inputs and, behind them, the time: shape ``(inputs + 1, n)``."""
+        values = np.empty((len(self.model.inputs) + 1, len(t)))
+        values[-1] = t
         for place, courses in enumerate(self.data.courses):
             rows = recording == place
             for index, course in enumerate(courses):
                 values[index, rows] = course(t[rows])
         return values
 
-    def _inputs(self) -> np.ndarray:
-        """Inputs at begin, middle and end of each step, shape ``(steps, 3, inputs, intervals)``."""
+    def _signals_of_steps(self) -> np.ndarray:
+        """Inputs and time at begin, middle and end of each step, ``(steps, 3, inputs + 1, intervals)``."""
         most = int(self._steps.max())
         recording = self.data.recording[self.begins]
-        found = np.empty((most, 3, len(self.model.inputs), len(self.begins)))
+        found = np.empty((most, 3, len(self.model.inputs) + 1, len(self.begins)))
         for step in range(most):
             for stage, part in enumerate((INSIDE, 0.5, 1 - INSIDE)):
                 t = self.data.t[self.begins] + (np.minimum(step, self._steps - 1) + part) * self._h
-                found[step, stage] = self._inputs_at(t, recording)
+                found[step, stage] = self._signals_at(t, recording)
         return found
 
-    def rates(self, x: np.ndarray, u: np.ndarray, values: np.ndarray) -> np.ndarray:
+    def rates(self, x: np.ndarray, signals: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Time derivatives, of the shape of the states; ``values`` is ``(parameters, …)``."""
         with np.errstate(all="ignore"):
-            found = self._rates(*x, *u, *values)
+            found = self._rates(*x, *signals, *values)
             return np.stack([np.broadcast_to(each, x.shape[1:]) for each in found])
 
     def outputs(self, states: np.ndarray, values: np.ndarray) -> np.ndarray:
         """What is measured at the samples, ``(n, m)``, for states ``(n, d)``."""
         with np.errstate(all="ignore"):
-            found = self._outputs(*states.T, *self.at_samples, *values)
+            found = self._outputs(*states.T, *self._at_samples, *values)
         return np.stack([np.broadcast_to(each, len(states)) for each in found], axis=1).astype(float)
 
     def across(
@@ -117,7 +125,7 @@ class Integrator:
         more = (1,) * (x.ndim - 2)
         h, steps = self._h[which].reshape(-1, *more), self._steps[which].reshape(-1, *more)
         for step in range(int(steps.max())):
-            u = self._u[step][:, :, which].reshape(3, len(self.model.inputs), len(which), *more)
+            u = self._signals[step][:, :, which].reshape(3, -1, len(which), *more)
             first = self.rates(x, u[0], values) + force
             second = self.rates(x + h / 2 * first, u[1], values) + force
             third = self.rates(x + h / 2 * second, u[1], values) + force

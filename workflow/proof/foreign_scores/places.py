@@ -90,8 +90,7 @@ def _responses(true: LeastSquares) -> Mapping[tuple[str, str], np.ndarray]:
     along = integrator.sensitivities(values, states)
     by_states, _ = integrator.output_slopes(values, states)
     coordinates = dict(zip(model.states, states.T, strict=True))
-    inputs = integrator.at_samples
-    coordinates |= {each.name: row for each, row in zip(model.inputs, inputs, strict=True)}
+    coordinates |= {each.name: row for each, row in zip(model.inputs, integrator.inputs, strict=True)}
     begins, found = integrator.begins, {}
     for of, course in coordinates.items():
         hats = _hats(course)

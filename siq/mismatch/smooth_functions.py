@@ -1,0 +1,315 @@
+"""Smooth functions without a name, of one coordinate or of two.
+
+A smooth function could be anything. All that is expected of it is that its values are alike where its
+coordinates are, and know nothing of each other far apart: a normal process with the covariance
+``s² exp(-½ Σ ((z_i - z'_i)/ℓ_i)²)`` (Rasmussen and Williams, Gaussian Processes for Machine Learning, MIT
+Press 2006). It is written as a sum of Gaussian bumps as wide as the lengths ℓ, which stand closely where the
+recordings have been; what is expected of their heights is what makes the sum such a process there
+(Quiñonero-Candela and Rasmussen, J. Mach. Learn. Res. 6, 1939 (2005)). A length or so beyond, the function
+goes to zero.
+
+Lengths and size are taken from the recordings (`siq.mismatch.smoothness`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+import scipy.linalg
+import sympy
+
+from siq.dynamics.dynamics import Dynamics, JointExpectation
+from siq.dynamics.formulas import compile_values
+from siq.dynamics.parametric import symbol
+from siq.estimation.measurements import Measurements
+from siq.mismatch.candidates import MechanismCandidate
+from siq.mismatch.function_places import Place
+from siq.mismatch.functions import built, fresh_names, unit_in
+
+CURVE, SURFACE = "curve", "surface"
+# Lengths between neighbours: a sum of bumps then has the variance of the process to 1e-5, that of two
+# coordinates to 4 %.
+APART = 0.5
+ROUNDING = 1e-6  # numerical: of the process's variance, added to it at every bump
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Where a smooth function may stand, and where the recordings have been there.
+
+    Attributes
+    ----------
+    place
+        In which equation, or output; what it is multiplied by there.
+    coordinates
+        What it is a function of: one formula, or two.
+    words
+        The same in words.
+    courses
+        Their values along the recordings, shape ``(c, n)``.
+    """
+
+    place: Place
+    coordinates: tuple[sympy.Expr, ...]
+    words: tuple[str, ...]
+    courses: np.ndarray
+
+    @property
+    def ranges(self) -> np.ndarray:
+        """Of each coordinate, shape ``(c,)``."""
+        return np.ptp(self.courses, axis=1)
+
+    @property
+    def usable(self) -> bool:
+        """Whether every coordinate takes several values, all of them finite."""
+        return bool(np.isfinite(self.courses).all() and (self.ranges > 0).all())
+
+    def along(self, model: Dynamics, data: Measurements, x: np.ndarray) -> Ground:
+        """The same ground where the recordings have been by other states, shape ``(n, d)``."""
+        return replace(self, courses=_courses(self.coordinates, model, data, x))
+
+
+class Smooth(Protocol):
+    """A smooth function with its bumps; see `SmoothFunction`."""
+
+    @property
+    def ground(self) -> Ground:
+        """Where it stands."""
+
+    @property
+    def kind(self) -> str:
+        """What it looks like."""
+
+    @property
+    def width(self) -> int:
+        """The number of bumps."""
+
+    @property
+    def linear(self) -> int:
+        """In how many of its heights, the first ones, it is linear if the others are given."""
+
+    @property
+    def begin(self) -> np.ndarray:
+        """Heights to begin with."""
+
+    @property
+    def limits(self) -> np.ndarray:
+        """Where the recordings have been."""
+
+    def along(self, heights: np.ndarray, courses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The function along courses, and its derivatives by the heights."""
+
+    def formula(self, heights: tuple[sympy.Expr, ...]) -> sympy.Expr:
+        """As a formula, heights being symbols."""
+
+    def expected(self, names: tuple[str, ...]) -> tuple[JointExpectation, ...]:
+        """What is expected of the heights."""
+
+    def units(self, whole: str) -> tuple[str, ...]:
+        """Of the heights, of a function with a unit."""
+
+
+def ground_of(place: Place, model: Dynamics, data: Measurements, x: np.ndarray) -> Ground:
+    """The ground of a function of one coordinate, in a place.
+
+    Parameters
+    ----------
+    place
+        The coordinate's second word, if it has one, is a factor of the function.
+    model, data, x
+        The simulation, the recordings, and the states along them, shape ``(n, d)``.
+    """
+    courses = _courses((place.coordinate,), model, data, x)
+    return Ground(place, (place.coordinate,), place.words[:1], courses)
+
+
+def ground_of_two(
+    target: str, words: tuple[str, str], model: Dynamics, data: Measurements, x: np.ndarray
+) -> Ground:
+    """The ground of a function of two states or inputs, in the equation of a state."""
+    coordinates = tuple(symbol(name) for name in words)
+    place = Place(((target, sympy.Integer(1)),), (), coordinates[0], words, np.empty(0))
+    return Ground(place, coordinates, words, _courses(coordinates, model, data, x))
+
+
+def _courses(
+    coordinates: tuple[sympy.Expr, ...], model: Dynamics, data: Measurements, x: np.ndarray
+) -> np.ndarray:
+    names = (*model.states, *(entry.name for entry in model.inputs), "t")
+    compiled = compile_values(coordinates, [symbol(name) for name in names], common=False)
+    signals = data.signals(data.t, data.recording, delays=())
+    values = compiled(*x.T[: model.dimension], *signals.inputs, signals.t)
+    return np.stack([np.broadcast_to(each, data.t.shape) for each in values])
+
+
+@dataclass(frozen=True)
+class SmoothFunction:
+    """A smooth function as a sum of bumps, and what is expected of it.
+
+    Attributes
+    ----------
+    ground
+        Where it stands, and of what it is a function.
+    centres
+        Of the bumps, shape ``(b, c)``.
+    lengths
+        Over which it changes, and how wide the bumps are, shape ``(c,)``.
+    deviation
+        s, the size that is expected of it.
+    """
+
+    ground: Ground
+    centres: np.ndarray
+    lengths: np.ndarray
+    deviation: float = 1.0
+
+    @property
+    def kind(self) -> str:
+        """What it looks like."""
+        return CURVE if len(self.lengths) == 1 else SURFACE
+
+    @property
+    def equations(self) -> tuple[tuple[str, sympy.Expr], ...]:
+        """What it is multiplied by in each equation in which it stands."""
+        return self.ground.place.equations
+
+    @property
+    def outputs(self) -> tuple[tuple[str, sympy.Expr], ...]:
+        """The same of outputs."""
+        return self.ground.place.outputs
+
+    @property
+    def coordinates(self) -> tuple[sympy.Expr, ...]:
+        """What it is a function of."""
+        return self.ground.coordinates
+
+    @property
+    def width(self) -> int:
+        """The number of bumps."""
+        return len(self.centres)
+
+    @property
+    def linear(self) -> int:
+        """In how many of its heights it is linear: in all of them."""
+        return self.width
+
+    @property
+    def begin(self) -> np.ndarray:
+        """Heights to begin with, shape ``(b,)``."""
+        return np.zeros(self.width)
+
+    def along(self, heights: np.ndarray, courses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The function along courses ``(c, n)``, ``(n,)``, and its derivatives by the heights, ``(n, b)``."""
+        values = self.values(courses)
+        return heights @ values, values.T
+
+    def formula(self, heights: tuple[sympy.Expr, ...]) -> sympy.Expr:
+        """The sum of its bumps, heights being symbols."""
+        return sympy.Add(
+            *(height * self._bump(centre) for height, centre in zip(heights, self.centres, strict=True))
+        )
+
+    def _bump(self, centre: np.ndarray) -> sympy.Expr:
+        away = [
+            ((z - _number(at)) / _number(length)) ** 2
+            for z, at, length in zip(self.coordinates, centre, self.lengths, strict=True)
+        ]
+        return sympy.exp(-sympy.Add(*away) / 2)
+
+    def units(self, whole: str) -> tuple[str, ...]:
+        """Of the heights, of a function with a unit."""
+        return (whole,) * self.width
+
+    def expected(self, names: tuple[str, ...]) -> tuple[JointExpectation, ...]:
+        """What is expected of the heights, by their names."""
+        return (JointExpectation(names, self.triangle.T / self.deviation),)
+
+    def values(self, courses: np.ndarray) -> np.ndarray:
+        """Every bump along courses ``(c, n)`` of the coordinates, shape ``(b, n)``."""
+        return np.exp(-0.5 * _squares(courses.T / self.lengths, self.centres / self.lengths)).T
+
+    @cached_property
+    def triangle(self) -> np.ndarray:
+        """Lower triangle L of the process's covariance at the centres over s², shape ``(b, b)``."""
+        return triangle_of(self.centres, self.lengths)
+
+    def heights_of(self, values: np.ndarray) -> np.ndarray:
+        """The heights with which it has given values ``(b,)`` at its centres."""
+        return scipy.linalg.cho_solve((self.triangle, True), values)
+
+    @property
+    def limits(self) -> np.ndarray:
+        """Where the recordings have been: lower and upper, shape ``(2, c)``."""
+        return np.stack([self.ground.courses.min(axis=1), self.ground.courses.max(axis=1)])
+
+
+def smooth_function(
+    ground: Ground, shares: tuple[float, ...], *, deviation: float = 1.0, most: int | None = None
+) -> SmoothFunction:
+    """A smooth function with its bumps where the recordings have been.
+
+    Parameters
+    ----------
+    ground
+        Where it stands.
+    shares
+        Its lengths, as shares of the coordinates' ranges.
+    deviation
+        The size that is expected of it.
+    most
+        So many bumps at most; those left out are nearest to others.
+    """
+    lengths = np.array(shares) * ground.ranges
+    if len(shares) == 1:
+        lower, upper = ground.courses.min(), ground.courses.max()
+        centres = np.linspace(lower, upper, int(np.ceil(1 / (APART * shares[0]))) + 1)[:most, None]
+    else:
+        apart = APART * np.sqrt(len(shares))
+        scaled = ground.courses / lengths[:, None]
+        centres = ground.courses[:, spread_out(scaled, apart=apart, most=most)].T
+    return SmoothFunction(ground, centres, lengths, deviation)
+
+
+def spread_out(points: np.ndarray, *, apart: float, most: int | None = None) -> np.ndarray:
+    """Indices of points ``(c, n)`` that are so far apart, beginning in their middle."""
+    away = np.full(points.shape[1], np.inf)
+    chosen = [int(np.argmin(((points - np.median(points, axis=1)[:, None]) ** 2).sum(axis=0)))]
+    while most is None or len(chosen) < most:
+        away = np.minimum(away, ((points - points[:, chosen[-1:]]) ** 2).sum(axis=0))
+        farthest = int(np.argmax(away))
+        if away[farthest] < apart**2:
+            break
+        chosen.append(farthest)
+    return np.array(chosen)
+
+
+def with_smooth_function(model: Dynamics, function: Smooth) -> MechanismCandidate:
+    """The simulation with a smooth function, as it begins; the heights of its bumps are the amplitudes."""
+    place = function.ground.place
+    names = tuple(fresh_names("b", function.width, model))
+    factors = len(place.words) - len(function.ground.words)
+    units = function.units(unit_in(place, model, 0, factors))
+    candidate = built(model, place, function.formula(tuple(map(symbol, names))), names, units)
+    together = (*candidate.model.expected_together, *function.expected(names))
+    known = dict(zip(names, function.begin, strict=True))
+    values = [known.get(each.name, each.value) for each in candidate.model.parameters]
+    begun = replace(candidate.model, expected_together=together).with_values(np.array(values))
+    return replace(candidate, model=begun)
+
+
+def triangle_of(points: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+    """Lower triangle of the covariance of a process of unit size at points ``(b, c)``, shape ``(b, b)``."""
+    likeness = np.exp(-0.5 * _squares(points / lengths, points / lengths))
+    return np.linalg.cholesky(likeness + ROUNDING * np.eye(len(points)))
+
+
+def _number(value: float) -> sympy.Expr:
+    return sympy.Float(float(f"{value:.6g}"))
+
+
+def _squares(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Squared distances of points ``(n, c)`` and ``(b, c)``, shape ``(n, b)``."""
+    return ((one[:, None, :] - other[None, :, :]) ** 2).sum(axis=2)
