@@ -58,10 +58,14 @@ class JointExpectation:
         Of the parameters.
     roots
         Shape ``(r, k)``; the inverse of their covariance is ``roots.T @ roots``.
+    weight
+        How often it counts against the data: of errors that hang together over τ samples, n count as n/τ, and
+        a fit that takes them for independent has to count what it expects τ times.
     """
 
     names: tuple[str, ...]
     roots: np.ndarray
+    weight: float = 1.0
 
 
 COMPILED = ("functions", "delays", "_lags")

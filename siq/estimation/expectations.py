@@ -46,9 +46,10 @@ class Expectations:
             mine = [place for place, name in enumerate(each.names) if name in free]
             if mine:
                 rows.append(np.zeros((len(each.roots), len(free))))
-                rows[-1][:, [free[each.names[place]] for place in mine]] = each.roots[:, mine]
+                roots = np.sqrt(each.weight) * each.roots
+                rows[-1][:, [free[each.names[place]] for place in mine]] = roots[:, mine]
                 known = [0.0 if name in free else values[name] for name in each.names]
-                middle.append(-each.roots @ np.array(known))
+                middle.append(-roots @ np.array(known))
         return cls(np.concatenate(rows), np.concatenate(middle))
 
     def deviations(self, values: np.ndarray) -> np.ndarray:

@@ -3,8 +3,10 @@
 A mechanism may be right although more is missing that no entry of the dictionary does. Two explanations are
 then fitted in earnest, each with a function for the rest: the mechanism and a function on top of it, against
 a function in its place and another on top of that. Neither is all of it, and the errors that both leave hang
-together over time; they count as so many as are independent (`siq.mismatch.evidence`). Where random forces
-still have to stand in for something, the rest has no model, and nobody can say.
+together over time; they count as so many as are independent (`siq.mismatch.evidence`). How many these are is
+known roughly, so that the odds may decide nothing. Parts of the recordings that are left out then tell which
+of the two foresees. Where random forces still have to stand in for something, the rest has no model, and
+nobody can say.
 """
 
 from __future__ import annotations
@@ -17,9 +19,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from siq.estimation.estimation import Fit
+from siq.estimation.measurements import Measurements
 from siq.mismatch.candidates import MechanismCandidate
 from siq.mismatch.evidence import correlation_time_left, log_evidence_of
 from siq.mismatch.fitted_functions import with_a_function
+from siq.mismatch.held_out_errors import change_between, in_blocks
+from siq.mismatch.left_out import errors_left_out
 from siq.mismatch.nameless_models import Material, Model, runs_freely
 from siq.mismatch.trials import TriedMechanism, admissible
 
@@ -39,11 +44,15 @@ class BesideARemainder:
         Functions on top of the mechanism.
     instead
         Functions in its place, alone and with another on top.
+    foresees
+        Whether an explanation with the mechanism foresees parts left out better than every one without it, by
+        more than appears by chance; asked only where the odds decide nothing.
     """
 
     log_odds: float
     on_top: tuple[Model, ...]
     instead: tuple[Model, ...]
+    foresees: bool = False
 
 
 def beside_a_remainder(
@@ -53,6 +62,7 @@ def beside_a_remainder(
     *,
     considered: Sequence[MechanismCandidate],
     unnamed: float,
+    least: float,
 ) -> BesideARemainder | None:
     """Hold a mechanism against functions in its place, whatever else is missing being a function for both.
 
@@ -68,6 +78,8 @@ def beside_a_remainder(
         The mechanisms that could have been named.
     unnamed
         Probability beforehand that what is missing has no name.
+    least
+        Logarithm of the odds that decide.
 
     Returns
     -------
@@ -108,4 +120,19 @@ def beside_a_remainder(
         "%s beside a function: log-odds %.1f, errors correlated over %.1f samples",
         trial.candidate.label, log_odds, correlated,
     )  # fmt: skip
-    return BesideARemainder(log_odds, tuple(on_top), tuple(instead))
+    foresees = False
+    if abs(log_odds) < least:
+        errors = [
+            min(known, key=np.mean, default=None)
+            for known in (_left_out(models, recalibrated, data) for models in (theirs, ours))
+        ]
+        blocks = [None if each is None else in_blocks(each) for each in errors]
+        foresees = None not in blocks and change_between(*blocks) == "better"
+        LOGGER.info("parts left out are foreseen better with it: %s", foresees)
+    return BesideARemainder(log_odds, tuple(on_top), tuple(instead), foresees)
+
+
+def _left_out(models: Sequence[Model], recalibrated: Fit, data: Measurements) -> list[np.ndarray]:
+    """Squared errors on parts left out, of each model that does not run away there."""
+    errors = (errors_left_out(each.fit, data, noise=recalibrated.noise) for each in models)
+    return [each for each in errors if each is not None]

@@ -104,7 +104,7 @@ def _function(asked: Smoothness, ground: Ground, *, product: bool, times: float)
     if product:
         return likeliest_product(asked, ground, times=times)
     shares = tuple(times * share for share in asked.shares)
-    return smooth_function(ground, shares, deviation=asked.deviation)
+    return smooth_function(ground, shares, deviation=asked.deviation, weight=asked.told.correlated)
 
 
 def with_surfaces(fit: Fit, models: Sequence[Model], material: Material) -> list[Model]:

@@ -75,7 +75,7 @@ def errors_left_out(fit: Fit, learned: Measurements, *, noise: Noise) -> np.ndar
     Returns
     -------
     numpy.ndarray or None
-        One part behind the other, shape ``(values,)``; None where a fit does not settle, or a simulation runs
+        One part behind the other, shape ``(values,)``; None where a fit has no result, or a simulation runs
         away.
     """
     squares = []
@@ -89,7 +89,8 @@ def errors_left_out(fit: Fit, learned: Measurements, *, noise: Noise) -> np.ndar
         except NumericalFailure:
             return None
         own = squared_errors(part.out.outputs, run)
-        if own is None or not again.converged:
+        # One that does not quite settle, as where a reading is cut off, is judged by what it foresees.
+        if own is None or again.fault:
             return None
         squares.append(own)
     return np.concatenate(squares)

@@ -93,9 +93,10 @@ def names_of(
         > -options.least_log_odds
     ):
         beside = beside_a_remainder(
-            whole.found[0].best, whole.recalibrated, material, considered=candidates, unnamed=options.unnamed
-        )
-    if beside is not None and beside.log_odds >= options.least_log_odds:
+            whole.found[0].best, whole.recalibrated, material,
+            considered=candidates, unnamed=options.unnamed, least=options.least_log_odds,
+        )  # fmt: skip
+    if beside is not None and (beside.log_odds >= options.least_log_odds or beside.foresees):
         naming = named_beside_a_remainder(naming, whole, left[0], beside)
         given, remarks = True, (f"{remains(naming.left)} {NAMELESS}",)
     named = naming.search

@@ -92,6 +92,7 @@ def product_of(
     gram: np.ndarray,
     overlap: np.ndarray,
     deviation: float,
+    weight: float = 1.0,
 ) -> ProductFunction:
     """The likeliest product, whose lengths may be any of several.
 
@@ -106,8 +107,9 @@ def product_of(
     gram, overlap
         Of what these values do to the innovations, in units of noise, with each other and with the
         innovations: shapes ``(z, z)`` and ``(z,)``.
-    deviation
-        The size that is expected of the product.
+    deviation, weight
+        The size that is expected of the product, and how often that counts against the data
+        (`siq.dynamics.dynamics.JointExpectation`).
     """
     grounds = [
         Ground(ground.place, (ground.coordinates[side],), (ground.words[side],), ground.courses[side, None])
@@ -115,7 +117,7 @@ def product_of(
     ]
     bases = []
     for side, own in enumerate(grounds):
-        functions = [smooth_function(own, (share,)) for share in shares]
+        functions = [smooth_function(own, (share,), weight=weight) for share in shares]
         along = [(each.triangle, each.values(points[:, side, None].T)) for each in functions]
         independent = [scipy.linalg.solve_triangular(*each, lower=True) for each in along]
         bases.append(list(zip(functions, independent, strict=True)))

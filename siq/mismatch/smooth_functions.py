@@ -159,12 +159,15 @@ class SmoothFunction:
         Over which it changes, and how wide the bumps are, shape ``(c,)``.
     deviation
         s, the size that is expected of it.
+    weight
+        See `siq.dynamics.dynamics.JointExpectation`.
     """
 
     ground: Ground
     centres: np.ndarray
     lengths: np.ndarray
     deviation: float = 1.0
+    weight: float = 1.0
 
     @property
     def kind(self) -> str:
@@ -225,7 +228,7 @@ class SmoothFunction:
 
     def expected(self, names: tuple[str, ...]) -> tuple[JointExpectation, ...]:
         """What is expected of the heights, by their names."""
-        return (JointExpectation(names, self.triangle.T / self.deviation),)
+        return (JointExpectation(names, self.triangle.T / self.deviation, self.weight),)
 
     def values(self, courses: np.ndarray) -> np.ndarray:
         """Every bump along courses ``(c, n)`` of the coordinates, shape ``(b, n)``."""
@@ -247,7 +250,12 @@ class SmoothFunction:
 
 
 def smooth_function(
-    ground: Ground, shares: tuple[float, ...], *, deviation: float = 1.0, most: int | None = None
+    ground: Ground,
+    shares: tuple[float, ...],
+    *,
+    deviation: float = 1.0,
+    weight: float = 1.0,
+    most: int | None = None,
 ) -> SmoothFunction:
     """A smooth function with its bumps where the recordings have been.
 
@@ -257,8 +265,8 @@ def smooth_function(
         Where it stands.
     shares
         Its lengths, as shares of the coordinates' ranges.
-    deviation
-        The size that is expected of it.
+    deviation, weight
+        See `SmoothFunction`.
     most
         So many bumps at most; those left out are nearest to others.
     """
@@ -270,7 +278,7 @@ def smooth_function(
         apart = APART * np.sqrt(len(shares))
         scaled = ground.courses / lengths[:, None]
         centres = ground.courses[:, spread_out(scaled, apart=apart, most=most)].T
-    return SmoothFunction(ground, centres, lengths, deviation)
+    return SmoothFunction(ground, centres, lengths, deviation, weight)
 
 
 def spread_out(points: np.ndarray, *, apart: float, most: int | None = None) -> np.ndarray:

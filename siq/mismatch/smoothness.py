@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +18,8 @@ from siq.estimation.estimation import Fit
 from siq.estimation.innovations import Whitened, profile_likelihood, whiten
 from siq.estimation.linearisation import Grid
 from siq.estimation.measurements import Measurements
-from siq.mismatch.evidence import evidences_by_size
+from siq.mismatch.clusters import correlation_time_of
+from siq.mismatch.evidence import evidences_by_size, orthonormal
 from siq.mismatch.function_places import NUMBERS, PlaceColumns
 from siq.mismatch.nameless_models import Part
 from siq.mismatch.product_functions import ProductFunction, product_of
@@ -43,9 +43,11 @@ class Told:
         Relative to the random forces of the fit.
     fine
         The function, with bumps as narrow as any.
+    correlated
+        Correlation time τ of the innovations in samples, with such a function: n of them count as n/τ.
     gram, overlap
         Of what a unit of each bump does to the innovations, with each other and with the innovations; shapes
-        ``(b, b)`` and ``(b,)``.
+        ``(b, b)`` and ``(b,)``. Over τ, as are those that follow.
     total, freedom
         Sum of squares of the innovations, and degrees of freedom.
     likelihood
@@ -54,11 +56,19 @@ class Told:
 
     level: float
     fine: SmoothFunction
+    correlated: float
     gram: np.ndarray
     overlap: np.ndarray
     total: float
-    freedom: int
+    freedom: float
     likelihood: float
+
+    def over(self, correlated: float) -> Told:
+        """The same where so many samples hang together."""
+        return Told(
+            self.level, self.fine, correlated, self.gram / correlated, self.overlap / correlated,
+            self.total / correlated, self.freedom / correlated, self.likelihood / correlated,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -157,13 +167,19 @@ def likeliest_product(asked: Smoothness, ground: Ground, *, times: float = 1.0) 
         gram=(by_value + by_value.T) / (2 * asked.noise),
         overlap=told.fine.heights_of(told.overlap) / asked.noise,
         deviation=asked.deviation,
+        weight=told.correlated,
     )
 
 
-def _told(fit: Fit, data: Measurements, fine: SmoothFunction, known: Part | None) -> Iterator[Told]:
-    """What is told at each level of random forces at which it can be worked out."""
+def _told(fit: Fit, data: Measurements, fine: SmoothFunction, known: Part | None) -> list[Told]:
+    """What is told at each level of random forces at which it can be worked out.
+
+    Errors are as correlated as the likeliest level leaves them with such a function, at all levels.
+    """
     grid = Grid(data, fit.substeps if known else min(fit.substeps, SUBSTEPS))
     response = probe_response(fit.model, grid, fit, PlaceColumns(fit.model, grid, [fine]))
+    found: list[Told] = []
+    highest, correlated = -np.inf, 1.0
     for level in LEVELS if fit.has_process_noise else (1.0,):
         try:
             white = whiten(response, data, fit.noise.scaled(level))
@@ -174,7 +190,16 @@ def _told(fit: Fit, data: Measurements, fine: SmoothFunction, known: Part | None
             continue
         total, freedom = float(left @ left), white.degrees_of_freedom - parameters
         likelihood = profile_likelihood(total, freedom, white.log_determinant)
-        yield Told(level, fine, columns.T @ columns, columns.T @ left, total, freedom, likelihood)
+        found.append(
+            Told(level, fine, 1.0, columns.T @ columns, columns.T @ left, total, freedom, likelihood)
+        )
+        basis = orthonormal(columns)
+        rest = left - basis @ (basis.T @ left)
+        likelihood = profile_likelihood(float(rest @ rest), freedom, white.log_determinant)
+        if likelihood > highest:
+            highest = likelihood
+            correlated = correlation_time_of(rest, white.recording, outputs=len(fit.model.outputs))
+    return [each.over(correlated) for each in found]
 
 
 def _finest(ground: Ground, data: Measurements, model: Dynamics) -> tuple[float, SmoothFunction]:

@@ -88,24 +88,36 @@ def trial_of(fit: SimpleNamespace) -> SimpleNamespace:
 
 def fit_of(evidence: float, *, forces: bool = False, dimension: int = 1) -> SimpleNamespace:
     model = SimpleNamespace(dimension=dimension, parameters=(), free=())
-    return SimpleNamespace(evidence=evidence, has_process_noise=forces, model=model)
+    return SimpleNamespace(evidence=evidence, has_process_noise=forces, model=model, noise=None)
 
 
 @pytest.mark.parametrize(
-    ("on_top", "instead", "pairs", "given"),
+    ("on_top", "instead", "pairs", "given", "foreseen"),
     [
-        (30.0, 10.0, 20.0, True),
+        (30.0, 10.0, 20.0, True, 0.5),
         # Another function in its place does as well, and so does one alone.
-        (30.0, 10.0, 30.0, False),
-        (30.0, 27.0, 20.0, False),
+        (30.0, 10.0, 30.0, False, 0.5),
+        (30.0, 27.0, 20.0, False, 0.5),
         # Nothing is likelier on top of it than nothing; alone it is not likely enough.
-        (0.0, 10.0, 15.0, False),
+        (0.0, 10.0, 15.0, False, 0.5),
+        # Where the odds decide nothing, parts left out do: foreseen with it better, worse, or not at all.
+        (30.0, 10.0, 30.0, False, 2.0),
+        (30.0, 10.0, 30.0, False, None),
     ],
 )
 def test_a_name_stands_beside_a_rest_where_no_function_does_as_well_in_its_place(
-    on_top: float, instead: float, pairs: float, given: bool, monkeypatch: pytest.MonkeyPatch
+    on_top: float,
+    instead: float,
+    pairs: float,
+    given: bool,
+    foreseen: float | None,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     own, base = fit_of(12.0), fit_of(0.0)
+    draw = np.random.default_rng(2)
+    known = {id(own): None if foreseen is None else squares(draw, foreseen)}
+    without = squares(draw, 1.0)
+    monkeypatch.setattr(beside, "errors_left_out", lambda fit, *_, **__: known.get(id(fit), without))
     part = SimpleNamespace(cost=1.0)
 
     def functions(parts: tuple, fit: SimpleNamespace, _: object) -> list[Model]:
@@ -119,19 +131,25 @@ def test_a_name_stands_beside_a_rest_where_no_function_does_as_well_in_its_place
     monkeypatch.setattr(beside, "log_evidence_of", lambda fit, *_, **__: fit.evidence)
     material = SimpleNamespace(data=None)
     considered = [SimpleNamespace(name=name) for name in ("overflow", "overflow", "leak")]
-    found = beside_a_remainder(trial_of(own), base, material, considered=considered, unnamed=0.1)
+    found = beside_a_remainder(trial_of(own), base, material, considered=considered, unnamed=0.1, least=2.9)
     # Each function costs what it was chosen among, and the probability that something has no name.
     cost = 1.0 + np.log(10)
     best = max(on_top - cost if on_top else 0.0, 12.0)
     expected = best + np.log(0.9) - np.log(2 * 2) - max(instead - cost, pairs - 2 * cost)
     assert found is not None and found.log_odds == pytest.approx(expected)
     assert bool(found.log_odds >= np.log(19)) is given
+    undecided = abs(found.log_odds) < 2.9
+    # Functions on top of the mechanism foresee as badly as those in its place here.
+    assert found.foresees is (undecided and foreseen == 0.5)
 
 
 def test_what_random_forces_stand_in_for_has_no_model_beside_which_a_name_could_stand() -> None:
     material = Material(SimpleNamespace(), SimpleNamespace(), 3, 10, 5)
     for fit in (fit_of(50.0, forces=True), fit_of(50.0, dimension=2)):
-        assert beside_a_remainder(trial_of(fit), fit_of(0.0), material, considered=(), unnamed=0.1) is None
+        assert (
+            beside_a_remainder(trial_of(fit), fit_of(0.0), material, considered=(), unnamed=0.1, least=2.9)
+            is None
+        )
 
 
 def decays(count: int, samples: int, *, rate: float = 1.0) -> Measurements:
