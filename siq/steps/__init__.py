@@ -31,6 +31,7 @@ overview                which landscape does the page open with?
 collect                 what do all runs say together?
 reference               what do methods say of a card that share nothing with ours?
 landscape_errors        how far are the landscapes from these references?
+beside_equations        and how far from the landscape of the card's own equations?
 escapes                 does a direct simulation leave the wells as the law says?
 invariant               which invariant distribution follows, and is it that of a long simulation?
 pipeline                all of a run, in memory

@@ -116,6 +116,18 @@ COLUMNS: Mapping[str, Mapping[str, str]] = {
         "error": "float64",
         "error_everywhere": "float64",
     },
+    "beside_equations": {
+        "run": "int64",
+        "item": "str",
+        "quantity": "str",
+        "noise": "float64",
+        "equations": "float64",
+        "trajectories": "float64",
+        "standard_error": "float64",
+        "relative_difference": "float64",
+        "in_errors": "float64",
+        "note": "str",
+    },
     "sweep": {
         "value": "float64",
         "second_value": "float64",
