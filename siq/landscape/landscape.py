@@ -353,7 +353,7 @@ class Landscape:
         return table.astype({"start": int, "end": "Int64", "mean_time": float})
 
     def beside(self, equations: Landscape, *, noise: float | None = None) -> pd.DataFrame:
-        """Barriers, prefactors and mean times that trajectories show beside those of the equations behind them.
+        """Barriers, prefactors and mean times of trajectories beside those of the equations behind them.
 
         Parameters
         ----------
