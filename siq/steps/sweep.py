@@ -17,6 +17,7 @@ import numpy as np
 import pandas as pd
 from pydantic.dataclasses import dataclass
 
+from siq.dynamics.bifurcation_curves import BifurcationCurve
 from siq.dynamics.cards import load_system
 from siq.dynamics.continuation import Branches, follow_branches
 from siq.dynamics.dynamics import Dynamics
@@ -27,6 +28,7 @@ from siq.landscape.dwell_times import NoiseStrength, dwell_time
 from siq.landscape.ensembles import shares_by_rates
 from siq.landscape.options import LandscapeOptions
 from siq.steps.settings import STRICT
+from siq.steps.sweep_maps import curve_notes, curve_rows, curves_of_map
 from siq.steps.sweep_points import PointSettings, SweptPoint, check_noise, point_at
 from siq.steps.sweep_wells import Wells, bifurcation_rows, position_text
 from siq.study.sweep import SweepOptions
@@ -79,6 +81,9 @@ class Sweep:
         What could not be done, in words.
     units
         Of the states, by name; of the time as ``t``, and of the parameters by their names.
+    curves
+        Of two parameters, the curves of folds and of Hopf points in their plane, a row for each point; empty
+        for one.
     """
 
     parameters: tuple[str, ...]
@@ -89,14 +94,15 @@ class Sweep:
     bifurcations: pd.DataFrame
     notes: tuple[str, ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
+    curves: pd.DataFrame = field(default_factory=lambda: as_table("bifurcation_curves", []))
 
     def plot(self) -> Figure:
-        """Equilibria, barriers and times against the parameter; of two parameters, a map of barriers."""
+        """Equilibria, barriers and times against the parameter; of two, a map with its curves."""
         from siq.report.plots.sweep import plot_sweep
 
         return plot_sweep(
             self.table, self.branches, self.bifurcations, parameters=self.parameters, states=self.states,
-            units=self.units,
+            units=self.units, curves=self.curves,
         )  # fmt: skip
 
     def __repr__(self) -> str:
@@ -192,10 +198,10 @@ def check_names(system: Dynamics, names: Iterable[str]) -> None:
 
 
 def write_tables(found: Sweep, files: Mapping[str, str | Path]) -> None:
-    """Write ``sweep``, ``sweep_ways``, ``branches`` and ``bifurcations``."""
+    """Write ``sweep``, ``sweep_ways``, ``branches``, ``bifurcations`` and ``bifurcation_curves``."""
     tables = {
         "sweep": found.table, "sweep_ways": found.ways, "branches": found.branches,
-        "bifurcations": found.bifurcations,
+        "bifurcations": found.bifurcations, "bifurcation_curves": found.curves,
     }  # fmt: skip
     for name, path in files.items():
         write_table(path, tables[name])
@@ -220,16 +226,20 @@ def collected(
     points = sorted(points, key=lambda point: point.values)
     notes: list[str] = []
     branches: Branches | None = None
+    curves: list[BifurcationCurve] = []
     values = [point.values[0] for point in points]
     if len(names) == 1 and min(values) < max(values):
         limits = (min(values), max(values))
         seeds = [(point.values[0], np.array(one)) for point in points for one in point.equilibria]
         branches = follow_branches(system, names[0], limits, seeds)
         notes += branches.notes
-        wells = Wells.along(ParameterFamily(system, names[0], limits), branches)
+        wells = Wells.along(ParameterFamily(system, {names[0]: limits}), branches)
         numbers = [wells.numbers(point) for point in points]
     else:
         numbers = [tuple(range(len(point.wells))) for point in points]
+    if len(names) == MOST_PARAMETERS:
+        curves = curves_of_map(system, names, points)
+        notes += curve_notes(names, curves)
     rows, ways = [], []
     for point, number in zip(points, numbers, strict=True):
         rows += _rows(point, number, noise)
@@ -240,7 +250,7 @@ def collected(
         names, system.states, as_table("sweep", rows), as_table("sweep_ways", ways),
         as_table("branches", [] if branches is None else wells.branch_rows()),
         as_table("bifurcations", [] if branches is None else bifurcation_rows(branches)),
-        tuple(dict.fromkeys(notes)), units,
+        tuple(dict.fromkeys(notes)), units, as_table("bifurcation_curves", curve_rows(curves)),
     )  # fmt: skip
 
 

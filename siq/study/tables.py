@@ -169,6 +169,14 @@ COLUMNS: Mapping[str, Mapping[str, str]] = {
         "frequency": "float64",
         "residual": "float64",
     },
+    "bifurcation_curves": {
+        "curve": "int64",
+        "kind": "str",
+        "value": "float64",
+        "second_value": "float64",
+        "position": "str",
+        "frequency": "float64",
+    },
     "escape": {
         "transition": "str",
         "intensity": "float64",

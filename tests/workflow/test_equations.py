@@ -88,7 +88,7 @@ def test_another_range_computes_new_points_only(fresh_project):
     assert before.items() < after.items() and set(after) == {"h=0.25.json", "h=0.json", "h=0.5.json"}
     tables = {
         name: pd.read_parquet(fresh_project.path(f"results/mini/tables/{name}.parquet"))
-        for name in ("sweep", "sweep_ways", "branches", "bifurcations")
+        for name in ("sweep", "sweep_ways", "branches", "bifurcations", "bifurcation_curves")
     }
     for name, table in tables.items():
         assert list(table.columns) == list(COLUMNS[name]) and len(table)
