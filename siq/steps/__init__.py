@@ -24,6 +24,7 @@ landscape               which wells, barriers and ways are there?
 equations               what landscape have equations alone?
 sweep_points            which wells and ways have they at other values of their parameters?
 sweep_wells             which of their attractors are one and the same well?
+sweep_rows              how deep are these, and how long do they last?
 sweep_maps              along which curves do they fold in the plane of two parameters?
 sweep                   and what is seen against a control parameter, or two?
 tipping                 how likely has a well been left while the parameter drifts?

@@ -8,8 +8,9 @@ from siq.dynamics.cards import load_system
 from siq.dynamics.dynamics import Dynamics
 from siq.errors import InputError
 from siq.landscape.landscape import Landscape
-from siq.steps.sweep import ALONE, Sweep, collected, sweep
+from siq.steps.sweep import Sweep, collected, sweep
 from siq.steps.sweep_points import PointSettings, point_at, read_point, with_parameters, write_point
+from siq.steps.sweep_rows import ALONE
 
 h, a, x, y = sympy.symbols("h a x y", real=True)
 FOLD = 2 / (3 * np.sqrt(3))
