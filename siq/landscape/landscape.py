@@ -358,7 +358,8 @@ class Landscape:
         Parameters
         ----------
         equations
-            From `from_equations`, of the same states, and with the same D.
+            From `from_equations`, of the same states. U is in the unit of D, which has to be the same: tell
+            the recordings that of the equations (`siq.steps.settings.StateSpace`), or read ΔU/ε of both.
         noise
             ε for which mean times are compared; left out, none are.
 
