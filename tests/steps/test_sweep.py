@@ -100,6 +100,17 @@ def test_a_second_parameter_gives_a_map():
     assert found.branches.empty and found.bifurcations.empty
 
 
+def test_the_curves_of_a_map_are_found_between_its_values():
+    brusselator = Dynamics.of(
+        (x, y), (a - (h + 1) * x + x**2 * y, h * x - x**2 * y), domain=[(0.1, 5), (0.1, 5)],
+        parameters={a: 1.0, h: 2.0},
+    )  # fmt: skip
+    curves = sweep(brusselator, "a", [0.8, 1.2], second=("h", [1.2, 3.0])).curves
+    assert set(curves["kind"]) == {"Hopf"} and set(curves["curve"]) == {0}
+    assert curves["second_value"].to_numpy() == pytest.approx(1 + curves["value"].to_numpy() ** 2, abs=1e-9)
+    assert curves["frequency"].to_numpy() == pytest.approx(curves["value"].to_numpy(), abs=1e-9)
+
+
 def test_parameters_in_d_follow_from_the_card(write):
     """D = s²: U and its barriers are as 1/s², at every value."""
     card = write(CARD, "tilted.yaml")
