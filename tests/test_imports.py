@@ -45,6 +45,7 @@ UPWARDS: frozenset[tuple[str, str]] = frozenset(
         ("siq.data.inspection", "siq.report.plots.inspection"),
         ("siq.landscape.landscape", "siq.report.landscape_text"),
         ("siq.landscape.landscape", "siq.report.plots.quasipotential"),
+        ("siq.landscape.landscape", "siq.steps.beside_equations"),
         ("siq.landscape.landscape", "siq.steps.equations"),
         ("siq.landscape.landscape", "siq.steps.outcomes"),
         ("siq.landscape.landscape", "siq.steps.pipeline"),

@@ -23,6 +23,7 @@
 `equilibrium_search`  where do given equations rest in their domain?
 `continuation`        and where when a parameter changes?
 `bifurcations`        where do equilibria fold, begin to oscillate, or meet others?
+`bifurcation_curves`  and along which curves, against two parameters?
 `parameter_family`    what is f against one of its parameters?
 `edge_tracking`       which saddle lies between two attractors, in many states?
 `many_states`         and which attractors and saddles have equations of many states?

@@ -14,12 +14,18 @@ import numpy as np
 
 from siq.dynamics.bifurcations import Bifurcation, bifurcations_between, distinct
 from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.parameter_family import BranchPoint, ParameterFamily, corrected, pinned, point_on
+from siq.dynamics.parameter_family import (
+    BranchPoint,
+    ParameterFamily,
+    corrected,
+    outside,
+    pinned,
+    point_on,
+)
 
 LONGEST = 0.01  # step along a branch: a curve of a hundred chords looks smooth
 SHORTEST = 1e-9  # a branch that asks for shorter steps is given up
 BENT = 0.98  # least cosine of the angle between the tangents of a step's ends: 11 degrees
-EDGE = 1e-6  # by which a branch may run outside the domain: as equilibria are sought
 SAME = 1e-6  # closer points are one
 MOST_POINTS = 20_000  # of one branch, a guard
 
@@ -101,13 +107,13 @@ def follow_branches(
     >>> [(one.kind, round(one.value, 10)) for one in found.bifurcations]
     [('fold', -0.3849001795), ('fold', 0.3849001795)]
     """
-    family = ParameterFamily(dynamics, parameter, limits)
+    family = ParameterFamily(dynamics, {parameter: limits})
     branches: list[Branch] = []
     found: list[Bifurcation] = []
     notes: list[str] = []
     for value, state in seeds:
         start = pinned(family, family.shares(np.atleast_2d(state), np.array([value]))[0], family.d)
-        if start is None or _outside(start) is not None:
+        if start is None or outside(start) is not None:
             continue
         if any(place_on(family, branch, start) is not None for branch in branches):
             continue
@@ -140,13 +146,6 @@ def place_on(family: ParameterFamily, branch: Branch, z: np.ndarray) -> int | No
     return None
 
 
-def _outside(z: np.ndarray) -> int | None:
-    """Which component lies furthest outside its range, None where none does."""
-    beyond = np.abs(z - 0.5) - 0.5
-    worst = int(beyond.argmax())
-    return worst if beyond[worst] > EDGE else None
-
-
 def _both_ways(family: ParameterFamily, start: np.ndarray) -> tuple[list[BranchPoint], str]:
     """A branch from end to end through a point, and what stopped it before its end, in words."""
     ahead = np.append(np.zeros(family.d), 1.0)
@@ -172,7 +171,7 @@ def _one_way(family: ParameterFamily, start: BranchPoint) -> tuple[list[BranchPo
             if length < SHORTEST:
                 return points, False, "could not be followed to its end"
             continue
-        if (component := _outside(new.z)) is not None:
+        if (component := outside(new.z)) is not None:
             points += _last_point(family, last, new, component)
             return points, False, ""
         points.append(new)

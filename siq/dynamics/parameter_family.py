@@ -1,6 +1,6 @@
-"""What is f against one of its parameters, and how is a point found at which it vanishes?
+"""What is f against some of its parameters, and how is a point found at which it vanishes?
 
-All lengths are shares of the domain of each state and of the range of the parameter λ. A point of a branch
+All lengths are shares of the domain of each state and of the range of each parameter λ. A point of a branch
 ``f(x(s), λ(s)) = 0`` is found by Newton's method across a tangent, which passes folds as well as anything.
 
 References
@@ -10,7 +10,7 @@ H. B. Keller, in Applications of Bifurcation Theory (1977) 359: pseudo-arclength
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,19 +22,18 @@ from siq.dynamics.parametric import symbol
 
 NEWTON_STEPS = 12
 CONVERGED = 1e-12  # last step of Newton's method, numerical
+EDGE = 1e-6  # by which a branch may run outside the domain: as equilibria are sought
 
 
 class ParameterFamily:
-    """f against one of its parameters, in shares of the domain and of the range.
+    """f against some of its parameters, in shares of the domain and of their ranges.
 
     Parameters
     ----------
     dynamics
-        f with its domain and parameters.
-    parameter
-        Name of the parameter.
+        f with its domain and parameters; those that are not named have their values.
     limits
-        The range of its values, lower before upper.
+        For each parameter by its name the range of its values, lower before upper.
 
     Raises
     ------
@@ -42,45 +41,47 @@ class ParameterFamily:
         When there is no such parameter, or no domain.
     """
 
-    def __init__(self, dynamics: Dynamics, parameter: str, limits: tuple[float, float]) -> None:
-        if parameter not in (each.name for each in dynamics.parameters):
-            raise ValueError(f"there is no parameter '{parameter}'")
-        low, high = limits
+    def __init__(self, dynamics: Dynamics, limits: Mapping[str, tuple[float, float]]) -> None:
+        known = [each.name for each in dynamics.parameters]
+        for name in limits:
+            if name not in known:
+                raise ValueError(f"there is no parameter '{name}'")
         others = {
             symbol(each.name): exact_number(each.value)
             for each in dynamics.parameters
-            if each.name != parameter
+            if each.name not in limits
         }
         formulas = [each.xreplace(others) for each in dynamics.equations]
-        box = np.vstack([dynamics.box, [low, high]])
+        box = np.vstack([dynamics.box, *limits.values()])
         self.d = dynamics.dimension
         self.low, self.width = box[:, 0], np.ptp(box, axis=1)
-        # The parameter as a state that stays where it is: all derivatives are those of Dynamics.
+        # Parameters as states that stay where they are: all derivatives are those of Dynamics.
         self._of_both = Dynamics.of(
-            (*dynamics.symbols, symbol(parameter)), (*formulas, 0), diffusion=Diffusion.identity(self.d + 1)
-        )
+            (*dynamics.symbols, *map(symbol, limits)), (*formulas, *[0] * len(limits)),
+            diffusion=Diffusion.identity(self.d + len(limits)),
+        )  # fmt: skip
 
     def shares(self, states: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """States ``(n, d)`` and values ``(n,)`` as shares, ``(n, d + 1)``."""
+        """States ``(n, d)`` and values, ``(n,)`` or ``(n, p)``, as shares, ``(n, d + p)``."""
         return (np.column_stack([states, values]) - self.low) / self.width
 
     def natural(self, z: np.ndarray) -> np.ndarray:
-        """Shares as states and, last, the value."""
+        """Shares as states and, last, the values."""
         return np.asarray(self.low + z * self.width)
 
     def flow(self, z: np.ndarray) -> np.ndarray:
-        """F in shares of the domain per unit of time, at one point ``(d + 1,)``: shape ``(d,)``."""
+        """F in shares of the domain per unit of time, at one point ``(d + p,)``: shape ``(d,)``."""
         with np.errstate(all="ignore"):
             return np.asarray(self._of_both.drift(self.natural(z)[None])[0, : self.d] / self.width[: self.d])
 
     def slopes(self, z: np.ndarray) -> np.ndarray:
-        """Its derivatives by states and parameter, shape ``(d, d + 1)``."""
+        """Its derivatives by states and parameters, shape ``(d, d + p)``."""
         with np.errstate(all="ignore"):
             found = self._of_both.jacobian(self.natural(z)[None])[0, : self.d]
         return np.asarray(found * self.width / self.width[: self.d, None])
 
     def bends(self, z: np.ndarray) -> np.ndarray:
-        """Its second derivatives, shape ``(d, d + 1, d + 1)``."""
+        """Its second derivatives, shape ``(d, d + p, d + p)``."""
         with np.errstate(all="ignore"):
             found = self._of_both.hessian(self.natural(z)[None])[0, : self.d]
         return np.asarray(found * self.width[:, None] * self.width / self.width[: self.d, None, None])
@@ -106,6 +107,13 @@ def point_on(family: ParameterFamily, z: np.ndarray, ahead: np.ndarray) -> Branc
     tangent = np.linalg.svd(slopes)[2][-1]
     values = np.linalg.eigvals(slopes[:, :-1])
     return BranchPoint(z, tangent if tangent @ ahead >= 0 else -tangent, values[np.argsort(-values.real)])
+
+
+def outside(z: np.ndarray) -> int | None:
+    """Which component of a point in shares lies furthest outside its range, None where none does."""
+    beyond = np.abs(z - 0.5) - 0.5
+    worst = int(beyond.argmax())
+    return worst if beyond[worst] > EDGE else None
 
 
 def solved(

@@ -24,6 +24,7 @@
 `record_test`             does the record hop, and spread, as what was identified foresees?
 `reference`               what do methods say of it that share no code with ours?
 `comparison`              how far is it from them?
+`beside_equations`        and from the landscape of the equations behind the trajectories?
 ========================  ====================================================================================
 
 Imports `siq.certificate` and what it may import.

@@ -352,6 +352,32 @@ class Landscape:
         table = pd.DataFrame(rows, columns=["start", "end", "mean_time", "note"])
         return table.astype({"start": int, "end": "Int64", "mean_time": float})
 
+    def beside(self, equations: Landscape, *, noise: float | None = None) -> pd.DataFrame:
+        """Barriers, prefactors and mean times of trajectories beside those of the equations behind them.
+
+        Parameters
+        ----------
+        equations
+            From `from_equations`, of the same states. U is in the unit of D, which has to be the same: tell
+            the recordings that of the equations (`siq.steps.settings.StateSpace`), or read ΔU/ε of both.
+        noise
+            ε for which mean times are compared; left out, none are.
+
+        Returns
+        -------
+        pandas.DataFrame
+            One row for each number, with the columns ``item quantity noise equations trajectories
+            standard_error relative_difference in_errors note``; see `siq.landscape.beside_equations`.
+
+        Raises
+        ------
+        ValueError
+            When the states are not the same.
+        """
+        from siq.steps.beside_equations import compared
+
+        return compared(equations, self, noise=noise)
+
     def report(self) -> str:
         """What was found, as text."""
         from siq.report.landscape_text import landscape_text

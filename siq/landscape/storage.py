@@ -19,10 +19,12 @@ from siq.dynamics.cycles import Cycle
 from siq.dynamics.dynamics import Dynamics
 from siq.errors import InputError
 from siq.files.whole import whole_file
+from siq.landscape.dwell_times import Exit
 from siq.landscape.global_quasipotential import GlobalQuasipotential, matched
 from siq.landscape.landscape import Landscape
 from siq.landscape.record_test import VisitTest
 from siq.landscape.transitions import Transition
+from siq.landscape.turnover import TurnLoss
 from siq.potential.storage import basis_from_data, powers_to_data
 from siq.potential.well import Well
 
@@ -191,6 +193,27 @@ def read_landscape(path: str | Path, *, dynamics: Dynamics) -> StoredLandscape |
         return StoredLandscape(matched(wells, heights), wells, data)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(path, "", f"it is no landscape ({type(error).__name__})", "make it again") from None
+
+
+def exits_of(data: Mapping[str, Any], well: int) -> list[Exit]:
+    """The ways out of a well of a landscape as plain data; a barrier that nobody knows is NaN."""
+    return [
+        Exit(
+            _known(way["barrier"]),
+            _known(way.get("error", way["standard_error"])),
+            way["prefactor"],
+            way.get("prefactor_error"),
+            way.get("prefactor_covariance", 0.0),
+            way.get("noise_leverage", 1.0),
+            TurnLoss(**way["turn"]) if way.get("turn") else None,
+        )
+        for way in data["transitions"]
+        if way["start"] == well
+    ]
+
+
+def _known(value: float | None) -> float:
+    return np.nan if value is None else float(value)
 
 
 def _well(data: Mapping[str, Any], dynamics: Dynamics) -> Well | None:

@@ -25,6 +25,7 @@
 `study_captions`         what do its figures show, and where do they stand?
 `study_figures`          and which figures has it?
 `landscape_tables`       what does it say of the landscape?
+`beside_equations`       and of that of the card's own equations?
 `landscape_figures`      and which figures of it?
 `record_answer`          what does it say of the record's own hops?
 `invariant_tables`       what does it say of the invariant distribution?

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from siq.landscape.dwell_times import Exit, MeanTime, NoiseStrength, dwell_time
-from siq.landscape.turnover import TurnLoss
+from siq.landscape.storage import exits_of
 from siq.numerics.measured_text import squared
 
 NOTHING = 1e-6  # of the size of a state
@@ -165,19 +165,7 @@ class SaidLandscape:
 
     def exits(self, well: int) -> list[Exit]:
         """What the times out of a well follow from; of a barrier that nobody knows, NaN."""
-        return [
-            Exit(
-                _float(way["barrier"]),
-                _float(way.get("error", way["standard_error"])),
-                way["prefactor"],
-                way.get("prefactor_error"),
-                way.get("prefactor_covariance", 0.0),
-                way.get("noise_leverage", 1.0),
-                TurnLoss(**way["turn"]) if way.get("turn") else None,
-            )
-            for way in self.data["transitions"]
-            if way["start"] == well
-        ]
+        return exits_of(self.data, well)
 
     def dwell_time(self, well: int, noise: NoiseStrength | None) -> MeanTime | None:
         """How long a well lasts under some noise."""

@@ -18,6 +18,7 @@ from siq.identify.diffusion import DiffusionSource
 from siq.identify.storage import FieldRecord
 from siq.landscape.refusal import told_without_landscape
 from siq.potential.symbolic import SymbolicDecomposition
+from siq.report.beside_equations import beside_sentences, beside_table
 from siq.report.certificate_text import certificate_badge, tests_table
 from siq.report.formatting import formula_matrix_mathml, matrix_mathml, vector_mathml
 from siq.report.inspection_section import inspection_section
@@ -54,7 +55,8 @@ class StudyResults:
     Attributes
     ----------
     tables
-        By name, see `siq.study.tables.COLUMNS`; `landscape_errors` and `escape` with a card only.
+        By name, see `siq.study.tables.COLUMNS`; `landscape_errors` and `escape` with a card only,
+        and `beside_equations` where the study asks for it.
     folder
         Where the whole tables are.
     models
@@ -227,6 +229,8 @@ class StudyParts:
                 found.append(ReportTable(caption, mine, {}, f"{folder}/certificates.csv", rows_named=True))
         if "landscape_errors" in tables and len(tables["landscape_errors"]):
             found.append(errors_table(tables["landscape_errors"], folder))
+        if "beside_equations" in tables and len(tables["beside_equations"]):
+            found.append(beside_table(tables["beside_equations"], folder))
         if "escape" in tables and len(tables["escape"]):
             time = "1" if self.results.overview is None else SaidLandscape(self.results.overview).time_unit
             found.append(escape_table(tables["escape"], time, folder))
@@ -236,6 +240,7 @@ class StudyParts:
             found.append(ReportTable(caption, troubled, {}, f"{folder}/outcomes.csv", rows_shown=60))
         text = [] if self.study.runs > 1 else self._runs_said()
         text += control_sentences(tables["certificates"])
+        text += beside_sentences(tables.get("beside_equations"))
         text += [
             line
             for line in landscape_sentences(tables["landscape"], tables["outcomes"])

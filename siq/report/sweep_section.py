@@ -15,10 +15,11 @@ from siq.report.page import ReportSection, ReportTable
 from siq.report.plots.sweep import plot_sweep
 from siq.report.said_landscape import well_name
 from siq.report.study_captions import figure_of
+from siq.steps.sweep_maps import curve_name
 from siq.study.sweep import SweepOptions
 
 FIGURE = "sweep"
-TABLES = ("sweep", "branches", "bifurcations")
+TABLES = ("sweep", "branches", "bifurcations", "bifurcation_curves")
 
 
 def sweep_figure(system: Dynamics, options: SweepOptions, tables: Mapping[str, pd.DataFrame]) -> Figure:
@@ -27,7 +28,7 @@ def sweep_figure(system: Dynamics, options: SweepOptions, tables: Mapping[str, p
     units |= {each.name: each.unit for each in system.parameters}
     return plot_sweep(
         tables["sweep"], tables["branches"], tables["bifurcations"], parameters=options.names,
-        states=system.states, units=units,
+        states=system.states, units=units, curves=tables["bifurcation_curves"],
     )  # fmt: skip
 
 
@@ -49,7 +50,7 @@ def sweep_section(
     options
         What was asked.
     tables
-        ``sweep``, ``branches`` and ``bifurcations``.
+        Those of `TABLES`.
     folder
         Where they lie.
     images, vectors
@@ -76,12 +77,30 @@ def _sentences(options: SweepOptions, tables: Mapping[str, pd.DataFrame]) -> lis
         said.append(f"{options.second.parameter} {len(other)} from {other[0]:g} to {other[-1]:g}")
     text = f"{' and '.join(said)}: {count} landscape{'s' if count > 1 else ''}, by the paths of least action."
     if options.second is not None:
-        return [text]
+        return [text, *_curves(options, tables["bifurcation_curves"])]
     found = tables["bifurcations"]
     ends = [f"{one.kind} at {options.parameter} = {one.value:.6g}" for one in found.itertuples()]
     if ends:
         return [text, f"Stable states begin, end or lose their stability here: {'; '.join(ends)}."]
     return [text, "No stable state begins, ends or loses its stability within this range."]
+
+
+def _curves(options: SweepOptions, found: pd.DataFrame) -> list[str]:
+    """How many curves of which kind there are, and over which ranges they reach."""
+    if found.empty:
+        return ["No row and no column of the map has a fold or a Hopf point."]
+    said = []
+    for kind, some in found.groupby("kind", sort=False):
+        count = some["curve"].nunique()
+        ranges = " and ".join(
+            f"{name} = {some[column].min():.5g} to {some[column].max():.5g}"
+            for name, column in zip(options.names, ("value", "second_value"), strict=True)
+        )
+        said.append(
+            f"{curve_name(str(kind)).capitalize()} lie on {count} curve{'s' if count > 1 else ''} of the"
+            f" plane, within {ranges}; they are drawn in the map."
+        )
+    return said
 
 
 def _bifurcations(
@@ -117,4 +136,5 @@ def _notes(table: pd.DataFrame, options: SweepOptions, folder: Path) -> list[str
             f"{', '.join(wells)} are named along their branches here, and need not be those of the"
             " quasipotential above."
         )
-    return [*notes, f"All numbers: {folder}/sweep.csv and {folder}/sweep_ways.csv."]
+    files = ["sweep", "sweep_ways", *([] if options.second is None else ["bifurcation_curves"])]
+    return [*notes, f"All numbers: {' and '.join(f'{folder}/{name}.csv' for name in files)}."]

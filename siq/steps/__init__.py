@@ -24,6 +24,8 @@ landscape               which wells, barriers and ways are there?
 equations               what landscape have equations alone?
 sweep_points            which wells and ways have they at other values of their parameters?
 sweep_wells             which of their attractors are one and the same well?
+sweep_rows              how deep are these, and how long do they last?
+sweep_maps              along which curves do they fold in the plane of two parameters?
 sweep                   and what is seen against a control parameter, or two?
 tipping                 how likely has a well been left while the parameter drifts?
 score                   how far is all this from exact answers, where these are known?
@@ -31,6 +33,7 @@ overview                which landscape does the page open with?
 collect                 what do all runs say together?
 reference               what do methods say of a card that share nothing with ours?
 landscape_errors        how far are the landscapes from these references?
+beside_equations        and how far from the landscape of the card's own equations?
 escapes                 does a direct simulation leave the wells as the law says?
 invariant               which invariant distribution follows, and is it that of a long simulation?
 pipeline                all of a run, in memory

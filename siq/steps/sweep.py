@@ -2,7 +2,7 @@
 
 Points (`siq.steps.sweep_points`) become tables here: equilibria are joined to branches by continuation
 (`siq.dynamics.continuation`), a well is a stable stretch of a branch, and its times and weights follow for a
-noise.
+noise (`siq.steps.sweep_rows`).
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ import numpy as np
 import pandas as pd
 from pydantic.dataclasses import dataclass
 
+from siq.dynamics.bifurcation_curves import BifurcationCurve
 from siq.dynamics.cards import load_system
 from siq.dynamics.continuation import Branches, follow_branches
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.parameter_family import ParameterFamily
-from siq.dynamics.phase_portrait import UNSETTLED
 from siq.errors import InputError, suggestion
-from siq.landscape.dwell_times import NoiseStrength, dwell_time
-from siq.landscape.ensembles import shares_by_rates
 from siq.landscape.options import LandscapeOptions
 from siq.steps.settings import STRICT
+from siq.steps.sweep_maps import curve_notes, curve_rows, curves_of_map
 from siq.steps.sweep_points import PointSettings, SweptPoint, check_noise, point_at
-from siq.steps.sweep_wells import Wells, bifurcation_rows, position_text
+from siq.steps.sweep_rows import way_rows, well_rows
+from siq.steps.sweep_wells import Wells, bifurcation_rows
 from siq.study.sweep import SweepOptions
 from siq.study.tables import as_table, write_table
 
@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MOST_PARAMETERS = 2
-ALONE = "it is the only stable state, and no way leads out of it"
-UNKNOWN = "no way out was found"
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -79,6 +77,9 @@ class Sweep:
         What could not be done, in words.
     units
         Of the states, by name; of the time as ``t``, and of the parameters by their names.
+    curves
+        Of two parameters, the curves of folds and of Hopf points in their plane, a row for each point; empty
+        for one.
     """
 
     parameters: tuple[str, ...]
@@ -89,14 +90,15 @@ class Sweep:
     bifurcations: pd.DataFrame
     notes: tuple[str, ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
+    curves: pd.DataFrame = field(default_factory=lambda: as_table("bifurcation_curves", []))
 
     def plot(self) -> Figure:
-        """Equilibria, barriers and times against the parameter; of two parameters, a map of barriers."""
+        """Equilibria, barriers and times against the parameter; of two, a map with its curves."""
         from siq.report.plots.sweep import plot_sweep
 
         return plot_sweep(
             self.table, self.branches, self.bifurcations, parameters=self.parameters, states=self.states,
-            units=self.units,
+            units=self.units, curves=self.curves,
         )  # fmt: skip
 
     def __repr__(self) -> str:
@@ -192,10 +194,10 @@ def check_names(system: Dynamics, names: Iterable[str]) -> None:
 
 
 def write_tables(found: Sweep, files: Mapping[str, str | Path]) -> None:
-    """Write ``sweep``, ``sweep_ways``, ``branches`` and ``bifurcations``."""
+    """Write ``sweep``, ``sweep_ways``, ``branches``, ``bifurcations`` and ``bifurcation_curves``."""
     tables = {
         "sweep": found.table, "sweep_ways": found.ways, "branches": found.branches,
-        "bifurcations": found.bifurcations,
+        "bifurcations": found.bifurcations, "bifurcation_curves": found.curves,
     }  # fmt: skip
     for name, path in files.items():
         write_table(path, tables[name])
@@ -220,101 +222,29 @@ def collected(
     points = sorted(points, key=lambda point: point.values)
     notes: list[str] = []
     branches: Branches | None = None
+    curves: list[BifurcationCurve] = []
     values = [point.values[0] for point in points]
     if len(names) == 1 and min(values) < max(values):
         limits = (min(values), max(values))
         seeds = [(point.values[0], np.array(one)) for point in points for one in point.equilibria]
         branches = follow_branches(system, names[0], limits, seeds)
         notes += branches.notes
-        wells = Wells.along(ParameterFamily(system, names[0], limits), branches)
+        wells = Wells.along(ParameterFamily(system, {names[0]: limits}), branches)
         numbers = [wells.numbers(point) for point in points]
     else:
         numbers = [tuple(range(len(point.wells))) for point in points]
+    if len(names) == MOST_PARAMETERS:
+        curves = curves_of_map(system, names, points)
+        notes += curve_notes(names, curves)
     rows, ways = [], []
     for point, number in zip(points, numbers, strict=True):
-        rows += _rows(point, number, noise)
-        ways += _way_rows(point, number)
+        rows += well_rows(point, number, noise)
+        ways += way_rows(point, number)
     units = dict(zip(system.states, system.units, strict=True)) | {"t": system.time_unit}
     units |= {each.name: each.unit for each in system.parameters if each.name in names}
     return Sweep(
         names, system.states, as_table("sweep", rows), as_table("sweep_ways", ways),
         as_table("branches", [] if branches is None else wells.branch_rows()),
         as_table("bifurcations", [] if branches is None else bifurcation_rows(branches)),
-        tuple(dict.fromkeys(notes)), units,
+        tuple(dict.fromkeys(notes)), units, as_table("bifurcation_curves", curve_rows(curves)),
     )  # fmt: skip
-
-
-def _place(point: SweptPoint) -> dict[str, object]:
-    first, second = (*point.values, np.nan)[:MOST_PARAMETERS]
-    return {"value": first, "second_value": second}
-
-
-def _rows(point: SweptPoint, number: Sequence[int], noise: float | None) -> list[dict[str, object]]:
-    """One row for every well of a point; one that says why where there is none."""
-    if not point.wells:
-        return [_place(point) | {"well": -1, "noise": noise, "note": point.reason or "; ".join(point.notes)}]
-    weights = _weights(point, noise)
-    return [
-        _place(point)
-        | {"well": number[index], "attractor": position_text(well.state), "relaxation": well.relaxation}
-        | _exits(point, index, number, noise)
-        | {"noise": noise, "weight": weights[index]}
-        for index, well in enumerate(point.wells)
-    ]
-
-
-def _weights(point: SweptPoint, noise: float | None) -> np.ndarray:
-    """Shares of time in the long run; NaN where a rate is not known, or the noise is not below a barrier."""
-    count = len(point.wells)
-    between = [way for way in point.ways if way.end is not None]
-    known = noise is not None and all(way.barrier is not None and noise < way.barrier for way in between)
-    # What leads elsewhere has a share of the time, too.
-    if noise is None or not known or point.settled < 1 - UNSETTLED:
-        return np.full(count, np.nan)
-    if count == 1:
-        return np.ones(1)
-    listed = [
-        {"start": way.start, "end": way.end, "barrier": way.barrier, "prefactor": way.prefactor}
-        for way in between
-    ]
-    return shares_by_rates(listed, count, intensity=noise)
-
-
-def _exits(point: SweptPoint, index: int, number: Sequence[int], noise: float | None) -> dict[str, object]:
-    """The lowest way out of a well, and its time over all ways."""
-    mine = [way for way in point.ways if way.start == index]
-    known = [way for way in mine if way.barrier is not None]
-    if not known:
-        # Beside a limit cycle, or another well, it can be left although nobody knows how.
-        alone = len(point.wells) == 1 and not point.notes and not mine
-        told = "; ".join(dict.fromkeys(way.note for way in mine if way.note))
-        return {"note": ALONE if alone else told or "; ".join(point.notes) or UNKNOWN}
-    lowest = min(known, key=lambda way: np.inf if way.barrier is None else way.barrier)
-    notes = [way.note for way in mine if way.note]
-    time = dwell_time([way.as_exit() for way in mine], None if noise is None else NoiseStrength(noise))
-    if noise is not None and time is None:
-        notes.append(f"no time: the noise {noise:g} is not below the barrier, or the law has no prefactor")
-    if time is not None and not time.complete:
-        notes.append("a way out has no rate: the well lasts no longer than this")
-    return {
-        "barrier": lowest.barrier,
-        "exit": None if lowest.end is None else number[lowest.end],
-        "mean_time": np.nan if time is None else time.value,
-        "law_error": np.nan if time is None else time.law_error,
-        "note": "; ".join(dict.fromkeys(notes)),
-    }
-
-
-def _way_rows(point: SweptPoint, number: Sequence[int]) -> list[dict[str, object]]:
-    return [
-        _place(point)
-        | {
-            "well": number[way.start],
-            "exit": None if way.end is None else number[way.end],
-            "barrier": way.barrier,
-            "prefactor": way.prefactor,
-            "relaxation": point.wells[way.start].relaxation,
-            "note": way.note,
-        }
-        for way in point.ways
-    ]

@@ -31,7 +31,8 @@ from scipy.integrate import cumulative_simpson
 from scipy.interpolate import PchipInterpolator
 
 from siq.landscape.dwell_times import FEWEST
-from siq.steps.sweep import ALONE, Sweep
+from siq.steps.sweep import Sweep
+from siq.steps.sweep_rows import ALONE
 
 WITHIN = 32  # steps of the integral between two times: Simpson's error falls as their fourth power
 

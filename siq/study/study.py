@@ -95,6 +95,7 @@ class RecordingsOptions(BaseModel):
 
 OF_TRAJECTORIES = (
     "recordings", "runs", "published", "simulation", "identification", "regression", "training",
+    "beside_equations",
 )  # fmt: skip
 """Keys of a study that equations have no use for."""
 
@@ -135,6 +136,9 @@ class Study(BaseModel):
         How the landscape is found: equilibria, a formula for each well, barriers, paths and escape times;
         by default with the options' own defaults. ``false`` finds none, but for the run that
         the page shows.
+    beside_equations
+        Whether the landscape of the card's own equations is found, too, and stands beside that of the
+        trajectories: barriers, prefactors and mean times. It scores, and is no input of the method.
     sweep
         A control parameter against which the landscape of equations is found, too, or two of them.
     """
@@ -157,6 +161,7 @@ class Study(BaseModel):
     certificate: CertificateOptions = CertificateOptions()
     invariant: tuple[Annotated[float, Field(gt=0)], ...] = ()
     landscape: LandscapeOptions | None = LandscapeOptions()
+    beside_equations: bool = False
     sweep: SweepOptions | None = None
 
     @field_validator("training", "landscape", mode="before")
@@ -188,6 +193,12 @@ class Study(BaseModel):
             raise ValueError(
                 "'refinement.routes' names the network route, but no networks are asked for; add"
                 " 'training: {}', or leave the routes out"
+            )
+        if self.beside_equations and (self.system is None or self.landscape is None):
+            remedy = "add 'system: NAME'" if self.system is None else "remove 'landscape: false'"
+            raise ValueError(
+                "'beside_equations' compares the landscape of every run with that of the equations, and one"
+                f" of both is missing; {remedy}, or remove it"
             )
         if self.entrance == "equations":
             self._check_equations()

@@ -116,6 +116,18 @@ COLUMNS: Mapping[str, Mapping[str, str]] = {
         "error": "float64",
         "error_everywhere": "float64",
     },
+    "beside_equations": {
+        "run": "int64",
+        "item": "str",
+        "quantity": "str",
+        "noise": "float64",
+        "equations": "float64",
+        "trajectories": "float64",
+        "standard_error": "float64",
+        "relative_difference": "float64",
+        "in_errors": "float64",
+        "note": "str",
+    },
     "sweep": {
         "value": "float64",
         "second_value": "float64",
@@ -156,6 +168,14 @@ COLUMNS: Mapping[str, Mapping[str, str]] = {
         "branch": "int64",
         "frequency": "float64",
         "residual": "float64",
+    },
+    "bifurcation_curves": {
+        "curve": "int64",
+        "kind": "str",
+        "value": "float64",
+        "second_value": "float64",
+        "position": "str",
+        "frequency": "float64",
     },
     "escape": {
         "transition": "str",

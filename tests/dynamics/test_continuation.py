@@ -124,7 +124,7 @@ def test_a_branch_ends_where_it_leaves_the_domain():
 def test_a_state_is_told_to_lie_on_its_branch_only():
     cusp = system((x,), (k + x - x**3,), [(-2, 2)])
     (branch,) = follow_branches(cusp, "k", (-1, 1), [(0.0, np.array([1.0]))]).branches
-    family = ParameterFamily(cusp, "k", (-1, 1))
+    family = ParameterFamily(cusp, {"k": (-1, 1)})
     for root in (-1.0, 0.0, 1.0):
         place = place_on(family, branch, family.shares(np.array([[root]]), np.array([0.0]))[0])
         assert place is not None and branch.states[place, 0] == pytest.approx(root, abs=0.05)

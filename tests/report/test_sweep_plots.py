@@ -23,7 +23,12 @@ def found() -> Sweep:
 
 
 def tables_of(found: Sweep) -> dict:
-    return {"sweep": found.table, "branches": found.branches, "bifurcations": found.bifurcations}
+    return {
+        "sweep": found.table,
+        "branches": found.branches,
+        "bifurcations": found.bifurcations,
+        "bifurcation_curves": found.curves,
+    }
 
 
 def test_one_panel_for_equilibria_and_one_for_each_quantity_that_is_known(found):
@@ -43,6 +48,23 @@ def test_two_parameters_are_a_map():
     count, lowest = (axes.collections[0].get_array().reshape(2, 2) for axes in found.plot().axes[:2])
     assert count.tolist() == [[1, 1], [2, 2]]
     assert lowest[1, 0] == pytest.approx(0.5, rel=1e-4) and np.isnan(np.ma.filled(lowest, np.nan)[0, 0])
+
+
+def test_the_folds_of_a_map_are_drawn_and_said():
+    options = {"parameter": "h", "from": -0.4, "to": 0.4, "step": 0.4}
+    second = {"parameter": "a", "from": -0.5, "to": 1.0, "step": 0.5}
+    asked = SweepOptions.model_validate(options | {"second": second})
+    found = sweep(CUSP, "h", asked.numbers, second=("a", asked.second.numbers))
+    assert set(found.curves["kind"]) == {"fold"} and found.curves["curve"].nunique() == 1
+    assert (27 * found.curves["value"] ** 2 - 4 * found.curves["second_value"] ** 3).abs().max() < 1e-9
+    for axes in found.plot().axes[:2]:
+        (line,) = axes.lines
+        assert 27 * line.get_xdata() ** 2 == pytest.approx(4 * line.get_ydata() ** 3, abs=1e-9)
+    section = sweep_section(
+        CUSP, asked, tables_of(found), folder=Path("results/s/tables"), images={}, vectors={}
+    )
+    assert "Folds lie on 1 curve of the plane, within h = -0.3849 to 0.3849 and a = " in section.text[1]
+    assert "bifurcation_curves.csv" in section.notes[-1]
 
 
 def test_a_state_that_is_named_is_drawn(found):

@@ -8,8 +8,9 @@ from siq.dynamics.cards import load_system
 from siq.dynamics.dynamics import Dynamics
 from siq.errors import InputError
 from siq.landscape.landscape import Landscape
-from siq.steps.sweep import ALONE, Sweep, collected, sweep
+from siq.steps.sweep import Sweep, collected, sweep
 from siq.steps.sweep_points import PointSettings, point_at, read_point, with_parameters, write_point
+from siq.steps.sweep_rows import ALONE
 
 h, a, x, y = sympy.symbols("h a x y", real=True)
 FOLD = 2 / (3 * np.sqrt(3))
@@ -97,6 +98,17 @@ def test_a_second_parameter_gives_a_map():
     counts = found.table.groupby(["value", "second_value"]).size().to_dict()
     assert counts == {(0.0, -0.5): 1, (0.0, 1.0): 2, (0.1, -0.5): 1, (0.1, 1.0): 2}
     assert found.branches.empty and found.bifurcations.empty
+
+
+def test_the_curves_of_a_map_are_found_between_its_values():
+    brusselator = Dynamics.of(
+        (x, y), (a - (h + 1) * x + x**2 * y, h * x - x**2 * y), domain=[(0.1, 5), (0.1, 5)],
+        parameters={a: 1.0, h: 2.0},
+    )  # fmt: skip
+    curves = sweep(brusselator, "a", [0.8, 1.2], second=("h", [1.2, 3.0])).curves
+    assert set(curves["kind"]) == {"Hopf"} and set(curves["curve"]) == {0}
+    assert curves["second_value"].to_numpy() == pytest.approx(1 + curves["value"].to_numpy() ** 2, abs=1e-9)
+    assert curves["frequency"].to_numpy() == pytest.approx(curves["value"].to_numpy(), abs=1e-9)
 
 
 def test_parameters_in_d_follow_from_the_card(write):

@@ -8,7 +8,8 @@ import pytest
 import sympy
 
 from siq.dynamics.dynamics import Dynamics
-from siq.steps.sweep import ALONE, Sweep, sweep
+from siq.steps.sweep import Sweep, sweep
+from siq.steps.sweep_rows import ALONE
 from siq.steps.tipping import probability_of_tipping
 from siq.study.tables import as_table
 

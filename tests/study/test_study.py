@@ -240,3 +240,16 @@ def test_a_missing_card_is_refused_by_name(write: Write) -> None:
     path = write("name: s\nsystem: nowhere\n")
     with pytest.raises(InputError, match=r"nowhere\.yaml"):
         check_system(path)
+
+
+@pytest.mark.parametrize(
+    ("study", "remedy"),
+    [
+        ("recordings: {file: mine.csv}\n", "add 'system: NAME'"),
+        ("system: archetype3d\nlandscape: false\n", "remove 'landscape: false'"),
+        ("system: archetype3d\nfrom: equations\n", "remove it, or 'from: equations'"),
+    ],
+)
+def test_two_landscapes_are_compared_where_there_are_two(write, study, remedy):
+    with pytest.raises(InputError, match=remedy):
+        load_study(write(f"name: plain\nbeside_equations: true\n{study}"))

@@ -88,10 +88,11 @@ def test_another_range_computes_new_points_only(fresh_project):
     assert before.items() < after.items() and set(after) == {"h=0.25.json", "h=0.json", "h=0.5.json"}
     tables = {
         name: pd.read_parquet(fresh_project.path(f"results/mini/tables/{name}.parquet"))
-        for name in ("sweep", "sweep_ways", "branches", "bifurcations")
+        for name in ("sweep", "sweep_ways", "branches", "bifurcations", "bifurcation_curves")
     }
     for name, table in tables.items():
-        assert list(table.columns) == list(COLUMNS[name]) and len(table)
+        assert list(table.columns) == list(COLUMNS[name])
+        assert len(table) or name == "bifurcation_curves"  # which are of two parameters
     assert tables["bifurcations"]["value"].to_numpy() == pytest.approx([2 / 27**0.5], abs=1e-9)
     page = fresh_project.path("results/mini/report.html").read_text()
     assert "Against h" in page and "fold at h = 0.3849" in page

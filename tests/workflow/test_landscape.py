@@ -14,6 +14,7 @@ runs: 1
 seed: 7
 published: resonator
 invariant: [2.0e-9]
+beside_equations: true
 simulation: {trajectories: 400, pairs: 60, pair_step: 10, interval: 100}
 training:
   widths: [12, 12]
@@ -40,7 +41,15 @@ def tables(fresh_module_project):
     project = fresh_module_project
     project.path("study.yaml").write_text(STUDY)
     project.make("results/mini/report.html")
-    names = ("landscape", "degrees", "landscape_errors", "escape", "invariant", "well_shares")
+    names = (
+        "landscape",
+        "degrees",
+        "landscape_errors",
+        "beside_equations",
+        "escape",
+        "invariant",
+        "well_shares",
+    )
     return {name: pd.read_parquet(project.path(f"results/mini/tables/{name}.parquet")) for name in names}
 
 
@@ -54,6 +63,14 @@ def test_equilibria_are_found_and_barriers_are_those_of_the_minimum_action(table
     assert sorted(landscape["kind"]) == ["attractor", "attractor", "saddle", "transition", "transition"]
     barriers = landscape[landscape["kind"] == "transition"]["barrier"].to_numpy()
     assert barriers == pytest.approx([1.046857e-8, 8.16145e-9], rel=0.01)
+
+
+def test_the_equations_stand_beside_the_trajectories(tables):
+    beside = tables["beside_equations"]
+    assert list(beside["quantity"].value_counts().sort_index()) == [2, 2, 2]  # barrier, mean time, prefactor
+    barriers = beside[beside["quantity"] == "barrier"]
+    assert barriers["equations"].to_numpy() == pytest.approx([1.046857e-8, 8.16145e-9], rel=1e-5)
+    assert (beside["relative_difference"].abs() < 0.05).all()
 
 
 def test_formulas_are_close_to_characteristics_and_the_mesh_too(tables):

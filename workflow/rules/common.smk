@@ -16,6 +16,7 @@ from siq.report.settings import (
 )
 from siq.report.study_captions import CAPTIONS as STUDY_CAPTIONS
 from siq.report.study_captions import Part, figure_place
+from siq.steps.beside_equations import BesideEquationsSettings
 from siq.steps.draw import DrawSettings
 from siq.steps.equations import EquationSettings
 from siq.steps.escapes import EscapesSettings
@@ -254,6 +255,16 @@ def landscape_table(name):
         study = study_of(wildcards).study
         known = study.landscape is not None and study.recordings is None
         return f"results/{wildcards.study}/tables/{name}.parquet" if known else []
+
+    return files
+
+
+def with_equations(pattern):
+    """Input function: a file of studies that compare with the equations of their card, none for others."""
+
+    def files(wildcards):
+        asked = study_of(wildcards).study.beside_equations
+        return pattern.format(study=wildcards.study) if asked else []
 
     return files
 

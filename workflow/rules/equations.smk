@@ -72,6 +72,7 @@ rule equations_page:
         sweep=with_sweep("sweep"),
         branches=with_sweep("branches"),
         bifurcations=with_sweep("bifurcations"),
+        bifurcation_curves=with_sweep("bifurcation_curves"),
         invariant=with_invariant("results/{study}/tables/invariant.parquet"),
         well_shares=with_invariant("results/{study}/tables/well_shares.parquet"),
         density=with_invariant("results/{study}/drawn/invariant"),

@@ -106,6 +106,31 @@ rule landscape_errors:
         "../scripts/landscape_errors.py"
 
 
+rule beside_equations:
+    # The landscape of the card's own equations beside those of the runs: scoring alone.
+    input:
+        landscapes=all_runs("results/{study}/runs/{run}/quasipotential.json"),
+        card=card_if_any,
+    output:
+        table="results/{study}/tables/beside_equations.parquet",
+        csv="results/{study}/tables/beside_equations.csv",
+    log:
+        "results/{study}/logs/beside_equations.log",
+    benchmark:
+        "results/{study}/benchmarks/beside_equations.tsv"
+    conda:
+        "../envs/siq.yaml"
+    threads: 1
+    params:
+        code=code("beside_equations.py"),
+        settings=settings_of(BesideEquationsSettings),
+        card=card_says,
+    message:
+        "{wildcards.study}: holding the landscapes against that of the equations"
+    script:
+        "../scripts/beside_equations.py"
+
+
 rule escapes:
     input:
         landscapes=all_runs("results/{study}/runs/{run}/quasipotential.json"),

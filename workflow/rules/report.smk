@@ -60,6 +60,9 @@ rule page:
         landscape="results/{study}/tables/landscape.parquet",
         landscape_errors=landscape_table("landscape_errors"),
         escape=landscape_table("escape"),
+        beside_equations=with_equations(
+            "results/{study}/tables/beside_equations.parquet"
+        ),
         card=card_if_any,
         published=published_if_any,
     output:

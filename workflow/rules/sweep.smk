@@ -35,6 +35,7 @@ rule sweep:
         sweep_ways="results/{study}/tables/sweep_ways.parquet",
         branches="results/{study}/tables/branches.parquet",
         bifurcations="results/{study}/tables/bifurcations.parquet",
+        bifurcation_curves="results/{study}/tables/bifurcation_curves.parquet",
     log:
         "results/{study}/logs/sweep.log",
     benchmark:

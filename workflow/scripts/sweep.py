@@ -14,5 +14,5 @@ if __name__ == "__main__":
         settings = now.settings(SweepSettings)
         points = [read_point(path) for path in now.input.points]
         found = collected(load_system(now.input.card), settings.names, points, noise=settings.noise)
-        names = ("sweep", "sweep_ways", "branches", "bifurcations")
+        names = ("sweep", "sweep_ways", "branches", "bifurcations", "bifurcation_curves")
         write_tables(found, {name: now.output[name] for name in names})

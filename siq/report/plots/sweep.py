@@ -11,6 +11,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
 
 from siq.report.plots.landscape_curves import COLOURS, LINE_STYLES, MARKERS
 from siq.report.plots.style import (
@@ -26,6 +27,9 @@ from siq.report.said_landscape import well_name
 
 BIFURCATIONS = {"fold": "o", "Hopf": "s", "branch point": "D"}
 PANEL = 2.2  # inches
+CURVES = {"fold": "-", "Hopf": "--"}
+CURVE = "white"
+OUTLINED = (withStroke(linewidth=2.4, foreground=BLACK),)  # seen on the dark and on the bright end of a map
 
 
 @drawn_in_style
@@ -38,6 +42,7 @@ def plot_sweep(
     states: Sequence[str],
     units: Mapping[str, str] | None = None,
     state: str | None = None,
+    curves: pd.DataFrame | None = None,
 ) -> Figure:
     """Draw a sweep.
 
@@ -51,6 +56,8 @@ def plot_sweep(
         By name; of the time as ``t``.
     state
         Which state is drawn above; by default the first.
+    curves
+        Of two parameters, where equilibria fold or begin to oscillate; by default none are drawn.
 
     Returns
     -------
@@ -58,11 +65,11 @@ def plot_sweep(
         Of one parameter: equilibria, stable ones as lines of their well's colour and unstable ones dashed,
         with folds, Hopf points and branch points; below it the lowest barrier of every well, and, where the
         noise is known, how long each lasts and its share of time in the long run. Of two: maps of the number
-        of wells and of the lowest barrier.
+        of wells and of the lowest barrier, with curves of folds and of Hopf points.
     """
     units = units or {}
     if len(parameters) > 1:
-        return _map(table, parameters, units)
+        return _map(table, parameters, units, curves)
     place = 0 if state is None else list(states).index(state)
     columns = [name for name in ("barrier", "mean_time", "weight") if np.isfinite(table[name]).any()]
     figure = Figure(figsize=(COLUMN_WIDTH, PANEL * (1.2 + len(columns))))
@@ -138,7 +145,9 @@ def _handles(table: pd.DataFrame, branches: pd.DataFrame, bifurcations: pd.DataF
     return handles
 
 
-def _map(table: pd.DataFrame, parameters: Sequence[str], units: Mapping[str, str]) -> Figure:
+def _map(
+    table: pd.DataFrame, parameters: Sequence[str], units: Mapping[str, str], curves: pd.DataFrame | None
+) -> Figure:
     """How many wells there are, and the lowest barrier among them, against two parameters."""
     known = table.assign(one=(table["well"] >= 0).astype(float))
     grid = known.groupby(["second_value", "value"])
@@ -158,5 +167,25 @@ def _map(table: pd.DataFrame, parameters: Sequence[str], units: Mapping[str, str
         if values is count:
             bar.set_ticks(sorted(set(count.to_numpy().ravel())))
         axes.set_ylabel(axis_label(parameters[1], units.get(parameters[1], "1")))
+        if curves is not None:
+            _draw_curves(axes, curves)
+    handles = [
+        Line2D([], [], color=CURVE, linestyle=CURVES[kind], path_effects=OUTLINED, label=kind)
+        for kind in CURVES
+        if curves is not None and (curves["kind"] == kind).any()
+    ]
+    if handles:
+        figure.legend(handles=handles, loc="outside upper center", ncols=len(handles))
     panels[-1].set_xlabel(axis_label(parameters[0], units.get(parameters[0], "1")))
     return figure
+
+
+def _draw_curves(axes: Axes, curves: pd.DataFrame) -> None:
+    """Curves over a map, whose limits stay those of its cells."""
+    limits = axes.get_xlim(), axes.get_ylim()
+    for _, rows in curves.groupby("curve"):
+        axes.plot(
+            rows["value"], rows["second_value"], color=CURVE, linestyle=CURVES[rows["kind"].iloc[0]],
+            linewidth=1.2, path_effects=OUTLINED,
+        )  # fmt: skip
+    axes.set(xlim=limits[0], ylim=limits[1])
