@@ -17,7 +17,7 @@ from siq.estimation.first_states import first_states
 from siq.estimation.innovations import Noise
 from siq.estimation.linearisation import Grid
 from siq.estimation.measurements import Measurements
-from siq.estimation.trajectories import run
+from siq.estimation.trajectories import fit_trajectories, run
 
 SHORTEST_PREFIX = 8  # samples
 PREFIX = 0.2  # of a recording
@@ -138,7 +138,12 @@ def initial_states(
         estimate_process=False,
         substeps=substeps,
     )
-    best = strict.x if strict.converged else x
+    if strict.converged:
+        return strict.x[data.first[:-1]]
+    # Where f jumps or a reading is cut off, steps of all samples at once may go to and fro. Damped steps of
+    # whole trajectories never make it worse.
+    damped = fit_trajectories(still, data, begin=x[data.first[:-1]], noise=noise, substeps=substeps)
+    best = damped.x if np.isfinite(damped.sum_of_squares) else x
     return best[data.first[:-1]]
 
 

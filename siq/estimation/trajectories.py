@@ -296,8 +296,10 @@ def normal_equations(
     between = np.zeros((recordings, parameters, dimension))
     for place, (first, end) in enumerate(zip(data.first[:-1], data.first[1:], strict=True)):
         # As of a root at zero: where a derivative is no number, no direction is known.
-        columns = np.nan_to_num(by_parameters[first:end].reshape(-1, parameters), posinf=0.0, neginf=0.0)
-        states = np.nan_to_num(by_initial[first:end].reshape(-1, dimension), posinf=0.0, neginf=0.0)
+        values = (end - first) * innovations.shape[1]
+        columns = by_parameters[first:end].reshape(values, parameters)
+        columns = np.nan_to_num(columns, posinf=0.0, neginf=0.0)
+        states = np.nan_to_num(by_initial[first:end].reshape(values, dimension), posinf=0.0, neginf=0.0)
         left = innovations[first:end].ravel()
         shared += columns.T @ columns
         shared_target += columns.T @ left
