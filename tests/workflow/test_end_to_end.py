@@ -24,7 +24,10 @@ def table(project, name):
 
 
 # See test_landscape.py and test_equations.py.
-NOT_OF_THIS = ("landscape_errors", "escape", "sweep", "sweep_ways", "branches", "bifurcations")
+NOT_OF_THIS = (
+    "landscape_errors", "escape", "sweep", "sweep_ways", "branches", "bifurcations", "bifurcation_curves",
+    "beside_equations",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("name", [name for name in COLUMNS if name not in NOT_OF_THIS])
