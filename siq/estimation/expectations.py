@@ -36,11 +36,11 @@ class Expectations:
         free = {model.parameters[place].name: column for column, place in enumerate(model.free)}
         values = {each.name: each.value for each in model.parameters}
         rows, middle = [np.zeros((0, len(free)))], [np.zeros(0)]
-        for name, column in free.items():
+        for column in free.values():
             expected = model.parameters[model.free[column]].expected
             if expected:
                 rows.append(np.zeros((1, len(free))))
-                rows[-1][0, free[name]] = 1 / abs(expected)
+                rows[-1][0, column] = 1 / abs(expected)
                 middle.append(np.array([np.sign(expected)]))
         for each in model.expected_together:
             mine = [place for place, name in enumerate(each.names) if name in free]

@@ -45,10 +45,9 @@ def models_of_the_nameless(
     if search.found and np.isfinite(search.fit.log_likelihood):
         models.append(Model(parts_of(search, material.considered), search.fit))
     models = weighed(models, base, data)
-    best = models[0] if models else None
     if functions is None:
         models = weighed([*models, *with_surfaces(base, models, material)], base, data)
-        best = models[0] if models else None
+    best = models[0] if models else None
     if (
         best is not None
         and best.fit.model.dimension == base.model.dimension

@@ -272,7 +272,7 @@ def log_evidence_of(fit: Fit, data: Measurements, *, correlated: float = 1.0) ->
     parameters, so that explanations with and without them can be compared. What the recordings do not tell
     of the parameters does not count. Of parameters of which something is expected together, such as the
     heights of a smooth function, the likelihood is averaged over that (Laplace's approximation,
-    -½ log det(1 + K G)): a hundred of them may count as three.
+    -½ log det(1 + K G)), so that they count as few as the data tell.
 
     Parameters
     ----------

@@ -15,6 +15,7 @@ import numpy as np
 
 from siq.dynamics.dynamics import Dynamics
 from siq.estimation.estimation import Fit
+from siq.estimation.measurements import Measurements
 from siq.mismatch.fitted_parts import fitted_part
 from siq.mismatch.function_places import Place, coordinates_of
 from siq.mismatch.likely_places import FITTED, likely_places
@@ -70,7 +71,7 @@ def with_a_smooth_function(
     current, known = (fit, None) if like is None else (like.fit, like.parts[-1])
     for _ in range(ROUNDS):
         here = ground.along(current.model, data, current.x)
-        asked = smoothness_of(current, data, here, known=known)
+        asked = _asked(current, data, here, known=known)
         if asked is None:
             break
         price = cost + float(np.log(asked.considered))
@@ -79,7 +80,11 @@ def with_a_smooth_function(
         for times, level in ((1.0, asked.told.level), (2.0, 1.0)):
             if parts:
                 break
-            function = _function(asked, here, product=product, times=times)
+            try:
+                function = _function(asked, here, product=product, times=times)
+            except UNFORESEEN as error:
+                LOGGER.info("no function of %s can be worked out: %s", " and ".join(here.words), error)
+                break
             candidate = with_smooth_function(fit.model, function)
             parts = fitted_part(
                 candidate, level, ground.place, fit, price, material, smooth=function, begin=current
@@ -92,11 +97,24 @@ def with_a_smooth_function(
             candidate.label, function.width, found.fit.log_likelihood,
         )  # fmt: skip
         if likeliest is not None:
-            both = {id(each.fit): each.log_evidence for each in weighed([likeliest, found], fit, data)}
-            if both[id(found.fit)] < both[id(likeliest.fit)] + WORTH:
+            new = {
+                each.fit is found.fit: each.log_evidence for each in weighed([likeliest, found], fit, data)
+            }
+            if new[True] < new[False] + WORTH:
                 break
         likeliest, current, known = found, found.fit, parts[0]
     return [] if likeliest is None else [likeliest]
+
+
+def _asked(
+    fit: Fit, data: Measurements, ground: Ground, *, known: Part | None, alike: bool = False
+) -> Smoothness | None:
+    """See `siq.mismatch.smoothness.smoothness_of`; what is beyond all numbers ends a function, not a case."""
+    try:
+        return smoothness_of(fit, data, ground, known=known, alike=alike)
+    except UNFORESEEN as error:
+        LOGGER.info("no function of %s can be worked out: %s", " and ".join(ground.words), error)
+        return None
 
 
 def _function(asked: Smoothness, ground: Ground, *, product: bool, times: float) -> Smooth:
@@ -129,7 +147,7 @@ def with_surfaces(fit: Fit, models: Sequence[Model], material: Material) -> list
         current, known = (fit, None) if like is None else (like.fit, like.parts[-1])
         alone = 0.0
         if known is not None:
-            one = smoothness_of(current, data, ground_of(place, current.model, data, current.x), known=known)
+            one = _asked(current, data, ground_of(place, current.model, data, current.x), known=known)
             alone = -np.inf if one is None else one.log_evidence
         for words in _pairs(fit.model, place):
             if (place.targets, words) in done:
@@ -138,7 +156,7 @@ def with_surfaces(fit: Fit, models: Sequence[Model], material: Material) -> list
             ground = ground_of_two(place.targets[0], words, current.model, data, current.x)
             if not ground.usable:
                 continue
-            both = smoothness_of(current, data, ground, known=known, alike=True)
+            both = _asked(current, data, ground, known=known, alike=True)
             if both is not None:
                 asked.append((both.log_evidence - alone, ground, like))
     cost = float(np.log(max(len(asked), 1)))

@@ -67,10 +67,9 @@ def held_out_runs(
     Of several models of what has no name the likeliest is adopted that makes the prediction better than it is
     without: than that of the mechanisms with a name, where there are any, or else of the simulation. What is
     not certain where it was found has to be better by more than appears by chance, what is certain better
-    than the simulation fitted alike; one of fewer coordinates
-    that foresees no worse takes its place. Where all recordings are tests of somebody else, each part of
-    those to learn from is left out in turn, and the model is adopted that foresees them best
-    (`siq.mismatch.left_out`).
+    than the simulation fitted alike; one of fewer coordinates that foresees no worse takes its place. Where
+    all recordings are tests of somebody else, each part of those to learn from is left out in turn, and the
+    model is adopted that foresees them best (`siq.mismatch.left_out`).
 
     Parameters
     ----------

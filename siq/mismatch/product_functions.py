@@ -1,7 +1,7 @@
 """Products of two smooth functions, of one coordinate each.
 
 What depends on two coordinates is often a product: a force that friction or a valve scales, a rate that food
-and temperature both limit. A product is told by far fewer recordings than a surface, and where each
+and temperature both limit. A product has far fewer heights than a surface, and where each
 coordinate has been, if not both at a time, it is known all the same.
 
 Of ``f(x) g(y)`` a normal process of unit size is expected of f, and one of the size of the whole of g. Given

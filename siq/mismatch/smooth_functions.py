@@ -30,8 +30,8 @@ from siq.mismatch.function_places import Place
 from siq.mismatch.functions import built, fresh_names, unit_in
 
 CURVE, SURFACE = "curve", "surface"
-# Lengths between neighbours: a sum of bumps then has the variance of the process to 1e-5, that of two
-# coordinates to 4 %.
+# Lengths between neighbours: a sum of bumps then has the variance of the process to 2e-5, that of two
+# coordinates to 4 % (of points that are spread evenly).
 APART = 0.5
 ROUNDING = 1e-6  # numerical: of the process's variance, added to it at every bump
 

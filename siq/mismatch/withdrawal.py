@@ -16,7 +16,7 @@ from siq.mismatch.case import Comparison
 from siq.mismatch.described import models_of_the_nameless
 from siq.mismatch.held_out import HeldOutRuns
 from siq.mismatch.investigation import Investigation, MismatchVerdict, quiet_verdict
-from siq.mismatch.nameless_models import Material, Model
+from siq.mismatch.nameless_models import MECHANISM, Material, Model
 from siq.mismatch.remainder import what_is_left
 
 REFUTED = (
@@ -59,7 +59,7 @@ def anything_else(found: Investigation, models: Sequence[Model], case: Compariso
     recalibrated = found.search.recalibrated
     if recalibrated.has_process_noise:
         return True
-    functions = [each for each in models if all(part.kind != "mechanism" for part in each.parts)]
+    functions = [each for each in models if all(part.kind != MECHANISM for part in each.parts)]
     if any(each.log_evidence >= case.settings.search.least_log_odds for each in functions):
         return True
     return what_is_left(found.model, case.learn, recalibrated, recalibrated, found.roles).structured

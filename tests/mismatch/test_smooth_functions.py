@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from siq.estimation.budget import Budget, BudgetSpent
 from siq.estimation.estimation import fit_by_multiple_shooting
 from siq.estimation.innovations import Noise
 from siq.estimation.measurements import Measurements
+from siq.mismatch import fitted_smooth
 from siq.mismatch.diagnosis import solve_case
 from siq.mismatch.evidence import evidences_by_size, log_evidence_of
 from siq.mismatch.function_places import Place
@@ -68,16 +70,18 @@ def test_a_formula_says_what_the_function_does(function: Smooth) -> None:
         np.testing.assert_allclose(slope, derivatives[:, place], atol=1e-4)
 
 
-@pytest.mark.parametrize(("where", "shares"), [(ground(X), (0.25,)), (ground(X, V), (0.5, 0.25))])
+@pytest.mark.parametrize(
+    ("where", "shares", "off"), [(ground(X), (0.25,), 1e-4), (ground(X, V), (0.5, 0.25), 0.05)]
+)
 def test_a_sum_of_bumps_is_the_process_where_the_recordings_have_been(
-    where: Ground, shares: tuple[float, ...]
+    where: Ground, shares: tuple[float, ...], off: float
 ) -> None:
     function = smooth_function(where, shares, deviation=1.7)
     (expected,) = function.expected(tuple(f"b{k}" for k in range(function.width)))
     along = np.linalg.solve(expected.roots.T, function.values(where.courses))
     scaled = where.courses / function.lengths[:, None]
     away = ((scaled[:, :, None] - scaled[:, None, :]) ** 2).sum(axis=0)
-    np.testing.assert_allclose(along.T @ along, 1.7**2 * np.exp(-0.5 * away), atol=0.05 * 1.7**2)
+    np.testing.assert_allclose(along.T @ along, 1.7**2 * np.exp(-0.5 * away), atol=off * 1.7**2)
 
 
 def test_a_length_beyond_the_recordings_a_function_is_zero() -> None:
@@ -153,6 +157,20 @@ def test_evidence_of_parameters_expected_together_is_the_marginal_likelihood() -
     constant = [np.log(np.linalg.solve(each, np.ones(len(t))).sum()) / 2 for each in exact]
     wanted = wide[0] + constant[0] - wide[1] - constant[1]
     assert found[0] - found[1] == pytest.approx(wanted, abs=0.02 * abs(wanted))
+
+
+def test_what_is_beyond_all_numbers_ends_a_function_and_not_the_case(monkeypatch: pytest.MonkeyPatch) -> None:
+    def singular(*_: object, **__: object) -> None:
+        raise np.linalg.LinAlgError("singular matrix")
+
+    where = SimpleNamespace(usable=True, words=("x",), along=lambda *_: where)
+    fit, material = SimpleNamespace(model=MODEL, x=np.zeros((3, 2))), SimpleNamespace(data=None)
+    monkeypatch.setattr(fitted_smooth, "smoothness_of", singular)
+    assert fitted_smooth.with_a_smooth_function((), fit, where, 0.0, material) == []
+    asked = SimpleNamespace(considered=9, told=SimpleNamespace(level=1.0))
+    monkeypatch.setattr(fitted_smooth, "smoothness_of", lambda *_, **__: asked)
+    monkeypatch.setattr(fitted_smooth, "likeliest_product", singular)
+    assert fitted_smooth.with_a_smooth_function((), fit, where, 0.0, material, product=True) == []
 
 
 def test_the_model_of_fewest_coordinates_is_taken_that_foresees_no_worse() -> None:
