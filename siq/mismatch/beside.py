@@ -124,7 +124,10 @@ def beside_a_remainder(
     if abs(log_odds) < least:
         errors = [
             min(known, key=np.mean, default=None)
-            for known in (_left_out(models, recalibrated, data) for models in (theirs, ours))
+            for known in (
+                _left_out(models, recalibrated, data, candidates=candidates)
+                for models, candidates in ((theirs, ()), (ours, (trial.candidate,)))
+            )
         ]
         blocks = [None if each is None else in_blocks(each) for each in errors]
         foresees = None not in blocks and change_between(*blocks) == "better"
@@ -132,7 +135,15 @@ def beside_a_remainder(
     return BesideARemainder(log_odds, tuple(on_top), tuple(instead), foresees)
 
 
-def _left_out(models: Sequence[Model], recalibrated: Fit, data: Measurements) -> list[np.ndarray]:
+def _left_out(
+    models: Sequence[Model],
+    recalibrated: Fit,
+    data: Measurements,
+    *,
+    candidates: Sequence[MechanismCandidate],
+) -> list[np.ndarray]:
     """Squared errors on parts left out, of each model that does not run away there."""
-    errors = (errors_left_out(each.fit, data, noise=recalibrated.noise) for each in models)
+    errors = (
+        errors_left_out(each.fit, data, noise=recalibrated.noise, candidates=candidates) for each in models
+    )
     return [each for each in errors if each is not None]

@@ -12,10 +12,12 @@ from siq.estimation.budget import BudgetSpent
 from siq.estimation.estimation import SUBSTEP_ERROR, Fit
 from siq.estimation.linearisation import substeps_needed
 from siq.estimation.process_noise import (
+    better_of,
     fit_with_and_without_process_noise,
     fit_with_process_noise_as_needed,
     simpler_fit,
 )
+from siq.estimation.trajectories import fit_trajectories
 from siq.mismatch.candidates import MechanismCandidate
 from siq.mismatch.function_places import Place
 from siq.mismatch.functions import FORMULA
@@ -98,6 +100,17 @@ def _fitted(
     if trial.converged and needed > trial.substeps:
         finer = replace(trial, substeps=needed)
         trial = fit_with_process_noise_as_needed(trial.model, data, finer, budget=budget)
+    if not (trial.has_process_noise or fit.has_process_noise) and trial.log_likelihood < fit.log_likelihood:
+        # Nothing added is as likely as the fit without it: steps of all samples at once have led away.
+        damped = fit_trajectories(
+            candidate.model.with_values(values),
+            data,
+            begin=begin.x[data.first[:-1]],
+            noise=begin.noise,
+            substeps=trial.substeps,
+            budget=budget,
+        )
+        trial = better_of(trial, damped)
     if not trial.converged:
         raise NumericalFailure(trial.fault or "its fit does not settle")
     return judged(trial, fit, data, candidate, blocks=material.blocks)

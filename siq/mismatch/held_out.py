@@ -131,8 +131,19 @@ def held_out_runs(
             sizes = [np.inf if each is None else float(each.mean()) for each in errors]
             adopted = simplest_of(sizes, [model.coordinates for model, _ in choices], adopted)
     elif choices:
-        alone = errors_left_out(plain if named else search.recalibrated, learned, noise=noise)
-        left_out = [errors_left_out(fit, learned, noise=noise) for _, fit in choices]
+        names = [each.best.candidate for each in search.found] if named else []
+        alone = errors_left_out(
+            plain if named else search.recalibrated, learned, noise=noise, candidates=names
+        )
+        left_out = [
+            errors_left_out(
+                fit,
+                learned,
+                noise=noise,
+                candidates=[*names, *(part.trial.candidate for part in model.parts)],
+            )
+            for model, fit in choices
+        ]
         sizes = [np.inf if each is None else float(each.mean()) for each in left_out]
         LOGGER.info("parts left out: mean squared errors %s with models of what has no name", sizes)
         best = int(np.argmin(sizes))

@@ -7,7 +7,8 @@ one. All parameters are fitted to the others, so that what is left out had no pa
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+import logging
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +19,9 @@ from siq.estimation.free_runs import UsualStates, free_run, squared_errors
 from siq.estimation.innovations import Noise
 from siq.estimation.measurements import Measurements
 from siq.estimation.process_noise import fit_with_process_noise_as_needed
+from siq.mismatch.building import MechanismCandidate
 
+LOGGER = logging.getLogger(__name__)
 PARTS = 4  # of which one is left out at a time: a quarter, as is held out by default
 FEWEST = 16  # samples of a stretch that an initial state and an error can be told from
 
@@ -60,7 +63,9 @@ def parts_left_out(learned: Measurements) -> Iterator[LeftOut]:
         yield LeftOut(out, rest, rows)
 
 
-def errors_left_out(fit: Fit, learned: Measurements, *, noise: Noise) -> np.ndarray | None:
+def errors_left_out(
+    fit: Fit, learned: Measurements, *, noise: Noise, candidates: Iterable[MechanismCandidate] = ()
+) -> np.ndarray | None:
     """Normalised squared errors of free runs of the parts left out.
 
     Parameters
@@ -71,6 +76,8 @@ def errors_left_out(fit: Fit, learned: Measurements, *, noise: Noise) -> np.ndar
         These recordings.
     noise
         See `siq.estimation.free_runs.free_run`.
+    candidates
+        The mechanisms in it, of which some amplitudes cannot be negative.
 
     Returns
     -------
@@ -78,10 +85,11 @@ def errors_left_out(fit: Fit, learned: Measurements, *, noise: Noise) -> np.ndar
         One part behind the other, shape ``(values,)``; None where a fit has no result, or a simulation runs
         away.
     """
+    positive = {name for each in candidates for name in each.positive.intersection(each.amplitudes)}
     squares = []
     for part in parts_left_out(learned):
         try:
-            again = fit_with_process_noise_as_needed(fit.model, part.rest, replace(fit, x=fit.x[part.rows]))
+            again = _made_again(fit, part, positive)
             run = free_run(
                 again.model, part.out, noise=noise, substeps=max(again.substeps, fit.substeps),
                 usual=UsualStates.along(again.x),
@@ -94,6 +102,27 @@ def errors_left_out(fit: Fit, learned: Measurements, *, noise: Noise) -> np.ndar
             return None
         squares.append(own)
     return np.concatenate(squares)
+
+
+def _made_again(fit: Fit, part: LeftOut, positive: Collection[str]) -> Fit:
+    """A fit to the rest alone. What the rest would have of a sign that cannot be is not there.
+
+    The part left out may be the only one that tells of it: of vessels that overflow once, say.
+    """
+    model = fit.model
+    while True:
+        again = fit_with_process_noise_as_needed(model, part.rest, replace(fit, x=fit.x[part.rows]))
+        wrong = [each.name for each in again.model.parameters if each.name in positive and each.value < 0]
+        if not wrong:
+            return again
+        LOGGER.info("without rows of one part, %s would be negative", ", ".join(wrong))
+        model = replace(
+            model,
+            parameters=tuple(
+                replace(each, value=0.0, fixed=True) if each.name in wrong else each
+                for each in model.parameters
+            ),
+        )
 
 
 def _joined(stretches: list[tuple[int, int]]) -> list[tuple[int, int]]:

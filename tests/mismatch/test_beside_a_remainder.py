@@ -202,6 +202,28 @@ def test_what_is_left_out_is_foreseen_up_to_noise_and_parameters_are_fitted_to_t
     assert wrong is not None and np.sqrt(wrong.mean()) > 2 * right
 
 
+def test_a_sign_that_cannot_be_is_nothing_where_the_rest_alone_would_have_it() -> None:
+    x = symbol("x")
+    faster = replace(
+        DECAY,
+        equations=(DECAY.equations[0] - symbol("c") * x**2,),
+        parameters=(*DECAY.parameters, Parameter("c", 0.1)),
+    )
+    fixed = replace(faster, parameters=(DECAY.parameters[0], Parameter("c", 0.0, fixed=True)))
+    data = decays(4, 60)
+    loses = SimpleNamespace(positive=frozenset({"c"}), amplitudes=("c",))
+    # A sensor that grows by its square bends a decay as a loss does, and one that falls short as a gain does.
+    for bend, bound in ((-0.1, True), (0.1, False)):
+        bent = replace(data, outputs=data.outputs + bend * data.outputs**2)
+        fit, _ = recalibrate(faster, bent)
+        free = errors_left_out(fit, bent, noise=fit.noise)
+        signed = errors_left_out(fit, bent, noise=fit.noise, candidates=[loses])
+        without = errors_left_out(replace(fit, model=fixed), bent, noise=fit.noise)
+        assert free is not None and signed is not None and without is not None
+        np.testing.assert_allclose(signed, without if bound else free, rtol=1e-3, atol=1e-9)
+        assert abs(free.mean() - without.mean()) > 0.01 * free.mean()
+
+
 def test_a_model_that_runs_away_from_where_it_is_held_is_none() -> None:
     data = decays(2, 40)
     fit, _ = recalibrate(DECAY, data)
