@@ -99,9 +99,13 @@ class CheckedStudy:
         recordings = self.study.recordings
         if recordings is None or recordings.file.startswith("results/"):
             return
-        space = StudyParts(self.study, self.system).space
+        parts = StudyParts(self.study, self.system)
         found, _ = read_pairs(
-            self.source(), states=space.names, units=space.units, pair_step=recordings.pair_step
+            self.source(),
+            states=parts.space.names,
+            units=parts.space.units,
+            pair_step=recordings.pair_step,
+            hidden_velocities=parts.hidden_velocities,
         )
         for name in found.names:
             try:

@@ -19,6 +19,7 @@ from siq.dynamics.formulas import compile_formulas
 from siq.dynamics.phase_portrait import PhasePortrait
 from siq.identify.identified_field import IdentifiedField
 from siq.numerics.measured_text import place_text
+from siq.numerics.normal_draws import normal_draws
 from siq.numerics.share_text import percent
 
 DRAWS = 200  # of f: a share of one in twenty is then known to ±0.015
@@ -97,7 +98,7 @@ def check_existence(found: IdentifiedField, portrait: PhasePortrait, *, seed: in
 def _drawn_changes(found: IdentifiedField, draw: np.random.Generator) -> np.ndarray:
     """Changes of all coefficients, shape ``(n, q, d)``."""
     changes = np.zeros((DRAWS, found.library.size, found.library.dimension))
-    own = draw.multivariate_normal(np.zeros(len(found.support)), found.covariance, size=DRAWS, method="eigh")
+    own = normal_draws(np.zeros(len(found.support)), found.covariance, DRAWS, generator=draw)
     changes[:, found.support[:, 1], found.support[:, 0]] = own
     if found.rivals is not None:
         changes += found.rivals.drawn(DRAWS, generator=draw)

@@ -41,6 +41,7 @@ from siq.dynamics.reach import measure_at
 from siq.identify.given_field import AnyField, GivenField
 from siq.identify.identified_field import IdentifiedField
 from siq.numerics.measured_text import place_text
+from siq.numerics.normal_draws import normal_draws
 from siq.potential.well import Well
 
 Function = Callable[[np.ndarray], np.ndarray]
@@ -359,7 +360,7 @@ def _relative_error_of_drift(found: AnyField, points: np.ndarray, measure: Diffu
 def _hessian_error(found: IdentifiedField, one: Equilibrium, root: np.ndarray, seed: int) -> float:
     """Standard deviation of M, in its own metric, over draws of f from its distribution."""
     generator = np.random.default_rng(seed)
-    draws = generator.multivariate_normal(found.values, found.covariance, size=DRAWS, method="eigh")
+    draws = normal_draws(found.values, found.covariance, DRAWS, generator=generator)
     reference = hessian_at(found.dynamics, one.position)
     spread = []
     for draw in draws:

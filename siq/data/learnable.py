@@ -20,11 +20,14 @@ SINGLE = (
     " of others, nor of barriers"
 )
 SINGLE_REMEDY = (
-    "record how the system settles from many starting points, or one long record in which noise makes it hop"
+    "record how the system settles from many starting points, or one long record in which noise makes it hop;"
+    " if these are positions of something that has inertia, set 'identification.hidden_velocities'"
 )
 
 
-def checked_for_learning(recordings: Recordings, *, file: str, chosen: bool) -> Recordings:
+def checked_for_learning(
+    recordings: Recordings, *, file: str, chosen: bool, hidden_velocities: bool = False
+) -> Recordings:
     """Refuse what nothing can be learned from; leave out columns that never change.
 
     Parameters
@@ -35,6 +38,8 @@ def checked_for_learning(recordings: Recordings, *, file: str, chosen: bool) -> 
         For messages.
     chosen
         Whether somebody named the states: then none is left out.
+    hidden_velocities
+        Whether they are positions: these are smooth, however strong the random forces on velocities are.
 
     Raises
     ------
@@ -42,7 +47,7 @@ def checked_for_learning(recordings: Recordings, *, file: str, chosen: bool) -> 
         For a single recording without noise, and for a state that never changes.
     """
     recordings = _moving(recordings, file=file, chosen=chosen)
-    if len(recordings.labels) == 1:
+    if len(recordings.labels) == 1 and not hidden_velocities:
         floors = noise_floors(recordings)
         if floors is not None and all(floor.process == 0 for floor in floors):
             raise InputError(file, "", SINGLE, SINGLE_REMEDY)
@@ -107,6 +112,7 @@ def read_pairs(
     states: Sequence[str] | None,
     units: Mapping[str, str] | None,
     pair_step: float | None,
+    hidden_velocities: bool = False,
 ) -> tuple[Recordings, SnapshotPairs]:
     """Read recordings that something is to be learned from, and their pairs.
 
@@ -116,6 +122,8 @@ def read_pairs(
         See `read_recordings`.
     pair_step
         See `snapshot_pairs`.
+    hidden_velocities
+        See `checked_for_learning`.
 
     Raises
     ------
@@ -124,7 +132,9 @@ def read_pairs(
         close enough to be a pair.
     """
     recordings = read_recordings(path, columns=states, units=units)
-    recordings = checked_for_learning(recordings, file=str(path), chosen=states is not None)
+    recordings = checked_for_learning(
+        recordings, file=str(path), chosen=states is not None, hidden_velocities=hidden_velocities
+    )
     try:
         pairs = snapshot_pairs(recordings, pair_step=pair_step)
     except ValueError as error:

@@ -72,18 +72,26 @@ STRETCH_LABEL = re.compile(r"(?P<label>.*) \((?P<number>\d+) of (?P<of>\d+)\)")
 LENGTH = 10  # correlation times in a stretch: what is left of its first sample at its end is then nothing
 
 
-def in_stretches(recordings: Recordings) -> Recordings:
+def in_stretches(recordings: Recordings, *, hidden_velocities: bool = False) -> Recordings:
     """Cut a recording that is the only one into stretches, of which some can be held out, or drawn again.
 
     Stretches are ten correlation times long, hops included, where this makes between ten and forty of them.
     Several recordings come back as they are, and so does one of fewer than `STRETCHES` pairs, or without
     random forces: a system that settles once is not seen again in another stretch.
+
+    Parameters
+    ----------
+    recordings
+        Trajectories.
+    hidden_velocities
+        Whether they are positions: these are smooth, however strong the random forces on velocities are, and
+        whether there are any is found together with f.
     """
     count = len(recordings.t)
     if len(np.unique(sources(recordings.labels))) > 1 or len(recordings.labels) > 1 or count < 2 * STRETCHES:
         return recordings
     floors = noise_floors(recordings)
-    if floors is not None and all(floor.process == 0 for floor in floors):
+    if floors is not None and all(floor.process == 0 for floor in floors) and not hidden_velocities:
         return recordings
     runs = runs_of(recordings)
     longest = max(correlated_samples(column, runs) for column in recordings.values.T)

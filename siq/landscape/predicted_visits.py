@@ -20,6 +20,7 @@ from siq.identify.identified_field import IdentifiedField, field_dynamics
 from siq.landscape.dwell_times import NoiseStrength, dwell_time
 from siq.landscape.transitions import transitions, ways_out
 from siq.numerics.measured_text import place_text
+from siq.numerics.normal_draws import normal_draws
 from siq.reference.fokker_planck import CELLS, CellProcess, cell_process, cores_of
 
 OVERSHOOT = 0.5826  # derived: -ζ(1/2)/√(2π)
@@ -232,7 +233,7 @@ def drawn_system(found: IdentifiedField, *, generator: np.random.Generator) -> D
         Where the draw comes from.
     """
     coefficients = np.zeros_like(found.coefficients)
-    own = generator.multivariate_normal(found.values, found.covariance, method="eigh")
+    own = normal_draws(found.values, found.covariance, 1, generator=generator)[0]
     coefficients[found.support[:, 1], found.support[:, 0]] = own
     if found.rivals is not None:
         coefficients += found.rivals.drawn(1, generator=generator)[0]
@@ -240,7 +241,7 @@ def drawn_system(found: IdentifiedField, *, generator: np.random.Generator) -> D
     diffusion = found.diffusion
     if found.noise is not None:
         terms = found.noise
-        entries = generator.multivariate_normal(terms.values, terms.covariance, method="eigh")
+        entries = normal_draws(terms.values, terms.covariance, 1, generator=generator)[0]
         diffusion = replace(terms, values=entries).diffusion(found.intensity)
     values = coefficients[support[:, 1], support[:, 0]]
     return field_dynamics(found.library, support, values, diffusion=diffusion)

@@ -4,6 +4,7 @@
 `integration`         how do many trajectories take a step of order eight at once, each its own?
 `machine_code`        how does a loop become machine code?
 `randomness`          where do the random numbers of a study come from?
+`normal_draws`        which parameters are as likely as those that were found?
 `thinning`            which points represent a region evenly?
 `triangle`            what do all least-squares fits to very many rows depend on?
 `density_comparison`  how far are samples from a density on a plane of two states?

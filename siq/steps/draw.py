@@ -23,12 +23,16 @@ from siq.steps.settings import STRICT, Sampling, StateSpace
 
 @dataclass(frozen=True, config=STRICT)
 class DrawSettings:
-    """What drawing depends on; `simulation` is None where recordings take its place."""
+    """What drawing depends on; `simulation` is None where recordings take its place.
+
+    Of the identification it is told one thing: whether the recordings are positions (`hidden_velocities`).
+    """
 
     seed: int
     space: StateSpace
     sampling: Sampling
     simulation: SimulationOptions | None
+    hidden_velocities: bool = False
 
 
 @plain_dataclass(frozen=True)
@@ -52,7 +56,7 @@ def run(settings: DrawSettings, source: Dynamics | Recordings, *, number: int) -
         Of the run.
     """
     if isinstance(source, Recordings):
-        source = in_stretches(without_slow_drift(source))
+        source = in_stretches(without_slow_drift(source), hidden_velocities=settings.hidden_velocities)
         if number > 0:
             draw = generator(settings.seed, number, Purpose.RESAMPLE)
             source = resample_recordings(source, generator=draw)
@@ -77,7 +81,11 @@ def read(path: str | Path, settings: DrawSettings) -> Dynamics | Recordings:
     if settings.simulation is not None:
         return load_system(path)
     recordings, _ = read_pairs(
-        path, states=settings.space.names, units=settings.space.units, pair_step=settings.sampling.pair_step
+        path,
+        states=settings.space.names,
+        units=settings.space.units,
+        pair_step=settings.sampling.pair_step,
+        hidden_velocities=settings.hidden_velocities,
     )
     space = settings.space
     units = tuple(

@@ -68,6 +68,11 @@ class StudyParts:
         return StateSpace(recordings.states, recordings.units, recordings.diffusion)
 
     @property
+    def hidden_velocities(self) -> bool:
+        """Whether the recordings are positions, whose velocities are states, too."""
+        return self.study.identification.hidden_velocities
+
+    @property
     def refinement(self) -> RefinementOptions:
         """How V is refined, by the routes that there are."""
         return self.study.refinement.with_routes(networks=self.study.training is not None)

@@ -140,7 +140,9 @@ def analyse(
         Also where a step failed, which its outcome then says.
     """
     settings = settings or PipelineSettings()
-    recordings = in_stretches(without_slow_drift(recordings))
+    recordings = in_stretches(
+        without_slow_drift(recordings), hidden_velocities=settings.identification.hidden_velocities
+    )
     identified = identify.run(settings.of(identify.IdentifySettings), recordings, number=number)
     trained, regressed = not_trained(number), None
     refinement = settings.refinement.with_routes(networks=settings.training is not None)

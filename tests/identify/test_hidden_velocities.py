@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from particles import TEMPERATURE, particle
 
-from siq.data.recordings import Recordings
+from siq.data.noise_floor import noise_floors
+from siq.data.recordings import Recordings, write_recordings
+from siq.data.selection import STRETCHES
 from siq.dynamics.phase_portrait import evenly_spread, phase_portrait
-from siq.errors import NumericalFailure
+from siq.errors import InputError, NumericalFailure
 from siq.identify.filtered_states import of_all_states
 from siq.identify.hidden_velocities import HiddenMotion, identify_hidden_motion
 from siq.identify.identification import IdentificationOptions
@@ -23,10 +25,10 @@ from siq.identify.velocities import smoothed_motion, velocity_names
 from siq.landscape.landscape import Landscape
 from siq.landscape.prefactor_errors import covariance_axes
 from siq.landscape.transitions import barrier_uncertainty, ways_out
-from siq.steps import identify
+from siq.steps import draw, identify
 from siq.steps.outcomes import Status
 from siq.steps.pipeline import PipelineSettings
-from siq.steps.settings import StateSpace
+from siq.steps.settings import Sampling, StateSpace
 
 FRICTION, SENSOR = 0.3, 0.02
 SETTINGS = PipelineSettings(identification=IdentificationOptions(degree=3, hidden_velocities=True))
@@ -139,6 +141,26 @@ def test_what_cannot_be_done_is_said() -> None:
     given = replace(SETTINGS, space=StateSpace(diffusion="identity"))
     done = identify.run(given.of(identify.IdentifySettings), identified()[1], number=0)
     assert done.record is None and "leave the diffusion out" in done.outcome.reason
+
+
+def test_one_record_of_smooth_positions_is_enough(tmp_path: Path) -> None:
+    """Random forces on velocities leave positions smooth, so that sample by sample none are seen."""
+    recordings, _ = particle(7, records=1, samples=12_000, step=0.02)
+    floors = noise_floors(recordings)
+    assert floors is not None and floors[0].process == 0
+    path = tmp_path / "particle.parquet"
+    write_recordings(path, recordings)
+    alone, hidden = (
+        draw.DrawSettings(0, StateSpace(), Sampling(), None, hidden_velocities=key) for key in (False, True)
+    )
+    with pytest.raises(InputError, match="positions of something that has inertia, set 'identification"):
+        draw.read(path, alone)
+    drawn = draw.run(hidden, draw.read(path, hidden), number=0).recordings
+    assert drawn is not None and len(drawn.labels) >= STRETCHES
+    done = identify.run(SETTINGS.of(identify.IdentifySettings), drawn, number=0)
+    assert done.record is not None and done.record.prediction["passed"]
+    field = done.record.found
+    assert [field.library.names[k] for _, k in field.support] == ["v_x", "x", "v_x", "x**3"]
 
 
 def test_what_is_known_exactly_has_no_axis() -> None:
