@@ -3,7 +3,11 @@
 ========================  ====================================================================================
 `options`                 what is asked?
 `paths`                   which path leads from an attractor to a saddle at least action?
-`discretised_paths`       what is the action of a chain of points, and how is it made minimal?
+`discretised_paths`       what is the action of a chain of points?
+`chain_spacing`           how are its points laid along a curve?
+`first_chains`            from which first chains is a path sought, and which minima are rivals?
+`chain_descent`           how is the action of a chain made minimal?
+`path_nodes`              which momenta and actions has it then?
 `hamiltonian_paths`       and which paths are most likely where noise acts on some states only?
 `tubes`                   where does a path leave a cycle, or arrive at one?
 `cycle_ways`              which ways lead out of cycles, over cycles, and into them?

@@ -29,7 +29,7 @@ from siq.dynamics.many_states import MOST_SEARCHED, portrait_of_many
 from siq.dynamics.phase_portrait import PhasePortrait
 from siq.errors import InputError, NumericalFailure
 from siq.identify.given_field import GivenField
-from siq.landscape.discretised_paths import evenly
+from siq.landscape.chain_spacing import evenly
 from siq.landscape.dwell_times import NoiseStrength
 from siq.landscape.landscape import Landscape, assembled
 from siq.landscape.options import LandscapeOptions
