@@ -9,6 +9,8 @@
 `chain_descent`           how is the action of a chain made minimal?
 `path_nodes`              which momenta and actions has it then?
 `hamiltonian_paths`       and which paths are most likely where noise acts on some states only?
+`hamiltonian_problem`     which boundary conditions have they, and how are they solved?
+`followed_solutions`      from which first guess does a solution get there?
 `tubes`                   where does a path leave a cycle, or arrive at one?
 `cycle_ways`              which ways lead out of cycles, over cycles, and into them?
 `turnover`                do states that turn about a well leave it as the law of escape says?
