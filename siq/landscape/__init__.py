@@ -19,7 +19,8 @@
 `dwell_times`             how long does a well last, and how sure is that?
 `transitions`             which barriers part the wells, how sure are they, and what does a way out look like?
 `global_quasipotential`   what is U over all wells?
-`landscape`               all of this of one identified vector field
+`landscape`               all of this of one vector field: what can be asked of it?
+`finding`                 how is it found, and what is it put together from?
 `refusal`                 why is there none, and what is known all the same?
 `storage`                 how is it kept in a file?
 `block_quadrature`        what is the integral of exp(-U/ε) over a box?

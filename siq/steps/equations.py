@@ -31,7 +31,8 @@ from siq.errors import InputError, NumericalFailure
 from siq.identify.given_field import GivenField
 from siq.landscape.chain_spacing import evenly
 from siq.landscape.dwell_times import NoiseStrength
-from siq.landscape.landscape import Landscape, assembled
+from siq.landscape.finding import assembled
+from siq.landscape.landscape import Landscape
 from siq.landscape.options import LandscapeOptions
 from siq.landscape.refusal import NoLandscape
 from siq.landscape.storage import write_landscape

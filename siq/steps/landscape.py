@@ -17,7 +17,8 @@ from siq.errors import NumericalFailure
 from siq.identify.filtered_states import of_all_states
 from siq.identify.storage import FieldRecord
 from siq.landscape.dwell_times import NoiseStrength
-from siq.landscape.landscape import Landscape, find_landscape
+from siq.landscape.finding import find_landscape
+from siq.landscape.landscape import Landscape
 from siq.landscape.options import LandscapeOptions
 from siq.landscape.record_test import VisitTest
 from siq.landscape.storage import write_landscape
