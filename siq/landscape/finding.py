@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from siq.certificate.certify import Certificate
+from siq.certificate.certificates import Certificate
 from siq.dynamics.cycles import Cycle
 from siq.dynamics.equilibria import Equilibrium
 from siq.dynamics.phase_portrait import PhasePortrait

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from siq.certificate.certify import Certificate
+from siq.certificate.certificates import Certificate
 from siq.data.inspection import seen_states
 from siq.data.record_states import RecordStates
 from siq.data.recordings import Recordings, recordings_of

@@ -16,7 +16,8 @@ import numpy as np
 import pandas as pd
 from pydantic.dataclasses import dataclass
 
-from siq.certificate.certify import caustics_below, certify_given_wells
+from siq.certificate.caustics import caustics_below
+from siq.certificate.certify_wells import certify_given_wells
 from siq.certificate.characteristics import references_about
 from siq.certificate.tests import CertificateOptions
 from siq.dynamics.basins import enlarged

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from pydantic.dataclasses import dataclass
 
-from siq.certificate.certify import Certificate
+from siq.certificate.certificates import Certificate
 from siq.data.recordings import Recordings, snapshot_pairs
 from siq.dynamics.phase_portrait import evenly_spread, phase_portrait
 from siq.errors import NumericalFailure

@@ -16,15 +16,12 @@ from typing import Any
 import numpy as np
 from pydantic.dataclasses import dataclass
 
-from siq.certificate.certify import (
-    HARMLESS,
-    Certificate,
-    caustic_notes,
-    certify_formulas,
-    certify_wells,
-    uncertified,
-)
+from siq.certificate.caustics import caustic_notes
+from siq.certificate.certificates import Certificate, uncertified
+from siq.certificate.certify import certify_formulas
+from siq.certificate.certify_wells import certify_wells
 from siq.certificate.characteristics import Reference, references_about
+from siq.certificate.common_tests import HARMLESS
 from siq.certificate.descent import FEWEST, MOST_PAIRS
 from siq.certificate.held_out import HeldOut
 from siq.certificate.regions import basin_region

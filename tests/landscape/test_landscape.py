@@ -19,7 +19,7 @@ from known_systems import (
 )
 from matplotlib.figure import Figure
 
-from siq.certificate.certify import Certificate
+from siq.certificate.certificates import Certificate
 from siq.certificate.tests import Verdict
 from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.dynamics import Dynamics

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import sympy
 
-from siq.certificate.certify import Certificate
+from siq.certificate.certificates import Certificate
 from siq.certificate.tests import Verdict
 from siq.data.recordings import SnapshotPairs
 from siq.dynamics.dynamics import Dynamics
