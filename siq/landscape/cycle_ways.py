@@ -10,8 +10,9 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from siq.dynamics.cycles import Cycle, unstable_direction
+from siq.dynamics.descents import ends_of
 from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.equilibria import Equilibrium, ends_of
+from siq.dynamics.equilibria import Equilibrium
 from siq.dynamics.phase_portrait import PhasePortrait
 from siq.errors import NumericalFailure
 from siq.landscape.chain_spacing import evenly
