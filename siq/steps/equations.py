@@ -46,7 +46,7 @@ from siq.potential.well import Well
 from siq.steps.landscape_tables import degree_rows, landscape_rows
 from siq.steps.outcomes import Method, Outcome, Status, Step
 from siq.steps.settings import STRICT
-from siq.study.study import fault_for_landscape
+from siq.study.study_system import fault_for_landscape
 from siq.study.tables import as_table, write_table
 
 ALONG = 300  # states along a path, from the neighbourhood of which further descents start
