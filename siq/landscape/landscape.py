@@ -352,8 +352,9 @@ class Landscape:
         Parameters
         ----------
         equations
-            From `from_equations`, of the same states. U is in the unit of D, which has to be the same: tell
-            the recordings that of the equations (`siq.steps.settings.StateSpace`), or read ΔU/ε of both.
+            From `from_equations`, of the same states. U is in the unit of D, which has to be the same, but
+            for the errors of one that was estimated: tell the recordings that of the equations
+            (`siq.steps.settings.StateSpace`), or read ΔU/ε of both.
         noise
             ε for which mean times are compared; left out, none are.
 
@@ -366,7 +367,7 @@ class Landscape:
         Raises
         ------
         ValueError
-            When the states are not the same.
+            When the states are not the same, or D is not.
         """
         from siq.steps.beside_equations import compared
 
