@@ -34,7 +34,7 @@ from known_systems import (
     potential_values,
 )
 
-from siq.certificate.certify import HARMLESS
+from siq.certificate.common_tests import HARMLESS
 from siq.certificate.tests import Candidate, CertificateOptions, check_hamilton_jacobi, stated_error
 from siq.dynamics.phase_portrait import PhasePortrait
 from siq.dynamics.simulation import SimulationOptions, simulate_snapshots

@@ -9,7 +9,8 @@ from siq.dynamics.cards import load_system
 from siq.steps import draw
 from siq.steps.of_study import StudyParts, settings_of
 from siq.steps.pipeline import Analysis, PipelineSettings, analyse
-from siq.study.study import load_study, system_path
+from siq.study.study import load_study
+from siq.study.study_system import system_path
 
 SYSTEMS = Path(__file__).parents[1] / "config" / "systems"
 

@@ -18,7 +18,9 @@ from siq.dynamics.dynamics import Dynamics
 from siq.errors import InputError, suggestion
 from siq.files.documents import Document, read_document, validate
 from siq.steps.of_study import StudyParts, settings_of
-from siq.study.study import Study, check_states, completed, load_published, load_study_system
+from siq.study.published_figures import load_published
+from siq.study.study import Study, completed
+from siq.study.study_system import check_states, load_study_system
 from siq.version import DISTRIBUTION
 from workflow.places import BASE, config_path, names_in, needed_file, published_figures, system_card
 

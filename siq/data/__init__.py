@@ -17,6 +17,9 @@
 `quantum`            how finely were the numbers of a column written?
 `stationarity`       how fast does a record forget, and does its background drift slowly?
 `transitions`        how many states does it support by itself, and how often does it hop?
+`two_state_tests`    is it pushed apart, or could a single state show as much?
+`two_levels`         at which levels does it stay, over which background?
+`visits`             when does it visit which state, and how long do visits last?
 `record_states`      what does it say of its two states, without any formula?
 `noise_floor`        how strong are the two kinds of noise, at a first look?
 `lagged`             where are samples evenly spaced, and how do neighbours go together over lags?

@@ -10,7 +10,8 @@ from siq.data.coverage import Coverage
 from siq.data.learnable import SINGLE, SINGLE_REMEDY
 from siq.data.markov_lag import MarkovLag
 from siq.data.recordings import Recordings
-from siq.data.transitions import DwellCount, Switching
+from siq.data.transitions import Switching
+from siq.data.visits import DwellCount
 from siq.numerics.measured_text import range_text, value_text
 
 COARSE = 0.5  # relaxation times: over a longer step most of what f does is forgotten

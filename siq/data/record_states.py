@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from siq.data.recordings import Recordings
-from siq.data.transitions import DwellCount, Switching
+from siq.data.transitions import Switching
+from siq.data.visits import DwellCount
 from siq.numerics.measured_text import range_text, unit_text, value_text
 
 if TYPE_CHECKING:

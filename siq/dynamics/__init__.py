@@ -13,7 +13,8 @@
 `tape`                and how is it written for a loop in machine code?
 `simulation`          which trajectories does it have?
 `sampling`            how is it simulated where nobody says it?
-`equilibria`          where does it rest, and where do its trajectories end?
+`equilibria`          where does it rest, and how is V curved there?
+`descents`            where do its trajectories end, and what lies below a saddle?
 `reach`               does noise reach every state, be it by way of others?
 `recurrence`          where does what comes to rest nowhere lead: to a cycle, or to chaos?
 `cycles`              which period and multipliers has a cycle, and how is V curved across it?

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from siq.dynamics.descents import Descents, follow
 from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.equilibria import Descents, Equilibrium, follow, hessian_at
+from siq.dynamics.equilibria import Equilibrium, hessian_at
 from siq.numerics.thinning import representative_subset
 
 NEAREST = 600  # descents that start close to the attractor, where recordings leave directions out

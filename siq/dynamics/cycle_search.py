@@ -15,9 +15,10 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from siq.dynamics.cycles import PARTS, Cycle, closed_orbit
+from siq.dynamics.descents import Descents, ends_of, follow, settled_on
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.edge_tracking import apart_of, bisected
-from siq.dynamics.equilibria import Descents, Equilibrium, classify, ends_of, follow, settled_on
+from siq.dynamics.equilibria import Equilibrium, classify
 from siq.dynamics.equilibrium_search import spread_evenly
 from siq.dynamics.recurrence import recurrence_of
 from siq.errors import NumericalFailure

@@ -13,8 +13,9 @@ import numpy as np
 
 from siq.dynamics.basins import Basin, Focus, basin_of
 from siq.dynamics.cycle_search import cycles_between, cycles_left, cycles_reached
+from siq.dynamics.descents import Descents, follow
 from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.equilibria import Descents, Equilibrium, follow, hessian_at
+from siq.dynamics.equilibria import Equilibrium, hessian_at
 from siq.dynamics.equilibrium_search import all_equilibria, spread_evenly
 from siq.dynamics.phase_portrait import (
     PhasePortrait,

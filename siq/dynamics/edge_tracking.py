@@ -17,8 +17,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import scipy.optimize
 
+from siq.dynamics.descents import follow
 from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.equilibria import Equilibrium, classify, distinct_roots, follow
+from siq.dynamics.equilibria import Equilibrium, classify, distinct_roots
 from siq.numerics.integration import dormand_prince_step, next_step
 
 SECTIONS = 16  # of a segment, whose ends are followed side by side

@@ -11,9 +11,10 @@ import itertools
 
 import numpy as np
 
+from siq.dynamics.descents import follow
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.edge_tracking import edge_saddle
-from siq.dynamics.equilibria import Equilibrium, classified, distinct_roots, follow
+from siq.dynamics.equilibria import Equilibrium, classified, distinct_roots
 from siq.dynamics.equilibrium_search import spread_evenly
 from siq.dynamics.phase_portrait import (
     PhasePortrait,

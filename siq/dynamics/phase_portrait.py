@@ -13,8 +13,9 @@ import numpy as np
 
 from siq.dynamics.basins import Basin, basin_of
 from siq.dynamics.cycles import Cycle
+from siq.dynamics.descents import Descents, follow, neighbours
 from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.equilibria import Descents, Equilibrium, find_equilibria, follow, neighbours, rate_of
+from siq.dynamics.equilibria import Equilibrium, find_equilibria, rate_of
 from siq.dynamics.recurrence import Recurrence, recurrence_of
 from siq.numerics.thinning import representative_subset
 

@@ -23,6 +23,7 @@ class DiffusionSource(StrEnum):
 
     GIVEN = "given"
     ESTIMATED = "estimated"
+    OF_VELOCITIES = "estimated of velocities"
     UNIT = "unit"
 
     @property
@@ -32,6 +33,9 @@ class DiffusionSource(StrEnum):
             DiffusionSource.GIVEN: None,
             DiffusionSource.ESTIMATED: "D is estimated from the noise of the recordings, since none was"
             " given, and scaled to the determinant 1: ε has the size of the noise, and U is in the unit of ε",
+            DiffusionSource.OF_VELOCITIES: "D is estimated from the recorded positions, and its part that"
+            " acts on the velocities, the only one there is, scaled to the determinant 1: ε has the size of"
+            " the random forces, and U is in the unit of ε",
             DiffusionSource.UNIT: "D is taken as the unit matrix, since none was given and the recordings do"
             " not show it: U, barriers and times follow from it",
         }[self]

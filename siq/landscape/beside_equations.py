@@ -7,6 +7,9 @@ input of it. Both are taken as plain data (`siq.landscape.storage`).
 An attractor of the trajectories is that attractor of the equations to which it is nearest among all their
 equilibria, in shares of the domain; of several, the nearest one. Ways out have the same two ends, and the
 nearest saddle where there are several.
+
+U is in the unit of D, so that only landscapes of one D can be compared: of the D of both no more may differ
+than the errors of one that was estimated leave open.
 """
 
 from __future__ import annotations
@@ -17,12 +20,19 @@ from typing import Any
 
 import numpy as np
 
+from siq.dynamics.diffusion import Diffusion
+from siq.dynamics.dynamics import Dynamics
+from siq.identify.diffusion import STANDARD_ERRORS
+from siq.identify.identified_field import IdentifiedField
 from siq.landscape.dwell_times import NoiseStrength, dwell_time
 from siq.landscape.storage import exits_of
+from siq.numerics.measured_text import place_text
 
 MISSED = "the trajectories do not show it"
 FURTHER = "the equations have no such"
 CYCLE = "limit cycles are not compared"
+
+ROUNDING = 1e-9  # numerical, of D: two formulas of the same matrix
 
 Plain = Mapping[str, Any]
 
@@ -96,6 +106,51 @@ def differences(
         if "cycle" in one or index not in pairs:
             found.append(_absent(f"A{index + 1}", CYCLE if "cycle" in one else MISSED))
     return [*_of_ways(equations, trajectories, pairs), *found]
+
+
+def check_same_noise(
+    equations: Dynamics, trajectories: Dynamics, x: np.ndarray, *, found: IdentifiedField | None
+) -> None:
+    """Refuse two landscapes whose D are not the same, and U in different units with them.
+
+    Parameters
+    ----------
+    equations, trajectories
+        Of the same states.
+    x
+        States at which D is compared, shape ``(n, d)``.
+    found
+        The identified f, whose D may have been estimated and has errors then; None where f is given.
+
+    Raises
+    ------
+    ValueError
+        With both D and the remedy.
+    """
+    one, other, d = equations.diffusion, trajectories.diffusion, equations.dimension
+    # Unit vectors and their sums tell a symmetric matrix; in the unit of the noise, or states would differ.
+    sides = np.array([np.eye(d)[[i, j]].sum(axis=0) for i, j in zip(*np.triu_indices(d), strict=True)])
+    size = np.sqrt(np.diagonal(one.at(x), axis1=1, axis2=2))
+    momenta = (sides / np.where(size > 0, size, 1.0)[:, None]).reshape(-1, d)
+    places = np.repeat(x, len(sides), axis=0)
+    difference = np.sum(momenta * (other.push(places, momenta) - one.push(places, momenta)), axis=1)
+    errors = np.zeros(len(places))
+    if found is not None:
+        errors = np.sqrt(found.noise_variance(found.noise_slopes(places, momenta)))
+    apart = ~(np.abs(difference) <= ROUNDING + STANDARD_ERRORS * errors)
+    if apart.any():
+        place = places[[np.argmax(apart)]]
+        where = "" if one.constant and other.constant else f" at {place_text(place[0])}"
+        raise ValueError(
+            f"U is in the unit of D, and D is not the same: the equations have {_rows(one, place)}{where},"
+            f" the trajectories {_rows(other, place)}; give both the same, recordings by"
+            " StateSpace(diffusion=...), or compare ΔU/ε"
+        )
+
+
+def _rows(noise: Diffusion, place: np.ndarray) -> list[list[float]]:
+    """D at a state, ``(1, d)``, to four digits."""
+    return [[float(f"{each:.4g}") for each in row] for row in noise.at(place)[0]]
 
 
 def difference_rows(found: Sequence[Difference]) -> list[dict[str, object]]:

@@ -10,11 +10,12 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from siq.dynamics.cycles import Cycle, unstable_direction
+from siq.dynamics.descents import ends_of
 from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.equilibria import Equilibrium, ends_of
+from siq.dynamics.equilibria import Equilibrium
 from siq.dynamics.phase_portrait import PhasePortrait
 from siq.errors import NumericalFailure
-from siq.landscape.discretised_paths import evenly
+from siq.landscape.chain_spacing import evenly
 from siq.landscape.paths import TransitionPath, minimum_action_path
 
 BESIDE = 1e-3  # of the domain: from where f leads on, beside what parts two basins

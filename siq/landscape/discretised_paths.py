@@ -1,19 +1,14 @@
-"""Chains of points as curves: their geometric action, and how it is made minimal.
+"""What is the action of a chain of points?
 
-The machinery of `siq.landscape.paths`, which says what it is for. Everything is in units in which the
-distance of both ends, D and the derivatives of f are of size one.
+Everything is in units in which the distance of both ends, D and the derivatives of f are of size one. What
+the chains are for is said in `siq.landscape.paths`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
-from scipy.integrate import solve_ivp
-from scipy.interpolate import Akima1DInterpolator
-from scipy.spatial import cKDTree
 
 from siq.dynamics.cycles import Cycle, hessians_along
 from siq.dynamics.diffusion import Diffusion
@@ -22,23 +17,9 @@ from siq.dynamics.equilibria import classify, hessian_at
 from siq.errors import NumericalFailure
 from siq.landscape.tubes import Bowl, Tube
 
-START_SHARE = 1e-6  # of the action: U on the ellipsoid where a chain begins
-CENTRAL = 0.005  # of the distance to the end: nearer to the attractor points lie no closer together
-MOST_BENDS = 6  # directions of bent first guesses: each costs as much as the path itself
-BEND = 0.4  # of the distance: how far bent first guesses leave the straight line
-KICKS = (0.3, 0.1, 0.03, 0.01)  # of the distance: tried from a chain that is at rest and no minimum
 AT_REST = 1e-5  # |f| at a state that counts as an equilibrium, in units of the Jacobian and the distance
-SMALLEST_SHIFT, LARGEST_SHIFT = 1e-3, 1e12  # of Newton's matrix
-LEAST_GAIN, GOOD_GAIN = 0.05, 0.7  # of what a step promised: it is taken; the next one is bolder
-STEPS, RESPACINGS, MOST_KICKS = 150, 40, 3
-UNEVEN = 1.6  # longest to shortest segment at which a chain is spaced anew
 FLAT = 1e-3  # of the upper bound of S: numerical, above the error of tubes, below what parts two minima
-COARSE, FINE = 1e-7, 1e-12  # share of S that a step must still gain, for first guesses and for the answer
-MOST_NODES = 60_000  # numerical, a guard on memory: 60 000 blocks of d × d
 NO_ACTION = 1e-7  # of ∫|f||φ'|ds: less is a path without noise
-APART = 0.03  # of the distance: minima further apart are two
-MOST_TURNS, STEPS_OF_A_TURN = 300, 64  # of a path from or to a cycle, within linear dynamics
-SPIRAL_STEP = 0.15  # of the shortest time of the linear dynamics
 
 
 @dataclass(frozen=True)
@@ -134,11 +115,6 @@ class PathProblem:
         """
         return FLAT if isinstance(self.begin, Tube) or self.finish is not None else 0.0
 
-    @property
-    def fine(self) -> float:
-        """Share of S that a step must still gain: of tubes, the third order that their cost leaves out."""
-        return START_SHARE**1.5 if self.flat > 0 else FINE
-
     def scaled(self, x: np.ndarray) -> np.ndarray:
         """Points in the units of the problem, from its start to its end."""
         y = (x - self.start) @ self.inverse.T
@@ -174,7 +150,7 @@ class PathProblem:
             whitening = np.broadcast_to(np.eye(y.shape[1]), (len(middles), y.shape[1], y.shape[1]))
         else:
             whitening = self.noise.whitening_at(middles)
-            own_force, own_forward = _of(whitening, force), _of(whitening, forward)
+            own_force, own_forward = products(whitening, force), products(whitening, forward)
         speed, length = (
             np.linalg.norm(part, axis=1) + np.finfo(float).tiny for part in (own_force, own_forward)
         )
@@ -203,322 +179,6 @@ class PathProblem:
         parts = self.segments(y)
         return float(np.sum(parts.speed * parts.length))
 
-    def guesses(self) -> tuple[list[np.ndarray], float]:
-        """First chains, and by how many radian the first of them turns, in the metric of M.
-
-        That would be the right one were f linear: ``ẋ = (J + 2DM) x``, backwards from the end.
-        """
-        share = np.linspace(0, 1, 201)[:, None]
-        line = share * self.end
-        chains = [line]
-        # The columns of the right factor span what is across the line.
-        across = np.linalg.svd(self.end[None])[2][1 : MOST_BENDS + 1]
-        chains += [line + BEND * side * np.sin(np.pi * share) * way for way in across for side in (1, -1)]
-        if self.hessian is None:
-            return chains, 0.0
-        spiral = np.vstack([self._spiral(self.end, START_SHARE), self.end])
-        forward = np.diff(spiral @ np.linalg.cholesky(self.hessian), axis=0)
-        forward /= np.linalg.norm(forward, axis=1, keepdims=True)
-        turns = np.arccos(np.clip(np.sum(forward[1:] * forward[:-1], axis=1), -1, 1))
-        return [spiral, *chains], float(turns.sum())
-
-    def _spiral(self, last: np.ndarray, share: float) -> np.ndarray:
-        """The way that linear dynamics takes to a point from where its level is a share of the one there."""
-        assert self.hessian is not None
-        flow = self.jacobian(np.zeros((1, len(last))))[0] + 2 * self.hessian
-        back = scipy.linalg.expm(-SPIRAL_STEP * flow / np.abs(np.linalg.eigvals(flow)).max())
-        lowest = share * self.level(last[None])[0]
-        y = [back @ last]
-        while y[-1] @ self.hessian @ y[-1] > lowest and len(y) < MOST_NODES:
-            y.append(back @ y[-1])
-        return np.array(y[::-1])
-
-    def _winding(self, tube: Tube, last: np.ndarray, level: float, sense: float) -> np.ndarray:
-        """The way by linear dynamics from a point onwards to a tube, or back to where it left one.
-
-        ``ẏ = F + 2Dp`` with ``p`` as the quadratic cost has it, with or against time.
-        """
-
-        def rates(_: float, y: np.ndarray) -> np.ndarray:
-            slope, force = tube.slope(y), self.force(y[None])[0]
-            push = slope if self.constant else self.noise.at(y[None])[0] @ slope
-            return np.asarray(sense * force - push)
-
-        def arrives(_: float, y: np.ndarray) -> float:
-            return float(tube.level(y[None])[0] - level)
-
-        arrives.terminal = True  # type: ignore[attr-defined]
-        if not arrives(0.0, last) > 0:
-            return np.zeros((0, len(last)))
-        way = solve_ivp(
-            rates, (0.0, MOST_TURNS * tube.period), last, rtol=1e-4, atol=1e-6,
-            max_step=tube.period / STEPS_OF_A_TURN, events=arrives,
-        )  # fmt: skip
-        return np.asarray(way.y[:, 1:].T)
-
-    def spaced(self, y: np.ndarray, count: int, level: float) -> np.ndarray:
-        """A chain along another one, which begins where the level is as given and is spaced for accuracy.
-
-        Near an attractor the segments are in proportion to the distance from it, in the metric of M, since
-        the path may wind.
-        """
-        y = y[np.append(np.linalg.norm(np.diff(y, axis=0), axis=1) > 1e-14, True)]
-        if self.hessian is not None and self.level(y[:1])[0] > level > 0:
-            y = np.vstack([self._spiral(y[0], level / self.level(y[:1])[0]), y])
-        if level > 0 and isinstance(self.begin, Tube):
-            y = np.vstack([self._winding(self.begin, y[0], level, -1.0)[::-1], y])
-        if level > 0 and self.finish is not None:
-            y = np.vstack([y, self._winding(self.finish, y[-1], level, 1.0)])
-        length = np.r_[0, np.cumsum(np.linalg.norm(np.diff(y, axis=0), axis=1))]
-        curve = Akima1DInterpolator(length, y)
-        dense = np.interp(np.arange(0, len(y) - 0.95, 0.1), np.arange(len(y)), length)
-        y = curve(dense)
-        if self.begin is not None:
-            first = max(int(np.flatnonzero(self.level(y) <= level).max(initial=0)), 0)
-            dense, y = dense[first:], y[first:]
-        if self.finish is not None:
-            beyond = np.flatnonzero(self.finish.level(y) > level).max(initial=len(y) - 3) + 2
-            dense, y = dense[:beyond], y[:beyond]
-        measure = np.r_[0, np.cumsum(self._measure(y))]
-        return curve(np.interp(np.linspace(0, measure[-1], count), measure, dense))
-
-    def _measure(self, y: np.ndarray) -> np.ndarray:
-        """Lengths of the segments, relative to what they should be."""
-        forward, middles = np.diff(y, axis=0), (y[1:] + y[:-1]) / 2
-        if self.hessian is None:
-            return np.linalg.norm(forward, axis=1)
-        near = np.sqrt(self.level(middles)) + CENTRAL * np.sqrt(self.level(self.end[None]))
-        return np.sqrt(self.level(forward)) / near
-
-    def descend(self, y: np.ndarray, count: int, action: float, *, first: bool = False) -> DiscretisedPath:
-        """Move a chain of `count` points down to a minimum of S, by steps across the chain.
-
-        A `first` chain is spaced anew where it has become uneven, and pushed off where it rests at a saddle
-        of S.
-
-        Parameters
-        ----------
-        y
-            Points along which the chain is laid, in any number.
-        count
-            Number of points of the chain.
-        action
-            About that of the path; it decides where the chain begins.
-        first
-            Whether it starts far from a minimum.
-        """
-        level = START_SHARE * action
-        y = self.spaced(y, count, level)
-        if y.shape[1] == 1:
-            return DiscretisedPath(y, self.action(y), True)
-        action, shift, spacings, kicks = self.action(y), 1.0, 0, 0
-        for _ in range(STEPS):
-            across = _Across(self, y)
-            resting = (COARSE if first else self.fine) * action + np.finfo(float).eps * across.effort
-            gained, expected = 0.0, np.inf
-            while shift < LARGEST_SHIFT:
-                step = across.step(shift)
-                if step is not None:
-                    new = across.moved(step)
-                    expected = -0.5 * float(across.slope @ step)
-                    gained = action - self.action(new)
-                    if gained > LEAST_GAIN * expected or expected < resting:
-                        break
-                shift = max(4 * shift, SMALLEST_SHIFT)
-            else:
-                break
-            if gained > 0:
-                y, action = new, action - gained
-            if expected > resting:
-                shift *= 0.2 if gained > GOOD_GAIN * expected else 1.0
-                shift = max(shift if shift > 1e-8 else 0.0, self.flat)
-                measure = self._measure(y)
-                if first and spacings < RESPACINGS and measure.max() > UNEVEN * measure.min():
-                    y = self.spaced(y, count, level)
-                    action, spacings = self.action(y), spacings + 1
-            elif across.step(self.flat) is None:
-                if not first or kicks == MOST_KICKS:
-                    break
-                kicks += 1
-                lower = min((across.moved(push) for push in across.kicks()), key=self.action)
-                if self.action(lower) >= action:
-                    break
-                y, action, shift = lower, self.action(lower), 1.0
-            elif shift <= SMALLEST_SHIFT:
-                return DiscretisedPath(y, action, True)
-            else:
-                shift = self.flat
-        return DiscretisedPath(y, action, False)
-
-    def nodes(self, chain: DiscretisedPath) -> np.ndarray:
-        """Points, momenta, and actions up to there, shape ``(n, 2d + 1)``."""
-        y, parts = chain.points, self.segments(chain.points)
-        # Momenta of the middles, carried over half a segment with ṗ = -Jᵀp - p·(∂D)p; both sides agree at a
-        # minimum.
-        times = (parts.length / parts.speed)[:, None]
-        middle = _of(parts.metric, (parts.forward / times - parts.force) / 2)
-        change = np.einsum("nij,ni->nj", self.jacobian(parts.middles), middle)
-        if not self.constant:
-            change += self.noise.pull(parts.middles, middle)
-        turn = times / 2 * change
-        p = np.empty_like(y)
-        p[1:-1] = (middle[1:] + turn[1:] + middle[:-1] - turn[:-1]) / 2
-        p[0] = middle[0] + turn[0] if self.begin is None else self.begin.slope(y[0]) / 2
-        p[-1] = middle[-1] - turn[-1] if self.finish is None else -self.finish.slope(y[-1]) / 2
-        values = self.level(y[:1]) + np.r_[0.0, np.cumsum(parts.actions)]
-        return np.column_stack([y, p, values])
-
-    def residual(self, nodes: np.ndarray) -> float:
-        """The largest Hamiltonian, in proportion to its parts."""
-        y, p = np.split(nodes[:, :-1], 2, axis=1)
-        force = self.force(y)
-        drift = np.sum(p * force, axis=1)
-        push = np.sum((p if self.constant else _of(self.noise.at(y), p)) * p, axis=1)
-        scale = max((np.abs(drift) + push).max(), NO_ACTION * np.sum(force**2, axis=1).max())
-        return float(np.abs(drift + push).max() / scale)
-
-    def extrapolated(self, coarse: DiscretisedPath, fine: DiscretisedPath) -> np.ndarray:
-        """Nodes without the error of second order, from a chain and one with half its spacing.
-
-        Where the two differ by more than their errors, by a turn about the attractor say, they do not match,
-        and the finer one stands for itself.
-        """
-        action = max((4 * fine.action - coarse.action) / 3, 0.0)
-        second = self.nodes(fine)
-        nodes = (4 * second[::2] - self.nodes(coarse)) / 3
-        if not self.residual(nodes) < self.residual(second):
-            nodes = second
-            nodes[:, -1] *= action / max(fine.action, np.finfo(float).tiny)
-        d, ends = self.end.size, np.zeros((2, nodes.shape[1]))
-        if self.finish is not None:
-            ends[1, :d] = self.finish.closest(nodes[-1:, :d])[0]
-            nodes[-1, -1] = action - self.remaining(nodes[-1, :d])
-            nodes = np.vstack([nodes, ends[1:]])
-        nodes[-1, -1] = action
-        if self.begin is None:
-            return nodes
-        ends[0, :d] = self.begin.closest(nodes[:1, :d])[0]
-        return np.vstack([ends[:1], nodes])
-
-
-class _Across:
-    """Moves of a chain across itself: slope and second derivatives of S, in banded form.
-
-    A chain may slide along itself without any change of S but that of its error, which must not matter. The
-    matrix for frozen times is that of ``Σ |Δ - τf|²/2τ``, ``τ = |Δ|/|f|`` being held fast, without the second
-    derivatives of f and D: of an upper bound of S that touches it. With ``q = D⁻¹(Δ/τ - f)``, twice the
-    momentum, and ``G_ik = ∂_k f_i + ((∂_k D)q)_i``, its blocks are ``τ GᵀD⁻¹G``, ``-D⁻¹G`` and ``D⁻¹/τ``.
-    """
-
-    def __init__(self, problem: PathProblem, y: np.ndarray) -> None:
-        parts, dimension = problem.segments(y), y.shape[1]
-        self.y, self.effort = y, float(np.sum(parts.speed * parts.length))
-        self.range = slice(1 if problem.begin is None else 0, -1 if problem.finish is None else None)
-        times = (parts.length / parts.speed)[:, None, None]
-        metric, middles, jacobian = parts.metric, parts.middles, problem.jacobian(parts.middles)
-        force, forward = (_of(metric, part) for part in (parts.force, parts.forward))
-        twice = forward / times[:, 0] - force
-        turned, by_middle = jacobian, np.einsum("nij,ni->nj", jacobian, twice)
-        bent = problem.bend(middles, -times[:, 0] * twice)
-        # The times change, too: by so much, up to a factor, with the middles and the differences.
-        slower = 2 * times[:, 0] * np.einsum("nij,ni->nj", jacobian, force)
-        if not problem.constant:
-            noise = problem.noise
-            turned = jacobian + noise.turn(middles, twice)
-            by_middle = by_middle + noise.pull(middles, twice) / 2
-            bent = bent - times / 2 * noise.bend(middles, twice)
-            slower -= times[:, 0] * noise.pull(middles, force) - noise.pull(middles, forward) / times[:, 0]
-        by_middle *= -times[:, 0]
-        slope = np.zeros_like(y)
-        slope[1:] += by_middle / 2 + twice
-        slope[:-1] += by_middle / 2 - twice
-        longer, share = -2 * forward / times[:, 0], (0.25 / (parts.speed * parts.length))[:, None, None]
-        pushed = metric @ turned
-        frozen = _Blocks(times * turned.transpose(0, 2, 1) @ pushed, -pushed, metric / times)
-        exact = _Blocks(
-            frozen.middle + bent - share * _outer(slower, slower),
-            frozen.mixed - share * _outer(longer, slower),
-            frozen.forward - share * _outer(longer, longer),
-        )
-        first, last = np.zeros((2, dimension, dimension))
-        if problem.begin is not None:
-            slope[0] += problem.begin.slope(y[0])
-            first = problem.begin.curvature(y[0])
-        if problem.finish is not None:
-            slope[-1] += problem.finish.slope(y[-1])
-            last = problem.finish.curvature(y[-1])
-        self.problem = problem
-        normal = _normals(y)
-        if isinstance(problem.begin, Tube):  # along the tube, on which the chain begins, and ends
-            normal[0] = np.linalg.svd(problem.begin.slope(y[0])[None])[2][1:].T
-        if problem.finish is not None:
-            normal[-1] = np.linalg.svd(problem.finish.slope(y[-1])[None])[2][1:].T
-        self.normal = normal[self.range]
-        self.slope = np.einsum("nij,ni->nj", self.normal, slope[self.range]).ravel()
-        self.exact = exact.banded(self.normal, self.range.start, (first, last))
-        self.frozen = frozen.banded(self.normal, self.range.start, (first, last))
-
-    def step(self, shift: float) -> np.ndarray | None:
-        """Newton's step with a shift; None where the matrix is not positive definite."""
-        try:
-            with np.errstate(all="ignore"):
-                matrix = self.exact + shift * self.frozen
-            factor = scipy.linalg.cholesky_banded(matrix, lower=True)
-        except (np.linalg.LinAlgError, ValueError):  # ValueError: not finite
-            return None
-        return -scipy.linalg.cho_solve_banded((factor, True), self.slope)
-
-    def moved(self, step: np.ndarray) -> np.ndarray:
-        """The chain after a step."""
-        y = self.y.copy()
-        y[self.range] += np.einsum("nij,nj->ni", self.normal, step.reshape(len(self.normal), -1))
-        if isinstance(begin := self.problem.begin, Tube):
-            y[0] = begin.onto(y[0], float(begin.level(self.y[:1])[0]))
-        if (finish := self.problem.finish) is not None:
-            y[-1] = finish.onto(y[-1], float(finish.level(self.y[-1:])[0]))
-        return y
-
-    def kicks(self) -> list[np.ndarray]:
-        """Steps to both sides along the direction in which S curves downwards most."""
-        _, vectors = scipy.linalg.eig_banded(self.exact, lower=True, select="i", select_range=(0, 0))
-        way = vectors[:, 0] / np.abs(vectors).max()
-        return [side * size * way for size in KICKS for side in (1, -1)]
-
-
-@dataclass(frozen=True)
-class _Blocks:
-    """Second derivatives of the segments by middles and differences, ``(n - 1, d, d)`` each."""
-
-    middle: np.ndarray
-    mixed: np.ndarray  # difference before middle
-    forward: np.ndarray
-
-    def banded(self, normal: np.ndarray, start: int, ends: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-        """The matrix of the moves ``normal`` from point `start` on, in the lower form of scipy's solvers.
-
-        `ends` are added to the blocks of the first point and of the last.
-        """
-        count, _, m = normal.shape
-        transposed = self.mixed.transpose(0, 2, 1)
-        both = (self.mixed + transposed) / 2
-        diagonal = np.zeros((len(self.middle) + 1, *ends[0].shape))
-        diagonal[1:] += self.middle / 4 + self.forward + both
-        diagonal[:-1] += self.middle / 4 + self.forward - both
-        diagonal[0] += ends[0]
-        diagonal[-1] += ends[1]
-        # Row of the next point, column of this one.
-        below = self.middle / 4 - self.forward + (self.mixed - transposed) / 2
-        turned = normal.transpose(0, 2, 1)
-        diagonal = turned @ diagonal[start : start + count] @ normal
-        below = turned[1:] @ below[start : start + count - 1] @ normal[:-1]
-        matrix = np.zeros((2 * m, count * m))
-        for column in range(m):
-            for row in range(column, m):
-                matrix[row - column, column::m] = diagonal[:, row, column]
-            for row in range(m):
-                matrix[m + row - column, column::m][: count - 1] = below[:, row, column]
-        return matrix
-
 
 def _closest_states(start: np.ndarray | Cycle, end: np.ndarray | Cycle) -> tuple[np.ndarray, np.ndarray]:
     """Of two states or cycles, the two states that are closest to each other."""
@@ -528,38 +188,6 @@ def _closest_states(start: np.ndarray | Cycle, end: np.ndarray | Cycle) -> tuple
     return one[row], two[column]
 
 
-def _of(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+def products(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Of each matrix with its vector: ``(n, d, d)`` and ``(n, d)`` to ``(n, d)``."""
     return np.asarray((matrices @ vectors[:, :, None])[:, :, 0])
-
-
-def _outer(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    return left[:, :, None] * right[:, None, :]
-
-
-def _normals(y: np.ndarray) -> np.ndarray:
-    """Orthonormal directions across a chain at its points, shape ``(n, d, d - 1)``."""
-    along = np.gradient(y, axis=0)
-    return np.linalg.svd(along[:, None, :])[2][:, 1:].transpose(0, 2, 1)
-
-
-def rivals_of(chains: Sequence[DiscretisedPath], best: DiscretisedPath) -> list[DiscretisedPath]:
-    """The minima that lie apart from the first chain, from what has become of it, and from each other."""
-
-    def tree(chain: DiscretisedPath) -> cKDTree:
-        length = np.linalg.norm(np.diff(chain.points, axis=0), axis=1).sum()
-        return cKDTree(evenly(chain.points, int(5 * length / APART) + 2))
-
-    rivals: list[DiscretisedPath] = []
-    trees = [tree(chains[0]), tree(best)]
-    for chain in chains[1:]:
-        if chain.minimum and all(other.query(chain.points)[0].max() > APART for other in trees):
-            rivals.append(chain)
-            trees.append(tree(chain))
-    return rivals
-
-
-def evenly(points: np.ndarray, count: int) -> np.ndarray:
-    """Evenly spaced points on a polygon."""
-    along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
-    places = np.linspace(0, along[-1], count)
-    return np.stack([np.interp(places, along, column) for column in points.T], axis=1)

@@ -28,40 +28,27 @@ W.-J. Beyn, IMA J. Numer. Anal. 9 (1990) 379: boundary conditions of orbits betw
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
-from scipy.integrate import solve_bvp
-from scipy.interpolate import Akima1DInterpolator, PchipInterpolator
+from scipy.interpolate import PchipInterpolator
 
 from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.equilibria import classify, hessian_at
+from siq.dynamics.equilibria import classify
 from siq.errors import NumericalFailure
+from siq.landscape.followed_solutions import ROUGH, curves_to, followed, last_states, longer, onward, way_down
+from siq.landscape.hamiltonian_problem import APPROACH, HamiltonianProblem, Solution
 from siq.reference.characteristics import crossed
-from siq.reference.cubic_series import cubic_series
-from siq.reference.hamiltonian import HamiltonianFlow
-from siq.reference.power_series import quasipotential_series
 
-FIRST = 0.1  # of the distance from A to S, in the metric of M: there the first end lies
-START = 0.003  # of it: where solutions begin, and the power series errs by its fifth power
-MOST_STATES = 8  # for a series of degree 4; beyond, of degree 3
-APPROACH, LAST = 0.1, 0.002  # of it: how far from S the end is at first, and in the answer
+LAST = 0.002  # of the distance from A to S, in the metric of M: how far from S the end is in the answer
 NEARER = 3.0  # by so much in one step
-ROUGH, SWITCHED, FINE = 1e-3, 1e-5, 1e-6  # relative residuals of collocation, on the way and of the answer
-LONGEST = 0.3  # of the distance: step of the end; it is halved where Newton's method does not follow ...
-SHORTEST = 0.004  # ... and a curve given up below this: it leaves the well, or V is not smooth there
-BENDS, BEND = 4, 0.4  # curves beside the straight one, and how far they leave it, as a share of the distance
+SWITCHED, FINE = 1e-5, 1e-6  # relative residuals of collocation, at the saddle and of the answer
 APART, COMPARED = 0.03, 400  # of the distance, at so many times: solutions further apart are two
 CENTRAL = 0.005  # of the distance to the end: nearer to A points lie no closer together
 TURN = 0.05  # of this distance, or of that from A: between two points of the answer
 FEWEST, MOST = 400, 20_000  # points of the answer
-MOST_NODES = 50_000  # numerical, a guard on memory
-FINER, ENOUGH = 6, 1000  # times the nodes of its guess, or so many: a mesh that needs more has no solution
 GAUSS = np.polynomial.legendre.leggauss(3)  # exact to the order of collocation
-SPIRAL = 0.3  # of the shortest time of the linear equations: steps of a first guess
-REST = 1e-5  # |f| at an equilibrium, in units of the flow
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,20 +121,20 @@ def hamiltonian_paths(
             f"{attractor.tolist()} is no stable equilibrium; where noise acts on some states only, paths are"
             " sought from stable equilibria alone"
         )
-    problem = _Problem(dynamics, attractor, end)
+    problem = HamiltonianProblem(dynamics, attractor, end)
     found: list[HamiltonianPath] = []
-    for last in problem.lasts(beside):
-        solutions: list[_Solution] = []
-        for curve in problem.curves(last, curves):
-            solution = problem.followed(curve)
+    for last in last_states(problem, beside):
+        solutions: list[Solution] = []
+        for curve in curves_to(problem, last, curves):
+            solution = followed(problem, curve)
             if solution is None or any(not _apart(solution, one, problem.dimension) for one in solutions):
                 continue
             solutions.append(solution)
-            path = problem.finished(solution, tolerance)
+            path = _finished(problem, solution, tolerance)
             found += [] if path is None else [path]
-        way = None if found else problem.way_down(beside, last)
-        if way is not None and (solution := problem.followed(way)) is not None:
-            path = problem.finished(solution, tolerance)
+        way = None if found else way_down(problem, beside, last)
+        if way is not None and (solution := followed(problem, way)) is not None:
+            path = _finished(problem, solution, tolerance)
             found += [] if path is None else [path]
         if found:
             break
@@ -158,364 +145,113 @@ def hamiltonian_paths(
     return sorted(found, key=lambda path: (not path.smooth, path.action))
 
 
-def _apart(one: _Solution, two: _Solution, dimension: int) -> bool:
+def _apart(one: Solution, two: Solution, dimension: int) -> bool:
     """Whether two solutions that end at one state come from different sides."""
     times = np.linspace(max(one.times[0], two.times[0]), 0.0, COMPARED)
     return bool(np.abs(one.at(times)[:dimension] - two.at(times)[:dimension]).max() > APART)
 
 
-@dataclass(frozen=True, eq=False)
-class _Solution:
-    """A solution over backward times, from -T to 0: positions and momenta, and its mesh."""
-
-    at: Callable[[np.ndarray], np.ndarray]
-    times: np.ndarray
-
-
-class _Problem:
-    """Hamilton's equations in units in which M is the unit matrix and the end is at the distance one."""
-
-    def __init__(self, dynamics: Dynamics, attractor: np.ndarray, end: np.ndarray) -> None:
-        offset = end - attractor
-        level = 0.5 * float(offset @ hessian_at(dynamics, attractor) @ offset)
-        if not level > 0:
-            raise ValueError(f"the path is to end where it starts, at {attractor.tolist()}")
-        self.flow = HamiltonianFlow(dynamics, attractor, level)
-        self.dimension = dynamics.dimension
-        self.end = self.flow.inverse @ offset
-        many = self.dimension > MOST_STATES
-        self.series = (
-            cubic_series(dynamics, attractor)
-            if many
-            else quasipotential_series(dynamics, attractor, degree=4)
+def _finished(problem: HamiltonianProblem, solution: Solution, tolerance: float) -> HamiltonianPath | None:
+    """The path of a solution that ends close to the end: on to it, and solved as finely as is asked."""
+    if problem.unstable is None:
+        ended: Solution | None = solution
+        last = problem.fixed(problem.end)
+    else:
+        # What winds has to be known better than on the way, or H is not zero where the condition changes.
+        known = problem.solved(
+            solution, problem.fixed(solution.at(np.zeros(1))[: problem.dimension, 0]), SWITCHED
         )
-        self.growth = self.flow.jacobian + 2 * self.flow.diffusion[0]  # of what leaves A: ẏ = (J + 2DM) y
-        self.fastest = float(np.abs(np.linalg.eigvals(self.growth)).max())
-        self.unstable: float | None = None
-        speed = np.abs(self.flow.inverse @ dynamics.drift(end[None])[0]).max()
-        kind = classify(dynamics, end)
-        if speed < REST * np.linalg.norm(self.flow.jacobian) and kind.kind == "saddle" and kind.unstable == 1:
-            self._about_saddle(end)
-
-    def _about_saddle(self, end: np.ndarray) -> None:
-        jacobian = self.flow.inverse @ self.flow.dynamics.jacobian(end[None])[0] @ self.flow.units
-        values, left, right = scipy.linalg.eig(jacobian, left=True)
-        place = int(np.argmax(values.real))
-        self.unstable, self.left = float(values[place].real), left[:, place].real
-        self.jacobian, self.right = jacobian, right[:, place].real / (self.left @ right[:, place].real)
-        self.noise = self.flow.at(self.end[None])[0]
-        self.push = float(self.left @ self.noise @ self.left)
-        if not self.push > 0:
-            raise NumericalFailure(f"the noise does not move states across the saddle {end.tolist()}")
-        # Where paths come from: ẏ = J (y - S) + 2Dq with q = -λ/(w·Dw) w e^(-λt). What other directions
-        # gather meanwhile is ∫ e^((J + λ)t) dt of what q gives them: since ever, where that is finite, or
-        # since the path was far from S, where they decay about as fast as q.
-        d = self.dimension
-        given = -2 * self.unstable / self.push * self.noise @ self.left
-        given -= self.right * (self.left @ given)
-        block = np.zeros((d + 1, d + 1))
-        block[:d, :d], block[:d, d] = jacobian + self.unstable * np.eye(d), given
-        since_ever = self.right - np.linalg.lstsq(block[:d, :d], given, rcond=None)[0]
-        lately = self.right + scipy.linalg.expm(-np.log(APPROACH) / self.unstable * block)[:d, d]
-        self.arrivals = [since_ever, lately]
-
-    def lasts(self, beside: np.ndarray | None) -> list[np.ndarray]:
-        """Where the end is moved to: itself, or states before the saddle, one of which will do."""
-        return [self.end] if self.unstable is None else [self._before(beside, one) for one in self.arrivals]
-
-    def curves(self, last: np.ndarray, further: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Along which the end is moved: straight, and bent to some sides."""
-        share = np.linspace(0, 1, 201)[:, None]
-        straight = share * last
-        across = np.linalg.svd(last[None])[2][1 : BENDS // 2 + 1]
-        bent = [straight + BEND * side * np.sin(np.pi * share) * way for way in across for side in (1, -1)]
-        return [straight, *bent, *((one - self.flow.center) @ self.flow.inverse.T for one in further)]
-
-    def way_down(self, beside: np.ndarray | None, last: np.ndarray) -> np.ndarray | None:
-        """The way down taken backwards: V falls along it, so that it crosses no ridge, but it may wind."""
-        if beside is None or self.unstable is None:
+        if known is None:
             return None
-        down = (beside - self.flow.center) @ self.flow.inverse.T
-        far = down[np.linalg.norm(down - self.end, axis=1) >= APPROACH]
-        return np.vstack([far[::-1], last])
-
-    def _before(self, beside: np.ndarray | None, arrival: np.ndarray) -> np.ndarray:
-        """A state before the saddle, on the side of A."""
-        side = np.sign(self.left @ -self.end)
-        if beside is not None:
-            down = (beside - self.flow.center) @ self.flow.inverse.T
-            far = np.flatnonzero(np.linalg.norm(down - self.end, axis=1) >= APPROACH)
-            side = np.sign(self.left @ (down[far[0]] - self.end))
-        return np.asarray(self.end + side * APPROACH * arrival / np.linalg.norm(arrival))
-
-    def followed(self, curve: np.ndarray) -> _Solution | None:
-        """The solution at the end of a curve, None where one of the steps fails."""
-        outside = np.linalg.norm(curve, axis=1) >= FIRST
-        curve = curve[int(np.flatnonzero(~outside).max(initial=0)) + 1 :]
-        along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))]
-
-        def at(place: float) -> np.ndarray:
-            return np.array([np.interp(place, along, column) for column in curve.T])
-
-        solution = self._solved(self._linear(at(0.0)), self._fixed(at(0.0)), ROUGH)
-        before: tuple[_Solution, float] | None = None
-        place, step, failed = 0.0, LONGEST, False
-        while solution is not None and place < along[-1]:
-            ahead = min(place + step, along[-1])
-            guess = self._longer(solution)
-            if before is not None:
-                guess = _predicted(guess, before[0], (ahead - place) / (place - before[1]))
-            moved = self._solved(guess, self._fixed(at(ahead)), ROUGH)
-            if moved is None:
-                step, failed = step / 2, True
-                if step < SHORTEST:
-                    return None
-                continue
-            before = solution, place
-            solution, place = moved, ahead
-            step, failed = (step if failed else min(1.5 * step, LONGEST)), False
-        return solution
-
-    def finished(self, solution: _Solution, tolerance: float) -> HamiltonianPath | None:
-        """The path of a solution that ends close to the end: on to it, and solved as finely as is asked."""
-        if self.unstable is None:
-            ended: _Solution | None = solution
-            last = self._fixed(self.end)
-        else:
-            # What winds has to be known better than on the way, or H is not zero where the condition changes.
-            known = self._solved(
-                solution, self._fixed(solution.at(np.zeros(1))[: self.dimension, 0]), SWITCHED
-            )
-            if known is None:
-                return None
-            ended = self._solved(known, self._at_saddle(known), SWITCHED)
-            distance = APPROACH
-            while ended is not None and distance > LAST:
-                distance /= NEARER
-                ended = self._onward(ended, distance)
-                ended = self._solved(ended, self._at_saddle(ended), ROUGH)
-            if ended is None:
-                return None
-            last = self._at_saddle(ended)
-        rough = None if ended is None else self._solved(self._longer(ended), last, ROUGH / 10)
-        if rough is None:
+        ended = problem.solved(known, problem.at_saddle(known), SWITCHED)
+        distance = APPROACH
+        while ended is not None and distance > LAST:
+            distance /= NEARER
+            ended = onward(problem, ended, distance)
+            ended = problem.solved(ended, problem.at_saddle(ended), ROUGH)
+        if ended is None:
             return None
-        fine: _Solution | None = None
-        value = self._values(rough)[-1]
-        for fineness in (FINE, FINE / 10, FINE / 100):
-            fine = self._solved(rough, last, fineness)
-            if fine is None:
-                return None
-            before, value, rough = value, self._values(fine)[-1], fine
-            if abs(value - before) <= tolerance * value:
-                break
-        return self._path(rough, abs(value - before))
-
-    def _rates(self, z: np.ndarray) -> np.ndarray:
-        y, q, _ = self.flow.velocities(z[: self.dimension].T, z[self.dimension :].T)
-        return np.concatenate([y, q], axis=1).T
-
-    def _matrices(self, z: np.ndarray) -> np.ndarray:
-        turned, noise, bend = self.flow.linear(z[: self.dimension].T, z[self.dimension :].T)
-        top = np.concatenate([turned, 2 * noise], axis=2)
-        return np.concatenate(
-            [top, np.concatenate([-bend, -turned.transpose(0, 2, 1)], axis=2)], axis=1
-        ).transpose(1, 2, 0)
-
-    def _slope(self, y: np.ndarray) -> np.ndarray:
-        """Q of the power series at points, ``(n, d)``."""
-        return np.asarray(self.series.gradient(self.flow.points(y)) @ self.flow.units / (2 * self.flow.level))
-
-    def _curvature(self, y: np.ndarray) -> np.ndarray:
-        hessians = self.series.hessian(self.flow.points(y))
-        return np.asarray(self.flow.units.T @ hessians @ self.flow.units / (2 * self.flow.level))
-
-    def _fixed(self, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The condition that y ends at a point, as a matrix before (y, q) and what it gives."""
-        return np.eye(self.dimension, 2 * self.dimension), last
-
-    def _at_saddle(self, solution: _Solution) -> tuple[np.ndarray, np.ndarray]:
-        """The conditions at the saddle, as close to it as a solution ends: one more than unknowns."""
-        d, rate = self.dimension, self.unstable
-        assert rate is not None
-        matrix = np.zeros((d + 1, 2 * d))
-        matrix[0, :d] = self.left
-        matrix[1:, d:] = np.eye(d)
-        matrix[1:, :d] = rate / self.push * np.outer(self.left, self.left)
-        right = matrix[:, :d] @ self.end
-        right[0] = self.left @ solution.at(np.zeros(1))[:d, 0]
-        return matrix, right
-
-    def _solved(
-        self, guess: _Solution, last: tuple[np.ndarray, np.ndarray], tolerance: float
-    ) -> _Solution | None:
-        """The solution with a condition at its end, None where Newton's method does not come to one.
-
-        As H is conserved, a condition at the saddle is one too many. A further unknown k makes up for it,
-        ``ż = F + k ∇H``, along which H would grow: it comes out as zero.
-        """
-        d, (matrix, right) = self.dimension, last
-        further = len(matrix) - d
-
-        def rates(_: np.ndarray, z: np.ndarray, k: np.ndarray | None = None) -> np.ndarray:
-            own = self._rates(z)
-            return own if k is None else own + k[0] * np.concatenate([-own[d:], own[:d]])
-
-        def derivatives(_: np.ndarray, z: np.ndarray, k: np.ndarray | None = None) -> object:
-            own = self._matrices(z)
-            if k is None:
-                return own
-            velocity = self._rates(z)
-            return own + k[0] * np.concatenate([-own[d:], own[:d]]), np.concatenate(
-                [-velocity[d:], velocity[:d]]
-            )[:, None]
-
-        def ends(first: np.ndarray, final: np.ndarray, _: np.ndarray | None = None) -> np.ndarray:
-            return np.concatenate([first[d:] - self._slope(first[None, :d])[0], matrix @ final - right])
-
-        def slopes(first: np.ndarray, _: np.ndarray, k: np.ndarray | None = None) -> tuple[np.ndarray, ...]:
-            own = np.concatenate([-self._curvature(first[None, :d])[0], np.eye(d)], axis=1)
-            begin = np.concatenate([own, np.zeros((d + further, 2 * d))])
-            final = np.concatenate([np.zeros((d, 2 * d)), matrix])
-            return (begin, final) if k is None else (begin, final, np.zeros((2 * d + 1, 1)))
-
-        with np.errstate(all="ignore"):
-            try:
-                found = solve_bvp(
-                    rates, ends, guess.times, guess.at(guess.times), p=np.zeros(1) if further else None,
-                    fun_jac=derivatives, bc_jac=slopes, tol=tolerance, bc_tol=min(tolerance, 1e-6),
-                    max_nodes=min(max(FINER * len(guess.times), ENOUGH), MOST_NODES),
-                )  # fmt: skip
-            except (ValueError, np.linalg.LinAlgError):  # not finite, where a trial has run away
-                return None
-        return _Solution(found.sol, found.x) if found.success else None
-
-    def _linear(self, last: np.ndarray) -> _Solution:
-        """The way to a point close to A, were f linear: q = y there."""
-        back = scipy.linalg.expm(-SPIRAL / self.fastest * self.growth)
-        y = [last]
-        while np.linalg.norm(y[-1]) > START and len(y) < MOST_NODES:
-            y.append(back @ y[-1])
-        states = np.array(y[::-1])
-        times = SPIRAL / self.fastest * np.arange(1 - len(y), 1)
-        return _interpolated(times, np.concatenate([states, states], axis=1))
-
-    def _longer(self, solution: _Solution) -> _Solution:
-        """The same at evenly spaced times, begun so close to A as the power series asks for."""
-        first = solution.at(solution.times[:1])[: self.dimension, 0]
-        if np.linalg.norm(first) > START:
-            before = self._linear(first)
-            times = np.r_[before.times[:-1] + solution.times[0], solution.times]
-            states = np.concatenate([before.at(before.times[:-1]), solution.at(solution.times)], axis=1)
-            solution = _interpolated(times, states.T)
-        count = int(-solution.times[0] * self.fastest / SPIRAL) + 2
-        return _Solution(solution.at, np.linspace(solution.times[0], 0.0, count))
-
-    def _onward(self, solution: _Solution, distance: float) -> _Solution:
-        """The same, continued by the linear equations to a distance from the saddle."""
-        d, rate = self.dimension, self.unstable
-        assert rate is not None
-        final = solution.at(np.zeros(1))[:, 0]
-        fastest = np.abs(np.linalg.eigvals(self.jacobian)).max()
-        step = SPIRAL / fastest
-        whole = np.block([[self.jacobian, 2 * self.noise], [np.zeros((d, d)), -self.jacobian.T]])
-        onward = scipy.linalg.expm(step * whole)
-        states = [np.concatenate([final[:d] - self.end, final[d:]])]
-        height = float(self.left @ states[0][:d])
-        while np.linalg.norm(states[-1][:d]) > distance and len(states) < MOST_NODES:
-            ahead = onward @ states[-1]
-            height *= np.exp(-step * rate)
-            # What grows is not there: of the two parts along w either follows from the height.
-            ahead[:d] += self.right * (height - self.left @ ahead[:d])
-            ahead[d:] = -rate * height / self.push * self.left
-            states.append(ahead)
-        further = np.array(states[1:]).reshape(-1, 2 * d) + np.r_[self.end, np.zeros(d)]
-        times = np.r_[solution.times, step * np.arange(1, len(states))]
-        rows = np.concatenate([solution.at(solution.times).T, further])
-        return _interpolated(times - times[-1], rows)
-
-    def _values(self, solution: _Solution) -> np.ndarray:
-        """V at the nodes of the mesh, and at the end: the last one twice if that is where the mesh ends."""
-        length = np.diff(solution.times)
-        total = np.zeros(len(length))
-        for place, weight in zip(*GAUSS, strict=True):
-            z = solution.at(solution.times[:-1] + (1 + place) / 2 * length).T
-            total += (
-                weight / 2 * length * self.flow.velocities(z[:, : self.dimension], z[:, self.dimension :])[2]
-            )
-        first, final = (solution.at(solution.times[[place]])[: self.dimension].T for place in (0, -1))
-        begin = 0.0  # of the power series, v = 2 ∫ q·dy from A on
-        for place, weight in zip(*GAUSS, strict=True):
-            share = (1 + place) / 2
-            begin += weight * float(self._slope(share * first)[0] @ first[0])
-        values = begin + np.r_[0.0, np.cumsum(total)]
-        rest = 0.0
-        if self.unstable is not None:
-            rest = self.unstable * float(self.left @ (final[0] - self.end)) ** 2 / self.push
-        return np.append(values, values[-1] + rest)
-
-    def _path(self, solution: _Solution, error: float) -> HamiltonianPath:
-        d, flow = self.dimension, self.flow
-        z = solution.at(solution.times).T
-        velocity = np.linalg.norm(self._rates(z.T)[:d].T, axis=1)
-        # About A the path may wind: points lie as close as their distance from it, and from the end, asks
-        # for.
-        pace = velocity / (np.linalg.norm(z[:, :d], axis=1) + CENTRAL)
-        measure = np.r_[0.0, np.cumsum((pace[1:] + pace[:-1]) / 2 * np.diff(solution.times))]
-        count = int(np.clip(measure[-1] / TURN, FEWEST, MOST))
-        times = PchipInterpolator(measure, solution.times)(np.linspace(0.0, measure[-1], count))
-        times[0], times[-1] = solution.times[0], 0.0
-        z = solution.at(times).T
-        places = np.union1d(times, solution.times)
-        whole = self._values(_Solution(solution.at, places))
-        values = np.append(whole[np.searchsorted(places, times)], whole[-1])
-        y, q = z[:, :d], z[:, d:]
-        force = flow.dynamics.drift(flow.points(y)) @ flow.inverse.T
-        drift, push = np.sum(q * force, axis=1), self.flow.velocities(y, q)[2] / 2
-        residual = float(np.abs(drift + push).max() / (np.abs(drift) + push).max())
-        times = np.r_[-np.inf, times]
-        if self.unstable is not None:
-            y, q, times = np.vstack([y, self.end]), np.vstack([q, np.zeros(d)]), np.append(times, np.inf)
-        else:
-            values = values[:-1]
-        y, q, values = np.vstack([np.zeros(d), y]), np.vstack([np.zeros(d), q]), np.r_[0.0, values]
-        return HamiltonianPath(
-            flow.points(y), 2 * flow.level * q @ flow.inverse, flow.level * values, times,
-            flow.level * error, residual, self._smooth(solution),
-        )  # fmt: skip
-
-    def _smooth(self, solution: _Solution) -> bool:
-        """Whether no neighbour crosses the path, by the tangents of those that leave A beside it."""
-        d, times = self.dimension, solution.times
-        middles = (times[1:] + times[:-1]) / 2
-        at_nodes, between = (self._matrices(solution.at(t)).transpose(2, 0, 1) for t in (times, middles))
-        first = solution.at(times[:1])[:d].T
-        frame = np.linalg.qr(np.concatenate([np.eye(d), self._curvature(first)[0]]))[0]
-        for index, step in enumerate(np.diff(times)):
-            k1 = at_nodes[index] @ frame
-            k2 = between[index] @ (frame + step / 2 * k1)
-            k3 = between[index] @ (frame + step / 2 * k2)
-            moved = frame + step / 6 * (k1 + 2 * k2 + 2 * k3 + at_nodes[index + 1] @ (frame + step * k3))
-            new, upper = np.linalg.qr(moved)
-            new *= np.sign(np.diag(upper))
-            if crossed(frame[None, :d], new[None, :d])[0]:
-                return False
-            frame = new
-        return True
+        last = problem.at_saddle(ended)
+    rough = None if ended is None else problem.solved(longer(problem, ended), last, ROUGH / 10)
+    if rough is None:
+        return None
+    fine: Solution | None = None
+    value = _values(problem, rough)[-1]
+    for fineness in (FINE, FINE / 10, FINE / 100):
+        fine = problem.solved(rough, last, fineness)
+        if fine is None:
+            return None
+        before, value, rough = value, _values(problem, fine)[-1], fine
+        if abs(value - before) <= tolerance * value:
+            break
+    return _path(problem, rough, abs(value - before))
 
 
-def _predicted(guess: _Solution, before: _Solution, share: float) -> _Solution:
-    """A solution moved on by a share of what it has moved from the one before, as far as both go back."""
+def _values(problem: HamiltonianProblem, solution: Solution) -> np.ndarray:
+    """V at the nodes of the mesh, and at the end: the last one twice if that is where the mesh ends."""
+    length = np.diff(solution.times)
+    total = np.zeros(len(length))
+    for place, weight in zip(*GAUSS, strict=True):
+        z = solution.at(solution.times[:-1] + (1 + place) / 2 * length).T
+        y, q = z[:, : problem.dimension], z[:, problem.dimension :]
+        total += weight / 2 * length * problem.flow.velocities(y, q)[2]
+    first, final = (solution.at(solution.times[[place]])[: problem.dimension].T for place in (0, -1))
+    begin = 0.0  # of the power series, v = 2 ∫ q·dy from A on
+    for place, weight in zip(*GAUSS, strict=True):
+        share = (1 + place) / 2
+        begin += weight * float(problem.slope(share * first)[0] @ first[0])
+    values = begin + np.r_[0.0, np.cumsum(total)]
+    rest = 0.0
+    if problem.unstable is not None:
+        rest = problem.unstable * float(problem.left @ (final[0] - problem.end)) ** 2 / problem.push
+    return np.append(values, values[-1] + rest)
 
-    def at(times: np.ndarray) -> np.ndarray:
-        own, common = guess.at(times), times >= before.times[0]
-        own[:, common] += share * (own[:, common] - before.at(times[common]))
-        return own
 
-    return _Solution(at, guess.times)
+def _path(problem: HamiltonianProblem, solution: Solution, error: float) -> HamiltonianPath:
+    d, flow = problem.dimension, problem.flow
+    z = solution.at(solution.times).T
+    velocity = np.linalg.norm(problem.rates(z.T)[:d].T, axis=1)
+    # About A the path may wind: points lie as close as their distance from it, and from the end, asks for.
+    pace = velocity / (np.linalg.norm(z[:, :d], axis=1) + CENTRAL)
+    measure = np.r_[0.0, np.cumsum((pace[1:] + pace[:-1]) / 2 * np.diff(solution.times))]
+    count = int(np.clip(measure[-1] / TURN, FEWEST, MOST))
+    times = PchipInterpolator(measure, solution.times)(np.linspace(0.0, measure[-1], count))
+    times[0], times[-1] = solution.times[0], 0.0
+    z = solution.at(times).T
+    places = np.union1d(times, solution.times)
+    whole = _values(problem, Solution(solution.at, places))
+    values = np.append(whole[np.searchsorted(places, times)], whole[-1])
+    y, q = z[:, :d], z[:, d:]
+    force = flow.dynamics.drift(flow.points(y)) @ flow.inverse.T
+    drift, push = np.sum(q * force, axis=1), problem.flow.velocities(y, q)[2] / 2
+    residual = float(np.abs(drift + push).max() / (np.abs(drift) + push).max())
+    times = np.r_[-np.inf, times]
+    if problem.unstable is not None:
+        y, q, times = np.vstack([y, problem.end]), np.vstack([q, np.zeros(d)]), np.append(times, np.inf)
+    else:
+        values = values[:-1]
+    y, q, values = np.vstack([np.zeros(d), y]), np.vstack([np.zeros(d), q]), np.r_[0.0, values]
+    return HamiltonianPath(
+        flow.points(y), 2 * flow.level * q @ flow.inverse, flow.level * values, times,
+        flow.level * error, residual, _smooth(problem, solution),
+    )  # fmt: skip
 
 
-def _interpolated(times: np.ndarray, states: np.ndarray) -> _Solution:
-    """States ``(n, 2d)`` at times, as a first guess."""
-    curve = Akima1DInterpolator(times, states)
-    return _Solution(lambda t: np.asarray(curve(t)).T, times)
+def _smooth(problem: HamiltonianProblem, solution: Solution) -> bool:
+    """Whether no neighbour crosses the path, by the tangents of those that leave A beside it."""
+    d, times = problem.dimension, solution.times
+    middles = (times[1:] + times[:-1]) / 2
+    at_nodes, between = (problem.matrices(solution.at(t)).transpose(2, 0, 1) for t in (times, middles))
+    first = solution.at(times[:1])[:d].T
+    frame = np.linalg.qr(np.concatenate([np.eye(d), problem.curvature(first)[0]]))[0]
+    for index, step in enumerate(np.diff(times)):
+        k1 = at_nodes[index] @ frame
+        k2 = between[index] @ (frame + step / 2 * k1)
+        k3 = between[index] @ (frame + step / 2 * k2)
+        moved = frame + step / 6 * (k1 + 2 * k2 + 2 * k3 + at_nodes[index + 1] @ (frame + step * k3))
+        new, upper = np.linalg.qr(moved)
+        new *= np.sign(np.diag(upper))
+        if crossed(frame[None, :d], new[None, :d])[0]:
+            return False
+        frame = new
+    return True

@@ -1,4 +1,7 @@
-"""The whole landscape of an identified vector field: equilibria, local formulas, transitions, global U."""
+"""The whole landscape of a vector field: attractors, wells, the ways out of them, and U over all of them.
+
+It is found by `siq.landscape.finding`; here is what can be asked of it.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from siq.certificate.certify import Certificate
+from siq.certificate.certificates import Certificate
 from siq.data.inspection import seen_states
 from siq.data.record_states import RecordStates
 from siq.data.recordings import Recordings, recordings_of
@@ -19,22 +22,13 @@ from siq.data.selection import joined
 from siq.dynamics.cycles import Cycle
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.equilibria import Equilibrium
-from siq.dynamics.phase_portrait import PhasePortrait
 from siq.errors import NumericalFailure
-from siq.identify.given_field import AnyField, GivenField
 from siq.identify.identified_field import IdentifiedField
 from siq.landscape.dwell_times import Exit, NoiseStrength, dwell_time
-from siq.landscape.global_quasipotential import GlobalQuasipotential, heights_of_attractors, matched
+from siq.landscape.global_quasipotential import GlobalQuasipotential, matched
 from siq.landscape.record_test import VisitTest
 from siq.landscape.refusal import NoLandscape
-from siq.landscape.transitions import (
-    Transition,
-    missing_diffusion,
-    position_standard_errors,
-    transitions,
-    ways_out,
-)
-from siq.potential.local_wells import WellOptions, local_well, surveyed
+from siq.landscape.transitions import Transition, missing_diffusion
 from siq.potential.uncertainty import potential_errors
 from siq.potential.well import Well
 
@@ -44,7 +38,7 @@ if TYPE_CHECKING:
     from siq.steps.equations import EquationSettings
     from siq.steps.pipeline import PipelineSettings
 
-SAME = 1e-6  # of the recorded box: one attractor, from different starts
+SAME = 1e-6  # numerical, of the level of a well: two values of U are one
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -358,8 +352,9 @@ class Landscape:
         Parameters
         ----------
         equations
-            From `from_equations`, of the same states. U is in the unit of D, which has to be the same: tell
-            the recordings that of the equations (`siq.steps.settings.StateSpace`), or read ΔU/ε of both.
+            From `from_equations`, of the same states. U is in the unit of D, which has to be the same, but
+            for the errors of one that was estimated: tell the recordings that of the equations
+            (`siq.steps.settings.StateSpace`), or read ΔU/ε of both.
         noise
             ε for which mean times are compared; left out, none are.
 
@@ -372,7 +367,7 @@ class Landscape:
         Raises
         ------
         ValueError
-            When the states are not the same.
+            When the states are not the same, or D is not.
         """
         from siq.steps.beside_equations import compared
 
@@ -416,110 +411,3 @@ def _mean_time(way: Transition, noise: float) -> tuple[float, str]:
         return way.rate.mean_time(noise), "; ".join(way.notes)
     except NumericalFailure as error:
         return np.nan, str(error)
-
-
-def find_landscape(
-    found: IdentifiedField,
-    portrait: PhasePortrait,
-    *,
-    wells: Sequence[Well] | None = None,
-    certificate: Certificate | None = None,
-    options: WellOptions | None = None,
-    noise: NoiseStrength | None = None,
-    seed: int = 0,
-) -> Landscape:
-    """Find the landscape of an identified vector field.
-
-    Parameters
-    ----------
-    found
-        The identified f with its uncertainty.
-    portrait
-        Attractors, saddles and basins of f; see `siq.dynamics.phase_portrait.phase_portrait`.
-    wells
-        V about the attractors as refinement found it; by default the local route finds it here.
-    certificate
-        Of these wells.
-    options
-        Of the local route.
-    noise
-        That drives the system, where it is known.
-    seed
-        Decides which points are used where there are too many.
-    """
-    notes = [fault] if (fault := portrait.fault()) is not None else []
-    if wells is None:
-        kept = _wells(found, portrait, options or WellOptions(), seed, notes)
-    else:
-        kept = [_given(wells, found, portrait, index, notes) for index in range(len(portrait.attractors))]
-    ways = transitions(found, ways_out(found.dynamics, portrait), kept)
-    return assembled(found, portrait, kept, ways, notes, certificate=certificate, noise=noise)
-
-
-def assembled(
-    found: AnyField,
-    portrait: PhasePortrait,
-    wells: Sequence[Well | None],
-    ways: Sequence[Transition],
-    notes: list[str],
-    *,
-    certificate: Certificate | None,
-    noise: NoiseStrength | None,
-) -> Landscape:
-    """The landscape of what was found; the arguments are those of `Landscape` and of `find_landscape`."""
-    ends = portrait.descents.ends
-    settled: tuple[Equilibrium | Cycle, ...] = (*portrait.attractors, *portrait.cycles)
-    return Landscape(
-        found.dynamics,
-        portrait.equilibria,
-        settled,
-        np.array([float((ends == index).mean()) for index in range(len(settled))]),
-        tuple(wells),
-        tuple(ways),
-        _heights(len(settled), ways, notes),
-        tuple(notes),
-        certificate,
-        np.array([position_standard_errors(found, one.position) for one in settled]),
-        noise,
-        None if isinstance(found, GivenField) else found,
-        given=isinstance(found, GivenField),
-        parting=portrait.parting,
-    )
-
-
-def _wells(
-    found: IdentifiedField, portrait: PhasePortrait, options: WellOptions, seed: int, notes: list[str]
-) -> list[Well | None]:
-    wells: list[Well | None] = []
-    for index, one in enumerate(portrait.attractors):
-        try:
-            wells.append(local_well(found.dynamics, portrait, index, options=options, seed=seed))
-        except NumericalFailure as error:
-            notes.append(f"no formula about {one.position.round(4).tolist()}: {error}")
-            wells.append(None)
-    return wells
-
-
-def _given(
-    wells: Sequence[Well], found: IdentifiedField, portrait: PhasePortrait, index: int, notes: list[str]
-) -> Well | None:
-    """The well of an attractor among those of the refinement."""
-    place = portrait.attractors[index].position
-    width = portrait.box[:, 1] - portrait.box[:, 0]
-    for well in wells:
-        if np.abs((well.attractor - place) / width).max() < SAME:
-            return surveyed(well, found.dynamics, portrait, index)
-    notes.append(f"refinement found no formula about {place.round(4).tolist()}")
-    return None
-
-
-def _heights(count: int, ways: Sequence[Transition], notes: list[str]) -> np.ndarray:
-    barriers = np.full((count, count), np.inf)
-    for way in ways:
-        if way.end is not None and np.isfinite(way.barrier):
-            barriers[way.start, way.end] = min(barriers[way.start, way.end], way.barrier)
-    try:
-        return heights_of_attractors(barriers) if count else np.zeros(0)
-    except NumericalFailure as error:
-        notes.append(str(error))
-        return np.full(count, np.nan)

@@ -32,15 +32,12 @@ from siq.dynamics.cycles import Cycle, hessians_along
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.reach import measure_at
 from siq.errors import NumericalFailure
-from siq.landscape.discretised_paths import (
-    MOST_NODES,
-    NO_ACTION,
-    DiscretisedPath,
-    PathProblem,
-    evenly,
-    rivals_of,
-)
+from siq.landscape.chain_descent import descended
+from siq.landscape.chain_spacing import MOST_NODES, evenly, spaced
+from siq.landscape.discretised_paths import NO_ACTION, DiscretisedPath, PathProblem
+from siq.landscape.first_chains import first_chains, rivals_of
 from siq.landscape.hamiltonian_paths import hamiltonian_paths
+from siq.landscape.path_nodes import extrapolated, hamiltonian_residual
 from siq.landscape.tubes import first_guesses
 
 FOLLOWED = 4000  # points of a way down that Hamilton's equations are told, which may wind
@@ -159,15 +156,15 @@ def minimum_action_path(
             raise NumericalFailure("paths from and to cycles need noise on every state of its own")
         return _by_hamilton(dynamics, start, end, tolerance, initial or ())
     problem = PathProblem(dynamics, start, end)
-    own, turning = problem.guesses() if problem.flat == 0 else _about_cycles(problem, start, end)
+    own, turning = first_chains(problem) if problem.flat == 0 else _about_cycles(problem, start, end)
     guesses = own if initial is None else [problem.scaled(np.asarray(one, dtype=float)) for one in initial]
     count = min(max(nodes, int(turning / TURN)), MOST_NODES // 4)
     chains: list[DiscretisedPath] = []
     for guess in guesses:
-        action = problem.action(problem.spaced(guess, count, 0.0))
+        action = problem.action(spaced(problem, guess, count, 0.0))
         if not np.isfinite(action):
             continue
-        chain = problem.descend(guess, count, action, first=True)
+        chain = descended(problem, guess, count, action, first=True)
         if np.isfinite(chain.action):
             chains.append(chain)
     if not chains:
@@ -176,15 +173,15 @@ def minimum_action_path(
             f"no path from {problem.start.tolist()} to {last.tolist()} was found that has a finite action"
         )
     chains.sort(key=lambda one: one.action)
-    fine, known = problem.descend(chains[0].points, count, chains[0].action), False
+    fine, known = descended(problem, chains[0].points, count, chains[0].action), False
     while not known and 2 * len(fine.points) < MOST_NODES:
         coarse = fine
-        fine = problem.descend(
-            coarse.points, 2 * len(coarse.points) - 1, coarse.action, first=not coarse.minimum
+        fine = descended(
+            problem, coarse.points, 2 * len(coarse.points) - 1, coarse.action, first=not coarse.minimum
         )
         error = abs(fine.action - coarse.action) / 3
         known = error <= max(tolerance * fine.action, NO_ACTION * problem.effort(fine.points))
-    line = problem.extrapolated(coarse, fine)
+    line = extrapolated(problem, coarse, fine)
     # Rivals have the error of short chains, which they share with the first one.
     shares = [one.action / max(chains[0].action, np.finfo(float).tiny) for one in rivals_of(chains, fine)]
     points, momenta = np.split(line[:, :-1], 2, axis=1)
@@ -194,7 +191,7 @@ def minimum_action_path(
         values=problem.unit * line[:, -1],
         action=problem.unit * float(line[-1, -1]),
         error=problem.unit * error,
-        residual=problem.residual(line),
+        residual=hamiltonian_residual(problem, line),
         converged=fine.minimum and known,
         rivals=tuple(float(problem.unit * line[-1, -1] * share) for share in shares),
     )

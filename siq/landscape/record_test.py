@@ -33,7 +33,8 @@ from siq.data.record_states import BINS
 from siq.data.recordings import Recordings
 from siq.data.selection import joined
 from siq.data.stationarity import correlated_samples, runs_of, usual_step
-from siq.data.transitions import LEVEL, DwellCount, Switching, continued_visits, dwell_counts, switching
+from siq.data.transitions import LEVEL, Switching, switching
+from siq.data.visits import DwellCount, continued_visits, dwell_counts
 from siq.dynamics.phase_portrait import PhasePortrait
 from siq.identify.identified_field import IdentifiedField
 from siq.landscape.dwell_times import NoiseStrength

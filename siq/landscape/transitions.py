@@ -15,8 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from siq.dynamics.cycles import Cycle
+from siq.dynamics.descents import leads_back, neighbours
 from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.equilibria import Equilibrium, leads_back, neighbours
+from siq.dynamics.equilibria import Equilibrium
 from siq.dynamics.phase_portrait import PhasePortrait
 from siq.dynamics.reach import measure_at
 from siq.errors import NumericalFailure

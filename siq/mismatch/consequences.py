@@ -17,7 +17,8 @@ from siq.errors import NumericalFailure
 from siq.identify.flow import FlowMap
 from siq.identify.identified_field import IdentifiedField
 from siq.identify.library import CandidateLibrary
-from siq.landscape.landscape import Landscape, find_landscape
+from siq.landscape.finding import find_landscape
+from siq.landscape.landscape import Landscape
 from siq.potential.local_wells import WellOptions
 
 ROUGH = (sympy.sign, sympy.Abs, sympy.Max, sympy.Min, sympy.Heaviside, sympy.Piecewise)

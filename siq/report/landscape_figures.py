@@ -24,7 +24,7 @@ from siq.report.said_landscape import SaidLandscape
 from siq.report.settings import LandscapeFiguresSettings
 from siq.steps.outcomes import Method
 from siq.study.published import published_formula
-from siq.study.study import PublishedFigure
+from siq.study.published_figures import PublishedFigure
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from siq.report.settings import ReproductionSettings
 from siq.steps.outcomes import Method
 from siq.steps.shown import ModelFiles, shown_formula
 from siq.study.published import own_equations, published_decomposition
+from siq.study.published_figures import PublishedFigure
 from siq.study.reproduction import (
     HEADINGS,
     OURS,
@@ -35,7 +36,6 @@ from siq.study.reproduction import (
     shown,
 )
 from siq.study.scoring import summary_row, summary_table
-from siq.study.study import PublishedFigure
 from siq.study.tables import as_table, read_table
 
 POINTS = 20_000  # of the domain, on which published formulas are held against their own equations

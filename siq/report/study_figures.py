@@ -40,7 +40,7 @@ from siq.report.said_landscape import SaidLandscape
 from siq.report.settings import FiguresSettings
 from siq.steps.outcomes import METHODS, Method
 from siq.steps.shown import ModelFiles, Shown
-from siq.study.study import PublishedFigure
+from siq.study.published_figures import PublishedFigure
 
 TRAJECTORIES = 5
 PREDICTED = 6

@@ -41,6 +41,9 @@ SOURCES = {
     DiffusionSource.GIVEN: "As given.",
     DiffusionSource.ESTIMATED: "Estimated from the noise in the recordings, since none was given, and"
     " scaled to the determinant 1, so that ε is the size of the noise.",
+    DiffusionSource.OF_VELOCITIES: "Estimated from the recorded positions. Its part that acts on the"
+    " velocities, the only one there is, is scaled to the determinant 1, so that ε is the size of the random"
+    " forces.",
     DiffusionSource.UNIT: "Taken as the unit matrix: none was given, and the recordings show no noise that"
     " would tell. U and the barriers follow from it.",
 }

@@ -20,6 +20,9 @@ identify_hidden         and where they are positions whose velocities were not r
 train                   which V and g do two networks find?
 regress                 which sparse formulas are these (the published method)?
 refine                  which V solves the Hamilton–Jacobi equation of f, and may it be believed?
+ground                  what has a run to refine V by?
+refined_routes          what do the routes to V make of it?
+control                 and what would they have made of networks with random weights?
 landscape               which wells, barriers and ways are there?
 equations               what landscape have equations alone?
 sweep_points            which wells and ways have they at other values of their parameters?

@@ -14,7 +14,7 @@ from pydantic.dataclasses import dataclass
 
 from siq.dynamics.dynamics import Dynamics
 from siq.errors import NumericalFailure
-from siq.landscape.beside_equations import difference_rows, differences
+from siq.landscape.beside_equations import check_same_noise, difference_rows, differences
 from siq.landscape.landscape import Landscape
 from siq.landscape.options import LandscapeOptions
 from siq.landscape.refusal import NoLandscape
@@ -48,10 +48,12 @@ def compared(equations: Landscape, learned: Landscape, *, noise: float | None = 
     Raises
     ------
     ValueError
-        When the states are not the same.
+        When the states are not the same, or D is not.
     """
     both = (landscape_data(one, dynamics=one.dynamics) for one in (equations, learned))
     found = differences(*both, box=equations.dynamics.box, noises=() if noise is None else (noise,))
+    places = np.array([one.position for one in (*equations.attractors, *equations.equilibria)])
+    check_same_noise(equations.dynamics, learned.dynamics, places, found=learned.found)
     return as_table(TABLE, [{"run": 0} | row for row in difference_rows(found)]).drop(columns="run")
 
 

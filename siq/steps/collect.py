@@ -8,8 +8,8 @@ from pathlib import Path
 import pandas as pd
 
 from siq.steps.outcomes import Outcome, Step
+from siq.study.published_figures import PublishedFigure
 from siq.study.scoring import summary_table
-from siq.study.study import PublishedFigure
 from siq.study.tables import as_table, concatenate
 
 OF_RUNS = (

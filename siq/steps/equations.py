@@ -16,7 +16,8 @@ import numpy as np
 import pandas as pd
 from pydantic.dataclasses import dataclass
 
-from siq.certificate.certify import caustics_below, certify_given_wells
+from siq.certificate.caustics import caustics_below
+from siq.certificate.certify_wells import certify_given_wells
 from siq.certificate.characteristics import references_about
 from siq.certificate.tests import CertificateOptions
 from siq.dynamics.basins import enlarged
@@ -29,9 +30,10 @@ from siq.dynamics.many_states import MOST_SEARCHED, portrait_of_many
 from siq.dynamics.phase_portrait import PhasePortrait
 from siq.errors import InputError, NumericalFailure
 from siq.identify.given_field import GivenField
-from siq.landscape.discretised_paths import evenly
+from siq.landscape.chain_spacing import evenly
 from siq.landscape.dwell_times import NoiseStrength
-from siq.landscape.landscape import Landscape, assembled
+from siq.landscape.finding import assembled
+from siq.landscape.landscape import Landscape
 from siq.landscape.options import LandscapeOptions
 from siq.landscape.refusal import NoLandscape
 from siq.landscape.storage import write_landscape
@@ -44,7 +46,7 @@ from siq.potential.well import Well
 from siq.steps.landscape_tables import degree_rows, landscape_rows
 from siq.steps.outcomes import Method, Outcome, Status, Step
 from siq.steps.settings import STRICT
-from siq.study.study import fault_for_landscape
+from siq.study.study_system import fault_for_landscape
 from siq.study.tables import as_table, write_table
 
 ALONG = 300  # states along a path, from the neighbourhood of which further descents start

@@ -85,7 +85,7 @@ def hidden_record(
             "correlation_score": motion.score,
             "measurement": sizes.tolist(),
             "measurement_error": (sizes * motion.sensor_error / 2).tolist(),
-            "diffusion": str(DiffusionSource.ESTIMATED),
+            "diffusion": str(DiffusionSource.OF_VELOCITIES),
             "note": "velocities were not recorded: f, the forces' noise and that of the sensor,"
             f" {said}, are by the likelihood of positions alone",
             "pairs": len(snapshot_pairs(recordings, pair_step=sampling.pair_step).h),

@@ -35,7 +35,7 @@ from siq.numerics.randomness import Purpose, generator
 from siq.potential.symbolic import SymbolicDecomposition
 from siq.steps.settings import STRICT, StateSpace
 from siq.study.published import published_formula
-from siq.study.study import PublishedFigure
+from siq.study.published_figures import PublishedFigure
 from siq.study.tables import as_table
 
 logger = logging.getLogger(__name__)

@@ -10,14 +10,15 @@ from pathlib import Path
 import numpy as np
 from pydantic.dataclasses import dataclass
 
-from siq.certificate.certify import Certificate
+from siq.certificate.certificates import Certificate
 from siq.data.recordings import Recordings, snapshot_pairs
 from siq.dynamics.phase_portrait import evenly_spread, phase_portrait
 from siq.errors import NumericalFailure
 from siq.identify.filtered_states import of_all_states
 from siq.identify.storage import FieldRecord
 from siq.landscape.dwell_times import NoiseStrength
-from siq.landscape.landscape import Landscape, find_landscape
+from siq.landscape.finding import find_landscape
+from siq.landscape.landscape import Landscape
 from siq.landscape.options import LandscapeOptions
 from siq.landscape.record_test import VisitTest
 from siq.landscape.storage import write_landscape

@@ -15,7 +15,7 @@ from siq.dynamics.formulas import compile_formulas, parse_formula
 from siq.errors import InputError
 from siq.landscape.comparison import Potential
 from siq.potential.symbolic import SymbolicDecomposition, downhill_formulas
-from siq.study.study import PublishedFigure, PublishedMesh
+from siq.study.published_figures import PublishedFigure, PublishedMesh
 
 
 def component_terms(figures: Mapping[str, PublishedFigure], component: str) -> dict[str, PublishedFigure]:

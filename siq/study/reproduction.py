@@ -20,8 +20,8 @@ from siq.dynamics.formulas import parse_formula
 from siq.files.documents import read_document, validate
 from siq.identify.library import linear_combination
 from siq.numerics.number_text import number_text
+from siq.study.published_figures import PublishedFigure
 from siq.study.scoring import summary_row
-from siq.study.study import PublishedFigure
 from siq.study.tables import as_table
 
 OURS = ("refined", "regression")

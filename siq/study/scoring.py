@@ -15,7 +15,7 @@ import pandas as pd
 from siq.dynamics.cards import load_exact, load_system
 from siq.dynamics.formulas import compile_formulas
 from siq.potential.symbolic import SymbolicDecomposition, exact_decomposition, term_coefficients
-from siq.study.study import PublishedFigure
+from siq.study.published_figures import PublishedFigure
 from siq.study.tables import as_table
 
 GRID_POINTS = 1_000_000  # the paper's grid has 100 points along each of three axes

@@ -30,7 +30,9 @@ from known_systems import (
     uniform_points,
 )
 
-from siq.certificate.certify import Certificate, certify_formulas, certify_wells
+from siq.certificate.certificates import Certificate
+from siq.certificate.certify import certify_formulas
+from siq.certificate.certify_wells import certify_wells
 from siq.certificate.characteristics import Reference, check_characteristics, references_about
 from siq.certificate.held_out import HeldOut
 from siq.certificate.tests import (

@@ -19,7 +19,7 @@ from known_systems import (
     potential_values,
 )
 
-from siq.certificate.certify import Certificate
+from siq.certificate.certificates import Certificate
 from siq.certificate.characteristics import (
     FEWEST,
     SHARE,

@@ -9,13 +9,8 @@ from scipy.signal import lfilter
 from siq.data.recordings import Recordings
 from siq.data.selection import in_stretches
 from siq.data.stationarity import background_of, correlation_times, relaxation_samples, runs_of
-from siq.data.transitions import (
-    DwellCount,
-    counted_visits,
-    dwell_counts,
-    switching,
-    without_slow_drift,
-)
+from siq.data.transitions import switching, without_slow_drift
+from siq.data.visits import DwellCount, counted_visits, dwell_counts
 
 STEP, COUNT = 0.05, 20_000
 TIME = STEP * np.arange(COUNT)

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import sympy
 
+from siq.dynamics.descents import follow
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.edge_tracking import _saddle_near, edge_saddle
-from siq.dynamics.equilibria import classify, follow
+from siq.dynamics.equilibria import classify
 from siq.landscape.landscape import Landscape
 
 

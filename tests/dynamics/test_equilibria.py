@@ -15,8 +15,9 @@ from known_systems import (
     uniform_points,
 )
 
+from siq.dynamics.descents import follow, neighbours
 from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.equilibria import classify, find_equilibria, follow, hessian_at, neighbours
+from siq.dynamics.equilibria import classify, find_equilibria, hessian_at
 from siq.dynamics.phase_portrait import phase_portrait
 
 x, y = (sympy.Symbol(name, real=True) for name in "xy")

@@ -10,12 +10,14 @@ from known_systems import as_system, linear_system
 
 from siq.certificate.tests import PredictionLimits
 from siq.data.recordings import Recordings, snapshot_pairs
+from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.simulation import SimulationOptions, simulate_snapshots
 from siq.errors import NumericalFailure
 from siq.identify.diffusion import DiffusionSource, check_units, estimated_diffusion
 from siq.identify.identification import IdentificationOptions, identify_vector_field
 from siq.identify.identified_field import IdentifiedField
 from siq.identify.storage import field_library, read_field, write_field
+from siq.landscape.beside_equations import check_same_noise
 from siq.landscape.landscape import Landscape
 from siq.steps import identify, landscape
 from siq.steps.outcomes import Status
@@ -42,6 +44,17 @@ def identified(recordings: Recordings, space: StateSpace | None = None) -> ident
     sampling = Sampling(integrator_step=0.002)
     settings = identify.IdentifySettings(0, space or StateSpace(), sampling, LINEAR, PredictionLimits())
     return identify.run(settings, recordings, number=0)
+
+
+def test_an_estimated_d_is_compared_within_its_errors() -> None:
+    """With the D behind the recordings it agrees, scaled alike; with any other, or another scale, not."""
+    field, states = field_of(identified(recorded(noise=0.02))), np.zeros((1, 2))
+    learned = field.dynamics
+    assert np.abs(field.diffusion.matrix - NORMALISED).max() > 1e-3  # by far more than rounding
+    check_same_noise(learned.with_diffusion(Diffusion(NORMALISED)), learned, states, found=field)
+    for other in (D, 1.2 * NORMALISED, np.eye(2)):
+        with pytest.raises(ValueError, match="D is not the same"):
+            check_same_noise(learned.with_diffusion(Diffusion(other)), learned, states, found=field)
 
 
 def field_of(found: identify.Identified) -> IdentifiedField:

@@ -15,6 +15,7 @@ from siq.data.recordings import Recordings, write_recordings
 from siq.data.selection import STRETCHES
 from siq.dynamics.phase_portrait import evenly_spread, phase_portrait
 from siq.errors import InputError, NumericalFailure
+from siq.identify.diffusion import DiffusionSource
 from siq.identify.filtered_states import of_all_states
 from siq.identify.hidden_velocities import HiddenMotion, identify_hidden_motion
 from siq.identify.identification import IdentificationOptions
@@ -92,6 +93,8 @@ def test_it_is_kept_in_a_file(tmp_path: Path) -> None:
     write_field(tmp_path / "field.json", done.record, SETTINGS.identification)
     again = read_field(tmp_path / "field.json")
     assert again is not None and again.hidden_velocities
+    assert again.diffusion_source == DiffusionSource.OF_VELOCITIES
+    assert str(DiffusionSource.OF_VELOCITIES.note) in done.outcome.reason
     np.testing.assert_array_equal(again.found.coefficients, done.record.found.coefficients)
     np.testing.assert_array_equal(again.found.covariance, done.record.found.covariance)
 

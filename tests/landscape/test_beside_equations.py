@@ -10,8 +10,16 @@ import pytest
 import sympy
 
 from siq.data.recordings import Recordings
+from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.dynamics import Dynamics
-from siq.landscape.beside_equations import CYCLE, FURTHER, MISSED, difference_rows, differences
+from siq.landscape.beside_equations import (
+    CYCLE,
+    FURTHER,
+    MISSED,
+    check_same_noise,
+    difference_rows,
+    differences,
+)
 from siq.landscape.landscape import Landscape
 from siq.landscape.options import LandscapeOptions
 from siq.landscape.storage import landscape_data
@@ -68,6 +76,31 @@ def test_an_attractor_next_to_the_saddle_of_the_equations_is_none_of_theirs():
 def test_landscapes_of_different_states_are_refused():
     with pytest.raises(ValueError, match="different states"):
         wells().beside(paths_of((X - X**3, -Y), [(-2, 2), (-1, 1)]))
+
+
+@pytest.mark.parametrize(
+    ("diffusion", "shown"),
+    [
+        (np.array([[2.0]]), r"equations have \[\[1\.0\]\], the trajectories \[\[2\.0\]\]; give both"),
+        ([[1 + X**2 / 4]], r"equations have \[\[1\.0\]\] at \(.*1\), the trajectories \[\[1\.25\]\]"),
+    ],
+)
+def test_landscapes_of_different_noise_are_refused(diffusion: object, shown: str) -> None:
+    system = Dynamics.of((X,), (X - X**3,), diffusion=diffusion, domain=[(-2, 2)])  # type: ignore[arg-type]
+    other = landscape_of_equations(system, EquationSettings(), formulas=False)
+    with pytest.raises(ValueError, match=shown):
+        other.beside(wells())
+    assert (other.beside(other)["relative_difference"] == 0).all()
+
+
+def test_noise_in_two_states_is_compared_in_its_own_unit() -> None:
+    """An entry that is not on the diagonal counts, however small a state's noise is; rounding does not."""
+    matrix, states = np.array([[1.0, 3e-5], [3e-5, 1e-8]]), np.zeros((1, 2))
+    one = Dynamics.of((X, Y), (-X, -Y), diffusion=matrix)
+    check_same_noise(one, one.with_diffusion(Diffusion(matrix * (1 + 1e-12))), states, found=None)
+    for changed in (np.diag(np.diag(matrix)), np.diag([0.0, 1e-8]), np.eye(2)):
+        with pytest.raises(ValueError, match="D is not the same"):
+            check_same_noise(one, one.with_diffusion(Diffusion(changed)), states, found=None)
 
 
 def test_a_limit_cycle_is_named_and_not_compared():

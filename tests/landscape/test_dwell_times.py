@@ -9,7 +9,7 @@ from known_systems import double_well, exact_field, portrait_of
 
 from siq.dynamics.dynamics import Dynamics
 from siq.landscape.dwell_times import Exit, MeanTime, NoiseStrength, dwell_time, exit_time
-from siq.landscape.landscape import find_landscape
+from siq.landscape.finding import find_landscape
 from siq.landscape.transitions import position_standard_errors
 from siq.potential.local_wells import WellOptions
 

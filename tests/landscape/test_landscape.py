@@ -19,12 +19,13 @@ from known_systems import (
 )
 from matplotlib.figure import Figure
 
-from siq.certificate.certify import Certificate
+from siq.certificate.certificates import Certificate
 from siq.certificate.tests import Verdict
 from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.dynamics import Dynamics
 from siq.errors import NumericalFailure
-from siq.landscape.landscape import Landscape, find_landscape
+from siq.landscape.finding import find_landscape
+from siq.landscape.landscape import Landscape
 from siq.landscape.storage import read_landscape, write_landscape
 from siq.potential.local_wells import WellOptions
 from siq.potential.refined_formulas import refined_decomposition

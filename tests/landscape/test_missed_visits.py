@@ -7,7 +7,8 @@ import pytest
 
 from siq.data.recordings import Recordings
 from siq.data.selection import in_stretches
-from siq.data.transitions import LEVEL, continued_visits, dwell_counts
+from siq.data.transitions import LEVEL
+from siq.data.visits import continued_visits, dwell_counts
 from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.phase_portrait import phase_portrait

@@ -24,8 +24,9 @@ from siq.landscape.density_of_wells import (
     sample_potential,
 )
 from siq.landscape.ensembles import starting_states
+from siq.landscape.finding import find_landscape
 from siq.landscape.invariant_distribution import marginal_density, normalisation_quadrature
-from siq.landscape.landscape import Landscape, find_landscape
+from siq.landscape.landscape import Landscape
 from siq.landscape.reference import reference_landscape
 from siq.numerics.density_comparison import total_variation
 from siq.potential.local_wells import WellOptions

@@ -10,7 +10,7 @@ import pytest
 from siq.certificate.tests import Verdict
 from siq.data.held_out import held_out_recordings
 from siq.data.recordings import Recordings
-from siq.data.transitions import DwellCount
+from siq.data.visits import DwellCount
 from siq.dynamics.phase_portrait import PhasePortrait, phase_portrait
 from siq.identify.storage import FieldRecord
 from siq.landscape.dwell_times import NoiseStrength

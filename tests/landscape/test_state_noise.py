@@ -8,8 +8,9 @@ from known_noise import exit_time, multiplicative, one_state, potential_of_one_s
 from known_systems import KnownSystem, portrait_of, potential_gradient, potential_values
 
 from siq.dynamics.equilibria import find_equilibria
+from siq.landscape.chain_descent import Across
 from siq.landscape.density_of_wells import known_density, lowest_possible, sample_potential
-from siq.landscape.discretised_paths import PathProblem, _Across
+from siq.landscape.discretised_paths import PathProblem
 from siq.landscape.global_quasipotential import GlobalQuasipotential
 from siq.landscape.paths import minimum_action_path
 from siq.landscape.rates import escape_rate
@@ -29,7 +30,7 @@ def test_moves_of_a_chain_have_the_slope_and_the_curvature_of_its_action(dimensi
     problem = PathProblem(known.dynamics, known.attractors[0], known.attractors[1])
     draw = np.random.default_rng(1)
     y = np.linspace(0.1, 1.0, 6)[:, None] * problem.end + 0.05 * draw.normal(size=(6, dimension))
-    across, size = _Across(problem, y), (5 * (dimension - 1),)
+    across, size = Across(problem, y), (5 * (dimension - 1),)
     band, matrix = across.exact, np.zeros(size * 2)
     for offset, diagonal in enumerate(band):
         for column in range(size[0] - offset):

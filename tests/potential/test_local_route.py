@@ -20,7 +20,7 @@ from known_systems import (
 )
 
 from siq.dynamics.basins import Basin, basin_of
-from siq.dynamics.equilibria import Descents
+from siq.dynamics.descents import Descents
 from siq.dynamics.formulas import compile_formulas
 from siq.dynamics.phase_portrait import PhasePortrait, phase_portrait
 from siq.errors import NumericalFailure

@@ -20,8 +20,8 @@ from pydantic import ValidationError
 
 from siq.dynamics.basins import Basin
 from siq.dynamics.cards import load_system
+from siq.dynamics.descents import follow
 from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.equilibria import follow
 from siq.dynamics.phase_portrait import PhasePortrait, phase_portrait
 from siq.errors import NumericalFailure
 from siq.potential.hamilton_jacobi import equation_at, gauss_newton

@@ -9,7 +9,7 @@ from scipy.integrate import cumulative_trapezoid
 
 from siq.data.recordings import Recordings
 from siq.data.stationarity import runs_of
-from siq.data.transitions import continued_visits, dwell_counts
+from siq.data.visits import continued_visits, dwell_counts
 from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.state_noise import StateNoise

@@ -19,7 +19,8 @@ from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.equilibria import hessian_at
 from siq.errors import NumericalFailure
-from siq.reference.mesh import MeshQuasipotential, mesh_quasipotential
+from siq.reference.mesh import mesh_quasipotential
+from siq.reference.mesh_values import MeshQuasipotential
 from siq.reference.sheets import adapted_fan, lowest_sheet
 
 LEFT = np.array([[-2.0, 0.0], [-1.0, 1.0]])  # the left well of a system with its saddle at the origin

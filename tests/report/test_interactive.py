@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from known_systems import double_well, exact_field, portrait_of
 
-from siq.landscape.landscape import find_landscape
+from siq.landscape.finding import find_landscape
 from siq.potential.local_wells import WellOptions
 from siq.report.drawn_landscape import DrawnLandscape, drawn
 from siq.report.interactive import UNKNOWN, interactive_view, script

@@ -8,7 +8,7 @@ from known_systems import double_well, exact_field, portrait_of
 from told_landscapes import NOISE, landscape
 
 from siq.landscape.dwell_times import NoiseStrength
-from siq.landscape.landscape import find_landscape
+from siq.landscape.finding import find_landscape
 from siq.landscape.storage import landscape_data
 from siq.potential.local_wells import WellOptions
 from siq.report.landscape_answer import headline, remarks, wells_table

@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 
 from siq.data.recordings import Recordings
 from siq.landscape.density_of_wells import known_density, lowest_possible, marginal_of, sample_potential
-from siq.landscape.landscape import Landscape, find_landscape
+from siq.landscape.finding import find_landscape
+from siq.landscape.landscape import Landscape
 from siq.landscape.options import LandscapeOptions
 from siq.landscape.reference import reference_landscape
 from siq.landscape.storage import StoredLandscape, read_landscape, write_landscape

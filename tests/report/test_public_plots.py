@@ -16,7 +16,8 @@ from matplotlib.figure import Figure
 
 import siq
 from siq.dynamics.simulation import runge_kutta_step
-from siq.landscape.landscape import Landscape, find_landscape
+from siq.landscape.finding import find_landscape
+from siq.landscape.landscape import Landscape
 from siq.landscape.storage import landscape_data
 from siq.landscape.transitions import barrier_uncertainty
 from siq.potential.local_wells import WellOptions

@@ -8,7 +8,7 @@ import numpy as np
 from told_landscapes import NOISE, landscape
 
 from siq.data.record_states import RecordStates
-from siq.data.transitions import DwellCount
+from siq.data.visits import DwellCount
 from siq.report.record_answer import with_visits
 from siq.report.said_landscape import SaidLandscape
 from siq.study.tables import as_table

@@ -5,8 +5,8 @@ import pandas as pd
 import pytest
 
 from siq.report.sentences import control_sentences, run_sentences
+from siq.study.published_figures import PublishedFigure
 from siq.study.scoring import summary_table
-from siq.study.study import PublishedFigure
 from siq.study.tables import as_table
 
 PUBLISHED = {"rrmse": PublishedFigure(mean=1e-3, source="paper")}

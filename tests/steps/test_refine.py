@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 import sympy
 
-from siq.certificate.certify import Certificate
+from siq.certificate.certificates import Certificate
 from siq.certificate.tests import Verdict
 from siq.data.recordings import SnapshotPairs
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.phase_portrait import phase_portrait
 from siq.potential.refinement import Refined, RefinementOptions
-from siq.steps import refine
+from siq.steps import refined_routes
+from siq.steps.ground import every_well_held_out
 
 PASSED, REFUSED = Verdict(0.0, 1.0, True), Verdict(2.0, 1.0, False, "it is no solution")
 
@@ -39,18 +40,18 @@ def test_the_wells_carry_the_certificate_where_one_formula_is_refused(
     found = Refined(
         None, None, np.ones(1), np.ones((1, 1)), np.eye(1), np.ones((1, 1)), 0.01, True, (well,), (), (),  # type: ignore[arg-type]
     )  # fmt: skip
-    monkeypatch.setattr(refine, "refine", lambda *_, **__: found)
-    monkeypatch.setattr(refine, "formula_library", lambda *_: None)
-    monkeypatch.setattr(refine, "relative_error_of", lambda *_: 0.0)
+    monkeypatch.setattr(refined_routes, "refine", lambda *_, **__: found)
+    monkeypatch.setattr(refined_routes, "formula_library", lambda *_: None)
+    monkeypatch.setattr(refined_routes, "relative_error_of", lambda *_: 0.0)
     monkeypatch.setattr(
-        refine, "refined_decomposition", lambda one, _: SimpleNamespace(potential=one.potential)
+        refined_routes, "refined_decomposition", lambda one, _: SimpleNamespace(potential=one.potential)
     )
     ground: Any = SimpleNamespace(
         found=None, portrait=None, points=None, number=0,
         certify=lambda *_, **__: certificate(formula, "region"),
         certify_wells=lambda *_, **__: certificate(wells, "wells"),
     )  # fmt: skip
-    refined, formulas, made = refine._refined(ground, RefinementOptions(), None, None)
+    refined, formulas, made = refined_routes.refined_by_routes(ground, RefinementOptions(), None, None)
     assert made.scope == scope
     assert (formulas.potential is not None) == whole
     assert made.certified == (PASSED in (formula, wells))
@@ -67,6 +68,6 @@ def test_recordings_of_every_well_are_held_out_where_they_stay_in_theirs() -> No
     recording = np.repeat(np.arange(5), 200)
     pairs = SnapshotPairs(x0=x0, xh=x0, h=np.full(1000, 0.1), recording=recording)
     mask = np.array([True, False, False, False, False])
-    found = refine.every_well_held_out(portrait, pairs, mask)
+    found = every_well_held_out(portrait, pairs, mask)
     assert found.tolist()[:2] == [True, False] and found[2:].sum() == 1
-    assert refine.every_well_held_out(portrait, pairs, found).tolist() == found.tolist()
+    assert every_well_held_out(portrait, pairs, found).tolist() == found.tolist()

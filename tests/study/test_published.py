@@ -19,7 +19,7 @@ from siq.study.published import (
     published_formula,
     published_potentials,
 )
-from siq.study.study import PublishedFigure, PublishedMesh, load_published
+from siq.study.published_figures import PublishedFigure, PublishedMesh, load_published
 
 CONFIG = Path(__file__).parents[2] / "config"
 X, Y = sympy.symbols("x y", real=True)

@@ -12,6 +12,7 @@ import sympy
 
 from siq.dynamics.dynamics import Dynamics
 from siq.report.study_captions import CAPTIONS
+from siq.study.published_figures import PublishedFigure, load_published
 from siq.study.reproduction import (
     attractor_rows,
     gradient_coefficients,
@@ -22,7 +23,7 @@ from siq.study.reproduction import (
     shown,
 )
 from siq.study.scoring import summary_table
-from siq.study.study import PublishedFigure, load_published, load_study
+from siq.study.study import load_study
 from siq.study.tables import as_table
 
 CONFIG = Path(__file__).parents[2] / "config"

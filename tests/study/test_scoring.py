@@ -12,6 +12,7 @@ from known_systems import exact_archetype
 from siq.dynamics.dynamics import Dynamics
 from siq.identify.library import candidate_library
 from siq.potential.symbolic import SymbolicDecomposition
+from siq.study.published_figures import PublishedFigure
 from siq.study.scoring import (
     coefficient_table,
     domain_grid,
@@ -22,7 +23,6 @@ from siq.study.scoring import (
     summary_table,
     support_is_correct,
 )
-from siq.study.study import PublishedFigure
 from siq.study.tables import as_table, concatenate
 
 

@@ -18,7 +18,9 @@ from siq.steps.of_study import settings_of
 from siq.steps.outcomes import Method
 from siq.steps.refine import RefineSettings
 from siq.steps.score import ScoreSettings
-from siq.study.study import load_published, load_study, load_study_system
+from siq.study.published_figures import load_published
+from siq.study.study import load_study
+from siq.study.study_system import load_study_system
 
 Write = Callable[..., Path]
 CONFIG = Path(__file__).parents[2] / "config"

@@ -12,8 +12,9 @@ from siq.report.page import render_reproduction
 from siq.report.reproduction_page import Paper, Results, reproduction_page
 from siq.report.settings import ReproductionSettings
 from siq.steps.of_study import settings_of
+from siq.study.published_figures import load_published
 from siq.study.reproduction import Parameters, Place
-from siq.study.study import completed, load_published, load_study
+from siq.study.study import completed, load_study
 from siq.study.tables import COLUMNS
 
 pytestmark = pytest.mark.workflow

@@ -32,7 +32,7 @@ from siq.steps.score import ScoreSettings
 from siq.steps.sweep import SweepSettings
 from siq.steps.sweep_points import PointSettings
 from siq.steps.train import TrainSettings
-from siq.study.study import load_published
+from siq.study.published_figures import load_published
 from siq.study.sweep import point_name
 from workflow.code_digest import code_digest
 from workflow.places import BASE, config_path, find_file

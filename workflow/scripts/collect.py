@@ -8,7 +8,7 @@ from pathlib import Path
 
 from siq.steps import collect
 from siq.steps.outcomes import read_outcomes
-from siq.study.study import load_published
+from siq.study.published_figures import load_published
 from siq.study.tables import read_table, write_table
 from step import job
 

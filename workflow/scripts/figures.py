@@ -20,8 +20,8 @@ from siq.steps.landscapes import first_stored
 from siq.steps.outcomes import Method
 from siq.steps.shown import ModelFiles, shown_formula
 from siq.steps.trained import read_trained
+from siq.study.published_figures import load_published
 from siq.study.scoring import exact_answer
-from siq.study.study import load_published
 from siq.study.tables import read_table
 from step import job, read_json
 

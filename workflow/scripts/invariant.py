@@ -13,7 +13,7 @@ from siq.steps import invariant
 from siq.steps.landscapes import first_stored
 from siq.steps.outcomes import Method
 from siq.steps.shown import ModelFiles, shown_formula
-from siq.study.study import load_published
+from siq.study.published_figures import load_published
 from siq.study.tables import read_table, write_table
 from step import Job, job
 

@@ -10,7 +10,7 @@ from siq.steps import landscape_errors
 from siq.steps.landscapes import read_stored
 from siq.steps.trained import read_trained
 from siq.study.published import mesh_potential
-from siq.study.study import load_published
+from siq.study.published_figures import load_published
 from siq.study.tables import write_table
 from step import job
 

@@ -17,7 +17,7 @@ from siq.steps.files import read_states
 from siq.steps.landscapes import first_stored
 from siq.steps.trained import read_trained
 from siq.study.published import mesh_potential
-from siq.study.study import load_published
+from siq.study.published_figures import load_published
 from siq.study.tables import read_table
 from step import job
 

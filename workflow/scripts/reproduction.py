@@ -14,8 +14,8 @@ from siq.files.whole import whole_file
 from siq.report.page import render_reproduction
 from siq.report.reproduction_page import Paper, Results, reproduction_page
 from siq.report.settings import ReproductionSettings
+from siq.study.published_figures import load_published
 from siq.study.reproduction import load_contents, load_parameters
-from siq.study.study import load_published
 from step import job
 
 if __name__ == "__main__":
