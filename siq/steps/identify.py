@@ -47,7 +47,12 @@ from siq.steps.identify_beside_sensor import (
     units_of_states,
 )
 from siq.steps.identify_from_earlier import record_from_earlier
-from siq.steps.identify_hidden import advice_on_inertia, hidden_record, with_inertia_asked
+from siq.steps.identify_hidden import (
+    advice_on_inertia,
+    advice_on_velocities,
+    hidden_record,
+    with_inertia_asked,
+)
 from siq.steps.outcomes import Outcome, Status, Step, read_outcomes, write_outcomes
 from siq.steps.settings import STRICT, Sampling, StateSpace
 
@@ -85,9 +90,10 @@ def run(settings: IdentifySettings, recordings: Recordings | None, *, number: in
     except (NumericalFailure, np.linalg.LinAlgError) as error:
         rounding = rounding_text(recordings, coarse=True)
         reason = str(error) if rounding is None else f"{error}; mind that {rounding}"
-        if not settings.identification.hidden_velocities:
-            advice = advice_on_inertia(recordings, pair_step=settings.sampling.pair_step)
-            reason = reason if advice is None else f"{reason}; {advice}"
+        hidden = settings.identification.hidden_velocities
+        advice_of = advice_on_velocities if hidden else advice_on_inertia
+        advice = advice_of(recordings, pair_step=settings.sampling.pair_step)
+        reason = reason if advice is None else f"{reason}; {advice}"
         return Identified(None, Outcome(number, Step.IDENTIFY, Status.FAILED, reason))
     if record.prediction["passed"]:
         notes = [note for note in (record.diffusion_source.note, record.noise.get("note")) if note]

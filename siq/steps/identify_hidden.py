@@ -15,7 +15,7 @@ from siq.identify.diffusion import DiffusionSource
 from siq.identify.filtered_states import evidence
 from siq.identify.hidden_velocities import HiddenMotion, identify_hidden_motion
 from siq.identify.identification import IdentificationOptions
-from siq.identify.inertia import seen_inertia
+from siq.identify.inertia import inertia_test, seen_inertia
 from siq.identify.residuals import LARGE, SIGNIFICANT
 from siq.identify.seen_states import View
 from siq.identify.storage import FieldRecord, field_library
@@ -139,3 +139,22 @@ def advice_on_inertia(recordings: Recordings, *, pair_step: float | None) -> str
         f"{test.sentence(recordings.time_unit or '')}: set 'identification.hidden_velocities: true', in"
         " Python hidden_velocities=True, and the velocity is a state that was not recorded"
     )
+
+
+def advice_on_velocities(recordings: Recordings, *, pair_step: float | None) -> str | None:
+    """What to do where f(x, v) was not found of a position that shows no inertia, or a slight one.
+
+    None where inertia is seen, and the velocity is needed.
+    """
+    if len(recordings.names) != 1:
+        return None
+    try:
+        test = inertia_test(recordings, pair_step=pair_step)
+    except (NumericalFailure, np.linalg.LinAlgError):
+        return None
+    if test.needs_velocity:
+        return None
+    said = test.sentence(recordings.time_unit or "")
+    if test.undecided:
+        return said
+    return f"{said}: leave 'identification.hidden_velocities' out, the position alone is the state"

@@ -70,6 +70,13 @@ def test_a_position_alone_is_refused_and_the_option_named() -> None:
     assert "has inertia" in done.outcome.reason
 
 
+def test_velocities_of_a_position_without_inertia_are_refused_and_the_option_named() -> None:
+    settings = PipelineSettings(identification=IdentificationOptions(degree=3, hidden_velocities=True))
+    done = identify.run(settings.of(identify.IdentifySettings), overdamped(3, step=0.02), number=0)
+    assert done.record is None
+    assert "leave 'identification.hidden_velocities' out" in done.outcome.reason
+
+
 @pytest.mark.slow
 def test_false_alarms_are_rare() -> None:
     assert not any(inertia_test(overdamped(seed, step=0.02), degree=3).seen for seed in range(50, 70))
