@@ -43,8 +43,10 @@
 `names`              what is named, and what models the rest?
 `investigation`      what is the verdict, and which fits does it rest on?
 `location`           where does the mismatch sit?
+`runs_alike`         how are several simulations run, so that their errors compare?
 `left_out`           does a model foresee what was left out of its fit?
 `held_out_errors`    which of two simulations foresees recordings better?
+`adoption`           which model of what has no name becomes a part of the new card?
 `held_out`           how well does it run on recordings that had no part in it?
 `withdrawal`         does a name mislead there?
 `verdict`            what is the verdict?

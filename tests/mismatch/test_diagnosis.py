@@ -18,7 +18,7 @@ from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.parametric import Signals
 from siq.errors import InputError, NumericalFailure
 from siq.estimation.budget import Budget
-from siq.mismatch import held_out, investigation, trials
+from siq.mismatch import adoption, investigation, trials
 from siq.mismatch.case import read_case
 from siq.mismatch.diagnosis import Diagnosis, solve_case
 from siq.mismatch.dictionary import standard_dictionary
@@ -223,7 +223,7 @@ def test_random_forces_are_no_noise_where_a_function_beside_them_is_likelier(
         return (Model((part,), search.recalibrated, 5.0),)
 
     monkeypatch.setattr(investigation, "models_of_the_nameless", models)
-    monkeypatch.setattr(held_out, "first_better", lambda *_: None)
+    monkeypatch.setattr(adoption, "first_better", lambda *_: None)
     diagnosis = solved(tmp_path, recordings_of(nothing, drive=0.05, count=4), study={"held_out": ["r2"]})
     assert said(diagnosis)["verdict"] == "unexplained" and names(diagnosis) == []
     # It is located where the likeliest function stands.
