@@ -52,6 +52,8 @@
 `verdict`            what is the verdict?
 `statement`          what is stated, and as data?
 `stated_functions`   what is stated of a model without a name?
+`part_words`         how is a part of what is missing called?
+`error_sentences`    what is said of the error on recordings held out?
 `sentences`          and how would a colleague say it?
 `augmented`          what is the simulation with what was found?
 `tables`             which tables are figures drawn from?

@@ -108,16 +108,6 @@ def described(findings: Findings) -> list[Mapping[str, Any]]:
     return list(findings.verdict.get("described") or [])
 
 
-def capital(text: str) -> str:
-    """The same with its first letter in upper case."""
-    return text[:1].upper() + text[1:]
-
-
-def listed(names: Sequence[str], word: str = "or") -> str:
-    """Names in a sentence."""
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} {word} {names[-1]}"
-
-
 def typeset(text: str, model: Dynamics, further: Iterable[str] = ()) -> Markup | str:
     """A formula of the verdict, typeset; as text where it cannot be read as one.
 

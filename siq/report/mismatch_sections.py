@@ -11,12 +11,11 @@ import pandas as pd
 from siq.mismatch.dictionary import Mechanism
 from siq.numerics.measured_text import unit_text, value_text
 from siq.numerics.share_text import p_text, percent
+from siq.numerics.word_text import capital, listed
 from siq.report.mismatch_findings import (
     SIMULATIONS,
     Findings,
-    capital,
     described,
-    listed,
     mathml,
     mechanisms_said,
     rate_of,
