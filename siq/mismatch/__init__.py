@@ -20,7 +20,10 @@
 `screening`          how much would each candidate gain, to first order?
 `trials`             and how much in earnest?
 `clusters`           does it stand, whatever errors within a recording are like?
-`search`             which mechanisms are found?
+`found`              what has a search found?
+`acceptance`         which of the mechanisms that were tried count as found?
+`on_top`             what does a mechanism become on top of others?
+`search`             and in which order are they looked for?
 `structure`          along which coordinates is something missing?
 `remainder`          what do the mechanisms leave?
 `rounded`            do the steps in which sensors read explain it?

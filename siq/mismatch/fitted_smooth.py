@@ -20,7 +20,7 @@ from siq.mismatch.fitted_parts import fitted_part
 from siq.mismatch.function_places import Place, coordinates_of
 from siq.mismatch.likely_places import FITTED, likely_places
 from siq.mismatch.nameless_models import Material, Model, Part, weighed
-from siq.mismatch.search import something_left
+from siq.mismatch.remainder import something_left
 from siq.mismatch.smooth_functions import (
     Ground,
     Smooth,

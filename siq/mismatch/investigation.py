@@ -20,13 +20,14 @@ from siq.estimation.unknown_forces import covariance_with_unknown_forces
 from siq.mismatch.candidates import MechanismCandidate, candidates_of, generic_candidates
 from siq.mismatch.described import models_of_the_nameless
 from siq.mismatch.dictionary import Mechanism
+from siq.mismatch.found import Search
 from siq.mismatch.nameless_models import Material, Model
 from siq.mismatch.names import names_of
 from siq.mismatch.naming import Naming
-from siq.mismatch.remainder import STRUCTURED, Remainder, what_is_left
+from siq.mismatch.remainder import LEFT, STRUCTURED, Remainder, what_is_left
 from siq.mismatch.roles import Roles, roles_of
 from siq.mismatch.rounded import explained_by_rounding
-from siq.mismatch.search import LEFT, Search, search
+from siq.mismatch.search import search
 from siq.mismatch.search_options import SearchOptions
 from siq.mismatch.steadiness import unsteadiness
 from siq.mismatch.structure import Structure

@@ -18,11 +18,11 @@ from siq.dynamics.dynamics import Dynamics
 from siq.estimation.measurements import Measurements
 from siq.mismatch.candidates import MechanismCandidate
 from siq.mismatch.evidence import log_odds_of_a_name
+from siq.mismatch.found import Search
 from siq.mismatch.matches import probability_of_a_match
 from siq.mismatch.probes import probes_of
 from siq.mismatch.remainder import Remainder
 from siq.mismatch.roles import Roles
-from siq.mismatch.search import Search
 from siq.mismatch.search_options import SearchOptions
 
 LOGGER = logging.getLogger(__name__)

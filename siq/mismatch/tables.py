@@ -11,8 +11,8 @@ from siq.dynamics.dynamics import Dynamics
 from siq.estimation.estimation import Fit
 from siq.mismatch.case import Comparison
 from siq.mismatch.diagnosis import Diagnosis
+from siq.mismatch.found import Search
 from siq.mismatch.investigation import Investigation
-from siq.mismatch.search import Search
 
 CURVE_COLUMNS = [
     "equation", "coordinate", "across", "at", "missing", "standard_error", "gain", "p_value", "stage",

@@ -10,10 +10,10 @@ from siq.estimation.estimation import Fit
 from siq.estimation.measurements import Measurements
 from siq.mismatch.candidates import PROCESS_NOISE
 from siq.mismatch.evidence import correlation_time_left, log_evidence_of
+from siq.mismatch.found import Found
 from siq.mismatch.held_out import HeldOutRuns
 from siq.mismatch.investigation import Investigation, MismatchVerdict
 from siq.mismatch.location import locate
-from siq.mismatch.search import Found
 from siq.mismatch.sentences import sentence_of, words_of
 from siq.mismatch.stated_functions import stated_functions
 from siq.mismatch.statement import (

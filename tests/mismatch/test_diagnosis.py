@@ -22,12 +22,12 @@ from siq.mismatch import adoption, investigation, trials
 from siq.mismatch.case import read_case
 from siq.mismatch.diagnosis import Diagnosis, solve_case
 from siq.mismatch.dictionary import standard_dictionary
+from siq.mismatch.found import Search
 from siq.mismatch.held_out import held_out_runs
 from siq.mismatch.nameless_models import MECHANISM, Material, Model, Part
 from siq.mismatch.naming import Naming
 from siq.mismatch.probes import Probe
 from siq.mismatch.remainder import Remainder
-from siq.mismatch.search import Search
 from siq.mismatch.trials import TriedMechanism
 from siq.mismatch.withdrawal import anything_else, withdrawn
 from tests.mismatch.foreign_cases import falling_ball
