@@ -18,7 +18,9 @@
 `places`             at which values of a shape does a search begin?
 `probes`             what does a little of each do to what is measured?
 `screening`          how much would each candidate gain, to first order?
-`trials`             and how much in earnest?
+`promises`           and which promise most, wherever their shapes may be?
+`tried`              what came of one that was tried?
+`trials`             how much do they explain in earnest?
 `clusters`           does it stand, whatever errors within a recording are like?
 `found`              what has a search found?
 `acceptance`         which of the mechanisms that were tried count as found?

@@ -22,7 +22,7 @@ from siq.mismatch.candidates import MechanismCandidate
 from siq.mismatch.clusters import clustered_probability, probability_by_chance
 from siq.mismatch.found import Found, Search
 from siq.mismatch.search_options import SearchOptions
-from siq.mismatch.trials import UNFORESEEN, TriedMechanism
+from siq.mismatch.tried import UNFORESEEN, TriedMechanism
 
 LOGGER = logging.getLogger(__name__)
 

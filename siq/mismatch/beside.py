@@ -26,7 +26,7 @@ from siq.mismatch.fitted_functions import with_a_function
 from siq.mismatch.held_out_errors import change_between, in_blocks
 from siq.mismatch.left_out import errors_left_out
 from siq.mismatch.nameless_models import Material, Model, runs_freely
-from siq.mismatch.trials import TriedMechanism, admissible
+from siq.mismatch.tried import TriedMechanism, admissible
 
 LOGGER = logging.getLogger(__name__)
 RIVALS = 2  # functions in the place of the mechanism that get another on top of them: a choice

@@ -22,7 +22,7 @@ from siq.mismatch.found import Search
 from siq.mismatch.likely_places import FITTED
 from siq.mismatch.nameless_models import MECHANISM, Material, Model, Part, runs_freely, weighed
 from siq.mismatch.remainder import something_left
-from siq.mismatch.trials import admissible
+from siq.mismatch.tried import admissible
 
 MOST = 2  # functions that are put on top of each other: more are no description
 

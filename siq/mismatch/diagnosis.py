@@ -18,7 +18,7 @@ from siq.mismatch.held_out import HeldOutRuns, held_out_runs
 from siq.mismatch.investigation import Investigation, MismatchVerdict, investigate
 from siq.mismatch.location import Location
 from siq.mismatch.study import MismatchStudy
-from siq.mismatch.trials import UNFORESEEN
+from siq.mismatch.tried import UNFORESEEN
 from siq.mismatch.verdict import StatedMechanism, Statement, statement_of
 from siq.mismatch.withdrawal import misleads, withdrawn
 

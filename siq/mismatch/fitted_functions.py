@@ -22,7 +22,7 @@ from siq.mismatch.functions import simplest, with_formula
 from siq.mismatch.likely_places import FITTED, LikelyPlace, few_powers, likely_places
 from siq.mismatch.nameless_models import Material, Model, Part, weighed
 from siq.mismatch.smooth_functions import ground_of
-from siq.mismatch.trials import UNFORESEEN
+from siq.mismatch.tried import UNFORESEEN
 
 LOGGER = logging.getLogger(__name__)
 

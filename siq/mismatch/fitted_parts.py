@@ -23,7 +23,7 @@ from siq.mismatch.function_places import Place
 from siq.mismatch.functions import FORMULA
 from siq.mismatch.nameless_models import Material, Part
 from siq.mismatch.smooth_functions import Smooth
-from siq.mismatch.trials import UNFORESEEN, TriedMechanism, judged
+from siq.mismatch.tried import UNFORESEEN, TriedMechanism, judged
 
 LOGGER = logging.getLogger(__name__)
 LARGEST_PART = 0.25  # of the work left, that a single fit may take: a choice

@@ -30,7 +30,7 @@ from siq.mismatch.smooth_functions import (
     with_smooth_function,
 )
 from siq.mismatch.smoothness import Smoothness, likeliest_product, smoothness_of
-from siq.mismatch.trials import UNFORESEEN
+from siq.mismatch.tried import UNFORESEEN
 
 LOGGER = logging.getLogger(__name__)
 ROUNDS = 4  # of fits, each along the trajectories of the one before: a choice

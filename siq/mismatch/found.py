@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from siq.estimation.estimation import Fit
 from siq.mismatch.probes import Probe
 from siq.mismatch.screening import Screened
-from siq.mismatch.trials import TriedMechanism, UntriedMechanism
+from siq.mismatch.tried import TriedMechanism, UntriedMechanism
 
 
 @dataclass(frozen=True)

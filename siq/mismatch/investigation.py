@@ -32,7 +32,7 @@ from siq.mismatch.search_options import SearchOptions
 from siq.mismatch.steadiness import unsteadiness
 from siq.mismatch.structure import Structure
 from siq.mismatch.study import MismatchStudy
-from siq.mismatch.trials import UntriedMechanism
+from siq.mismatch.tried import UntriedMechanism
 
 
 class MismatchVerdict(StrEnum):

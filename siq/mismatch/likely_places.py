@@ -26,9 +26,9 @@ from siq.mismatch.function_places import (
 )
 from siq.mismatch.functions import Power, powers, with_formula
 from siq.mismatch.probes import Probe, ProbeColumns
+from siq.mismatch.promises import PROBE_SUBSTEPS
 from siq.mismatch.roles import Roles
 from siq.mismatch.screening import LEVELS, probe_response, projected
-from siq.mismatch.trials import PROBE_SUBSTEPS
 
 FITTED = 3  # places in which functions are fitted, the most likely ones: a choice
 

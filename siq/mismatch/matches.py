@@ -19,9 +19,9 @@ from siq.estimation.measurements import Measurements
 from siq.mismatch.evidence import LENGTHS, orthonormal, smooth_prior
 from siq.mismatch.function_places import linearised_with_places, places_in
 from siq.mismatch.probes import Probe, ProbeColumns
+from siq.mismatch.promises import PROBE_SUBSTEPS
 from siq.mismatch.roles import Roles
 from siq.mismatch.screening import probe_response
-from siq.mismatch.trials import PROBE_SUBSTEPS
 
 DRAWS = 300  # effects without a name, which tell a probability of 5 % to 1 %
 

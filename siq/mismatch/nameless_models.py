@@ -17,7 +17,7 @@ from siq.mismatch.evidence import correlation_time_left, log_evidence_of
 from siq.mismatch.function_places import Place
 from siq.mismatch.roles import Roles
 from siq.mismatch.smooth_functions import Smooth
-from siq.mismatch.trials import TriedMechanism
+from siq.mismatch.tried import TriedMechanism
 
 MECHANISM = "mechanism"
 

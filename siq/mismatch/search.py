@@ -17,9 +17,11 @@ from siq.mismatch.acceptance import accepted, better_without, tried_together
 from siq.mismatch.candidates import MechanismCandidate
 from siq.mismatch.found import Found, Search
 from siq.mismatch.on_top import once_more, rebased
+from siq.mismatch.promises import screen_all
 from siq.mismatch.remainder import something_left
 from siq.mismatch.search_options import SearchOptions
-from siq.mismatch.trials import TriedMechanism, UntriedMechanism, fit_most_promising, screen_all
+from siq.mismatch.trials import fit_most_promising
+from siq.mismatch.tried import TriedMechanism, UntriedMechanism
 
 LOGGER = logging.getLogger(__name__)
 FOR_FUNCTIONS = 0.4  # of the budget, for functions without a name: a choice

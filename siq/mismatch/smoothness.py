@@ -26,7 +26,7 @@ from siq.mismatch.product_functions import ProductFunction, product_of
 from siq.mismatch.screening import LEVELS, probe_response, projected
 from siq.mismatch.smooth_functions import Ground, SmoothFunction, smooth_function, triangle_of
 from siq.mismatch.structure import SUBSTEPS
-from siq.mismatch.trials import UNFORESEEN
+from siq.mismatch.tried import UNFORESEEN
 
 LOGGER = logging.getLogger(__name__)
 SHARES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0)  # of the range; over twice of it a function is a parabola

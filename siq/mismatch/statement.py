@@ -13,7 +13,7 @@ from siq.mismatch.candidates import PROCESS_NOISE
 from siq.mismatch.held_out_errors import HeldOutErrors
 from siq.mismatch.investigation import MismatchVerdict
 from siq.mismatch.location import Location
-from siq.mismatch.trials import BUDGET_SPENT
+from siq.mismatch.tried import BUDGET_SPENT
 
 METRIC = "normalised rms, held-out recordings"
 UNKNOWN_ERRORS = HeldOutErrors()
@@ -35,7 +35,7 @@ class Evidence:
     Attributes
     ----------
     delta_chi2, delta_bic
-        What it gains, see `siq.mismatch.trials.TriedMechanism`.
+        What it gains, see `siq.mismatch.tried.TriedMechanism`.
     p_white, p_cluster
         Probabilities of as much by chance: if all errors are independent, and whatever errors within a
         recording have to do with each other.

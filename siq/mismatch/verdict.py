@@ -31,7 +31,7 @@ from siq.mismatch.statement import (
     Statement,
     UpperBound,
 )
-from siq.mismatch.trials import BUDGET_SPENT, TriedMechanism
+from siq.mismatch.tried import BUDGET_SPENT, TriedMechanism
 from siq.mismatch.units import unit_of
 
 __all__ = [

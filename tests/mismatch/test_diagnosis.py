@@ -28,7 +28,7 @@ from siq.mismatch.nameless_models import MECHANISM, Material, Model, Part
 from siq.mismatch.naming import Naming
 from siq.mismatch.probes import Probe
 from siq.mismatch.remainder import Remainder
-from siq.mismatch.trials import TriedMechanism
+from siq.mismatch.tried import TriedMechanism
 from siq.mismatch.withdrawal import anything_else, withdrawn
 from tests.mismatch.foreign_cases import falling_ball
 

@@ -30,7 +30,7 @@ from siq.mismatch.remainder import Remainder
 from siq.mismatch.roles import Roles
 from siq.mismatch.search_options import SearchOptions
 from siq.mismatch.structure import Curve, Direction, Structure
-from siq.mismatch.trials import TriedMechanism
+from siq.mismatch.tried import TriedMechanism
 
 
 def autoregressive(memory: float, size: int) -> np.ndarray:
