@@ -55,6 +55,7 @@
 `held_out`           how well does it run on recordings that had no part in it?
 `withdrawal`         does a name mislead there?
 `verdict`            what is the verdict?
+`stated_parts`       what is stated of a part of what is missing?
 `statement`          what is stated, and as data?
 `stated_functions`   what is stated of a model without a name?
 `part_words`         how is a part of what is missing called?

@@ -17,9 +17,11 @@ from siq.mismatch.case import Comparison, comparison_of
 from siq.mismatch.held_out import HeldOutRuns, held_out_runs
 from siq.mismatch.investigation import Investigation, MismatchVerdict, investigate
 from siq.mismatch.location import Location
+from siq.mismatch.stated_parts import StatedMechanism
+from siq.mismatch.statement import Statement
 from siq.mismatch.study import MismatchStudy
 from siq.mismatch.tried import UNFORESEEN
-from siq.mismatch.verdict import StatedMechanism, Statement, statement_of
+from siq.mismatch.verdict import statement_of
 from siq.mismatch.withdrawal import misleads, withdrawn
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from siq.mismatch.candidates import GENERIC, PROCESS_NOISE
-from siq.mismatch.statement import Rival, StatedFunction, StatedMechanism
+from siq.mismatch.stated_parts import Rival, StatedFunction, StatedMechanism
 from siq.numerics.measured_text import value_text
 from siq.numerics.word_text import capital, listed
 

@@ -11,7 +11,8 @@ from siq.mismatch.candidates import PROCESS_NOISE
 from siq.mismatch.error_sentences import as_it_is, error_stays, gained, not_foreseen
 from siq.mismatch.investigation import MismatchVerdict
 from siq.mismatch.part_words import LISTED, alternatives, described_part, named, or_else, placed
-from siq.mismatch.statement import Description, Recalibrated, StatedMechanism, Statement
+from siq.mismatch.stated_parts import StatedMechanism
+from siq.mismatch.statement import Description, Recalibrated, Statement
 from siq.numerics.measured_text import value_text
 from siq.numerics.number_text import number_text
 from siq.numerics.share_text import SMALLEST_SHARE, p_equation, p_text, percent

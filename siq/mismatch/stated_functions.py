@@ -15,7 +15,7 @@ from siq.mismatch.functions import FORMULA
 from siq.mismatch.held_out import HeldOutRuns
 from siq.mismatch.nameless_models import MECHANISM, Part
 from siq.mismatch.smooth_functions import CURVE, SURFACE, Smooth
-from siq.mismatch.statement import DescribedCurve, DescribedSurface, Estimate, Evidence, StatedFunction
+from siq.mismatch.stated_parts import DescribedCurve, DescribedSurface, Estimate, Evidence, StatedFunction
 
 GRID = 25  # places along either coordinate of a surface, for its figure
 _KINDS: Mapping[str, Literal["formula", "curve", "surface", "mechanism"]] = {

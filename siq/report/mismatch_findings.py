@@ -104,7 +104,7 @@ def mechanisms_said(findings: Findings) -> list[Mapping[str, Any]]:
 
 
 def described(findings: Findings) -> list[Mapping[str, Any]]:
-    """The model of what has no name; see `siq.mismatch.statement.StatedFunction`."""
+    """The model of what has no name; see `siq.mismatch.stated_parts.StatedFunction`."""
     return list(findings.verdict.get("described") or [])
 
 
