@@ -46,6 +46,7 @@
 `beside`             is a mechanism likelier where a function models the rest?
 `described`          which of these models are candidates for the new card?
 `names`              what is named, and what models the rest?
+`possible_verdicts`  what may a diagnosis end with?
 `investigation`      what is the verdict, and which fits does it rest on?
 `location`           where does the mismatch sit?
 `runs_alike`         how are several simulations run, so that their errors compare?

@@ -15,8 +15,9 @@ from siq.estimation.budget import Budget
 from siq.mismatch.augmented import completed
 from siq.mismatch.case import Comparison, comparison_of
 from siq.mismatch.held_out import HeldOutRuns, held_out_runs
-from siq.mismatch.investigation import Investigation, MismatchVerdict, investigate
+from siq.mismatch.investigation import Investigation, investigate
 from siq.mismatch.location import Location
+from siq.mismatch.possible_verdicts import MismatchVerdict
 from siq.mismatch.stated_parts import StatedMechanism
 from siq.mismatch.statement import Statement
 from siq.mismatch.study import MismatchStudy

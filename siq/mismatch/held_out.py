@@ -13,8 +13,9 @@ from siq.estimation.free_runs import FreeRun, squared_errors
 from siq.estimation.measurements import Measurements
 from siq.mismatch.adoption import adopted_by_held_out, adopted_by_left_out
 from siq.mismatch.held_out_errors import HeldOutErrors
-from siq.mismatch.investigation import Investigation, MismatchVerdict
+from siq.mismatch.investigation import Investigation
 from siq.mismatch.nameless_models import Model
+from siq.mismatch.possible_verdicts import MismatchVerdict
 from siq.mismatch.runs_alike import RunsAlike
 
 

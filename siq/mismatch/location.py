@@ -13,8 +13,9 @@ from siq.estimation.estimation import Fit
 from siq.estimation.innovations import Noise, solve, whiten
 from siq.estimation.measurements import Measurements
 from siq.mismatch.candidates import MechanismCandidate
-from siq.mismatch.investigation import Investigation, MismatchVerdict
+from siq.mismatch.investigation import Investigation
 from siq.mismatch.nameless_models import Model
+from siq.mismatch.possible_verdicts import MismatchVerdict
 from siq.mismatch.roles import Roles
 from siq.mismatch.structure import Curve, Structure
 from siq.numerics.measured_text import unit_text, value_text

@@ -9,8 +9,8 @@ from collections.abc import Mapping, Sequence
 
 from siq.mismatch.candidates import PROCESS_NOISE
 from siq.mismatch.error_sentences import as_it_is, error_stays, gained, not_foreseen
-from siq.mismatch.investigation import MismatchVerdict
 from siq.mismatch.part_words import LISTED, alternatives, described_part, named, or_else, placed
+from siq.mismatch.possible_verdicts import MismatchVerdict
 from siq.mismatch.stated_parts import StatedMechanism
 from siq.mismatch.statement import Description, Recalibrated, Statement
 from siq.numerics.measured_text import value_text

@@ -11,8 +11,8 @@ import numpy as np
 from siq.estimation.budget import UNLIMITED, Account
 from siq.mismatch.candidates import PROCESS_NOISE
 from siq.mismatch.held_out_errors import HeldOutErrors
-from siq.mismatch.investigation import MismatchVerdict
 from siq.mismatch.location import Location
+from siq.mismatch.possible_verdicts import MismatchVerdict
 from siq.mismatch.stated_parts import StatedFunction, StatedMechanism
 from siq.mismatch.tried import BUDGET_SPENT
 

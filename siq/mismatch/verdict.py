@@ -12,8 +12,9 @@ from siq.mismatch.candidates import PROCESS_NOISE
 from siq.mismatch.evidence import correlation_time_left, log_evidence_of
 from siq.mismatch.found import Found
 from siq.mismatch.held_out import HeldOutRuns
-from siq.mismatch.investigation import Investigation, MismatchVerdict
+from siq.mismatch.investigation import Investigation
 from siq.mismatch.location import locate
+from siq.mismatch.possible_verdicts import MismatchVerdict
 from siq.mismatch.sentences import sentence_of, words_of
 from siq.mismatch.stated_functions import stated_functions
 from siq.mismatch.stated_parts import Estimate, Evidence, Rival, Standing, StatedMechanism

@@ -26,6 +26,7 @@ from siq.mismatch.found import Search
 from siq.mismatch.held_out import held_out_runs
 from siq.mismatch.nameless_models import MECHANISM, Material, Model, Part
 from siq.mismatch.naming import Naming
+from siq.mismatch.possible_verdicts import MismatchVerdict
 from siq.mismatch.probes import Probe
 from siq.mismatch.remainder import Remainder
 from siq.mismatch.tried import TriedMechanism
@@ -459,7 +460,7 @@ def test_where_nothing_speaks_of_a_mismatch_but_a_refuted_name_there_is_none(tmp
     diagnosis = solved(tmp_path, recordings_of(nothing))
     found = diagnosis.investigation
     assert said(diagnosis)["verdict"] == "no mismatch"
-    refuted = replace(found, verdict=investigation.MismatchVerdict.MISSING_PHYSICS)
+    refuted = replace(found, verdict=MismatchVerdict.MISSING_PHYSICS)
     again = withdrawn(refuted, diagnosis.case, Budget())
     assert str(again.verdict) == "no mismatch" and not again.withdrawn and not again.search.found
     assert "nothing else speaks of a mismatch" in again.remarks[-1]

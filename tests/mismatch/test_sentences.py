@@ -11,8 +11,8 @@ import pytest
 
 from siq.mismatch.candidates import PROCESS_NOISE
 from siq.mismatch.held_out_errors import HeldOutErrors
-from siq.mismatch.investigation import MismatchVerdict
 from siq.mismatch.location import where_it_sits
+from siq.mismatch.possible_verdicts import MismatchVerdict
 from siq.mismatch.sentences import sentence_of, words_of
 from siq.mismatch.stated_parts import Estimate, Evidence, Rival, StatedFunction, StatedMechanism
 from siq.mismatch.statement import Description, Recalibrated, Statement
