@@ -38,6 +38,7 @@
 `nameless_models`    what is a model of what has no name, and how likely?
 `likely_places`      where is a function likeliest, and which powers does it need?
 `fitted_parts`       what does a part of a description explain, fitted in earnest?
+`grounds`            where may a smooth function stand?
 `smooth_functions`   what is a smooth function, and what is expected of it?
 `product_functions`  what is a product of two of them?
 `smoothness`         over which lengths does it change, and how large is it?

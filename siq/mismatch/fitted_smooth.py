@@ -18,17 +18,11 @@ from siq.estimation.estimation import Fit
 from siq.estimation.measurements import Measurements
 from siq.mismatch.fitted_parts import fitted_part
 from siq.mismatch.function_places import Place, coordinates_of
+from siq.mismatch.grounds import Ground, ground_of, ground_of_two
 from siq.mismatch.likely_places import FITTED, likely_places
 from siq.mismatch.nameless_models import Material, Model, Part, weighed
 from siq.mismatch.remainder import something_left
-from siq.mismatch.smooth_functions import (
-    Ground,
-    Smooth,
-    ground_of,
-    ground_of_two,
-    smooth_function,
-    with_smooth_function,
-)
+from siq.mismatch.smooth_functions import Smooth, smooth_function, with_smooth_function
 from siq.mismatch.smoothness import Smoothness, likeliest_product, smoothness_of
 from siq.mismatch.tried import UNFORESEEN
 
