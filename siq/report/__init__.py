@@ -19,7 +19,11 @@
 `equations_page`         and that of given equations?
 `sweep_section`          and what does it say of a control parameter?
 `inspection_section`     what is in the recordings, first of all?
-`study_sections`         and in each of its parts?
+`study_results`          what did a study leave behind, and what of it is shown?
+`formula_section`        what does its page say of the formulas?
+`evidence_section`       and of how far they can be trusted?
+`workings_section`       and of how they were worked out?
+`study_sections`         and in each of its other parts?
 `study_formulas`         which formulas?
 `study_runs`             which tables of several runs?
 `study_captions`         what do its figures show, and where do they stand?
