@@ -37,7 +37,10 @@
 `mismatch_page`          what does the page of a diagnosis say?
 `largest_difference`     where do a simulation and held-out recordings differ most?
 `mismatch_first_screen`  and what does it open with?
-`mismatch_sections`      which sections has it?
+`mismatch_formulas`      which formulas are missing?
+`mismatch_evidence`      how sure is it?
+`mismatch_sections`      and which other sections has it?
+`mismatch_captions`      what do its figures show?
 `mismatch_findings`      what is it made from?
 `mismatch_answer`        and what does a terminal print at its end?
 `official_tests`         and what do official tests of benchmarks say, in one table?

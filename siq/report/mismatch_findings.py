@@ -41,7 +41,7 @@ class Findings:
     candidates
         Columns ``label shapes gain stage beside``.
     figures
-        SVG files by the names of `siq.report.mismatch_sections.CAPTIONS`, as far as there was something to
+        SVG files by the names of `siq.report.mismatch_captions.CAPTIONS`, as far as there was something to
         draw.
     wells, escape, notes
         See `siq.mismatch.consequences.Consequences`.
