@@ -15,7 +15,7 @@ import numpy as np
 
 from siq.dynamics.dynamics import Dynamics
 from siq.estimation.budget import Budget, BudgetSpent
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.measurements import Measurements
 from siq.estimation.process_noise import fit_with_process_noise_as_needed
 from siq.mismatch.candidates import MechanismCandidate

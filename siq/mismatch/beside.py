@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.measurements import Measurements
 from siq.mismatch.candidates import MechanismCandidate
 from siq.mismatch.evidence import correlation_time_left, log_evidence_of

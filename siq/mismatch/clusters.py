@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 import scipy.stats
 
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import solve, whiten
 from siq.estimation.measurements import Measurements
 from siq.mismatch.candidates import MechanismCandidate

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.measurements import Measurements
 from siq.estimation.process_noise import fit_with_and_without_process_noise
 from siq.mismatch.fitted_functions import with_a_function

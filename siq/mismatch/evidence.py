@@ -22,7 +22,7 @@ import scipy.linalg
 import scipy.special
 
 from siq.dynamics.dynamics import Dynamics
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import Whitened, solve, whiten
 from siq.estimation.measurements import Measurements
 from siq.mismatch.candidates import MechanismCandidate

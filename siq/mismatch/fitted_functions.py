@@ -15,7 +15,7 @@ import numpy as np
 import sympy
 
 from siq.dynamics.parametric import symbol
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.mismatch.fitted_parts import fitted_part
 from siq.mismatch.fitted_smooth import with_a_smooth_function
 from siq.mismatch.functions import simplest, with_formula

@@ -9,7 +9,8 @@ import numpy as np
 
 from siq.errors import NumericalFailure
 from siq.estimation.budget import BudgetSpent
-from siq.estimation.estimation import SUBSTEP_ERROR, Fit
+from siq.estimation.estimation import SUBSTEP_ERROR
+from siq.estimation.fit import Fit
 from siq.estimation.linearisation import substeps_needed
 from siq.estimation.process_noise import (
     better_of,

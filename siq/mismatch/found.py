@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.mismatch.probes import Probe
 from siq.mismatch.screening import Screened
 from siq.mismatch.tried import TriedMechanism, UntriedMechanism

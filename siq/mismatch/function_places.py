@@ -18,7 +18,7 @@ import sympy
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.formulas import compile_values, exact_number
 from siq.dynamics.parametric import Signals, symbol
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.linearisation import Grid, Linearisation
 from siq.estimation.measurements import Measurements
 from siq.mismatch.roles import Roles

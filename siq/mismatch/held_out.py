@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from siq.dynamics.dynamics import Dynamics
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.free_runs import FreeRun, squared_errors
 from siq.estimation.measurements import Measurements
 from siq.mismatch.adoption import adopted_by_held_out, adopted_by_left_out

@@ -10,8 +10,8 @@ import numpy as np
 from siq.dynamics.dynamics import Dynamics
 from siq.errors import NumericalFailure
 from siq.estimation.budget import UNLIMITED, Account, Budget
-from siq.estimation.estimation import Fit
 from siq.estimation.expectations import with_expectations
+from siq.estimation.fit import Fit
 from siq.estimation.measurements import Measurements
 from siq.estimation.recalibration import recalibrate
 from siq.estimation.unknown_forces import covariance_with_unknown_forces

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from siq.errors import NumericalFailure
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import Noise
 from siq.estimation.measurements import Measurements
 from siq.estimation.process_noise import fit_with_process_noise_as_needed

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from siq.errors import NumericalFailure
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import Whitened, profile_likelihood, whiten
 from siq.estimation.linearisation import Grid
 from siq.estimation.measurements import Measurements

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from siq.dynamics.dynamics import Dynamics
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import Noise, solve, whiten
 from siq.estimation.measurements import Measurements
 from siq.mismatch.candidates import MechanismCandidate

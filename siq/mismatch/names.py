@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from siq.dynamics.dynamics import Dynamics
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.process_noise import fit_with_and_without_process_noise
 from siq.mismatch.beside import BesideARemainder, beside_a_remainder
 from siq.mismatch.candidates import MechanismCandidate

@@ -8,7 +8,7 @@ import numpy as np
 import scipy.stats
 
 from siq.dynamics.dynamics import Dynamics
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.mismatch.search_options import SearchOptions
 
 

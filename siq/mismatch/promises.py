@@ -9,7 +9,7 @@ import numpy as np
 
 from siq.dynamics.dynamics import Dynamics
 from siq.estimation.budget import Budget, BudgetSpent, evaluation
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.jumps import EDGE_SUBSTEPS, spread_edges
 from siq.estimation.linearisation import Grid
 from siq.estimation.measurements import Measurements

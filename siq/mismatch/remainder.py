@@ -8,7 +8,7 @@ import numpy as np
 
 from siq.dynamics.dynamics import Dynamics
 from siq.errors import NumericalFailure
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import Noise
 from siq.estimation.measurements import Measurements
 from siq.mismatch.roles import Roles, roles_of

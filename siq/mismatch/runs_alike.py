@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.free_runs import FreeRun, UsualStates, free_run, squared_errors
 from siq.estimation.innovations import Noise
 from siq.estimation.measurements import Measurements

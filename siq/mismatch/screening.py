@@ -14,7 +14,7 @@ import numpy as np
 
 from siq.dynamics.dynamics import Dynamics
 from siq.errors import NumericalFailure
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import Whitened, profile_likelihood, whiten
 from siq.estimation.linearisation import Columns, Grid, Linearisation, linearise
 from siq.estimation.measurements import Measurements

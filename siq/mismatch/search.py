@@ -11,7 +11,7 @@ from dataclasses import replace
 
 from siq.dynamics.dynamics import Dynamics
 from siq.estimation.budget import Budget
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.measurements import Measurements
 from siq.mismatch.acceptance import accepted, better_without, tried_together
 from siq.mismatch.candidates import MechanismCandidate

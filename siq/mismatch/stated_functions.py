@@ -10,7 +10,7 @@ import numpy as np
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.formulas import compile_values
 from siq.dynamics.parametric import symbol
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.mismatch.functions import FORMULA
 from siq.mismatch.held_out import HeldOutRuns
 from siq.mismatch.nameless_models import MECHANISM, Part

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from siq.dynamics.dynamics import Dynamics
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.mismatch.case import Comparison
 from siq.mismatch.diagnosis import Diagnosis
 from siq.mismatch.found import Search

@@ -10,7 +10,7 @@ import numpy as np
 from siq.dynamics.dynamics import Dynamics
 from siq.errors import NumericalFailure
 from siq.estimation.budget import Budget, BudgetSpent
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.jumps import sharpened
 from siq.estimation.linearisation import Grid
 from siq.estimation.measurements import Measurements

@@ -8,7 +8,7 @@ import numpy as np
 import scipy.stats
 
 from siq.errors import NumericalFailure
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.measurements import Measurements
 from siq.mismatch.candidates import MechanismCandidate
 from siq.mismatch.clusters import probability_by_chance

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.measurements import Measurements
 from siq.mismatch.candidates import PROCESS_NOISE
 from siq.mismatch.evidence import correlation_time_left, log_evidence_of
