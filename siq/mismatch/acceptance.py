@@ -18,7 +18,7 @@ from siq.estimation.budget import Budget, BudgetSpent
 from siq.estimation.fit import Fit
 from siq.estimation.measurements import Measurements
 from siq.estimation.process_noise import fit_with_process_noise_as_needed
-from siq.mismatch.candidates import MechanismCandidate
+from siq.mismatch.building import MechanismCandidate
 from siq.mismatch.clusters import clustered_probability, probability_by_chance
 from siq.mismatch.found import Found, Search
 from siq.mismatch.search_options import SearchOptions

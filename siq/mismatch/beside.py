@@ -20,7 +20,7 @@ import numpy as np
 
 from siq.estimation.fit import Fit
 from siq.estimation.measurements import Measurements
-from siq.mismatch.candidates import MechanismCandidate
+from siq.mismatch.building import MechanismCandidate
 from siq.mismatch.evidence import correlation_time_left, log_evidence_of
 from siq.mismatch.fitted_functions import with_a_function
 from siq.mismatch.held_out_errors import change_between, in_blocks

@@ -19,7 +19,7 @@ from siq.estimation.process_noise import (
     simpler_fit,
 )
 from siq.estimation.trajectories import fit_trajectories
-from siq.mismatch.candidates import MechanismCandidate
+from siq.mismatch.building import MechanismCandidate
 from siq.mismatch.function_places import Place
 from siq.mismatch.functions import FORMULA
 from siq.mismatch.nameless_models import Material, Part

@@ -11,7 +11,7 @@ import sympy
 
 from siq.dynamics.dynamics import Dynamics, Parameter
 from siq.dynamics.parametric import symbol
-from siq.mismatch.candidates import MechanismCandidate
+from siq.mismatch.building import MechanismCandidate
 from siq.mismatch.function_places import Place
 from siq.mismatch.units import unit_of, units_of
 

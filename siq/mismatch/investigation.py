@@ -15,7 +15,8 @@ from siq.estimation.fit import Fit
 from siq.estimation.measurements import Measurements
 from siq.estimation.recalibration import recalibrate
 from siq.estimation.unknown_forces import covariance_with_unknown_forces
-from siq.mismatch.candidates import MechanismCandidate, candidates_of, generic_candidates
+from siq.mismatch.building import MechanismCandidate
+from siq.mismatch.candidates import candidates_of, generic_candidates
 from siq.mismatch.described import models_of_the_nameless
 from siq.mismatch.dictionary import Mechanism
 from siq.mismatch.found import Search

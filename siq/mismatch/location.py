@@ -11,7 +11,7 @@ import numpy as np
 from siq.estimation.fit import Fit
 from siq.estimation.innovations import Noise, solve, whiten
 from siq.estimation.measurements import Measurements
-from siq.mismatch.candidates import MechanismCandidate
+from siq.mismatch.building import MechanismCandidate
 from siq.mismatch.investigation import Investigation
 from siq.mismatch.nameless_models import Model
 from siq.mismatch.possible_verdicts import MismatchVerdict

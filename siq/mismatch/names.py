@@ -16,7 +16,7 @@ from siq.dynamics.dynamics import Dynamics
 from siq.estimation.fit import Fit
 from siq.estimation.process_noise import fit_with_and_without_process_noise
 from siq.mismatch.beside import BesideARemainder, beside_a_remainder
-from siq.mismatch.candidates import MechanismCandidate
+from siq.mismatch.building import MechanismCandidate
 from siq.mismatch.described import models_beside_names, models_of_the_nameless
 from siq.mismatch.found import Search
 from siq.mismatch.nameless_models import Material, Model

@@ -16,7 +16,7 @@ import scipy.special
 
 from siq.dynamics.dynamics import Dynamics
 from siq.estimation.measurements import Measurements
-from siq.mismatch.candidates import MechanismCandidate
+from siq.mismatch.building import MechanismCandidate
 from siq.mismatch.evidence import log_odds_of_a_name
 from siq.mismatch.found import Search
 from siq.mismatch.matches import probability_of_a_match

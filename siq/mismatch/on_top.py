@@ -8,7 +8,7 @@ import sympy
 
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.parametric import symbol
-from siq.mismatch.candidates import MechanismCandidate
+from siq.mismatch.building import MechanismCandidate
 
 
 def once_more(candidate: MechanismCandidate, found: MechanismCandidate) -> bool:

@@ -13,7 +13,7 @@ from siq.estimation.fit import Fit
 from siq.estimation.jumps import EDGE_SUBSTEPS, spread_edges
 from siq.estimation.linearisation import Grid
 from siq.estimation.measurements import Measurements
-from siq.mismatch.candidates import MechanismCandidate
+from siq.mismatch.building import MechanismCandidate
 from siq.mismatch.probes import Probe, ProbeColumns, probes_of
 from siq.mismatch.screening import Screened, in_portions, probe_response, screen
 from siq.mismatch.tried import BUDGET_SPENT, UNFORESEEN, UntriedMechanism, in_words

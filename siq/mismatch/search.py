@@ -14,7 +14,7 @@ from siq.estimation.budget import Budget
 from siq.estimation.fit import Fit
 from siq.estimation.measurements import Measurements
 from siq.mismatch.acceptance import accepted, better_without, tried_together
-from siq.mismatch.candidates import MechanismCandidate
+from siq.mismatch.building import MechanismCandidate
 from siq.mismatch.found import Found, Search
 from siq.mismatch.on_top import once_more, rebased
 from siq.mismatch.promises import screen_all

@@ -23,7 +23,7 @@ import sympy
 
 from siq.dynamics.dynamics import Dynamics, JointExpectation
 from siq.dynamics.parametric import symbol
-from siq.mismatch.candidates import MechanismCandidate
+from siq.mismatch.building import MechanismCandidate
 from siq.mismatch.functions import built, fresh_names, unit_in
 from siq.mismatch.grounds import Ground
 

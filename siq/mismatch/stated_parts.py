@@ -74,7 +74,7 @@ class StatedMechanism:
     name, label
         Of the dictionary, and told apart from its other forms and places.
     terms
-        Formula that is added, by equation; see `siq.mismatch.candidates.MechanismCandidate.changes`.
+        Formula that is added, by equation; see `siq.mismatch.building.MechanismCandidate.changes`.
     parameters
         Those that it brings.
     evidence

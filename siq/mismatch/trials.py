@@ -15,7 +15,7 @@ from siq.estimation.jumps import sharpened
 from siq.estimation.linearisation import Grid
 from siq.estimation.measurements import Measurements
 from siq.estimation.process_noise import fit_with_process_noise_as_needed, least_to_believe
-from siq.mismatch.candidates import MechanismCandidate
+from siq.mismatch.building import MechanismCandidate
 from siq.mismatch.probes import Probe, ProbeColumns
 from siq.mismatch.screening import Screened
 from siq.mismatch.tried import (

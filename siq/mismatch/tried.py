@@ -10,7 +10,7 @@ import scipy.stats
 from siq.errors import NumericalFailure
 from siq.estimation.fit import Fit
 from siq.estimation.measurements import Measurements
-from siq.mismatch.candidates import MechanismCandidate
+from siq.mismatch.building import MechanismCandidate
 from siq.mismatch.clusters import probability_by_chance
 
 UNFORESEEN = (ArithmeticError, ValueError, np.linalg.LinAlgError)

@@ -95,7 +95,7 @@ def model_without_a_name(findings: Findings) -> ReportSection | None:
 
 
 def _of_what(name: str, entry: Mechanism | None, findings: Findings) -> str:
-    """What a formula of a mechanism is; see `siq.mismatch.candidates.MechanismCandidate.changes`."""
+    """What a formula of a mechanism is; see `siq.mismatch.building.MechanismCandidate.changes`."""
     measured = name in [output for output, _ in findings.before.outputs]
     if measured and entry is not None and any(form.outputs for form in entry.forms):
         return f"what is measured as {name}"
