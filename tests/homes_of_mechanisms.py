@@ -20,7 +20,8 @@ from siq.dynamics.parametric import Signals, symbol
 from siq.estimation.linearisation import Grid
 from siq.estimation.measurements import Measurements
 from siq.files.documents import Document, validate
-from siq.mismatch.candidates import MechanismCandidate, candidates_of
+from siq.mismatch.building import MechanismCandidate
+from siq.mismatch.candidates import candidates_of
 from siq.mismatch.dictionary import standard_dictionary
 from siq.mismatch.roles import roles_of
 from siq.mismatch.study import measurements_of

@@ -18,7 +18,7 @@ from benchmarks.discrepancies.simulation import Simulation
 from siq.dynamics.dynamics import Dynamics, Parameter
 from siq.dynamics.parametric import symbol
 from siq.errors import NumericalFailure
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.measurements import Measurements
 from siq.estimation.recalibration import recalibrate
 

@@ -12,7 +12,7 @@ from benchmarks.discrepancies.refit import refitted, runs_better
 from benchmarks.discrepancies.regression import Equation, Found, chosen_terms, joint, powers
 from benchmarks.discrepancies.states import SeenStates, seen_states
 from siq.dynamics.dynamics import Dynamics
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.measurements import Measurements
 from siq.estimation.recalibration import recalibrate
 from siq.mismatch.case import Comparison

@@ -15,7 +15,7 @@ import scipy.interpolate
 
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.parametric import Signals
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.measurements import Measurements
 
 TRIMMED = 0.05  # of a recording, at each end, where derivatives of a smoothing spline are poor

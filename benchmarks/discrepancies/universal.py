@@ -25,7 +25,7 @@ from benchmarks.discrepancies.segments import Segments, segments_of
 from benchmarks.discrepancies.sindy import WORSE, along, dynamic, strongest_term, values_of
 from benchmarks.discrepancies.states import SeenStates, parts, seen_states, smooth
 from siq.dynamics.parametric import arguments_of, evaluable
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.measurements import Measurements
 from siq.estimation.recalibration import recalibrate
 from siq.mismatch.case import Comparison

@@ -32,7 +32,7 @@ from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.dynamics import Dynamics, Parameter
 from siq.dynamics.parametric import symbol
 from siq.estimation import estimation
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import Noise
 from siq.estimation.measurements import Measurements
 

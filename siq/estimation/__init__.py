@@ -16,6 +16,7 @@ Imports `siq.dynamics` and what it may import.
 `expectations`       what does a card say of parameters that recordings do not tell?
 `first_states`       with which states does a fit begin?
 `shooting`           where does one step of a fit lead?
+`fit`                what is known of a fit?
 `estimation`         which parameters, states and noise fit best?
 `unknown_forces`     and where nobody knows how strong random forces are?
 `noise_uncertainty`  how well is the noise known, and what does that leave open?

@@ -15,7 +15,7 @@ restricted likelihood, which allows for that.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -23,11 +23,12 @@ from siq.dynamics.dynamics import Dynamics
 from siq.estimation.budget import Budget
 from siq.estimation.closure import ClosedFunctions
 from siq.estimation.expectations import Expectations
+from siq.estimation.fit import RUNS_AWAY, Fit, failed_fit, fit_at
 from siq.estimation.innovations import Noise, solve, whiten
-from siq.estimation.linearisation import Grid, Linearisation, linearise, substeps_needed
+from siq.estimation.linearisation import Grid, linearise, substeps_needed
 from siq.estimation.measurements import Measurements
 from siq.estimation.noise import Priors, noise_along
-from siq.estimation.shooting import INEXACT, Iterate, Shooting, changed
+from siq.estimation.shooting import Iterate, Shooting
 
 SUBSTEP_ERROR = 3e-6  # of the spread of a state: far below what any sensor resolves
 SETTLED = 1e-4  # change of the innovations, squared and per sample, at which a fit has converged
@@ -35,69 +36,6 @@ FINE = 1e-3  # the same of all innovations together, by the parameters: a thirti
 STANDSTILL = 0.005  # change of the sum of squares over four steps, below which a fit moves to no avail
 PATIENCE = 6  # steps before that is asked
 RESTING = 1e-12  # of a state's domain, the least that its spread is taken for
-RUNS_AWAY = "the simulation runs away between two samples"
-
-
-@dataclass(frozen=True)
-class Fit:
-    """A fitted model.
-
-    Attributes
-    ----------
-    model
-        With the estimates as its parameters' values.
-    covariance
-        Of the free parameters, shape ``(p, p)``, from white innovations.
-    x
-        Smoothed states at all samples, shape ``(n, d)``.
-    linearised_at
-        Where f was taken for `linearisation`, shape ``(n, d)``: `x` without process noise, otherwise what the
-        filter knows at each sample.
-    spread
-        Covariance of what the filter knows at each sample, shape ``(n, d, d)``; None without process noise.
-    noise
-        Estimates, or what was given.
-    linearisation
-        At `linearised_at` and the estimates.
-    log_likelihood
-        Not the restricted one, which depends on the units in which a model has its states.
-    sum_of_squares
-        Of the whitened innovations, and of what is expected of parameters: about `degrees_of_freedom` where
-        the model is right.
-    degrees_of_freedom
-        Measured values, and what is expected of several parameters together, less initial states and free
-        parameters.
-    substeps
-        Runge–Kutta steps between samples.
-    converged
-        Whether the iteration settled.
-    fault
-        Why there is no result; empty where there is one, settled or not.
-    """
-
-    model: Dynamics
-    covariance: np.ndarray
-    x: np.ndarray
-    linearised_at: np.ndarray
-    spread: np.ndarray | None
-    noise: Noise
-    linearisation: Linearisation
-    log_likelihood: float
-    sum_of_squares: float
-    degrees_of_freedom: int
-    substeps: int
-    converged: bool
-    fault: str = ""
-
-    @property
-    def standard_errors(self) -> np.ndarray:
-        """Of the free parameters, shape ``(p,)``."""
-        return np.sqrt(np.diag(self.covariance))
-
-    @property
-    def has_process_noise(self) -> bool:
-        """Whether the states were let deviate from their equations."""
-        return bool((self.noise.process > 0).any())
 
 
 def fit_by_multiple_shooting(
@@ -149,12 +87,12 @@ def fit_by_multiple_shooting(
         grid = Grid(data, substeps)
         begin = Iterate(model.values, x, linearise(model, grid, model.values, x), x)
         if not begin.along.finite:
-            return _failed(model, begin, noise, substeps, RUNS_AWAY)
+            return failed_fit(model, begin, noise, substeps, RUNS_AWAY)
         shooting = Shooting(model, grid, _sizes(model, x), budget=budget)
         try:
             fit = _gauss_newton(shooting, begin, noise, estimate_process=estimate_process, most=iterations)
         except (ArithmeticError, np.linalg.LinAlgError) as error:
-            return _failed(model, begin, noise, substeps, str(error))
+            return failed_fit(model, begin, noise, substeps, str(error))
     if not (fit.converged and fit.has_process_noise):
         return fit
     return fit_by_filter(
@@ -203,11 +141,11 @@ def fit_by_filter(
         )
         begin = Iterate(model.values, x, shooting.linearised(model.values, x, None, noise), x)
         if not begin.along.finite:
-            return _failed(model, begin, noise, substeps, RUNS_AWAY)
+            return failed_fit(model, begin, noise, substeps, RUNS_AWAY)
         try:
             return _gauss_newton(shooting, begin, noise, estimate_process=estimate_process, most=iterations)
         except (ArithmeticError, np.linalg.LinAlgError) as error:
-            return _failed(model, begin, noise, substeps, str(error))
+            return failed_fit(model, begin, noise, substeps, str(error))
 
 
 def _gauss_newton(
@@ -259,73 +197,10 @@ def _gauss_newton(
             break
         now, length = step
         whole = length == 1.0
-    return _fit_at(
+    return fit_at(
         shooting.model, data, now, noise=noise, substeps=shooting.grid.substeps, converged=converged,
         resolution=shooting.resolution,
     )  # fmt: skip
-
-
-def fit_of_states(
-    model: Dynamics, data: Measurements, *, x: np.ndarray, noise: Noise, substeps: int, converged: bool
-) -> Fit:
-    """What is known of a fit that was made otherwise: without process noise, its states follow the equations.
-
-    Parameters
-    ----------
-    model
-        With the estimates.
-    data, substeps, converged
-        Of the fit.
-    x
-        The fitted states, shape ``(n, d)``.
-    noise
-        To begin with; the measurement noise is estimated.
-    """
-    at = Iterate(model.values, x, linearise(model, Grid(data, substeps), model.values, x), x)
-    if not at.along.finite:
-        return _failed(model, at, noise, substeps, RUNS_AWAY)
-    try:
-        priors = Priors(Expectations.of(model), model.values[list(model.free)])
-        noise = noise_along(at.along, data, noise, estimate_process=False, priors=priors)
-        return _fit_at(
-            model, data, at, noise=noise, substeps=substeps, converged=converged, resolution=INEXACT
-        )
-    except (ArithmeticError, np.linalg.LinAlgError) as error:
-        return _failed(model, at, noise, substeps, str(error))
-
-
-def _fit_at(
-    model: Dynamics,
-    data: Measurements,
-    at: Iterate,
-    *,
-    noise: Noise,
-    substeps: int,
-    converged: bool,
-    resolution: float,
-) -> Fit:
-    white = whiten(at.along, data, noise)
-    columns, innovations = Expectations.of(model).beside(
-        white.columns, white.innovations, at.values[list(model.free)]
-    )
-    change, covariance = solve(columns, innovations, least=resolution)
-    # The last change is below the errors. The likelihood is that of the states in hand, not of a forecast.
-    total = float(innovations @ innovations)
-    together = sum(len(each.roots) for each in model.expected_together)
-    return Fit(
-        model=model.with_values(changed(at.values, model.free, change if converged else 0 * change)),
-        covariance=covariance,
-        x=at.smoothed,
-        linearised_at=at.x,
-        spread=at.spread,
-        noise=noise,
-        linearisation=at.along,
-        log_likelihood=white.log_likelihood(total),
-        sum_of_squares=total,
-        degrees_of_freedom=white.degrees_of_freedom + together - len(model.free),
-        substeps=substeps,
-        converged=converged,
-    )
 
 
 def _stands_still(totals: list[float]) -> bool:
@@ -339,22 +214,3 @@ def _sizes(model: Dynamics, x: np.ndarray) -> np.ndarray:
     about_zero = 2 * np.where(x.any(axis=0), np.abs(x).max(axis=0), 1.0)
     wide = np.ptp(model.limits, axis=1)
     return np.maximum(x.std(axis=0), RESTING * np.where(np.isfinite(wide), wide, about_zero))
-
-
-def _failed(model: Dynamics, at: Iterate, noise: Noise, substeps: int, fault: str) -> Fit:
-    free = len(model.free)
-    return Fit(
-        model=model,
-        covariance=np.full((free, free), np.nan),
-        x=at.smoothed,
-        linearised_at=at.x,
-        spread=at.spread,
-        noise=noise,
-        linearisation=at.along,
-        log_likelihood=-np.inf,
-        sum_of_squares=np.inf,
-        degrees_of_freedom=1,
-        substeps=substeps,
-        converged=False,
-        fault=fault,
-    )

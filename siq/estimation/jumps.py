@@ -15,7 +15,8 @@ from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.formulas import compile_values
 from siq.dynamics.parametric import arguments_of, evaluable
 from siq.estimation.budget import Budget
-from siq.estimation.estimation import Fit, fit_by_multiple_shooting
+from siq.estimation.estimation import fit_by_multiple_shooting
+from siq.estimation.fit import Fit
 from siq.estimation.measurements import Measurements
 from siq.estimation.trajectories import fit_trajectories
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import Noise, solve, whiten, with_parameters_changed
 from siq.estimation.measurements import Measurements
 from siq.estimation.noise import log_likelihood, noise_coordinates

@@ -9,7 +9,8 @@ import scipy.stats
 
 from siq.dynamics.dynamics import Dynamics
 from siq.estimation.budget import COMPILATION, Budget
-from siq.estimation.estimation import Fit, fit_by_multiple_shooting
+from siq.estimation.estimation import fit_by_multiple_shooting
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import Noise, with_parameters_changed
 from siq.estimation.jumps import EDGE_SUBSTEPS, jumps_of, spread_edges
 from siq.estimation.measurements import Measurements

@@ -7,8 +7,9 @@ import numpy as np
 from siq.dynamics.dynamics import Dynamics
 from siq.errors import NumericalFailure
 from siq.estimation.budget import Budget
-from siq.estimation.estimation import Fit, fit_by_multiple_shooting
+from siq.estimation.estimation import fit_by_multiple_shooting
 from siq.estimation.first_states import first_states
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import Noise
 from siq.estimation.linearisation import Grid
 from siq.estimation.measurements import Measurements

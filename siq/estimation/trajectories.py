@@ -14,8 +14,8 @@ import numpy as np
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.tape import Tape
 from siq.estimation.budget import Budget, evaluation
-from siq.estimation.estimation import Fit, fit_of_states
 from siq.estimation.expectations import Expectations
+from siq.estimation.fit import Fit, fit_of_states
 from siq.estimation.innovations import Noise
 from siq.estimation.kernels import whitened_innovations
 from siq.estimation.linearisation import Grid, Linearisation, integrate_intervals, linearise

@@ -13,7 +13,8 @@ import numpy as np
 
 from siq.errors import NumericalFailure
 from siq.estimation.budget import Budget, evaluation
-from siq.estimation.estimation import Fit, fit_by_multiple_shooting
+from siq.estimation.estimation import fit_by_multiple_shooting
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import Noise, profile_likelihood, solve, whiten
 from siq.estimation.measurements import Measurements
 

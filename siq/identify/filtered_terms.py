@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from siq.data.labels import sources
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import Noise, Whitened, solve, whiten
 from siq.estimation.measurements import Measurements
 from siq.identify.rival_terms import RivalTerms, rivals_of_all

@@ -19,7 +19,8 @@ import numpy as np
 from siq.data.recordings import Recordings
 from siq.dynamics.diffusion import Diffusion
 from siq.errors import NumericalFailure
-from siq.estimation.estimation import Fit, fit_by_filter
+from siq.estimation.estimation import fit_by_filter
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import whiten
 from siq.estimation.measurements import Measurements
 from siq.estimation.noise_uncertainty import NoiseUncertainty, noise_uncertainty

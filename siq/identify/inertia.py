@@ -30,7 +30,8 @@ from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.dynamics import Dynamics, Parameter
 from siq.dynamics.parametric import symbol
 from siq.errors import NumericalFailure
-from siq.estimation.estimation import Fit, fit_by_filter
+from siq.estimation.estimation import fit_by_filter
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import Noise, whiten
 from siq.estimation.linearisation import Linearisation
 from siq.estimation.measurements import Measurements

@@ -19,7 +19,7 @@ import sympy
 from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.formulas import compile_formulas
 from siq.errors import NumericalFailure
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import Noise, solve, whiten, with_parameters_changed
 from siq.estimation.measurements import Measurements
 from siq.estimation.score_kernel import noise_scores

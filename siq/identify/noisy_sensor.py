@@ -15,7 +15,8 @@ import numpy as np
 from siq.data.recordings import Recordings
 from siq.dynamics.diffusion import Diffusion
 from siq.errors import NumericalFailure
-from siq.estimation.estimation import Fit, fit_by_filter
+from siq.estimation.estimation import fit_by_filter
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import Noise, whiten
 from siq.estimation.measurements import Measurements
 from siq.estimation.noise import log_likelihood

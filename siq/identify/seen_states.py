@@ -11,7 +11,8 @@ from siq.data.stationarity import runs_of, usual_step
 from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.dynamics import Dynamics
 from siq.errors import NumericalFailure
-from siq.estimation.estimation import Fit, fit_by_filter
+from siq.estimation.estimation import fit_by_filter
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import Noise
 from siq.estimation.measurements import Measurements
 from siq.identify.exposure import exposed, exposed_measurements, exposed_noise, kept_samples

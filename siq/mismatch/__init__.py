@@ -18,9 +18,14 @@
 `places`             at which values of a shape does a search begin?
 `probes`             what does a little of each do to what is measured?
 `screening`          how much would each candidate gain, to first order?
-`trials`             and how much in earnest?
+`promises`           and which promise most, wherever their shapes may be?
+`tried`              what came of one that was tried?
+`trials`             how much do they explain in earnest?
 `clusters`           does it stand, whatever errors within a recording are like?
-`search`             which mechanisms are found?
+`found`              what has a search found?
+`acceptance`         which of the mechanisms that were tried count as found?
+`on_top`             what does a mechanism become on top of others?
+`search`             and in which order are they looked for?
 `structure`          along which coordinates is something missing?
 `remainder`          what do the mechanisms leave?
 `rounded`            do the steps in which sensors read explain it?
@@ -33,6 +38,7 @@
 `nameless_models`    what is a model of what has no name, and how likely?
 `likely_places`      where is a function likeliest, and which powers does it need?
 `fitted_parts`       what does a part of a description explain, fitted in earnest?
+`grounds`            where may a smooth function stand?
 `smooth_functions`   what is a smooth function, and what is expected of it?
 `product_functions`  what is a product of two of them?
 `smoothness`         over which lengths does it change, and how large is it?
@@ -41,15 +47,21 @@
 `beside`             is a mechanism likelier where a function models the rest?
 `described`          which of these models are candidates for the new card?
 `names`              what is named, and what models the rest?
+`possible_verdicts`  what may a diagnosis end with?
 `investigation`      what is the verdict, and which fits does it rest on?
 `location`           where does the mismatch sit?
+`runs_alike`         how are several simulations run, so that their errors compare?
 `left_out`           does a model foresee what was left out of its fit?
 `held_out_errors`    which of two simulations foresees recordings better?
+`adoption`           which model of what has no name becomes a part of the new card?
 `held_out`           how well does it run on recordings that had no part in it?
 `withdrawal`         does a name mislead there?
 `verdict`            what is the verdict?
+`stated_parts`       what is stated of a part of what is missing?
 `statement`          what is stated, and as data?
 `stated_functions`   what is stated of a model without a name?
+`part_words`         how is a part of what is missing called?
+`error_sentences`    what is said of the error on recordings held out?
 `sentences`          and how would a colleague say it?
 `augmented`          what is the simulation with what was found?
 `tables`             which tables are figures drawn from?

@@ -18,15 +18,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.measurements import Measurements
-from siq.mismatch.candidates import MechanismCandidate
+from siq.mismatch.building import MechanismCandidate
 from siq.mismatch.evidence import correlation_time_left, log_evidence_of
 from siq.mismatch.fitted_functions import with_a_function
 from siq.mismatch.held_out_errors import change_between, in_blocks
 from siq.mismatch.left_out import errors_left_out
 from siq.mismatch.nameless_models import Material, Model, runs_freely
-from siq.mismatch.trials import TriedMechanism, admissible
+from siq.mismatch.tried import TriedMechanism, admissible
 
 LOGGER = logging.getLogger(__name__)
 RIVALS = 2  # functions in the place of the mechanism that get another on top of them: a choice

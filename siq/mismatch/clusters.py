@@ -12,10 +12,10 @@ from collections.abc import Sequence
 import numpy as np
 import scipy.stats
 
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import solve, whiten
 from siq.estimation.measurements import Measurements
-from siq.mismatch.candidates import MechanismCandidate
+from siq.mismatch.building import MechanismCandidate
 
 LONG = 4.0  # correlation times in a block
 CHANCE = 1.96  # standard deviations of an autocorrelation of white errors, which are 1/√n

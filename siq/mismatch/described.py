@@ -13,15 +13,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.measurements import Measurements
 from siq.estimation.process_noise import fit_with_and_without_process_noise
 from siq.mismatch.fitted_functions import with_a_function
 from siq.mismatch.fitted_smooth import with_surfaces
+from siq.mismatch.found import Search
 from siq.mismatch.likely_places import FITTED
 from siq.mismatch.nameless_models import MECHANISM, Material, Model, Part, runs_freely, weighed
-from siq.mismatch.search import Search, something_left
-from siq.mismatch.trials import admissible
+from siq.mismatch.remainder import something_left
+from siq.mismatch.tried import admissible
 
 MOST = 2  # functions that are put on top of each other: more are no description
 

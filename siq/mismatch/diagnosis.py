@@ -15,11 +15,14 @@ from siq.estimation.budget import Budget
 from siq.mismatch.augmented import completed
 from siq.mismatch.case import Comparison, comparison_of
 from siq.mismatch.held_out import HeldOutRuns, held_out_runs
-from siq.mismatch.investigation import Investigation, MismatchVerdict, investigate
+from siq.mismatch.investigation import Investigation, investigate
 from siq.mismatch.location import Location
+from siq.mismatch.possible_verdicts import MismatchVerdict
+from siq.mismatch.stated_parts import StatedMechanism
+from siq.mismatch.statement import Statement
 from siq.mismatch.study import MismatchStudy
-from siq.mismatch.trials import UNFORESEEN
-from siq.mismatch.verdict import StatedMechanism, Statement, statement_of
+from siq.mismatch.tried import UNFORESEEN
+from siq.mismatch.verdict import statement_of
 from siq.mismatch.withdrawal import misleads, withdrawn
 
 if TYPE_CHECKING:

@@ -22,10 +22,10 @@ import scipy.linalg
 import scipy.special
 
 from siq.dynamics.dynamics import Dynamics
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import Whitened, solve, whiten
 from siq.estimation.measurements import Measurements
-from siq.mismatch.candidates import MechanismCandidate
+from siq.mismatch.building import MechanismCandidate
 from siq.mismatch.clusters import correlation_time_of
 from siq.mismatch.function_places import Place, linearised_with_places, places_in, products_in
 from siq.mismatch.roles import Roles

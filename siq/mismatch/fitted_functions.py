@@ -15,14 +15,14 @@ import numpy as np
 import sympy
 
 from siq.dynamics.parametric import symbol
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.mismatch.fitted_parts import fitted_part
 from siq.mismatch.fitted_smooth import with_a_smooth_function
 from siq.mismatch.functions import simplest, with_formula
+from siq.mismatch.grounds import ground_of
 from siq.mismatch.likely_places import FITTED, LikelyPlace, few_powers, likely_places
 from siq.mismatch.nameless_models import Material, Model, Part, weighed
-from siq.mismatch.smooth_functions import ground_of
-from siq.mismatch.trials import UNFORESEEN
+from siq.mismatch.tried import UNFORESEEN
 
 LOGGER = logging.getLogger(__name__)
 

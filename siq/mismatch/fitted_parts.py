@@ -9,7 +9,8 @@ import numpy as np
 
 from siq.errors import NumericalFailure
 from siq.estimation.budget import BudgetSpent
-from siq.estimation.estimation import SUBSTEP_ERROR, Fit
+from siq.estimation.estimation import SUBSTEP_ERROR
+from siq.estimation.fit import Fit
 from siq.estimation.linearisation import substeps_needed
 from siq.estimation.process_noise import (
     better_of,
@@ -18,12 +19,12 @@ from siq.estimation.process_noise import (
     simpler_fit,
 )
 from siq.estimation.trajectories import fit_trajectories
-from siq.mismatch.candidates import MechanismCandidate
+from siq.mismatch.building import MechanismCandidate
 from siq.mismatch.function_places import Place
 from siq.mismatch.functions import FORMULA
 from siq.mismatch.nameless_models import Material, Part
 from siq.mismatch.smooth_functions import Smooth
-from siq.mismatch.trials import UNFORESEEN, TriedMechanism, judged
+from siq.mismatch.tried import UNFORESEEN, TriedMechanism, judged
 
 LOGGER = logging.getLogger(__name__)
 LARGEST_PART = 0.25  # of the work left, that a single fit may take: a choice

@@ -14,23 +14,17 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from siq.dynamics.dynamics import Dynamics
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.measurements import Measurements
 from siq.mismatch.fitted_parts import fitted_part
 from siq.mismatch.function_places import Place, coordinates_of
+from siq.mismatch.grounds import Ground, ground_of, ground_of_two
 from siq.mismatch.likely_places import FITTED, likely_places
 from siq.mismatch.nameless_models import Material, Model, Part, weighed
-from siq.mismatch.search import something_left
-from siq.mismatch.smooth_functions import (
-    Ground,
-    Smooth,
-    ground_of,
-    ground_of_two,
-    smooth_function,
-    with_smooth_function,
-)
+from siq.mismatch.remainder import something_left
+from siq.mismatch.smooth_functions import Smooth, smooth_function, with_smooth_function
 from siq.mismatch.smoothness import Smoothness, likeliest_product, smoothness_of
-from siq.mismatch.trials import UNFORESEEN
+from siq.mismatch.tried import UNFORESEEN
 
 LOGGER = logging.getLogger(__name__)
 ROUNDS = 4  # of fits, each along the trajectories of the one before: a choice

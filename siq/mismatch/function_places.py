@@ -18,7 +18,7 @@ import sympy
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.formulas import compile_values, exact_number
 from siq.dynamics.parametric import Signals, symbol
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.linearisation import Grid, Linearisation
 from siq.estimation.measurements import Measurements
 from siq.mismatch.roles import Roles
@@ -229,21 +229,35 @@ def _with_knots(
     drafts: Sequence[Place], model: Dynamics, data: Measurements, x: np.ndarray
 ) -> Iterator[Place]:
     """Places with their knots, but for those whose coordinate takes too few values for a function."""
-    signals = data.signals(data.t, data.recording, delays=())
-    names = (*model.states, *(entry.name for entry in model.inputs), "t")
-    arguments = [symbol(name) for name in names]
     known: dict[sympy.Expr, np.ndarray] = {}
     for each in drafts:
         if each.coordinate not in known:
-            compiled = compile_values([each.coordinate], arguments, common=False)
-            states = x.T[: model.dimension]
-            course = np.broadcast_to(compiled(*states, *signals.inputs, signals.t)[0], data.t.shape)
+            (course,) = courses_of((each.coordinate,), model, data, x)
             finite = course[np.isfinite(course)]
             known[each.coordinate] = (
                 np.unique(np.quantile(finite, np.linspace(0, 1, KNOTS))) if len(finite) else np.empty(0)
             )
         if len(known[each.coordinate]) > 3:
             yield replace(each, knots=known[each.coordinate])
+
+
+def courses_of(
+    coordinates: tuple[sympy.Expr, ...], model: Dynamics, data: Measurements, x: np.ndarray
+) -> np.ndarray:
+    """What formulas of states, inputs and time are along recordings, shape ``(c, n)``.
+
+    Parameters
+    ----------
+    coordinates
+        The formulas.
+    model, data, x
+        The simulation, the recordings, and the states along them, shape ``(n, d)``.
+    """
+    names = (*model.states, *(entry.name for entry in model.inputs), "t")
+    compiled = compile_values(coordinates, [symbol(name) for name in names], common=False)
+    signals = data.signals(data.t, data.recording, delays=())
+    values = compiled(*x.T[: model.dimension], *signals.inputs, signals.t)
+    return np.stack([np.broadcast_to(each, data.t.shape) for each in values])
 
 
 def linearised_with_places(

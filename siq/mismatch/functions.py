@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,9 +11,9 @@ import sympy
 
 from siq.dynamics.dynamics import Dynamics, Parameter
 from siq.dynamics.parametric import symbol
-from siq.mismatch.candidates import MechanismCandidate
+from siq.mismatch.building import MechanismCandidate
 from siq.mismatch.function_places import Place
-from siq.mismatch.units import unit_of
+from siq.mismatch.units import unit_of, units_of
 
 FORMULA = "formula"
 
@@ -131,7 +131,7 @@ def built(
 
 def unit_in(place: Place, model: Dynamics, first: int, second: int) -> str:
     """Unit of the coefficient of a term with so many factors of either coordinate, in a place."""
-    known = _units(model)
+    known = units_of(model)
     units = {"_t": model.time_unit}
     if len(place.equations) > 1:  # of a rotating frame: the function is multiplied by the states themselves
         first_unit = known.get(place.words[0], known[place.targets[0]])
@@ -143,9 +143,3 @@ def unit_in(place: Place, model: Dynamics, first: int, second: int) -> str:
     units["_second"] = known.get(place.targets[0] if factor == "amplitude" else factor, "1")
     per = "/_t" if place.equations else ""
     return unit_of(f"_whole{per}/_first**{first}/_second**{second}", units)
-
-
-def _units(model: Dynamics) -> Mapping[str, str]:
-    units = dict(zip(model.states, model.units, strict=True))
-    units |= {entry.name: entry.unit for entry in model.inputs}
-    return units | {"t": model.time_unit}

@@ -4,49 +4,35 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from enum import StrEnum
 
 import numpy as np
-import scipy.stats
 
 from siq.dynamics.dynamics import Dynamics
 from siq.errors import NumericalFailure
 from siq.estimation.budget import UNLIMITED, Account, Budget
-from siq.estimation.estimation import Fit
 from siq.estimation.expectations import with_expectations
+from siq.estimation.fit import Fit
 from siq.estimation.measurements import Measurements
 from siq.estimation.recalibration import recalibrate
 from siq.estimation.unknown_forces import covariance_with_unknown_forces
-from siq.mismatch.candidates import MechanismCandidate, candidates_of, generic_candidates
+from siq.mismatch.building import MechanismCandidate
+from siq.mismatch.candidates import candidates_of, generic_candidates
 from siq.mismatch.described import models_of_the_nameless
 from siq.mismatch.dictionary import Mechanism
+from siq.mismatch.found import Search
 from siq.mismatch.nameless_models import Material, Model
 from siq.mismatch.names import names_of
 from siq.mismatch.naming import Naming
-from siq.mismatch.remainder import STRUCTURED, Remainder, what_is_left
+from siq.mismatch.possible_verdicts import MismatchVerdict, quiet_verdict, shift_probability
+from siq.mismatch.remainder import LEFT, STRUCTURED, Remainder, what_is_left
 from siq.mismatch.roles import Roles, roles_of
 from siq.mismatch.rounded import explained_by_rounding
-from siq.mismatch.search import LEFT, Search, search
+from siq.mismatch.search import search
 from siq.mismatch.search_options import SearchOptions
 from siq.mismatch.steadiness import unsteadiness
 from siq.mismatch.structure import Structure
 from siq.mismatch.study import MismatchStudy
-from siq.mismatch.trials import UntriedMechanism
-
-
-class MismatchVerdict(StrEnum):
-    """What a diagnosis ends with, as files have it."""
-
-    NO_MISMATCH = "no mismatch"
-    PARAMETER_SHIFT = "parameter shift"
-    MISSING_PHYSICS = "missing physics"
-    UNEXPLAINED = "unexplained"
-
-    @property
-    def mismatch(self) -> bool:
-        """Whether the equations differ from the system, whatever their parameters."""
-        return self in (MismatchVerdict.MISSING_PHYSICS, MismatchVerdict.UNEXPLAINED)
-
+from siq.mismatch.tried import UntriedMechanism
 
 ROUNDED = "What is left looks like noise once the steps are allowed for in which {} was recorded."
 GROWING = "Random forces would explain it only if they grew with the motion; a hidden state is more likely."
@@ -304,24 +290,3 @@ def considered(
         monomials = generic_candidates(model, roles, degree=study.degree, named=candidates)
         candidates += [each for each in monomials if each.coordinate != "constant"]
     return candidates
-
-
-def quiet_verdict(p_shift: float, options: SearchOptions) -> MismatchVerdict:
-    """The verdict where nothing is missing, by the probability that the card's parameters are right."""
-    shifted = p_shift < options.false_alarms
-    return MismatchVerdict.PARAMETER_SHIFT if shifted else MismatchVerdict.NO_MISMATCH
-
-
-def shift_probability(model: Dynamics, recalibrated: Fit) -> float:
-    """p-value of the test that the card's parameters are the true ones, given the recalibrated ones."""
-    free = np.array(model.free, dtype=int)
-    if not len(free):
-        return 1.0
-    difference = recalibrated.model.values[free] - model.values[free]
-    scale = np.sqrt(np.diag(recalibrated.covariance))
-    scale = np.where(scale > 0, scale, np.inf)
-    correlation = recalibrated.covariance / np.outer(scale, scale)
-    values, vectors = np.linalg.eigh(correlation)
-    kept = values > 1e-9 * values[-1]
-    along = vectors[:, kept].T @ (difference / scale) / np.sqrt(values[kept])
-    return float(scipy.stats.chi2.sf(float(along @ along), int(kept.sum())))

@@ -14,12 +14,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from siq.errors import NumericalFailure
-from siq.estimation.estimation import Fit
-from siq.estimation.free_runs import UsualStates, free_run, squared_errors
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import Noise
 from siq.estimation.measurements import Measurements
 from siq.estimation.process_noise import fit_with_process_noise_as_needed
 from siq.mismatch.building import MechanismCandidate
+from siq.mismatch.runs_alike import RunsAlike
 
 LOGGER = logging.getLogger(__name__)
 PARTS = 4  # of which one is left out at a time: a quarter, as is held out by default
@@ -86,17 +86,14 @@ def errors_left_out(
         away.
     """
     positive = {name for each in candidates for name in each.positive.intersection(each.amplitudes)}
+    runs = RunsAlike(noise, fit.substeps)
     squares = []
     for part in parts_left_out(learned):
         try:
             again = _made_again(fit, part, positive)
-            run = free_run(
-                again.model, part.out, noise=noise, substeps=max(again.substeps, fit.substeps),
-                usual=UsualStates.along(again.x),
-            )  # fmt: skip
+            own = runs.errors(again, part.out)
         except NumericalFailure:
             return None
-        own = squared_errors(part.out.outputs, run)
         # One that does not quite settle, as where a reading is cut off, is judged by what it foresees.
         if own is None or again.fault:
             return None

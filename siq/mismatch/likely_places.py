@@ -12,23 +12,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from siq.errors import NumericalFailure
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import Whitened, profile_likelihood, whiten
 from siq.estimation.linearisation import Grid
 from siq.estimation.measurements import Measurements
 from siq.mismatch.clusters import correlation_time_of
 from siq.mismatch.evidence import evidence_of_function, orthonormal
-from siq.mismatch.function_places import (
-    Place,
-    linearised_with_places,
-    places_in,
-    products_in,
-)
+from siq.mismatch.function_places import Place, linearised_with_places, places_in, products_in
 from siq.mismatch.functions import Power, powers, with_formula
 from siq.mismatch.probes import Probe, ProbeColumns
+from siq.mismatch.promises import PROBE_SUBSTEPS
 from siq.mismatch.roles import Roles
-from siq.mismatch.screening import LEVELS, probe_response, projected
-from siq.mismatch.trials import PROBE_SUBSTEPS
+from siq.mismatch.screening import levels_of, probe_response, projected
 
 FITTED = 3  # places in which functions are fitted, the most likely ones: a choice
 
@@ -65,7 +60,7 @@ def _compared(fit: Fit, data: Measurements, places: Sequence[Place]) -> list[Lik
     found: dict[int, LikelyPlace] = {}
     alone = -np.inf
     for response, some in linearised_with_places(fit, data, places):
-        for level in LEVELS if fit.has_process_noise else (1.0,):
+        for level in levels_of(fit):
             try:
                 white = whiten(response, data, fit.noise.scaled(level))
                 left, columns = projected(white, parameters)

@@ -8,15 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from siq.dynamics.dynamics import Dynamics
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import Noise, solve, whiten
 from siq.estimation.measurements import Measurements
-from siq.mismatch.candidates import MechanismCandidate
-from siq.mismatch.investigation import Investigation, MismatchVerdict
+from siq.mismatch.building import MechanismCandidate
+from siq.mismatch.investigation import Investigation
 from siq.mismatch.nameless_models import Model
+from siq.mismatch.possible_verdicts import MismatchVerdict
 from siq.mismatch.roles import Roles
 from siq.mismatch.structure import Curve, Structure
+from siq.mismatch.units import units_of
 from siq.numerics.measured_text import unit_text, value_text
 
 VISIBLE = 0.1  # of the largest value of a curve
@@ -133,7 +134,7 @@ def locate(
             region,
             affected=len(recordings),
             recordings=len(data.labels),
-            units=_units_of(investigation.model),
+            units=units_of(investigation.model),
         ),
         curve=curve,
         recordings_total=len(data.labels),
@@ -261,10 +262,3 @@ def where_it_sits(
     else:
         who = f", mainly in {affected} of {recordings} recordings"
     return f"The difference sits {where}{along}{who}."
-
-
-def _units_of(model: Dynamics) -> dict[str, str]:
-    """Units of everything that a coordinate may be."""
-    units = dict(zip(model.states, model.units, strict=True))
-    units |= {entry.name: entry.unit for entry in model.inputs}
-    return units | {"t": model.time_unit}

@@ -12,16 +12,16 @@ from collections.abc import Sequence
 import numpy as np
 
 from siq.errors import NumericalFailure
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import Noise, whiten
 from siq.estimation.linearisation import Grid
 from siq.estimation.measurements import Measurements
 from siq.mismatch.evidence import LENGTHS, orthonormal, smooth_prior
 from siq.mismatch.function_places import linearised_with_places, places_in
 from siq.mismatch.probes import Probe, ProbeColumns
+from siq.mismatch.promises import PROBE_SUBSTEPS
 from siq.mismatch.roles import Roles
 from siq.mismatch.screening import probe_response
-from siq.mismatch.trials import PROBE_SUBSTEPS
 
 DRAWS = 300  # effects without a name, which tell a probability of 5 % to 1 %
 

@@ -10,14 +10,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 from siq.estimation.budget import Budget
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.free_runs import UsualStates, free_run, normalised_rms
 from siq.estimation.measurements import Measurements
 from siq.mismatch.evidence import correlation_time_left, log_evidence_of
 from siq.mismatch.function_places import Place
 from siq.mismatch.roles import Roles
 from siq.mismatch.smooth_functions import Smooth
-from siq.mismatch.trials import TriedMechanism
+from siq.mismatch.tried import TriedMechanism
 
 MECHANISM = "mechanism"
 

@@ -13,15 +13,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from siq.dynamics.dynamics import Dynamics
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.process_noise import fit_with_and_without_process_noise
 from siq.mismatch.beside import BesideARemainder, beside_a_remainder
-from siq.mismatch.candidates import MechanismCandidate
+from siq.mismatch.building import MechanismCandidate
 from siq.mismatch.described import models_beside_names, models_of_the_nameless
+from siq.mismatch.found import Search
 from siq.mismatch.nameless_models import Material, Model
 from siq.mismatch.naming import Naming, log_odds_of_the_first, naming_of
 from siq.mismatch.remainder import Remainder
-from siq.mismatch.search import Search
 from siq.mismatch.search_options import SearchOptions
 from siq.numerics.share_text import p_equation, percent
 

@@ -16,14 +16,15 @@ import scipy.special
 
 from siq.dynamics.dynamics import Dynamics
 from siq.estimation.measurements import Measurements
-from siq.mismatch.candidates import MechanismCandidate
+from siq.mismatch.building import MechanismCandidate
 from siq.mismatch.evidence import log_odds_of_a_name
+from siq.mismatch.found import Search
 from siq.mismatch.matches import probability_of_a_match
 from siq.mismatch.probes import probes_of
 from siq.mismatch.remainder import Remainder
 from siq.mismatch.roles import Roles
-from siq.mismatch.search import Search
 from siq.mismatch.search_options import SearchOptions
+from siq.mismatch.tried import UNFORESEEN
 
 LOGGER = logging.getLogger(__name__)
 
@@ -116,40 +117,36 @@ def log_odds_of_the_first(
     return _Jury(search, data, model, roles, candidates, options, np.random.default_rng(0)).log_odds(1, [0])
 
 
+@dataclass(frozen=True)
 class _Jury:
-    """What is asked of mechanisms several times."""
+    """What is asked of mechanisms several times; the attributes are the parameters of `naming_of`."""
 
-    def __init__(
-        self,
-        search: Search,
-        data: Measurements,
-        model: Dynamics,
-        roles: Roles,
-        candidates: Sequence[MechanismCandidate],
-        options: SearchOptions,
-        generator: np.random.Generator,
-    ) -> None:
-        self._search, self._data, self._model, self._roles = search, data, model, roles
-        self._candidates, self._options, self._generator = candidates, options, generator
+    search: Search
+    data: Measurements
+    model: Dynamics
+    roles: Roles
+    candidates: Sequence[MechanismCandidate]
+    options: SearchOptions
+    generator: np.random.Generator
 
     def log_odds(self, number: int, chosen: Sequence[int]) -> float:
         """Of some mechanisms, in the fit with the first so many."""
-        found = [each.best for each in self._search.found]
+        found = [each.best for each in self.search.found]
         try:
             odds = log_odds_of_a_name(
                 found[number - 1].fit,
-                self._data,
+                self.data,
                 [found[place].candidate for place in chosen],
-                self._roles,
-                self._model,
-                considered=self._candidates,
-                unnamed=self._options.unnamed,
+                self.roles,
+                self.model,
+                considered=self.candidates,
+                unnamed=self.options.unnamed,
             )
-        except (ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
+        except UNFORESEEN as error:
             LOGGER.info("the odds of a name are not known: %s", error)
             return -np.inf
         if len(chosen) == 1:  # what cannot be told apart is named as a class
-            one = self._search.found[chosen[0]]
+            one = self.search.found[chosen[0]]
             same = [one.best.delta_bic, *(each.delta_bic for each in one.indistinguishable)]
             odds += float(scipy.special.logsumexp(-0.5 * (np.array(same) - one.best.delta_bic)))
         LOGGER.info("%s: log-odds of the name %.1f", [found[k].candidate.label for k in chosen], odds)
@@ -157,38 +154,38 @@ class _Jury:
 
     def convincing(self, number: int, left: Remainder) -> tuple[bool, float | None]:
         """Whether the first so many mechanisms leave nothing, or explain more than by chance."""
-        if not (left.doubtful or self._search.found[number - 1].best.fit.has_process_noise):
+        if not (left.doubtful or self.search.found[number - 1].best.fit.has_process_noise):
             return True, None
-        recalibrated = self._search.recalibrated
+        recalibrated = self.search.recalibrated
         probes = [
             probe
-            for each in self._candidates
-            for probe in probes_of(each, self._data, self._model, recalibrated.x)
+            for each in self.candidates
+            for probe in probes_of(each, self.data, self.model, recalibrated.x)
         ]
         try:
             p_alike = probability_of_a_match(
                 recalibrated,
-                self._data,
+                self.data,
                 probes,
-                self._roles,
+                self.roles,
                 share=left.share,
                 mechanisms=number,
-                measurement=self._search.fit.noise.measurement,
-                generator=self._generator,
+                measurement=self.search.fit.noise.measurement,
+                generator=self.generator,
             )
-        except (ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
+        except UNFORESEEN as error:
             LOGGER.info("matches by chance are not known: %s", error)
             return False, None
         LOGGER.info("%d mechanisms explain %.4f; by chance: p %.3f", number, left.share, p_alike)
-        return p_alike <= self._options.most_alike, p_alike
+        return p_alike <= self.options.most_alike, p_alike
 
     def without_patches(self, left: Sequence[Remainder]) -> tuple[Search, list[Remainder]]:
         """The first mechanism, and those after it as long as each is likely and leaves less of the excess."""
-        search, kept = self._search, 1
+        search, kept = self.search, 1
         while (
             kept < len(left)
             and left[kept].share > left[kept - 1].share
-            and self.log_odds(kept + 1, [kept]) >= self._options.least_log_odds
+            and self.log_odds(kept + 1, [kept]) >= self.options.least_log_odds
         ):
             kept += 1
         found = search.found[:kept]

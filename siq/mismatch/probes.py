@@ -21,7 +21,7 @@ from siq.errors import NumericalFailure
 from siq.estimation.linearisation import Grid
 from siq.estimation.measurements import Measurements
 from siq.estimation.trajectories import run_along
-from siq.mismatch.candidates import MechanismCandidate
+from siq.mismatch.building import MechanismCandidate
 from siq.mismatch.places import along, places_of
 
 

@@ -19,7 +19,8 @@ import sympy
 
 from siq.dynamics.dynamics import JointExpectation
 from siq.errors import NumericalFailure
-from siq.mismatch.smooth_functions import SURFACE, Ground, SmoothFunction, smooth_function
+from siq.mismatch.grounds import Ground
+from siq.mismatch.smooth_functions import SURFACE, SmoothFunction, smooth_function
 
 TURNS = 30  # at most, of working out one factor after the other
 SETTLED = 1e-4  # of what is left, by which a turn has to be better

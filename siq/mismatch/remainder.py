@@ -7,14 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from siq.dynamics.dynamics import Dynamics
-from siq.estimation.estimation import Fit
+from siq.errors import NumericalFailure
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import Noise
 from siq.estimation.measurements import Measurements
-from siq.mismatch.roles import Roles
+from siq.mismatch.roles import Roles, roles_of
 from siq.mismatch.structure import Structure, structure_of
 
 STRUCTURED = 1e-4  # probability below which residuals are not called random
 DOUBTFUL = 2e-3  # the same for what a mechanism leaves: the burden of proof is on a name
+LEFT = 0.01  # probability that residuals are random, above which no further mechanism is sought
 
 
 @dataclass(frozen=True)
@@ -80,3 +82,14 @@ def explained_share(before: Structure, after: Structure) -> float:
     systematic = 0.0 if best is None else best.gain - 2 * len(best.direction.knots)
     left = max(after.total - after.freedom, systematic, 0.0)
     return float(np.clip(1 - left / (before.total - before.freedom), 0.0, 1.0))
+
+
+def something_left(current: Fit, data: Measurements) -> bool:
+    """Whether it is worth looking for something on top of a fit."""
+    model = current.model
+    if current.has_process_noise:
+        return True
+    try:
+        return structure_of(model, data, current, roles_of(model)).p_value < LEFT
+    except NumericalFailure:  # a simulation that runs away lacks something, whatever it is
+        return True

@@ -20,7 +20,8 @@ import scipy.stats
 from siq.dynamics.dynamics import Dynamics
 from siq.errors import NumericalFailure
 from siq.estimation.budget import Budget
-from siq.estimation.estimation import Fit, fit_by_multiple_shooting
+from siq.estimation.estimation import fit_by_multiple_shooting
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import Noise
 from siq.estimation.linearisation import Grid
 from siq.estimation.measurements import Measurements

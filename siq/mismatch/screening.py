@@ -14,7 +14,7 @@ import numpy as np
 
 from siq.dynamics.dynamics import Dynamics
 from siq.errors import NumericalFailure
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import Whitened, profile_likelihood, whiten
 from siq.estimation.linearisation import Columns, Grid, Linearisation, linearise
 from siq.estimation.measurements import Measurements
@@ -47,6 +47,11 @@ class Screened:
     amplitudes: np.ndarray
     standard_errors: np.ndarray
     finite: bool = True
+
+
+def levels_of(fit: Fit) -> tuple[float, ...]:
+    """The levels of random forces at which something is judged on top of a fit; one where it has none."""
+    return LEVELS if fit.has_process_noise else (1.0,)
 
 
 def in_portions(widths: Sequence[int], model: Dynamics, data: Measurements) -> Iterator[slice]:
@@ -141,11 +146,10 @@ def screen(
         When the simulation runs away at every level.
     """
     parameters = len(fit.model.free)
-    levels = LEVELS if fit.has_process_noise else (1.0,)
     base = -np.inf
     best = [Screened(-np.inf, 1.0, np.zeros(0), np.zeros(0), finite=False)] * len(groups)
     failure: NumericalFailure | None = None
-    for level in levels:
+    for level in levels_of(fit):
         try:
             white = whiten(linearisation, data, fit.noise.scaled(level))
         except NumericalFailure as error:  # without random forces an unstable simulation does not follow

@@ -22,54 +22,16 @@ import scipy.linalg
 import sympy
 
 from siq.dynamics.dynamics import Dynamics, JointExpectation
-from siq.dynamics.formulas import compile_values
 from siq.dynamics.parametric import symbol
-from siq.estimation.measurements import Measurements
-from siq.mismatch.candidates import MechanismCandidate
-from siq.mismatch.function_places import Place
+from siq.mismatch.building import MechanismCandidate
 from siq.mismatch.functions import built, fresh_names, unit_in
+from siq.mismatch.grounds import Ground
 
 CURVE, SURFACE = "curve", "surface"
 # Lengths between neighbours: a sum of bumps then has the variance of the process to 2e-5, that of two
 # coordinates to 4 % (of points that are spread evenly).
 APART = 0.5
 ROUNDING = 1e-6  # numerical: of the process's variance, added to it at every bump
-
-
-@dataclass(frozen=True)
-class Ground:
-    """Where a smooth function may stand, and where the recordings have been there.
-
-    Attributes
-    ----------
-    place
-        In which equation, or output; what it is multiplied by there.
-    coordinates
-        What it is a function of: one formula, or two.
-    words
-        The same in words.
-    courses
-        Their values along the recordings, shape ``(c, n)``.
-    """
-
-    place: Place
-    coordinates: tuple[sympy.Expr, ...]
-    words: tuple[str, ...]
-    courses: np.ndarray
-
-    @property
-    def ranges(self) -> np.ndarray:
-        """Of each coordinate, shape ``(c,)``."""
-        return np.ptp(self.courses, axis=1)
-
-    @property
-    def usable(self) -> bool:
-        """Whether every coordinate takes several values, all of them finite."""
-        return bool(np.isfinite(self.courses).all() and (self.ranges > 0).all())
-
-    def along(self, model: Dynamics, data: Measurements, x: np.ndarray) -> Ground:
-        """The same ground where the recordings have been by other states, shape ``(n, d)``."""
-        return replace(self, courses=_courses(self.coordinates, model, data, x))
 
 
 class Smooth(Protocol):
@@ -110,39 +72,6 @@ class Smooth(Protocol):
 
     def units(self, whole: str) -> tuple[str, ...]:
         """Of the heights, of a function with a unit."""
-
-
-def ground_of(place: Place, model: Dynamics, data: Measurements, x: np.ndarray) -> Ground:
-    """The ground of a function of one coordinate, in a place.
-
-    Parameters
-    ----------
-    place
-        The coordinate's second word, if it has one, is a factor of the function.
-    model, data, x
-        The simulation, the recordings, and the states along them, shape ``(n, d)``.
-    """
-    courses = _courses((place.coordinate,), model, data, x)
-    return Ground(place, (place.coordinate,), place.words[:1], courses)
-
-
-def ground_of_two(
-    target: str, words: tuple[str, str], model: Dynamics, data: Measurements, x: np.ndarray
-) -> Ground:
-    """The ground of a function of two states or inputs, in the equation of a state."""
-    coordinates = tuple(symbol(name) for name in words)
-    place = Place(((target, sympy.Integer(1)),), (), coordinates[0], words, np.empty(0))
-    return Ground(place, coordinates, words, _courses(coordinates, model, data, x))
-
-
-def _courses(
-    coordinates: tuple[sympy.Expr, ...], model: Dynamics, data: Measurements, x: np.ndarray
-) -> np.ndarray:
-    names = (*model.states, *(entry.name for entry in model.inputs), "t")
-    compiled = compile_values(coordinates, [symbol(name) for name in names], common=False)
-    signals = data.signals(data.t, data.recording, delays=())
-    values = compiled(*x.T[: model.dimension], *signals.inputs, signals.t)
-    return np.stack([np.broadcast_to(each, data.t.shape) for each in values])
 
 
 @dataclass(frozen=True)

@@ -14,19 +14,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from siq.dynamics.dynamics import Dynamics
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import Whitened, profile_likelihood, whiten
 from siq.estimation.linearisation import Grid
 from siq.estimation.measurements import Measurements
 from siq.mismatch.clusters import correlation_time_of
 from siq.mismatch.evidence import evidences_by_size, orthonormal
 from siq.mismatch.function_places import NUMBERS, PlaceColumns
+from siq.mismatch.grounds import Ground
 from siq.mismatch.nameless_models import Part
 from siq.mismatch.product_functions import ProductFunction, product_of
-from siq.mismatch.screening import LEVELS, probe_response, projected
-from siq.mismatch.smooth_functions import Ground, SmoothFunction, smooth_function, triangle_of
+from siq.mismatch.screening import levels_of, probe_response, projected
+from siq.mismatch.smooth_functions import SmoothFunction, smooth_function, triangle_of
 from siq.mismatch.structure import SUBSTEPS
-from siq.mismatch.trials import UNFORESEEN
+from siq.mismatch.tried import UNFORESEEN
 
 LOGGER = logging.getLogger(__name__)
 SHARES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0)  # of the range; over twice of it a function is a parabola
@@ -180,7 +181,7 @@ def _told(fit: Fit, data: Measurements, fine: SmoothFunction, known: Part | None
     response = probe_response(fit.model, grid, fit, PlaceColumns(fit.model, grid, [fine]))
     found: list[Told] = []
     highest, correlated = -np.inf, 1.0
-    for level in LEVELS if fit.has_process_noise else (1.0,):
+    for level in levels_of(fit):
         try:
             white = whiten(response, data, fit.noise.scaled(level))
             white, parameters = _without(white, fit, known)

@@ -10,12 +10,12 @@ import numpy as np
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.formulas import compile_values
 from siq.dynamics.parametric import symbol
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.mismatch.functions import FORMULA
 from siq.mismatch.held_out import HeldOutRuns
 from siq.mismatch.nameless_models import MECHANISM, Part
 from siq.mismatch.smooth_functions import CURVE, SURFACE, Smooth
-from siq.mismatch.statement import DescribedCurve, DescribedSurface, Estimate, Evidence, StatedFunction
+from siq.mismatch.stated_parts import DescribedCurve, DescribedSurface, Estimate, Evidence, StatedFunction
 
 GRID = 25  # places along either coordinate of a surface, for its figure
 _KINDS: Mapping[str, Literal["formula", "curve", "surface", "mechanism"]] = {

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import Noise, profile_likelihood
 from siq.estimation.measurements import Measurements
 from siq.estimation.noise import likelihood_sums

@@ -13,7 +13,7 @@ import numpy as np
 import scipy.stats
 
 from siq.dynamics.dynamics import Dynamics
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import Noise, Whitened, solve, whiten
 from siq.estimation.linearisation import Grid
 from siq.estimation.measurements import Measurements

@@ -8,11 +8,11 @@ import numpy as np
 import pandas as pd
 
 from siq.dynamics.dynamics import Dynamics
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.mismatch.case import Comparison
 from siq.mismatch.diagnosis import Diagnosis
+from siq.mismatch.found import Search
 from siq.mismatch.investigation import Investigation
-from siq.mismatch.search import Search
 
 CURVE_COLUMNS = [
     "equation", "coordinate", "across", "at", "missing", "standard_error", "gain", "p_value", "stage",
@@ -33,8 +33,8 @@ def tables_of(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:
         ``curves``: what is missing against each coordinate, in the unit of the equation.
         ``candidates``: every mechanism that was fitted, and every probe that was only screened, with what it
         gains ``beside`` the mechanisms that were in place. Stages: ``found``; fitted in its place: ``same``,
-        ``needless`` and ``less`` (see `siq.mismatch.statement.Rival`); screened: ``further``, on top of all
-        that was found, and ``instead``, in the place of the last that was found.
+        ``needless`` and ``less`` (see `siq.mismatch.stated_parts.Rival`); screened: ``further``, on top of
+        all that was found, and ``instead``, in the place of the last that was found.
         ``held_out``: recordings and their three simulations.
         ``forces``: what the recalibrated simulation lacks at each sample, as far as random forces were
         admitted.

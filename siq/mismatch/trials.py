@@ -1,167 +1,36 @@
-"""Trials: the candidates that promise most, screened and then fitted, each with its evidence."""
+"""Trials: the candidates that promise most are fitted; how much do they explain in earnest?"""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
 
 import numpy as np
-import scipy.stats
 
 from siq.dynamics.dynamics import Dynamics
 from siq.errors import NumericalFailure
-from siq.estimation.budget import Budget, BudgetSpent, evaluation
-from siq.estimation.estimation import Fit
-from siq.estimation.jumps import EDGE_SUBSTEPS, sharpened, spread_edges
+from siq.estimation.budget import Budget, BudgetSpent
+from siq.estimation.fit import Fit
+from siq.estimation.jumps import sharpened
 from siq.estimation.linearisation import Grid
 from siq.estimation.measurements import Measurements
 from siq.estimation.process_noise import fit_with_process_noise_as_needed, least_to_believe
-from siq.mismatch.candidates import MechanismCandidate
-from siq.mismatch.clusters import probability_by_chance
-from siq.mismatch.probes import Probe, ProbeColumns, probes_of
-from siq.mismatch.screening import Screened, in_portions, probe_response, screen
+from siq.mismatch.building import MechanismCandidate
+from siq.mismatch.probes import Probe, ProbeColumns
+from siq.mismatch.screening import Screened
+from siq.mismatch.tried import (
+    BUDGET_SPENT,
+    UNFORESEEN,
+    TriedMechanism,
+    UntriedMechanism,
+    admissible,
+    in_words,
+    judged,
+)
 
 LOGGER = logging.getLogger(__name__)
-PROBE_SUBSTEPS = 2  # what a little of a mechanism does need not be known to many digits
 PROMISING = 0.2  # of the best gain so far; a candidate that promises less is not fitted
-UNFORESEEN = (ArithmeticError, ValueError, np.linalg.LinAlgError)
-"""What ends a candidate, never the search: an overflow, a division by zero, a singular matrix."""
-OVERFLOWS = "its effect along the recorded motion is beyond all numbers"
-BUDGET_SPENT = "the budget was spent before it was tried"
-LARGEST_PORTION = (
-    20_000_000  # numbers that are worked out at once in a screening: with copies about a gigabyte
-)
-LEAST_PORTION = 10  # columns
 RIVALS = 0.6  # of the best gain, from which on a candidate's jumps are sharpened: that gains up to a quarter
-
-
-@dataclass(frozen=True)
-class TriedMechanism:
-    """A candidate, fitted.
-
-    Attributes
-    ----------
-    candidate
-        The mechanism.
-    fit
-        Of the simulation with it.
-    delta_chi2
-        Twice the increase of the log-likelihood over the simulation without it.
-    delta_bic
-        Change of the Bayesian information criterion; negative where the mechanism is worth its parameters.
-    p_white, p_cluster
-        Probabilities of as much by chance.
-    """
-
-    candidate: MechanismCandidate
-    fit: Fit
-    delta_chi2: float
-    delta_bic: float
-    p_white: float
-    p_cluster: float
-
-
-@dataclass(frozen=True)
-class UntriedMechanism:
-    """A candidate that promised something, and whose fit gave nothing that could be judged.
-
-    Attributes
-    ----------
-    candidate
-        The mechanism.
-    reason
-        Why, in words.
-    """
-
-    candidate: MechanismCandidate
-    reason: str
-
-
-def screen_all(
-    model: Dynamics,
-    data: Measurements,
-    current: Fit,
-    candidates: Sequence[MechanismCandidate],
-    *,
-    fruitless: Collection[str] = (),
-    budget: Budget | None = None,
-) -> tuple[list[tuple[Probe, Screened]], list[UntriedMechanism]]:
-    """Screen every candidate, with its shapes at all places where they are looked for.
-
-    One whose shape the recordings themselves show promises as much as the best, unless it was fitted before
-    and gained nothing: see `Probe.recorded`.
-
-    Parameters
-    ----------
-    model, data, current
-        The simulation, the recordings, and the fit that is to be improved.
-    candidates
-        What may be missing.
-    fruitless
-        Labels of those that gained nothing when they were fitted.
-    budget
-        Charged for the work; what it does not reach is not screened.
-
-    Returns
-    -------
-    list of (Probe, Screened), list of UntriedMechanism
-        What each probe would gain; and candidates of which no probe could be screened, with the reason.
-    """
-    budget = budget or Budget()
-    substeps = current.substeps
-    untried: dict[str, UntriedMechanism] = {}
-    probes = []
-    for candidate in candidates:
-        try:
-            sharp = max(substeps, EDGE_SUBSTEPS)
-            spread = replace(candidate, model=spread_edges(candidate.model, data, current.x, substeps=sharp))
-            probes += probes_of(spread, data, model, current.x)
-        except UNFORESEEN as error:
-            untried[candidate.label] = UntriedMechanism(candidate, _in_words(error))
-    grid = Grid(data, min(substeps, PROBE_SUBSTEPS))
-    screened: list[tuple[Probe, Screened]] = []
-    for portion in in_portions([probe.width for probe in probes], model, data):
-        some = probes[portion]
-        columns = sum(probe.width for probe in some)
-        try:
-            budget.says(f"screening {len(candidates)} candidates")
-            budget.charge(grid.substeps * evaluation(model, data, columns=columns))
-            screened += _screened(model, data, current, grid, some)
-        except BudgetSpent:
-            break
-        except UNFORESEEN as error:
-            for probe in some:
-                reason = _in_words(error)
-                untried[probe.candidate.label] = UntriedMechanism(probe.candidate, reason)
-    most = max((result.gain for _, result in screened), default=0.0)
-    screened = [
-        (probe, replace(result, gain=max(most, result.gain)))
-        if probe.recorded and result.finite and probe.candidate.label not in fruitless
-        else (probe, result)
-        for probe, result in screened
-    ]
-    finite = {probe.candidate.label for probe, result in screened if result.finite}
-    seen = {probe.candidate.label for probe, _ in screened}
-    for candidate in (probe.candidate for probe in probes):  # some have no place where they could be
-        if candidate.label not in finite:
-            why = OVERFLOWS if candidate.label in seen else BUDGET_SPENT
-            untried.setdefault(candidate.label, UntriedMechanism(candidate, why))
-    return screened, [each for label, each in untried.items() if label not in finite]
-
-
-def _screened(
-    model: Dynamics, data: Measurements, current: Fit, grid: Grid, probes: Sequence[Probe]
-) -> list[tuple[Probe, Screened]]:
-    columns = ProbeColumns(model, grid, probes, current.x, current.model.values)
-    response = probe_response(model, grid, current, columns)
-    ends = np.cumsum([probe.width for probe in probes])
-    groups = [slice(end - probe.width, end) for probe, end in zip(probes, ends, strict=True)]
-    positive = [
-        np.array([name in probe.candidate.positive for name in probe.candidate.amplitudes] or [True])
-        for probe in probes
-    ]
-    return list(zip(probes, screen(response, data, current, groups, positive=positive), strict=True))
 
 
 def fit_most_promising(
@@ -200,11 +69,7 @@ def fit_most_promising(
         Those whose fit settled, with signs that their mechanism allows; and the others, with the reason.
     """
     budget = budget or Budget()
-    best: dict[str, tuple[Probe, Screened]] = {}
-    for probe, result in screened:
-        label = probe.candidate.label
-        if result.gain > 0 and (label not in best or result.gain > best[label][1].gain):
-            best[label] = (probe, result)
+    best = _best_probes(screened)
     ranked = sorted(best.values(), key=lambda each: -each[1].gain)
     trials: dict[str, TriedMechanism] = {}
     failed: dict[str, UntriedMechanism] = {}
@@ -219,7 +84,7 @@ def fit_most_promising(
             return
         except UNFORESEEN as error:
             LOGGER.info("%s cannot be fitted: %s", candidate.label, error)
-            failed[candidate.label] = UntriedMechanism(candidate, _in_words(error))
+            failed[candidate.label] = UntriedMechanism(candidate, in_words(error))
             return
         known = trials.get(candidate.label)
         if known is None or trial.fit.log_likelihood > known.fit.log_likelihood:
@@ -247,16 +112,39 @@ def fit_most_promising(
         if better is not None:
             budget.says(f"once more: {probe.candidate.label}")
             attempt(probe, result, better)
-    most_gained = max((each.delta_chi2 for each in trials.values()), default=0.0)
-    for label, trial in trials.items():
+    sharp = _with_jumps_followed(list(trials.values()), current, data, blocks=blocks, budget=budget)
+    return sharp, [each for label, each in failed.items() if label not in trials]
+
+
+def _best_probes(
+    screened: Sequence[tuple[Probe, Screened]],
+) -> dict[str, tuple[Probe, Screened]]:
+    """Of each candidate the probe that promises most, by label; none that promises nothing."""
+    best: dict[str, tuple[Probe, Screened]] = {}
+    for probe, result in screened:
+        label = probe.candidate.label
+        if result.gain > 0 and (label not in best or result.gain > best[label][1].gain):
+            best[label] = (probe, result)
+    return best
+
+
+def _with_jumps_followed(
+    trials: Sequence[TriedMechanism], current: Fit, data: Measurements, *, blocks: int, budget: Budget
+) -> list[TriedMechanism]:
+    """The same trials, those sharper whose f jumps and which rival the best."""
+    most_gained = max((each.delta_chi2 for each in trials), default=0.0)
+    result = []
+    for trial in trials:
+        better, label = trial, trial.candidate.label
         if trial.fit.model.edges and trial.delta_chi2 >= RIVALS * most_gained:
             try:
                 budget.says(f"following the jumps of {label}")
                 sharp = sharpened(trial.fit, data, budget=budget)
-                trials[label] = judged(sharp, current, data, trial.candidate, blocks=blocks)
+                better = judged(sharp, current, data, trial.candidate, blocks=blocks)
             except (*UNFORESEEN, BudgetSpent) as error:
                 LOGGER.info("%s stays as sharp as it is: %s", label, error)
-    return list(trials.values()), [each for label, each in failed.items() if label not in trials]
+        result.append(better)
+    return result
 
 
 def _tried(
@@ -296,10 +184,6 @@ def _tried(
     return judged(trial, current, data, candidate, blocks=blocks)
 
 
-def _in_words(error: Exception) -> str:
-    return str(error) if isinstance(error, NumericalFailure) else f"{type(error).__name__}: {error}"
-
-
 def _better_start(candidate: MechanismCandidate, trials: Mapping[str, TriedMechanism]) -> Fit | None:
     """Where a candidate is begun once more: one that led nowhere, or to less than a special case of it."""
     own = trials.get(candidate.label)
@@ -328,32 +212,3 @@ def with_start(probe: Probe, result: Screened, base: Dynamics) -> Dynamics:
     if candidate.amplitudes and candidate.shapes:
         known |= dict(zip(candidate.amplitudes, map(float, result.amplitudes), strict=True))
     return candidate.model.with_values(np.array([known[each.name] for each in candidate.model.parameters]))
-
-
-def judged(
-    trial: Fit, before: Fit, data: Measurements, candidate: MechanismCandidate, *, blocks: int
-) -> TriedMechanism:
-    """A candidate's fit with its evidence over the fit without it."""
-    extra = len(trial.model.free) - len(before.model.free)
-    gained = 2 * (trial.log_likelihood - before.log_likelihood)
-    count = trial.degrees_of_freedom + len(trial.model.free)
-    return TriedMechanism(
-        candidate=candidate,
-        fit=trial,
-        delta_chi2=gained,
-        delta_bic=-gained + extra * np.log(count),
-        p_white=float(scipy.stats.chi2.sf(max(gained, 0.0), extra)),
-        p_cluster=probability_by_chance(trial, before, data, candidate, blocks=blocks),
-    )
-
-
-def admissible(trial: Fit, candidate: MechanismCandidate) -> bool:
-    """Whether parameters that a mechanism allows one sign only have it, or are zero within their errors."""
-    names = [trial.model.parameters[place].name for place in trial.model.free]
-    for name in candidate.positive:
-        if name in names:
-            place = names.index(name)
-            value = trial.model.values[trial.model.free[place]]
-            if value < -2 * trial.standard_errors[place]:
-                return False
-    return True

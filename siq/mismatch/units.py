@@ -7,7 +7,15 @@ from collections.abc import Mapping
 
 import sympy
 
+from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.formulas import FormulaError, parse_formula
+
+
+def units_of(model: Dynamics) -> dict[str, str]:
+    """Units of everything that a coordinate may be: states, inputs and the time, by name."""
+    units = dict(zip(model.states, model.units, strict=True))
+    units |= {entry.name: entry.unit for entry in model.inputs}
+    return units | {"t": model.time_unit}
 
 
 def unit_of(formula: str, units: Mapping[str, str]) -> str:

@@ -6,46 +6,21 @@ from dataclasses import replace
 
 import numpy as np
 
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.measurements import Measurements
 from siq.mismatch.candidates import PROCESS_NOISE
 from siq.mismatch.evidence import correlation_time_left, log_evidence_of
+from siq.mismatch.found import Found
 from siq.mismatch.held_out import HeldOutRuns
-from siq.mismatch.investigation import Investigation, MismatchVerdict
+from siq.mismatch.investigation import Investigation
 from siq.mismatch.location import locate
-from siq.mismatch.search import Found
+from siq.mismatch.possible_verdicts import MismatchVerdict
 from siq.mismatch.sentences import sentence_of, words_of
 from siq.mismatch.stated_functions import stated_functions
-from siq.mismatch.statement import (
-    METRIC,
-    UNKNOWN_ERRORS,
-    Description,
-    Estimate,
-    Evidence,
-    Explanation,
-    NotFitted,
-    Recalibrated,
-    Rival,
-    Standing,
-    StatedMechanism,
-    Statement,
-    UpperBound,
-)
-from siq.mismatch.trials import BUDGET_SPENT, TriedMechanism
+from siq.mismatch.stated_parts import Estimate, Evidence, Rival, Standing, StatedMechanism
+from siq.mismatch.statement import Description, Explanation, NotFitted, Recalibrated, Statement, UpperBound
+from siq.mismatch.tried import BUDGET_SPENT, TriedMechanism
 from siq.mismatch.units import unit_of
-
-__all__ = [
-    "METRIC",
-    "UNKNOWN_ERRORS",
-    "Description",
-    "Estimate",
-    "Evidence",
-    "Rival",
-    "StatedMechanism",
-    "Statement",
-    "statement_of",
-    "statement_of_failure",
-]
 
 NOT_INDEPENDENT = (
     "There is one recording only. What is held out is its later part, which is no independent recording."

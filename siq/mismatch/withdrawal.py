@@ -15,8 +15,9 @@ from siq.estimation.budget import Budget
 from siq.mismatch.case import Comparison
 from siq.mismatch.described import models_of_the_nameless
 from siq.mismatch.held_out import HeldOutRuns
-from siq.mismatch.investigation import Investigation, MismatchVerdict, quiet_verdict
+from siq.mismatch.investigation import Investigation
 from siq.mismatch.nameless_models import MECHANISM, Material, Model
+from siq.mismatch.possible_verdicts import MismatchVerdict, quiet_verdict
 from siq.mismatch.remainder import what_is_left
 
 REFUTED = (

@@ -11,6 +11,7 @@
 `number_text`         how is a number written for a reader?
 `measured_text`       and a measured value, with its error and its unit?
 `share_text`          and a share, or a p-value?
+`word_text`           and words, in a sentence?
 ====================  ==========================================================================
 
 Imports `siq.errors`.

@@ -19,7 +19,11 @@
 `equations_page`         and that of given equations?
 `sweep_section`          and what does it say of a control parameter?
 `inspection_section`     what is in the recordings, first of all?
-`study_sections`         and in each of its parts?
+`study_results`          what did a study leave behind, and what of it is shown?
+`formula_section`        what does its page say of the formulas?
+`evidence_section`       and of how far they can be trusted?
+`workings_section`       and of how they were worked out?
+`study_sections`         and in each of its other parts?
 `study_formulas`         which formulas?
 `study_runs`             which tables of several runs?
 `study_captions`         what do its figures show, and where do they stand?
@@ -33,7 +37,10 @@
 `mismatch_page`          what does the page of a diagnosis say?
 `largest_difference`     where do a simulation and held-out recordings differ most?
 `mismatch_first_screen`  and what does it open with?
-`mismatch_sections`      which sections has it?
+`mismatch_formulas`      which formulas are missing?
+`mismatch_evidence`      how sure is it?
+`mismatch_sections`      and which other sections has it?
+`mismatch_captions`      what do its figures show?
 `mismatch_findings`      what is it made from?
 `mismatch_answer`        and what does a terminal print at its end?
 `official_tests`         and what do official tests of benchmarks say, in one table?

@@ -5,7 +5,8 @@ from __future__ import annotations
 from html import escape
 
 from siq.dynamics.dynamics import Dynamics
-from siq.mismatch.statement import METRIC, Estimate, StatedFunction, StatedMechanism, Statement
+from siq.mismatch.stated_parts import Estimate, StatedFunction, StatedMechanism
+from siq.mismatch.statement import METRIC, Statement
 from siq.numerics.measured_text import value_text
 from siq.numerics.share_text import p_text
 

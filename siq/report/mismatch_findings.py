@@ -41,7 +41,7 @@ class Findings:
     candidates
         Columns ``label shapes gain stage beside``.
     figures
-        SVG files by the names of `siq.report.mismatch_sections.CAPTIONS`, as far as there was something to
+        SVG files by the names of `siq.report.mismatch_captions.CAPTIONS`, as far as there was something to
         draw.
     wells, escape, notes
         See `siq.mismatch.consequences.Consequences`.
@@ -104,18 +104,8 @@ def mechanisms_said(findings: Findings) -> list[Mapping[str, Any]]:
 
 
 def described(findings: Findings) -> list[Mapping[str, Any]]:
-    """The model of what has no name; see `siq.mismatch.statement.StatedFunction`."""
+    """The model of what has no name; see `siq.mismatch.stated_parts.StatedFunction`."""
     return list(findings.verdict.get("described") or [])
-
-
-def capital(text: str) -> str:
-    """The same with its first letter in upper case."""
-    return text[:1].upper() + text[1:]
-
-
-def listed(names: Sequence[str], word: str = "or") -> str:
-    """Names in a sentence."""
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} {word} {names[-1]}"
 
 
 def typeset(text: str, model: Dynamics, further: Iterable[str] = ()) -> Markup | str:

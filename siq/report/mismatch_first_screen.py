@@ -6,8 +6,9 @@ import numpy as np
 import pandas as pd
 
 from siq.numerics.measured_text import unit_text, value_text
+from siq.numerics.word_text import capital
 from siq.report.largest_difference import largest_difference
-from siq.report.mismatch_findings import SIMULATIONS, Findings, capital, described, mechanisms_said
+from siq.report.mismatch_findings import SIMULATIONS, Findings, described, mechanisms_said
 from siq.report.page import Badge, ReportFigure, ReportTable
 
 PANELS = (

@@ -5,10 +5,21 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
+from siq.report.evidence_section import evidence_section, study_badge
+from siq.report.formula_section import formula_section
 from siq.report.landscape_answer import wells_table
 from siq.report.page import ReportContent, ReportSection, ReportTable
 from siq.report.study_captions import LEADING, OF_ONE_STATE, figure_of, shown_figures
-from siq.report.study_sections import StudyParts, StudyResults
+from siq.report.study_results import ShownStudy, StudyResults
+from siq.report.study_sections import (
+    landscape_section,
+    published_section,
+    record_section,
+    recordings_section,
+    runs_section,
+    study_answer,
+)
+from siq.report.workings_section import provenance_section, workings_section
 from siq.study.study import Study
 
 AGAIN = "Change one parameter of the study and run it again: only what depends on it is made again."
@@ -36,7 +47,7 @@ def study_page(
     )
     images = {name: image for name, image in results.images.items() if name in drawn}
     lead = next((name for name in LEADING if name in drawn), None)
-    page = StudyParts(study, results, images, lead, beside_paper)
+    page = ShownStudy(study, results, images, lead, beside_paper)
     overview = results.overview
     table = None
     if overview is not None and overview["wells"]:
@@ -48,21 +59,21 @@ def study_page(
         if overview is not None and len(overview["states"]) == 1:
             figure = replace(figure, caption=OF_ONE_STATE, alternative=OF_ONE_STATE)
     sections = [
-        page.inspected(),
-        page.formulas(),
-        page.record(),
-        page.evidence(),
-        page.landscape(),
-        page.over_runs(),
-        page.published(),
-        page.workings(),
+        recordings_section(page),
+        formula_section(page),
+        record_section(page),
+        evidence_section(page),
+        landscape_section(page),
+        runs_section(page),
+        published_section(page),
+        workings_section(page),
         ReportSection("How to run it again", listing=command, text=[AGAIN]),
-        page.provenance(versions),
+        provenance_section(page, versions),
     ]
     return ReportContent(
         title=study.title or study.name,
-        answer=page.answer(),
-        badge=page.badge(),
+        answer=study_answer(page),
+        badge=study_badge(page),
         figure=figure,
         table=table,
         interactive=results.interactive,

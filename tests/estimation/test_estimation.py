@@ -10,8 +10,9 @@ import scipy.linalg
 
 from siq.dynamics.cards import SystemCard, build_system
 from siq.dynamics.dynamics import Dynamics
-from siq.estimation.estimation import Fit, fit_by_multiple_shooting
+from siq.estimation.estimation import fit_by_multiple_shooting
 from siq.estimation.first_states import first_states
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import Noise, process_covariance, whiten
 from siq.estimation.kernels import smoothed_states
 from siq.estimation.linearisation import Grid, linearise

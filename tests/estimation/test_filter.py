@@ -11,7 +11,8 @@ from siq.dynamics.dynamics import Dynamics, Parameter
 from siq.dynamics.parametric import Signals
 from siq.estimation import linearisation
 from siq.estimation.closure import ClosedFunctions
-from siq.estimation.estimation import Fit, fit_by_filter
+from siq.estimation.estimation import fit_by_filter
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import Noise
 from siq.estimation.measurements import Measurements, measurements
 from siq.estimation.noise_uncertainty import noise_uncertainty

@@ -11,7 +11,7 @@ import sympy
 
 from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.dynamics import Dynamics, Parameter
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import Noise
 from siq.estimation.measurements import Measurements
 from siq.estimation.process_noise import fit_with_and_without_process_noise, simpler_fit, without_idle_forces

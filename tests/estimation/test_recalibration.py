@@ -13,7 +13,8 @@ import sympy
 from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.dynamics import Dynamics, Parameter
 from siq.estimation import estimation, recalibration
-from siq.estimation.estimation import Fit, fit_by_multiple_shooting
+from siq.estimation.estimation import fit_by_multiple_shooting
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import Noise
 from siq.estimation.measurements import Measurements
 from siq.estimation.shooting import Iterate, Shooting

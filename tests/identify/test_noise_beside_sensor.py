@@ -9,7 +9,8 @@ import sympy
 from siq.data.recordings import Recordings
 from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.state_noise import state_noise
-from siq.estimation.estimation import Fit, fit_by_filter
+from siq.estimation.estimation import fit_by_filter
+from siq.estimation.fit import Fit
 from siq.estimation.innovations import Noise
 from siq.estimation.measurements import Measurements
 from siq.identify.library import candidate_library

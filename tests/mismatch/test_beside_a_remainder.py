@@ -17,10 +17,10 @@ from siq.estimation.innovations import Whitened
 from siq.estimation.measurements import Measurements, measurements
 from siq.estimation.recalibration import recalibrate
 from siq.mismatch import beside
+from siq.mismatch.adoption import first_better
 from siq.mismatch.beside import beside_a_remainder
 from siq.mismatch.clusters import correlation_time_of
 from siq.mismatch.evidence import Missing
-from siq.mismatch.held_out import first_better
 from siq.mismatch.left_out import errors_left_out, parts_left_out
 from siq.mismatch.nameless_models import Material, Model, runs_freely
 

@@ -18,17 +18,18 @@ from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.parametric import Signals
 from siq.errors import InputError, NumericalFailure
 from siq.estimation.budget import Budget
-from siq.mismatch import held_out, investigation, trials
+from siq.mismatch import adoption, investigation, trials
 from siq.mismatch.case import read_case
 from siq.mismatch.diagnosis import Diagnosis, solve_case
 from siq.mismatch.dictionary import standard_dictionary
+from siq.mismatch.found import Search
 from siq.mismatch.held_out import held_out_runs
 from siq.mismatch.nameless_models import MECHANISM, Material, Model, Part
 from siq.mismatch.naming import Naming
+from siq.mismatch.possible_verdicts import MismatchVerdict
 from siq.mismatch.probes import Probe
 from siq.mismatch.remainder import Remainder
-from siq.mismatch.search import Search
-from siq.mismatch.trials import TriedMechanism
+from siq.mismatch.tried import TriedMechanism
 from siq.mismatch.withdrawal import anything_else, withdrawn
 from tests.mismatch.foreign_cases import falling_ball
 
@@ -223,7 +224,7 @@ def test_random_forces_are_no_noise_where_a_function_beside_them_is_likelier(
         return (Model((part,), search.recalibrated, 5.0),)
 
     monkeypatch.setattr(investigation, "models_of_the_nameless", models)
-    monkeypatch.setattr(held_out, "first_better", lambda *_: None)
+    monkeypatch.setattr(adoption, "first_better", lambda *_: None)
     diagnosis = solved(tmp_path, recordings_of(nothing, drive=0.05, count=4), study={"held_out": ["r2"]})
     assert said(diagnosis)["verdict"] == "unexplained" and names(diagnosis) == []
     # It is located where the likeliest function stands.
@@ -459,7 +460,7 @@ def test_where_nothing_speaks_of_a_mismatch_but_a_refuted_name_there_is_none(tmp
     diagnosis = solved(tmp_path, recordings_of(nothing))
     found = diagnosis.investigation
     assert said(diagnosis)["verdict"] == "no mismatch"
-    refuted = replace(found, verdict=investigation.MismatchVerdict.MISSING_PHYSICS)
+    refuted = replace(found, verdict=MismatchVerdict.MISSING_PHYSICS)
     again = withdrawn(refuted, diagnosis.case, Budget())
     assert str(again.verdict) == "no mismatch" and not again.withdrawn and not again.search.found
     assert "nothing else speaks of a mismatch" in again.remarks[-1]

@@ -18,9 +18,9 @@ from siq.mismatch.building import MechanismCandidate
 from siq.mismatch.candidates import candidates_of, generic_candidates
 from siq.mismatch.dictionary import Mechanism, Shape, standard_dictionary
 from siq.mismatch.places import lattice_step, places_of, plateau
+from siq.mismatch.promises import screen_all
 from siq.mismatch.roles import roles_of
 from siq.mismatch.search_options import SearchOptions
-from siq.mismatch.trials import screen_all
 
 OSCILLATOR = {
     "time_unit": "s",

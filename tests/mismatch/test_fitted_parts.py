@@ -13,7 +13,7 @@ from siq.data.recordings import Recordings
 from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.dynamics import Dynamics, Parameter
 from siq.dynamics.parametric import symbol
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.measurements import Measurements, measurements
 from siq.estimation.recalibration import recalibrate
 from siq.mismatch import fitted_parts

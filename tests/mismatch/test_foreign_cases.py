@@ -135,12 +135,12 @@ def test_a_candidate_that_overflows_ends_itself_and_not_the_case(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Screening that has no numbers leaves what can be said without it."""
-    from siq.mismatch import trials
+    from siq.mismatch import promises
 
     def overflow(*_: object, **__: object) -> None:
         raise NumericalFailure("it runs away")
 
-    monkeypatch.setattr(trials, "_screened", overflow)
+    monkeypatch.setattr(promises, "_screened", overflow)
     found = answered(falling_ball(0.3), tmp_path)
     assert {each.reason for each in found.statement.not_fitted} == {"it runs away"}
     assert not found.statement.partial and np.isfinite(found.statement.errors.recalibrated or 0.0)

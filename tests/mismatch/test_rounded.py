@@ -14,7 +14,7 @@ from siq.estimation.expectations import with_expectations
 from siq.estimation.measurements import Measurements
 from siq.estimation.recalibration import recalibrate
 from siq.mismatch.diagnosis import diagnose
-from siq.mismatch.investigation import MismatchVerdict
+from siq.mismatch.possible_verdicts import MismatchVerdict
 from siq.mismatch.roles import roles_of
 from siq.mismatch.rounded import Unrounded, explained_by_rounding, steps_of, unrounded
 from siq.mismatch.study import measurements_of

@@ -14,21 +14,23 @@ from siq.data.recordings import Recordings
 from siq.dynamics.diffusion import Diffusion
 from siq.dynamics.dynamics import Dynamics, Parameter
 from siq.estimation.budget import Budget
-from siq.estimation.estimation import Fit
+from siq.estimation.fit import Fit
 from siq.estimation.measurements import Measurements, measurements
 from siq.estimation.recalibration import recalibrate
 from siq.mismatch import naming
+from siq.mismatch.acceptance import accepted, better_without
 from siq.mismatch.clusters import blocks_of, correlated_probability, correlation_time
 from siq.mismatch.dictionary import Shape
+from siq.mismatch.found import Found, Search
 from siq.mismatch.location import most_telling
 from siq.mismatch.names import named_or_not
 from siq.mismatch.naming import Naming, naming_of
+from siq.mismatch.on_top import once_more
 from siq.mismatch.remainder import Remainder
 from siq.mismatch.roles import Roles
-from siq.mismatch.search import Found, Search, _once_more, accepted, better_without
 from siq.mismatch.search_options import SearchOptions
 from siq.mismatch.structure import Curve, Direction, Structure
-from siq.mismatch.trials import TriedMechanism
+from siq.mismatch.tried import TriedMechanism
 
 
 def autoregressive(memory: float, size: int) -> np.ndarray:
@@ -107,12 +109,12 @@ def test_a_mechanism_that_was_found_is_not_found_once_more_in_another_form() -> 
         )
 
     found = one("overflow", "overflow in h, g", ("h", "g"), "h")
-    assert _once_more(one("overflow", "overflow in h", ("h",), "h"), found)
-    assert not _once_more(one("overflow", "overflow in g", ("g",), "g"), found)
-    assert not _once_more(one("leak", "leak in h", ("h",), "h"), found)
+    assert once_more(one("overflow", "overflow in h", ("h",), "h"), found)
+    assert not once_more(one("overflow", "overflow in g", ("g",), "g"), found)
+    assert not once_more(one("leak", "leak in h", ("h",), "h"), found)
     # Two parameters may drift in time, each by its own.
     drift = one("parameter drift", "parameter drift in h (a)", ("h",), "t")
-    assert not _once_more(one("parameter drift", "parameter drift in h (b)", ("h",), "t"), drift)
+    assert not once_more(one("parameter drift", "parameter drift in h (b)", ("h",), "t"), drift)
 
 
 def structure(excess: float, *gains: tuple[str, str, float]) -> Structure:

@@ -11,19 +11,11 @@ import pytest
 
 from siq.mismatch.candidates import PROCESS_NOISE
 from siq.mismatch.held_out_errors import HeldOutErrors
-from siq.mismatch.investigation import MismatchVerdict
 from siq.mismatch.location import where_it_sits
+from siq.mismatch.possible_verdicts import MismatchVerdict
 from siq.mismatch.sentences import sentence_of, words_of
-from siq.mismatch.statement import (
-    Description,
-    Estimate,
-    Evidence,
-    Recalibrated,
-    Rival,
-    StatedFunction,
-    StatedMechanism,
-    Statement,
-)
+from siq.mismatch.stated_parts import Estimate, Evidence, Rival, StatedFunction, StatedMechanism
+from siq.mismatch.statement import Description, Recalibrated, Statement
 from siq.mismatch.verdict import statement_of_failure
 from siq.numerics.share_text import p_text, percent
 

@@ -18,18 +18,13 @@ from siq.estimation.estimation import fit_by_multiple_shooting
 from siq.estimation.innovations import Noise
 from siq.estimation.measurements import Measurements
 from siq.mismatch import fitted_smooth
+from siq.mismatch.adoption import simplest_of
 from siq.mismatch.diagnosis import solve_case
 from siq.mismatch.evidence import evidences_by_size, log_evidence_of
 from siq.mismatch.function_places import Place
-from siq.mismatch.held_out import simplest_of
+from siq.mismatch.grounds import Ground
 from siq.mismatch.product_functions import ProductFunction, product_of
-from siq.mismatch.smooth_functions import (
-    Ground,
-    Smooth,
-    smooth_function,
-    triangle_of,
-    with_smooth_function,
-)
+from siq.mismatch.smooth_functions import Smooth, smooth_function, triangle_of, with_smooth_function
 from siq.mismatch.smoothness import SHARES
 from siq.report.plots.described import plot_described
 from tests.mismatch.foreign_cases import ForeignCase, course, table_of

@@ -18,9 +18,9 @@ from siq.mismatch.consequences import compare_landscapes, identified, obstacle
 from siq.mismatch.dictionary import dictionary_of
 from siq.mismatch.verdict import statement_of_failure
 from siq.report.largest_difference import largest_difference
+from siq.report.mismatch_captions import CAPTIONS
 from siq.report.mismatch_findings import Findings
 from siq.report.mismatch_page import mismatch_page
-from siq.report.mismatch_sections import CAPTIONS
 from siq.report.plots.before_after import plot_before_after, plot_held_out
 from siq.report.plots.described import plot_described
 from siq.report.plots.mismatch import limits_of, plot_candidates, plot_curves, plot_escapes, plot_missing

@@ -17,7 +17,7 @@ from siq.potential.symbolic import SymbolicDecomposition, exact_decomposition
 from siq.report.page import ReportContent, render_report
 from siq.report.study_captions import CAPTIONS, LEADING, OF_NETWORKS, OF_ONE_STATE, OF_RUNS
 from siq.report.study_page import study_page
-from siq.report.study_sections import StudyResults
+from siq.report.study_results import StudyResults
 from siq.steps.outcomes import Method
 from siq.steps.shown import ModelFiles, shown_formula
 from siq.study.scoring import coefficient_table, summary_table

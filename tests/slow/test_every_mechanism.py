@@ -6,7 +6,8 @@ import pytest
 from homes_of_mechanisms import HOMES, RESIDENTS, Resident, recorded
 
 from siq.mismatch.dictionary import standard_dictionary
-from siq.mismatch.investigation import MismatchVerdict, investigate
+from siq.mismatch.investigation import investigate
+from siq.mismatch.possible_verdicts import MismatchVerdict
 from siq.mismatch.study import MismatchStudy
 
 pytestmark = pytest.mark.slow

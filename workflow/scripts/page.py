@@ -19,7 +19,7 @@ from siq.report.page import render_report
 from siq.report.record_answer import with_visits
 from siq.report.settings import PageSettings
 from siq.report.study_page import study_page
-from siq.report.study_sections import StudyResults
+from siq.report.study_results import StudyResults
 from siq.steps.outcomes import Method
 from siq.steps.shown import ModelFiles, shown_formula
 from siq.study.scoring import exact_answer

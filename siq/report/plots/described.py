@@ -28,7 +28,7 @@ def plot_described(
     Parameters
     ----------
     described
-        As ``verdict.json`` has them; see `siq.mismatch.statement.StatedFunction`.
+        As ``verdict.json`` has them; see `siq.mismatch.stated_parts.StatedFunction`.
     units
         Units of states and inputs.
     time_unit
