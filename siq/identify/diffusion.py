@@ -25,6 +25,7 @@ class DiffusionSource(StrEnum):
     ESTIMATED = "estimated"
     OF_VELOCITIES = "estimated of velocities"
     UNIT = "unit"
+    UNIT_OF_VELOCITIES = "unit of velocities"
 
     @property
     def note(self) -> str | None:
@@ -38,6 +39,8 @@ class DiffusionSource(StrEnum):
             " the random forces, and U is in the unit of ε",
             DiffusionSource.UNIT: "D is taken as the unit matrix, since none was given and the recordings do"
             " not show it: U, barriers and times follow from it",
+            DiffusionSource.UNIT_OF_VELOCITIES: "D is taken as the unit matrix of the velocities, since the"
+            " recordings show no random forces: U and barriers follow from it, and times need the strength of the noise",
         }[self]
 
 

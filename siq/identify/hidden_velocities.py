@@ -24,6 +24,7 @@ from siq.estimation.fit import Fit
 from siq.estimation.innovations import whiten
 from siq.estimation.measurements import Measurements
 from siq.estimation.noise_uncertainty import NoiseUncertainty, noise_uncertainty
+from siq.estimation.process_noise import without_idle_forces
 from siq.identify.filtered_terms import FilteredTerms, neighbours
 from siq.identify.flow import FlowMap
 from siq.identify.identified_field import IdentifiedField
@@ -43,13 +44,14 @@ class HiddenMotion:
     Attributes
     ----------
     found
-        f of positions and velocities, `siq.identify.velocities.with_definitions`; D acts on velocities.
+        f of positions and velocities, `siq.identify.velocities.with_definitions`; D acts on velocities, and
+        is the unit matrix there if no random forces are seen.
     sensor
         Variance of each position's sensor noise, shape ``(d/2,)``.
     sensor_error
         Standard error of its logarithm.
     intensity, intensity_error
-        ε, and the standard error of its logarithm.
+        ε, and the standard error of its logarithm; zero of ring-downs, without random forces.
     correlation, score
         Of neighbouring innovations, the strongest, and in standard errors.
     states
@@ -95,7 +97,7 @@ def identify_hidden_motion(
     Raises
     ------
     NumericalFailure
-        When the fit does not settle, no random force is seen, or the library is too large.
+        When the fit does not settle, or the library is too large.
     """
     d = library.dimension
     half = d // 2
@@ -123,11 +125,8 @@ def identify_hidden_motion(
         if place not in everything[chosen, 0]:
             raise NumericalFailure(f"no term of the equation of {name} is significant; record longer")
     fit, support, chosen = terms.settled(chosen, whole.noise, x=whole.linearised_at)
-    if not fit.noise.process.any():
-        raise NumericalFailure(
-            "no random force is seen beside the noise of the sensor, and ring-downs of positions alone are"
-            " not worked out; give the velocities as columns"
-        )
+    # The search for intensities ends at the least that it tries; of ring-downs there are none.
+    fit = without_idle_forces(fit, data) or fit
     one = _as_motion(view, support, fit, data, noise_uncertainty(fit, data))
     shares = np.concatenate([np.ones(half), terms.stability(chosen, generator=generator)])
     return replace(one, found=replace(one.found, rivals=terms.rivals(chosen), stability=shares))
@@ -155,7 +154,7 @@ def _as_motion(
         fit.noise.measurement,
         certain.measurement,
         intensity,
-        float(np.sqrt((certain.process[half:] ** 2).sum())) / half,
+        float(np.sqrt((certain.process[half:] ** 2).sum())) / half if intensity else 0.0,
         *neighbours(whiten(fit.linearisation, data, fit.noise), data),
         fit.linearised_at,
         fit.log_likelihood,

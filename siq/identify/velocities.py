@@ -101,15 +101,18 @@ def force_noise(sensor: np.ndarray, rate: np.ndarray) -> Noise:
 def force_diffusion(rate: np.ndarray) -> tuple[Diffusion, float]:
     """D and ε of forces that noise drives: the part of D that acts on velocities has the determinant 1.
 
+    Without noise it is the unit matrix there, and ε is zero.
+
     Parameters
     ----------
     rate
         What noise adds to the covariance of the velocities in a unit of time, shape ``(d/2, d/2)``.
     """
     half = len(rate)
-    intensity = float(np.exp(np.linalg.slogdet(rate)[1] / half))
+    forced = bool(rate.any())
+    intensity = float(np.exp(np.linalg.slogdet(rate)[1] / half)) if forced else 0.0
     matrix = np.zeros((2 * half, 2 * half))
-    matrix[half:, half:] = (rate + rate.T) / 2 / intensity
+    matrix[half:, half:] = (rate + rate.T) / 2 / intensity if forced else np.eye(half)
     return Diffusion(matrix), intensity
 
 

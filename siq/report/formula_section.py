@@ -17,6 +17,8 @@ SOURCES = {
     DiffusionSource.OF_VELOCITIES: "Estimated from the recorded positions. Its part that acts on the"
     " velocities, the only one there is, is scaled to the determinant 1, so that ε is the size of the random"
     " forces.",
+    DiffusionSource.UNIT_OF_VELOCITIES: "Taken as the unit matrix of the velocities: the recordings show no"
+    " random forces. U and the barriers follow from it.",
     DiffusionSource.UNIT: "Taken as the unit matrix: none was given, and the recordings show no noise that"
     " would tell. U and the barriers follow from it.",
 }

@@ -21,6 +21,7 @@ from siq.identify.seen_states import View
 from siq.identify.storage import FieldRecord, field_library
 from siq.identify.velocities import velocity_names
 from siq.numerics.randomness import Purpose, generator
+from siq.steps.identify_beside_sensor import units_of_states
 from siq.steps.settings import Sampling, StateSpace
 
 
@@ -71,23 +72,30 @@ def hidden_record(
         noise_fault=fault, errors=None, mean_probability=probability, held_out_ratio=ratio, limits=limits
     )
     sizes = np.sqrt(motion.sensor)
+    forced = motion.intensity > 0
+    if not forced and len({unit for unit in units_of_states(recordings, space) if unit}) > 1:
+        raise NumericalFailure(
+            "no random forces are seen that would show D, and the positions have different units, so that no"
+            " unit matrix can stand for it; scale them to one unit"
+        )
     error = motion.intensity * motion.intensity_error
     said = ", ".join(f"{size:.2g} in {name}" for size, name in zip(sizes, recordings.titles, strict=True))
+    noises = "the forces' noise and that" if forced else "and the noise"
     return FieldRecord(
         motion.found,
         verdict.as_data(),
         {
-            "kind": "process" if fault is None else "coloured",
+            "kind": "coloured" if fault is not None else "process" if forced else "sensor",
             "intensity": motion.intensity,
             "intensity_error": error if np.isfinite(error) else None,
-            "covariance": (motion.found.noise_rate / motion.intensity).tolist(),
+            "covariance": motion.found.diffusion.matrix.tolist(),
             "correlation": motion.correlation,
             "correlation_score": motion.score,
             "measurement": sizes.tolist(),
             "measurement_error": (sizes * motion.sensor_error / 2).tolist(),
-            "diffusion": str(DiffusionSource.OF_VELOCITIES),
-            "note": "velocities were not recorded: f, the forces' noise and that of the sensor,"
-            f" {said}, are by the likelihood of positions alone",
+            "diffusion": str(DiffusionSource.OF_VELOCITIES if forced else DiffusionSource.UNIT_OF_VELOCITIES),
+            "note": f"velocities were not recorded: f, {noises} of the sensor, {said}, are by the likelihood"
+            " of positions alone",
             "pairs": len(snapshot_pairs(recordings, pair_step=sampling.pair_step).h),
         },
     )

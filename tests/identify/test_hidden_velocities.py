@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import scipy.integrate
 from particles import TEMPERATURE, particle
 
 from siq.data.noise_floor import noise_floors
@@ -26,7 +28,7 @@ from siq.identify.velocities import smoothed_motion, velocity_names
 from siq.landscape.landscape import Landscape
 from siq.landscape.prefactor_errors import covariance_axes
 from siq.landscape.transitions import barrier_uncertainty, ways_out
-from siq.steps import draw, identify
+from siq.steps import draw, identify, identify_hidden
 from siq.steps.outcomes import Status
 from siq.steps.pipeline import PipelineSettings
 from siq.steps.settings import Sampling, StateSpace
@@ -164,6 +166,46 @@ def test_one_record_of_smooth_positions_is_enough(tmp_path: Path) -> None:
     assert done.record is not None and done.record.prediction["passed"]
     field = done.record.found
     assert [field.library.names[k] for _, k in field.support] == ["v_x", "x", "v_x", "x**3"]
+
+
+def ring_downs(positions: int = 1) -> Recordings:
+    """Damped Duffing particles that run down, seen by a sensor, without random forces."""
+    draw = np.random.default_rng(12)
+    t = 0.05 * np.arange(500)
+    seen = []
+    for begin in draw.uniform(-1.5, 1.5, (10, 2)):
+        solved = scipy.integrate.solve_ivp(
+            lambda _, y: (y[1], y[0] - y[0] ** 3 - FRICTION * y[1]), (0, t[-1]), begin, t_eval=t, rtol=1e-9
+        )
+        seen.append(solved.y[:1].repeat(positions, axis=0).T)
+    values = np.array(seen) + 0.005 * draw.standard_normal((10, len(t), positions))
+    return Recordings.from_arrays(t, values, names=["x", "y"][:positions])
+
+
+def test_ring_downs_have_no_random_forces_and_the_unit_matrix_of_the_velocities() -> None:
+    done = identify.run(SETTINGS.of(identify.IdentifySettings), ring_downs(), number=0)
+    assert done.record is not None and done.record.prediction["passed"]
+    assert done.record.diffusion_source == DiffusionSource.UNIT_OF_VELOCITIES
+    assert done.record.noise_strength is None and done.record.noise["kind"] == "sensor"
+    assert done.record.noise["measurement"][0] == pytest.approx(0.005, rel=0.05)
+    field = done.record.found
+    assert not field.noise_rate.any()
+    np.testing.assert_array_equal(field.diffusion.matrix, [[0, 0], [0, 1]])
+    errors = np.sqrt(np.diag(field.covariance))[1:]
+    assert [field.library.names[k] for _, k in field.support] == ["v_x", "x", "v_x", "x**3"]
+    assert (np.abs(field.values[1:] - [1, -FRICTION, -1]) < 3.5 * errors).all() and errors.max() < 2e-3
+
+
+def test_ring_downs_of_positions_in_different_units_show_no_unit_matrix(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    motion = SimpleNamespace(intensity=0.0, found=SimpleNamespace(diffusion=None), sensor=np.ones(2))
+    monkeypatch.setattr(identify_hidden, "identify_hidden_motion", lambda *_, **__: motion)
+    monkeypatch.setattr(identify_hidden, "evidence", lambda *_, **__: (0.5, 1.0))
+    monkeypatch.setattr(identify_hidden, "_fault", lambda _: None)
+    several = replace(ring_downs(2), units=("m", "rad"))
+    done = identify.run(SETTINGS.of(identify.IdentifySettings), several, number=0)
+    assert done.record is None and "scale them to one unit" in done.outcome.reason
 
 
 def test_what_is_known_exactly_has_no_axis() -> None:
