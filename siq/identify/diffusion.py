@@ -40,7 +40,8 @@ class DiffusionSource(StrEnum):
             DiffusionSource.UNIT: "D is taken as the unit matrix, since none was given and the recordings do"
             " not show it: U, barriers and times follow from it",
             DiffusionSource.UNIT_OF_VELOCITIES: "D is taken as the unit matrix of the velocities, since the"
-            " recordings show no random forces: U and barriers follow from it, and times need the strength of the noise",
+            " recordings show no random forces: U and barriers follow from it, and times need the strength of"
+            " the noise",
         }[self]
 
 

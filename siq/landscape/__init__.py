@@ -11,6 +11,7 @@
 `hamiltonian_paths`       and which paths are most likely where noise acts on some states only?
 `hamiltonian_problem`     which boundary conditions have they, and how are they solved?
 `followed_solutions`      from which first guess does a solution get there?
+`reversed_motion`         what is the way up of particles, nearly, where the way down is known?
 `tubes`                   where does a path leave a cycle, or arrive at one?
 `cycle_ways`              which ways lead out of cycles, over cycles, and into them?
 `turnover`                do states that turn about a well leave it as the law of escape says?

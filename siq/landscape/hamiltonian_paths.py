@@ -39,9 +39,11 @@ from siq.dynamics.equilibria import classify
 from siq.errors import NumericalFailure
 from siq.landscape.followed_solutions import ROUGH, curves_to, followed, last_states, longer, onward, way_down
 from siq.landscape.hamiltonian_problem import APPROACH, HamiltonianProblem, Solution
+from siq.landscape.reversed_motion import reversed_motion
 from siq.reference.characteristics import crossed
 
 LAST = 0.002  # of the distance from A to S, in the metric of M: how far from S the end is in the answer
+LEAST_SHARE = 0.05  # numerical: of the way to the conditions at the saddle, in one step
 NEARER = 3.0  # by so much in one step
 SWITCHED, FINE = 1e-5, 1e-6  # relative residuals of collocation, at the saddle and of the answer
 APART, COMPARED = 0.03, 400  # of the distance, at so many times: solutions further apart are two
@@ -123,8 +125,12 @@ def hamiltonian_paths(
         )
     problem = HamiltonianProblem(dynamics, attractor, end)
     found: list[HamiltonianPath] = []
+    backwards = _of_reversed_motion(problem, beside)
+    known = [] if backwards is None else [backwards]
+    path = None if backwards is None else _finished(problem, backwards, tolerance)
+    found += [] if path is None else [path]
     for last in last_states(problem, beside):
-        solutions: list[Solution] = []
+        solutions = list(known)
         for curve in curves_to(problem, last, curves):
             solution = followed(problem, curve)
             if solution is None or any(not _apart(solution, one, problem.dimension) for one in solutions):
@@ -145,6 +151,14 @@ def hamiltonian_paths(
     return sorted(found, key=lambda path: (not path.smooth, path.action))
 
 
+def _of_reversed_motion(problem: HamiltonianProblem, beside: np.ndarray | None) -> Solution | None:
+    """The solution next to the way down with velocities reversed, which ends where that does."""
+    guess = reversed_motion(problem, beside)
+    if guess is None:
+        return None
+    return problem.solved(guess, problem.fixed(guess.at(np.zeros(1))[: problem.dimension, 0]), ROUGH)
+
+
 def _apart(one: Solution, two: Solution, dimension: int) -> bool:
     """Whether two solutions that end at one state come from different sides."""
     times = np.linspace(max(one.times[0], two.times[0]), 0.0, COMPARED)
@@ -163,7 +177,7 @@ def _finished(problem: HamiltonianProblem, solution: Solution, tolerance: float)
         )
         if known is None:
             return None
-        ended = problem.solved(known, problem.at_saddle(known), SWITCHED)
+        ended = _as_at_saddle(problem, known)
         distance = APPROACH
         while ended is not None and distance > LAST:
             distance /= NEARER
@@ -185,6 +199,27 @@ def _finished(problem: HamiltonianProblem, solution: Solution, tolerance: float)
         if abs(value - before) <= tolerance * value:
             break
     return _path(problem, rough, abs(value - before))
+
+
+def _as_at_saddle(problem: HamiltonianProblem, solution: Solution) -> Solution | None:
+    """A solution that ends somewhere before the saddle, moved to where those end that come to it.
+
+    In steps as long as Newton's method follows: of what other directions have gathered on the way the ends
+    that are tried know little, least where they decay about as fast as the path comes to the saddle.
+    """
+    matrix, right = problem.at_saddle(solution)
+    own = matrix @ solution.at(np.zeros(1))[:, 0]
+    share, step, moved = 0.0, 1.0, solution
+    while share < 1:
+        ahead = min(share + step, 1.0)
+        new = problem.solved(moved, (matrix, own + ahead * (right - own)), SWITCHED)
+        if new is None:
+            step /= 2
+            if step < LEAST_SHARE:
+                return None
+            continue
+        moved, share = new, ahead
+    return moved
 
 
 def _values(problem: HamiltonianProblem, solution: Solution) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import sympy
-from scipy.integrate import solve_ivp
+from scipy.integrate import quad, solve_ivp
 from scipy.optimize import fsolve, least_squares
 
 from siq.dynamics.dynamics import Dynamics
@@ -58,6 +58,32 @@ def test_damped_particles_have_the_barrier_and_the_momenta_of_their_energy(
     speeds = friction / noise * (path.points[:, count:] ** 2).sum(axis=1)
     values = speeds + 2 * friction / noise * (energy(*path.points[:, :count].T) - energy(*start[:count]))
     np.testing.assert_allclose(path.values, values, atol=1e-4 * barrier)
+
+
+@pytest.mark.parametrize("balanced", [True, False])
+def test_damping_that_all_but_vanishes_at_the_saddle_has_a_path(balanced: bool) -> None:
+    """``dv = (x - x³ - γ(x) v) dt + √(ε D) dW`` with γ = 0.1 x² + 0.01: the path winds, and comes in slowly.
+
+    If D is γ, V is the energy. If D is one, ``dU/dE = 2⟨γv²⟩/⟨v²⟩`` on orbits, to the first order in γ.
+    """
+    damping = sympy.Rational(1, 10) * X**2 + sympy.Rational(1, 100)
+    noise = [[0, 0], [0, damping if balanced else 1]]
+    system = Dynamics.of((X, V), (V, X - X**3 - damping * V), diffusion=noise)
+    way = transition_path(system, np.array([1.0, 0.0]), np.zeros(2), np.array([-1.0, 0.0]))
+    assert way.uphill.converged
+    if balanced:
+        assert way.uphill.action == pytest.approx(0.5, rel=1e-5)
+        return
+
+    def slope(energy: float) -> float:
+        turns = np.sqrt(1 + np.array([-1, 1]) * 2 * np.sqrt(energy + 0.25))  # from -1/4 in the well to 0
+        x = turns.mean() + np.diff(turns) / 2 * np.sin(np.linspace(-np.pi / 2, np.pi / 2, 4001))
+        speed = np.sqrt(np.maximum(2 * energy + x**2 - x**4 / 2, 0.0))
+        lost = sympy.lambdify(X, damping)(x) * speed
+        return float(2 * np.trapezoid(lost, x) / np.trapezoid(speed, x))
+
+    barrier, _ = quad(slope, -0.25, 0.0, epsrel=1e-6)
+    assert way.uphill.action == pytest.approx(barrier, rel=0.03)
 
 
 def test_the_way_up_is_the_way_down_with_the_velocity_reversed() -> None:
