@@ -43,8 +43,11 @@ def _measured_states(model: Dynamics) -> dict[str, tuple[int, float, float]]:
         known = formula.xreplace(values)
         for name in model.states:
             slope = known.diff(symbol(name))
-            rest = sympy.expand(known - slope * symbol(name))
-            if slope.is_number and slope != 0 and rest.is_number:
+            if not slope.is_number or slope == 0:
+                continue
+            # Of a constant slope the rest is what is left at zero: long formulas are never multiplied out.
+            rest = known.xreplace({symbol(name): sympy.S.Zero})
+            if rest.is_number:
                 found[name] = (place, float(slope), float(rest))
     return found
 
