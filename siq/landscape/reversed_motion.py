@@ -43,15 +43,14 @@ def reversed_motion(problem: HamiltonianProblem, beside: np.ndarray | None) -> S
     if places is None or beside is None or problem.unstable is None:
         return None
     positions, velocities = places
-    x = _way_down(problem, beside)
-    if x is None:
+    down = _way_down(problem, beside)
+    if down is None:
         return None
     step = SPIRAL / problem.fastest / PACE
+    x = down.copy()
     x[:, velocities] *= -1
     noise = dynamics.diffusion.at(x)[:, velocities[:, None], velocities]
-    # On the way down the velocity changes by f_v at its own sign; reversed, it changes by the same.
-    down = x.copy()
-    down[:, velocities] *= -1
+    # On the way down velocities change by f_v at their own sign; reversed, they change by the same.
     missing = (dynamics.drift(down) - dynamics.drift(x))[:, velocities]
     momenta = np.zeros_like(x)
     try:
