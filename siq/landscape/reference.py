@@ -6,6 +6,7 @@ Characteristics of the Hamilton–Jacobi equation (any dimension), an ordered li
 
 from __future__ import annotations
 
+import logging
 import zipfile
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -20,8 +21,10 @@ from siq.files.whole import whole_file
 from siq.landscape.global_quasipotential import heights_of_attractors, least_over_wells
 from siq.landscape.paths import minimum_action_path
 from siq.reference.mesh import mesh_quasipotential
+from siq.reference.mesh_values import MeshQuasipotential
 from siq.reference.sheets import adapted_fan, lowest_sheet, value_near
 
+LOGGER = logging.getLogger(__name__)
 GRID = 161  # points along each of two states
 SCATTERED = 4000  # points of a fan where there are more states
 MESH = 512
@@ -43,7 +46,7 @@ class ReferenceLandscape:
         Shape ``(n, d)``.
     characteristics, mesh
         U about each attractor, zero there, shape ``(k, n)``; NaN where the method does not tell. The mesh is
-        NaN throughout where there are not two states.
+        NaN throughout where there are not two states, or D is not positive definite somewhere in the box.
     barriers
         Lowest barrier of U out of each well, by minimum action, shape ``(k,)``; infinite without a saddle.
     mesh_barriers
@@ -137,20 +140,31 @@ def reference_landscape(
         ]
     )
     on_mesh, mesh_barriers = np.full(values.shape, np.nan), np.full(len(attractors), np.nan)
-    if dynamics.dimension == 2 and dynamics.diffusion.constant:  # the mesh knows no other
-        for index, one in enumerate(attractors):
-            mesh = mesh_quasipotential(
-                dynamics.drift, one, hessian=hessian_at(dynamics, one), box=box,
-                shape=(MESH, MESH), diffusion=dynamics.diffusion, level=levels[index] / 2,
-                stop_at_boundary=False,
-            )  # fmt: skip
-            on_mesh[index] = 2 * mesh.evaluate(points)
-            tops = np.array([saddle.position for saddle in portrait.saddles[index]]).reshape(-1, 2)
-            if len(tops):
-                mesh_barriers[index] = np.nanmin(2 * mesh.evaluate(tops), initial=np.inf)
+    for index, one in enumerate(attractors if dynamics.dimension == 2 else ()):
+        mesh = _mesh(dynamics, one, box, level=levels[index] / 2)
+        if mesh is None:
+            continue
+        on_mesh[index] = 2 * mesh.evaluate(points)
+        tops = np.array([saddle.position for saddle in portrait.saddles[index]]).reshape(-1, 2)
+        if len(tops):
+            mesh_barriers[index] = np.nanmin(2 * mesh.evaluate(tops), initial=np.inf)
     return ReferenceLandscape(
         attractors, points, values, on_mesh, barriers, mesh_barriers, _heights(actions, len(attractors))
     )
+
+
+def _mesh(
+    dynamics: Dynamics, attractor: np.ndarray, box: np.ndarray, *, level: float
+) -> MeshQuasipotential | None:
+    """V of two states on a mesh; none where D is not positive definite in the whole box."""
+    try:
+        return mesh_quasipotential(
+            dynamics.drift, attractor, hessian=hessian_at(dynamics, attractor), box=box,
+            shape=(MESH, MESH), diffusion=dynamics.diffusion, level=level, stop_at_boundary=False,
+        )  # fmt: skip
+    except NumericalFailure as reason:
+        LOGGER.info("no mesh about %s: %s", attractor, reason)
+        return None
 
 
 def no_reference(dimension: int, reason: str) -> ReferenceLandscape:

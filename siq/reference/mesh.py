@@ -5,18 +5,18 @@ attractor,
 
     U(y) = inf ∫ (|f| |φ'| - f·φ') ds,
 
-lengths and the product being those of ``D⁻¹``. The mesh is worked through as by Dijkstra's algorithm, from
-the attractor upwards. What is known so far ends in a front. A node next to it takes the least action over
-straight segments from the front within a reach of some mesh widths, from a node or from between two
-neighbours,
+lengths and the product being those of ``D⁻¹``, which may depend on the state. The mesh is worked through as
+by Dijkstra's algorithm, from the attractor upwards. What is known so far ends in a front. A node next to it
+takes the least action over straight segments from the front within a reach of some mesh widths, from a node
+or from between two neighbours,
 
     U(y) = min over λ of (1 - λ) U(x₀) + λ U(x₁) + |f_m| |y - x_λ| - f_m·(y - x_λ),
 
-f_m being f in the middle of the segment. Of all such nodes the one with the lowest value is known for good,
-and joins the front (D. Dahiya, M. Cameron, *Ordered line integral methods for computing the quasi-potential*,
-J. Sci. Comput. 75, 2018). Where f turns fast, segments lead far along the front, and the reach has to be
-large. A reach larger than that does harm: the longest segments have the largest errors, and the minimum picks
-those that are too low.
+f_m being f in the middle of the segment, where D is taken, too. Of all such nodes the one with the lowest
+value is known for good, and joins the front (D. Dahiya, M. Cameron, *Ordered line integral methods for
+computing the quasi-potential*, J. Sci. Comput. 75, 2018). Where f turns fast, segments lead far along the
+front, and the reach has to be large. A reach larger than that does harm: the longest segments have the
+largest errors, and the minimum picks those that are too low.
 
 Two differences from the published method, which is there as an option: along the front U is interpolated with
 its second difference and not linearly, which raises the order from one to two; and a node tries all pairs of
@@ -29,7 +29,7 @@ code; so that agreement with them means something. No derivative of f is needed,
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -42,7 +42,8 @@ from siq.reference.mesh_start import (
     check_room,
     check_start,
     drift_values,
-    metric_root,
+    metric_roots,
+    square,
 )
 from siq.reference.mesh_values import MeshQuasipotential
 
@@ -80,7 +81,7 @@ def mesh_quasipotential(
     shape
         Nodes along each state, ends included.
     diffusion
-        D.
+        D; where it depends on the state, positive definite in the whole box.
     reach
         Longest segment, in mesh widths. By default ``3 + r/2``, r being the ratio ``|f + 2D∇V| |∇V| /
         ((f + 2D∇V)·∇V)`` in mesh widths at its largest near A, 1 if f does not turn there: the least that
@@ -107,7 +108,7 @@ def mesh_quasipotential(
         When an argument has the wrong shape, D or M is not positive definite, A is not an equilibrium
         inside the box, M is not the Hessian of V there, or the mesh is too coarse for the start.
     NumericalFailure
-        When f is not finite everywhere in the box.
+        When f is not finite, or D not positive definite, everywhere in the box.
 
     Notes
     -----
@@ -173,13 +174,9 @@ def mesh_quasipotential_of_cycle(
 
     Raises
     ------
-    ValueError
-        When D is not the same everywhere.
     NumericalFailure
-        When f is not finite everywhere in the box.
+        When f is not finite, or D not positive definite, everywhere in the box.
     """
-    if not diffusion.constant:
-        raise ValueError("the mesh knows only a D that is the same everywhere; use characteristics instead")
     axes = tuple(np.linspace(low, high, count) for (low, high), count in zip(box, shape, strict=True))
     widths = (box[:, 1] - box[:, 0]) / (np.array(shape) - 1)
     x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -208,10 +205,16 @@ def _marched(
     """V on the mesh from where it is known, `begin` being infinite elsewhere."""
     shape = begin.shape
     widths = (box[:, 1] - box[:, 0]) / (np.array(shape) - 1)
-    root = metric_root(diffusion) * widths
-    small = math.frexp(np.abs(root).max())[1]
-    root = np.ldexp(root, -small)
-    flow = _halfway(drift, box, shape) @ (root / widths).T
+    finer = tuple(np.linspace(low, high, 2 * n - 1) for (low, high), n in zip(box, shape, strict=True))
+    if diffusion.constant:
+        roots = metric_roots(diffusion, attractor[None])[None]
+    else:
+        roots = _by_rows(lambda x: metric_roots(diffusion, x), finer)
+    roots = roots * widths[[0, 0, 1]]
+    small = math.frexp(np.abs(roots).max())[1]
+    roots = np.ldexp(roots, -small)
+    flow = _by_rows(lambda x: drift_values(drift, x), finer)
+    flow = (square(roots) @ (flow / widths)[..., None])[..., 0]
     fast = math.frexp(np.abs(flow).max())[1]
     flow = np.ldexp(flow, -fast)
     unit = math.ldexp(0.5, 2 * small + fast)  # V of one unit of U within the mesh
@@ -223,7 +226,8 @@ def _marched(
         lowest=np.full(shape, np.inf),
         source=np.full(shape, -1),
         drift=flow,
-        root=root,
+        roots=roots,
+        varies=int(not diffusion.constant),
         reach=reach,
         refined=refined,
     )
@@ -233,14 +237,12 @@ def _marched(
     return MeshQuasipotential((axes[0], axes[1]), known, attractor, unit * highest, STOPS[stop], reach)
 
 
-def _halfway(
-    drift: Callable[[np.ndarray], np.ndarray], box: np.ndarray, shape: tuple[int, int]
-) -> np.ndarray:
-    """F at the nodes and half-way between them, shape ``(2 nx - 1, 2 ny - 1, 2)``."""
-    first, second = (np.linspace(low, high, 2 * n - 1) for (low, high), n in zip(box, shape, strict=True))
-    values = np.empty((len(first), len(second), 2))
+def _by_rows(function: Callable[[np.ndarray], np.ndarray], axes: Sequence[np.ndarray]) -> np.ndarray:
+    """A function of points ``(n, 2)`` on a rectangular mesh, some rows of it at a time."""
+    first, second = axes
     rows = max(AT_ONCE // len(second), 1)
+    parts = []
     for row in range(0, len(first), rows):
         points = np.stack(np.meshgrid(first[row : row + rows], second, indexing="ij"), axis=-1)
-        values[row : row + rows] = drift_values(drift, points.reshape(-1, 2)).reshape(points.shape)
-    return values
+        parts.append(function(points.reshape(-1, 2)).reshape(*points.shape[:2], -1))
+    return np.concatenate(parts)

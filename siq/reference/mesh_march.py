@@ -36,8 +36,11 @@ class Mesh(NamedTuple):
         The lowest value by a segment from a single node, and that node as ``i * ny + j``.
     drift
         R f at the nodes and half-way, shape ``(2 nx - 1, 2 ny - 1, 2)``.
-    root
-        R, with which lengths in ``D⁻¹`` become plain ones.
+    roots
+        R, with which lengths in ``D⁻¹`` become plain ones: R₁₁, R₂₁ and R₂₂ where `drift` is, shape
+        ``(2 nx - 1, 2 ny - 1, 3)``; ``(1, 1, 3)`` of a D that is the same everywhere.
+    varies
+        1 where D depends on the state, 0 elsewhere.
     reach
         Longest segment.
     refined
@@ -49,7 +52,8 @@ class Mesh(NamedTuple):
     lowest: np.ndarray
     source: np.ndarray
     drift: np.ndarray
-    root: np.ndarray
+    roots: np.ndarray
+    varies: int
     reach: int
     refined: bool
 
@@ -179,8 +183,8 @@ def _leave_front(mesh: Mesh, i: int, j: int) -> None:
 @machine_code
 def _action(mesh: Mesh, a: int, b: int, i: int, j: int) -> float:
     """Action of the segment from (a, b) to (i, j); its middle is a node of the mesh half as wide."""
-    u = mesh.root[0, 0] * (i - a)
-    v = mesh.root[1, 0] * (i - a) + mesh.root[1, 1] * (j - b)
+    r, s, t = mesh.roots[mesh.varies * (a + i), mesh.varies * (b + j)]
+    u, v = r * (i - a), s * (i - a) + t * (j - b)
     p, q = mesh.drift[a + i, b + j, 0], mesh.drift[a + i, b + j, 1]
     return math.sqrt((u * u + v * v) * (p * p + q * q)) - (u * p + v * q)
 
@@ -190,26 +194,31 @@ def _from_between(mesh: Mesh, a: int, b: int, c: int, d: int, i: int, j: int) ->
     """The least value of (i, j) by segments from between (a, b) and (c, d), infinite if there is none.
 
     At either end of the pair the segment from a single node has the same value, so that only a minimum
-    inside counts. f in the middle of the segment is linear between its values for the two ends.
+    inside counts. R and R f in the middle of the segment are linear between their values for the two ends,
+    so that R times the segment is a parabola of λ.
     """
-    u, v = mesh.root[0, 0] * (i - a), mesh.root[1, 0] * (i - a) + mesh.root[1, 1] * (j - b)
-    du, dv = mesh.root[0, 0] * (a - c), mesh.root[1, 0] * (a - c) + mesh.root[1, 1] * (b - d)
+    r, s, t = mesh.roots[mesh.varies * (a + i), mesh.varies * (b + j)]
+    dr, ds, dt = mesh.roots[mesh.varies * (c + i), mesh.varies * (d + j)]
+    dr, ds, dt = dr - r, ds - s, dt - t
+    u, v = r * (i - a), s * (i - a) + t * (j - b)
+    du, dv = r * (a - c) + dr * (i - a), s * (a - c) + t * (b - d) + ds * (i - a) + dt * (j - b)
+    ddu, ddv = dr * (a - c), ds * (a - c) + dt * (b - d)
     p, q = mesh.drift[a + i, b + j, 0], mesh.drift[a + i, b + j, 1]
     dp, dq = mesh.drift[c + i, d + j, 0] - p, mesh.drift[c + i, d + j, 1] - q
     rise = mesh.values[c, d] - mesh.values[a, b]
     bend = _second_difference(mesh, a, b, c, d) if mesh.refined else 0.0
 
-    low, low_slope = 0.0, _slope(0.0, u, v, du, dv, p, q, dp, dq, rise, bend)
+    low, low_slope = 0.0, _slope(0.0, u, v, du, dv, ddu, ddv, p, q, dp, dq, rise, bend)
     if low_slope >= 0:
         return math.inf
-    high, high_slope = 1.0, _slope(1.0, u, v, du, dv, p, q, dp, dq, rise, bend)
+    high, high_slope = 1.0, _slope(1.0, u, v, du, dv, ddu, ddv, p, q, dp, dq, rise, bend)
     if high_slope <= 0:
         return math.inf
     share, last = 0.5, 0
     for _ in range(MOST_SECANTS):
         before = share
         share = (low * high_slope - high * low_slope) / (high_slope - low_slope)
-        slope = _slope(share, u, v, du, dv, p, q, dp, dq, rise, bend)
+        slope = _slope(share, u, v, du, dv, ddu, ddv, p, q, dp, dq, rise, bend)
         if abs(share - before) < PRECISION:
             break
         # Of an end that stays twice in a row the slope is halved (Illinois), or the other would creep.
@@ -221,7 +230,8 @@ def _from_between(mesh: Mesh, a: int, b: int, c: int, d: int, i: int, j: int) ->
             low, low_slope = share, slope
             high_slope *= 0.5 if last == -1 else 1.0
             last = -1
-    u, v, p, q = u + share * du, v + share * dv, p + share * dp, q + share * dq
+    u, v = u + share * (du + share * ddu), v + share * (dv + share * ddv)
+    p, q = p + share * dp, q + share * dq
     base = mesh.values[a, b] + share * rise - bend * share * (1 - share) / 2
     return base + math.sqrt((u * u + v * v) * (p * p + q * q)) - (u * p + v * q)
 
@@ -233,6 +243,8 @@ def _slope(
     v: float,
     du: float,
     dv: float,
+    ddu: float,
+    ddv: float,
     p: float,
     q: float,
     dp: float,
@@ -241,7 +253,9 @@ def _slope(
     bend: float,
 ) -> float:
     """Derivative by λ of the value that `_from_between` minimises."""
-    u, v, p, q = u + share * du, v + share * dv, p + share * dp, q + share * dq
+    u, v = u + share * (du + share * ddu), v + share * (dv + share * ddv)
+    du, dv = du + 2 * share * ddu, dv + 2 * share * ddv
+    p, q = p + share * dp, q + share * dq
     length, speed = math.sqrt(u * u + v * v), math.sqrt(p * p + q * q) + 1e-300
     product = (p * dp + q * dq) * length / speed + (u * du + v * dv) * speed / length
     return rise - bend * (0.5 - share) + product - (u * dp + v * dq + p * du + q * dv)

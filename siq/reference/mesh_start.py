@@ -30,24 +30,24 @@ def check_arguments(
     level: float | None,
 ) -> None:
     """Refuse arguments of the wrong shape or sign."""
-    if not diffusion.constant:
-        raise ValueError("the mesh knows only a D that is the same everywhere; use characteristics instead")
     for name, array, wanted in (
         ("attractor", attractor, (2,)),
         ("hessian", hessian, (2, 2)),
         ("box", box, (2, 2)),
-        ("diffusion", diffusion.matrix, (2, 2)),
     ):
         if array.shape != wanted or not np.isfinite(array).all():
             raise ValueError(f"the {name} must be finite numbers of shape {wanted}: the mesh has two states")
+    noise = diffusion.at(attractor[None])[0]
+    if noise.shape != (2, 2):
+        raise ValueError(f"the diffusion is one of {len(noise)} states: the mesh has two")
     if len(shape) != 2 or min(shape) < FEWEST:
         raise ValueError(f"a mesh of {shape} nodes is too coarse; give at least {FEWEST} along each state")
     scale = np.sqrt(np.abs(np.diag(hessian)))
     ratio = hessian / np.maximum(np.outer(scale, scale), np.finfo(float).tiny)
     if not np.allclose(ratio, ratio.T) or np.diag(hessian).min() <= 0 or np.linalg.eigvalsh(ratio)[0] <= 0:
         raise ValueError(f"the hessian {hessian.tolist()} is not symmetric and positive definite")
-    if not diffusion.regular:
-        raise ValueError(f"the diffusion {diffusion.matrix.tolist()} is not positive definite")
+    if not diffusion.frozen(attractor).regular:
+        raise ValueError(f"the diffusion {noise.tolist()} at the attractor is not positive definite")
     if np.any(box[:, 0] >= box[:, 1]):
         raise ValueError(f"the box {box.tolist()} needs a lower and an upper end for each state")
     if np.any((attractor <= box[:, 0]) | (attractor >= box[:, 1])):
@@ -99,7 +99,7 @@ def check_start(
     push = diffusion.push(attractor + offset, momentum)
     # Of H = p·(f + Dp), which vanishes.
     energy = np.sum(momentum * (force + push), axis=1)
-    root = metric_root(diffusion)
+    root = square(metric_roots(diffusion, attractor[None]))[0]
     size = np.linalg.norm(momentum @ np.linalg.inv(root), axis=1) * np.linalg.norm(force @ root.T, axis=1)
     resting = np.linalg.norm(root @ drift_values(drift, attractor[None])[0]) * SMALL
     if resting > SLACK * np.linalg.norm(force @ root.T, axis=1).max():
@@ -114,10 +114,24 @@ def check_start(
     return float((lengths / np.sum(velocity * slope, axis=1)).max())
 
 
-def metric_root(diffusion: Diffusion) -> np.ndarray:
-    """R with ``RᵀR = D⁻¹``, exact in powers of two."""
-    (a, _), (b, c) = diffusion.root
-    return np.array([[1 / a, 0.0], [-b / (a * c), 1 / c]])
+def metric_roots(diffusion: Diffusion, x: np.ndarray) -> np.ndarray:
+    """R with ``RᵀR = D⁻¹`` at points ``(n, 2)``, exact in powers of two: R₁₁, R₂₁, R₂₂, shape ``(n, 3)``.
+
+    Raises
+    ------
+    NumericalFailure
+        Where D is not positive definite.
+    """
+    root = diffusion.root_at(x)
+    a, b, c = root[:, 0, 0], root[:, 1, 0], root[:, 1, 1]
+    return np.stack([1 / a, -b / (a * c), 1 / c], axis=1)
+
+
+def square(roots: np.ndarray) -> np.ndarray:
+    """Lower triangular matrices of their three entries: ``(..., 3)`` to ``(..., 2, 2)``."""
+    matrices = np.zeros((*roots.shape[:-1], 2, 2))
+    matrices[..., 0, 0], matrices[..., 1, 0], matrices[..., 1, 1] = np.moveaxis(roots, -1, 0)
+    return matrices
 
 
 def drift_values(drift: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> np.ndarray:

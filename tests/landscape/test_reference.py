@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.io
+from known_noise import multiplicative
 from known_systems import linear_system, maier_stein, portrait_of, potential_values
 from scipy.interpolate import RegularGridInterpolator
 
@@ -47,6 +48,19 @@ def test_both_references_are_the_exact_quasipotential(smooth) -> None:
     np.testing.assert_allclose(smooth.barriers, 0.5, rtol=1e-5)
     np.testing.assert_allclose(smooth.mesh_barriers, 0.5, rtol=1e-3)
     np.testing.assert_allclose(smooth.heights, 0, atol=1e-6)
+
+
+def test_both_references_are_exact_where_the_noise_depends_on_the_state() -> None:
+    known = multiplicative(2)
+    found = reference_of(known)
+    exact = 2 * potential_values(known, found.points)
+    for index, attractor in enumerate(found.attractors):
+        own = exact - 2 * potential_values(known, attractor[None])
+        inside = found.below(index, 0.9)
+        assert inside.sum() > 500
+        assert relative_l2(found.characteristics[index][inside], own[inside]) < 1e-3
+        assert relative_l2(found.mesh[index][inside], own[inside]) < 1e-3
+    np.testing.assert_allclose(found.mesh_barriers, 0.5, rtol=1e-3)
 
 
 def test_a_reference_comes_back_from_its_file(smooth, tmp_path) -> None:
