@@ -12,7 +12,7 @@ from siq.estimation.budget import COMPILATION, Budget
 from siq.estimation.estimation import fit_by_multiple_shooting
 from siq.estimation.fit import Fit
 from siq.estimation.innovations import Noise, with_parameters_changed
-from siq.estimation.jumps import EDGE_SUBSTEPS, jumps_of, spread_edges
+from siq.estimation.jumps import EDGE_SUBSTEPS, jumps_of, sharpened, spread_edges
 from siq.estimation.measurements import Measurements
 from siq.estimation.noise import log_likelihood
 from siq.estimation.trajectories import fit_trajectories
@@ -29,10 +29,16 @@ def fit_with_process_noise_as_needed(
     x: np.ndarray | None = None,
     budget: Budget | None = None,
 ) -> Fit:
-    """Fit with process noise estimated, and without; the simpler unless the data speak against it."""
-    return simpler_fit(
-        *fit_with_and_without_process_noise(model, data, begin, level=level, x=x, budget=budget)
-    )
+    """Fit with process noise estimated, and without; the simpler unless the data speak against it.
+
+    A jump that is spread too far leaves errors which random forces stand in for. Before they are believed the
+    jumps of the fit without them are followed more finely.
+    """
+    loose, strict = fit_with_and_without_process_noise(model, data, begin, level=level, x=x, budget=budget)
+    chosen = simpler_fit(loose, strict)
+    if chosen is loose and strict.converged and strict.model.edges:
+        chosen = simpler_fit(loose, sharpened(strict, data, budget=budget))
+    return chosen
 
 
 def simpler_fit(loose: Fit | None, strict: Fit) -> Fit:

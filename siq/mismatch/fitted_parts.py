@@ -14,9 +14,7 @@ from siq.estimation.fit import Fit
 from siq.estimation.linearisation import substeps_needed
 from siq.estimation.process_noise import (
     better_of,
-    fit_with_and_without_process_noise,
     fit_with_process_noise_as_needed,
-    simpler_fit,
 )
 from siq.estimation.trajectories import fit_trajectories
 from siq.mismatch.building import MechanismCandidate
@@ -91,10 +89,8 @@ def _fitted(
     values = np.array([known.get(each.name, 0.0) for each in candidate.model.parameters])
     if not begin.has_process_noise:  # a function that was nearly right may not be followed by another
         begin = replace(begin, noise=replace(begin.noise, process=fit.noise.process))
-    trial = simpler_fit(
-        *fit_with_and_without_process_noise(
-            candidate.model.with_values(values), data, begin, level=level, budget=budget
-        )
+    trial = fit_with_process_noise_as_needed(
+        candidate.model.with_values(values), data, begin, level=level, budget=budget
     )
     # A function may be steeper than the simulation, whose steps are then too long to follow it.
     needed = substeps_needed(trial.model, data, trial.model.values, trial.x, tolerance=SUBSTEP_ERROR)

@@ -23,6 +23,7 @@ LEVELS = (1.0, 0.1, 1e-2, 1e-3, 1e-4, 0.0)
 """Process noise, relative to that of the fit."""
 LARGEST_PORTION = 20_000_000  # numbers that are worked out at once; with copies about a gigabyte
 LEAST_PORTION = 10  # columns
+CLEARLY = 2.0  # standard errors below zero, from which on an amplitude is taken for negative
 COLLINEAR = 0.02  # share of a column left beside the parameters, below which its amplitude knows no bounds
 
 
@@ -138,7 +139,7 @@ def screen(
     groups
         The columns of each group, counted behind the parameters'.
     positive
-        For each group which amplitudes must not be negative; a group that would need one gains nothing.
+        For each group which amplitudes must not be negative; one that would be is zero.
 
     Raises
     ------
@@ -166,18 +167,37 @@ def screen(
                 continue
             best[place] = replace(best[place], finite=True)
             gram = columns[:, group].T @ columns[:, group]
-            amplitudes, covariance = _small_solve(gram, overlap[group])
-            after = max(total - float(amplitudes @ overlap[group]), 1e-12 * total)
-            scale = after / max(freedom - len(amplitudes), 1)
-            errors = np.sqrt(np.diag(covariance) * scale)
+            amplitudes, errors, after = _admissible(gram, overlap[group], total, freedom, positive[place])
             value = profile_likelihood(after, freedom, white.log_determinant)
-            if (amplitudes[positive[place]] < -2 * errors[positive[place]]).any():
-                continue
-            if value > best[place].gain:
+            if amplitudes.any() and value > best[place].gain:
                 best[place] = Screened(value, level, amplitudes, errors)
     if failure is not None and base == -np.inf:
         raise failure
     return [replace(each, gain=2 * (each.gain - base)) for each in best]
+
+
+def _admissible(
+    gram: np.ndarray, overlap: np.ndarray, total: float, freedom: int, positive: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Amplitudes that their signs allow, their standard errors, and the squares that are left.
+
+    Those that would clearly be negative, and must not, are zero, the clearest first: what is left of a
+    mechanism then is a special case of it.
+    """
+    kept = np.ones(len(overlap), dtype=bool)
+    amplitudes, errors, after = np.zeros(len(overlap)), np.zeros(len(overlap)), total
+    while kept.any():
+        solved, covariance = _small_solve(gram[np.ix_(kept, kept)], overlap[kept])
+        after = max(total - float(solved @ overlap[kept]), 1e-12 * total)
+        spread = np.sqrt(np.diag(covariance) * after / max(freedom - len(solved), 1))
+        amplitudes[kept], errors[kept] = solved, spread
+        below = np.where(positive & kept, -amplitudes / np.maximum(errors, np.finfo(float).tiny), 0.0)
+        worst = int(np.argmax(below))
+        if below[worst] <= CLEARLY:
+            break
+        kept[worst] = False
+        amplitudes[worst] = errors[worst] = 0.0
+    return amplitudes, errors, after if kept.any() else total
 
 
 def _small_solve(gram: np.ndarray, overlap: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
+import sympy
 
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.formulas import compile_values
@@ -17,6 +18,7 @@ from siq.mismatch.nameless_models import MECHANISM, Part
 from siq.mismatch.smooth_functions import CURVE, SURFACE, Smooth
 from siq.mismatch.stated_parts import DescribedCurve, DescribedSurface, Estimate, Evidence, StatedFunction
 
+COORDINATE = sympy.Symbol("coordinate", positive=True)  # positive, so that the root of its square is itself
 GRID = 25  # places along either coordinate of a surface, for its figure
 _KINDS: Mapping[str, Literal["formula", "curve", "surface", "mechanism"]] = {
     FORMULA: "formula",
@@ -136,12 +138,22 @@ def _errors(weights: np.ndarray, part: Part, fit: Fit) -> np.ndarray:
 def _terms(part: Part, model: Dynamics, knots: np.ndarray) -> np.ndarray:
     """What a unit of each coefficient of a formula is at the knots, shape ``(k, c)``."""
     assert part.place is not None
-    candidate, coordinate = part.trial.candidate, symbol("coordinate")
+    candidate = part.trial.candidate
     name, formula = candidate.changes[0]
     factor = dict((*part.place.equations, *part.place.outputs))[name]
     columns = []
     for amplitude in candidate.amplitudes:
-        term = (formula.diff(symbol(amplitude)) / factor).subs(part.place.coordinate, coordinate)
-        value = compile_values([term], [coordinate], common=False)(knots)[0]
+        term = in_coordinate(formula.diff(symbol(amplitude)) / factor, part.place.coordinate)
+        value = compile_values([term], [COORDINATE], common=False)(knots)[0]
         columns.append(np.broadcast_to(np.asarray(value, dtype=float), knots.shape))
     return np.stack(columns, axis=1)
+
+
+def in_coordinate(term: sympy.Expr, coordinate: sympy.Expr) -> sympy.Expr:
+    """A formula in `COORDINATE`, in the place of the formula that the coordinate is.
+
+    The square of ``sqrt(P**2 + Q**2)`` has no root in it, so that what stands under the root is replaced.
+    """
+    if isinstance(coordinate, sympy.Pow) and coordinate.exp == sympy.Rational(1, 2):
+        return term.subs(coordinate.base, COORDINATE**2)
+    return term.subs(coordinate, COORDINATE)

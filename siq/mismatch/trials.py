@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,7 +17,9 @@ from siq.estimation.linearisation import Grid
 from siq.estimation.measurements import Measurements
 from siq.estimation.process_noise import fit_with_process_noise_as_needed, least_to_believe
 from siq.mismatch.building import MechanismCandidate
+from siq.mismatch.on_top import rebased
 from siq.mismatch.probes import Probe, ProbeColumns
+from siq.mismatch.promises import screen_all
 from siq.mismatch.screening import Screened
 from siq.mismatch.tried import (
     BUDGET_SPENT,
@@ -111,7 +114,7 @@ def fit_most_promising(
         better = _better_start(probe.candidate, trials)
         if better is not None:
             budget.says(f"once more: {probe.candidate.label}")
-            attempt(probe, result, better)
+            attempt(_with_shapes_on_top(probe, better, base_model, data, budget), result, better.fit)
     sharp = _with_jumps_followed(list(trials.values()), current, data, blocks=blocks, budget=budget)
     return sharp, [each for label, each in failed.items() if label not in trials]
 
@@ -184,7 +187,9 @@ def _tried(
     return judged(trial, current, data, candidate, blocks=blocks)
 
 
-def _better_start(candidate: MechanismCandidate, trials: Mapping[str, TriedMechanism]) -> Fit | None:
+def _better_start(
+    candidate: MechanismCandidate, trials: Mapping[str, TriedMechanism]
+) -> TriedMechanism | None:
     """Where a candidate is begun once more: one that led nowhere, or to less than a special case of it."""
     own = trials.get(candidate.label)
     if own is None:
@@ -193,11 +198,33 @@ def _better_start(candidate: MechanismCandidate, trials: Mapping[str, TriedMecha
         rivals = [
             each
             for each in trials.values()
-            if each.candidate.name in candidate.generalises
-            and each.candidate.equations == candidate.equations
-            and each.delta_chi2 > own.delta_chi2
+            if _special_case(each.candidate, candidate) and each.delta_chi2 > own.delta_chi2
         ]
-    return max(rivals, key=lambda each: each.delta_chi2).fit if rivals else None
+    return max(rivals, key=lambda each: each.delta_chi2) if rivals else None
+
+
+def _special_case(one: MechanismCandidate, of: MechanismCandidate) -> bool:
+    return one.name in of.generalises and one.equations == of.equations
+
+
+def _with_shapes_on_top(
+    probe: Probe, better: TriedMechanism, base_model: Dynamics, data: Measurements, budget: Budget
+) -> Probe:
+    """A candidate's probe with the shapes that promise most on top of a special case of it.
+
+    Beside the simulation alone they may all promise the same: the special case. Where the fit is that of
+    another mechanism, and where nothing can be screened, the shapes stay as they are.
+    """
+    candidate = probe.candidate
+    if not (candidate.shapes and _special_case(better.candidate, candidate)):
+        return probe
+    on_top = replace(rebased(candidate, base_model, better.fit.model), positive=frozenset())
+    screened, _ = screen_all(better.fit.model, data, better.fit, [on_top], budget=budget)
+    if not screened:
+        return probe
+    best, _ = max(screened, key=lambda each: each[1].gain)
+    values = [value for _, value in best.shapes]
+    return replace(probe, shapes=tuple(zip(candidate.shapes, values, strict=True)))
 
 
 def with_start(probe: Probe, result: Screened, base: Dynamics) -> Dynamics:

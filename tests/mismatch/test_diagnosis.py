@@ -250,6 +250,15 @@ def test_unequal_friction_is_found_though_its_first_fit_may_lead_nowhere(tmp_pat
     assert diagnosis.investigation.search.fit.substeps > 12  # the jump was made sharp enough
 
 
+def test_random_forces_stand_for_no_jump_that_is_spread_too_far(tmp_path: Path) -> None:
+    def force(x: np.ndarray, v: np.ndarray, t: float) -> np.ndarray:
+        return -(0.1 + 0.25 * np.exp(-((v / 0.6) ** 2))) * np.tanh(v / 1e-3)
+
+    diagnosis = solved(tmp_path, recordings_of(force, noise=0.003))
+    assert names(diagnosis) == ["Stribeck friction"]
+    assert not diagnosis.investigation.search.fit.has_process_noise
+
+
 @pytest.mark.slow
 def test_a_function_of_a_sensor_is_located_in_what_is_measured(tmp_path: Path) -> None:
     table = recordings_of(nothing, count=4)

@@ -59,7 +59,7 @@ def test_a_function_whose_fit_leads_away_begins_again(monkeypatch: pytest.Monkey
 
     right = fitted()
     away = replace(right, log_likelihood=alone.log_likelihood - 50, model=right.model.with_values(np.ones(2)))
-    monkeypatch.setattr(fitted_parts, "fit_with_and_without_process_noise", lambda *_, **__: (None, away))
+    monkeypatch.setattr(fitted_parts, "fit_with_process_noise_as_needed", lambda *_, **__: away)
     again = fitted()
     assert again.log_likelihood == pytest.approx(right.log_likelihood, abs=0.5)
     np.testing.assert_allclose(again.model.values, right.model.values, atol=0.02)

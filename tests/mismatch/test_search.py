@@ -28,6 +28,7 @@ from siq.mismatch.naming import Naming, naming_of
 from siq.mismatch.on_top import once_more
 from siq.mismatch.remainder import Remainder
 from siq.mismatch.roles import Roles
+from siq.mismatch.screening import screen
 from siq.mismatch.search_options import SearchOptions
 from siq.mismatch.structure import Curve, Direction, Structure
 from siq.mismatch.tried import TriedMechanism
@@ -99,6 +100,29 @@ def test_every_place_at_which_a_shape_was_looked_for_is_a_chance(decaying: Dynam
     )
     alone = correlated_probability(fit, data, once, gained=30.0)
     assert correlated_probability(fit, data, often, gained=30.0) == pytest.approx(180 * alone)
+
+
+def test_an_amplitude_that_may_not_be_negative_is_zero_and_leaves_the_special_case(
+    decaying: Dynamics,
+) -> None:
+    t = np.linspace(0, 3, 400)
+    shapes = np.stack([np.sin(6 * t), np.cos(9 * t)], axis=1)
+    noise = 0.01 * np.random.default_rng(5).normal(size=400)
+    fit, data = fit_with_errors(decaying, shapes @ [0.05, -0.05] + noise)
+    known = fit.linearisation
+    with_shapes = replace(
+        known,
+        measured_response=np.concatenate([known.measured_response, shapes[:, None, :]], axis=2),
+        response=np.concatenate([known.response, np.zeros((*known.response.shape[:2], 2))], axis=2),
+    )
+    either, first, both = screen(
+        with_shapes, data, fit, [slice(0, 2), slice(0, 1), slice(0, 2)],
+        positive=[np.array([True, True]), np.array([True]), np.array([False, False])],
+    )  # fmt: skip
+    assert either.amplitudes[1] == 0
+    assert either.amplitudes[0] == pytest.approx(first.amplitudes[0])
+    assert either.gain == pytest.approx(first.gain)
+    assert both.amplitudes[1] < 0 and both.gain > either.gain > 0
 
 
 def test_a_mechanism_that_was_found_is_not_found_once_more_in_another_form() -> None:
