@@ -140,13 +140,10 @@ def main(results: Path) -> None:
     """Write what the results give, and fill in the README."""
     known = json.loads(FIGURES.read_text(encoding="utf-8"))
     for group, (tables, read, command) in SOURCES.items():
-        try:
-            found = read(results / tables)
-        except FileNotFoundError:
-            print(
-                f"{group}: {results / tables} has no tables; its figures stay as they were", file=sys.stderr
-            )
+        if not (results / tables).is_dir():
+            print(f"{group}: there is no {results / tables}; its figures stay as they were", file=sys.stderr)
             continue
+        found = read(results / tables)
         known.setdefault(group, {}).update(
             {
                 name: {"value": value, "command": command, "source": f"results/{tables}"}
