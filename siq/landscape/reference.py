@@ -46,7 +46,8 @@ class ReferenceLandscape:
         Shape ``(n, d)``.
     characteristics, mesh
         U about each attractor, zero there, shape ``(k, n)``; NaN where the method does not tell. The mesh is
-        NaN throughout where there are not two states, or D is not positive definite somewhere in the box.
+        NaN throughout where there are not two states, or somewhere in the box f is not finite or D not
+        positive definite.
     barriers
         Lowest barrier of U out of each well, by minimum action, shape ``(k,)``; infinite without a saddle.
     mesh_barriers
@@ -156,7 +157,7 @@ def reference_landscape(
 def _mesh(
     dynamics: Dynamics, attractor: np.ndarray, box: np.ndarray, *, level: float
 ) -> MeshQuasipotential | None:
-    """V of two states on a mesh; none where D is not positive definite in the whole box."""
+    """V of two states on a mesh; none where f is not finite, or D not positive definite, in the whole box."""
     try:
         return mesh_quasipotential(
             dynamics.drift, attractor, hessian=hessian_at(dynamics, attractor), box=box,
