@@ -111,12 +111,13 @@ class Progress:
         return f": {said[-1]}" if said else ""
 
     def left(self) -> float | None:
-        """Seconds that are left, as far as can be told; None before anything has begun."""
+        """Seconds that are left; None before anything began, and where it takes longer than was thought."""
         if self._began is None or not self._work:
             return None
         spent = self._latest - self._began
         pace = spent / self._worked if self._worked and spent > 0 else 1.0
-        return max((self._work - self._worked) * pace - (self.clock() - self._latest), 0.0)
+        left = (self._work - self._worked) * pace - (self.clock() - self._latest)
+        return None if left < 0 and self.running else max(left, 0.0)
 
     def line(self) -> str:
         """Where it stands, in one line."""

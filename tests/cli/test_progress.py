@@ -40,6 +40,16 @@ def test_the_line_says_what_runs_how_many_of_how_many_and_the_time_left() -> Non
     assert progress.left() is not None and progress.done == 1
 
 
+def test_a_job_that_takes_longer_than_was_thought_promises_no_end() -> None:
+    clock = Clock()
+    progress = Progress(clock=clock)
+    for event in EVENTS:
+        progress.take(event)
+    clock.now += 10_000
+    assert progress.left() is None
+    assert progress.line() == "2 of 3: refining (bead)"
+
+
 def test_a_job_says_what_it_is_doing() -> None:
     progress = Progress(clock=Clock())
     for event in EVENTS:
