@@ -21,7 +21,8 @@ from siq.estimation.measurements import Measurements
 from siq.estimation.trajectories import fit_trajectories
 
 EDGE_SUBSTEPS = 12  # between samples, for models whose f jumps
-FINEST = 384  # the same, where the likelihood still changes
+# A guard, for where the likelihood still changes. Friction that sticks took more than 96 at 40 dB.
+FINEST = 384
 SHARP = 0.5  # change of the log-likelihood by halving the substeps, below which a jump is sharp enough
 EDGE = 0.05  # width of a jump, in what its argument passes in a substep
 

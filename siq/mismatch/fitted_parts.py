@@ -12,10 +12,7 @@ from siq.estimation.budget import BudgetSpent
 from siq.estimation.estimation import SUBSTEP_ERROR
 from siq.estimation.fit import Fit
 from siq.estimation.linearisation import substeps_needed
-from siq.estimation.process_noise import (
-    better_of,
-    fit_with_process_noise_as_needed,
-)
+from siq.estimation.process_noise import better_of, fit_with_process_noise_as_needed
 from siq.estimation.trajectories import fit_trajectories
 from siq.mismatch.building import MechanismCandidate
 from siq.mismatch.function_places import Place

@@ -37,17 +37,17 @@ def check_arguments(
     ):
         if array.shape != wanted or not np.isfinite(array).all():
             raise ValueError(f"the {name} must be finite numbers of shape {wanted}: the mesh has two states")
-    noise = diffusion.at(attractor[None])[0]
-    if noise.shape != (2, 2):
-        raise ValueError(f"the diffusion is one of {len(noise)} states: the mesh has two")
+    if diffusion.dimension != 2:  # asked before D is evaluated, which takes a state of its own dimension
+        raise ValueError(f"the diffusion is one of {diffusion.dimension} states: the mesh has two")
     if len(shape) != 2 or min(shape) < FEWEST:
         raise ValueError(f"a mesh of {shape} nodes is too coarse; give at least {FEWEST} along each state")
     scale = np.sqrt(np.abs(np.diag(hessian)))
     ratio = hessian / np.maximum(np.outer(scale, scale), np.finfo(float).tiny)
     if not np.allclose(ratio, ratio.T) or np.diag(hessian).min() <= 0 or np.linalg.eigvalsh(ratio)[0] <= 0:
         raise ValueError(f"the hessian {hessian.tolist()} is not symmetric and positive definite")
-    if not diffusion.frozen(attractor).regular:
-        raise ValueError(f"the diffusion {noise.tolist()} at the attractor is not positive definite")
+    noise = diffusion.frozen(attractor)
+    if not noise.regular:
+        raise ValueError(f"the diffusion {noise.matrix.tolist()} at the attractor is not positive definite")
     if np.any(box[:, 0] >= box[:, 1]):
         raise ValueError(f"the box {box.tolist()} needs a lower and an upper end for each state")
     if np.any((attractor <= box[:, 0]) | (attractor >= box[:, 1])):
