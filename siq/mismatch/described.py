@@ -20,6 +20,7 @@ from siq.mismatch.fitted_functions import with_a_function
 from siq.mismatch.fitted_smooth import with_surfaces
 from siq.mismatch.found import Search
 from siq.mismatch.likely_places import FITTED
+from siq.mismatch.memories import memory_suspected, with_memories
 from siq.mismatch.nameless_models import MECHANISM, Material, Model, Part, runs_freely, weighed
 from siq.mismatch.remainder import something_left
 from siq.mismatch.tried import admissible
@@ -48,6 +49,8 @@ def models_of_the_nameless(
     models = weighed(models, base, data)
     if functions is None:
         models = weighed([*models, *with_surfaces(base, models, material)], base, data)
+        if memory_suspected(models, data):
+            models = weighed([*models, *with_memories(base, models, material)], base, data)
     best = models[0] if models else None
     if (
         best is not None

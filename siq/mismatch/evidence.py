@@ -272,7 +272,8 @@ def log_evidence_of(fit: Fit, data: Measurements, *, correlated: float = 1.0) ->
     parameters, so that explanations with and without them can be compared. What the recordings do not tell
     of the parameters does not count. Of parameters of which something is expected together, such as the
     heights of a smooth function, the likelihood is averaged over that (Laplace's approximation,
-    -½ log det(1 + K G)), so that they count as few as the data tell.
+    -½ log det(1 + K G)), so that they count as few as the data tell. Where a recording begins is a parameter
+    for each state, so that a hidden state more has to be worth its beginnings.
 
     Parameters
     ----------
@@ -289,6 +290,8 @@ def log_evidence_of(fit: Fit, data: Measurements, *, correlated: float = 1.0) ->
     variances = int((fit.noise.process > 0).sum())
     count = max(float(white.known.sum()) / correlated, 2.0)
     price = 0.5 * (basis.shape[1] + variances) * np.log(count)
+    beginnings = fit.model.dimension * len(data.labels)
+    price += 0.5 * beginnings * np.log(max(count / len(data.labels), 2.0))
     if smooth:
         together = fit.model.expected_together
         own = white.columns[:, [names.index(name) for each in together for name in each.names]]

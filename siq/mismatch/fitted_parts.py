@@ -28,13 +28,14 @@ LARGEST_PART = 0.25  # of the work left, that a single fit may take: a choice
 def fitted_part(
     candidate: MechanismCandidate,
     level: float,
-    place: Place,
+    place: Place | None,
     fit: Fit,
     cost: float,
     material: Material,
     *,
     smooth: Smooth | None = None,
     begin: Fit | None = None,
+    x: np.ndarray | None = None,
 ) -> list[Part]:
     """A function as part of a model, or nothing where it cannot be fitted.
 
@@ -45,7 +46,7 @@ def fitted_part(
     level
         Of random forces to begin with, as a multiple of those of the fit.
     place
-        Where the function stands.
+        Where the function stands; None for one of what was.
     fit
         The simulation without it.
     cost
@@ -56,12 +57,14 @@ def fitted_part(
         See `siq.mismatch.nameless_models.Part`.
     begin
         Where the fit begins, if it is not the simulation without the function.
+    x
+        States to begin with, shape ``(n, d)``, where the function brings further ones.
     """
     kind = FORMULA if smooth is None else smooth.kind
     try:
         material.budget.says(f"a {kind}: {candidate.label}")
         with material.budget.part(LARGEST_PART):
-            trial = _fitted(candidate, level, begin or fit, fit, material)
+            trial = _fitted(candidate, level, begin or fit, fit, material, x=x)
     except (*UNFORESEEN, BudgetSpent) as error:
         LOGGER.info("%s as a %s cannot be fitted: %s", candidate.label, kind, error)
         return []
@@ -69,7 +72,13 @@ def fitted_part(
 
 
 def _fitted(
-    candidate: MechanismCandidate, level: float, begin: Fit, fit: Fit, material: Material
+    candidate: MechanismCandidate,
+    level: float,
+    begin: Fit,
+    fit: Fit,
+    material: Material,
+    *,
+    x: np.ndarray | None = None,
 ) -> TriedMechanism:
     """A function, fitted from a fit on, and judged against the fit without it.
 
@@ -80,14 +89,12 @@ def _fitted(
     """
     data, budget = material.data, material.budget
     known = {each.name: each.value for each in begin.model.parameters}
-    known |= {
-        each.name: each.value for each in candidate.model.parameters if each.name in candidate.amplitudes
-    }
+    known |= {each.name: each.value for each in candidate.model.parameters if each.name in candidate.new}
     values = np.array([known.get(each.name, 0.0) for each in candidate.model.parameters])
     if not begin.has_process_noise:  # a function that was nearly right may not be followed by another
         begin = replace(begin, noise=replace(begin.noise, process=fit.noise.process))
     trial = fit_with_process_noise_as_needed(
-        candidate.model.with_values(values), data, begin, level=level, budget=budget
+        candidate.model.with_values(values), data, begin, level=level, x=x, budget=budget
     )
     # A function may be steeper than the simulation, whose steps are then too long to follow it.
     needed = substeps_needed(trial.model, data, trial.model.values, trial.x, tolerance=SUBSTEP_ERROR)
@@ -99,7 +106,7 @@ def _fitted(
         damped = fit_trajectories(
             candidate.model.with_values(values),
             data,
-            begin=begin.x[data.first[:-1]],
+            begin=(begin.x if x is None else x)[data.first[:-1]],
             noise=begin.noise,
             substeps=trial.substeps,
             budget=budget,

@@ -72,7 +72,7 @@ def fit_most_promising(
         Those whose fit settled, with signs that their mechanism allows; and the others, with the reason.
     """
     budget = budget or Budget()
-    best = _best_probes(screened)
+    best = best_probes(screened)
     ranked = sorted(best.values(), key=lambda each: -each[1].gain)
     trials: dict[str, TriedMechanism] = {}
     failed: dict[str, UntriedMechanism] = {}
@@ -119,7 +119,7 @@ def fit_most_promising(
     return sharp, [each for label, each in failed.items() if label not in trials]
 
 
-def _best_probes(
+def best_probes(
     screened: Sequence[tuple[Probe, Screened]],
 ) -> dict[str, tuple[Probe, Screened]]:
     """Of each candidate the probe that promises most, by label; none that promises nothing."""

@@ -1,0 +1,175 @@
+"""Memories: does what is missing depend on what a coordinate was, and not only on what it is?
+
+A body that warms up, a store that fills, a prey that takes time to become a predator: what such a thing does
+depends on a hidden state that follows a coordinate late, ``z' = (x - z)/τ``. A function of what is measured now
+can only imitate it, mostly as one of the time. Such forms have no name of their own; they describe what is
+missing where they are likelier than any function.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import sympy
+
+from siq.estimation.fit import Fit
+from siq.estimation.linearisation import Grid
+from siq.estimation.measurements import Measurements
+from siq.mismatch.building import MechanismCandidate
+from siq.mismatch.candidates import candidates_of
+from siq.mismatch.dictionary import Form, FurtherState, Mechanism, MechanismParameter, Role, Shape
+from siq.mismatch.fitted_parts import LARGEST_PART, fitted_part
+from siq.mismatch.nameless_models import Material, Model, Part
+from siq.mismatch.probes import Probe, ProbeColumns
+from siq.mismatch.promises import screen_all
+from siq.mismatch.remainder import something_left
+from siq.mismatch.screening import Screened
+from siq.mismatch.trials import best_probes
+from siq.mismatch.tried import admissible
+
+LOGGER = logging.getLogger(__name__)
+# Of the time in which a coordinate changes: τ is tried here, and fitted. A memory much shorter is none, and of
+# one much longer a recording tells the beginning.
+TIMES = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
+DAMPINGS = (0.1, 1.0)  # of what rings: little, and so much that it hardly does
+MOST = 6  # memories that are fitted, the most promising ones: a choice
+
+
+def memory_suspected(models: Sequence[Model], data: Measurements) -> bool:
+    """Whether models leave room for a memory: all but a function of one coordinate that leaves nothing.
+
+    The time is no such coordinate, since nothing but the time itself knows it: what seems to depend on it may
+    have been brought about before.
+
+    Parameters
+    ----------
+    models
+        Of what has no name, the likeliest first.
+    data
+        The recordings.
+    """
+    if not models:
+        return True
+    best = models[0]
+    place = best.parts[0].place
+    told = len(best.parts) == 1 and place is not None and len(place.words) == 1 and place.words[0] != "t"
+    return not told or something_left(best.fit, data)
+
+
+def with_memories(fit: Fit, models: Sequence[Model], material: Material) -> list[Model]:
+    """Models with a hidden state that follows a coordinate late.
+
+    Parameters
+    ----------
+    fit
+        Of the simulation without them.
+    models
+        Others: the equations in which these have something come first, should work be scarce.
+    material
+        What models are made from.
+    """
+    likely = {name for each in models for part in each.parts for name in part.trial.candidate.equations}
+    candidates = sorted(memories_of(fit, material), key=lambda each: not likely & set(each.equations))
+    if not candidates:
+        return []
+    cost = float(np.log(len(candidates)))
+    # Nobody knows what was remembered when a recording began: what was there already, or nothing.
+    begun = [
+        each
+        for one in candidates
+        for each in (one, replace(one, begins=(sympy.Integer(0),) * len(one.begins)))
+    ]
+    with material.budget.part(LARGEST_PART):
+        screened, _ = screen_all(fit.model, material.data, fit, begun, budget=material.budget)
+    found: list[Model] = []
+    ranked = sorted(best_probes(screened).values(), key=lambda each: -each[1].gain)
+    for probe, result in ranked[:MOST]:
+        if result.gain < 2 * cost:
+            break
+        found += [Model((part,), part.trial.fit) for part in _fitted(probe, result, fit, cost, material)]
+    return found
+
+
+def _fitted(probe: Probe, result: Screened, fit: Fit, cost: float, material: Material) -> list[Part]:
+    """A memory fitted from no effect on, with the τ that promises most."""
+    candidate, model = probe.candidate, probe.candidate.model
+    known = dict(probe.shapes)
+    values = [known.get(each.name, each.value) for each in model.parameters]
+    candidate = replace(candidate, model=model.with_values(np.array(values)))
+    along = ProbeColumns(fit.model, Grid(material.data, fit.substeps), [probe], fit.x, fit.model.values)
+    x = np.concatenate([fit.x, along.further_states(0)], axis=1)
+    parts = fitted_part(candidate, result.level, None, fit, cost, material, x=x)
+    for each in parts:
+        LOGGER.info("%s: chi2 better by %.1f", candidate.label, each.trial.delta_chi2)
+    return [each for each in parts if admissible(each.trial.fit, candidate)]
+
+
+def memories_of(fit: Fit, material: Material) -> list[MechanismCandidate]:
+    """A memory of every coordinate in every equation that says more than a definition."""
+    what = Mechanism(name="memory", sentence="What is missing follows a coordinate late.", forms=FORMS)
+    return [_named(each) for each in candidates_of(fit.model, material.roles, (what,))]
+
+
+def _named(candidate: MechanismCandidate) -> MechanismCandidate:
+    name = f"a memory of {candidate.coordinate}"
+    variant = f", {candidate.variant}" if candidate.variant else ""
+    return replace(candidate, name=name, label=f"{name} in {', '.join(candidate.equations)}{variant}")
+
+
+def _late(of: str) -> Shape:
+    return Shape(time_of=of, at=TIMES)
+
+
+def _form(roles: dict[str, Role], of: str, terms: dict[str, str], unit: str, variant: str = "") -> Form:
+    """A form in which z follows a coordinate, and acts with the amplitude c."""
+    return Form(
+        roles=roles,
+        states={"z": FurtherState(equation=f"({of} - z)/tau", begin=of, unit=of, scale=of)},
+        terms=terms,
+        parameters={
+            "c": MechanismParameter(unit=unit),
+            "tau": MechanismParameter(sign="positive", unit="T", shape=_late(of)),
+        },
+        coordinate="amplitude" if "**" in of else of,
+        variant=variant,
+    )
+
+
+def _forms_of(roles: dict[str, Role], of: str) -> tuple[Form, ...]:
+    """What is remembered as a force, and as a rate at which the state grows; and what rings."""
+    ringing = Form(
+        roles=roles,
+        states={
+            "z": FurtherState(equation="y", begin=of, unit=of, scale=of),
+            "y": FurtherState(equation=f"({of} - z)/tau**2 - k*y/tau", unit=f"{of}/T", scale=of),
+        },
+        terms={"q": "c*z"},
+        parameters={
+            "c": MechanismParameter(unit=f"q/T/{of}"),
+            "tau": MechanismParameter(sign="positive", unit="T", shape=_late(of)),
+            "k": MechanismParameter(sign="positive", shape=Shape(scale_of="1", at=DAMPINGS)),
+        },
+        coordinate=of,
+        variant="that rings",
+    )
+    return (
+        _form(roles, of, {"q": "c*z"}, f"q/T/{of}"),
+        _form(roles, of, {"q": "c*z*q"}, f"1/T/{of}", "as a rate"),
+        ringing,
+    )
+
+
+# In a rotating frame what is remembered is the intensity, which shifts the frequency, or damps.
+INTENSITY = "p**2 + q**2"
+PAIR: dict[str, Role] = {"p": "amplitude", "q": "amplitude"}
+FORMS = (
+    *_forms_of({"q": "state"}, "q"),
+    *_forms_of({"x": "state", "q": "state"}, "x"),
+    *_forms_of({"x": "position", "q": "state"}, "x"),
+    *_forms_of({"x": "input", "q": "state"}, "x"),
+    _form(PAIR, INTENSITY, {"p": "c*z*q", "q": "-c*z*p"}, "1/T/p**2", "across the state"),
+    _form(PAIR, INTENSITY, {"p": "c*z*p", "q": "c*z*q"}, "1/T/p**2", "along the state"),
+)
