@@ -44,6 +44,7 @@
 `smoothness`         over which lengths does it change, and how large is it?
 `fitted_smooth`      which smooth function fits best, of one coordinate or of two?
 `fitted_functions`   which functions, as formulas or smooth, fit best?
+`memories`           does what is missing depend on what was?
 `beside`             is a mechanism likelier where a function models the rest?
 `described`          which of these models are candidates for the new card?
 `names`              what is named, and what models the rest?

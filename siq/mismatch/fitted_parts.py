@@ -35,7 +35,6 @@ def fitted_part(
     *,
     smooth: Smooth | None = None,
     begin: Fit | None = None,
-    x: np.ndarray | None = None,
 ) -> list[Part]:
     """A function as part of a model, or nothing where it cannot be fitted.
 
@@ -56,15 +55,14 @@ def fitted_part(
     smooth
         See `siq.mismatch.nameless_models.Part`.
     begin
-        Where the fit begins, if it is not the simulation without the function.
-    x
-        States to begin with, shape ``(n, d)``, where the function brings further ones.
+        Where the fit begins, if it is not the simulation without the function: with states for those that
+        the function brings, if it brings any.
     """
     kind = FORMULA if smooth is None else smooth.kind
     try:
         material.budget.says(f"a {kind}: {candidate.label}")
         with material.budget.part(LARGEST_PART):
-            trial = _fitted(candidate, level, begin or fit, fit, material, x=x)
+            trial = _fitted(candidate, level, begin or fit, fit, material)
     except (*UNFORESEEN, BudgetSpent) as error:
         LOGGER.info("%s as a %s cannot be fitted: %s", candidate.label, kind, error)
         return []
@@ -72,13 +70,7 @@ def fitted_part(
 
 
 def _fitted(
-    candidate: MechanismCandidate,
-    level: float,
-    begin: Fit,
-    fit: Fit,
-    material: Material,
-    *,
-    x: np.ndarray | None = None,
+    candidate: MechanismCandidate, level: float, begin: Fit, fit: Fit, material: Material
 ) -> TriedMechanism:
     """A function, fitted from a fit on, and judged against the fit without it.
 
@@ -94,7 +86,7 @@ def _fitted(
     if not begin.has_process_noise:  # a function that was nearly right may not be followed by another
         begin = replace(begin, noise=replace(begin.noise, process=fit.noise.process))
     trial = fit_with_process_noise_as_needed(
-        candidate.model.with_values(values), data, begin, level=level, x=x, budget=budget
+        candidate.model.with_values(values), data, begin, level=level, budget=budget
     )
     # A function may be steeper than the simulation, whose steps are then too long to follow it.
     needed = substeps_needed(trial.model, data, trial.model.values, trial.x, tolerance=SUBSTEP_ERROR)
@@ -106,7 +98,7 @@ def _fitted(
         damped = fit_trajectories(
             candidate.model.with_values(values),
             data,
-            begin=(begin.x if x is None else x)[data.first[:-1]],
+            begin=begin.x[data.first[:-1]],
             noise=begin.noise,
             substeps=trial.substeps,
             budget=budget,

@@ -1,9 +1,10 @@
 """Memories: does what is missing depend on what a coordinate was, and not only on what it is?
 
 A body that warms up, a store that fills, a prey that takes time to become a predator: what such a thing does
-depends on a hidden state that follows a coordinate late, ``z' = (x - z)/τ``. A function of what is measured now
-can only imitate it, mostly as one of the time. Such forms have no name of their own; they describe what is
-missing where they are likelier than any function.
+depends on a hidden state that follows a coordinate late, ``z' = (x - z)/τ``, or that the coordinate makes
+ring, ``τ² z'' + kτ z' + z = x``. A function of what is measured now can only imitate it, mostly as one of the
+time. Such forms have no name of their own; they describe what is missing where they are likelier than any
+function.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ from siq.mismatch.trials import best_probes
 from siq.mismatch.tried import admissible
 
 LOGGER = logging.getLogger(__name__)
-# Of the time in which a coordinate changes: τ is tried here, and fitted. A memory much shorter is none, and of
-# one much longer a recording tells the beginning.
+# Of the time in which a coordinate changes: τ is tried here, and fitted. What is remembered much shorter than
+# that is what is, and of what is remembered much longer a recording tells the beginning.
 TIMES = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 DAMPINGS = (0.1, 1.0)  # of what rings: little, and so much that it hardly does
 MOST = 6  # memories that are fitted, the most promising ones: a choice
@@ -101,7 +102,8 @@ def _fitted(probe: Probe, result: Screened, fit: Fit, cost: float, material: Mat
     candidate = replace(candidate, model=model.with_values(np.array(values)))
     along = ProbeColumns(fit.model, Grid(material.data, fit.substeps), [probe], fit.x, fit.model.values)
     x = np.concatenate([fit.x, along.further_states(0)], axis=1)
-    parts = fitted_part(candidate, result.level, None, fit, cost, material, x=x)
+    begin = replace(fit, x=x)
+    parts = fitted_part(candidate, result.level, None, fit, cost, material, begin=begin)
     for each in parts:
         LOGGER.info("%s: chi2 better by %.1f", candidate.label, each.trial.delta_chi2)
     return [each for each in parts if admissible(each.trial.fit, candidate)]

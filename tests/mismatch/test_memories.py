@@ -1,0 +1,93 @@
+"""Memories: what follows a coordinate late is found as such, and no function of the time stands in for it."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import scipy.linalg
+import sympy
+
+from siq.data.recordings import Recordings
+from siq.dynamics.diffusion import Diffusion
+from siq.dynamics.dynamics import Dynamics, Parameter
+from siq.dynamics.parametric import symbol
+from siq.estimation.fit import Fit
+from siq.estimation.measurements import Measurements, measurements
+from siq.estimation.recalibration import recalibrate
+from siq.mismatch.described import models_of_the_nameless
+from siq.mismatch.found import Search
+from siq.mismatch.function_places import Place
+from siq.mismatch.memories import memories_of, memory_suspected, with_memories
+from siq.mismatch.nameless_models import Material, weighed
+from siq.mismatch.roles import roles_of
+
+X = symbol("x")
+DECAY = Dynamics(
+    ("x",),
+    (-symbol("k") * X,),
+    Diffusion.identity(1),
+    parameters=(Parameter("k", 1.2),),
+    outputs=(("x", X),),
+)
+COUNT = 80
+FLOW = np.array([[-1.0, 0.8], [0.5, -0.5]])  # of x and of what is remembered
+
+
+@pytest.fixture(scope="module")
+def fading() -> Measurements:
+    """Decays, of a rate, that are held back by what x was: ``x' = -x + 0.8 z`` and ``z' = (x - z)/2``."""
+    t = np.linspace(0, 6, COUNT)
+    draw = np.random.default_rng(3)
+    begins = draw.normal(size=(6, 2))
+    x = [[(scipy.linalg.expm(FLOW * each) @ begin)[0] for each in t] for begin in begins]
+    labels = tuple("abcdef")
+    table = Recordings(
+        ("x",), (None,), labels, np.repeat(np.arange(6), COUNT), np.tile(t, 6),
+        (np.concatenate(x) + 0.003 * draw.normal(size=6 * COUNT))[:, None],
+    )  # fmt: skip
+    return measurements(table, DECAY)
+
+
+@pytest.fixture(scope="module")
+def alone(fading: Measurements) -> Fit:
+    return recalibrate(DECAY, fading)[0]
+
+
+def material(data: Measurements) -> Material:
+    return Material(data, roles_of(DECAY), 3, 10, 5)
+
+
+def test_what_x_was_is_likelier_than_any_function(fading: Measurements, alone: Fit) -> None:
+    models = models_of_the_nameless(Search(alone, (), alone, ()), material(fading))
+    (part,) = models[0].parts
+    assert part.trial.candidate.name == "a memory of x"
+    found = {each.name: each.value for each in models[0].fit.model.parameters}
+    # A decay with a memory is a sum of two; of k, c and τ their rates tell two combinations.
+    k, c, tau = found["k"], found["c_1"], found["tau_1"]
+    rates = np.sort(np.linalg.eigvals(np.array([[-k, c], [1 / tau, -1 / tau]])))
+    np.testing.assert_allclose(rates, np.sort(np.linalg.eigvals(FLOW)), rtol=0.05)
+    assert not models[0].fit.has_process_noise
+
+
+def test_a_hidden_state_pays_for_its_beginnings(fading: Measurements, alone: Fit) -> None:
+    (model,) = weighed(with_memories(alone, [], material(fading))[:1], alone, fading)
+    gained = model.fit.log_likelihood - alone.log_likelihood
+    assert model.log_evidence < gained - 0.5 * 6 * np.log(COUNT / 10)
+
+
+def test_every_coordinate_and_equation_has_its_memories(fading: Measurements, alone: Fit) -> None:
+    labels = [each.label for each in memories_of(alone, material(fading))]
+    assert labels == ["a memory of x in x", "a memory of x in x, as a rate", "a memory of x in x, that rings"]
+
+
+@pytest.mark.parametrize(("words", "suspected"), [(("t",), True), (("x", "t"), True), (("x",), False)])
+def test_the_time_is_suspected_of_standing_in_for_what_was(
+    words: tuple[str, ...], *, suspected: bool, fading: Measurements, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("siq.mismatch.memories.something_left", lambda *_: False)
+    place = Place((("x", sympy.Integer(1)),), (), X, words, np.empty(0))
+    model = SimpleNamespace(parts=(SimpleNamespace(place=place),), fit=None)
+    assert memory_suspected([model], fading) is suspected
+    assert memory_suspected([], fading)
