@@ -29,7 +29,7 @@ from siq.mismatch.promises import screen_all
 from siq.mismatch.remainder import something_left
 from siq.mismatch.screening import Screened
 from siq.mismatch.trials import best_probes
-from siq.mismatch.tried import admissible
+from siq.mismatch.tried import UNFORESEEN, admissible
 
 LOGGER = logging.getLogger(__name__)
 # Of the time in which a coordinate changes: τ is tried here, and fitted. What is remembered much shorter than
@@ -100,8 +100,12 @@ def _fitted(probe: Probe, result: Screened, fit: Fit, cost: float, material: Mat
     known = dict(probe.shapes)
     values = [known.get(each.name, each.value) for each in model.parameters]
     candidate = replace(candidate, model=model.with_values(np.array(values)))
-    along = ProbeColumns(fit.model, Grid(material.data, fit.substeps), [probe], fit.x, fit.model.values)
-    x = np.concatenate([fit.x, along.further_states(0)], axis=1)
+    try:
+        along = ProbeColumns(fit.model, Grid(material.data, fit.substeps), [probe], fit.x, fit.model.values)
+        x = np.concatenate([fit.x, along.further_states(0)], axis=1)
+    except UNFORESEEN as error:
+        LOGGER.info("%s cannot be fitted: %s", candidate.label, error)
+        return []
     begin = replace(fit, x=x)
     parts = fitted_part(candidate, result.level, None, fit, cost, material, begin=begin)
     for each in parts:
@@ -125,17 +129,26 @@ def _late(of: str) -> Shape:
     return Shape(time_of=of, at=TIMES)
 
 
-def _form(roles: dict[str, Role], of: str, terms: dict[str, str], unit: str, variant: str = "") -> Form:
-    """A form in which z follows a coordinate, and acts with the amplitude c."""
+def _form(
+    roles: dict[str, Role],
+    of: str,
+    terms: dict[str, str],
+    unit: str,
+    variant: str = "",
+    *,
+    own_unit: str | None = None,
+    coordinate: str | None = None,
+) -> Form:
+    """A form in which z follows a coordinate, or a formula with a unit and a word, and acts with c."""
     return Form(
         roles=roles,
-        states={"z": FurtherState(equation=f"({of} - z)/tau", begin=of, unit=of, scale=of)},
+        states={"z": FurtherState(equation=f"({of} - z)/tau", begin=of, unit=own_unit or of, scale=of)},
         terms=terms,
         parameters={
             "c": MechanismParameter(unit=unit),
             "tau": MechanismParameter(sign="positive", unit="T", shape=_late(of)),
         },
-        coordinate="amplitude" if "**" in of else of,
+        coordinate=coordinate or of,
         variant=variant,
     )
 
@@ -164,14 +177,19 @@ def _forms_of(roles: dict[str, Role], of: str) -> tuple[Form, ...]:
     )
 
 
-# In a rotating frame what is remembered is the intensity, which shifts the frequency, or damps.
-INTENSITY = "p**2 + q**2"
-PAIR: dict[str, Role] = {"p": "amplitude", "q": "amplitude"}
+def _intensity(terms: dict[str, str], variant: str) -> Form:
+    """In a rotating frame what is remembered is the intensity, which shifts the frequency, or damps."""
+    return _form(
+        {"p": "amplitude", "q": "amplitude"}, "p**2 + q**2", terms, "1/T/p**2", variant,
+        own_unit="p**2", coordinate="amplitude",
+    )  # fmt: skip
+
+
 FORMS = (
     *_forms_of({"q": "state"}, "q"),
     *_forms_of({"x": "state", "q": "state"}, "x"),
     *_forms_of({"x": "position", "q": "state"}, "x"),
     *_forms_of({"x": "input", "q": "state"}, "x"),
-    _form(PAIR, INTENSITY, {"p": "c*z*q", "q": "-c*z*p"}, "1/T/p**2", "across the state"),
-    _form(PAIR, INTENSITY, {"p": "c*z*p", "q": "c*z*q"}, "1/T/p**2", "along the state"),
+    _intensity({"p": "c*z*q", "q": "-c*z*p"}, "across the state"),
+    _intensity({"p": "c*z*p", "q": "c*z*q"}, "along the state"),
 )

@@ -82,6 +82,25 @@ def test_every_coordinate_and_equation_has_its_memories(fading: Measurements, al
     assert labels == ["a memory of x in x", "a memory of x in x, as a rate", "a memory of x in x, that rings"]
 
 
+def test_the_intensity_of_a_rotating_frame_has_its_own_unit() -> None:
+    p, q = symbol("P"), symbol("Q")
+    frame = Dynamics(
+        ("P", "Q"),
+        (-symbol("k") * p + q, -symbol("k") * q - p),
+        Diffusion.identity(2),
+        parameters=(Parameter("k", 0.3),),
+        outputs=(("P", p), ("Q", q)),
+        units=("mV", "mV"),
+        time_unit="s",
+    )
+    nothing = SimpleNamespace(model=frame)
+    found = memories_of(nothing, SimpleNamespace(roles=roles_of(frame)))
+    (shift, _) = (each for each in found if each.coordinate == "amplitude")
+    assert shift.label == "a memory of amplitude in P, Q, across the state"
+    assert shift.model.units == ("mV", "mV", "mV**2")
+    assert shift.model.parameters[1].unit == "1/(mV**2*s)"
+
+
 @pytest.mark.parametrize(("words", "suspected"), [(("t",), True), (("x", "t"), True), (("x",), False)])
 def test_the_time_is_suspected_of_standing_in_for_what_was(
     words: tuple[str, ...], *, suspected: bool, fading: Measurements, monkeypatch: pytest.MonkeyPatch
