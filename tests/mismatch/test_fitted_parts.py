@@ -10,9 +10,6 @@ import pytest
 import sympy
 
 from siq.data.recordings import Recordings
-from siq.dynamics.diffusion import Diffusion
-from siq.dynamics.dynamics import Dynamics, Parameter
-from siq.dynamics.parametric import symbol
 from siq.estimation.fit import Fit
 from siq.estimation.measurements import Measurements, measurements
 from siq.estimation.recalibration import recalibrate
@@ -21,15 +18,7 @@ from siq.mismatch.fitted_parts import fitted_part
 from siq.mismatch.function_places import Place
 from siq.mismatch.functions import Power, with_formula
 from siq.mismatch.nameless_models import Material
-
-X = symbol("x")
-DECAY = Dynamics(
-    ("x",),
-    (-symbol("k") * X,),
-    Diffusion.identity(1),
-    parameters=(Parameter("k", 1.2),),
-    outputs=(("x", X),),
-)
+from tests.mismatch.decays import DECAY, X
 
 
 def bent_decays() -> Measurements:

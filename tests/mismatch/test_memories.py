@@ -22,15 +22,8 @@ from siq.mismatch.function_places import Place
 from siq.mismatch.memories import memories_of, memory_suspected, with_memories
 from siq.mismatch.nameless_models import Material, weighed
 from siq.mismatch.roles import roles_of
+from tests.mismatch.decays import DECAY, X
 
-X = symbol("x")
-DECAY = Dynamics(
-    ("x",),
-    (-symbol("k") * X,),
-    Diffusion.identity(1),
-    parameters=(Parameter("k", 1.2),),
-    outputs=(("x", X),),
-)
 COUNT = 80
 FLOW = np.array([[-1.0, 0.8], [0.5, -0.5]])  # of x and of what is remembered
 

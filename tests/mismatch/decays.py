@@ -1,0 +1,16 @@
+"""A decay of a single state, which tests add something to."""
+
+from __future__ import annotations
+
+from siq.dynamics.diffusion import Diffusion
+from siq.dynamics.dynamics import Dynamics, Parameter
+from siq.dynamics.parametric import symbol
+
+X = symbol("x")
+DECAY = Dynamics(
+    ("x",),
+    (-symbol("k") * X,),
+    Diffusion.identity(1),
+    parameters=(Parameter("k", 1.2),),
+    outputs=(("x", X),),
+)
