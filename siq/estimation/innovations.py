@@ -73,6 +73,13 @@ class Noise:
         """The same measurement noise, and states that follow their equations exactly."""
         return replace(self, process=np.zeros_like(self.process))
 
+    def of_states(self, dimension: int) -> Noise:
+        """The same noise where there are more states, or fewer: what is added has none of its own."""
+        if len(self.process) == dimension:
+            return self
+        driven = self.process[:dimension]
+        return replace(self, process=np.append(driven, np.zeros(dimension - len(driven))))
+
     def scaled(self, factor: float) -> Noise:
         """The same measurement noise, with the process noise multiplied."""
         return replace(self, process=self.process * factor)

@@ -87,10 +87,7 @@ def fit_with_and_without_process_noise(
     if jumps_of(model):
         substeps = max(substeps, EDGE_SUBSTEPS)
         model = spread_edges(model, data, states, substeps=substeps)
-    noise = begin.noise
-    if len(noise.process) != model.dimension:  # what a mechanism brings is driven by no noise of its own
-        driven = noise.process[: model.dimension]
-        noise = replace(noise, process=np.append(driven, np.zeros(model.dimension - len(driven))))
+    noise = begin.noise.of_states(model.dimension)
     loose: Fit | None = None
     if settled and not jumps_of(model):
         loose = begin

@@ -99,7 +99,7 @@ def _fitted(
             candidate.model.with_values(values),
             data,
             begin=begin.x[data.first[:-1]],
-            noise=begin.noise,
+            noise=begin.noise.of_states(candidate.model.dimension),
             substeps=trial.substeps,
             budget=budget,
         )

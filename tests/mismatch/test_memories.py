@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from siq.dynamics.parametric import symbol
 from siq.estimation.fit import Fit
 from siq.estimation.measurements import Measurements, measurements
 from siq.estimation.recalibration import recalibrate
+from siq.mismatch import fitted_parts
 from siq.mismatch.described import models_of_the_nameless
 from siq.mismatch.found import Search
 from siq.mismatch.function_places import Place
@@ -62,6 +65,20 @@ def test_what_x_was_is_likelier_than_any_function(fading: Measurements, alone: F
     rates = np.sort(np.linalg.eigvals(np.array([[-k, c], [1 / tau, -1 / tau]])))
     np.testing.assert_allclose(rates, np.sort(np.linalg.eigvals(FLOW)), rtol=0.05)
     assert not models[0].fit.has_process_noise
+
+
+def test_a_memory_whose_fit_leads_away_begins_again(
+    fading: Measurements, alone: Fit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    still = replace(alone, noise=alone.noise.without_process(), log_likelihood=0.0)
+    usual = fitted_parts.fit_with_process_noise_as_needed
+
+    def leading_away(*given: Any, **options: Any) -> Fit:
+        return replace(usual(*given, **options), log_likelihood=-1e3)
+
+    monkeypatch.setattr(fitted_parts, "fit_with_process_noise_as_needed", leading_away)
+    found = with_memories(still, [], material(fading))
+    assert found and all(each.fit.log_likelihood > -1e3 for each in found)
 
 
 def test_a_hidden_state_pays_for_its_beginnings(fading: Measurements, alone: Fit) -> None:
