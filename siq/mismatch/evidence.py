@@ -273,7 +273,7 @@ def log_evidence_of(fit: Fit, data: Measurements, *, correlated: float = 1.0) ->
     of the parameters does not count. Of parameters of which something is expected together, such as the
     heights of a smooth function, the likelihood is averaged over that (Laplace's approximation,
     -½ log det(1 + K G)), so that they count as few as the data tell. Where a recording begins is a parameter
-    for each state, so that a hidden state more has to be worth its beginnings.
+    for each state, told or not, so that one more hidden state has to be worth its beginnings.
 
     Parameters
     ----------

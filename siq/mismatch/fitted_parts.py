@@ -45,7 +45,7 @@ def fitted_part(
     level
         Of random forces to begin with, as a multiple of those of the fit.
     place
-        Where the function stands; None for one of what was.
+        Where the function stands; None for a memory.
     fit
         The simulation without it.
     cost

@@ -16,26 +16,28 @@ from dataclasses import replace
 import numpy as np
 import sympy
 
+from siq.dynamics.dynamics import Dynamics
 from siq.estimation.fit import Fit
-from siq.estimation.linearisation import Grid
 from siq.estimation.measurements import Measurements
 from siq.mismatch.building import MechanismCandidate
 from siq.mismatch.candidates import candidates_of
 from siq.mismatch.dictionary import Form, FurtherState, Mechanism, MechanismParameter, Role, Shape
 from siq.mismatch.fitted_parts import LARGEST_PART, fitted_part
 from siq.mismatch.nameless_models import Material, Model, Part
-from siq.mismatch.probes import Probe, ProbeColumns
+from siq.mismatch.probes import Probe, with_further_states
 from siq.mismatch.promises import screen_all
 from siq.mismatch.remainder import something_left
+from siq.mismatch.roles import Roles
 from siq.mismatch.screening import Screened
 from siq.mismatch.trials import best_probes
 from siq.mismatch.tried import UNFORESEEN, admissible
 
 LOGGER = logging.getLogger(__name__)
-# Of the time in which a coordinate changes: τ is tried here, and fitted. What is remembered much shorter than
-# that is what is, and of what is remembered much longer a recording tells the beginning.
+# Times τ that are tried, in units of the time in which the coordinate changes; the best of them is then
+# fitted. A much shorter memory cannot be told from none, nor a much longer one from a constant of each
+# recording.
 TIMES = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
-DAMPINGS = (0.1, 1.0)  # of what rings: little, and so much that it hardly does
+DAMPINGS = (0.1, 1.0)  # k of what rings, tried and then fitted: over many turns, and over hardly one
 MOST = 6  # memories that are fitted, the most promising ones: a choice
 
 
@@ -61,7 +63,7 @@ def memory_suspected(models: Sequence[Model], data: Measurements) -> bool:
 
 
 def with_memories(fit: Fit, models: Sequence[Model], material: Material) -> list[Model]:
-    """Models with a hidden state that follows a coordinate late.
+    """Models with a hidden state that follows a coordinate late, or that it makes ring.
 
     Parameters
     ----------
@@ -73,7 +75,9 @@ def with_memories(fit: Fit, models: Sequence[Model], material: Material) -> list
         What models are made from.
     """
     likely = {name for each in models for part in each.parts for name in part.trial.candidate.equations}
-    candidates = sorted(memories_of(fit, material), key=lambda each: not likely & set(each.equations))
+    candidates = sorted(
+        memories_of(fit.model, material.roles), key=lambda each: not likely & set(each.equations)
+    )
     if not candidates:
         return []
     cost = float(np.log(len(candidates)))
@@ -101,8 +105,9 @@ def _fitted(probe: Probe, result: Screened, fit: Fit, cost: float, material: Mat
     values = [known.get(each.name, each.value) for each in model.parameters]
     candidate = replace(candidate, model=model.with_values(np.array(values)))
     try:
-        along = ProbeColumns(fit.model, Grid(material.data, fit.substeps), [probe], fit.x, fit.model.values)
-        x = np.concatenate([fit.x, along.further_states(0)], axis=1)
+        x = with_further_states(
+            probe, fit.model, material.data, fit.x, substeps=fit.substeps, values=fit.model.values
+        )
     except UNFORESEEN as error:
         LOGGER.info("%s cannot be fitted: %s", candidate.label, error)
         return []
@@ -113,10 +118,10 @@ def _fitted(probe: Probe, result: Screened, fit: Fit, cost: float, material: Mat
     return [each for each in parts if admissible(each.trial.fit, candidate)]
 
 
-def memories_of(fit: Fit, material: Material) -> list[MechanismCandidate]:
+def memories_of(model: Dynamics, roles: Roles) -> list[MechanismCandidate]:
     """A memory of every coordinate in every equation that says more than a definition."""
     what = Mechanism(name="memory", sentence="What is missing follows a coordinate late.", forms=FORMS)
-    return [_named(each) for each in candidates_of(fit.model, material.roles, (what,))]
+    return [_named(each) for each in candidates_of(model, roles, (what,))]
 
 
 def _named(candidate: MechanismCandidate) -> MechanismCandidate:

@@ -63,7 +63,7 @@ class Part:
     cost
         Logarithm of the number of places, or mechanisms, that it was chosen among.
     place
-        Where a function stands; None for a mechanism.
+        Where a function stands; None for a mechanism or a memory.
     smooth
         What a curve or a surface is made of: the amplitudes are the heights of its bumps.
     """

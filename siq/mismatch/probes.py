@@ -255,6 +255,26 @@ class _Compiled:
         return self._candidate.model.lags(np.array(values))
 
 
+def with_further_states(
+    probe: Probe, model: Dynamics, data: Measurements, x: np.ndarray, *, substeps: int, values: np.ndarray
+) -> np.ndarray:
+    """States along recordings, with those that a probe brings behind them, shape ``(n, d + k)``.
+
+    Parameters
+    ----------
+    probe
+        The mechanism with its shapes.
+    model, data, x
+        The simulation without it, the recordings, and the states along them, shape ``(n, d)``.
+    substeps, values
+        Runge–Kutta steps between samples, and the simulation's parameters.
+    """
+    if not probe.candidate.scales:
+        return x
+    own = ProbeColumns(model, Grid(data, substeps), [probe], x, values)
+    return np.concatenate([x, own.further_states(0)], axis=1)
+
+
 def probes_of(
     candidate: MechanismCandidate, data: Measurements, model: Dynamics, x: np.ndarray
 ) -> list[Probe]:

@@ -13,12 +13,11 @@ from siq.errors import NumericalFailure
 from siq.estimation.budget import Budget, BudgetSpent
 from siq.estimation.fit import Fit
 from siq.estimation.jumps import sharpened
-from siq.estimation.linearisation import Grid
 from siq.estimation.measurements import Measurements
 from siq.estimation.process_noise import fit_with_process_noise_as_needed, least_to_believe
 from siq.mismatch.building import MechanismCandidate
 from siq.mismatch.on_top import rebased
-from siq.mismatch.probes import Probe, ProbeColumns
+from siq.mismatch.probes import Probe, with_further_states
 from siq.mismatch.promises import screen_all
 from siq.mismatch.screening import Screened
 from siq.mismatch.tried import (
@@ -171,10 +170,10 @@ def _tried(
         When nothing is left of what is allowed.
     """
     candidate = probe.candidate
-    x = begin.x[:, : base_model.dimension]
-    if candidate.scales:
-        own = ProbeColumns(base_model, Grid(data, current.substeps), [probe], x, current.model.values)
-        x = np.concatenate([x, own.further_states(0)], axis=1)
+    x = with_further_states(
+        probe, base_model, data, begin.x[:, : base_model.dimension],
+        substeps=current.substeps, values=current.model.values,
+    )  # fmt: skip
     start = with_start(probe, result, begin.model)
     trial = fit_with_process_noise_as_needed(start, data, begin, level=result.level, x=x, budget=budget)
     if not trial.converged:

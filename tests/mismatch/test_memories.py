@@ -33,7 +33,7 @@ FLOW = np.array([[-1.0, 0.8], [0.5, -0.5]])  # of x and of what is remembered
 
 @pytest.fixture(scope="module")
 def fading() -> Measurements:
-    """Decays, of a rate, that are held back by what x was: ``x' = -x + 0.8 z`` and ``z' = (x - z)/2``."""
+    """Decays that are held back by what x was: ``x' = -x + 0.8 z`` and ``z' = (x - z)/2``."""
     t = np.linspace(0, 6, COUNT)
     draw = np.random.default_rng(3)
     begins = draw.normal(size=(6, 2))
@@ -87,8 +87,8 @@ def test_a_hidden_state_pays_for_its_beginnings(fading: Measurements, alone: Fit
     assert model.log_evidence < gained - 0.5 * 6 * np.log(COUNT / 10)
 
 
-def test_every_coordinate_and_equation_has_its_memories(fading: Measurements, alone: Fit) -> None:
-    labels = [each.label for each in memories_of(alone, material(fading))]
+def test_every_coordinate_and_equation_has_its_memories() -> None:
+    labels = [each.label for each in memories_of(DECAY, roles_of(DECAY))]
     assert labels == ["a memory of x in x", "a memory of x in x, as a rate", "a memory of x in x, that rings"]
 
 
@@ -103,8 +103,7 @@ def test_the_intensity_of_a_rotating_frame_has_its_own_unit() -> None:
         units=("mV", "mV"),
         time_unit="s",
     )
-    nothing = SimpleNamespace(model=frame)
-    found = memories_of(nothing, SimpleNamespace(roles=roles_of(frame)))
+    found = memories_of(frame, roles_of(frame))
     (shift, _) = (each for each in found if each.coordinate == "amplitude")
     assert shift.label == "a memory of amplitude in P, Q, across the state"
     assert shift.model.units == ("mV", "mV", "mV**2")
