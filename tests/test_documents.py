@@ -282,8 +282,10 @@ def test_the_catalogue_of_workflows_finds_what_it_expects() -> None:
 
 
 @pytest.mark.workflow
-def test_the_workflow_begins_where_the_catalogue_looks_too() -> None:
-    command = [sys.executable, "-m", "snakemake", "-n", "-s", "workflow/Snakefile", "statistics"]
+def test_the_workflow_begins_where_the_catalogue_looks_too(tmp_path: Path) -> None:
+    # In a folder without results, where everything is left to do.
+    where = ["-s", "workflow/Snakefile", "--directory", str(tmp_path)]
+    command = [sys.executable, "-m", "snakemake", "-n", *where, "statistics"]
     run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
     assert "archetype3d" in run.stdout + run.stderr

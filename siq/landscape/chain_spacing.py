@@ -16,6 +16,7 @@ from siq.landscape.tubes import Tube
 
 START_SHARE = 1e-6  # of the action: U on the ellipsoid where a chain begins
 CENTRAL = 0.005  # of the distance to the end: nearer to the attractor points lie no closer together
+COINCIDING = 1e-14  # numerical, of the length: neighbours so close are one point
 MOST_NODES = 60_000  # numerical, a guard on memory: 60 000 blocks of d × d
 MOST_TURNS, STEPS_OF_A_TURN = 300, 64  # of a path from or to a cycle, within linear dynamics
 SPIRAL_STEP = 0.15  # of the shortest time of the linear dynamics
@@ -27,7 +28,6 @@ def spaced(problem: PathProblem, y: np.ndarray, count: int, level: float) -> np.
     Near an attractor the segments are in proportion to the distance from it, in the metric of M, since the
     path may wind.
     """
-    y = y[np.append(np.linalg.norm(np.diff(y, axis=0), axis=1) > 1e-14, True)]
     if problem.hessian is not None and problem.level(y[:1])[0] > level > 0:
         y = np.vstack([spiral(problem, y[0], level / problem.level(y[:1])[0]), y])
     if level > 0 and isinstance(problem.begin, Tube):
@@ -35,6 +35,8 @@ def spaced(problem: PathProblem, y: np.ndarray, count: int, level: float) -> np.
     if level > 0 and problem.finish is not None:
         y = np.vstack([y, _winding(problem, problem.finish, y[-1], level, 1.0)])
     length = np.r_[0, np.cumsum(np.linalg.norm(np.diff(y, axis=0), axis=1))]
+    apart = np.append(np.diff(length) > COINCIDING * length[-1], True)
+    length, y = length[apart], y[apart]
     curve = Akima1DInterpolator(length, y)
     dense = np.interp(np.arange(0, len(y) - 0.95, 0.1), np.arange(len(y)), length)
     y = curve(dense)

@@ -58,7 +58,7 @@ def test_positions_alone_show_the_force_and_both_noises() -> None:
     assert field.values[0] == 1 and not field.covariance[0].any()
     errors = np.sqrt(np.diag(field.covariance))[1:]
     assert (np.abs(field.values[1:] - [1, -FRICTION, -1]) < 3.5 * errors).all()
-    np.testing.assert_array_equal(field.diffusion.matrix, [[0, 0], [0, 1]])
+    np.testing.assert_allclose(field.diffusion.matrix, [[0, 0], [0, 1]], rtol=1e-12)
     intensity, error = done.record.noise["intensity"], done.record.noise["intensity_error"]
     assert abs(intensity - 2 * FRICTION * TEMPERATURE) < 3.5 * error < 0.2 * intensity
     assert done.record.noise["measurement"][0] == pytest.approx(SENSOR, rel=0.03)

@@ -78,7 +78,10 @@ def test_a_memory_whose_fit_leads_away_begins_again(
 
     monkeypatch.setattr(fitted_parts, "fit_with_process_noise_as_needed", leading_away)
     found = with_memories(still, [], material(fading))
-    assert found and all(each.fit.log_likelihood > -1e3 for each in found)
+    kept = {each.parts[0].trial.candidate.label: each.fit.log_likelihood for each in found}
+    assert kept["a memory of x in x"] > 2000 and kept["a memory of x in x, as a rate"] > -1e3
+    # Nothing rings here: how much it is damped no recording tells, and such a fit may lead away once more.
+    assert min(kept.values()) >= -1e3
 
 
 def test_a_hidden_state_pays_for_its_beginnings(fading: Measurements, alone: Fit) -> None:
