@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import sympy
+from siq.identify.identification import IdentificationOptions, identify_vector_field
+from siq.identify.library import candidate_library
 
 import siq
 from siq.data.recordings import snapshot_pairs
-from siq.identify.identification import IdentificationOptions, identify_vector_field
-from siq.identify.library import candidate_library
 
 installed = Path(siq.__file__).resolve()
 assert not installed.is_relative_to(Path(sys.argv[1]).resolve()), f"{installed} is not the installed one"

@@ -34,18 +34,23 @@ from known_systems import (
     potential_values,
 )
 
-from siq.certificate.common_tests import HARMLESS
-from siq.certificate.tests import Candidate, CertificateOptions, check_hamilton_jacobi, stated_error
-from siq.dynamics.phase_portrait import PhasePortrait
-from siq.dynamics.simulation import SimulationOptions, simulate_snapshots
 from siq.errors import NumericalFailure
-from siq.identify.identified_field import IdentifiedField
+from siq.inference.field_estimate import IdentifiedField
 from siq.networks.options import TrainingOptions
 from siq.networks.trained import TrainedNetworks
-from siq.potential.bases import LibraryBasis
-from siq.potential.refinement import RefinementOptions, formula_library, local_wells, refine
-from siq.steps import train
-from siq.steps.settings import Sampling, StateSpace
+from siq.quasipotential.certificate import HARMLESS
+from siq.quasipotential.certificate_tests import (
+    Candidate,
+    CertificateOptions,
+    check_hamilton_jacobi,
+    stated_error,
+)
+from siq.quasipotential.hamilton_jacobi import LibraryBasis
+from siq.quasipotential.refinement import RefinementOptions, formula_library, local_wells, refine
+from siq.systems.phase_portrait import PhasePortrait
+from siq.systems.simulation import SimulationOptions, simulate_snapshots
+from siq.workflow import training_step
+from siq.workflow.settings import Sampling, StateSpace
 
 SYSTEMS = {
     "Maier–Stein, β = 1": (maier_stein(1), 3),
@@ -65,13 +70,13 @@ def networks_of(known: KnownSystem, steps: int) -> list[TrainedNetworks]:
     """Networks of `TRAININGS` runs, each with recordings of its own, trained side by side."""
     options = TrainingOptions(widths=(16, 16), steps=steps, check=None, batch_size=128)
     space = StateSpace(diffusion=known.diffusion.tolist())
-    settings = train.TrainSettings(steps, space, Sampling(pair_step=0.01), options)
+    settings = training_step.TrainSettings(steps, space, Sampling(pair_step=0.01), options)
     runs = {}
     for number in range(TRAININGS):
         draw = np.random.default_rng([steps, number])
         recordings = simulate_snapshots(as_system(known), options=SIMULATION, generator=draw)
-        runs[number] = train.RunToTrain(recordings, None)
-    return list(train.run(settings, runs, device="cpu").networks.values())
+        runs[number] = training_step.RunToTrain(recordings, None)
+    return list(training_step.run(settings, runs, device="cpu").networks.values())
 
 
 def about_attractors(

@@ -27,23 +27,19 @@ import sympy
 
 from siq.data.recordings import Recordings
 from siq.data.selection import in_stretches
-from siq.data.transitions import without_slow_drift
-from siq.dynamics.diffusion import Diffusion
-from siq.dynamics.dynamics import Dynamics, Parameter
-from siq.dynamics.parametric import symbol
-from siq.dynamics.phase_portrait import evenly_spread, phase_portrait
-from siq.estimation.estimation import fit_by_filter
-from siq.estimation.innovations import whiten
-from siq.estimation.linearisation import Grid, linearise
-from siq.files.whole import whole_file
-from siq.identify.filtered_states import of_all_states
-from siq.identify.identification import IdentificationOptions
-from siq.identify.seen_states import unbroken
-from siq.identify.storage import FieldRecord
-from siq.identify.velocities import force_noise, seen_positions, smoothed_motion
-from siq.landscape.transitions import barrier_uncertainty, ways_out
-from siq.steps import identify
-from siq.steps.pipeline import PipelineSettings, analyse
+from siq.data.two_states import without_slow_drift
+from siq.inference.identification import FieldRecord, IdentificationOptions
+from siq.inference.kalman_filter import Grid, linearise, whiten
+from siq.inference.maximum_likelihood import fit_by_filter
+from siq.inference.noisy_sensor import of_all_states
+from siq.inference.observation import force_noise, seen_positions, smoothed_motion, unbroken
+from siq.numerics.files import whole_file
+from siq.quasipotential.transitions import barrier_uncertainty, ways_out
+from siq.systems.diffusion import Diffusion
+from siq.systems.dynamics import Dynamics, Parameter, symbol
+from siq.systems.phase_portrait import evenly_spread, phase_portrait
+from siq.workflow import identification_step
+from siq.workflow.pipeline import PipelineSettings, analyse
 
 RECORDS, SAMPLES, STEP, WITHIN = 8, 20_000, 0.01, 10
 SIMULATED = 4  # records from which the bound is taken; their seeds lie beyond those of the laboratories
@@ -168,7 +164,9 @@ def only_barriers(particle: Particle, seed: int) -> dict[str, object]:
     settings = PipelineSettings(identification=IdentificationOptions(hidden_velocities=True))
     recordings = in_stretches(without_slow_drift(recorded(particle, seed)))
     began = time.process_time()
-    identified = identify.run(settings.of(identify.IdentifySettings), recordings, number=0)
+    identified = identification_step.run(
+        settings.of(identification_step.IdentifySettings), recordings, number=0
+    )
     record = identified.record
     if record is None:
         return {"fault": [identified.outcome.reason], "seconds": time.process_time() - began}

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from siq.data.recordings import Recordings
-from siq.landscape.landscape import Landscape, NoLandscape
+from siq.quasipotential.landscape import Landscape, NoLandscape
 
 Force = Callable[[np.ndarray], np.ndarray]
 

@@ -15,9 +15,8 @@ import time
 
 import numpy as np
 
-from siq.dynamics.diffusion import Diffusion
-from siq.reference.mesh import mesh_quasipotential
-from siq.reference.mesh_values import MeshQuasipotential
+from siq.systems.diffusion import Diffusion
+from siq.validation.mesh import MeshQuasipotential, mesh_quasipotential
 
 BOX = np.array([[-2.0, 0.0], [-1.0, 1.0]])
 COUNTS = (64, 128, 256, 512)

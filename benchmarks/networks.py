@@ -25,15 +25,14 @@ sys.path.append(str(Path(__file__).parents[1] / "tests"))
 from untuned_systems import SYSTEMS, simulated
 
 from siq.data.recordings import Recordings, snapshot_pairs
-from siq.dynamics.cards import load_exact, load_system
-from siq.dynamics.formulas import compile_formulas
-from siq.dynamics.sampling import complete
-from siq.dynamics.simulation import simulate_snapshots
 from siq.networks.options import TrainingOptions
-from siq.steps.outcomes import Method
-from siq.steps.pipeline import Analysis, PipelineSettings, analyse
-from siq.steps.settings import Sampling, StateSpace
-from siq.study.study import SimulationEntry
+from siq.systems.cards import load_exact, load_system
+from siq.systems.formulas import compile_formulas
+from siq.systems.simulation import complete, simulate_snapshots
+from siq.workflow.outcomes import Method
+from siq.workflow.pipeline import Analysis, PipelineSettings, analyse
+from siq.workflow.settings import Sampling, StateSpace
+from siq.workflow.study import SimulationEntry
 
 ROOT = Path(__file__).parents[1]
 CARDS = ("archetype3d", "resonator", "maier-stein")

@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from siq.dynamics.cards import load_system
-from siq.reference.escapes import neighbourhood, simulate_escapes
-from siq.steps.equations import EquationSettings, landscape_of_equations
+from siq.systems.cards import load_system
+from siq.validation.escapes import neighbourhood, simulate_escapes
+from siq.workflow.equations_step import EquationSettings, landscape_of_equations
 
 CARD = Path(__file__).parents[1] / "config" / "systems" / "consumer-resource.yaml"
 PUBLISHED = (0.007056, 0.00092975)  # Φ of the saddle from (1.4049, 2.8081) and from (4.9040, 4.0619)

@@ -14,9 +14,9 @@ import time
 
 import numpy as np
 
-from siq.dynamics.cards import load_system
-from siq.dynamics.simulation import SimulationOptions, runge_kutta_step, simulate_snapshots
-from siq.numerics.thinning import representative_subset
+from siq.numerics.least_squares import representative_subset
+from siq.systems.cards import load_system
+from siq.systems.simulation import SimulationOptions, runge_kutta_step, simulate_snapshots
 
 
 def plain_field(x: np.ndarray) -> np.ndarray:

@@ -17,15 +17,14 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-import siq.networks.networks as networks_module
 from siq.data.recordings import snapshot_pairs
-from siq.dynamics.cards import load_system
-from siq.dynamics.simulation import SimulationOptions, simulate_snapshots
-from siq.networks.data import prepare_data
+from siq.networks import networks as networks_module
 from siq.networks.networks import Layer
 from siq.networks.options import TrainingOptions
-from siq.networks.training import start, train
-from siq.study.study import load_study
+from siq.networks.training import prepare_data, start, train
+from siq.systems.cards import load_system
+from siq.systems.simulation import SimulationOptions, simulate_snapshots
+from siq.workflow.study import load_study
 
 Gradient = Callable[[tuple[Layer, ...], torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
 

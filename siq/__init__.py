@@ -17,36 +17,32 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from siq.data.inspection import inspect
     from siq.data.recordings import Recordings, read_recordings, snapshot_pairs, write_recordings
-    from siq.dynamics.cards import load_system
-    from siq.dynamics.diffusion import Diffusion
-    from siq.dynamics.dynamics import Dynamics
-    from siq.dynamics.exports import Formula
-    from siq.dynamics.formulas import parse_formula
-    from siq.dynamics.simulation import SimulationOptions, simulate_snapshots
+    from siq.diagnosis.diagnosis import Diagnosis, diagnose, solve_case
+    from siq.diagnosis.investigation import read_case
+    from siq.diagnosis.study import MismatchStudy
     from siq.errors import InputError, MissingExtra, NumericalFailure
-    from siq.identify.library import candidate_library
-    from siq.landscape.landscape import Landscape
-    from siq.landscape.refusal import NoLandscape
-    from siq.mismatch.case import read_case
-    from siq.mismatch.diagnosis import Diagnosis, diagnose, solve_case
-    from siq.mismatch.study import MismatchStudy
+    from siq.inference.library import candidate_library
     from siq.networks.options import TrainingOptions
     from siq.networks.regression import RegressionOptions, sparse_decomposition
     from siq.networks.training import train
-    from siq.potential.storage import read_model
-    from siq.potential.symbolic import SymbolicDecomposition
-    from siq.reference.system_table import reference_table
-    from siq.reference.systems import reference_systems
-    from siq.report.plots.barriers import plot_barriers
+    from siq.quasipotential.formulas import SymbolicDecomposition, read_model
+    from siq.quasipotential.landscape import Landscape, NoLandscape
     from siq.report.plots.diagnosis import plot_diagnosis
+    from siq.report.plots.prediction import plot_residuals
     from siq.report.plots.quasipotential import plot_quasipotential
-    from siq.report.plots.residuals import plot_residuals
-    from siq.report.plots.wells import plot_paths, plot_wells
-    from siq.steps.equations import EquationSettings
-    from siq.steps.pipeline import PipelineSettings
-    from siq.steps.sweep import Sweep, sweep
-    from siq.steps.tipping import probability_of_tipping
-    from siq.study.study import Study, load_study
+    from siq.report.plots.wells import plot_barriers, plot_paths, plot_wells
+    from siq.systems.cards import load_system
+    from siq.systems.diffusion import Diffusion
+    from siq.systems.dynamics import Dynamics
+    from siq.systems.export import Formula
+    from siq.systems.formulas import parse_formula
+    from siq.systems.simulation import SimulationOptions, simulate_snapshots
+    from siq.validation.reference_systems import reference_systems, reference_table
+    from siq.workflow.equations_step import EquationSettings
+    from siq.workflow.pipeline import PipelineSettings
+    from siq.workflow.study import Study, load_study
+    from siq.workflow.sweep_step import Sweep, sweep
+    from siq.workflow.tipping import probability_of_tipping
 
     __version__: str
 
@@ -98,48 +94,48 @@ __all__ = [
 ]
 
 _MODULES = {
-    "Diagnosis": "siq.mismatch.diagnosis",
-    "Diffusion": "siq.dynamics.diffusion",
-    "Dynamics": "siq.dynamics.dynamics",
-    "EquationSettings": "siq.steps.equations",
-    "Formula": "siq.dynamics.exports",
+    "Diagnosis": "siq.diagnosis.diagnosis",
+    "Diffusion": "siq.systems.diffusion",
+    "Dynamics": "siq.systems.dynamics",
+    "EquationSettings": "siq.workflow.equations_step",
+    "Formula": "siq.systems.export",
     "InputError": "siq.errors",
-    "Landscape": "siq.landscape.landscape",
-    "MismatchStudy": "siq.mismatch.study",
+    "Landscape": "siq.quasipotential.landscape",
+    "MismatchStudy": "siq.diagnosis.study",
     "MissingExtra": "siq.errors",
-    "NoLandscape": "siq.landscape.refusal",
+    "NoLandscape": "siq.quasipotential.landscape",
     "NumericalFailure": "siq.errors",
-    "PipelineSettings": "siq.steps.pipeline",
+    "PipelineSettings": "siq.workflow.pipeline",
     "Recordings": "siq.data.recordings",
     "RegressionOptions": "siq.networks.regression",
-    "SimulationOptions": "siq.dynamics.simulation",
-    "Study": "siq.study.study",
-    "Sweep": "siq.steps.sweep",
-    "SymbolicDecomposition": "siq.potential.symbolic",
+    "SimulationOptions": "siq.systems.simulation",
+    "Study": "siq.workflow.study",
+    "Sweep": "siq.workflow.sweep_step",
+    "SymbolicDecomposition": "siq.quasipotential.formulas",
     "TrainingOptions": "siq.networks.options",
-    "candidate_library": "siq.identify.library",
-    "diagnose": "siq.mismatch.diagnosis",
+    "candidate_library": "siq.inference.library",
+    "diagnose": "siq.diagnosis.diagnosis",
     "inspect": "siq.data.inspection",
-    "load_study": "siq.study.study",
-    "load_system": "siq.dynamics.cards",
-    "parse_formula": "siq.dynamics.formulas",
-    "plot_barriers": "siq.report.plots.barriers",
+    "load_study": "siq.workflow.study",
+    "load_system": "siq.systems.cards",
+    "parse_formula": "siq.systems.formulas",
+    "plot_barriers": "siq.report.plots.wells",
     "plot_diagnosis": "siq.report.plots.diagnosis",
     "plot_paths": "siq.report.plots.wells",
     "plot_quasipotential": "siq.report.plots.quasipotential",
-    "plot_residuals": "siq.report.plots.residuals",
+    "plot_residuals": "siq.report.plots.prediction",
     "plot_wells": "siq.report.plots.wells",
-    "probability_of_tipping": "siq.steps.tipping",
-    "read_case": "siq.mismatch.case",
-    "read_model": "siq.potential.storage",
+    "probability_of_tipping": "siq.workflow.tipping",
+    "read_case": "siq.diagnosis.investigation",
+    "read_model": "siq.quasipotential.formulas",
     "read_recordings": "siq.data.recordings",
-    "reference_systems": "siq.reference.systems",
-    "reference_table": "siq.reference.system_table",
-    "simulate_snapshots": "siq.dynamics.simulation",
+    "reference_systems": "siq.validation.reference_systems",
+    "reference_table": "siq.validation.reference_systems",
+    "simulate_snapshots": "siq.systems.simulation",
     "snapshot_pairs": "siq.data.recordings",
-    "solve_case": "siq.mismatch.diagnosis",
+    "solve_case": "siq.diagnosis.diagnosis",
     "sparse_decomposition": "siq.networks.regression",
-    "sweep": "siq.steps.sweep",
+    "sweep": "siq.workflow.sweep_step",
     "train": "siq.networks.training",
     "write_recordings": "siq.data.recordings",
 }

@@ -1,4 +1,4 @@
-"""What is said when a file cannot be used, a computation has no result, or a package is not installed."""
+"""Errors: a value or a file that cannot be used, a computation without a result, a missing package."""
 
 from __future__ import annotations
 
@@ -8,6 +8,29 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from siq.version import DISTRIBUTION
+
+
+class Fault(ValueError):
+    """A value that cannot be used, told by code that does not know which file it came from.
+
+    Whoever knows the file makes an `InputError` of it: ``raise error.at(file, place) from None``.
+
+    Parameters
+    ----------
+    fault
+        What is wrong, in lower case and without a full stop.
+    remedy
+        What to do, in lower case and without a full stop.
+    """
+
+    def __init__(self, fault: str, remedy: str) -> None:
+        super().__init__(f"{fault}; {remedy}")
+        self.fault = fault
+        self.remedy = remedy
+
+    def at(self, file: str | Path, place: str = "") -> InputError:
+        """The same fault, with the file and the place in it."""
+        return InputError(file, place, self.fault, self.remedy)
 
 
 class InputError(ValueError):

@@ -9,8 +9,8 @@ import pytest
 # Before torch and numpy start their threads: arrays this small take thrice as long on two as on one.
 os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
-from siq.dynamics.cards import load_system
-from siq.dynamics.dynamics import Dynamics
+from siq.systems.cards import load_system
+from siq.systems.dynamics import Dynamics
 
 ROOT = Path(__file__).parents[1]
 

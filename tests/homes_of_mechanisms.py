@@ -13,18 +13,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from siq.dynamics.cards import SystemCard, build_system
-from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.formulas import compile_values
-from siq.dynamics.parametric import Signals, symbol
-from siq.estimation.linearisation import Grid
-from siq.estimation.measurements import Measurements
-from siq.files.documents import Document, validate
-from siq.mismatch.building import MechanismCandidate
-from siq.mismatch.candidates import candidates_of
-from siq.mismatch.dictionary import standard_dictionary
-from siq.mismatch.roles import roles_of
-from siq.mismatch.study import measurements_of
+from siq.diagnosis.dictionary import roles_of, standard_dictionary
+from siq.diagnosis.mechanisms import MechanismCandidate, candidates_of
+from siq.diagnosis.study import measurements_of
+from siq.inference.kalman_filter import Grid
+from siq.inference.measurements import Measurements
+from siq.numerics.files import Document, validate
+from siq.systems.cards import SystemCard, build_system
+from siq.systems.dynamics import Dynamics, Signals, symbol
+from siq.systems.formulas import compile_values
 
 FINE = 10  # steps of integration between samples
 NOISE = 0.01  # of the spread of what is measured

@@ -11,8 +11,8 @@ from known_systems import (
 )
 from scipy.interpolate import RegularGridInterpolator
 
-from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.equilibria import hessian_at
+from siq.systems.dynamics import Dynamics
+from siq.systems.equilibria import hessian_at
 
 
 def compressible(slope: float, rotation: float = 0.0) -> KnownSystem:

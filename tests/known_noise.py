@@ -7,7 +7,7 @@ import sympy
 from known_systems import KnownSystem
 from scipy.integrate import quad
 
-from siq.dynamics.dynamics import Dynamics
+from siq.systems.dynamics import Dynamics
 
 NAMES = "xyzw"
 

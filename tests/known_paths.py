@@ -14,9 +14,9 @@ from known_systems import (
 )
 from scipy.integrate import solve_ivp
 
-from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.equilibria import find_equilibria, hessian_at
-from siq.landscape.paths import MinimumActionPath, minimum_action_path
+from siq.quasipotential.paths import MinimumActionPath, minimum_action_path
+from siq.systems.dynamics import Dynamics
+from siq.systems.equilibria import find_equilibria, hessian_at
 
 
 def path_of(known: KnownSystem, end: np.ndarray, *, which: int = 0, **options: Any) -> MinimumActionPath:

@@ -18,15 +18,14 @@ import numpy as np
 import sympy
 from scipy.optimize import minimize
 
-from siq.dynamics.diffusion import Diffusion
-from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.formulas import compile_formulas
-from siq.dynamics.phase_portrait import PhasePortrait, phase_portrait
-from siq.identify.flow import FlowMap
-from siq.identify.identified_field import IdentifiedField
-from siq.identify.library import candidate_library, monomial_exponents
-from siq.potential.symbolic import SymbolicDecomposition
-from siq.study.scoring import exact_answer
+from siq.inference.field_estimate import FlowMap, IdentifiedField
+from siq.inference.library import candidate_library, monomial_exponents
+from siq.quasipotential.formulas import SymbolicDecomposition
+from siq.systems.diffusion import Diffusion
+from siq.systems.dynamics import Dynamics
+from siq.systems.formulas import compile_formulas
+from siq.systems.phase_portrait import PhasePortrait, phase_portrait
+from siq.workflow.scoring import exact_answer
 
 Function = Callable[[np.ndarray], np.ndarray]
 

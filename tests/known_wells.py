@@ -7,11 +7,8 @@ import functools
 import numpy as np
 from known_systems import KnownSystem, double_well, maier_stein, portrait_of, potential_values
 
-from siq.landscape.global_quasipotential import (
-    GlobalQuasipotential,
-    global_quasipotential,
-)
-from siq.potential.local_wells import WellOptions, local_well
+from siq.quasipotential.landscape import GlobalQuasipotential, global_quasipotential
+from siq.quasipotential.wells import WellOptions, local_well
 
 
 def stationary(rates: np.ndarray) -> np.ndarray:

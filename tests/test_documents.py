@@ -16,11 +16,11 @@ import yaml
 from pydantic import BaseModel
 
 import siq
-from siq.dynamics.cards import SystemCard
-from siq.mismatch.dictionary import Form, Mechanism, MechanismParameter, standard_dictionary
-from siq.mismatch.study import MismatchStudy
+from siq.diagnosis.dictionary import Form, Mechanism, MechanismParameter, standard_dictionary
+from siq.diagnosis.study import MismatchStudy
 from siq.networks.options import TrainingOptions
-from siq.study.study import RecordingsOptions, Study
+from siq.systems.cards import SystemCard
+from siq.workflow.study import RecordingsOptions, Study
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

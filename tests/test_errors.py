@@ -16,11 +16,10 @@ ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 
 # Packages whose modules import without any extra. `networks` needs its own, `report.plots` matplotlib.
-LIGHT = ("numerics", "files", "data", "dynamics", "identify", "estimation", "reference", "potential",
-         "certificate", "landscape", "mismatch", "study")  # fmt: skip
+LIGHT = ("numerics", "data", "systems", "inference", "validation", "quasipotential", "diagnosis")
 ABSENT = ("torch", "pysindy", "sklearn", "cvxpy", "matplotlib", "snakemake", "pygments", "pyarrow", "h5py")
 # Of files of recordings: these are pyarrow's.
-READERS = tuple(f"siq.data.{name}" for name in ("cells", "clock_times", "formats", "layout", "tables"))
+READERS = tuple(f"siq.data.{name}" for name in ("cells", "formats", "layout", "tables"))
 
 
 BLOCK = """
@@ -72,9 +71,8 @@ def test_the_mathematics_needs_no_extra() -> None:
     "statement, package, extra",
     [
         ("import siq; siq.train", "torch", "networks"),
-        ("import siq.networks.data", "torch", "networks"),
-        ("import siq.networks.checkpoint", "torch", "networks"),
-        ("import siq.report.plots.landscape", "matplotlib", "plots"),
+        ("import siq.networks.training", "torch", "networks"),
+        ("import siq.report.plots.errors", "matplotlib", "plots"),
     ],
 )
 def test_what_an_extra_is_for_names_it(statement: str, package: str, extra: str) -> None:

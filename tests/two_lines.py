@@ -5,12 +5,11 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-from siq.dynamics.cards import load_system
-from siq.steps import draw
-from siq.steps.of_study import StudyParts, settings_of
-from siq.steps.pipeline import Analysis, PipelineSettings, analyse
-from siq.study.study import load_study
-from siq.study.study_system import system_path
+from siq.systems.cards import load_system
+from siq.workflow import recordings_step
+from siq.workflow.pipeline import Analysis, PipelineSettings, analyse
+from siq.workflow.settings import StudyParts, settings_of
+from siq.workflow.study import load_study, system_path
 
 SYSTEMS = Path(__file__).parents[1] / "config" / "systems"
 
@@ -27,9 +26,9 @@ def analysed(data: str, folder: Path) -> Analysis:
     settings = PipelineSettings(
         published_method=False, **{name: parts.part(name) for name in names if name != "published_method"}
     )
-    own = settings_of(draw.DrawSettings, study, system)
+    own = settings_of(recordings_step.DrawSettings, study, system)
     source = card if study.recordings is None else study.recordings.file
     assert source is not None
-    drawn = draw.run(own, draw.read(source, own), number=0)
+    drawn = recordings_step.run(own, recordings_step.read(source, own), number=0)
     assert drawn.recordings is not None
     return analyse(drawn.recordings, settings)

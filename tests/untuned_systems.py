@@ -17,10 +17,10 @@ from known_systems import (
 )
 
 from siq.data.recordings import Recordings
-from siq.dynamics.equilibria import hessian_at
-from siq.dynamics.simulation import SimulationOptions, simulate_snapshots
-from siq.potential.well import Well
-from siq.reference.mesh import mesh_quasipotential
+from siq.quasipotential.wells import Well
+from siq.systems.equilibria import hessian_at
+from siq.systems.simulation import SimulationOptions, simulate_snapshots
+from siq.validation.mesh import mesh_quasipotential
 
 SYSTEMS = {
     **{f"linear in {d} dimensions": linear_system(d) for d in range(2, 7)},

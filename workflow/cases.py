@@ -13,11 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from siq.data.folders import CARD, RECORDINGS, case_folders
 from siq.data.public_recordings import BENCHMARKS
-from siq.dynamics.cards import SystemCard
 from siq.errors import InputError
-from siq.files.documents import Document, read_document, validate
+from siq.numerics.files import CARD, RECORDINGS, Document, case_folders, read_document, validate
+from siq.systems.cards import SystemCard
 from workflow.places import config_path, find_file, needed_file, system_card
 
 MADE = "results/recordings"
@@ -175,7 +174,7 @@ class Cases:
         return _checked(name, str(folder / CARD), found[0], study, command)
 
     def _of_study(self, name: str) -> CheckedCase:
-        from siq.mismatch.study import MismatchStudy
+        from siq.diagnosis.study import MismatchStudy
 
         file = str(config_path("mismatch", f"{name}.yaml"))
         document = read_document(file)
@@ -193,10 +192,10 @@ class Cases:
 
 def _checked(name: str, card: str, recordings: str, study: str | None, command: str) -> CheckedCase:
     """Check the files of a case; recordings that a rule makes are checked by their job."""
-    from siq.dynamics.cards import build_system
-    from siq.mismatch.case import read_case
-    from siq.mismatch.dictionary import dictionary_of
-    from siq.mismatch.study import MismatchStudy
+    from siq.diagnosis.dictionary import dictionary_of
+    from siq.diagnosis.investigation import read_case
+    from siq.diagnosis.study import MismatchStudy
+    from siq.systems.cards import build_system
 
     document = read_document(card)
     model = build_system(document, validate(document, SystemCard))

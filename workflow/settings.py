@@ -12,16 +12,15 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from siq.data.learnable import read_pairs
-from siq.dynamics.cards import check_name, load_exact
-from siq.dynamics.dynamics import Dynamics
+from siq.data.inspection import read_pairs
 from siq.errors import InputError, suggestion
-from siq.files.documents import Document, read_document, validate
-from siq.steps.of_study import StudyParts, settings_of
-from siq.study.published_figures import load_published
-from siq.study.study import Study, completed
-from siq.study.study_system import check_states, load_study_system
+from siq.numerics.files import Document, read_document, validate
+from siq.systems.cards import check_name, load_exact
+from siq.systems.dynamics import Dynamics
 from siq.version import DISTRIBUTION
+from siq.workflow.published import load_published
+from siq.workflow.settings import StudyParts, settings_of
+from siq.workflow.study import Study, check_states, completed, load_study_system
 from workflow.places import BASE, config_path, names_in, needed_file, published_figures, system_card
 
 WORKFLOW_KEYS = ("statistics", "device", "runs_per_training", "mismatch", "cases", "keys", "proof", "origin")

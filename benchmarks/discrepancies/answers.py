@@ -8,7 +8,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict
 
 from benchmarks.discrepancies.added import Added
-from siq.files.whole import whole_file
+from siq.numerics.files import whole_file
 
 
 class Term(BaseModel):

@@ -13,9 +13,8 @@ from tempfile import TemporaryDirectory
 
 from pydantic import BaseModel, ConfigDict
 
-from siq.files.documents import read_document, validate
-from siq.files.whole import whole_file
-from siq.mismatch.case import Comparison, read_case
+from siq.diagnosis.investigation import Comparison, read_case
+from siq.numerics.files import read_document, validate, whole_file
 from workflow.proof.batches import Generator, check_digests, read_digests, write_batch
 from workflow.proof.concealment import cases as concealment
 from workflow.proof.foreign import cases as foreign

@@ -26,9 +26,9 @@ from benchmarks.discrepancies.regression import (
 )
 from benchmarks.discrepancies.sindy import WORSE, plain_equations, values_of
 from benchmarks.discrepancies.states import SeenStates, seen_states
-from siq.dynamics.dynamics import Dynamics
-from siq.estimation.recalibration import recalibrate
-from siq.mismatch.case import Comparison
+from siq.diagnosis.investigation import Comparison
+from siq.inference.recalibration import recalibrate
+from siq.systems.dynamics import Dynamics
 
 TOLD = 300  # samples that tell the hyperparameters
 POINTS = 800  # that the process is conditioned on, at most

@@ -6,11 +6,11 @@ import time
 from dataclasses import replace
 
 from benchmarks.discrepancies.answers import Answer
+from siq.diagnosis.diagnosis import solve_case
+from siq.diagnosis.investigation import Comparison
+from siq.diagnosis.study import Allowance
+from siq.diagnosis.verdict import statement_of_failure
 from siq.errors import NumericalFailure
-from siq.mismatch.case import Comparison
-from siq.mismatch.diagnosis import solve_case
-from siq.mismatch.study import Allowance
-from siq.mismatch.verdict import statement_of_failure
 from workflow.proof.foreign_scores.rulers import said_place
 from workflow.proof.scoring import NOTHING
 

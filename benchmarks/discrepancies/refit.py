@@ -15,12 +15,11 @@ import sympy
 
 from benchmarks.discrepancies.added import Added, Polynomial
 from benchmarks.discrepancies.simulation import Simulation
-from siq.dynamics.dynamics import Dynamics, Parameter
-from siq.dynamics.parametric import symbol
 from siq.errors import NumericalFailure
-from siq.estimation.fit import Fit
-from siq.estimation.measurements import Measurements
-from siq.estimation.recalibration import recalibrate
+from siq.inference.maximum_likelihood import Fit
+from siq.inference.measurements import Measurements
+from siq.inference.recalibration import recalibrate
+from siq.systems.dynamics import Dynamics, Parameter, symbol
 
 COEFFICIENT = "_coefficient_"
 MOST = 20  # terms, up to which a formula is refitted

@@ -14,11 +14,11 @@ from benchmarks.discrepancies.added import Added
 from benchmarks.discrepancies.answers import Answer, Term, answer_file, read_answer
 from benchmarks.discrepancies.cases import CaseFiles
 from benchmarks.discrepancies.truth import TrueCase, true_case
-from siq.dynamics.dynamics import Dynamics
+from siq.diagnosis.investigation import Comparison
 from siq.errors import NumericalFailure
-from siq.estimation.recalibration import recalibrate
-from siq.mismatch.case import Comparison
-from siq.study.tables import write_table
+from siq.inference.recalibration import recalibrate
+from siq.systems.dynamics import Dynamics
+from siq.workflow.tables import write_table
 from workflow.proof.foreign_scores.rulers import NEAR, name_error, true_place, unreal_names
 from workflow.proof.foreign_scores.scores import first_states
 from workflow.proof.keys import CaseKey, read_key, read_truth

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.discrepancies.states import parts
-from siq.estimation.measurements import Measurements
+from siq.inference.measurements import Measurements
 
 LENGTH = 10  # intervals of a segment
 INSIDE = 1e-9  # of an interval, by which an input is read within it: it may jump at its ends

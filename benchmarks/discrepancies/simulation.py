@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.discrepancies.added import Added
-from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.parametric import Signals
-from siq.estimation.measurements import Measurements
+from siq.inference.measurements import Measurements
+from siq.systems.dynamics import Dynamics, Signals
 
 STEPS = 2  # of the rule, in the usual interval between two samples
 INSIDE = 1e-9  # of a step, by which an input is read within it: it may jump at its ends

@@ -11,11 +11,11 @@ from benchmarks.discrepancies.answers import Answer, Term
 from benchmarks.discrepancies.refit import refitted, runs_better
 from benchmarks.discrepancies.regression import Equation, Found, chosen_terms, joint, powers
 from benchmarks.discrepancies.states import SeenStates, seen_states
-from siq.dynamics.dynamics import Dynamics
-from siq.estimation.fit import Fit
-from siq.estimation.measurements import Measurements
-from siq.estimation.recalibration import recalibrate
-from siq.mismatch.case import Comparison
+from siq.diagnosis.investigation import Comparison
+from siq.inference.maximum_likelihood import Fit
+from siq.inference.measurements import Measurements
+from siq.inference.recalibration import recalibrate
+from siq.systems.dynamics import Dynamics
 
 WINDOW = 8.0  # samples, at least, of half a window of the weak form; by default a twentieth of a recording
 WINDOWS = 0.5  # for each sample

@@ -13,10 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.interpolate
 
-from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.parametric import Signals
-from siq.estimation.fit import Fit
-from siq.estimation.measurements import Measurements
+from siq.inference.maximum_likelihood import Fit
+from siq.inference.measurements import Measurements
+from siq.systems.dynamics import Dynamics, Signals
 
 TRIMMED = 0.05  # of a recording, at each end, where derivatives of a smoothing spline are poor
 BLOCKS = 24  # of neighbouring samples, about, between which errors are taken to be independent

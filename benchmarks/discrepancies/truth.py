@@ -11,9 +11,8 @@ import sympy
 from benchmarks.discrepancies.added import Added
 from benchmarks.discrepancies.regression import DEGREE
 from benchmarks.discrepancies.simulation import Simulation
-from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.parametric import symbol
-from siq.mismatch.case import Comparison
+from siq.diagnosis.investigation import Comparison
+from siq.systems.dynamics import Dynamics, symbol
 from workflow.proof.foreign_scores.oracle import free_errors, true_simulation
 from workflow.proof.keys import CaseKey, Truth
 from workflow.proof.oracle import oracle_of, true_model

@@ -24,11 +24,11 @@ from benchmarks.discrepancies.regression import SURE, Equation, chosen_terms, po
 from benchmarks.discrepancies.segments import Segments, segments_of
 from benchmarks.discrepancies.sindy import WORSE, along, dynamic, strongest_term, values_of
 from benchmarks.discrepancies.states import SeenStates, parts, seen_states, smooth
-from siq.dynamics.parametric import arguments_of, evaluable
-from siq.estimation.fit import Fit
-from siq.estimation.measurements import Measurements
-from siq.estimation.recalibration import recalibrate
-from siq.mismatch.case import Comparison
+from siq.diagnosis.investigation import Comparison
+from siq.inference.maximum_likelihood import Fit
+from siq.inference.measurements import Measurements
+from siq.inference.recalibration import recalibrate
+from siq.systems.dynamics import arguments_of, evaluable
 
 HIDDEN = 16  # in each of two layers
 TOGETHER = 0.02  # of a state's deviation, by which segments may miss each other

@@ -12,9 +12,9 @@ from benchmarks.laboratories.models import Laboratory
 from benchmarks.laboratories.records import table
 from benchmarks.laboratories.truths import Truth
 from siq.data.recordings import Recordings
-from siq.landscape.landscape import Landscape
-from siq.steps.pipeline import Analysis, PipelineSettings, analyse
-from siq.steps.settings import StateSpace
+from siq.quasipotential.landscape import Landscape
+from siq.workflow.pipeline import Analysis, PipelineSettings, analyse
+from siq.workflow.settings import StateSpace
 
 SAME_PLACE = 0.25  # of the way from an attractor to its saddle: where an attractor found is this one
 TRUE_BRANCH = 3.0  # a curvature of V that is wrong by this factor is that of another solution (a choice)

@@ -28,13 +28,12 @@ from benchmarks.laboratories.information import information
 from benchmarks.laboratories.models import Laboratory
 from benchmarks.laboratories.one import read, write
 from benchmarks.laboratories.records import generator, recorded
-from siq.dynamics.diffusion import Diffusion
-from siq.dynamics.dynamics import Dynamics, Parameter
-from siq.dynamics.parametric import symbol
-from siq.estimation import estimation
-from siq.estimation.fit import Fit
-from siq.estimation.innovations import Noise
-from siq.estimation.measurements import Measurements
+from siq.inference import maximum_likelihood
+from siq.inference.kalman_filter import Noise
+from siq.inference.maximum_likelihood import Fit
+from siq.inference.measurements import Measurements
+from siq.systems.diffusion import Diffusion
+from siq.systems.dynamics import Dynamics, Parameter, symbol
 
 RATIOS = (0.01, 0.1, 1.0, 10.0, 100.0)
 START = 0.7  # of the true coefficients: where a fit begins
@@ -115,14 +114,14 @@ def first_noise(laboratory: Laboratory, seen: np.ndarray) -> Noise:
 
 def by_multiple_shooting(model: Dynamics, data: Measurements, noise: Noise) -> Fit:
     """The fit that diagnoses use."""
-    return estimation.fit_by_multiple_shooting(
+    return maximum_likelihood.fit_by_multiple_shooting(
         model, data, x=data.outputs, noise=noise, estimate_process=True
     )
 
 
 def by_filter(model: Dynamics, data: Measurements, noise: Noise) -> Fit:
     """The fit that identifies f beside a noisy sensor."""
-    return estimation.fit_by_filter(model, data, x=data.outputs, noise=noise)
+    return maximum_likelihood.fit_by_filter(model, data, x=data.outputs, noise=noise)
 
 
 # A further estimator is a line here: a function of the model, the data, and the noises to begin with.

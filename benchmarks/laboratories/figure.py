@@ -12,7 +12,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from benchmarks.laboratories.summary import Row
-from siq.files.whole import whole_file
+from siq.numerics.files import whole_file
 
 WIDEST = 6.0  # bounds: what is further off stands at the edge
 MARKS = {"siq": "o", "Kramers–Moyal": "x", "PySINDy": "+", "StochasticForceInference": "^"}

@@ -18,7 +18,7 @@ from benchmarks.laboratories.models import LABORATORIES, Laboratory
 from benchmarks.laboratories.others import OTHERS
 from benchmarks.laboratories.records import crossings, generator, recorded
 from benchmarks.laboratories.truths import truth
-from siq.files.whole import whole_file
+from siq.numerics.files import whole_file
 
 MADE_BY, CROSSINGS = "laboratory", "crossings"  # what else stands in a file
 

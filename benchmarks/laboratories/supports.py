@@ -25,19 +25,17 @@ from benchmarks.laboratories.coverage import DOUBLE_WELL
 from benchmarks.laboratories.models import ARCHETYPE, Laboratory, maier_stein, resonator
 from benchmarks.laboratories.one import read, write
 from benchmarks.laboratories.records import generator, recorded, table
-from siq.certificate.tests import PredictionLimits
 from siq.data.recordings import Recordings, snapshot_pairs
-from siq.dynamics.diffusion import Diffusion
-from siq.estimation.innovations import Noise
-from siq.identify.flow import FlowMap
-from siq.identify.flow_regression import FlowRegression, fit_support
-from siq.identify.identification import IdentificationOptions
-from siq.identify.identified_field import IdentifiedField
-from siq.identify.library import CandidateLibrary
-from siq.identify.seen_states import View, settled, unbroken
-from siq.identify.storage import field_library
-from siq.steps.identify import IdentifySettings, run
-from siq.steps.settings import Sampling, StateSpace
+from siq.inference.field_estimate import FlowMap, IdentifiedField
+from siq.inference.flow_regression import FlowRegression, fit_support
+from siq.inference.identification import IdentificationOptions, field_library
+from siq.inference.kalman_filter import Noise
+from siq.inference.library import CandidateLibrary
+from siq.inference.observation import View, settled, unbroken
+from siq.quasipotential.certificate_tests import PredictionLimits
+from siq.systems.diffusion import Diffusion
+from siq.workflow.identification_step import IdentifySettings, run
+from siq.workflow.settings import Sampling, StateSpace
 
 STRONG = 5.0  # standard errors of the weakest true term of a record that counts
 WANTED = 0.93

@@ -19,9 +19,9 @@ from scipy.optimize import root
 
 from benchmarks.laboratories.models import Laboratory
 from benchmarks.laboratories.polynomials import drift, intensity, jacobian, monomial, polynomials
-from siq.dynamics.dynamics import Dynamics
 from siq.errors import NumericalFailure
-from siq.landscape.paths import MinimumActionPath, minimum_action_path
+from siq.quasipotential.paths import MinimumActionPath, minimum_action_path
+from siq.systems.dynamics import Dynamics
 
 TOLERANCE = 1e-6  # of an action: far below what a record can say
 

@@ -13,8 +13,8 @@ from docutils import nodes
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
-from siq.mismatch import dictionary
-from siq.mismatch.dictionary import Form, Mechanism, MechanismParameter, Shape, standard_dictionary
+from siq.diagnosis import dictionary
+from siq.diagnosis.dictionary import Form, Mechanism, MechanismParameter, Shape, standard_dictionary
 
 
 def page(mechanisms: Sequence[Mechanism]) -> str:
@@ -114,7 +114,7 @@ class Mechanisms(SphinxDirective):
     """The dictionary of mechanisms that comes with the library."""
 
     def run(self) -> list[nodes.Node]:
-        """Write it from `siq/mismatch/mechanisms.yaml`."""
+        """Write it from `siq/diagnosis/mechanisms.yaml`."""
         self.env.note_dependency(dictionary.__file__)
         self.env.note_dependency(dictionary.__file__.replace("dictionary.py", "mechanisms.yaml"))
         return self.parse_text_to_nodes(page(standard_dictionary()))

@@ -1,6 +1,6 @@
 """Tables of every key of a schema, written from the schema itself when the pages are built.
 
-`{schema} siq.study.study:Study` becomes a table: key, type, default, meaning. Types and limits come from
+`{schema} siq.workflow.study:Study` becomes a table: key, type, default, meaning. Types and limits come from
 the annotations, meanings from the `Attributes` of the docstring. A key without a meaning is a warning,
 and `make docs` makes that an error: whoever adds a key has to say what it is.
 """
@@ -144,8 +144,8 @@ class ColumnsTable(SphinxDirective):
     """A table of the tables: which columns each has, and of which type."""
 
     def run(self) -> list[nodes.Node]:
-        """Write it from `siq.study.tables.COLUMNS`."""
-        from siq.study import tables
+        """Write it from `siq.workflow.tables.COLUMNS`."""
+        from siq.workflow import tables
 
         self.env.note_dependency(inspect.getfile(tables))
         text = ["| table | columns |", "|---|---|"]

@@ -18,11 +18,10 @@ from pathlib import Path
 
 import pandas as pd
 
-from siq.numerics.measured_text import range_text, value_text
-from siq.report.inspection_section import read_seen
-from siq.report.landscape_answer import counted_text, foreseen_text
-from siq.report.record_answer import with_visits
-from siq.report.said_landscape import SaidLandscape
+from siq.numerics.text import range_text, value_text
+from siq.report.landscape_answer import counted_text, foreseen_text, with_visits
+from siq.report.landscape_summary import SaidLandscape
+from siq.report.study_page import read_seen
 
 ROOT = Path(__file__).parents[2]
 FIGURES = ROOT / "docs" / "figures.json"

@@ -21,7 +21,7 @@ import pandas as pd
 from matplotlib import pyplot
 
 import siq
-from siq.data.transitions import Switching
+from siq.data.two_states import Switching
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "docs" / "images" / "real-records"

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from siq.errors import InputError
-from siq.files.whole import whole_file
+from siq.numerics.files import whole_file
 
 DOUBLE_WELL = """\
 # A bead hops between two optical traps at -0.5 um and 0.5 um, and the camera adds an error of 0.01 um to each

@@ -10,10 +10,9 @@ from pathlib import Path
 from siq.cli.answers import Exit, Told, answer_of_page
 from siq.cli.studies import is_study, name_for, own_path, write_generated
 from siq.cli.workflow import Ended, Request, known_studies, need_workflow, run_workflow
-from siq.data.folders import CARD, case_folders
 from siq.errors import InputError, suggestion
-from siq.files.documents import read_document
-from siq.study.study import load_study
+from siq.numerics.files import CARD, case_folders, read_document
+from siq.workflow.study import load_study
 
 RESULTS = Path("results")
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from siq.data.inspection import Inspection, inspect_recordings
 from siq.data.recordings import read_recordings
 from siq.errors import InputError
-from siq.files.whole import whole_file
+from siq.numerics.files import whole_file
 from siq.version import DISTRIBUTION
 
 GENERATED = Path(".snakemake", "siq")

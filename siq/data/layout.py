@@ -12,16 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import pyarrow as pa
 
+from siq.data.columns import TIME_UNITS, Heading, is_index, is_label, is_time, read_heading, usable_name
 from siq.data.formats import ColumnFile
-from siq.data.headings import (
-    TIME_UNITS,
-    Heading,
-    is_index,
-    is_label,
-    is_time,
-    read_heading,
-    usable_name,
-)
 from siq.errors import InputError, suggestion
 
 

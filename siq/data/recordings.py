@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from siq.data.checks import check_times
-from siq.data.labels import sources
-from siq.files.whole import whole_file
+from siq.data.columns import check_times, sources
+from siq.numerics.files import whole_file
 
 if TYPE_CHECKING:
     import pandas as pd

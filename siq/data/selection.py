@@ -1,4 +1,4 @@
-"""Selection: whole recordings, chosen or drawn, since the samples of one recording are not independent."""
+"""Selection of recordings: whole ones, stretches, resampled ones, and those that are held out."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from siq.data.labels import distinct_labels, sources
-from siq.data.noise_floor import noise_floors
+from siq.data.columns import distinct_labels, sources
+from siq.data.correlation import noise_floors
+from siq.data.inspection import SINGLE_REMEDY
 from siq.data.recordings import Recordings
 from siq.data.stationarity import correlated_samples, runs_of
+from siq.errors import NumericalFailure
 
 
 def select_recordings(recordings: Recordings, indices: Sequence[int] | np.ndarray) -> Recordings:
@@ -131,3 +133,29 @@ def joined(recordings: Recordings) -> Recordings:
         labels = tuple(label for label, later in zip(recordings.labels, follows, strict=True) if not later)
     whole = np.cumsum(~np.array(follows)) - 1
     return replace(recordings, labels=labels, recording=whole[recordings.recording])
+
+
+SHARE = 0.2  # a convention: the usual fifth
+
+
+def held_out_recordings(
+    recordings: Recordings, *, generator: np.random.Generator, share: float = SHARE
+) -> np.ndarray:
+    """A random part of the recordings, as a mask over ``recordings.labels``.
+
+    Copies of a resampled recording stay together: none is held out while another is fitted.
+
+    Raises
+    ------
+    NumericalFailure
+        When all recordings are copies of one, so that none can be held out.
+    """
+    groups = np.asarray(sources(recordings.labels))
+    names = np.unique(groups)
+    if len(names) < 2:
+        raise NumericalFailure(
+            "there is only one recording, and it shows no random forces or is too short to be divided, so"
+            f" that none can be held out; {SINGLE_REMEDY}"
+        )
+    count = min(max(round(share * len(names)), 1), len(names) - 1)
+    return np.isin(groups, generator.permutation(names)[:count])

@@ -1,4 +1,4 @@
-"""Does a record stay where it is: how fast does it forget, and does its background drift slowly?
+"""Stationarity: relaxation times and slow drift of a record.
 
 Three times of a record differ by orders of magnitude, and each has its use:
 

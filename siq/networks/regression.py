@@ -20,9 +20,9 @@ import scipy.linalg
 from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from siq.dynamics.diffusion import Diffusion
 from siq.errors import NumericalFailure, needs_extra
-from siq.identify.library import CandidateLibrary, constraint_matrix
+from siq.inference.library import CandidateLibrary, constraint_matrix
+from siq.systems.diffusion import Diffusion
 
 LOWER_SHARE = 0.75
 """Of the points by V_θ, where no level is given, a choice: the highest are few, and networks worst there."""

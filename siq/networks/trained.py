@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from siq.errors import InputError
-from siq.files.whole import whole_file
+from siq.numerics.files import whole_file
 
 Layer = tuple[np.ndarray, np.ndarray]
 """Weights, shape ``(inputs, outputs)``, and biases, shape ``(1, outputs)``."""

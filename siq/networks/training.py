@@ -1,4 +1,4 @@
-"""Training: fit the two networks to snapshot pairs (paper, section 2.2 and Appendix B).
+"""Training of the networks on snapshot pairs (paper, section 2.2 and Appendix B).
 
 Several runs can train side by side. All random choices of a run come from its own seed and from the
 number of the step, so that a run neither depends on its neighbours nor on interruptions: a killed
@@ -10,19 +10,274 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-from siq.dynamics.diffusion import Diffusion
-from siq.errors import needs_extra
-from siq.networks.data import Batches, TrainingData, child_seed
-from siq.networks.initial import initial_networks
-from siq.networks.loss import dynamics_loss, orthogonality_loss
-from siq.networks.matching import mean_velocity
-from siq.networks.networks import Networks, evaluate, move
-from siq.networks.options import TrainingOptions
+from siq.data.recordings import SnapshotPairs
+from siq.errors import InputError, NumericalFailure, needs_extra
+from siq.networks.networks import (
+    Networks,
+    at_rest,
+    dynamics_loss,
+    evaluate,
+    initial_layers,
+    move,
+    orthogonality_loss,
+    select_run,
+    side_by_side,
+)
+from siq.networks.options import TrainingOptions, mean_velocity
+from siq.networks.trained import pack, read_archive, unpack, write_archive
+from siq.numerics.least_squares import representative_subset
+from siq.systems.diffusion import Diffusion
+
+with needs_extra("networks"):
+    import torch
+    from torch import Tensor
+
+CHUNK = 100  # steps whose batches are drawn together; part of what a seed means
+STANDARD_THINNING = 0.1  # distance of representative points, in standard deviations of the states
+FEWEST_REPRESENTATIVE = 10  # below this, orthogonality is asked for almost nowhere
+HELD_OUT_PAIRS = 4096  # pairs on which the held-out loss is measured
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """The pairs of one run, divided, with its representative points.
+
+    Attributes
+    ----------
+    training, held_out
+        Pairs of the recordings that train, and of the others.
+    representative_rows
+        Which S of the training pairs have evenly spread X0.
+    """
+
+    training: SnapshotPairs
+    held_out: SnapshotPairs
+    representative_rows: np.ndarray
+
+    @property
+    def representative(self) -> SnapshotPairs:
+        """The training pairs whose X0 are spread evenly."""
+        return self.training.take(self.representative_rows)
+
+
+def prepare_data(
+    pairs: SnapshotPairs, *, options: TrainingOptions, generator: np.random.Generator
+) -> TrainingData:
+    """Divide the recordings into training and held-out ones, and thin the training points.
+
+    Parameters
+    ----------
+    pairs
+        The snapshot pairs of one run.
+    options
+        For the share and the thinning distance.
+    generator
+        Decides which recordings train and which points represent.
+
+    Raises
+    ------
+    NumericalFailure
+        When there are fewer than two recordings to divide, a state does not vary, or hardly any
+        representative points remain.
+    """
+    names = np.unique(pairs.recording)
+    if len(names) < 2:
+        raise NumericalFailure("there is only one recording; give at least two, so that one can be held out")
+    count = min(max(round(options.training_share * len(names)), 1), len(names) - 1)
+    trains = np.isin(pairs.recording, generator.permutation(names)[:count])
+    training, held_out = pairs.take(trains), pairs.take(~trains)
+    spread = training.x0.std(axis=0)
+    if not (spread > 0).all():
+        raise NumericalFailure("a state does not vary in the recordings; leave it out or record it in motion")
+    distance, points = options.thinning_distance, training.x0
+    if distance is None:
+        distance, points = STANDARD_THINNING, points / spread
+    rows = representative_subset(points, distance=distance, generator=generator)
+    if len(rows) < FEWEST_REPRESENTATIVE:
+        raise NumericalFailure(
+            f"only {len(rows)} representative points are {distance} apart;"
+            " lower training.thinning_distance or leave it out"
+        )
+    return TrainingData(training, held_out, rows)
+
+
+def slowest_part(data: TrainingData, share: float) -> TrainingData:
+    """Representative points without the fastest ones.
+
+    Far out f is often many times faster than about the attractors, and none of what is asked there matters
+    to the wells. Speeds are measured in standard deviations of the states.
+
+    Parameters
+    ----------
+    data
+        The pairs of one run.
+    share
+        Share of the representative points that stay, the slowest; at least a few do.
+    """
+    if share >= 1:
+        return data
+    pairs = data.representative
+    speed = np.linalg.norm((pairs.xh - pairs.x0) / pairs.h[:, None] / data.training.x0.std(axis=0), axis=1)
+    count = max(int(np.ceil(share * len(speed))), min(FEWEST_REPRESENTATIVE, len(speed)))
+    return replace(data, representative_rows=np.sort(data.representative_rows[np.argsort(speed)[:count]]))
+
+
+class Batches:
+    """Random batches of every run, drawn from its seed and the number of the step.
+
+    All runs stand in one table, so that one look-up serves them all. A batch depends on the seed and on
+    the step alone, which is what lets an interrupted training resume exactly.
+
+    Parameters
+    ----------
+    data, seeds
+        One entry a run.
+    options
+        For the batch size.
+    device, dtype
+        Where the batches are wanted, and in which precision.
+    """
+
+    def __init__(
+        self,
+        data: Sequence[TrainingData],
+        *,
+        options: TrainingOptions,
+        seeds: Sequence[np.random.SeedSequence],
+        device: torch.device,
+        dtype: torch.dtype,
+    ) -> None:
+        self.seeds = seeds
+        self.device = device
+        self.dtype = dtype
+        self.size = options.batch_size
+        self.representative_size = round(options.representative_share * options.batch_size)
+        self.data = data
+        self.pairs = torch.cat([_table(run.training) for run in data]).to(device, dtype)
+        self.dimension = data[0].training.x0.shape[1]
+        self.chunk = -1
+
+    def batch(self, step: int) -> tuple[Tensor, Tensor]:
+        """Rows of X0, Xh, (Xh - X0)/h, h, and representative points: ``(runs, batch, ...)`` each."""
+        chunk, position = divmod(step, CHUNK)
+        if chunk != self.chunk:
+            self.chunk, self.indices = chunk, self._draw(chunk)
+        rows = self.pairs[self.indices[:, position]]
+        return rows[:, : self.size], rows[:, self.size :, : self.dimension]
+
+    def held_out(self) -> tuple[Tensor, Tensor]:
+        """A fixed batch of held-out pairs, and of representative points, for every run."""
+        pairs, points = [], []
+        for run in self.data:
+            table = _table(run.held_out)
+            pairs.append(table[np.linspace(0, len(table) - 1, HELD_OUT_PAIRS).astype(int)])
+            rows = run.representative_rows[
+                np.linspace(0, len(run.representative_rows) - 1, HELD_OUT_PAIRS).astype(int)
+            ]
+            points.append(torch.from_numpy(run.training.x0[rows]))
+        return (
+            torch.stack(pairs).to(self.device, self.dtype),
+            torch.stack(points).to(self.device, self.dtype),
+        )
+
+    def _draw(self, chunk: int) -> Tensor:
+        """Rows of a chunk of steps, shape ``(runs, steps, pairs + points)``."""
+        drawn, offset = [], 0
+        for seed, run in zip(self.seeds, self.data, strict=True):
+            generator = np.random.default_rng(child_seed(seed, 1 + chunk))
+            pairs = generator.integers(
+                len(run.training.h), size=(CHUNK, self.size - self.representative_size)
+            )
+            evenly = generator.integers(
+                len(run.representative_rows), size=(CHUNK, self.representative_size + self.size)
+            )
+            drawn.append(offset + np.concatenate([pairs, run.representative_rows[evenly]], axis=1))
+            offset += len(run.training.h)
+        return torch.from_numpy(np.stack(drawn)).to(self.device)
+
+
+def child_seed(seed: np.random.SeedSequence, key: int) -> np.random.SeedSequence:
+    """A child seed by its number, without counting how many were taken before."""
+    return np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, key))
+
+
+def _table(pairs: SnapshotPairs) -> Tensor:
+    """Pairs as rows of X0, Xh, (Xh - X0)/h, h; the quotient is taken in double precision."""
+    h = pairs.h[:, None]
+    return torch.from_numpy(np.concatenate([pairs.x0, pairs.xh, (pairs.xh - pairs.x0) / h, h], axis=1))
+
+
+with needs_extra("networks"):
+    import torch
+
+
+def initial_networks(
+    data: Sequence[TrainingData],
+    *,
+    options: TrainingOptions,
+    diffusion: Diffusion,
+    generators: Sequence[np.random.Generator],
+) -> Networks:
+    """Random networks, normalised and rescaled to the data of each run (paper, Eqs. eta_v, eta_g).
+
+    η_v and η_g bring the initial ∣∇V∣ and ∣g∣ to the size of the observed velocities.
+    """
+    dtype = getattr(torch, options.precision)
+    dimension = diffusion.dimension
+    sources = [run.training if options.normalise_on == "pairs" else run.representative for run in data]
+    means = np.stack([pairs.x0.mean(axis=0) for pairs in sources])[:, None]
+    scales = np.stack([pairs.x0.std(axis=0) for pairs in sources])[:, None]
+    ones = torch.ones(len(data), 1, 1, dtype=dtype)
+    networks = Networks(
+        potential=initial_layers((dimension, *options.widths, 1), generators=generators, dtype=dtype),
+        circulatory=initial_layers(
+            (dimension, *options.widths, dimension), generators=generators, dtype=dtype
+        ),
+        mean=torch.from_numpy(means).to(dtype),
+        scale=torch.from_numpy(scales).to(dtype),
+        potential_scale=ones,
+        circulatory_scale=ones,
+        diffusion=torch.from_numpy(diffusion.matrix).to(dtype),
+    )
+    potential_scales, circulatory_scales = [], []
+    for run, pairs in enumerate(sources):
+        one = select_run(networks, run)
+        # A few thousand pairs fix a single number well; the whole data would only cost memory.
+        rows = np.linspace(0, len(pairs.h) - 1, min(len(pairs.h), 20_000)).astype(int)
+        components = evaluate(one, torch.from_numpy(pairs.x0[rows]).to(dtype)[None])
+        velocity = (pairs.xh[rows] - pairs.x0[rows]) / pairs.h[rows, None]
+        speed = np.linalg.norm(velocity, axis=1)
+        # ∇ with respect to y = (x - μ)/σ, as the paper writes it. Where the σ differ this makes V several
+        # times larger than ∇ with respect to x would, and V then learns as fast as g does; with the
+        # smaller scale training ends in a V that is flat along x.
+        downhill = torch.linalg.norm(components.gradient * one.scale, dim=-1)[0].numpy()
+        circulatory = torch.linalg.norm(components.circulatory, dim=-1)[0].numpy()
+        along = float(downhill @ speed / (downhill @ downhill))
+        if options.potential_from == "descent":
+            along = (
+                _descent(pairs.x0[rows], components.gradient[0].double().numpy(), velocity, diffusion)
+                or along
+            )
+        potential_scales.append(along)
+        circulatory_scales.append(float(circulatory @ speed / (circulatory @ circulatory)))
+    return replace(
+        networks,
+        potential_scale=options.potential_gain * torch.tensor(potential_scales, dtype=dtype)[:, None, None],
+        circulatory_scale=torch.tensor(circulatory_scales, dtype=dtype)[:, None, None],
+    )
+
+
+def _descent(x: np.ndarray, gradient: np.ndarray, velocity: np.ndarray, diffusion: Diffusion) -> float:
+    """The factor on V with which -D∇V comes closest to the velocities; 0 where these go up V on the whole."""
+    size = diffusion.steepness(x, gradient).sum()
+    return max(float(-(gradient * velocity).sum() / size), 0.0)
+
 
 with needs_extra("networks"):
     import torch
@@ -247,3 +502,42 @@ class _Objective:
             at_points, self.diffusion, self.precision, asymmetry=options.asymmetry
         )
         return dynamics, orthogonality
+
+
+with needs_extra("networks"):
+    import torch
+
+
+def save_checkpoint(path: str | Path, state: TrainingState, *, fingerprint: str) -> None:
+    """Write the state of a training, with a fingerprint of the data and options that it belongs to."""
+    arrays = pack([at_rest(state.networks, run) for run in range(state.networks.runs)])
+    for name, moments in (("first", state.first_moments), ("second", state.second_moments)):
+        arrays |= {f"{name}{index}": tensor.numpy() for index, tensor in enumerate(moments)}
+    arrays["step"] = np.array(state.step)
+    arrays["history"] = state.history[list(HISTORY)].to_numpy(dtype=float)
+    arrays["fingerprint"] = np.array(fingerprint)
+    write_archive(path, arrays)
+
+
+def load_checkpoint(path: str | Path, *, fingerprint: str) -> TrainingState | None:
+    """Read the state of an interrupted training, or None where there is none that can be continued.
+
+    A checkpoint of other data or options has another fingerprint and is passed over, and so is one that
+    is damaged: training then starts afresh, which costs time but never a wrong result.
+    """
+    try:
+        arrays = read_archive(path)
+        if str(arrays["fingerprint"]) != fingerprint:
+            return None
+        networks = side_by_side([unpack(arrays, run) for run in range(len(arrays["mean"]))])
+        count = len(networks.parameters())
+        history = pd.DataFrame(arrays["history"], columns=list(HISTORY))
+        return TrainingState(
+            step=int(arrays["step"]),
+            networks=networks,
+            first_moments=tuple(torch.from_numpy(arrays[f"first{index}"]) for index in range(count)),
+            second_moments=tuple(torch.from_numpy(arrays[f"second{index}"]) for index in range(count)),
+            history=history.astype({"run": "int64", "step": "int64"}),
+        )
+    except (InputError, KeyError, ValueError):
+        return None

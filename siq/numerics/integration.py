@@ -1,4 +1,4 @@
-"""One step of order eight for many trajectories at once, each with a step of its own.
+"""Integration of many trajectories at once, and loops as machine code.
 
 Library integrators take one trajectory, or many with the step that the most difficult of them needs. Here
 every row of a state array has its own step, so that a whole fan costs hardly more than one trajectory.
@@ -7,7 +7,9 @@ every row of a state array has its own step, so that a whole fan costs hardly mo
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TypeVar, cast
 
+import numba
 import numpy as np
 from scipy.integrate import DOP853
 
@@ -67,3 +69,14 @@ def next_step(step: np.ndarray, error: np.ndarray) -> np.ndarray:
     with np.errstate(divide="ignore"):
         factor = SAFETY * error ** (-1 / ORDER)
     return step * np.clip(factor, SMALLEST_FACTOR, LARGEST_FACTOR)
+
+
+Function = TypeVar("Function", bound=Callable[..., object])
+
+
+def machine_code(function: Function) -> Function:
+    """The function as machine code, kept on disk where there is a folder to write to."""
+    try:
+        return cast(Function, numba.njit(cache=True)(function))
+    except RuntimeError:  # neither beside the module nor in the user's own folder
+        return cast(Function, numba.njit(function))

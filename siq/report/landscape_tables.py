@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from siq.landscape.dwell_times import NoiseStrength, exit_time
-from siq.numerics.measured_text import range_text, unit_text, value_text
+from siq.numerics.text import range_text, unit_text, value_text
+from siq.quasipotential.rates import NoiseStrength, exit_time
 from siq.report.landscape_answer import time_text
+from siq.report.landscape_summary import SaidLandscape, well_name
 from siq.report.page import ReportTable
-from siq.report.said_landscape import SaidLandscape, well_name
-from siq.steps.outcomes import Status, Step
+from siq.workflow.outcomes import Status, Step
 
 
 def landscape_sentences(landscape: pd.DataFrame, outcomes: pd.DataFrame) -> list[str]:
@@ -260,3 +260,147 @@ def errors_table(errors: pd.DataFrame, folder: Path) -> ReportTable:
         f"{folder}/landscape_errors.csv",
         40,
     )
+
+
+SHORT = {
+    "intensity": "ε",
+    "bessel": "Bessel",
+    "simulated_distance": "distance",
+    "sampling_floor": "floor",
+    "unknown_at_most": "unknown, at most",
+    "simulated_unknown": "simulated there",
+}
+
+
+def invariant_tables(invariant: pd.DataFrame, shares: pd.DataFrame, folder: Path) -> list[ReportTable]:
+    """The normalisation of the invariant distribution, and the wells' shares, where one was asked for."""
+    if invariant.empty:
+        return []
+    explained = {
+        "Bessel": "Z by the paper's closed formula, over all space",
+        "quadrature": "Z by quadrature, over the domain; of local formulas, over its part where U is known",
+        "distance": "total variation between density and long simulation, on the first two states; of local"
+        " formulas, within the region where U is known",
+        "floor": "what this distance is expected to be if the density is exact",
+        "unknown, at most": "share of all probability in the domain that can lie where U is not known",
+        "simulated there": "share of the simulation that was in that region",
+        "method": "the published formula is as printed; its run −1 is none of ours",
+    }
+    tables = [
+        ReportTable(
+            "Normalisation Z of the invariant distribution exp(−U/ε)/Z for √ε dW, for each ε, and its"
+            " distance from a long simulation.",
+            readable(invariant.rename(columns=SHORT)), explained, f"{folder}/invariant.csv",
+        )
+    ]  # fmt: skip
+    if len(shares):
+        tables.append(
+            ReportTable(
+                "The wells' shares of the invariant distribution. Walkers of the simulation start with the"
+                " shares of the formulas, since at small ε they do not change wells; where few have changed,"
+                " the simulated shares are those of the start, and the simulation tests the density within"
+                " each well alone. exp(−U/ε) is the leading order as ε → 0, without the density's prefactor.",
+                readable(shares.rename(columns=SHORT)),
+                {
+                    "share": "by exp(−U/ε) over the region where U is known",
+                    "by rates": "by the law of the escape times, prefactors included",
+                    "changed": "of the walkers that start in the well, the share that ends in another",
+                },
+                f"{folder}/well_shares.csv",
+            )
+        )
+    return tables
+
+
+def readable(table: pd.DataFrame) -> pd.DataFrame:
+    """A table with headings in words, without columns that say nothing."""
+    return table.dropna(axis=1, how="all").rename(columns=lambda name: name.replace("_", " "))
+
+
+CAPTION = (
+    "Barriers, prefactors and mean times: by the equations of the card, and by the trajectories alone. This"
+    " is scoring, and no input of the method."
+)
+EXPLAINED = {
+    "item": "A1 is the first attractor of the equations, and so on; A1 to A2 is the way out of it",
+    "difference": "trajectories / equations − 1",
+    "in standard errors": "of the number by the trajectories, as these state it",
+}
+
+
+def beside_sentences(table: pd.DataFrame | None) -> list[str]:
+    """The largest difference of a barrier, and what cannot be compared; nothing where nobody asked.
+
+    Parameters
+    ----------
+    table
+        `beside_equations`, None where there is none.
+    """
+    if table is None or table.empty:
+        return []
+    barriers = table[table["quantity"] == "barrier"]
+    off = barriers["relative_difference"].abs().max()
+    said = []
+    if np.isfinite(off):
+        said.append(
+            "The equations of the card, which are no input of the method, have barriers too: those of the"
+            f" trajectories are off by {_share(off)} at most."
+        )
+    for note, some in table[table["note"].fillna("") != ""].groupby("note", sort=False):
+        named = ", ".join(item for item in dict.fromkeys(some["item"].fillna("")) if item)
+        said.append(f"Beside the equations: {named + ': ' if named else ''}{note}.")
+    return said
+
+
+def beside_table(table: pd.DataFrame, folder: Path) -> ReportTable:
+    """Every number by both; of several runs their mean, with the largest difference.
+
+    Parameters
+    ----------
+    table
+        `beside_equations`.
+    folder
+        Where it lies.
+    """
+    known = table[table["quantity"].fillna("") != ""]
+    rows = []
+    for _, some in known.groupby(["item", "quantity", "noise"], sort=False, dropna=False):
+        first = some.iloc[0]
+        at = f" at ε = {value_text(first['noise'])}" if np.isfinite(first["noise"]) else ""
+        several = some["run"].nunique() > 1
+        off, sharp = some["relative_difference"], some["in_errors"]
+        rows.append(
+            {
+                "item": first["item"],
+                "what": f"{first['quantity']}{at}",
+                "by the equations": _text(first["equations"]),
+                "by the trajectories": _text(some["trajectories"].mean()),
+            }
+            | (
+                {
+                    "runs": int(some["trajectories"].notna().sum()),
+                    "largest difference": _share(off.abs().max()),
+                    "largest in standard errors": _text(sharp.abs().max(), digits=2),
+                }
+                if several
+                else {
+                    "difference": _share(off.iloc[0], sign=True),
+                    "in standard errors": _text(sharp.iloc[0], digits=2),
+                }
+            )
+        )
+    return ReportTable(
+        CAPTION, pd.DataFrame(rows), EXPLAINED, f"{folder}/beside_equations.csv", 40, data=table
+    )
+
+
+def _text(value: float, *, digits: int = 5) -> str:
+    return value_text(value, digits=digits) if np.isfinite(value) else ""
+
+
+def _share(value: float, *, sign: bool = False) -> str:
+    """A difference in per cent."""
+    if not np.isfinite(value):
+        return ""
+    text = value_text(100 * value, digits=2)
+    return f"+{text} %" if sign and value > 0 else f"{text} %"

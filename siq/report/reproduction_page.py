@@ -1,4 +1,4 @@
-"""One page that lists the paper's tables, figures and numbers, with ours beside them and the difference."""
+"""The page beside a publication, and the table of official tests."""
 
 from __future__ import annotations
 
@@ -11,22 +11,20 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from siq.dynamics.dynamics import Dynamics
-from siq.identify.storage import read_field
+from siq.inference.identification import read_field
 from siq.networks.regression import points_below
-from siq.numerics.number_text import number_text
 from siq.numerics.randomness import Purpose, generator
-from siq.report.invariant_tables import invariant_tables, readable
-from siq.report.landscape_tables import errors_table
+from siq.numerics.text import number_text, value_text
+from siq.report.landscape_tables import errors_table, invariant_tables, readable
 from siq.report.page import ReportFigure, ReportTable, ReproductionContent, ReproductionSection
 from siq.report.settings import ReproductionSettings
-from siq.steps.outcomes import Method
-from siq.steps.shown import ModelFiles, shown_formula
-from siq.study.published import own_equations, published_decomposition
-from siq.study.published_figures import PublishedFigure
-from siq.study.reproduction import (
+from siq.systems.dynamics import Dynamics
+from siq.workflow.collection_steps import ModelFiles, shown_formula
+from siq.workflow.outcomes import Method
+from siq.workflow.published import PublishedFigure, own_equations, published_decomposition
+from siq.workflow.reproduction import (
     HEADINGS,
-    OURS,
+    REPRODUCED_METHODS,
     Parameters,
     Place,
     attractor_rows,
@@ -35,8 +33,8 @@ from siq.study.reproduction import (
     parameter_table,
     shown,
 )
-from siq.study.scoring import summary_row, summary_table
-from siq.study.tables import as_table, read_table
+from siq.workflow.scoring import summary_row, summary_table
+from siq.workflow.tables import as_table, read_table
 
 POINTS = 20_000  # of the domain, on which published formulas are held against their own equations
 SHOWN = 60  # rows of a table
@@ -202,7 +200,7 @@ def _overview(places: Sequence[Place], tables: Sequence[pd.DataFrame]) -> Report
             "in the paper": place.place, "study": place.study or "", "shown beside": ", ".join(names),
             "numbers": len(table),
         }  # fmt: skip
-        for method, heading in zip(OURS, HEADINGS, strict=True):
+        for method, heading in zip(REPRODUCED_METHODS, HEADINGS, strict=True):
             row[heading] = np.nan
             if f"{method} − published" in table:
                 away = table[f"{method} − published"].abs() / table["published"].abs().replace(0, np.nan)
@@ -286,3 +284,61 @@ def reproduction_page(
         commands=[command],
     )
     return content, pd.concat(every, ignore_index=True)
+
+
+OURS = {
+    "recalibrated": "the card’s equations, refitted",
+    "augmented": "the card with what the diagnosis found",
+}
+
+
+def official_rows(benchmark: str, table: pd.DataFrame) -> pd.DataFrame:
+    """The errors of a benchmark, ready to stand in one table with others.
+
+    Parameters
+    ----------
+    benchmark
+        Its name.
+    table
+        Of `siq.diagnosis.official_tests.official_tables`.
+
+    Returns
+    -------
+    pandas.DataFrame
+        Columns ``benchmark test by error unit scored source``.
+    """
+    return pd.DataFrame(
+        {
+            "benchmark": benchmark,
+            "test": table["test"],
+            "by": table["simulation"].map(OURS).fillna(table["simulation"]),
+            "error": table["error"],
+            "unit": table["unit"],
+            "scored": table["scored"],
+            "source": table["source"],
+        }
+    )
+
+
+def official_page(rows: pd.DataFrame, verdicts: Mapping[str, Mapping[str, Any]]) -> str:
+    """The table as Markdown, below what the diagnosis says of each benchmark.
+
+    Parameters
+    ----------
+    rows
+        Of `official_rows`, of all benchmarks.
+    verdicts
+        What ``verdict.json`` says, by benchmark.
+    """
+    lines = ["# Official tests of public benchmarks", ""]
+    for name, verdict in verdicts.items():
+        lines += [f"**{name}**: {verdict['sentence']}", ""]
+    lines += [
+        "| benchmark | test | by | error | how it was scored | who says so |",
+        "|---|---|---|---|---|---|",
+    ]
+    for row in rows.to_dict("records"):
+        error = f"{value_text(float(row['error']), digits=3)} {row['unit']}"
+        cells = (row["benchmark"], row["test"], row["by"], error, row["scored"], row["source"])
+        lines.append(f"| {' | '.join(map(str, cells))} |")
+    return "\n".join(lines) + "\n"

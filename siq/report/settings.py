@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pydantic.dataclasses import dataclass
 
-from siq.dynamics.simulation import SimulationOptions
-from siq.landscape.options import LandscapeOptions
 from siq.networks.options import TrainingOptions
 from siq.networks.regression import RegressionOptions
-from siq.steps.settings import STRICT, Sampling, StateSpace
-from siq.study.study import Study
+from siq.quasipotential.landscape import LandscapeOptions
+from siq.systems.simulation import SimulationOptions
+from siq.workflow.settings import STRICT, Sampling, StateSpace
+from siq.workflow.study import Study
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -7,8 +7,7 @@ from typing import Any
 import pytest
 
 from benchmarks.laboratories.supports import STRONG, SYSTEMS, WANTED, identified, row, true_terms
-from siq.identify.identification import IdentificationOptions
-from siq.identify.storage import field_library
+from siq.inference.identification import IdentificationOptions, field_library
 
 
 def test_terms_of_a_record_are_compared_with_the_true_ones() -> None:

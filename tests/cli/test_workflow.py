@@ -9,7 +9,7 @@ from types import ModuleType
 import pytest
 
 from siq.cli.workflow import PLUGINS, Request, known_studies, workflow_folder
-from siq.data.folders import case_folders
+from siq.numerics.files import case_folders
 
 ROOT = Path(__file__).resolve().parents[2]
 

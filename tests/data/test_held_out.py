@@ -3,9 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from siq.data.held_out import held_out_recordings
 from siq.data.recordings import Recordings
-from siq.data.selection import resample_recordings, select_recordings
+from siq.data.selection import held_out_recordings, resample_recordings, select_recordings
 from siq.errors import NumericalFailure
 
 

@@ -4,9 +4,16 @@ import numpy as np
 import pytest
 from remembering import STEP, double_wells, trap
 
-from siq.data.lagged import even_stretches, lagged_covariances, long_run_covariance
-from siq.data.markov_lag import MarkovLag, markov_lag
-from siq.data.noise_memory import coloured_displacement, exposure_displacement, increment_covariances
+from siq.data.correlation import (
+    MarkovLag,
+    coloured_displacement,
+    even_stretches,
+    exposure_displacement,
+    increment_covariances,
+    lagged_covariances,
+    long_run_covariance,
+    markov_lag,
+)
 from siq.data.recordings import Recordings
 
 

@@ -9,8 +9,7 @@ from scipy.signal import lfilter
 from siq.data.recordings import Recordings
 from siq.data.selection import in_stretches
 from siq.data.stationarity import background_of, correlation_times, relaxation_samples, runs_of
-from siq.data.transitions import switching, without_slow_drift
-from siq.data.visits import DwellCount, counted_visits, dwell_counts
+from siq.data.two_states import DwellCount, counted_visits, dwell_counts, switching, without_slow_drift
 
 STEP, COUNT = 0.05, 20_000
 TIME = STEP * np.arange(COUNT)

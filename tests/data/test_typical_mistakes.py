@@ -11,16 +11,22 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from siq.data.headings import RESERVED, is_unit, read_heading, usable_name
-from siq.data.inspection import inspect_recordings
-from siq.data.learnable import checked_for_learning, read_pairs
-from siq.data.noise_floor import noise_floors
-from siq.data.quantum import decimals_of, quantum, rounding_error
+from siq.data.columns import (
+    RESERVED,
+    decimals_of,
+    is_unit,
+    quantum,
+    read_heading,
+    rounding_error,
+    usable_name,
+)
+from siq.data.correlation import noise_floors
+from siq.data.inspection import checked_for_learning, inspect_recordings, read_pairs
 from siq.data.recordings import Recordings, read_recordings, write_recordings
 from siq.data.selection import STRETCHES, in_stretches
-from siq.dynamics.cards import check_name
-from siq.dynamics.formulas import CONSTANTS, FUNCTIONS
 from siq.errors import InputError
+from siq.systems.cards import check_name
+from siq.systems.formulas import CONSTANTS, FUNCTIONS
 
 
 def put(folder: Path, name: str, content: str | bytes) -> Path:

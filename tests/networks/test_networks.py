@@ -8,20 +8,11 @@ import torch
 from known_settings import PAPER
 
 from siq.data.recordings import SnapshotPairs
-from siq.dynamics.diffusion import Diffusion
 from siq.errors import NumericalFailure
-from siq.networks.data import prepare_data
-from siq.networks.initial import initial_networks
-from siq.networks.networks import (
-    Networks,
-    at_rest,
-    evaluate,
-    initial_layers,
-    move,
-    select_run,
-    side_by_side,
-)
+from siq.networks.networks import Networks, at_rest, evaluate, initial_layers, move, select_run, side_by_side
+from siq.networks.training import initial_networks, prepare_data
 from siq.numerics.randomness import generator
+from siq.systems.diffusion import Diffusion
 
 FULL = np.array([[2.0, 0.3, 0.1], [0.3, 1.0, -0.2], [0.1, -0.2, 0.5]])
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from known_systems import exact_archetype
 
-from siq.dynamics.diffusion import Diffusion
 from siq.errors import NumericalFailure
-from siq.identify.library import CandidateLibrary, candidate_library
+from siq.inference.library import CandidateLibrary, candidate_library
 from siq.networks.regression import RegressionOptions, RegressionResult, points_below, sparse_decomposition
-from siq.potential.symbolic import term_coefficients
-from siq.study.scoring import exact_values
+from siq.quasipotential.formulas import term_coefficients
+from siq.systems.diffusion import Diffusion
+from siq.workflow.scoring import exact_values
 
 FULL = np.array([[1.0, 0.4], [0.4, 2.0]])
 Values = tuple[np.ndarray, np.ndarray, np.ndarray]

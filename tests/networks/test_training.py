@@ -12,16 +12,25 @@ from known_settings import PAPER
 
 from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
 from siq.data.selection import resample_recordings
-from siq.dynamics.diffusion import Diffusion
 from siq.errors import InputError, NumericalFailure
-from siq.networks.checkpoint import load_checkpoint, save_checkpoint
-from siq.networks.data import Batches, TrainingData, prepare_data, slowest_part
-from siq.networks.loss import dynamics_loss, orthogonality_loss
-from siq.networks.networks import Components, at_rest
+from siq.networks.networks import Components, at_rest, dynamics_loss, orthogonality_loss
 from siq.networks.options import TrainingOptions
 from siq.networks.trained import load_networks, pack, save_networks
-from siq.networks.training import HISTORY, TrainingState, failed_runs, start, train
+from siq.networks.training import (
+    HISTORY,
+    Batches,
+    TrainingData,
+    TrainingState,
+    failed_runs,
+    load_checkpoint,
+    prepare_data,
+    save_checkpoint,
+    slowest_part,
+    start,
+    train,
+)
 from siq.numerics.randomness import generator, seed_sequence
+from siq.systems.diffusion import Diffusion
 
 OPTIONS = replace(
     PAPER,

@@ -2,8 +2,7 @@ import math
 
 import pytest
 
-from siq.numerics.measured_text import range_text, squared, unit_text, value_text
-from siq.numerics.number_text import number_text
+from siq.numerics.text import number_text, range_text, squared, unit_text, value_text
 
 
 @pytest.mark.parametrize(

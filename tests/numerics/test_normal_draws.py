@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from siq.numerics.normal_draws import normal_draws
+from siq.numerics.randomness import normal_draws
 
 
 def test_draws_have_mean_and_covariance_in_any_units() -> None:

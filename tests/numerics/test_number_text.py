@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from siq.numerics.number_text import number_text
+from siq.numerics.text import number_text
 
 
 @pytest.mark.parametrize(

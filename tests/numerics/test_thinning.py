@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist
 
+from siq.numerics.least_squares import representative_subset
 from siq.numerics.randomness import generator
-from siq.numerics.thinning import representative_subset
 
 
 def naive_subset(points: np.ndarray, distance: float, order: np.ndarray) -> np.ndarray:

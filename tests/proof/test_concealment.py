@@ -17,8 +17,8 @@ import yaml
 from pyarrow import parquet
 from scipy.integrate import solve_ivp
 
-from siq.dynamics.cards import check_name
-from siq.dynamics.formulas import compile_formulas, parse_formula
+from siq.systems.cards import check_name
+from siq.systems.formulas import compile_formulas, parse_formula
 from workflow.proof.concealment import cases as concealment_cases
 from workflow.proof.concealment.cases import (
     PROOF,

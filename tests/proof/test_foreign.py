@@ -16,13 +16,12 @@ import sympy
 import yaml
 from scipy.integrate import solve_ivp
 
-from siq.dynamics.cards import load_system
-from siq.dynamics.diffusion import Diffusion
-from siq.dynamics.dynamics import Dynamics, Parameter
-from siq.dynamics.parametric import Signals, symbol
-from siq.mismatch.case import Comparison, read_case
-from siq.mismatch.study import measurements_of
-from siq.report.plots.foreign_proof import plot_foreign_proof
+from siq.diagnosis.investigation import Comparison, read_case
+from siq.diagnosis.study import measurements_of
+from siq.report.plots.proof import plot_foreign_proof
+from siq.systems.cards import load_system
+from siq.systems.diffusion import Diffusion
+from siq.systems.dynamics import Dynamics, Parameter, Signals, symbol
 from workflow.proof.batches import write_batch
 from workflow.proof.concealment.designs import draw_cases as draw_others
 from workflow.proof.foreign import cases as generator
@@ -111,7 +110,7 @@ def test_scores_import_nothing_of_the_search_and_the_verdict_that_they_test() ->
     for file in sorted((ROOT / "workflow/proof/foreign_scores").glob("*.py")):
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
             if isinstance(node, ast.ImportFrom) and str(node.module).startswith("siq.mismatch"):
-                assert node.module == "siq.mismatch.case", file.name
+                assert node.module == "siq.diagnosis.investigation", file.name
 
 
 def test_a_third_of_the_cases_conceal_nothing_and_all_kinds_take_turns() -> None:

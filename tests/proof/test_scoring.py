@@ -12,10 +12,9 @@ import pandas as pd
 import pytest
 import yaml
 
-from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.parametric import Signals
 from siq.errors import InputError
 from siq.report.plots.proof import plot_proof
+from siq.systems.dynamics import Dynamics, Signals
 from workflow.code_digest import imported_files
 from workflow.proof.batches import check_digests
 from workflow.proof.concealment.cases import CaseDesign, make_case
@@ -342,7 +341,7 @@ def test_settings_of_the_proof_are_checked(tmp_path: Path) -> None:
 def test_the_blind_diagnosis_imports_nothing_of_keys_and_concealment() -> None:
     found = imported_files(ROOT, ROOT / "workflow/scripts/blind_diagnosis.py")
     files = {str(file.relative_to(ROOT)) for file in found}
-    assert "siq/mismatch/case.py" in files
+    assert "siq/diagnosis/investigation.py" in files
     ours = {file for file in files if file.startswith("workflow/")}
     scripts = {"workflow/scripts/blind_diagnosis.py", "workflow/scripts/step.py"}
     assert ours == {"workflow/__init__.py", *scripts}

@@ -2,8 +2,8 @@ import json
 
 import pytest
 
-from siq.report.answer import answer_of, write_answer
-from siq.study.tables import as_table
+from siq.report.answers import answer_of, write_answer
+from siq.workflow.tables import as_table
 
 
 def answer(certified: list[bool], *, failed: list[int] | None = None):

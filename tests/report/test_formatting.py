@@ -3,12 +3,7 @@ from xml.etree import ElementTree
 import pytest
 import sympy
 
-from siq.report.formatting import (
-    formula_mathml,
-    formula_text,
-    polynomial_expression,
-    vector_mathml,
-)
+from siq.report.formatting import formula_mathml, formula_text, polynomial_expression, vector_mathml
 
 x, y, z = sympy.symbols("x y z", real=True)
 IDENTIFIED = 0.9991 * y**2 + 1.0009 - 2.0012 * x**2 + 0.9991 * z**2 + 1.0001 * x**4

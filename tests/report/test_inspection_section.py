@@ -6,7 +6,7 @@ import numpy as np
 from remembering import STEP, double_wells
 
 from siq.data.recordings import Recordings
-from siq.report.inspection_section import CAPTIONS, inspection_drawn, inspection_section, read_inspection
+from siq.report.study_page import CAPTIONS, inspection_drawn, inspection_section, read_inspection
 
 
 def test_the_first_section_has_sentences_and_three_figures(tmp_path: Path) -> None:

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from known_systems import double_well, exact_field, portrait_of
 
-from siq.landscape.finding import find_landscape
-from siq.potential.local_wells import WellOptions
-from siq.report.drawn_landscape import DrawnLandscape, drawn
-from siq.report.interactive import UNKNOWN, interactive_view, script
+from siq.quasipotential.landscape_assembly import find_landscape
+from siq.quasipotential.wells import WellOptions
+from siq.report.landscape_summary import DrawnLandscape, drawn
+from siq.report.page import UNKNOWN, interactive_view, script
 
 
 @functools.cache

@@ -7,14 +7,14 @@ import pytest
 from known_systems import double_well, exact_field, portrait_of
 from told_landscapes import NOISE, landscape
 
-from siq.landscape.dwell_times import NoiseStrength
-from siq.landscape.finding import find_landscape
-from siq.landscape.storage import landscape_data
-from siq.potential.local_wells import WellOptions
+from siq.quasipotential.landscape_assembly import find_landscape
+from siq.quasipotential.landscape_files import landscape_data
+from siq.quasipotential.rates import NoiseStrength
+from siq.quasipotential.wells import WellOptions
 from siq.report.landscape_answer import headline, remarks, wells_table
+from siq.report.landscape_summary import SaidLandscape, well_name
 from siq.report.landscape_tables import landscape_tables
-from siq.report.said_landscape import SaidLandscape, well_name
-from siq.study.tables import as_table
+from siq.workflow.tables import as_table
 
 
 def test_two_wells_without_noise_have_depths_and_a_way_to_times() -> None:

@@ -7,9 +7,8 @@ import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
-from siq.report.plots.landscape import plot_degrees, plot_error_maps, plot_escape
-from siq.report.plots.landscape_curves import power_of_ten
-from siq.report.plots.saving import save_figure
+from siq.report.plots.errors import plot_degrees, plot_error_maps, plot_escape, power_of_ten
+from siq.report.plots.style import save_figure
 
 X, Y = np.linspace(-2, 2, 41), np.linspace(-1.5, 1.5, 31)
 

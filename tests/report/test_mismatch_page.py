@@ -11,20 +11,26 @@ import pandas as pd
 import pytest
 import sympy
 
-from siq.dynamics.cards import load_system
-from siq.dynamics.diffusion import Diffusion
-from siq.dynamics.dynamics import Dynamics
-from siq.mismatch.consequences import compare_landscapes, identified, obstacle
-from siq.mismatch.dictionary import dictionary_of
-from siq.mismatch.verdict import statement_of_failure
-from siq.report.largest_difference import largest_difference
-from siq.report.mismatch_captions import CAPTIONS
-from siq.report.mismatch_findings import Findings
-from siq.report.mismatch_page import mismatch_page
-from siq.report.plots.before_after import plot_before_after, plot_held_out
-from siq.report.plots.described import plot_described
-from siq.report.plots.mismatch import limits_of, plot_candidates, plot_curves, plot_escapes, plot_missing
-from siq.report.plots.reading import rate_unit
+from siq.diagnosis.consequences import compare_landscapes, identified, obstacle
+from siq.diagnosis.dictionary import dictionary_of
+from siq.diagnosis.verdict import statement_of_failure
+from siq.report.diagnosis_page import mismatch_page
+from siq.report.diagnosis_sections import CAPTIONS, Findings
+from siq.report.plots.diagnosis import (
+    largest_difference,
+    limits_of,
+    plot_before_after,
+    plot_candidates,
+    plot_curves,
+    plot_described,
+    plot_escapes,
+    plot_held_out,
+    plot_missing,
+)
+from siq.report.plots.style import rate_unit
+from siq.systems.cards import load_system
+from siq.systems.diffusion import Diffusion
+from siq.systems.dynamics import Dynamics
 
 CARD = """\
 name: spring

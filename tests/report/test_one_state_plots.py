@@ -11,20 +11,24 @@ from known_systems import double_well, exact_field, portrait_of
 from matplotlib.figure import Figure
 
 from siq.data.recordings import Recordings
-from siq.landscape.density_of_wells import known_density, lowest_possible, marginal_of, sample_potential
-from siq.landscape.finding import find_landscape
-from siq.landscape.landscape import Landscape
-from siq.landscape.options import LandscapeOptions
-from siq.landscape.reference import reference_landscape
-from siq.landscape.storage import StoredLandscape, read_landscape, write_landscape
-from siq.numerics.density_comparison import ComparedDensity, total_variation
-from siq.potential.local_wells import WellOptions
-from siq.report.landscape_figures import LandscapeComparisons, LandscapeRun, landscape_figures
+from siq.quasipotential.invariant_density import (
+    ComparedDensity,
+    known_density,
+    lowest_possible,
+    marginal_of,
+    sample_potential,
+    total_variation,
+)
+from siq.quasipotential.landscape import Landscape, LandscapeOptions
+from siq.quasipotential.landscape_assembly import find_landscape
+from siq.quasipotential.landscape_comparison import reference_landscape
+from siq.quasipotential.landscape_files import StoredLandscape, read_landscape, write_landscape
+from siq.quasipotential.wells import WellOptions
 from siq.report.plots import plot_components, plot_invariant_distribution
-from siq.report.projection import project_landscape
 from siq.report.settings import LandscapeFiguresSettings
-from siq.steps.settings import StateSpace
-from siq.study.tables import as_table
+from siq.report.study_figures import LandscapeComparisons, LandscapeRun, landscape_figures, project_landscape
+from siq.workflow.settings import StateSpace
+from siq.workflow.tables import as_table
 
 KNOWN = double_well(1)
 

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
-from siq.numerics.density_comparison import ComparedDensity, DensityComparison, MarginalDensity
+from siq.quasipotential.invariant_density import ComparedDensity, DensityComparison, MarginalDensity
 from siq.report.plots import (
     ComponentFields,
     Dataset,

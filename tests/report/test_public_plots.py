@@ -15,18 +15,17 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import siq
-from siq.dynamics.simulation import runge_kutta_step
-from siq.landscape.finding import find_landscape
-from siq.landscape.landscape import Landscape
-from siq.landscape.storage import landscape_data
-from siq.landscape.transitions import barrier_uncertainty
-from siq.potential.local_wells import WellOptions
-from siq.potential.symbolic import SymbolicDecomposition
-from siq.report.drawn_landscape import DrawnLandscape, DrawnPoint, DrawnWay, drawn, drawn_data
-from siq.report.plots import residuals
-from siq.report.plots.barriers import joined
-from siq.report.plots.planes import plane_of
-from siq.report.plots.quasipotential import quasipotential_figure
+from siq.quasipotential.formulas import SymbolicDecomposition
+from siq.quasipotential.landscape import Landscape
+from siq.quasipotential.landscape_assembly import find_landscape
+from siq.quasipotential.landscape_files import landscape_data
+from siq.quasipotential.transitions import barrier_uncertainty
+from siq.quasipotential.wells import WellOptions
+from siq.report.landscape_summary import DrawnLandscape, DrawnPoint, DrawnWay, drawn, drawn_data
+from siq.report.plots import prediction
+from siq.report.plots.quasipotential import plane_of, quasipotential_figure
+from siq.report.plots.wells import joined
+from siq.systems.simulation import runge_kutta_step
 
 NONE = np.zeros((0, 1))
 
@@ -203,11 +202,11 @@ def test_residuals_of_the_right_field_lie_within_the_band_and_a_missing_term_bey
         x = x + 0.01 * known.dynamics.drift(x) + 0.03 * rng.normal(size=x.shape)
         path.append(x)
     noisy = siq.Recordings.from_arrays(0.01 * np.arange(401), np.stack(path, axis=1), names=["x"])
-    right = residuals.binned_residuals(known.dynamics, noisy, 0)
+    right = prediction.binned_residuals(known.dynamics, noisy, 0)
     far = np.abs(right.mean) / right.standard_error
     assert (far < 2).mean() > 0.75 and far.max() < 5
     missing = known.dynamics.of(known.dynamics.symbols, [known.dynamics.formulas[0] + 0.5])
-    wrong = residuals.binned_residuals(missing, noisy, 0)
+    wrong = prediction.binned_residuals(missing, noisy, 0)
     assert (np.abs(wrong.mean) > 2 * wrong.standard_error).mean() > 0.7
     assert np.average(wrong.mean, weights=wrong.standard_error**-2) == pytest.approx(-0.5, abs=0.05)
 
@@ -221,12 +220,12 @@ def test_where_rounding_alone_is_left_there_is_no_figure_and_no_band() -> None:
             x = runge_kutta_step(known.dynamics.drift_of_components, x, 5e-4)
         path.append(x)
     quiet = siq.Recordings.from_arrays(t, np.concatenate(path).T[:, :, None], names=["x"], units=["um"])
-    assert residuals.residuals_figure(known.dynamics, quiet, units=["um"]) is None
+    assert prediction.residuals_figure(known.dynamics, quiet, units=["um"]) is None
     axes = siq.plot_residuals(landscape(1), quiet, ax=Figure().add_subplot())
     assert len(axes.collections) == (0 if "no noise" in axes.get_title(loc="left") else 1)
     shake = 1e-3 * np.random.default_rng(1).normal(size=quiet.values.shape)
     shaken = replace(quiet, values=quiet.values + shake)
-    figure = residuals.residuals_figure(known.dynamics, shaken, units=["um"], time_unit="s")
+    figure = prediction.residuals_figure(known.dynamics, shaken, units=["um"], time_unit="s")
     assert figure is not None and "µm/s" in figure.axes[0].get_ylabel()
 
 

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from siq.report.plots.record import plot_record
-from siq.report.record_answer import record_sentences, record_table
-from siq.study.tables import as_table
+from siq.report.landscape_answer import record_sentences, record_table
+from siq.report.plots.prediction import plot_record
+from siq.workflow.tables import as_table
 
 
 def well(**change: Any) -> dict[str, object]:

@@ -7,11 +7,10 @@ from dataclasses import replace
 import numpy as np
 from told_landscapes import NOISE, landscape
 
-from siq.data.record_states import RecordStates
-from siq.data.visits import DwellCount
-from siq.report.record_answer import with_visits
-from siq.report.said_landscape import SaidLandscape
-from siq.study.tables import as_table
+from siq.data.two_states import DwellCount, RecordStates
+from siq.report.landscape_answer import with_visits
+from siq.report.landscape_summary import SaidLandscape
+from siq.workflow.tables import as_table
 
 SEEN = RecordStates(
     "rate", "Hz", "s", True, 1e-6, (0.825, 35.29), (DwellCount(48, 48 * 1.74), DwellCount(0, 1.1)),

@@ -4,10 +4,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from siq.report.sentences import control_sentences, run_sentences
-from siq.study.published_figures import PublishedFigure
-from siq.study.scoring import summary_table
-from siq.study.tables import as_table
+from siq.report.study_results import control_sentences, run_sentences
+from siq.workflow.published import PublishedFigure
+from siq.workflow.scoring import summary_table
+from siq.workflow.tables import as_table
 
 PUBLISHED = {"rrmse": PublishedFigure(mean=1e-3, source="paper")}
 

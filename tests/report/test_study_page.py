@@ -11,18 +11,17 @@ import pytest
 import sympy
 from told_landscapes import NOISE, landscape
 
-from siq.dynamics.dynamics import Dynamics
-from siq.potential.storage import model_to_data, write_model
-from siq.potential.symbolic import SymbolicDecomposition, exact_decomposition
+from siq.quasipotential.formulas import SymbolicDecomposition, exact_decomposition, model_to_data, write_model
 from siq.report.page import ReportContent, render_report
-from siq.report.study_captions import CAPTIONS, LEADING, OF_NETWORKS, OF_ONE_STATE, OF_RUNS
+from siq.report.study_figures import CAPTIONS, LEADING, OF_NETWORKS, OF_ONE_STATE, OF_RUNS
 from siq.report.study_page import study_page
 from siq.report.study_results import StudyResults
-from siq.steps.outcomes import Method
-from siq.steps.shown import ModelFiles, shown_formula
-from siq.study.scoring import coefficient_table, summary_table
-from siq.study.study import Study
-from siq.study.tables import COLUMNS, as_table
+from siq.systems.dynamics import Dynamics
+from siq.workflow.collection_steps import ModelFiles, shown_formula
+from siq.workflow.outcomes import Method
+from siq.workflow.scoring import coefficient_table, summary_table
+from siq.workflow.study import Study
+from siq.workflow.tables import COLUMNS, as_table
 
 PNG = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR" + (1400).to_bytes(4, "big") + (940).to_bytes(4, "big")
 X = sympy.Symbol("x", real=True)

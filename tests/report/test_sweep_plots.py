@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import sympy
 
-from siq.dynamics.dynamics import Dynamics
+from siq.report.equations_page import sweep_figure, sweep_section
 from siq.report.plots.sweep import plot_sweep
-from siq.report.sweep_section import sweep_figure, sweep_section
-from siq.steps.sweep import Sweep, sweep
-from siq.study.sweep import SweepOptions
+from siq.systems.dynamics import Dynamics
+from siq.workflow.study import SweepOptions
+from siq.workflow.sweep_step import Sweep, sweep
 
 h, a, x = sympy.symbols("h a x", real=True)
 CUSP = Dynamics.of((x,), (h + a * x - x**3,), domain=[(-2, 2)], parameters={h: 0.0, a: 1.0})

@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 from homes_of_mechanisms import HOMES, RESIDENTS, Resident, recorded
 
-from siq.mismatch.dictionary import standard_dictionary
-from siq.mismatch.investigation import investigate
-from siq.mismatch.possible_verdicts import MismatchVerdict
-from siq.mismatch.study import MismatchStudy
+from siq.diagnosis.dictionary import standard_dictionary
+from siq.diagnosis.investigation import investigate
+from siq.diagnosis.options import MismatchVerdict
+from siq.diagnosis.study import MismatchStudy
 
 pytestmark = pytest.mark.slow
 

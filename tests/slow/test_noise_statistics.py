@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 from siq.data.recordings import snapshot_pairs
-from siq.dynamics.cards import load_system
-from siq.dynamics.simulation import SimulationOptions
 from siq.networks.regression import RegressionOptions
-from siq.potential.symbolic import term_coefficients
-from siq.steps import draw
-from siq.steps.outcomes import Method
-from siq.steps.pipeline import PipelineSettings, analyse
-from siq.steps.settings import Sampling, StateSpace
+from siq.quasipotential.formulas import term_coefficients
+from siq.systems.cards import load_system
+from siq.systems.simulation import SimulationOptions
+from siq.workflow import recordings_step
+from siq.workflow.outcomes import Method
+from siq.workflow.pipeline import PipelineSettings, analyse
+from siq.workflow.settings import Sampling, StateSpace
 
 SEED = 20260102
 RUNS = 50
@@ -83,8 +83,8 @@ def one_run(run: int):
         regression=RegressionOptions(degree=5),
         landscape=None,
     )
-    drawing = draw.DrawSettings(SEED, settings.space, sampling, SIMULATION)
-    recordings = draw.run(drawing, load_system(CARD), number=run).recordings
+    drawing = recordings_step.DrawSettings(SEED, settings.space, sampling, SIMULATION)
+    recordings = recordings_step.run(drawing, load_system(CARD), number=run).recordings
     x = snapshot_pairs(recordings, pair_step=sampling.pair_step).x0
     formulas = analyse(recordings, settings, number=run).refined.formulas[Method.REFINED]
     components = formulas.components()

@@ -14,12 +14,12 @@ from known_systems import KnownSystem, limit_cycle, maier_stein, potential_value
 from untuned_systems import SYSTEMS, error_beside_mesh, simulated
 
 from siq.data.recordings import snapshot_pairs
-from siq.identify.identification import IdentificationOptions
+from siq.inference.identification import IdentificationOptions
 from siq.networks.options import CheckOptions, TrainingOptions
 from siq.networks.regression import RegressionOptions
-from siq.steps.outcomes import Method
-from siq.steps.pipeline import Analysis, PipelineSettings, analyse
-from siq.steps.settings import Sampling, StateSpace
+from siq.workflow.outcomes import Method
+from siq.workflow.pipeline import Analysis, PipelineSettings, analyse
+from siq.workflow.settings import Sampling, StateSpace
 
 TRAINING = TrainingOptions(
     steps=8000,

@@ -1,6 +1,6 @@
 """Does the diagnosis say rightly what a simulation lacks? Cases that conceal something, and their scores.
 
-Nothing here imports what it tests, the search and the verdict of `siq.mismatch`; and what makes the cases,
+Nothing here imports what it tests, the search and the verdict of `siq.diagnosis`; and what makes the cases,
 `concealment` and `foreign`, imports nothing of `siq` at all.
 
 =================  ===========================================================

@@ -10,9 +10,9 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, model_validator
 
-from siq.dynamics.cards import Formula, Name
 from siq.errors import InputError
-from siq.files.documents import read_document, validate
+from siq.numerics.files import read_document, validate
+from siq.systems.cards import Formula, Name
 
 CaseKind = Literal["null", "shift", "mechanism", "process noise", "withheld"]
 ROWS = ("t", "states", "inputs", "derivative_true", "derivative_without")

@@ -12,18 +12,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 import sympy
 
-from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.formulas import compile_values, delay
-from siq.dynamics.parametric import symbol
+from siq.diagnosis.dictionary import Form, FurtherState, Mechanism, MechanismParameter
+from siq.diagnosis.dictionary import Role as RoleKind
+from siq.diagnosis.investigation import Comparison
+from siq.diagnosis.mechanisms import MechanismCandidate, build_candidate
 from siq.errors import NumericalFailure
-from siq.estimation.free_runs import free_run, normalised_rms
-from siq.estimation.jumps import sharpened
-from siq.estimation.process_noise import fit_with_process_noise_as_needed
-from siq.estimation.recalibration import recalibrate
-from siq.mismatch.building import MechanismCandidate, build_candidate
-from siq.mismatch.case import Comparison
-from siq.mismatch.dictionary import Form, FurtherState, Mechanism, MechanismParameter
-from siq.mismatch.dictionary import Role as RoleKind
+from siq.inference.recalibration import fit_with_process_noise_as_needed, recalibrate
+from siq.inference.trajectories import free_run, normalised_rms, sharpened
+from siq.systems.dynamics import Dynamics, symbol
+from siq.systems.formulas import compile_values, delay
 from workflow.proof.keys import CaseKey
 
 POINTS = 24

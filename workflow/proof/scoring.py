@@ -14,11 +14,10 @@ import numpy as np
 import pandas as pd
 import sympy
 
-from siq.dynamics.cards import load_system
-from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.formulas import parse_formula
-from siq.dynamics.parametric import Signals
-from siq.mismatch.case import Comparison, read_case
+from siq.diagnosis.investigation import Comparison, read_case
+from siq.systems.cards import load_system
+from siq.systems.dynamics import Dynamics, Signals
+from siq.systems.formulas import parse_formula
 from workflow.proof.keys import CaseKey, Truth, read_key, read_truth
 from workflow.proof.oracle import Oracle, oracle_of, pairing, true_model
 

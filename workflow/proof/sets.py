@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from siq.files.documents import read_document, validate
+from siq.numerics.files import read_document, validate
 from workflow.proof.keys import CaseKind
 
 

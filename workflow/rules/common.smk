@@ -6,7 +6,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from siq.cli.answers import Exit, answer_of_page
-from siq.data.folders import files_of
+from siq.numerics.files import files_of
 from siq.errors import InputError
 from siq.report.settings import (
     FiguresSettings,
@@ -14,26 +14,26 @@ from siq.report.settings import (
     PageSettings,
     ReproductionSettings,
 )
-from siq.report.study_captions import CAPTIONS as STUDY_CAPTIONS
-from siq.report.study_captions import Part, figure_place
-from siq.steps.beside_equations import BesideEquationsSettings
-from siq.steps.draw import DrawSettings
-from siq.steps.equations import EquationSettings
-from siq.steps.escapes import EscapesSettings
-from siq.steps.identify import IdentifySettings
-from siq.steps.invariant import InvariantSettings
-from siq.steps.landscape import LandscapeSettings
-from siq.steps.landscape_errors import LandscapeErrorsSettings
-from siq.steps.of_study import card_content, card_content_beside
-from siq.steps.reference import ReferenceSettings
-from siq.steps.refine import RefineSettings
-from siq.steps.regress import RegressSettings
-from siq.steps.score import ScoreSettings
-from siq.steps.sweep import SweepSettings
-from siq.steps.sweep_points import PointSettings
-from siq.steps.train import TrainSettings
-from siq.study.published_figures import load_published
-from siq.study.sweep import point_name
+from siq.report.study_figures import CAPTIONS as STUDY_CAPTIONS
+from siq.report.study_figures import Part, figure_place
+from siq.workflow.comparison_steps import BesideEquationsSettings
+from siq.workflow.recordings_step import DrawSettings
+from siq.workflow.equations_step import EquationSettings
+from siq.workflow.comparison_steps import EscapesSettings
+from siq.workflow.identification_step import IdentifySettings
+from siq.workflow.invariant_step import InvariantSettings
+from siq.workflow.landscape_step import LandscapeSettings
+from siq.workflow.comparison_steps import LandscapeErrorsSettings
+from siq.workflow.settings import card_content, card_content_beside
+from siq.workflow.comparison_steps import ReferenceSettings
+from siq.workflow.refinement_step import RefineSettings
+from siq.workflow.regression_step import RegressSettings
+from siq.workflow.scoring_step import ScoreSettings
+from siq.workflow.sweep_step import SweepSettings
+from siq.workflow.sweep_step import PointSettings
+from siq.workflow.training_step import TrainSettings
+from siq.workflow.published import load_published
+from siq.workflow.study import point_name
 from workflow.code_digest import code_digest
 from workflow.places import BASE, config_path, find_file
 from workflow.settings import Studies, prepare_environment

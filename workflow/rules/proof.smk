@@ -76,7 +76,7 @@ rule blind_diagnosis:
     input:
         cases="results/proof/{proof}/cases/{batch}",
         digests="results/proof/{proof}/digests.json",
-        dictionary="siq/mismatch/mechanisms.yaml",
+        dictionary="siq/diagnosis/mechanisms.yaml",
     output:
         "results/proof/{proof}/verdicts/{batch}.json",
     log:

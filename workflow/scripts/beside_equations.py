@@ -4,13 +4,16 @@ from workflow.warm import run_warm
 
 run_warm()
 
-from siq.dynamics.cards import load_system
-from siq.steps import beside_equations
-from siq.study.tables import write_table
+from siq.systems.cards import load_system
+from siq.workflow import comparison_steps
+from siq.workflow.tables import write_table
 from step import job, read_json
 
 if __name__ == "__main__":
     with job() as now:
-        settings = now.settings(beside_equations.BesideEquationsSettings)
+        settings = now.settings(comparison_steps.BesideEquationsSettings)
         runs = [read_json(path) for path in now.input.landscapes]
-        write_table(now.output.table, beside_equations.run(settings, load_system(now.input.card), runs))
+        write_table(
+            now.output.table,
+            comparison_steps.run_beside_equations(settings, load_system(now.input.card), runs),
+        )

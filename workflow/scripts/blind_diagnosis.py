@@ -10,11 +10,11 @@ import time
 from pathlib import Path
 from typing import Any
 
+from siq.diagnosis.diagnosis import solve_case
+from siq.diagnosis.investigation import read_case
+from siq.diagnosis.verdict import statement_of_failure
 from siq.errors import NumericalFailure
-from siq.files.whole import whole_file
-from siq.mismatch.case import read_case
-from siq.mismatch.diagnosis import solve_case
-from siq.mismatch.verdict import statement_of_failure
+from siq.numerics.files import whole_file
 from step import job
 
 LOGGER = logging.getLogger(__name__)

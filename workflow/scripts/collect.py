@@ -6,18 +6,18 @@ run_warm()
 
 from pathlib import Path
 
-from siq.steps import collect
-from siq.steps.outcomes import read_outcomes
-from siq.study.published_figures import load_published
-from siq.study.tables import read_table, write_table
+from siq.workflow import collection_steps
+from siq.workflow.outcomes import read_outcomes
+from siq.workflow.published import load_published
+from siq.workflow.tables import read_table, write_table
 from step import job
 
 if __name__ == "__main__":
     with job() as now:
-        parts = {name: [read_table(path) for path in now.input[name]] for name in collect.OF_RUNS}
+        parts = {name: [read_table(path) for path in now.input[name]] for name in collection_steps.OF_RUNS}
         outcomes = [one for path in now.input.outcomes for one in read_outcomes(path)]
         published = now.given("published")
-        tables = collect.run(
+        tables = collection_steps.run(
             parts,
             outcomes,
             {} if published is None else load_published(published).figures,

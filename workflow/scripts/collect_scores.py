@@ -8,7 +8,7 @@ from typing import Any
 
 import pandas as pd
 
-from siq.study.tables import read_table, write_table
+from siq.workflow.tables import read_table, write_table
 from step import job
 from workflow.proof.scoring import score_table
 

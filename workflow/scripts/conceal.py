@@ -9,7 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from siq.files.whole import whole_file
+from siq.numerics.files import whole_file
 from step import job
 from workflow.proof.batches import write_batch
 from workflow.proof.concealment import cases as generator

@@ -8,13 +8,13 @@ import json
 import logging
 from typing import Any
 
+from siq.diagnosis.diagnosis import solve_case
+from siq.diagnosis.investigation import read_case
+from siq.diagnosis.tables import tables_of, tables_of_failure
+from siq.diagnosis.verdict import statement_of_failure
 from siq.errors import NumericalFailure
-from siq.files.whole import whole_file
-from siq.mismatch.case import read_case
-from siq.mismatch.diagnosis import solve_case
-from siq.mismatch.tables import tables_of, tables_of_failure
-from siq.mismatch.verdict import statement_of_failure
-from siq.study.tables import write_table
+from siq.numerics.files import whole_file
+from siq.workflow.tables import write_table
 from step import job, teller
 
 LOGGER = logging.getLogger(__name__)

@@ -4,15 +4,15 @@ from workflow.warm import run_warm
 
 run_warm()
 
-from siq.dynamics.cards import load_system
-from siq.steps import equations
+from siq.systems.cards import load_system
+from siq.workflow import equations_step
 from step import job
 
 if __name__ == "__main__":
     with job() as now:
-        found = equations.run(now.settings(equations.EquationSettings), load_system(now.input.card))
+        found = equations_step.run(now.settings(equations_step.EquationSettings), load_system(now.input.card))
         names = ("landscape", "degrees", "certificates", "outcomes")
-        equations.write(
+        equations_step.write(
             found,
             quasipotential=now.output.quasipotential,
             tables={name: now.output[name] for name in names},

@@ -11,23 +11,22 @@ from pathlib import Path
 from markupsafe import Markup
 
 import siq
-from siq.dynamics.cards import load_system
-from siq.files.whole import whole_file
-from siq.landscape.storage import read_landscape
-from siq.report.answer import write_answer
+from siq.numerics.files import whole_file
+from siq.quasipotential.landscape_files import read_landscape
+from siq.report.answers import write_answer
 from siq.report.equations_page import (
+    TABLES,
     EquationsResults,
     answer_of_equations,
     drawn_of,
     equations_figures,
     equations_page,
 )
-from siq.report.interactive import interactive_view
-from siq.report.page import render_report
+from siq.report.page import interactive_view, render_report
 from siq.report.plots import save_figure
 from siq.report.settings import PageSettings
-from siq.report.sweep_section import TABLES
-from siq.study.tables import read_table
+from siq.systems.cards import load_system
+from siq.workflow.tables import read_table
 from step import job
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from workflow.warm import run_warm
 run_warm()
 
 from siq.cli.examples import double_well_recordings
-from siq.files.whole import whole_file
+from siq.numerics.files import whole_file
 from step import job
 
 if __name__ == "__main__":

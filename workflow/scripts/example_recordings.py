@@ -5,9 +5,9 @@ from workflow.warm import run_warm
 run_warm()
 
 from siq.data.recordings import write_recordings
-from siq.dynamics.cards import load_system
-from siq.dynamics.simulation import SimulationOptions, simulate_snapshots
 from siq.numerics.randomness import Purpose, generator
+from siq.systems.cards import load_system
+from siq.systems.simulation import SimulationOptions, simulate_snapshots
 from step import job
 
 if __name__ == "__main__":

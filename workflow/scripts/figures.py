@@ -7,22 +7,22 @@ run_warm()
 from dataclasses import fields, replace
 from pathlib import Path
 
-from siq.dynamics.cards import load_system
-from siq.identify.storage import read_field
-from siq.landscape.storage import read_landscape
-from siq.report.inspection_section import inspection_drawn
-from siq.report.interactive import interactive_view
+from siq.inference.identification import read_field
+from siq.quasipotential.landscape_files import read_landscape
+from siq.report.page import interactive_view
 from siq.report.plots import save_figure
 from siq.report.settings import FiguresSettings
 from siq.report.study_figures import PicturedRun, StudyTables, leading_figures, study_figures, what_is_shown
-from siq.steps.files import read_run, read_states
-from siq.steps.landscapes import first_stored
-from siq.steps.outcomes import Method
-from siq.steps.shown import ModelFiles, shown_formula
-from siq.steps.trained import read_trained
-from siq.study.published_figures import load_published
-from siq.study.scoring import exact_answer
-from siq.study.tables import read_table
+from siq.report.study_page import inspection_drawn
+from siq.systems.cards import load_system
+from siq.workflow.collection_steps import ModelFiles, shown_formula
+from siq.workflow.comparison_steps import first_stored
+from siq.workflow.outcomes import Method
+from siq.workflow.published import load_published
+from siq.workflow.recordings_step import read_run, read_states
+from siq.workflow.scoring import exact_answer
+from siq.workflow.tables import read_table
+from siq.workflow.training_step import read_trained
 from step import job, read_json
 
 if __name__ == "__main__":

@@ -10,11 +10,11 @@ from typing import Any
 import yaml
 
 from proof_page import HELP, answer
-from siq.files.whole import whole_file
+from siq.numerics.files import whole_file
 from siq.report.page import ReportContent, ReportFigure, ReportSection, ReportTable, render_report
-from siq.report.plots.foreign_proof import plot_foreign_proof
-from siq.report.plots.saving import save_figure
-from siq.study.tables import read_table, write_table
+from siq.report.plots.proof import plot_foreign_proof
+from siq.report.plots.style import save_figure
+from siq.workflow.tables import read_table, write_table
 from step import job
 from workflow.proof.foreign_scores.rulers import NEAR
 from workflow.proof.foreign_scores.scores import ENOUGH

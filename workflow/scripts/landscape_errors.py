@@ -4,23 +4,22 @@ from workflow.warm import run_warm
 
 run_warm()
 
-from siq.landscape.reference import read_reference
-from siq.potential.storage import read_model
-from siq.steps import landscape_errors
-from siq.steps.landscapes import read_stored
-from siq.steps.trained import read_trained
-from siq.study.published import mesh_potential
-from siq.study.published_figures import load_published
-from siq.study.tables import write_table
+from siq.quasipotential.formulas import read_model
+from siq.quasipotential.landscape_comparison import read_reference
+from siq.workflow import comparison_steps
+from siq.workflow.comparison_steps import read_stored
+from siq.workflow.published import load_published, mesh_potential
+from siq.workflow.tables import write_table
+from siq.workflow.training_step import read_trained
 from step import job
 
 if __name__ == "__main__":
     with job() as now:
-        settings = now.settings(landscape_errors.LandscapeErrorsSettings)
+        settings = now.settings(comparison_steps.LandscapeErrorsSettings)
         source = now.input
         trained = list(zip(source.networks, source.training, strict=True))
         runs = [
-            landscape_errors.RunToCompare(
+            comparison_steps.RunToCompare(
                 number,
                 read_stored(field, landscape),
                 read_model(model)[0],
@@ -35,6 +34,8 @@ if __name__ == "__main__":
             figures = load_published(file)
             if (path := now.given("mesh")) is not None and figures.mesh is not None:
                 mesh = mesh_potential(path, figures.mesh)
-            published = landscape_errors.PublishedAnswers(figures.figures, mesh)
-        table = landscape_errors.run(settings, read_reference(source.reference), runs, published)
+            published = comparison_steps.PublishedAnswers(figures.figures, mesh)
+        table = comparison_steps.run_landscape_errors(
+            settings, read_reference(source.reference), runs, published
+        )
         write_table(now.output.table, table)

@@ -8,17 +8,16 @@ from pathlib import Path
 
 import pandas as pd
 
-from siq.landscape.reference import read_reference
-from siq.potential.storage import read_model
-from siq.report.landscape_figures import LandscapeComparisons, LandscapeRun, landscape_figures
-from siq.report.plots.saving import save_figure
+from siq.quasipotential.formulas import read_model
+from siq.quasipotential.landscape_comparison import read_reference
+from siq.report.plots.style import save_figure
 from siq.report.settings import LandscapeFiguresSettings
-from siq.steps.files import read_states
-from siq.steps.landscapes import first_stored
-from siq.steps.trained import read_trained
-from siq.study.published import mesh_potential
-from siq.study.published_figures import load_published
-from siq.study.tables import read_table
+from siq.report.study_figures import LandscapeComparisons, LandscapeRun, landscape_figures
+from siq.workflow.comparison_steps import first_stored
+from siq.workflow.published import load_published, mesh_potential
+from siq.workflow.recordings_step import read_states
+from siq.workflow.tables import read_table
+from siq.workflow.training_step import read_trained
 from step import job
 
 if __name__ == "__main__":

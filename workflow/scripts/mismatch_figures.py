@@ -12,22 +12,21 @@ import pandas as pd
 import sympy
 from matplotlib.figure import Figure
 
-from siq.dynamics.cards import load_system
-from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.formulas import compile_formulas
-from siq.dynamics.parametric import symbol
-from siq.report.mismatch_findings import final_simulation
-from siq.report.plots.described import plot_described
-from siq.report.plots.mismatch import (
+from siq.report.diagnosis_sections import final_simulation
+from siq.report.plots.diagnosis import (
     plot_before_after,
     plot_candidates,
     plot_curves,
+    plot_described,
     plot_escapes,
     plot_held_out,
     plot_missing,
 )
-from siq.report.plots.saving import save_figure
-from siq.study.tables import read_table
+from siq.report.plots.style import save_figure
+from siq.systems.cards import load_system
+from siq.systems.dynamics import Dynamics, symbol
+from siq.systems.formulas import compile_formulas
+from siq.workflow.tables import read_table
 from step import job, read_json
 
 

@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from siq.dynamics.cards import load_system
-from siq.errors import NumericalFailure
-from siq.files.whole import whole_file
-from siq.mismatch.consequences import (
+from siq.diagnosis.consequences import (
     ESCAPE_COLUMNS,
     WELLS_COLUMNS,
     Consequences,
     compare_landscapes,
     obstacle,
 )
-from siq.study.tables import read_table, write_table
+from siq.errors import NumericalFailure
+from siq.numerics.files import whole_file
+from siq.systems.cards import load_system
+from siq.workflow.tables import read_table, write_table
 from step import job, read_json
 
 COMPARED = {

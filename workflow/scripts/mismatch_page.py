@@ -10,14 +10,14 @@ from typing import Any
 
 import pandas as pd
 
-from siq.dynamics.cards import load_system
-from siq.files.whole import whole_file
-from siq.mismatch.dictionary import dictionary_of
-from siq.mismatch.study import MismatchStudy, load_mismatch_study
-from siq.report.mismatch_answer import mismatch_answer
-from siq.report.mismatch_findings import Findings
-from siq.report.mismatch_page import mismatch_page
-from siq.study.tables import read_table
+from siq.diagnosis.dictionary import dictionary_of
+from siq.diagnosis.study import MismatchStudy, load_mismatch_study
+from siq.numerics.files import whole_file
+from siq.report.answers import mismatch_answer
+from siq.report.diagnosis_page import mismatch_page
+from siq.report.diagnosis_sections import Findings
+from siq.systems.cards import load_system
+from siq.workflow.tables import read_table
 from step import job, read_json
 
 

@@ -10,12 +10,12 @@ from typing import Any
 import pandas as pd
 
 from siq.data.public_recordings import BENCHMARKS
-from siq.dynamics.cards import load_system
-from siq.files.whole import whole_file
-from siq.report.official_tests import official_page, official_rows
-from siq.report.plots.official import plot_official_tests
-from siq.report.plots.saving import save_figure
-from siq.study.tables import read_table, write_table
+from siq.numerics.files import whole_file
+from siq.report.plots.proof import plot_official_tests
+from siq.report.plots.style import save_figure
+from siq.report.reproduction_page import official_page, official_rows
+from siq.systems.cards import load_system
+from siq.workflow.tables import read_table, write_table
 from step import job, read_json
 
 

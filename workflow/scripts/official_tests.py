@@ -7,10 +7,10 @@ run_warm()
 from typing import Any
 
 from siq.data.public_recordings import BENCHMARKS
-from siq.dynamics.cards import load_system
-from siq.mismatch.case import read_case
-from siq.mismatch.official_tests import official_tables
-from siq.study.tables import read_table, write_table
+from siq.diagnosis.investigation import read_case
+from siq.diagnosis.official_tests import official_tables
+from siq.systems.cards import load_system
+from siq.workflow.tables import read_table, write_table
 from step import job
 
 

@@ -6,12 +6,12 @@ run_warm()
 
 from functools import partial
 
-from siq.identify.storage import read_field
-from siq.steps import overview
-from siq.steps.files import read_run
-from siq.steps.landscape import LandscapeSettings, read_wells
-from siq.steps.shown import ModelFiles, shown_formula
-from siq.study.tables import read_table
+from siq.inference.identification import read_field
+from siq.workflow import collection_steps
+from siq.workflow.collection_steps import ModelFiles, shown_formula
+from siq.workflow.landscape_step import LandscapeSettings, read_wells
+from siq.workflow.recordings_step import read_run
+from siq.workflow.tables import read_table
 from step import job, read_json
 
 if __name__ == "__main__":
@@ -21,15 +21,15 @@ if __name__ == "__main__":
         number = shown.run if shown.run is not None else models.first_wells().run
         found = None
         if now.params.every_run:
-            chosen = overview.choose(number, [partial(read_json, path) for path in source.landscapes])
+            chosen = collection_steps.choose(number, [partial(read_json, path) for path in source.landscapes])
             if chosen is not None:
-                found = overview.of_stored(chosen, read_json(source.landscapes[chosen]))
+                found = collection_steps.of_stored(chosen, read_json(source.landscapes[chosen]))
         elif number is not None:
-            given = overview.RunToShow(
+            given = collection_steps.RunToShow(
                 number,
                 read_run(source.recordings[number]),
                 read_field(source.fields[number]),
                 read_wells(source.models[number]),
             )
-            found = overview.run(now.settings(LandscapeSettings), given)
-        overview.write(now.output.overview, found)
+            found = collection_steps.run_overview(now.settings(LandscapeSettings), given)
+        collection_steps.write(now.output.overview, found)

@@ -11,19 +11,18 @@ from pathlib import Path
 from markupsafe import Markup
 
 import siq
-from siq.files.whole import whole_file
-from siq.identify.storage import read_field
-from siq.report.answer import answer_of, write_answer
-from siq.report.inspection_section import read_inspection, read_seen
+from siq.inference.identification import read_field
+from siq.numerics.files import whole_file
+from siq.report.answers import answer_of, write_answer
+from siq.report.landscape_answer import with_visits
 from siq.report.page import render_report
-from siq.report.record_answer import with_visits
 from siq.report.settings import PageSettings
-from siq.report.study_page import study_page
+from siq.report.study_page import read_inspection, read_seen, study_page
 from siq.report.study_results import StudyResults
-from siq.steps.outcomes import Method
-from siq.steps.shown import ModelFiles, shown_formula
-from siq.study.scoring import exact_answer
-from siq.study.tables import COLUMNS, read_table
+from siq.workflow.collection_steps import ModelFiles, shown_formula
+from siq.workflow.outcomes import Method
+from siq.workflow.scoring import exact_answer
+from siq.workflow.tables import COLUMNS, read_table
 from step import job, read_json
 
 PACKAGES = ("numpy", "snakemake")

@@ -7,7 +7,7 @@ run_warm()
 import json
 from typing import Any
 
-from siq.files.whole import whole_file
+from siq.numerics.files import whole_file
 from step import job
 from workflow.proof.batches import read_digests
 

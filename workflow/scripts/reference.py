@@ -4,12 +4,14 @@ from workflow.warm import run_warm
 
 run_warm()
 
-from siq.dynamics.cards import load_system
-from siq.landscape.reference import write_reference
-from siq.steps import reference
+from siq.quasipotential.landscape_comparison import write_reference
+from siq.systems.cards import load_system
+from siq.workflow import comparison_steps
 from step import job
 
 if __name__ == "__main__":
     with job() as now:
-        found = reference.run(now.settings(reference.ReferenceSettings), load_system(now.input.card))
+        found = comparison_steps.run(
+            now.settings(comparison_steps.ReferenceSettings), load_system(now.input.card)
+        )
         write_reference(now.output[0], found)

@@ -6,14 +6,14 @@ run_warm()
 
 import pysindy  # noqa: F401 (once for all runs: it takes seconds)
 
-from siq.steps import regress
-from siq.steps.files import read_run
-from siq.steps.trained import read_trained
+from siq.workflow import regression_step
+from siq.workflow.recordings_step import read_run
+from siq.workflow.training_step import read_trained
 from step import job
 
 if __name__ == "__main__":
     with job() as now:
         trained = read_trained(now.input.networks, now.input.outcome, number=now.run)
-        settings = now.settings(regress.RegressSettings)
-        regressed = regress.run(settings, read_run(now.input.recordings), trained)
-        regress.write(regressed, model=now.output.model, outcome=now.output.outcome)
+        settings = now.settings(regression_step.RegressSettings)
+        regressed = regression_step.run(settings, read_run(now.input.recordings), trained)
+        regression_step.write(regressed, model=now.output.model, outcome=now.output.outcome)

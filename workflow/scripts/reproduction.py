@@ -9,13 +9,13 @@ from pathlib import Path
 import yaml
 from pydantic import TypeAdapter
 
-from siq.dynamics.cards import load_system
-from siq.files.whole import whole_file
+from siq.numerics.files import whole_file
 from siq.report.page import render_reproduction
 from siq.report.reproduction_page import Paper, Results, reproduction_page
 from siq.report.settings import ReproductionSettings
-from siq.study.published_figures import load_published
-from siq.study.reproduction import load_contents, load_parameters
+from siq.systems.cards import load_system
+from siq.workflow.published import load_published
+from siq.workflow.reproduction import load_contents, load_parameters
 from step import job
 
 if __name__ == "__main__":

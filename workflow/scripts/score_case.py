@@ -7,7 +7,7 @@ run_warm()
 from pathlib import Path
 from typing import Any
 
-from siq.study.tables import write_table
+from siq.workflow.tables import write_table
 from step import job, read_json
 from workflow.proof.scoring import Answer, score_case, score_table
 

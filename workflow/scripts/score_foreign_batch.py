@@ -7,7 +7,7 @@ run_warm()
 from pathlib import Path
 from typing import Any
 
-from siq.study.tables import write_table
+from siq.workflow.tables import write_table
 from step import job
 from workflow.proof.foreign_scores.scores import foreign_score_table, score_foreign_case
 from workflow.proof.scoring import read_answers

@@ -4,9 +4,8 @@ from workflow.warm import run_warm
 
 run_warm()
 
-from siq.dynamics.cards import load_system
-from siq.steps.sweep import SweepSettings, collected, write_tables
-from siq.steps.sweep_points import read_point
+from siq.systems.cards import load_system
+from siq.workflow.sweep_step import SweepSettings, collected, read_point, write_tables
 from step import job
 
 if __name__ == "__main__":

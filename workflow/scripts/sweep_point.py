@@ -4,8 +4,8 @@ from workflow.warm import run_warm
 
 run_warm()
 
-from siq.steps.sweep_points import PointSettings, point_at, write_point
-from siq.study.sweep import point_values
+from siq.workflow.study import point_values
+from siq.workflow.sweep_step import PointSettings, point_at, write_point
 from step import job
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 import torch._dynamo  # the first optimiser loads it: once for all runs
 
-from siq.steps import train
+from siq.workflow import training_step
 from step import job
 
 if __name__ == "__main__":
@@ -17,10 +17,12 @@ if __name__ == "__main__":
         torch.set_num_threads(now.threads)
         folder = Path(now.output.networks).parent
         first = int(now.wildcards.block.split("-")[0])
-        runs = train.read(now.input.recordings, now.input.fields, first=first)
+        runs = training_step.read(now.input.recordings, now.input.fields, first=first)
         device = now.config.get("device", "auto")
-        trained = train.run(now.settings(train.TrainSettings), runs, folder=folder, device=device)
-        train.write(
+        trained = training_step.run(
+            now.settings(training_step.TrainSettings), runs, folder=folder, device=device
+        )
+        training_step.write(
             trained, networks=now.output.networks, history=now.output.history, outcome=now.output.outcome
         )
-        train.clean(folder)
+        training_step.clean(folder)

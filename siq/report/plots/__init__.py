@@ -7,15 +7,16 @@ column in print, and tells its groups apart for colour-blind readers too.
 from siq.errors import needs_extra
 
 with needs_extra("plots"):
-    from siq.report.plots.accuracy import plot_error_distribution
-    from siq.report.plots.coefficients import plot_coefficient_distributions
-    from siq.report.plots.components import ComponentFields, plot_components
-    from siq.report.plots.dataset import Dataset, plot_dataset
-    from siq.report.plots.inclusion import plot_inclusion
     from siq.report.plots.invariant import plot_invariant_distribution
     from siq.report.plots.prediction import plot_prediction
-    from siq.report.plots.saving import save_figure
-    from siq.report.plots.training import plot_training
+    from siq.report.plots.recordings import ComponentFields, Dataset, plot_components, plot_dataset
+    from siq.report.plots.runs import (
+        plot_coefficient_distributions,
+        plot_error_distribution,
+        plot_inclusion,
+        plot_training,
+    )
+    from siq.report.plots.style import save_figure
 
 __all__ = [
     "ComponentFields",

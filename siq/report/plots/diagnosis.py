@@ -1,23 +1,328 @@
-"""How well does a simulation follow recordings that it has not seen, before and after its mend?"""
+"""Figures of a diagnosis: recordings beside simulations, what is missing and where."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
+import scipy.interpolate
 from matplotlib.axes import Axes
+from matplotlib.contour import ContourSet
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
-from siq.report.plots.landscape_curves import scaled_label
+from siq.report.plots.errors import scaled_label
 from siq.report.plots.quasipotential import add_legend, new_axes
-from siq.report.plots.style import BLACK, BLUE, GREY, ORANGE, VERMILLION, name_label
+from siq.report.plots.style import (
+    BLACK,
+    BLUE,
+    GREY,
+    ORANGE,
+    SKY_BLUE,
+    VERMILLION,
+    WIDTH,
+    axis_unit,
+    counted,
+    drawn_to_be_read,
+    name_label,
+    rate_unit,
+)
+
+
+@dataclass(frozen=True)
+class LargestDifference:
+    """The recording and the output in which a simulation is off the furthest.
+
+    Attributes
+    ----------
+    recording, output
+        Which.
+    before, after
+        Root mean square difference there, in the unit of the output, of the simulation as given and of the
+        one that the verdict ends with; infinite where it runs away.
+    recordings
+        How many were held out.
+    """
+
+    recording: str
+    output: str
+    before: float
+    after: float
+    recordings: int
+
+
+def largest_difference(table: pd.DataFrame, *, after: str) -> LargestDifference | None:
+    """The held-out recording to begin with; None where nothing was held out.
+
+    The output is the one in which the simulation as given is off the furthest, in units of its spread, in
+    the middle of all recordings, so that a single runaway does not decide. Of its recordings it is the one
+    in which the difference is largest.
+
+    Parameters
+    ----------
+    table
+        Columns ``recording output measured before recalibrated augmented scored``.
+    after
+        The simulation that the verdict ends with: ``"augmented"``, ``"recalibrated"``, or ``"before"``.
+    """
+    scored = table[table["scored"].astype(bool) & table["measured"].notna()]
+    if scored.empty:
+        return None
+    squares = {
+        name: ((scored[name] - scored["measured"]) ** 2).fillna(np.inf)
+        for name in dict.fromkeys(("before", after))
+    }
+    places = [scored["output"], scored["recording"].astype(str)]
+    errors = {name: each.groupby(places, sort=False).mean() for name, each in squares.items()}
+    spread = scored.groupby("output", sort=False)["measured"].var()
+    middle = errors["before"].groupby(level="output", sort=False).median()
+    output = str((middle / spread.where(spread > 0, 1.0)).idxmax())
+    recording = str(errors["before"].loc[output].idxmax())
+    return LargestDifference(
+        recording,
+        output,
+        before=float(np.sqrt(errors["before"].loc[output, recording])),
+        after=float(np.sqrt(errors[after].loc[output, recording])),
+        recordings=scored["recording"].nunique(),
+    )
+
+
+SAMPLES_SHOWN = 300
+PAIRS = 4  # of recording and output
+BEYOND = 0.35  # of the range of what was measured, by which a panel is higher
+WORDS = {
+    "before": ("simulated as given", BLUE, "--"),
+    "recalibrated": ("with its own parameters refitted", VERMILLION, "-"),
+    "augmented": ("with what was found", VERMILLION, "-"),
+}
+
+
+@drawn_to_be_read
+def plot_before_after(
+    table: pd.DataFrame,
+    *,
+    after: str,
+    noise: Mapping[str, float] | None = None,
+    units: Mapping[str, str] | None = None,
+    time_unit: str = "1",
+) -> Figure | None:
+    """Draw the held-out recording that differs most, with the simulation before and after.
+
+    Parameters
+    ----------
+    table
+        Columns ``recording t output measured before recalibrated augmented scored``.
+    after
+        The simulation that the verdict ends with: ``"augmented"``, ``"recalibrated"``, or ``"before"`` where
+        nothing is to be changed.
+    noise
+        Variance of the sensor's noise by output, for a band of ± 2 standard deviations.
+    units
+        Units of the outputs.
+    time_unit
+        Of ``t``.
+
+    Returns
+    -------
+    matplotlib.figure.Figure or None
+        The course above, simulation minus recording below; None where no recording was held out.
+    """
+    largest = largest_difference(table, after=after)
+    if largest is None:
+        return None
+    pair = (largest.recording, largest.output)
+    figure = Figure(figsize=(WIDTH, 4.2))
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[1.7, 1])
+    shown = ["before"] if after == "before" else ["before", after]
+    _draw(upper, lower, _rows(table, *pair), shown, noise=(noise or {}).get(pair[1]))
+    unit = axis_unit((units or {}).get(pair[1], "1"))
+    upper.set_ylabel(f"${name_label(pair[1])}${unit}")
+    lower.set_ylabel(f"error{unit}")
+    lower.set_xlabel(f"$t${axis_unit(time_unit)}")
+    handles, labels = upper.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper left", ncols=2, handlelength=1.6, columnspacing=1.2)
+    return figure
+
+
+@drawn_to_be_read
+def plot_held_out(
+    table: pd.DataFrame, *, units: Mapping[str, str] | None = None, time_unit: str = "1"
+) -> Figure | None:
+    """Draw held-out recordings with the free runs of all three simulations.
+
+    Parameters
+    ----------
+    table
+        Columns ``recording t output measured before recalibrated augmented scored``, one row per sample and
+        output.
+    units
+        Units of the outputs.
+    time_unit
+        Of ``t``.
+
+    Returns
+    -------
+    matplotlib.figure.Figure or None
+        Two panels below each other for each of up to four pairs of recording and output: the courses, and
+        simulation minus recording. None where no recording was held out.
+    """
+    scored = table[table["scored"].astype(bool)]
+    if scored.empty:
+        return None
+    outputs = list(dict.fromkeys(scored["output"]))
+    recordings = list(dict.fromkeys(scored["recording"]))[: max(1, PAIRS // len(outputs))]
+    pairs = [(recording, output) for recording in recordings for output in outputs][:PAIRS]
+    figure = Figure(figsize=(WIDTH, 0.6 + 2.9 * len(pairs)))
+    axes = figure.subplots(2 * len(pairs), 1, height_ratios=[1.5, 1] * len(pairs))
+    for (recording, output), (upper, lower) in zip(pairs, axes.reshape(-1, 2), strict=True):
+        same = _same(scored)
+        shown = ["before", "recalibrated"] if same else ["before", "recalibrated", "augmented"]
+        _draw(upper, lower, _rows(table, recording, output), shown, distinct=not same)
+        unit = axis_unit((units or {}).get(output, "1"))
+        upper.set_title(f"recording {recording}", loc="left")
+        upper.set_ylabel(f"${name_label(output)}${unit}")
+        upper.tick_params(labelbottom=False)
+        lower.set_ylabel(f"error{unit}")
+        lower.set_xlabel(f"$t${axis_unit(time_unit)}")
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper left", ncols=2, handlelength=1.6, columnspacing=1.2)
+    return figure
+
+
+def _same(scored: pd.DataFrame) -> bool:
+    """Whether nothing was added, so that two of the three simulations are one."""
+    return bool(np.array_equal(scored["recalibrated"], scored["augmented"], equal_nan=True))
+
+
+def _rows(table: pd.DataFrame, recording: str, output: str) -> pd.DataFrame:
+    mine = table[(table["recording"].astype(str) == recording) & (table["output"] == output)]
+    return mine[mine["scored"].astype(bool)].tail(SAMPLES_SHOWN)
+
+
+def _draw(
+    upper: Axes, lower: Axes, rows: pd.DataFrame, shown: list[str], *, noise: float | None = None,
+    distinct: bool = False,
+) -> None:  # fmt: skip
+    t, measured = rows["t"].to_numpy(float), rows["measured"].to_numpy(float)
+    size = 3.5 if len(t) <= 100 else 2.2
+    upper.plot(
+        t, measured, "o", color=BLACK, markersize=size, markeredgewidth=0, alpha=0.75, label="recorded"
+    )
+    low, high = np.nanmin(measured), np.nanmax(measured)
+    room = BEYOND * ((high - low) or abs(high) or 1.0)
+    if noise is not None and noise > 0:
+        band = 2 * float(np.sqrt(noise))
+        lower.axhspan(-band, band, color=GREY, alpha=0.25, linewidth=0)
+    lower.axhline(0.0, color=BLACK, linewidth=0.7)
+    largest = 0.0
+    for name in shown:
+        label, colour, style = WORDS[name]
+        style = "-" if len(shown) == 1 else style
+        if distinct and name == "recalibrated":
+            colour, style = GREY, ":"
+        values = rows[name].to_numpy(float)
+        upper.plot(t, values, color=colour, linestyle=style, label=label)
+        lower.plot(t, values - measured, color=colour, linestyle=style)
+        error = np.abs(values - measured)
+        largest = max(largest, float(np.nanmax(error)) if np.isfinite(error).any() else 0.0)
+    # A simulation that runs away would leave the others no room.
+    upper.set_ylim(low - room, high + room)
+    largest = 1.1 * min(largest, high - low + room)
+    if largest > 0:
+        lower.set_ylim(-largest, largest)
+
+
+POINTS = 200
+LEVELS = 20  # an even number of edges, so that zero lies within the white one
+BAND = 1.96  # standard errors within which 95 % lie
+
+
+@drawn_to_be_read
+def plot_described(
+    described: Sequence[Mapping[str, Any]], *, units: Mapping[str, str] | None = None, time_unit: str = "1"
+) -> Figure | None:
+    """Draw every curve and every surface of a model.
+
+    Parameters
+    ----------
+    described
+        As ``verdict.json`` has them; see `siq.diagnosis.wording.StatedFunction`.
+    units
+        Units of states and inputs.
+    time_unit
+        Of time.
+
+    Returns
+    -------
+    matplotlib.figure.Figure or None
+        A panel for each, with bands of 95 % between values at knots. None where there is no such function.
+    """
+    shown = [each for each in described if each.get("curve") or each.get("surface")]
+    if not shown:
+        return None
+    figure = Figure(figsize=(WIDTH, 0.4 + 2.4 * len(shown)))
+    for axes, each in zip(np.atleast_1d(figure.subplots(len(shown), 1)), shown, strict=True):
+
+        def with_unit(name: str) -> str:
+            unit = time_unit if name == "t" else (units or {}).get(name, "1")
+            return f"{name if name == 'amplitude' else f'${name_label(name)}$'}{axis_unit(unit)}"
+
+        targets = " and ".join(f"${name_label(name)}$" for name in (*each["equations"], *each["outputs"]))
+        where = f"added {'in the equation of' if each['equations'] else 'in the measurement of'} {targets}"
+        if each.get("curve"):
+            _draw_curve(axes, each["curve"])
+            axes.set_xlabel(with_unit(each["curve"]["coordinate"]))
+            axes.set_ylabel(where)
+            if len(each["coordinates"]) > 1:
+                axes.set_title(f"the coefficient of ${name_label(each['coordinates'][1])}$", loc="left")
+        else:
+            drawn = _draw_surface(axes, each["surface"])
+            figure.colorbar(drawn, ax=axes, label=where)
+            first, second = each["surface"]["coordinates"]
+            axes.set_xlabel(with_unit(first))
+            axes.set_ylabel(with_unit(second))
+    return figure
+
+
+def _draw_curve(axes: Axes, curve: Mapping[str, Any]) -> None:
+    """A function of one coordinate, its values at knots and its band."""
+    at, value, error = (np.array(curve[name]) for name in ("at", "value", "standard_error"))
+    fine = np.linspace(at[0], at[-1], POINTS)
+    middle, wide = (
+        scipy.interpolate.make_interp_spline(at, values, bc_type="natural")(fine)
+        if len(at) > 3
+        else np.interp(fine, at, values)
+        for values in (value, error)
+    )
+    half = BAND * np.abs(wide)
+    axes.fill_between(fine, middle - half, middle + half, color=BLUE, alpha=0.2, linewidth=0)
+    axes.plot(fine, middle, color=BLUE)
+    axes.plot(at, value, "o", color=BLUE, markersize=4)
+    axes.axhline(0.0, color=GREY, linewidth=0.8)
+
+
+def _draw_surface(axes: Axes, surface: Mapping[str, Any]) -> ContourSet:
+    """A function of two coordinates in colours, white where it is zero; dotted where it may well be zero."""
+    first, second = (np.array(each) for each in surface["at"])
+    value, error = (np.array(surface[name]).T for name in ("value", "standard_error"))
+    most = max(float(np.abs(value).max()), np.finfo(float).tiny)
+    levels = np.linspace(-most, most, LEVELS)
+    drawn = axes.contourf(first, second, value, levels=levels, cmap="PuOr")
+    unclear = np.abs(value) <= BAND * error
+    axes.contourf(first, second, unclear.astype(float), levels=[0.5, 1.5], colors="none", hatches=["..."])
+    return drawn
+
 
 if TYPE_CHECKING:
-    from siq.estimation.measurements import Measurements
-    from siq.mismatch.diagnosis import Diagnosis
+    from siq.diagnosis.diagnosis import Diagnosis
+    from siq.inference.measurements import Measurements
 
-SAMPLES_SHOWN = 400  # of a long recording the end, where simulations are off the furthest
-BEYOND = 0.6  # of the range of what was measured, by which the axis is longer
+DIAGNOSIS_SAMPLES_SHOWN = 400  # of a long recording the end, where simulations are off the furthest
+DIAGNOSIS_BEYOND = 0.6  # of the range of what was measured, by which the axis is longer
 RECORDED: dict[str, Any] = {"color": ORANGE, "linewidth": 4.0, "alpha": 0.55}
 BEFORE: dict[str, Any] = {"color": GREY, "linestyle": (0, (1, 1)), "linewidth": 1.8}
 RECALIBRATED: dict[str, Any] = {"color": BLUE, "linestyle": (0, (4, 2)), "linewidth": 1.5}
@@ -61,7 +366,7 @@ def plot_diagnosis(
     >>> import pandas as pd, sympy
     >>> import siq
     >>> from matplotlib.figure import Figure
-    >>> from siq.dynamics.dynamics import Parameter
+    >>> from siq.systems.dynamics import Parameter
     >>> n, r = sympy.symbols("n r", real=True)
     >>> growth = siq.Dynamics(("n",), (r * n,), siq.Diffusion.identity(1), parameters=(Parameter("r", 1.0),))
     >>> t, noise = np.arange(0, 8, 0.4), np.random.default_rng(1)
@@ -84,7 +389,7 @@ def plot_diagnosis(
         handles.append(Line2D([], [], label=name, **look))
     # A simulation that runs away would leave the others no room.
     low, high = np.nanmin(measured), np.nanmax(measured)
-    room = BEYOND * ((high - low) or abs(high) or 1.0)
+    room = DIAGNOSIS_BEYOND * ((high - low) or abs(high) or 1.0)
     axes.set_ylim(low - room, high + room)
     _name(axes, diagnosis, place, t, "")
     if legend:
@@ -144,7 +449,7 @@ def _shown(
         range(len(parts)), key=lambda one: float(np.median(error[parts[one]])) if len(parts[one]) else -1.0
     )
     chosen = worst if recording is None else case.labels.index(recording)
-    return case, place, parts[chosen][-SAMPLES_SHOWN:]
+    return case, place, parts[chosen][-DIAGNOSIS_SAMPLES_SHOWN:]
 
 
 def _name(axes: Axes, diagnosis: Diagnosis, place: int, t: np.ndarray, what: str) -> None:
@@ -155,3 +460,279 @@ def _name(axes: Axes, diagnosis: Diagnosis, place: int, t: np.ndarray, what: str
     largest = max(abs(limit) for limit in axes.get_ylim())
     axes.set_ylabel(scaled_label(axes.yaxis, f"{what}${name_label(name)}$", unit, largest))
     axes.set_xlabel(scaled_label(axes.xaxis, "$t$", system.time_unit, float(np.abs(t).max(initial=0.0))))
+
+
+__all__ = [
+    "plot_before_after",
+    "plot_candidates",
+    "plot_curves",
+    "plot_escapes",
+    "plot_held_out",
+    "plot_missing",
+]
+
+SIMULATIONS = {"before": "as given", "recalibrated": "refitted", "augmented": "with what was found"}
+CURVES = 3
+CANDIDATES = 10
+CELLS = 22  # of the map, in each direction
+SUPPORTED = 3.0  # times the median error of a curve: what is known less well does not decide about its axis
+STAGES = {
+    "found": ("found", VERMILLION), "same": ("explains as much", ORANGE),
+    "needless": ("explains as much, with more parameters", SKY_BLUE), "less": ("explains less", BLUE),
+    "further": ("would add, on top of what was found", GREY), "instead": ("in its place, roughly", GREY),
+}  # fmt: skip
+
+
+@drawn_to_be_read
+def plot_curves(
+    curves: pd.DataFrame,
+    *,
+    named: tuple[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
+    time_unit: str = "1",
+) -> Figure | None:
+    """Draw what is missing in equations against coordinates, before and after mechanisms were added.
+
+    Parameters
+    ----------
+    curves
+        Columns ``stage equation coordinate across at missing standard_error gain``, one row per knot.
+    named
+        Equation and coordinate of the mechanism that was named; its curve is drawn first.
+    units
+        Units of states and inputs.
+    time_unit
+        Of time, for coordinates and rates.
+
+    Returns
+    -------
+    matplotlib.figure.Figure or None
+        Up to three panels below each other, by what a function of the coordinate alone explains; bands: ± 2
+        standard errors, cut off at the edge of the panel. None where there is no curve.
+    """
+    before = curves[curves["stage"] == "before"] if len(curves) else curves
+    if before.empty:
+        return None
+    keys = ["equation", "coordinate", "across"]
+    order = before.groupby(keys, sort=False)["gain"].first().sort_values(ascending=False, kind="stable")
+    shown = list(order.index)
+    if named is not None:
+        shown.sort(key=lambda key: (key[0], key[1]) != named)
+    visible = before[before["missing"].abs() > 2 * before["standard_error"]].groupby(keys).size()
+    # The first is what the page speaks of; others only if they show something.
+    shown = [key for place, key in enumerate(shown) if place == 0 or key in visible.index][:CURVES]
+    figure = Figure(figsize=(WIDTH, 0.7 + 2.3 * len(shown)))
+    for axes, key in zip(np.atleast_1d(figure.subplots(len(shown), 1)), shown, strict=True):
+        equation, coordinate, across = key
+        stages = {
+            stage: curves[(curves[keys] == list(key)).all(axis=1) & (curves["stage"] == stage)]
+            for stage in ("before", "after")
+        }
+        _draw_curves(axes, stages)
+        first = equation.split(", ")[0]
+        unit = (units or {}).get(coordinate if coordinate != "amplitude" else first, "1")
+        unit = time_unit if coordinate == "t" else unit
+        symbol = coordinate if coordinate == "amplitude" else f"${name_label(coordinate)}$"
+        axes.set_xlabel(f"{symbol}{axis_unit(unit)}")
+        rate = axis_unit(rate_unit((units or {}).get(first, "1"), time_unit))
+        where = " and ".join(f"$\\dot{{{name_label(name)}}}$" for name in equation.split(", "))
+        axes.set_ylabel(f"missing in {where}\n{rate.strip()}" if rate else f"missing in {where}")
+        if across:
+            axes.set_title("across the amplitude", loc="left")
+    figure.legend(
+        handles=[
+            Line2D([], [], color=BLUE, marker="o", markersize=4, label="before"),
+            Line2D([], [], color=VERMILLION, linestyle="--", marker="s", markersize=4, label="after"),
+            Patch(color=GREY, alpha=0.3, label="± 2 standard errors"),
+        ],
+        loc="outside upper left",
+        ncols=3,
+        columnspacing=1.2,
+    )  # fmt: skip
+    return figure
+
+
+def _draw_curves(axes: Axes, stages: Mapping[str, pd.DataFrame]) -> None:
+    """Both curves, with an axis on which the values can be seen, however wide the bands are."""
+    low, high = limits_of(stages.values())
+    looks = {"before": (BLUE, "-", "o"), "after": (VERMILLION, "--", "s")}
+    for stage, (colour, style, marker) in looks.items():
+        at, value, error = (
+            stages[stage][name].to_numpy(float) for name in ("at", "missing", "standard_error")
+        )
+        wide = float(np.mean(2 * error > (high - low) / 2)) > 0.5 if len(at) else True
+        if wide and stage == "after":
+            continue  # the recordings say nothing about it
+        # A band that fills the panel would only tint it.
+        if not wide:
+            band = [np.clip(value + sign * 2 * error, low, high) for sign in (-1, 1)]
+            axes.fill_between(at, *band, color=colour, alpha=0.2, linewidth=0)
+        axes.plot(at, value, color=colour, linestyle=style, marker=marker, markersize=4)
+    axes.axhline(0.0, color=GREY, linewidth=0.8)
+    axes.set_ylim(low, high)
+
+
+def limits_of(curves: Iterable[pd.DataFrame]) -> tuple[float, float]:
+    """Limits of an axis by the values of curves where these are supported by data, and zero.
+
+    Parameters
+    ----------
+    curves
+        Each with the columns ``missing standard_error``; a knot whose error is several times the median of
+        its curve has hardly any data.
+    """
+    values = [np.zeros(1)]
+    for curve in curves:
+        value, error = (curve[name].to_numpy(float) for name in ("missing", "standard_error"))
+        known = np.isfinite(value) & np.isfinite(error)
+        if known.any():
+            supported = known & (error <= SUPPORTED * np.median(error[known]))
+            values.append(value[supported])
+            # The error of a value that is well known belongs to the picture.
+            largest = float(np.abs(value[supported]).max())
+            small = supported & (2 * error < largest)
+            values += [value[small] - 2 * error[small], value[small] + 2 * error[small]]
+    together = np.concatenate(values)
+    low, high = float(together.min()), float(together.max())
+    margin = 0.15 * ((high - low) or 1.0)
+    return low - margin, high + margin
+
+
+@drawn_to_be_read
+def plot_missing(
+    points: np.ndarray,
+    missing: Mapping[str, np.ndarray],
+    *,
+    names: tuple[str, str],
+    units: Mapping[str, str] | None = None,
+    time_unit: str = "1",
+    source: str = "",
+) -> Figure | None:
+    """Draw the missing part of equations over a plane of the state space.
+
+    Parameters
+    ----------
+    points
+        States in the plane, shape ``(n, 2)``.
+    missing
+        What must be added to each equation there, shape ``(n,)`` each; means over cells are drawn.
+    names
+        Names of the two states.
+    units, time_unit
+        Units of states and time.
+    source
+        Where the numbers are from, in words.
+
+    Returns
+    -------
+    matplotlib.figure.Figure or None
+        A panel for each of up to two equations, below each other; None where nothing is missing anywhere.
+    """
+    shown = {name: values for name, values in missing.items() if np.isfinite(values).any()}
+    shown = dict(sorted(shown.items(), key=lambda each: -float(np.nanstd(each[1])))[:2])
+    if not len(points) or not any(np.any(values) for values in shown.values()):
+        return None
+    figure = Figure(figsize=(WIDTH, 0.4 + 3.2 * len(shown)))
+    panels = np.atleast_1d(figure.subplots(len(shown), 1))
+    for axes, (name, values) in zip(panels, shown.items(), strict=True):
+        known = np.isfinite(values)
+        x, y = points[known, 0], points[known, 1]
+        counts, *edges = np.histogram2d(x, y, bins=CELLS)
+        sums = np.histogram2d(x, y, bins=edges, weights=values[known])[0]
+        mean = np.where(counts > 0, sums / np.where(counts > 0, counts, 1), np.nan)
+        largest = float(np.nanquantile(np.abs(mean), 0.98)) or 1.0
+        image = axes.pcolormesh(
+            *edges, mean.T, cmap="PuOr", vmin=-largest, vmax=largest, rasterized=True, linewidth=0
+        )
+        axes.set_facecolor("#EDEDED")
+        first, second = names
+        axes.set_xlabel(f"${name_label(first)}${axis_unit((units or {}).get(first, '1'))}")
+        axes.set_ylabel(f"${name_label(second)}${axis_unit((units or {}).get(second, '1'))}")
+        rate = axis_unit(rate_unit((units or {}).get(name, "1"), time_unit))
+        label = f"missing in $\\dot{{{name_label(name)}}}${rate}"
+        axes.figure.colorbar(image, ax=axes, extend="both", label=label)
+    if source:
+        figure.suptitle(source)
+    return figure
+
+
+@drawn_to_be_read
+def plot_candidates(table: pd.DataFrame) -> Figure | None:
+    """Draw how much mechanisms explain: what was found, what was fitted in its place, what would add to it.
+
+    Parameters
+    ----------
+    table
+        Columns ``label gain stage``, one row per probe; of each label the best counts. For the stages see
+        `siq.diagnosis.tables.tables_of`.
+
+    Returns
+    -------
+    matplotlib.figure.Figure or None
+        The best ten, as bars, those that were found first; None where nothing would gain anything.
+    """
+    positive = table[table["gain"] > 0] if len(table) else table
+    if positive.empty:
+        return None
+    best = positive.groupby(["label", "stage"], sort=False)["gain"].max().reset_index()
+    best = best.assign(first=best["stage"] != "found")
+    best = best.sort_values(["first", "gain"], ascending=[True, False], kind="stable").head(CANDIDATES)[::-1]
+    figure = Figure(figsize=(WIDTH, 1.3 + 0.27 * len(best) + 0.1 * best["stage"].nunique()))
+    axes = figure.add_subplot()
+    places = np.arange(len(best))
+    axes.barh(places, best["gain"], color=[STAGES[stage][1] for stage in best["stage"]], height=0.7)
+    axes.set_yticks(places, [shortened(text).replace("$", r"\$") for text in best["label"]])
+    axes.set_xscale("log")
+    axes.set_xlim(left=min(1.0, float(best["gain"].min()) / 2))
+    axes.set_xlabel(r"gain in $\chi^2$")
+    present = [stage for stage in STAGES if stage in set(best["stage"])]
+    handles = [Patch(color=STAGES[stage][1], label=STAGES[stage][0]) for stage in present]
+    figure.legend(handles=handles, loc="outside upper left", ncols=1)
+    return figure
+
+
+def shortened(label: str, most: int = 30) -> str:
+    """A label that leaves room for its bar."""
+    return label if len(label) <= most else f"{label[: most - 1]}…"
+
+
+@drawn_to_be_read
+def plot_escapes(table: pd.DataFrame, *, time_unit: str = "1") -> Figure | None:
+    """Draw mean escape times of two simulations against the inverse of the noise intensity.
+
+    Parameters
+    ----------
+    table
+        Columns ``transition intensity simulation time``, one row per way out, simulation and ε.
+    time_unit
+        Of the times.
+
+    Returns
+    -------
+    matplotlib.figure.Figure or None
+        A colour for each way out, a line style for each simulation; None where there is no way out.
+    """
+    if table.empty:
+        return None
+    figure = Figure(figsize=(WIDTH, 3.8))
+    axes = figure.add_subplot()
+    axes.set_yscale("log")
+    colours = (BLUE, VERMILLION, BLACK, ORANGE)
+    names, ways = (list(dict.fromkeys(table[column])) for column in ("simulation", "transition"))
+    styles = dict(zip(names, ("--", "-"), strict=False))
+    for place, way in enumerate(ways[: len(colours)]):
+        for name in names:
+            rows = table[(table["transition"] == way) & (table["simulation"] == name)]
+            if len(rows):
+                # Two ways of the same height would hide each other.
+                axes.plot(
+                    1 / rows["intensity"], rows["time"], color=colours[place],
+                    label=f"{way}, {SIMULATIONS.get(name, name)}",
+                    linestyle=styles[name], linewidth=2.6 - 1.2 * (place % 2),
+                )  # fmt: skip
+    axes.set_xlabel(r"$1/\varepsilon$, inverse of the noise intensity")
+    axes.set_ylabel(f"mean escape time{axis_unit(time_unit)}")
+    figure.legend(loc="outside upper left", ncols=1)
+    if len(ways) > len(colours):
+        figure.supxlabel(f"{counted(len(ways) - len(colours), 'further way')} out not drawn")
+    return figure

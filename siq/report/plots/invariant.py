@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
-from siq.report.plots.one_state import plot_invariant_curves
+from siq.report.plots.quasipotential import plot_invariant_curves
 from siq.report.plots.style import (
     COLUMN_WIDTH,
     PAGE_WIDTH,
@@ -25,7 +25,7 @@ from siq.report.plots.style import (
 )
 
 if TYPE_CHECKING:  # to draw a density takes none of what it takes to compute one
-    from siq.numerics.density_comparison import ComparedDensity, MarginalDensity
+    from siq.quasipotential.invariant_density import ComparedDensity, MarginalDensity
 
 COLOUR_MAP = "viridis"
 LEVELS = 13  # filled, from zero to the peak

@@ -1,4 +1,4 @@
-"""What the diagnosis said of concealed cases: verdicts by kind, and names against how much could be known."""
+"""Figures of the proofs and of official tests."""
 
 from __future__ import annotations
 
@@ -8,15 +8,20 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from siq.report.plots.style import (
+    BLACK,
     BLUE,
     GREEN,
     GREY,
     PAGE_WIDTH,
     VERMILLION,
+    WIDTH,
+    axis_unit,
     counted,
     drawn_in_style,
+    drawn_to_be_read,
     say,
     sentence_figure,
 )
@@ -116,3 +121,130 @@ def _named(axes: Axes, mechanisms: pd.DataFrame, strong: float) -> None:
     axes.set_ylabel("share of mechanisms\nwithin the reported class")
     axes.set_title("Mechanisms by signal-to-noise ratio")
     axes.legend(loc="lower right")
+
+
+LEVELS = {40.0: ("o", BLUE), 30.0: ("s", VERMILLION), 20.0: ("^", GREEN)}
+LEAST = -0.5  # shares of the gain below are drawn at the edge
+
+
+@drawn_in_style
+def plot_foreign_proof(scores: pd.DataFrame, *, enough: float = 0.9) -> Figure:
+    """Draw what was had of the gain on held-out recordings, and whether places are right.
+
+    Parameters
+    ----------
+    scores
+        Columns ``noise_db told_effect told_equation share_of_gain gain_asked place_asked place_right``, one
+        row a case.
+    enough
+        Share of the gain that is marked.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Left the share of the oracle's gain in each case, against what the recordings tell of the function;
+        right the share of right places against what they tell of the place.
+    """
+    if scores.empty:
+        return sentence_figure("There is no case to show.")
+    figure = Figure(figsize=(PAGE_WIDTH, 2.9))
+    left, right = figure.subplots(1, 2)
+    _gains(left, scores[scores["gain_asked"]], enough)
+    _places(right, scores[scores["place_asked"]])
+    return figure
+
+
+def _gains(axes: Axes, asked: pd.DataFrame, enough: float) -> None:
+    if asked.empty:
+        say(axes, "No gain could be had.")
+        return
+    for level, (marker, colour) in LEVELS.items():
+        own = asked[asked["noise_db"] == level]
+        share = own["share_of_gain"].fillna(LEAST).clip(lower=LEAST)
+        axes.plot(
+            own["told_effect"].clip(lower=1), share, marker, markersize=4, color=colour,
+            label=f"{level:g} dB ({counted(len(own), 'case')})",
+        )  # fmt: skip
+    axes.axhline(enough, color=GREY, linewidth=0.8, linestyle="--")
+    axes.set_xscale("log")
+    axes.set_xlabel("$\\Delta\\chi^2$ of the function\n(dimensionless)")
+    axes.set_ylabel("share of the oracle's gain\non held-out recordings")
+    axes.set_title(counted(len(asked), "case"))
+    axes.legend(loc="best")
+
+
+def _places(axes: Axes, asked: pd.DataFrame) -> None:
+    if asked.empty:
+        say(axes, "No place could be told.")
+        return
+    told = np.log10(asked["told_equation"].clip(1, 1e12))
+    edges = np.arange(np.floor(told.min()), np.ceil(told.max()) + 1)
+    bins = np.digitize(told, edges) - 1
+    for each in np.unique(bins):
+        own = asked["place_right"].to_numpy(bool)[bins == each]
+        axes.plot(edges[each] + 0.5, own.mean(), "o", color=BLUE)
+        axes.annotate(
+            str(len(own)), (edges[each] + 0.5, own.mean()), textcoords="offset points", xytext=(5, 5)
+        )
+    axes.set_xlim(edges[0], edges[-1] + 1)
+    axes.set_ylim(-0.03, 1.1)
+    axes.set_xlabel("$\\log_{10}\\,\\Delta\\chi^2$ of its place\n(dimensionless)")
+    axes.set_ylabel("share of right places")
+    axes.set_title(f"Places ({counted(len(asked), 'case')})")
+
+
+FINE = 2000  # points of a curve that can be told apart on a page
+
+
+@drawn_to_be_read
+def plot_official_tests(runs: pd.DataFrame, *, unit: str, time_unit: str) -> Figure:
+    """Draw every test of a benchmark: the course above, simulation minus recording below.
+
+    Parameters
+    ----------
+    runs
+        Columns ``test output t measured scored recalibrated augmented``; see
+        `siq.diagnosis.official_tests.official_tables`.
+    unit, time_unit
+        Of the outputs, and of ``t``.
+    """
+    pairs = list(runs.groupby(["test", "output"], sort=False))
+    figure = Figure(figsize=(WIDTH, 3.2 * len(pairs)))
+    axes = figure.subplots(2 * len(pairs), 1, squeeze=False, height_ratios=[1.4, 1] * len(pairs))[:, 0]
+    for place, ((test, output), rows) in enumerate(pairs):
+        upper, lower = axes[2 * place], axes[2 * place + 1]
+        t = rows["t"].to_numpy(float)
+        measured = rows["measured"].to_numpy(float)
+        upper.set_title(str(test), loc="left")
+        upper.plot(*envelope(t, measured), color=BLACK, linewidth=0.8)
+        upper.plot(
+            *envelope(t, rows["augmented"].to_numpy(float)), color=VERMILLION, linewidth=0.8, linestyle="--"
+        )  # fmt: skip
+        for name, colour in (("recalibrated", BLUE), ("augmented", VERMILLION)):
+            error = np.where(rows["scored"], rows[name].to_numpy(float) - measured, np.nan)
+            lower.plot(*envelope(t, error), color=colour, linewidth=0.8)
+        upper.set_ylabel(f"{output}{axis_unit(unit)}")
+        lower.set_ylabel(f"off by{axis_unit(unit)}")
+        lower.set_xlabel(f"$t${axis_unit(time_unit)}")
+    handles = [
+        Line2D([], [], color=BLACK, label="measured"),
+        Line2D([], [], color=BLUE, label="its own parameters refitted"),
+        Line2D([], [], color=VERMILLION, label="with what was found"),
+    ]
+    figure.legend(handles=handles, loc="outside upper left", ncols=3, columnspacing=1.2)
+    return figure
+
+
+def envelope(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A curve of few points that looks the same on a page: least and greatest value of every stretch."""
+    if len(values) <= FINE:
+        return t, values
+    parts = np.array_split(np.arange(len(values)), FINE // 2)
+    filled = np.where(np.isfinite(values), values, 0.0)
+    chosen = np.array([place for part in parts for place in _ends(part, filled)])
+    return t[chosen], values[chosen]
+
+
+def _ends(part: np.ndarray, values: np.ndarray) -> list[int]:
+    low, high = part[values[part].argmin()], part[values[part].argmax()]
+    return sorted((int(low), int(high)))

@@ -1,9 +1,11 @@
-"""What does U look like: as a curve of one state, a map of two, a plane of more?"""
+"""Figures of U: a curve of one state, a map of two, planes of more."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from string import ascii_lowercase
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -14,20 +16,308 @@ from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
-from siq.landscape.landscape import Landscape
-from siq.numerics.measured_text import unit_text
-from siq.report.drawn_landscape import DrawnLandscape, drawn
-from siq.report.plots.landscape_curves import power_of_ten, scaled_label
-from siq.report.plots.planes import Plane, View, plane_of
+from siq.numerics.text import unit_text
+from siq.quasipotential.landscape import Landscape
+from siq.report.landscape_summary import BLOCK_OF_POINTS, DrawnLandscape, Potential, chosen_states, drawn
+from siq.report.plots.errors import CURVE_COLOURS, LINE_STYLES, UNKNOWN, power_of_ten, scaled_label
 from siq.report.plots.style import (
     BLACK,
     BLUE,
+    COLUMN_WIDTH,
     GREY,
     ORANGE,
+    PAGE_WIDTH,
     VERMILLION,
+    counted,
     drawn_in_style,
+    magnitude_label,
     name_label,
+    say,
+    unit_label,
 )
+
+if TYPE_CHECKING:  # to draw takes none of what it takes to compute
+    from siq.quasipotential.invariant_density import ComparedDensity
+    from siq.report.plots.recordings import Dataset
+
+BINS = 60  # of histograms of recorded states
+ENERGY = "unit of ε"
+DECADES = 6  # of differences, below the largest one
+
+
+def _draw_unknown(axes: Axes, x: np.ndarray, values: np.ndarray) -> list[Any]:
+    edges = np.flatnonzero(np.diff(np.r_[False, np.isnan(values), False].astype(int)))
+    for begin, end in edges.reshape(-1, 2):
+        axes.axvspan(x[begin], x[min(end, len(x) - 1)], zorder=-1, **UNKNOWN)
+    return [Patch(label="$U$ is not known", **UNKNOWN)] if len(edges) else []
+
+
+@drawn_in_style
+def plot_error_curves(
+    x: np.ndarray, curves: Mapping[str, np.ndarray], *, name: str, unit: str, energy_unit: str = ""
+) -> Figure | None:
+    """Draw U of one state by several sources, and how far each is from the first one.
+
+    Parameters
+    ----------
+    x
+        States in ascending order, shape ``(n,)``.
+    curves
+        U by each source, shape ``(n,)``, NaN where it says nothing. The first one is the reference.
+    name, unit
+        Of the state.
+    energy_unit
+        Unit of U; empty where it is that of ε.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Above U; below the absolute difference as a share of the reference's highest value, on a
+        logarithmic axis.
+    """
+    (reference_name, reference), *others = [
+        (key, one) for key, one in curves.items() if np.isfinite(one).any()
+    ] or [("the reference", np.zeros(0))]
+    if not reference.size or not others:
+        return None
+    highest = float(np.nanmax(np.abs(reference))) or 1.0
+    figure = Figure(figsize=(COLUMN_WIDTH, 5.4))
+    left, right = figure.subplots(2, 1, sharex=True)
+    left.plot(x, reference, color=BLACK, linewidth=2.4, alpha=0.4, label=reference_name)
+    right.set_yscale("log")
+    shares = []
+    for place, (key, values) in enumerate(others):
+        look: dict[str, Any] = {
+            "color": CURVE_COLOURS[place % len(CURVE_COLOURS)],
+            "linestyle": LINE_STYLES[place % len(LINE_STYLES)],
+        }  # fmt: skip
+        left.plot(x, values, linewidth=1.2, label=key, **look)
+        difference = np.abs(values - reference) / highest
+        shares.append(float(np.nanmax(difference, initial=0.0)))
+        right.plot(x, np.where(difference > 0, difference, np.nan), linewidth=1.0, **look)
+    largest = max(shares)
+    if largest > 0:
+        right.set_ylim(largest / 10**DECADES, 2 * largest)
+    else:
+        say(right, "no difference at all")
+    left.set_ylabel(scaled_label(left.yaxis, "$U$", energy_unit or ENERGY, highest))
+    right.set_ylabel(f"difference from\n{reference_name} / highest $U$")
+    for axes in (left, right):
+        axes.set_xlabel(scaled_label(axes.xaxis, f"${name_label(name)}$", unit, float(np.abs(x).max())))
+    figure.legend(loc="outside upper center", ncols=2)
+    return figure
+
+
+@drawn_in_style
+def plot_invariant_curves(panels: Sequence[ComparedDensity], *, state: str, unit: str) -> Figure:
+    """Draw the invariant density of one state, with a long simulation's histogram: a panel for each ε."""
+    rows = -(-len(panels) // 2)
+    figure = Figure(figsize=(PAGE_WIDTH, 3.1 * rows + 0.4))
+    every = figure.subplots(rows, min(len(panels), 2), squeeze=False).ravel()
+    for axes in every[len(panels) :]:
+        axes.remove()
+    for place, (axes, panel) in enumerate(zip(every[: len(panels)], panels, strict=True)):
+        density, comparison = panel.density, panel.comparison
+        if comparison is not None:
+            axes.stairs(comparison.histogram[0], comparison.x1_edges, color=ORANGE, fill=True, alpha=0.5)
+        axes.plot(density.x1, density.values[0], color=BLUE, linewidth=1.2)
+        _draw_unknown(axes, density.x1, density.values[0])
+        axes.set_ylim(bottom=0)
+        axes.set_xlabel(
+            scaled_label(axes.xaxis, f"${name_label(state)}$", unit, float(np.abs(density.x1).max()))
+        )
+        title = f"({ascii_lowercase[place % 26]}) " + r"$\varepsilon$ = " + magnitude_label(density.intensity)
+        if panel.normalisation is not None:
+            title += "\n$Z$ = " + magnitude_label(panel.normalisation, digits=4)
+        if panel.unknown is not None:
+            title += f"\nhatched: at most {100 * panel.unknown:.2g} %"
+        if comparison is not None:
+            title += f"\ntotal variation {comparison.total_variation:.2g}"
+            if np.isfinite(comparison.sampling_floor):
+                title += f"\n(sampling alone: {comparison.sampling_floor:.2g})"
+        axes.set_title(title, loc="left")
+        if place % 2 == 0:
+            axes.set_ylabel(f"density {'' if unit in ('1', '') else unit_label(f'per {unit}')}")
+    handles: list[Any] = [Line2D([], [], color=BLUE, label=r"$Z^{-1}\exp(-U/\varepsilon)$")]
+    if any(panel.comparison is not None for panel in panels):
+        handles.append(Patch(color=ORANGE, alpha=0.5, label="a long simulation"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=2)
+    return figure
+
+
+@drawn_in_style
+def plot_dataset_curves(data: Dataset, *, state: str, unit: str) -> Figure:
+    """Draw trajectories of one state, histograms of what was recorded and of what the regression sees."""
+    count = 2 if data.below is None else 3
+    figure = Figure(figsize=(COLUMN_WIDTH, 2.3 * count))
+    left, middle, *others = figure.subplots(count, 1)
+    label = f"${name_label(state)}$ {unit_label('' if unit == '1' else unit)}".strip()
+    for path in data.trajectories:
+        left.plot(path[:, 0], linewidth=0.7)
+    for path in data.without_noise:
+        left.plot(path[:, 0], color=BLACK, linewidth=0.9, linestyle="--")
+    left.set_xlabel("number of the sample")
+    left.set_ylabel(label)
+    dashed = "; dashed: no noise" if len(data.without_noise) else ""
+    left.set_title(f"(a) {counted(len(data.trajectories), 'recording')}{dashed}", loc="left")
+    x = data.points[:, 0]
+    edges = np.linspace(x.min(), x.max(), BINS + 1)
+    middle.hist(x, edges, color=GREY)
+    middle.set_title(f"(b) recorded: {len(x)} pairs", loc="left")
+    if data.below is not None:
+        others[0].hist(x[data.below], edges, color=BLUE)
+        others[0].set_title(f"(c) seen by the regression: {100 * data.below.mean():.3g} %", loc="left")
+    for axes in (middle, *others):
+        axes.set_xlabel(label)
+        axes.set_ylabel("number of pairs")
+    return figure
+
+
+View = Literal["projection", "section"]
+
+POINTS = 141  # along each axis, of two states
+POINTS_OF_MORE = 61  # of a projection, which asks for many points behind each of these
+BEHIND = 40  # states in the other directions that a projection tries at each point
+SWEEPS = 3  # after which the lowest of them moves by less than a pixel
+
+
+@dataclass(frozen=True)
+class Plane:
+    """U on a plane of two states.
+
+    Attributes
+    ----------
+    shown
+        Places of the two states.
+    x1, x2
+        The grid, shapes ``(n,)`` and ``(m,)``.
+    values
+        U, shape ``(n, m)``, NaN where it is not known.
+    sentence
+        What the plane is, where there are more states; otherwise empty.
+    """
+
+    shown: tuple[int, int]
+    x1: np.ndarray
+    x2: np.ndarray
+    values: np.ndarray
+    sentence: str
+
+
+def plane_of(
+    landscape: DrawnLandscape, *, states: Sequence[str] | None = None, view: View = "projection"
+) -> Plane:
+    """U on the plane of two states.
+
+    Parameters
+    ----------
+    landscape
+        What is drawn, of two states at least.
+    states
+        Names of the two.
+    view
+        Of more states: ``projection``, the lowest U that the others allow, which keeps wells and passes at
+        their heights; or ``section``, the others held at the lowest pass.
+    """
+    if view not in ("projection", "section"):
+        raise ValueError(f"view is '{view}'; it is 'projection' or 'section'")
+    shown = chosen_states(landscape, states)
+    rest = [place for place in range(len(landscape.names)) if place not in shown]
+    count = POINTS_OF_MORE if rest and view == "projection" else POINTS
+    x1, x2 = (landscape.along(place, count) for place in shown)
+    at = landscape.lowest_pass
+    grid = np.tile(at, (count * count, 1))
+    grid[:, shown] = np.stack(np.meshgrid(x1, x2, indexing="ij"), axis=-1).reshape(-1, 2)
+    if not rest:
+        values, sentence = in_blocks(landscape.potential, grid), ""
+    elif view == "section":
+        values = in_blocks(landscape.potential, grid)
+        held = ", ".join(f"{landscape.names[place]} = {at[place]:.3g}" for place in rest)
+        sentence = f"section at {held}, through the lowest pass"
+    else:
+        values = _lowest_behind(landscape, grid, rest)
+        sentence = f"projection: the lowest $U$ over {', '.join(landscape.names[place] for place in rest)}"
+    return Plane(shown, x1, x2, values.reshape(count, count), sentence)
+
+
+def in_blocks(potential: Potential, x: np.ndarray) -> np.ndarray:
+    """A potential at many points, some at a time."""
+    parts = [potential(x[start : start + BLOCK_OF_POINTS]) for start in range(0, len(x), BLOCK_OF_POINTS)]
+    return np.concatenate(parts) if parts else np.zeros(0)
+
+
+def _lowest_behind(landscape: DrawnLandscape, grid: np.ndarray, rest: list[int]) -> np.ndarray:
+    """The lowest U over the other states at each point of a plane.
+
+    The best of some states seen anywhere is followed down, one direction after another, by parabolas.
+    """
+    seen = [np.stack([one.position for one in (*landscape.wells, *landscape.saddles)])] if (
+        landscape.wells or landscape.saddles
+    ) else []  # fmt: skip
+    seen += [way.uphill for way in landscape.ways if len(way.uphill)]
+    places = np.concatenate([*seen, _points(landscape)])[:, rest]
+    width = np.ptp(landscape.box, axis=1)[rest]
+    behind = _far_apart(places / width, BEHIND) * width
+    best, lowest = grid.copy(), np.full(len(grid), np.inf)
+    for one in behind:
+        tried = grid.copy()
+        tried[:, rest] = one
+        values = np.nan_to_num(in_blocks(landscape.potential, tried), nan=np.inf)
+        better = values < lowest
+        best[better], lowest[better] = tried[better], values[better]
+    known = np.flatnonzero(np.isfinite(lowest))
+    step = 0.5 * width / max(len(behind), 1) ** (1 / len(rest))
+    for _ in range(SWEEPS):
+        for place, size in zip(rest, step, strict=True):
+            _descend(landscape.potential, best, lowest, known, place, float(size))
+        step = step / 3
+    return np.where(np.isfinite(lowest), lowest, np.nan)
+
+
+def _descend(
+    potential: Potential, best: np.ndarray, lowest: np.ndarray, known: np.ndarray, place: int, size: float
+) -> None:
+    """Move points along one state to the lowest place of a parabola, where U really is lower there."""
+    middle, centre = lowest[known].copy(), best[known].copy()
+    sides = []
+    for sign in (-1, 1):
+        moved = centre.copy()
+        moved[:, place] += sign * size
+        sides.append(in_blocks(potential, moved))
+        _take(best, lowest, known, moved, sides[-1])
+    left, right = sides
+    with np.errstate(invalid="ignore", divide="ignore"):
+        shift = 0.5 * size * (left - right) / (left + right - 2 * middle)
+    moved = centre
+    moved[:, place] += np.clip(np.nan_to_num(shift, nan=0.0, posinf=0.0, neginf=0.0), -size, size)
+    _take(best, lowest, known, moved, in_blocks(potential, moved))
+
+
+def _take(
+    best: np.ndarray, lowest: np.ndarray, known: np.ndarray, moved: np.ndarray, values: np.ndarray
+) -> None:
+    better = np.nan_to_num(values, nan=np.inf) < lowest[known]
+    best[known[better]], lowest[known[better]] = moved[better], values[better]
+
+
+def _points(landscape: DrawnLandscape) -> np.ndarray:
+    points = landscape.points
+    fitted = [well.points for well in landscape.formulas if well is not None]
+    together = np.concatenate([np.zeros((0, len(landscape.names))), *fitted])
+    if not len(together) and points is not None:
+        together = points
+    return together[:: max(len(together) // 2000, 1)]
+
+
+def _far_apart(points: np.ndarray, count: int) -> np.ndarray:
+    """So many of the points, each as far as possible from those before it."""
+    chosen = [0]
+    distance = np.linalg.norm(points - points[0], axis=1)
+    while len(chosen) < min(count, len(points)) and distance.max() > 0:
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return points[chosen]
+
 
 if TYPE_CHECKING:
     from siq.data.recordings import Recordings

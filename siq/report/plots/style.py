@@ -1,4 +1,4 @@
-"""How all figures look: fonts, colours, and the names of terms and components on them."""
+"""How all figures look, and how they are written to files."""
 
 from __future__ import annotations
 
@@ -7,14 +7,17 @@ import math
 import re
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
+from pathlib import Path
 from typing import ParamSpec, TypeVar
 
+import matplotlib as mpl
 import matplotlib.style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.rcsetup import cycler
 
-from siq.numerics.measured_text import unit_text
+from siq.numerics.files import whole_file
+from siq.numerics.text import unit_text
 
 # Inches. A figure is no wider than its letters allow: a phone of 400 pixels leaves it 368, and there text of
 # `SMALLEST` points in a figure of `PAGE_WIDTH` is 9 pixels high.
@@ -195,3 +198,80 @@ def mean_and_spread(mean: float, spread: float, *, digits: int = 2) -> str:
         return f"${numbers}$"
     bracketed = f"({numbers})" if math.isfinite(spread) else numbers
     return rf"${bracketed} \times 10^{{{exponent}}}$"
+
+
+DOTS_PER_INCH = {".png": 200, ".svg": 300}  # in an SVG, of the parts drawn as an image
+
+
+def save_figure(figure: Figure, path_without_suffix: str | Path) -> tuple[Path, Path]:
+    """Write a figure as SVG and PNG, whole or not at all, the same bytes every time.
+
+    Parameters
+    ----------
+    figure
+        The figure.
+    path_without_suffix
+        Where to, without ``.svg`` or ``.png``; the folder is created if need be.
+
+    Returns
+    -------
+    tuple of pathlib.Path
+        The SVG file and the PNG file.
+    """
+    stem = Path(path_without_suffix)
+    # Date and Software would make the same figure differ between days and versions.
+    return _save(figure, stem, ".svg", {"Date": None}), _save(figure, stem, ".png", {"Software": None})
+
+
+def _save(figure: Figure, stem: Path, suffix: str, metadata: dict[str, None]) -> Path:
+    path = stem.with_name(stem.name + suffix)
+    with whole_file(path) as partial, drawing_style():
+        figure.savefig(partial, dpi=DOTS_PER_INCH[suffix], metadata=metadata)
+    return path
+
+
+WIDTH = 5.0  # inches; on a phone of 400 pixels a point of text is then one pixel high
+_LARGE = {
+    "font.size": 10,
+    "axes.titlesize": 10,
+    "axes.labelsize": 10,
+    "xtick.labelsize": 9,
+    "ytick.labelsize": 9,
+    "legend.fontsize": 9.5,
+    "figure.titlesize": 10,
+    "lines.linewidth": 1.4,
+}
+
+
+def drawn_to_be_read(function: Callable[Parameters, Figure | None]) -> Callable[Parameters, Figure | None]:
+    """Decorate a plot function that returns None where there is nothing to draw."""
+
+    @functools.wraps(function)
+    def draw(*arguments: Parameters.args, **options: Parameters.kwargs) -> Figure | None:
+        with drawing_style():
+            mpl.rcParams.update(_LARGE)  # which the context undoes
+            figure = function(*arguments, **options)
+            if figure is not None:
+                # Worked out once and then frozen, the same figure gives the same file.
+                figure.draw_without_rendering()
+                figure.set_layout_engine("none")
+        return figure
+
+    return draw
+
+
+def axis_unit(unit: str) -> str:
+    """A unit behind the name of an axis, typeset; nothing for a plain number."""
+    text = unit_text(unit)
+    return f" ({text})" if text else ""
+
+
+def rate_unit(unit: str, time_unit: str) -> str:
+    """The unit of a rate of change, as cards write units."""
+    if time_unit in ("1", ""):
+        return unit
+    if unit in ("1", ""):
+        return f"1/{time_unit}"
+    if power := re.fullmatch(rf"(.+)/{re.escape(time_unit)}(?:\*\*(\d+))?", unit):
+        return f"{power[1]}/{time_unit}**{int(power[2] or 1) + 1}"
+    return f"{unit}/{time_unit}" if "/" not in unit else f"({unit})/{time_unit}"

@@ -13,7 +13,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 
-from siq.report.plots.landscape_curves import COLOURS, LINE_STYLES, MARKERS
+from siq.report.landscape_summary import well_name
+from siq.report.plots.errors import CURVE_COLOURS, LINE_STYLES, MARKERS
 from siq.report.plots.style import (
     BLACK,
     COLUMN_WIDTH,
@@ -23,7 +24,6 @@ from siq.report.plots.style import (
     energy_label,
     unit_label,
 )
-from siq.report.said_landscape import well_name
 
 BIFURCATIONS = {"fold": "o", "Hopf": "s", "branch point": "D"}
 PANEL = 2.2  # inches
@@ -97,7 +97,11 @@ def plot_sweep(
 
 
 def _look(well: int) -> tuple[str, str, str]:
-    return COLOURS[well % len(COLOURS)], MARKERS[well % len(MARKERS)], LINE_STYLES[well % len(LINE_STYLES)]
+    return (
+        CURVE_COLOURS[well % len(CURVE_COLOURS)],
+        MARKERS[well % len(MARKERS)],
+        LINE_STYLES[well % len(LINE_STYLES)],
+    )
 
 
 def _draw_branches(axes: Axes, branches: pd.DataFrame, bifurcations: pd.DataFrame, place: int) -> None:

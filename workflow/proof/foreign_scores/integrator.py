@@ -11,10 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.formulas import compile_values
-from siq.dynamics.parametric import symbol
-from siq.estimation.measurements import Measurements
+from siq.inference.measurements import Measurements
+from siq.systems.dynamics import Dynamics, symbol
+from siq.systems.formulas import compile_values
 
 STEPS = 2  # of the rule, in the usual interval between two samples
 NUDGE = 1e-6  # relative to its size, by which a state or a parameter is moved for a difference

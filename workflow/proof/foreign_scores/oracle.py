@@ -9,9 +9,9 @@ from typing import Protocol
 import numpy as np
 import scipy.optimize
 
-from siq.dynamics.dynamics import Dynamics
-from siq.estimation.measurements import Measurements
-from siq.mismatch.case import Comparison
+from siq.diagnosis.investigation import Comparison
+from siq.inference.measurements import Measurements
+from siq.systems.dynamics import Dynamics
 from workflow.proof.foreign_scores.integrator import Integrator
 from workflow.proof.keys import CaseKey, Truth
 from workflow.proof.oracle import true_model

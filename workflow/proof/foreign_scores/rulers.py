@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from siq.dynamics.dynamics import Dynamics
-from siq.dynamics.parametric import Signals
+from siq.systems.dynamics import Dynamics, Signals
 from workflow.proof.foreign_scores.places import orthonormal
 from workflow.proof.keys import CaseKey, Truth
 from workflow.proof.oracle import true_model

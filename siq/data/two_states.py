@@ -1,0 +1,645 @@
+"""Two-state statistics of a record: levels, hops, residence times.
+
+A hidden Markov model of two normal distributions finds the levels, and what both have in common is the
+background; each in turn.
+
+*Hops* are counted with two thresholds, the levels of the two states: a visit begins where the record reaches
+the level of a state, and lasts until it reaches the level of the other one. The mean dwell time is the time
+of all visits, those that the record cuts at its ends included, over the number of visits whose end was seen:
+the best estimate for exponential times, with a relative error of ``1/√n``.
+
+Two tests. *The first one* regresses increments over a lag on polynomials of the state in stretches of forty
+local relaxation times, each with a level of its own, which takes with it whatever drifts slowly. With the
+polynomial of the state, ``E[x(t + 2l) - x(t + l) | x(t)] = l·f(x(t))``, every difference f(b) - f(a) with
+a < b would be negative if a single state attracted; the sensor's noise in x(t) is not that of the increment.
+The largest of them in standard errors counts, with Scheffé's bound for having looked at all pairs.
+
+*The second one* asks for a valley of the histogram, deeper than in surrogates of the record with the same
+spectrum and random phases, which are what a linear system could have shown; of both, every such stretch is
+taken less a straight line.
+
+Nothing is identified here: this is what the numbers say before any formula does.
+
+*Two states.* A histogram with two peaks is no evidence: a slow background makes one of a single state. Two
+states have a place between them *from which the record is pushed away to both sides*: that is the first test.
+Where hops are faster than that shows, as in counts of events, there is a second one, a valley of the
+histogram that no linear system shows (`siq.data.two_states` has both). Few hops do not pass it, and
+records that stay where they are neither; and where a single state attracts beyond doubt by the first test, it
+is not asked. Two states are supported if one of the tests says so, and a hop was seen.
+
+*Hops* are counted from one of their levels (`siq.data.two_states`) to the other (`siq.data.two_states`).
+
+This holds where no f is found, or none is certified: it is counted, and rests on no model but that of two
+levels (`siq.data.two_states`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy import stats
+
+from siq.data.correlation import noise_floors
+from siq.data.recordings import Recordings
+from siq.data.stationarity import (
+    Background,
+    background_of,
+    relaxation_samples,
+    runs_of,
+    stretches_of,
+    stretches_of_all,
+    usual_step,
+    without_background,
+)
+from siq.numerics.integration import machine_code
+from siq.numerics.text import range_text, unit_text, value_text
+
+WINDOW = 0.5  # of the local relaxation time, over which samples are averaged for the hidden Markov model
+SWEEPS = 200  # of its estimation, at most
+
+
+def two_levels(
+    recordings: Recordings, values: np.ndarray, runs: list[slice], relaxation: float
+) -> tuple[Background, tuple[float, float], tuple[float, float]]:
+    """Two levels over a common background: each in turn, until neither changes."""
+    width = max(int(WINDOW * relaxation), 1)
+    background = Background(np.zeros(len(values)), 0)
+    levels, spreads = (0.0, 0.0), (0.0, 0.0)
+    for _ in range(5):
+        flat = values - background.values
+        begins = stretches_of_all(runs, width)
+        means = flat[begins[:, None] + np.arange(width)].mean(axis=1)
+        first = np.append(True, np.diff(begins) != width)
+        centre, spread, weights = _two_normals(means, first)
+        order = np.argsort(centre)
+        levels = (float(centre[order[0]]), float(centre[order[1]]))
+        spreads = (float(spread[order[0]]), float(spread[order[1]]))
+        share = np.full(len(values), np.nan)
+        share[begins[:, None] + np.arange(width)] = weights[:, order[1]][:, None]
+        known = np.isfinite(share)
+        share = np.interp(np.arange(len(share)), np.flatnonzero(known), share[known])
+        found = background_of(recordings, values - (1 - share) * levels[0] - share * levels[1])
+        unchanged = found.half_periods == background.half_periods and (
+            np.abs(found.values - background.values).max() <= 0.01 * min(spreads)
+        )
+        background = found
+        if unchanged:
+            break
+    return background, levels, spreads
+
+
+def _two_normals(series: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, ...]:
+    """A hidden Markov model of two normal distributions: centres, spreads, and weights ``(n, 2)``."""
+    centre = np.quantile(series, [0.1, 0.9])
+    if not centre[1] > centre[0]:
+        centre = np.array([series.min(), series.max()])
+    spread = np.full(2, max(np.ptp(centre) / 4, 1e-12))
+    transition = np.array([[0.95, 0.05], [0.05, 0.95]])
+    smallest = 1e-3 * max(float(series.std()), 1e-300)  # a level of a single repeated value has no spread
+    before = -np.inf
+    weights = np.full((len(series), 2), 0.5)
+    for _ in range(SWEEPS):
+        logs = -0.5 * ((series[:, None] - centre) / spread) ** 2 - np.log(spread)
+        highest = logs.max(axis=1, keepdims=True)
+        weights, pairs, likelihood = _forward_backward(np.exp(logs - highest), transition, first)
+        likelihood += float(highest.sum())
+        total = weights.sum(axis=0) + 1e-12
+        centre = weights.T @ series / total
+        spread = np.sqrt(np.maximum((weights * (series[:, None] - centre) ** 2).sum(axis=0) / total, 0))
+        spread = np.maximum(spread, smallest)
+        transition = (pairs + 1e-6) / (pairs + 1e-6).sum(axis=1, keepdims=True)
+        if likelihood - before < 1e-6 * len(series) ** 0.5:
+            break
+        before = likelihood
+    return centre, spread, weights
+
+
+@machine_code
+def _forward_backward(
+    density: np.ndarray, transition: np.ndarray, first: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Probabilities of the two states at each time, expected transitions, and the log-likelihood."""
+    count = len(density)
+    forward = np.empty((count, 2))
+    scale = np.empty(count)
+    weights = np.empty((count, 2))
+    pairs = np.zeros((2, 2))
+    likelihood = 0.0
+    for k in range(count):
+        for j in range(2):
+            if first[k]:
+                prior = 0.5
+            else:
+                prior = forward[k - 1, 0] * transition[0, j] + forward[k - 1, 1] * transition[1, j]
+            forward[k, j] = prior * density[k, j]
+        scale[k] = max(forward[k, 0] + forward[k, 1], 1e-300)
+        forward[k, 0] /= scale[k]
+        forward[k, 1] /= scale[k]
+        likelihood += np.log(scale[k])
+    after = np.ones(2)
+    for k in range(count - 1, -1, -1):
+        if k + 1 == count or first[k + 1]:
+            after[0], after[1] = 1.0, 1.0
+        else:
+            low = density[k + 1, 0] * after[0] / scale[k + 1]
+            high = density[k + 1, 1] * after[1] / scale[k + 1]
+            for i in range(2):
+                pairs[i, 0] += forward[k, i] * transition[i, 0] * low
+                pairs[i, 1] += forward[k, i] * transition[i, 1] * high
+            one = transition[0, 0] * low + transition[0, 1] * high
+            two = transition[1, 0] * low + transition[1, 1] * high
+            after[0], after[1] = one, two
+        weights[k, 0] = forward[k, 0] * after[0]
+        weights[k, 1] = forward[k, 1] * after[1]
+    return weights, pairs, likelihood
+
+
+CONFIDENCE = 0.95  # of the intervals of mean dwell times
+
+
+@dataclass(frozen=True)
+class DwellCount:
+    """How long a state lasts, as counted.
+
+    Attributes
+    ----------
+    visits
+        How many were seen to end, each by a hop.
+    time
+        Spent in the state by all visits, in the unit of time.
+    """
+
+    visits: int
+    time: float
+
+    @property
+    def mean(self) -> float:
+        """Mean dwell time; NaN where no visit ended."""
+        return self.time / self.visits if self.visits else float("nan")
+
+    @property
+    def relative_error(self) -> float:
+        """``1/√n``; infinite where no visit ended."""
+        return float(1 / np.sqrt(self.visits)) if self.visits else float("inf")
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Interval of 95 % for exponential times; the upper end is infinite where no visit ended.
+
+        The number of hops in a given time is Poisson's, so that ``2T/τ`` lies between quantiles of χ².
+        """
+        tail = (1 - CONFIDENCE) / 2
+        upper = stats.chi2.ppf(1 - tail, 2 * self.visits + 2)
+        lower = stats.chi2.ppf(tail, 2 * self.visits) if self.visits else 0.0
+        return float(2 * self.time / upper), float(2 * self.time / lower) if lower > 0 else float("inf")
+
+
+def counted_visits(values: np.ndarray, runs: list[slice], levels: tuple[float, float]) -> np.ndarray:
+    """0 from where the lower level is reached, 1 from where the upper one is, -1 before: shape ``(n,)``."""
+    core = np.full(len(values), -1)
+    core[values <= levels[0]] = 0
+    core[values >= levels[1]] = 1
+    return continued_visits(core, runs)
+
+
+def continued_visits(core: np.ndarray, runs: list[slice]) -> np.ndarray:
+    """Which core was entered last, at every sample of a run; -1 before the first.
+
+    Parameters
+    ----------
+    core
+        Shape ``(n,)``: the core that a sample lies in, -1 between them.
+    runs
+        See `siq.data.stationarity.runs_of`.
+    """
+    visits = np.full(len(core), -1)
+    for run in runs:
+        part = core[run]
+        last = np.maximum.accumulate(np.where(part >= 0, np.arange(len(part)), -1))
+        visits[run] = np.where(last >= 0, part[np.maximum(last, 0)], -1)
+    return visits
+
+
+def dwell_counts(
+    t: np.ndarray, visits: np.ndarray, runs: list[slice], *, states: int = 2
+) -> tuple[DwellCount, ...]:
+    """Time spent in each state, and visits that ended in another: one for each.
+
+    The first and the last visit of a run count with the time that was seen of them; only the last has no end.
+    """
+    spent, ended = np.zeros(states), np.zeros(states, dtype=int)
+    for run in runs:
+        inside, gaps = visits[run], np.diff(t[run])
+        before, known = inside[:-1], inside[:-1] >= 0
+        spent += np.bincount(before[known], weights=gaps[known], minlength=states)
+        hops = known & (inside[1:] != before)
+        ended += np.bincount(before[hops], minlength=states)
+    return tuple(DwellCount(int(n), float(time)) for n, time in zip(ended, spent, strict=True))
+
+
+SURROGATES = 999  # for each state that is looked at: fewer could not be rare enough for all of them
+ENOUGH = 20  # as deep as the record: the probability is then known to a fifth
+MOST_POINTS = 8192  # of a series that surrogates are made of
+BINS = 40  # of a histogram with a valley
+DEGREE = 5  # of f in the test: two attractors that differ in depth and width need more than a cubic
+STRETCH = 40  # local relaxation times: shorter ones bias f towards one state, longer ones let drifts in
+FEWEST, SHORTEST = 6, 10  # stretches, at least, for which they may be as short as ten relaxation times
+LAG = 0.1  # of the local relaxation time: over it a state hardly changes what pushes it
+PLACES = 25  # at which f is compared with itself, between the quantiles
+INNER = 0.02  # the quantile from which on f is known well enough
+
+
+def pushed_apart(values: np.ndarray, runs: list[slice], relaxation: float) -> tuple[float, float] | None:
+    """By how many standard errors f rises somewhere, and how probable that is where a single state attracts.
+
+    Parameters
+    ----------
+    values
+        Shape ``(n,)``.
+    runs
+        See `siq.data.stationarity.runs_of`.
+    relaxation
+        The local relaxation time in samples.
+
+    Returns
+    -------
+    tuple or None
+        The largest ``(f(b) - f(a)) / error`` with a < b, and its probability by Scheffé's bound; None where
+        there are too few stretches.
+    """
+    lag = max(int(LAG * relaxation), 1)
+    longest = sum(run.stop - run.start for run in runs) / (lag * FEWEST) - 2
+    rows = int(min(np.ceil(STRETCH * relaxation / lag), longest))
+    begins = stretches_of(runs, (rows + 2) * lag) if rows * lag >= SHORTEST * relaxation else np.zeros(0)
+    if len(begins) < FEWEST - 2:  # gaps cost some
+        return None
+    low, high = np.quantile(values, [0.001, 0.999])
+    if not high > low:
+        return None
+    scaled = 2 * (values - low) / (high - low) - 1
+    at = begins[:, None] + lag * np.arange(rows)
+    now = np.clip(scaled[at], -1.2, 1.2)  # a polynomial has no business beyond
+    increments = scaled[at + 2 * lag] - scaled[at + lag]
+    terms = np.polynomial.legendre.legvander(now, DEGREE)[..., 1:]
+    design = (terms - terms.mean(axis=1, keepdims=True)).reshape(-1, DEGREE)
+    goal = (increments - increments.mean(axis=1, keepdims=True)).ravel()
+    normal = design.T @ design
+    if np.linalg.cond(normal) > 1e12:  # numerical: a record of hardly any different values
+        return None
+    inverse = np.linalg.inv(normal)
+    coefficients = inverse @ design.T @ goal
+    rest = goal - design @ coefficients
+    # Each stretch is one draw: its residuals may depend on each other and on the state as they like.
+    scores = (design * rest[:, None]).reshape(len(begins), rows, DEGREE).sum(axis=1)
+    freedom = goal.size - len(begins) - DEGREE
+    covariance = inverse * float(rest @ rest) / freedom
+    if len(begins) >= 4 * DEGREE:
+        robust = inverse @ (scores.T @ scores) @ inverse * len(begins) / (len(begins) - 1)
+        covariance = _larger(covariance, robust)
+    places = np.linspace(np.quantile(now, INNER), np.quantile(now, 1 - INNER), PLACES)
+    at_places = np.polynomial.legendre.legvander(places, DEGREE)[:, 1:]
+    first, second = np.triu_indices(PLACES, k=1)
+    contrasts = at_places[second] - at_places[first]
+    errors = np.sqrt(np.einsum("ij,jk,ik->i", contrasts, covariance, contrasts))
+    largest = float(np.max(contrasts @ coefficients / errors))
+    return largest, float(stats.f.sf(max(largest, 0.0) ** 2 / DEGREE, DEGREE, freedom))
+
+
+def valley_between(
+    values: np.ndarray,
+    runs: list[slice],
+    relaxation: float,
+    *,
+    generator: np.random.Generator | None,
+    surrogates: int = SURROGATES,
+) -> tuple[float, float]:
+    """How much of the record lies in the lesser peak of its histogram, and how probable that is.
+
+    Parameters
+    ----------
+    values, runs, relaxation
+        As of `pushed_apart`.
+    generator
+        Where the phases of the surrogates come from; None makes none.
+    surrogates
+        How many, unless `ENOUGH` of them are as deep before: then it is no rare thing (Besag and Clifford,
+        Biometrika 78 (1991) 301).
+
+    Returns
+    -------
+    tuple
+        The share of the samples, and its probability among surrogates with random phases.
+    """
+    every = max(int(relaxation / 4), -(-len(values) // MOST_POINTS), 1)
+    levelled = _less_lines(values, runs, max(int(STRETCH * relaxation), 2))
+    parts = [levelled[run][::every] for run in runs if run.stop - run.start >= 4 * every]
+    if not parts:
+        return 0.0, 1.0
+    seen = _valley(np.concatenate(parts))
+    if seen <= 0 or generator is None:
+        return seen, 1.0
+    spectra = [(np.fft.rfft(part), len(part)) for part in parts]
+    deeper = 0
+    for number in range(surrogates):
+        drawn = []
+        for spectrum, size in spectra:
+            turned = spectrum * np.exp(2j * np.pi * generator.random(len(spectrum)))
+            turned[0] = spectrum[0]
+            drawn.append(np.fft.irfft(turned, n=size))
+        deeper += _valley(np.concatenate(drawn)) >= seen
+        if deeper == ENOUGH:
+            return seen, deeper / (number + 1)
+    return seen, (1 + deeper) / (1 + surrogates)
+
+
+def _less_lines(values: np.ndarray, runs: list[slice], length: int) -> np.ndarray:
+    """The series less a straight line in every stretch of that many samples, the last of a run longer."""
+    rest = values.copy()
+    for run in runs:
+        count = max((run.stop - run.start) // length, 1)
+        for part in np.array_split(np.arange(run.start, run.stop), count):
+            line = np.vander(np.linspace(-1, 1, len(part)), 2)
+            rest[part] -= line @ np.linalg.lstsq(line, values[part], rcond=None)[0]
+    return rest
+
+
+def _valley(series: np.ndarray) -> float:
+    low, high = np.quantile(series, [0.001, 0.999])
+    if not high > low:
+        return 0.0
+    share = np.histogram(series, bins=BINS, range=(float(low), float(high)))[0] / len(series)
+    above = np.maximum(share[:, None] - share, 0)  # bins by places of the valley
+    left, right = np.tril(above.T, -1).sum(axis=1), np.triu(above.T, 1).sum(axis=1)
+    return float(np.minimum(left, right).max())
+
+
+def _larger(one: np.ndarray, two: np.ndarray) -> np.ndarray:
+    """A covariance that is not smaller than either in any direction in which they differ."""
+    root = np.linalg.cholesky(one)
+    inverse = np.linalg.inv(root)
+    values, vectors = np.linalg.eigh(inverse @ two @ inverse.T)
+    turned = root @ vectors
+    return (turned * np.maximum(values, 1.0)) @ turned.T
+
+
+LEVEL = 0.01  # probability with which a single state is taken for two
+DECIDED = 1e-5  # probability for the first test from which on the second one is not asked
+PULLED = -3.0  # standard errors: where f falls so clearly from every place to every other, one state attracts
+
+
+@dataclass(frozen=True)
+class Switching:
+    """Two states of a record, and its hops between them.
+
+    Attributes
+    ----------
+    state
+        Index of the state (column) that shows them best.
+    levels
+        The two levels, the lower first, in the unit of the state; of the record less its background.
+    spreads
+        Standard deviation about each.
+    counts
+        How long each lasts.
+    visits
+        Shape ``(n,)``: 0 or 1 at each sample, -1 before the record has reached a level.
+    background
+        What drifts slowly below both levels.
+    relaxation
+        The local relaxation time.
+    pushed
+        By how many standard errors the record is pushed away from between the levels; negative where it is
+        pulled there, NaN where it is too short to tell.
+    valley
+        Share of the samples in the lesser peak of the histogram, above the valley; 0 where there is one peak.
+    probability
+        Of so much with a single state over a slowly drifting background, both tests and all states counted.
+    """
+
+    state: int
+    levels: tuple[float, float]
+    spreads: tuple[float, float]
+    counts: tuple[DwellCount, DwellCount]
+    visits: np.ndarray
+    background: Background
+    relaxation: float
+    pushed: float
+    valley: float
+    probability: float
+
+    @property
+    def hops(self) -> int:
+        """How many transitions were seen, both ways."""
+        return self.counts[0].visits + self.counts[1].visits
+
+    @property
+    def supported(self) -> bool:
+        """Whether the record supports two states: it is pushed apart, and was seen to hop at least once."""
+        return self.probability < LEVEL and self.hops > 0
+
+
+def switching(recordings: Recordings, *, generator: np.random.Generator | None = None) -> Switching | None:
+    """The two states that the recordings show best; None where they are too short to tell anything.
+
+    Every state is looked at by itself, and the one in which the record is pushed apart most clearly is taken.
+    Whether two are supported at all is `Switching.supported`.
+
+    Parameters
+    ----------
+    recordings
+        Trajectories, of any number.
+    generator
+        Where surrogates come from; by default always the same ones.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from siq.data.recordings import Recordings
+    >>> generator = np.random.default_rng(1)
+    >>> x = np.empty((20_000, 1))
+    >>> x[0] = 1.0
+    >>> for before in range(len(x) - 1):
+    ...     kick = np.sqrt(0.25 * 0.05) * generator.standard_normal()
+    ...     x[before + 1] = x[before] + 0.05 * (x[before] - x[before] ** 3) + kick
+    >>> found = switching(Recordings.from_arrays(0.05 * np.arange(len(x)), x, names=["x"]))
+    >>> found.supported, [round(level, 1) for level in found.levels]
+    (True, [-0.9, 0.8])
+    """
+    runs, step = runs_of(recordings), usual_step(recordings)
+    generator = np.random.default_rng(0) if generator is None else generator
+    tests: dict[int, tuple[float, float, float, float]] = {}
+    for place, column in enumerate(recordings.values.T):
+        relaxation = relaxation_samples(column, runs)
+        if relaxation is None:  # too short, or a column that runs on like a clock
+            continue
+        pushed = pushed_apart(column, runs, relaxation) or (float("nan"), 1.0)
+        if pushed[0] < PULLED or pushed[1] < DECIDED:
+            valley = (valley_between(column, runs, relaxation, generator=None)[0], 1.0)
+        else:
+            number = SURROGATES * recordings.values.shape[1]
+            valley = valley_between(column, runs, relaxation, generator=generator, surrogates=number)
+        tests[place] = (min(pushed[1], valley[1]), pushed[0], valley[0], relaxation)
+    if not tests:
+        return None
+    state = min(tests, key=lambda place: (tests[place][0], -tests[place][2]))
+    probability, push, depth, relaxation = tests[state]
+    values = recordings.values[:, state]
+    background, levels, spreads = two_levels(recordings, values, runs, relaxation)
+    visits = counted_visits(values - background.values, runs, levels)
+    lower, upper = dwell_counts(recordings.t, visits, runs)
+    return Switching(
+        state,
+        levels,
+        spreads,
+        (lower, upper),
+        visits,
+        background,
+        relaxation * step,
+        push,
+        depth,
+        min(2 * probability * len(tests), 1.0),
+    )
+
+
+def without_slow_drift(recordings: Recordings) -> Recordings:
+    """A single long recording less what drifts slowly in it, which a note says for each state.
+
+    Of a record that supports two states the drift is what both levels have in common; of any other, what slow
+    cosines explain. Several recordings come back as they are: how they begin may be a part of what they show.
+    So does one without random forces, in which nothing but the system itself moves.
+    """
+    floors = noise_floors(recordings) if len(recordings.labels) == 1 else None
+    if floors is None or any(floor.process == 0 for floor in floors):
+        return recordings
+    found = switching(recordings)
+    flat = recordings
+    for state, values in enumerate(recordings.values.T):
+        if found is not None and found.supported and state == found.state:
+            flat = without_background(flat, state, found.background)
+        else:
+            flat = without_background(flat, state, background_of(recordings, values))
+    return flat
+
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True, eq=False)
+class RecordStates:
+    """The two states that recordings show by themselves.
+
+    Attributes
+    ----------
+    state
+        The measured quantity that shows them best, as its file calls it.
+    unit, time_unit
+        None where the file does not say.
+    supported
+        Whether the record supports two states at all.
+    probability
+        Of as much with a single state over a slowly drifting background.
+    levels
+        The two, the lower first, in the unit of the state.
+    counts
+        How long each lasts, the lower first.
+    edges, density
+        Histogram of the state: edges ``(b + 1,)`` and, per unit of the state, ``(b,)``.
+    """
+
+    state: str
+    unit: str | None
+    time_unit: str | None
+    supported: bool
+    probability: float
+    levels: tuple[float, float]
+    counts: tuple[DwellCount, DwellCount]
+    edges: np.ndarray
+    density: np.ndarray
+
+    @property
+    def transitions(self) -> int:
+        """How many were seen, both ways."""
+        return self.counts[0].visits + self.counts[1].visits
+
+    def dwell_times(self) -> pd.DataFrame:
+        """How long each state lasts, a row for each.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Columns ``level visits mean_time lowest highest``: the level of the state; how many visits were
+            seen to end; their mean in the unit of time, NaN where none ended, with its interval of 95 %.
+        """
+        import pandas as pd
+
+        return pd.DataFrame(
+            [
+                (level, one.visits, one.mean, *one.limits)
+                for level, one in zip(self.levels, self.counts, strict=True)
+            ],
+            columns=["level", "visits", "mean_time", "lowest", "highest"],
+        )
+
+    def sentence(self) -> str:
+        """The same in a sentence; empty where two states are not supported."""
+        if not self.supported:
+            return ""
+        low, high = (value_text(level, unit=self.unit or "", digits=3) for level in self.levels)
+        time = unit_text(self.time_unit) or "time units"
+        means = " and ".join(map(_mean_text, self.counts))
+        return (
+            f"The recordings hop between two states of {self.state}, at {low} and {high}: {self.transitions}"
+            f" transition{'s were' if self.transitions > 1 else ' was'} seen, from level to level, and the"
+            f" states last {means} {time} in the mean."
+        )
+
+    def as_data(self) -> dict[str, Any]:
+        """As plain data."""
+        return {
+            "state": self.state,
+            "unit": self.unit,
+            "time_unit": self.time_unit,
+            "supported": self.supported,
+            "probability": self.probability,
+            "levels": list(self.levels),
+            "counts": [{"visits": one.visits, "time": one.time} for one in self.counts],
+            "edges": self.edges.tolist(),
+            "density": self.density.tolist(),
+        }
+
+    @classmethod
+    def from_data(cls, data: Mapping[str, Any]) -> RecordStates:
+        """What `as_data` gave."""
+        low, high = data["levels"]
+        first, second = (DwellCount(int(one["visits"]), float(one["time"])) for one in data["counts"])
+        return cls(
+            data["state"], data["unit"], data["time_unit"], bool(data["supported"]),
+            float(data["probability"]), (float(low), float(high)), (first, second),
+            np.array(data["edges"], dtype=float), np.array(data["density"], dtype=float),
+        )  # fmt: skip
+
+
+def states_of_record(recordings: Recordings, found: Switching | None) -> RecordStates | None:
+    """What `switching` found in recordings; None where it found nothing.
+
+    Where a background drifts slowly it is taken off the histogram, as it is off the levels.
+    """
+    if found is None:
+        return None
+    values = recordings.values[:, found.state] - found.background.values
+    density, edges = np.histogram(values, bins=BINS, density=True)
+    return RecordStates(
+        recordings.titles[found.state], recordings.units[found.state], recordings.time_unit,
+        found.supported, found.probability, found.levels, found.counts, edges, density,
+    )  # fmt: skip
+
+
+def _mean_text(one: DwellCount) -> str:
+    low, high = one.limits
+    if not one.visits:
+        return f"more than {value_text(low, digits=2)}"
+    return f"{value_text(one.mean, digits=3)} ({range_text(low, high)})"

@@ -1,0 +1,1 @@
+"""Diagnosis: where a simulation and recordings differ, and which physics was left out."""

@@ -1,0 +1,586 @@
+"""The dictionary of mechanisms, and which states, inputs and parameters may take part in each.
+
+Mechanisms are written for roles - a position, a velocity, the two quadratures of a rotating frame, a
+population, a level, a store - and roles are read off equations and units, never off names. A system of mere
+numbers is described by generic monomials only.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import sympy
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from siq.errors import InputError
+from siq.numerics.files import read_document, validate
+from siq.systems.cards import Formula, Name
+from siq.systems.dynamics import Dynamics, Signals, arguments_of, evaluable, symbol
+from siq.systems.formulas import FormulaError, compile_values, parse_formula
+
+Role = Literal[
+    "position", "displacement", "angle", "velocity", "amplitude", "population", "prey", "predator", "level",
+    "upper level", "lower level", "store", "stock", "state", "input", "parameter", "output",
+]  # fmt: skip
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Shape(_Part):
+    """Where a parameter is looked for that the mechanism does not depend on linearly.
+
+    Give one way of looking.
+
+    Attributes
+    ----------
+    at
+        Multiples, or probabilities for `quantiles_of`, that are tried.
+    scale_of
+        A formula: multiples of its root mean square along the recordings are tried.
+    inverse_scale_of
+        The same of its inverse.
+    quantiles_of
+        A formula: its quantiles at these probabilities are tried.
+    time_of
+        A formula: multiples of the time in which it changes by its own spread are tried.
+    lattice_of
+        An output: the step of the lattice on which its recorded values lie. It is known from the recordings
+        and not fitted; where they lie on none that holds zero, the mechanism is not tried.
+    top_of, bottom_of
+        An output: where its recorded values end in a plateau, above or below. Where there is none, the
+        mechanism is not tried.
+    samples
+        Multiples of the time between samples are tried.
+    frequencies
+        So many angular frequencies that the recordings can resolve are tried.
+    """
+
+    at: tuple[float, ...] = (1.0,)
+    scale_of: str | None = None
+    inverse_scale_of: str | None = None
+    quantiles_of: str | None = None
+    time_of: str | None = None
+    lattice_of: str | None = None
+    top_of: str | None = None
+    bottom_of: str | None = None
+    samples: bool = False
+    frequencies: Annotated[int, Field(ge=2, le=2000)] | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> Shape:
+        given = (
+            self.scale_of, self.inverse_scale_of, self.quantiles_of, self.time_of, self.lattice_of,
+            self.top_of, self.bottom_of, self.frequencies,
+        )  # fmt: skip
+        if sum(each is not None for each in given) + self.samples != 1:
+            raise ValueError("a shape is looked for in one way; give one of scale_of, quantiles_of, ...")
+        return self
+
+    @property
+    def recorded(self) -> str | None:
+        """The output whose recorded values tell the shape by themselves."""
+        return self.lattice_of or self.top_of or self.bottom_of
+
+
+class MechanismParameter(_Part):
+    """A parameter that a mechanism brings: an amplitude, or a shape.
+
+    Attributes
+    ----------
+    unit
+        In terms of the roles and the time T: ``v/T/x**3``.
+    sign
+        ``positive`` where passivity, or the meaning of the word, demands it.
+    shape
+        Where to look for it. Left out, it is an amplitude, which is zero where the mechanism is absent.
+    """
+
+    unit: str = "1"
+    sign: Literal["any", "positive"] = "any"
+    shape: Shape | None = None
+
+
+class FurtherState(_Part):
+    """A state that a mechanism brings.
+
+    Attributes
+    ----------
+    equation
+        Its time derivative.
+    unit
+        In terms of the roles.
+    scale
+        A formula of its size.
+    begin
+        A formula of the roles: where it is taken to begin in every recording, until a fit tells.
+    """
+
+    equation: Formula
+    unit: str = "1"
+    scale: str
+    begin: Formula = 0
+
+
+class Form(_Part):
+    """How a mechanism shows in one kind of system.
+
+    Attributes
+    ----------
+    roles
+        What each name in the formulas stands for. Several roles are filled by different states.
+    terms
+        Formulas that are added to the equation of the state in that role.
+    replace
+        Formulas that take the place of an input or a parameter, wherever it stands.
+    within
+        Formulas that take the place of a state in the equation of another: ``{q: {p: z}}`` puts z in the
+        place of p in the equation of q.
+    outputs
+        Formulas of what a sensor reads instead; ``y`` stands for what it read before.
+    states
+        Further states, by name.
+    noise
+        The state on which random forces act.
+    parameters
+        What the mechanism's formulas need to know, by name.
+    coordinate
+        Along which role the mechanism acts.
+    variant
+        What tells the form from others of the same roles, in words that follow the name: ``from above``.
+    symmetric
+        Whether exchanging the roles gives the same mechanism.
+    one_unit
+        Whether the states that fill the roles must have one unit, and not be mere numbers.
+    """
+
+    roles: dict[Name, Role]
+    terms: dict[Name, Formula] = {}
+    replace: dict[Name, Formula] = {}
+    within: dict[Name, dict[Name, Formula]] = {}
+    outputs: dict[Name, Formula] = {}
+    states: dict[Name, FurtherState] = {}
+    noise: Name | None = None
+    parameters: dict[Name, MechanismParameter]
+    coordinate: str
+    variant: str = ""
+    symmetric: bool = False
+    one_unit: bool = False
+
+    @model_validator(mode="after")
+    def _about_roles(self) -> Form:
+        changed = [
+            *self.terms, *self.replace, *self.outputs, *self.within,
+            *(name for put in self.within.values() for name in put), *([self.noise] if self.noise else []),
+        ]  # fmt: skip
+        if not changed:
+            raise ValueError("a form changes nothing; give terms, replace, within, outputs or noise")
+        for name in changed:
+            if name not in self.roles:
+                raise ValueError(f"'{name}' has no role; add 'roles: {{{name}: state}}' or another role")
+        return self
+
+
+class Mechanism(_Part):
+    """An entry of the dictionary.
+
+    Attributes
+    ----------
+    name
+        What pages and tables call it.
+    sentence
+        What it means, in a sentence.
+    forms
+        One for each kind of system in which it shows.
+    generalises
+        Mechanisms that are special cases of it.
+    look_alikes
+        Mechanisms that are easily taken for it.
+    reference
+        Where it is described.
+    """
+
+    name: Annotated[str, Field(min_length=1)]
+    sentence: str
+    forms: Annotated[tuple[Form, ...], Field(min_length=1)]
+    generalises: tuple[str, ...] = ()
+    look_alikes: tuple[str, ...] = ()
+    reference: str = ""
+
+
+class Dictionary(BaseModel):
+    """The schema of a file of mechanisms."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    mechanisms: tuple[Mechanism, ...]
+
+
+def standard_dictionary() -> tuple[Mechanism, ...]:
+    """The mechanisms that come with the library."""
+    with as_file(files("siq.diagnosis") / "mechanisms.yaml") as path:
+        return read_dictionary(path)
+
+
+def read_dictionary(path: str | Path) -> tuple[Mechanism, ...]:
+    """Read a file ``mechanisms: [...]``.
+
+    Raises
+    ------
+    InputError
+        With the line of the first entry that cannot be used.
+    """
+    document = read_document(path)
+    return validate(document, Dictionary).mechanisms
+
+
+def dictionary_of(
+    *, without: Collection[str], further: Sequence[Mechanism], file: str
+) -> tuple[Mechanism, ...]:
+    """The standard mechanisms, less some by name, and with further ones; an equal name replaces.
+
+    Raises
+    ------
+    InputError
+        For a name to leave out that there is none of.
+    """
+    known = {each.name: each for each in standard_dictionary()}
+    for name in without:
+        if name not in known:
+            raise InputError(
+                file, "without", f"no mechanism is called '{name}'", f"use one of {', '.join(known)}"
+            )
+        del known[name]
+    return tuple((known | {each.name: each for each in further}).values())
+
+
+def units_of(model: Dynamics) -> dict[str, str]:
+    """Units of everything that a coordinate may be: states, inputs and the time, by name."""
+    units = dict(zip(model.states, model.units, strict=True))
+    units |= {entry.name: entry.unit for entry in model.inputs}
+    return units | {"t": model.time_unit}
+
+
+def unit_of(formula: str, units: Mapping[str, str]) -> str:
+    """The unit of a formula of quantities, such as ``"v/T/x**2"``.
+
+    Parameters
+    ----------
+    formula
+        Products and powers of quantities.
+    units
+        The unit of each, such as ``"m/s"``; ``"1"`` for a number. What cannot be read as a product of powers
+        (``"°C"``) is kept as one word.
+
+    Returns
+    -------
+    str
+        Such as ``"1/(m*s)"``.
+    """
+    words: dict[str, sympy.Symbol] = {}
+    known = {name: _parse(unit, words) for name, unit in units.items()}
+    result = parse_formula(formula, known)
+    text = str(sympy.powsimp(result, force=True))
+    for word, stand_in in words.items():
+        text = re.sub(rf"\b{stand_in}\b", word, text)
+    return text
+
+
+def _parse(unit: str, words: dict[str, sympy.Symbol]) -> sympy.Expr:
+    def stand_in(word: str) -> sympy.Symbol:
+        return words.setdefault(word, sympy.Symbol(f"unit{len(words)}", positive=True))
+
+    names = {word: stand_in(word) for word in re.findall(r"[A-Za-z_]\w*", unit)}
+    try:
+        return parse_formula(unit, names)
+    except FormulaError:
+        return stand_in(unit)
+
+
+SAME = 1e-9  # relative difference of values of formulas that are the same
+TRIALS = 12
+ANYWHERE = (0.5, 1.5)  # where formulas of a state without a domain are compared, as those of inputs are
+
+
+@dataclass(frozen=True)
+class Roles:
+    """Names by role.
+
+    Attributes
+    ----------
+    motions
+        Pairs of position and velocity, ``x' = v``.
+    angles
+        Positions that are angles: in radians, or within a sine or cosine of the equations.
+    amplitudes
+        Pairs of quadratures: but for a constant drive, the equations look the same from every angle, and turn
+        the state.
+    populations
+        States that stay zero once they are.
+    feeding
+        Pairs of prey and predator: populations whose meetings make the one fewer and the other more.
+    levels
+        States whose own outflow goes with their square root.
+    cascades
+        Pairs of levels of which the first flows into the second.
+    stores
+        All others that have a unit: a charge, a temperature, a concentration. Of a mere number nothing is
+        known that a mechanism could be written for.
+    states
+        All that are not mere derivatives; only in their equations can physics be missing.
+    """
+
+    motions: tuple[tuple[str, str], ...] = ()
+    angles: tuple[str, ...] = ()
+    amplitudes: tuple[tuple[str, str], ...] = ()
+    populations: tuple[str, ...] = ()
+    feeding: tuple[tuple[str, str], ...] = ()
+    levels: tuple[str, ...] = ()
+    cascades: tuple[tuple[str, str], ...] = ()
+    stores: tuple[str, ...] = ()
+    states: tuple[str, ...] = ()
+
+    @property
+    def physical(self) -> bool:
+        """Whether any state has a role for which mechanisms have names."""
+        return bool(self.motions or self.amplitudes or self.populations or self.levels)
+
+
+def roles_of(model: Dynamics) -> Roles:
+    """Read the roles of a model's states off its equations."""
+    motions = tuple(
+        (name, str(equation))
+        for name, equation, definition in zip(model.states, model.equations, model.kinematic, strict=True)
+        if definition
+    )
+    in_motion = {name for pair in motions for name in pair}
+    dynamic = tuple(
+        name for name, definition in zip(model.states, model.kinematic, strict=True) if not definition
+    )
+    others = [name for name in dynamic if name not in in_motion]
+    amplitudes = tuple(
+        (a, b)
+        for place, a in enumerate(others)
+        for b in others[place + 1 :]
+        if _turns(model, model.states.index(a), model.states.index(b))
+    )
+    in_pairs = {name for pair in amplitudes for name in pair}
+    alone = [name for name in others if name not in in_pairs]
+    equations = dict(zip(model.states, model.equations, strict=True))
+    levels = tuple(name for name in alone if _has_root(equations[name], name))
+    populations = tuple(
+        name for name in alone if name not in levels and _stays_zero(model, model.states.index(name))
+    )
+    units = dict(zip(model.states, model.units, strict=True))
+    return Roles(
+        motions=motions,
+        angles=tuple(x for x, _ in motions if units[x] == "rad" or _turns_round(model, x)),
+        amplitudes=amplitudes,
+        populations=populations,
+        feeding=tuple(
+            (prey, predator)
+            for prey, predator in itertools.permutations(populations, 2)
+            if _feeds(model, prey, predator)
+        ),
+        levels=levels,
+        cascades=tuple(
+            (upper, lower)
+            for upper, lower in itertools.permutations(levels, 2)
+            if _has_root(equations[lower], upper)
+        ),
+        stores=tuple(name for name in alone if name not in (*levels, *populations) and units[name] != "1"),
+        states=dynamic,
+    )
+
+
+def meetings(equation: sympy.Expr, one: str, other: str) -> sympy.Expr:
+    """The part of an equation in which two states stand together."""
+    terms = sympy.Add.make_args(sympy.expand(equation))
+    both = {symbol(one), symbol(other)}
+    return sympy.Add(*(term for term in terms if both <= term.free_symbols))
+
+
+def trial_points(
+    model: Dynamics, count: int = TRIALS, *, either_sign: bool = False
+) -> tuple[np.ndarray, Signals]:
+    """States and signals at which formulas are compared; any will do that are the same each time.
+
+    Parameters
+    ----------
+    model
+        Its domain is where the states lie.
+    count
+        How many points.
+    either_sign
+        Whether inputs, and states without a domain, are of either sign.
+
+    Returns
+    -------
+    np.ndarray, Signals
+        States of shape ``(d, count)``, and the signals there.
+    """
+    generator = np.random.default_rng(0)
+    known = np.isfinite(model.limits).all(axis=1)
+    lower, upper = np.where(known[:, None], model.limits, ANYWHERE).T
+    x = generator.uniform(lower[:, None], upper[:, None], size=(model.dimension, count))
+    inputs = generator.uniform(*ANYWHERE, size=(len(model.inputs), count))
+    delayed = generator.uniform(*ANYWHERE, size=(len(model.delays), count))
+    if either_sign:
+        x[~known] *= generator.choice([-1.0, 1.0], size=(int((~known).sum()), count))
+        inputs *= generator.choice([-1.0, 1.0], size=inputs.shape)
+    return x, Signals(
+        inputs=inputs,
+        delayed=delayed,
+        slopes=np.zeros_like(delayed),
+        t=generator.uniform(0.0, 1.0, size=count),
+    )
+
+
+def _turns_round(model: Dynamics, name: str) -> bool:
+    """Whether a state stands within a sine or cosine."""
+    return any(
+        symbol(name) in each.free_symbols
+        for formula in (*model.equations, *dict(model.outputs).values())
+        for each in formula.atoms(sympy.sin, sympy.cos)
+    )
+
+
+def _feeds(model: Dynamics, prey: str, predator: str) -> bool:
+    equations = dict(zip(model.states, model.equations, strict=True))
+    lost, won = meetings(equations[prey], prey, predator), meetings(equations[predator], prey, predator)
+    if lost == 0 or won == 0:
+        return False
+    x, signals = trial_points(model)
+    at = (*np.abs(x), *signals.inputs, *signals.delayed, *signals.slopes, signals.t, *model.values)
+    written = [evaluable(each, model) for each in (lost, won)]
+    losses, gains = compile_values(written, arguments_of(model), common=False)(*at)
+    return bool(np.all(np.asarray(losses) <= 0) and np.all(np.asarray(gains) >= 0))
+
+
+def _turns(model: Dynamics, first: int, second: int) -> bool:
+    """Whether f commutes with rotations of two states, but for a constant, and itself turns them."""
+    if model.units[first] != model.units[second]:
+        return False
+    x, signals = trial_points(model)
+    angle = np.linspace(0.3, 5.9, TRIALS)
+    turned = x.copy()
+    turned[first] = np.cos(angle) * x[first] - np.sin(angle) * x[second]
+    turned[second] = np.sin(angle) * x[first] + np.cos(angle) * x[second]
+    still = x.copy()
+    still[[first, second]] = 0.0
+    rates = model.functions.rates
+    free = rates(x, signals, model.values) - rates(still, signals, model.values)
+    after = rates(turned, signals, model.values) - rates(still, signals, model.values)
+    expected = free.copy()
+    expected[first] = np.cos(angle) * free[first] - np.sin(angle) * free[second]
+    expected[second] = np.sin(angle) * free[first] + np.cos(angle) * free[second]
+    size = np.abs(free).max()
+    if not (np.isfinite(free).all() and np.abs(after - expected).max() <= SAME * size):
+        return False
+    turning = x[first] * free[second] - x[second] * free[first]
+    return bool(np.abs(turning).max() > SAME * np.abs(x[[first, second]]).max() * size)
+
+
+def _stays_zero(model: Dynamics, place: int) -> bool:
+    x, signals = trial_points(model)
+    moving = model.functions.rates(x, signals, model.values)[place]
+    x[place] = 0.0
+    rate = model.functions.rates(x, signals, model.values)[place]
+    return bool(
+        np.isfinite(rate).all() and np.abs(rate).max() <= SAME * np.abs(moving).max() and moving.any()
+    )
+
+
+def _has_root(equation: sympy.Expr, name: str) -> bool:
+    return any(
+        power.exp == sympy.Rational(1, 2) and symbol(name) in power.base.free_symbols
+        for power in equation.atoms(sympy.Pow)
+    )
+
+
+def assignments(form: Form, model: Dynamics, roles: Roles) -> Iterator[dict[str, str]]:
+    """Every way of filling a form's roles.
+
+    Position (or displacement, or angle) and velocity, the two quadratures of a rotating frame, prey and
+    predator, and upper and lower level are filled in pairs where the form names them one after the other.
+    Nothing fills two roles, and of a symmetric form's ways only one is kept.
+
+    Yields
+    ------
+    dict
+        From each role to the name that fills it.
+    """
+    kinds = list(form.roles.values())
+    names = list(form.roles)
+    choices: list[list[dict[str, str]]] = []
+    place = 0
+    while place < len(names):
+        pairs = _pairs(kinds[place : place + 2], roles)
+        if pairs is not None:
+            choices.append([{names[place]: one, names[place + 1]: other} for one, other in pairs])
+            place += 2
+        else:
+            choices.append([{names[place]: name} for name in _of_kind(kinds[place], model, roles)])
+            place += 1
+    units = dict(zip(model.states, model.units, strict=True))
+    for combination in itertools.product(*choices):
+        filled = [name for part in combination for name in part.values()]
+        if len(set(filled)) < len(filled) or (form.symmetric and filled != sorted(filled, key=_order(model))):
+            continue
+        found = {units.get(name, "1") for name in filled} if form.one_unit else set()
+        if len(found) > 1 or "1" in found:
+            continue
+        yield {role: name for part in combination for role, name in part.items()}
+
+
+def _pairs(kinds: Sequence[str], roles: Roles) -> tuple[tuple[str, str], ...] | None:
+    """What fills two roles together; None where they are filled one by one."""
+    match kinds:
+        case ["position", "velocity"]:
+            return roles.motions
+        case ["displacement", "velocity"]:
+            return tuple(pair for pair in roles.motions if pair[0] not in roles.angles)
+        case ["angle", "velocity"]:
+            return tuple(pair for pair in roles.motions if pair[0] in roles.angles)
+        case ["amplitude", "amplitude"]:
+            return roles.amplitudes
+        case ["prey", "predator"]:
+            return roles.feeding
+        case ["upper level", "lower level"]:
+            return roles.cascades
+    return None
+
+
+def _order(model: Dynamics) -> Callable[[str], int]:
+    places = {name: place for place, name in enumerate(model.states)}
+    return lambda name: places.get(name, -1)
+
+
+def _of_kind(kind: str, model: Dynamics, roles: Roles) -> tuple[str, ...]:
+    return {
+        "position": tuple(x for x, _ in roles.motions),
+        "displacement": tuple(x for x, _ in roles.motions if x not in roles.angles),
+        "angle": roles.angles,
+        "velocity": tuple(v for _, v in roles.motions),
+        "amplitude": tuple(name for pair in roles.amplitudes for name in pair),
+        "population": roles.populations,
+        "prey": tuple(prey for prey, _ in roles.feeding),
+        "predator": tuple(predator for _, predator in roles.feeding),
+        "level": roles.levels,
+        "upper level": tuple(upper for upper, _ in roles.cascades),
+        "lower level": tuple(lower for _, lower in roles.cascades),
+        "store": roles.stores,
+        "stock": (*roles.populations, *roles.levels, *roles.stores),
+        "state": roles.states,
+        "input": tuple(entry.name for entry in model.inputs),
+        "parameter": tuple(entry.name for entry in model.parameters),  # what is known at first may drift, too
+        "output": model.output_names,
+    }[kind]

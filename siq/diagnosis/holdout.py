@@ -1,0 +1,323 @@
+"""Errors of free runs on held-out recordings, and cross-validation.
+
+Two simulations of the same recordings are off by the same noise. Whether one is better is therefore asked of
+pairs: of the ratio of their errors, whose own error is known from leaving out one block of samples at a time
+(the jackknife). Errors of a simulation last; blocks are long, and few.
+
+Every part of the recordings to learn from is left out in turn: whole recordings, or stretches of a single
+one. All parameters are fitted to the others, so that what is left out had no part in them.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+import scipy.stats
+
+from siq.diagnosis.mechanisms import MechanismCandidate
+from siq.errors import NumericalFailure
+from siq.inference.kalman_filter import Noise
+from siq.inference.maximum_likelihood import Fit
+from siq.inference.measurements import Measurements
+from siq.inference.recalibration import fit_with_process_noise_as_needed
+from siq.inference.trajectories import FreeRun, UsualStates, free_run, squared_errors
+
+
+@dataclass(frozen=True)
+class RunsAlike:
+    """What all of them have in common.
+
+    Attributes
+    ----------
+    noise
+        See `siq.inference.trajectories.free_run`.
+    substeps
+        Runge–Kutta steps between samples at least; a fit that needed more is run with its own.
+    """
+
+    noise: Noise
+    substeps: int
+
+    def run(self, fit: Fit, data: Measurements) -> FreeRun:
+        """A fit's simulation of recordings, told how they begin and where it usually is."""
+        finer = max(self.substeps, fit.substeps)
+        return free_run(fit.model, data, noise=self.noise, substeps=finer, usual=UsualStates.along(fit.x))
+
+    def errors(self, fit: Fit, data: Measurements) -> np.ndarray | None:
+        """Normalised squared errors of that run, shape ``(values,)``; None where it ran away."""
+        return squared_errors(data.outputs, self.run(fit, data))
+
+    def nearest(self, fits: list[Fit], data: Measurements) -> Fit:
+        """The fit that runs nearest to recordings; the first of those that are as near, or run away."""
+        return fits[0] if len(fits) == 1 else min(fits, key=lambda fit: mean_error(self.errors(fit, data)))
+
+
+def mean_error(squares: np.ndarray | None) -> float:
+    """The mean of squared errors, infinite where a simulation ran away."""
+    return float("inf") if squares is None else float(squares.mean())
+
+
+Change = Literal["better", "same", "worse", "unknown"]
+Run = Literal["before", "recalibrated", "augmented", "named", "without"]
+WIDE = 1.96  # standard errors within which 95 % lie
+BLOCKS = 12  # as many as tell an error of a ratio; fewer leave more samples that belong together in one
+BY_CHANCE = 0.05  # probability of a gain, or a loss, where there is none
+
+
+@dataclass(frozen=True)
+class HeldOutErrors:
+    """Normalised errors on held-out recordings; None where a simulation ran away.
+
+    Attributes
+    ----------
+    before, recalibrated, augmented
+        Of the simulation as it is, with its parameters refitted, and with what was found.
+    noise_floor
+        What measurement noise alone amounts to.
+    values
+        Number of measured values that the errors are means over; 0 where it is not known.
+    named
+        With what has a name only, where something without a name describes the rest.
+    squares
+        Mean squared errors of blocks of samples, by simulation: what changes are told by.
+    """
+
+    before: float | None = None
+    recalibrated: float | None = None
+    augmented: float | None = None
+    noise_floor: float | None = None
+    values: int = 0
+    named: float | None = None
+    squares: Mapping[str, tuple[float, ...]] = field(default_factory=dict, repr=False)
+
+    @classmethod
+    def of(
+        cls,
+        runs: Mapping[str, np.ndarray | None],
+        *,
+        noise_floor: float | None = None,
+    ) -> HeldOutErrors:
+        """From squared errors of each simulation.
+
+        Parameters
+        ----------
+        runs
+            By their names above: normalised squared errors of the same values, sample by sample, shape
+            ``(values,)``; None where the simulation ran away (`siq.inference.trajectories.squared_errors`).
+        noise_floor
+            See above.
+        """
+        known = {name: each for name, each in runs.items() if each is not None}
+        errors = {name: float(np.sqrt(each.mean())) for name, each in known.items()}
+        return cls(
+            errors.get("before"),
+            errors.get("recalibrated"),
+            errors.get("augmented"),
+            noise_floor,
+            max((len(each) for each in known.values()), default=0),
+            errors.get("named"),
+            {name: in_blocks(each) for name, each in known.items()},
+        )
+
+    @property
+    def better_without(self) -> Run:
+        """The better one of the simulation as it is and with its parameters refitted."""
+        if self.before is None:
+            return "recalibrated"
+        if self.recalibrated is None:
+            return "before"
+        return "before" if self.before <= self.recalibrated else "recalibrated"
+
+    def error(self, run: Run) -> float | None:
+        """The error of a simulation; that ``without`` is the better of those without what was found."""
+        known: float | None = getattr(self, self.better_without if run == "without" else run)
+        return known
+
+    def change(self, first: Run, second: Run) -> Change:
+        """Whether one simulation is better than another, by more than appears by chance.
+
+        Parameters
+        ----------
+        first, second
+            Without and with what is judged.
+        """
+        names = [self.better_without if each == "without" else each for each in (first, second)]
+        if any(self.error(name) is None for name in names):
+            runs = [self.error(name) is not None for name in names]
+            return "unknown" if not any(runs) else "better" if runs[1] else "worse"
+        return change_between(self.squares[names[0]], self.squares[names[1]])
+
+    def at_noise(self, run: Run) -> bool:
+        """Whether an error is that of measurement noise alone.
+
+        The root mean square of n independent values has the relative standard error 1/√(2n).
+        """
+        error = self.error(run)
+        if error is None or self.noise_floor is None:
+            return False
+        tolerance = WIDE / float(np.sqrt(2 * self.values)) if self.values else 0.0
+        return error * (1 - tolerance) <= self.noise_floor
+
+
+def change_between(first: tuple[float, ...] | None, second: tuple[float, ...] | None) -> Change:
+    """Whether the second of two simulations is better, by mean squared errors of the same blocks of samples.
+
+    Parameters
+    ----------
+    first, second
+        Without and with what is judged; None where the simulation ran away.
+    """
+    if first is None or second is None:
+        return "unknown" if first is second else "better" if first is None else "worse"
+    one, other = np.asarray(first), np.asarray(second)
+    if len(one) < 2 or np.array_equal(one, other):
+        return "same"
+    if not one.any() or not other.any():
+        return "worse" if other.any() else "better"
+    rest, other_rest = one.sum() - one, other.sum() - other
+    if not (rest.all() and other_rest.all()):
+        return "same"  # all of it is in one block
+    middle, left_out = np.log(other.sum() / one.sum()), np.log(other_rest / rest)
+    count = len(one)
+    deviation = np.sqrt((count - 1) / count * ((left_out - left_out.mean()) ** 2).sum())
+    limit = scipy.stats.t.isf(BY_CHANCE, count - 1) * deviation
+    return "same" if abs(middle) <= limit else "better" if middle < 0 else "worse"
+
+
+def in_blocks(squares: np.ndarray) -> tuple[float, ...]:
+    """Mean squared errors of blocks of values that follow each other."""
+    return tuple(float(each.mean()) for each in np.array_split(squares, max(min(BLOCKS, len(squares)), 1)))
+
+
+LOGGER = logging.getLogger(__name__)
+PARTS = 4  # of which one is left out at a time: a quarter, as is held out by default
+FEWEST = 16  # samples of a stretch that an initial state and an error can be told from
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """What is left out, the rest, and the rows of the rest in all of it."""
+
+    out: Measurements
+    rest: Measurements
+    rows: np.ndarray
+
+
+def parts_left_out(learned: Measurements) -> Iterator[LeftOut]:
+    """The recordings divided into parts, each left out once.
+
+    Of recordings, so many at equal distances are a part; a single one is cut into stretches, of which the
+    rest has two recordings unless it is the first or the last that is left out.
+    """
+    count = len(learned.labels)
+    if count > 1:
+        pieces = list(zip(learned.first[:-1], learned.first[1:], strict=True))
+        owner = np.arange(count)
+        groups = [np.arange(part, count, min(PARTS, count)) for part in range(min(PARTS, count))]
+    else:
+        parts = max(min(PARTS, len(learned.t) // FEWEST), 2)
+        edges = np.linspace(0, len(learned.t), parts + 1).round().astype(int)
+        pieces, owner = list(itertools.pairwise(edges)), np.zeros(parts, dtype=int)
+        groups = [np.array([part]) for part in range(parts)]
+    for group in groups:
+        others = np.setdiff1d(np.arange(len(pieces)), group)
+        chosen = [pieces[place] for place in group]
+        kept = [pieces[place] for place in others]
+        if count == 1:  # what was not cut stays one recording
+            kept = _joined(kept)
+            others = np.zeros(len(kept), dtype=int)
+        rest, rows = _stretches(learned, kept, owner[others] if count > 1 else others)
+        out, _ = _stretches(learned, chosen, owner[group])
+        yield LeftOut(out, rest, rows)
+
+
+def errors_left_out(
+    fit: Fit, learned: Measurements, *, noise: Noise, candidates: Iterable[MechanismCandidate] = ()
+) -> np.ndarray | None:
+    """Normalised squared errors of free runs of the parts left out.
+
+    Parameters
+    ----------
+    fit
+        Of a simulation to all of the recordings. It is made again without each part, from where it is.
+    learned
+        These recordings.
+    noise
+        See `siq.inference.trajectories.free_run`.
+    candidates
+        The mechanisms in it, of which some amplitudes cannot be negative.
+
+    Returns
+    -------
+    numpy.ndarray or None
+        One part behind the other, shape ``(values,)``; None where a fit has no result, or a simulation runs
+        away.
+    """
+    positive = {name for each in candidates for name in each.positive.intersection(each.amplitudes)}
+    runs = RunsAlike(noise, fit.substeps)
+    squares = []
+    for part in parts_left_out(learned):
+        try:
+            again = _made_again(fit, part, positive)
+            own = runs.errors(again, part.out)
+        except NumericalFailure:
+            return None
+        # One that does not quite settle, as where a reading is cut off, is judged by what it foresees.
+        if own is None or again.fault:
+            return None
+        squares.append(own)
+    return np.concatenate(squares)
+
+
+def _made_again(fit: Fit, part: LeftOut, positive: Collection[str]) -> Fit:
+    """A fit to the rest alone. What the rest would have of a sign that cannot be is not there.
+
+    The part left out may be the only one that tells of it: of vessels that overflow once, say.
+    """
+    model = fit.model
+    while True:
+        again = fit_with_process_noise_as_needed(model, part.rest, replace(fit, x=fit.x[part.rows]))
+        wrong = [each.name for each in again.model.parameters if each.name in positive and each.value < 0]
+        if not wrong:
+            return again
+        LOGGER.info("without rows of one part, %s would be negative", ", ".join(wrong))
+        model = replace(
+            model,
+            parameters=tuple(
+                replace(each, value=0.0, fixed=True) if each.name in wrong else each
+                for each in model.parameters
+            ),
+        )
+
+
+def _joined(stretches: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Stretches of rows, those that follow each other as one."""
+    whole: list[tuple[int, int]] = []
+    for begin, end in stretches:
+        if whole and whole[-1][1] == begin:
+            whole[-1] = (whole[-1][0], end)
+        else:
+            whole.append((begin, end))
+    return whole
+
+
+def _stretches(
+    data: Measurements, stretches: list[tuple[int, int]], owner: np.ndarray
+) -> tuple[Measurements, np.ndarray]:
+    """Stretches of rows as recordings of their own, and their rows; the inputs stay whole."""
+    rows = np.concatenate([np.arange(begin, end) for begin, end in stretches])
+    return replace(
+        data,
+        labels=tuple(
+            f"{data.labels[place]}, rows {a} to {b}" for place, (a, b) in zip(owner, stretches, strict=True)
+        ),
+        first=np.concatenate([[0], np.cumsum([end - begin for begin, end in stretches])]),
+        t=data.t[rows],
+        outputs=data.outputs[rows],
+        courses=tuple(data.courses[place] for place in owner) if data.courses else data.courses,
+    ), rows

@@ -1,0 +1,368 @@
+"""The investigation of a case, from its recalibration to what it lacks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from siq.diagnosis.dictionary import Mechanism, Roles, dictionary_of, roles_of
+from siq.diagnosis.hidden_state_terms import models_of_the_nameless
+from siq.diagnosis.mechanisms import MechanismCandidate, candidates_of, generic_candidates
+from siq.diagnosis.naming import Naming, names_of
+from siq.diagnosis.options import MismatchVerdict, SearchOptions, quiet_verdict, shift_probability
+from siq.diagnosis.residual_structure import (
+    LEFT,
+    STRUCTURED,
+    Remainder,
+    Structure,
+    explained_by_rounding,
+    unsteadiness,
+    what_is_left,
+)
+from siq.diagnosis.search import Search, search
+from siq.diagnosis.significance import UntriedMechanism
+from siq.diagnosis.study import MismatchStudy, load_mismatch_study, measurements_of, split, with_known_noise
+from siq.diagnosis.unnamed_models import Material, Model
+from siq.errors import NumericalFailure
+from siq.inference.budget import UNLIMITED, Account, Budget
+from siq.inference.maximum_likelihood import Fit
+from siq.inference.measurements import Measurements, with_expectations
+from siq.inference.recalibration import covariance_with_unknown_forces, recalibrate
+from siq.systems.cards import load_system
+from siq.systems.dynamics import Dynamics
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from siq.data.recordings import Recordings
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What is compared with what.
+
+    Attributes
+    ----------
+    system
+        The simulation.
+    learn, kept
+        Recordings to learn from, and those held out.
+    settings
+        How to go about it.
+    dictionary
+        The mechanisms that may be named.
+    """
+
+    system: Dynamics
+    learn: Measurements
+    kept: Measurements
+    settings: MismatchStudy
+    dictionary: tuple[Mechanism, ...]
+
+
+def comparison_of(
+    system: Dynamics,
+    recordings: Recordings | pd.DataFrame | str | Path,
+    settings: MismatchStudy | None = None,
+    *,
+    file: str = "the settings",
+) -> Comparison:
+    """Check a simulation, recordings and settings against each other.
+
+    Parameters
+    ----------
+    system
+        The simulation. A state needs no domain; the recordings tell where it lies.
+    recordings
+        With a column for each output and each input.
+    settings
+        What is held out, what is known of the noise, and what counts as found.
+    file
+        What messages about the settings call them.
+
+    Raises
+    ------
+    InputError
+        For the first thing that cannot be used, with its file, place and remedy.
+    """
+    settings = MismatchStudy() if settings is None else settings
+    data = with_known_noise(measurements_of(recordings, system), system, settings, file=file)
+    learn, kept = split(data, settings, file=file)
+    dictionary = dictionary_of(without=settings.without, further=settings.mechanisms, file=file)
+    return Comparison(system, learn, kept, settings, dictionary)
+
+
+def read_case(card: str | Path, recordings: str | Path, study: str | Path | None) -> Comparison:
+    """Read and check the files of a case.
+
+    Raises
+    ------
+    InputError
+        For the first thing that cannot be used, with its file, place and remedy.
+    """
+    system = load_system(card)
+    if study is None:
+        return comparison_of(system, recordings)
+    return comparison_of(system, recordings, load_mismatch_study(study), file=str(study))
+
+
+ROUNDED = "What is left looks like noise once the steps are allowed for in which {} was recorded."
+GROWING = "Random forces would explain it only if they grew with the motion; a hidden state is more likely."
+
+
+@dataclass(frozen=True)
+class Investigation:
+    """What was found out about a simulation and recordings of the system, with all fits that it rests on.
+
+    Attributes
+    ----------
+    verdict
+        One of four.
+    model
+        The simulation as its author believes it.
+    roles
+        Of its states.
+    search
+        Recalibration, mechanisms found, and the final fit.
+    least_squares
+        The recalibration whose trajectories follow the equations exactly.
+    augmented_least_squares
+        The same of the final simulation, where a remainder that is no noise was admitted as random forces.
+    before
+        Structure of what the recalibrated simulation does not explain, random forces included.
+    after
+        Structure that the final fit leaves.
+    process_noise
+        Whether random forces are part of the verdict.
+    p_shift
+        p-value of the test that the parameters of the card are the true ones.
+    share
+        Of the excess that the mechanisms explain.
+    remarks
+        Sentences about reservations.
+    candidates
+        All mechanisms that were considered.
+    naming
+        What was asked of mechanisms before they could be named; None where none was found.
+    models
+        Of what has no name, be it all that is missing or what names leave, the likeliest first.
+    account
+        The work that it took, and whether something was left undone.
+    withdrawn
+        Whether a name was given, and mislead on recordings held out (`siq.diagnosis.diagnosis`).
+    """
+
+    verdict: MismatchVerdict
+    model: Dynamics
+    roles: Roles
+    search: Search
+    least_squares: Fit
+    augmented_least_squares: Fit | None
+    before: Structure
+    after: Structure
+    process_noise: bool
+    p_shift: float
+    share: float
+    remarks: tuple[str, ...]
+    candidates: tuple[MechanismCandidate, ...]
+    naming: Naming | None = None
+    models: tuple[Model, ...] = ()
+    account: Account = UNLIMITED
+    withdrawn: bool = False
+
+    @property
+    def too_faint(self) -> bool:
+        """Whether what was found explains enough, and is not named since a function is nearly as likely."""
+        return (
+            self.verdict is MismatchVerdict.UNEXPLAINED
+            and not self.withdrawn
+            and self.naming is not None
+            and self.naming.convincing
+        )
+
+    @property
+    def final(self) -> Fit:
+        """The fit that the verdict stands on: with mechanisms only where they are physics."""
+        return (
+            self.search.fit if self.verdict is MismatchVerdict.MISSING_PHYSICS else self.search.recalibrated
+        )
+
+
+def investigate(
+    model: Dynamics,
+    data: Measurements,
+    dictionary: Sequence[Mechanism],
+    study: MismatchStudy,
+    *,
+    file: str = "the dictionary",
+    seed: int = 0,
+    budget: Budget | None = None,
+) -> Investigation:
+    """Say whether, where and in which way a simulation differs from recordings.
+
+    Parameters
+    ----------
+    model
+        The simulation, as its card says.
+    data
+        The recordings to learn from; those held out stay out.
+    dictionary
+        The mechanisms that may be named.
+    study
+        What counts as found, and whether monomials do.
+    file
+        Where the dictionary's entries come from, for messages.
+    seed
+        Of the effects without a name that mechanisms are held against.
+    budget
+        Charged for the work; what it does not reach is left undone, and the answer is that of the rest.
+
+    Raises
+    ------
+    NumericalFailure
+        When not even the recalibrated simulation with process noise can be fitted.
+    """
+    options = study.search
+    model = with_expectations(model)
+    roles = roles_of(model)
+    candidates = considered(model, roles, dictionary, study, file=file)
+    budget = budget or Budget()
+    budget.says("fitting the simulation's own parameters")
+    with budget.exempt():
+        recalibrated, least_squares = recalibrate(model, data, budget=budget)
+    found = search(model, data, recalibrated, candidates, options=options, budget=budget)
+    recalibrated = found.recalibrated  # from where a mechanism led it, if that is better
+    if not (recalibrated.has_process_noise or recalibrated.log_likelihood < least_squares.log_likelihood):
+        least_squares = recalibrated
+    found, by_each = remainders(model, data, found, roles)
+    left = by_each[-1]
+    exact: Fit | None = None
+    naming: Naming | None = None
+    models: tuple[Model, ...] = ()
+    verdict, remarks = MismatchVerdict.NO_MISMATCH, tuple[str, ...]()
+    material = Material(data, roles, study.degree, options.blocks, len(candidates), budget)
+    tried = bool(found.found)
+    if tried:
+        names = names_of(
+            found, by_each, model, material, candidates,
+            options=options, generator=np.random.default_rng(seed),
+        )  # fmt: skip
+        naming, models, exact, remarks = names.naming, names.models, names.exact, names.remarks
+        found, left = naming.search, naming.left
+        verdict = MismatchVerdict.MISSING_PHYSICS if names.given else MismatchVerdict.UNEXPLAINED
+    rounded = None
+    doubtful = not tried and (found.fit.has_process_noise or left.structured)
+    if doubtful or verdict is MismatchVerdict.UNEXPLAINED:
+        budget.says("asking whether the sensors' steps explain it")
+        with budget.exempt():
+            # What a mechanism has found already has to be gone more clearly.
+            least = LEFT if tried else STRUCTURED
+            rounded = explained_by_rounding(model, data, least_squares, roles, least=least, budget=budget)
+    if rounded is not None:
+        found = replace(found, recalibrated=rounded.fit, found=(), fit=rounded.fit)
+        left, least_squares, naming, models, exact = rounded.left, rounded.fit, None, (), None
+        remarks = (ROUNDED.format(", ".join(rounded.outputs)),)
+    p_shift = shift_probability(model, found.recalibrated)
+    if rounded is not None or not (tried or doubtful):
+        verdict = quiet_verdict(p_shift, options)
+    elif not tried and found.fit.has_process_noise:
+        verdict, models, remarks = driven(found, left, material, dictionary, options)
+    elif not tried:
+        verdict = MismatchVerdict.UNEXPLAINED
+    if verdict is MismatchVerdict.UNEXPLAINED and not (models or found.found):
+        models = models_of_the_nameless(found, material)
+    budget.says("working out how well parameters are known")
+    with budget.exempt():
+        covariance = covariance_with_unknown_forces(found.fit, data, budget=budget)
+    found = replace(found, fit=replace(found.fit, covariance=covariance))
+    return Investigation(
+        verdict=verdict,
+        model=model,
+        roles=roles,
+        search=found,
+        least_squares=least_squares,
+        augmented_least_squares=exact,
+        before=left.before,
+        after=left.after,
+        process_noise=verdict is MismatchVerdict.MISSING_PHYSICS and not found.found,
+        p_shift=p_shift,
+        share=left.share,
+        remarks=remarks,
+        candidates=tuple(candidates),
+        naming=naming,
+        models=models,
+        account=budget.account(),
+    )
+
+
+def driven(
+    found: Search,
+    left: Remainder,
+    material: Material,
+    dictionary: Sequence[Mechanism],
+    options: SearchOptions,
+) -> tuple[MismatchVerdict, tuple[Model, ...], tuple[str, ...]]:
+    """The verdict where random forces are needed and no mechanism was found, with models and remarks.
+
+    Random forces explain any recordings. They are named where nothing else is likelier, neither a function
+    instead of them nor one beside what is left of them: noise does not know where a system is, so that no
+    function of the states takes a part of it over.
+
+    Parameters
+    ----------
+    found, left
+        The search, and what its fit leaves.
+    material, options
+        What functions without a name are fitted with, and what a name takes.
+    dictionary
+        Random forces are named only where an entry of it knows them.
+    """
+    steady = unsteadiness(found.fit, material.data) < 2 * options.least_log_odds
+    remarks = () if steady else (GROWING,)
+    knows_noise = any(form.noise for mechanism in dictionary for form in mechanism.forms)
+    if not (knows_noise and steady) or left.doubtful:
+        return MismatchVerdict.UNEXPLAINED, (), remarks
+    models = models_of_the_nameless(found, material)
+    if not models or models[0].log_evidence < options.least_log_odds:
+        return MismatchVerdict.MISSING_PHYSICS, (), remarks
+    return MismatchVerdict.UNEXPLAINED, models, remarks
+
+
+def remainders(
+    model: Dynamics, data: Measurements, search: Search, roles: Roles
+) -> tuple[Search, list[Remainder]]:
+    """What is left with each mechanism that was found, or of the recalibrated simulation where there is none.
+
+    A mechanism whose remainder has no finite size, such as one that makes the simulation run away without
+    random forces, is taken back, with those after it.
+
+    Raises
+    ------
+    NumericalFailure
+        When that of the recalibrated simulation has none, either.
+    """
+    left: list[Remainder] = []
+    for place, found in enumerate(search.found):
+        try:
+            left.append(what_is_left(model, data, search.recalibrated, found.best.fit, roles))
+        except NumericalFailure as error:
+            fit = search.found[place - 1].best.fit if place else search.recalibrated
+            untried = (*search.untried, UntriedMechanism(found.best.candidate, str(error)))
+            search = replace(search, found=search.found[:place], fit=fit, untried=untried)
+            break
+    return search, left or [what_is_left(model, data, search.recalibrated, search.recalibrated, roles)]
+
+
+def considered(
+    model: Dynamics, roles: Roles, dictionary: Sequence[Mechanism], study: MismatchStudy, *, file: str
+) -> list[MechanismCandidate]:
+    """The candidates of the dictionary, and monomials where the study or the lack of roles allows them."""
+    candidates = candidates_of(model, roles, dictionary, file=file)
+    if study.generic if study.generic is not None else not roles.physical:
+        monomials = generic_candidates(model, roles, degree=study.degree, named=candidates)
+        candidates += [each for each in monomials if each.coordinate != "constant"]
+    return candidates

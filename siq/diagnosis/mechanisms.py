@@ -1,0 +1,754 @@
+"""Mechanisms built into a simulation, and which of them are no more than a recalibration.
+
+What a mechanism does not depend on linearly is looked for about sizes, times and frequencies of the recorded
+motion; what the values themselves show of a sensor, its steps and the ends of its range, is read off them.
+
+A mechanism is written for roles (`siq.diagnosis.dictionary`). Beside the roles its formulas may use what the
+simulation itself says of them: `v_rate`, the equation of the state v; `p_with_q`, the part of the equation of
+p in which q stands as well; `y_rate` and `y_curvature`, the first and second time derivative of the output y,
+inputs being held.
+
+Where a simulation has a free damping rate, linear damping is another value of it: no recording can tell the
+two apart, and a mechanism of that kind would only stand in the way of the parameter. This follows from the
+formulas alone. To first order a mechanism adds the derivatives of f and h by its amplitudes; it is something
+new where these are linearly independent, as functions of states, inputs and time, of the derivatives by the
+free parameters.
+
+A mechanism is written for roles (`siq.diagnosis.dictionary`); here it becomes models, one for each way of
+filling the roles (`siq.diagnosis.mechanisms`). Generic monomials become candidates of the same kind, for
+systems whose states have no roles.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import sympy
+
+from siq.diagnosis.dictionary import (
+    ANYWHERE,
+    Form,
+    Mechanism,
+    Roles,
+    Shape,
+    assignments,
+    meetings,
+    trial_points,
+    unit_of,
+)
+from siq.errors import InputError
+from siq.inference.measurements import Measurements
+from siq.systems.diffusion import Diffusion
+from siq.systems.dynamics import TIME, Dynamics, Parameter, Signals, arguments_of, evaluable, symbol
+from siq.systems.formulas import FormulaError, compile_values, parse_formula
+
+ON_LATTICE = 1e-3  # of a step: numbers that were written with a few digits lie on their lattice within this
+
+
+def places_of(search: Shape, data: Measurements, model: Dynamics, x: np.ndarray) -> np.ndarray:
+    """The values of a shape that a search begins with."""
+    factors = np.array(search.at)
+    steps = np.diff(data.t)[np.diff(data.recording) == 0]
+    if search.samples:
+        return factors * np.median(steps)
+    if search.frequencies is not None:
+        longest = max(
+            data.t[end - 1] - data.t[begin]
+            for begin, end in zip(data.first[:-1], data.first[1:], strict=True)
+        )
+        # From one period in the longest recording to four samples a period.
+        return np.linspace(2 * np.pi / longest, np.pi / (2 * np.median(steps)), search.frequencies)
+    if search.recorded is not None:
+        place = model.output_names.index(search.recorded)
+        values = data.outputs[:, place]
+        if search.lattice_of is not None:
+            found = lattice_step(values)
+        else:
+            side = 1.0 if search.top_of is not None else -1.0
+            top = plateau(side * values, data.recording, noise=float(np.sqrt(data.roughness[place])))
+            found = None if top is None else side * top
+        return np.zeros(0) if found is None else np.array([found])
+    text = search.scale_of or search.inverse_scale_of or search.quantiles_of or search.time_of
+    course = along(str(text), data, model, x)
+    if search.quantiles_of is not None:
+        return np.quantile(course, factors)
+    if search.time_of is not None:
+        rows = data.begins
+        rates = (course[rows + 1] - course[rows]) / (data.t[rows + 1] - data.t[rows])
+        rate = float(np.sqrt(np.mean(rates**2)))
+        return factors * (float(course.std()) / rate if rate > 0 else float(np.median(steps)))
+    size = float(np.sqrt(np.mean(course**2))) or 1.0
+    return factors * size if search.scale_of is not None else factors / size
+
+
+def lattice_step(values: np.ndarray) -> float | None:
+    """The step of the lattice through zero on which all values lie; None where there is none.
+
+    Parameters
+    ----------
+    values
+        What a sensor recorded, shape ``(n,)``; NaN where nothing was measured.
+    """
+    values = values[np.isfinite(values)]
+    levels = np.unique(values)
+    if not 2 < len(levels) < len(values) / 2:  # of values that hardly repeat a lattice tells nothing
+        return None
+    step = float(np.diff(levels).min())
+    numbers = np.rint(levels / step)
+    if not numbers.any():
+        return None
+    step = float(levels @ numbers / (numbers @ numbers))
+    return step if np.abs(levels - numbers * step).max() < ON_LATTICE * step else None
+
+
+def plateau(values: np.ndarray, recording: np.ndarray, *, noise: float) -> float | None:
+    """Where recorded values end, if they stay there for a while; None where they only turn.
+
+    Parameters
+    ----------
+    values
+        What a sensor recorded, shape ``(n,)``.
+    recording
+        The place of each value's recording; it never decreases. Shape ``(n,)``.
+    noise
+        Standard deviation of the sensor's noise: what lies within two of it on either side is at the end.
+    """
+    ends = values >= np.nanmax(values) - 4 * noise
+    same = recording[2:] == recording[:-2]
+    stays = ends[2:] & ends[1:-1] & ends[:-2] & same  # a parabola has two points of one height, not three
+    if not stays.any():
+        return None
+    rows = np.flatnonzero(stays)
+    return float(np.median(values[np.unique(np.concatenate([rows, rows + 1, rows + 2]))]))
+
+
+def along(text: str, data: Measurements, model: Dynamics, x: np.ndarray) -> np.ndarray:
+    """A formula of states and inputs at all samples, shape ``(n,)``."""
+    known = {symbol(each.name): each.value for each in model.parameters}
+    formula = parse_formula(text, model.names).subs(known)
+    signals = data.signals(data.t, data.recording, delays=())
+    arguments = [*(symbol(n) for n in model.states), *(symbol(e.name) for e in model.inputs), symbol("t")]
+    value = compile_values([formula], arguments, common=False)(*x.T, *signals.inputs, signals.t)[0]
+    return np.broadcast_to(value, data.t.shape)
+
+
+@dataclass(frozen=True)
+class MechanismCandidate:
+    """One way in which a mechanism may be at work in a system.
+
+    Attributes
+    ----------
+    name
+        Of the mechanism.
+    label
+        The same, told apart from its other forms and places: what is added where.
+    model
+        The simulation with the mechanism built in; amplitudes are zero, shapes not yet set.
+    amplitudes, shapes
+        Names of the new parameters, those that the mechanism depends on linearly and the others.
+    positive
+        Those that must not be negative.
+    searches
+        For each shape how it is looked for.
+    scales, begins
+        For each further state a formula of its size, and one of where it begins.
+    equations
+        States in whose equations something changes.
+    coordinate
+        Along which coordinate it acts, in words of the system.
+    changes
+        What is added to equations, by state; where something is replaced, the new equation or output; and
+        the equations of further states.
+    generalises
+        Mechanisms that are special cases of it.
+    variant
+        What tells its form from others, in words.
+    """
+
+    name: str
+    label: str
+    model: Dynamics
+    amplitudes: tuple[str, ...]
+    shapes: tuple[str, ...]
+    positive: frozenset[str]
+    searches: tuple[Shape, ...]
+    scales: tuple[sympy.Expr, ...]
+    equations: tuple[str, ...]
+    coordinate: str
+    changes: tuple[tuple[str, sympy.Expr], ...] = ()
+    generalises: tuple[str, ...] = ()
+    begins: tuple[sympy.Expr, ...] = ()
+    variant: str = ""
+
+    @property
+    def new(self) -> tuple[str, ...]:
+        """All new parameters, in the order of the model's."""
+        return tuple(p.name for p in self.model.parameters if p.name in {*self.amplitudes, *self.shapes})
+
+
+def build_candidate(
+    model: Dynamics, mechanism: Mechanism, form: Form, assignment: Mapping[str, str]
+) -> MechanismCandidate | None:
+    """Build a mechanism into a model, for one assignment of names to roles; None where it changes nothing."""
+    fresh: dict[str, str] = {}
+    for name in (*form.parameters, *form.states):
+        fresh[name] = fresh_name(name, model, set(fresh.values()))
+    names = _vocabulary(model, form, assignment, fresh)
+    equations = dict(zip(model.states, model.equations, strict=True))
+    outputs = dict(model.outputs)
+    delayed = [assignment[role] for role, kind in form.roles.items() if kind == "input"]
+
+    def parse(text: object, **other: sympy.Expr) -> sympy.Expr:
+        return parse_formula(str(text), names | other, inputs=delayed)
+
+    changes = list(_built_in(form, assignment, parse, equations, outputs))
+    if tuple(equations.values()) == model.equations and outputs == dict(model.outputs):
+        return None
+    units = _units(model, assignment)
+    parameters = tuple(
+        Parameter(
+            fresh[name],
+            0.0,
+            unit_of(entry.unit, units),
+            fixed=entry.shape is not None and entry.shape.lattice_of is not None,
+        )
+        for name, entry in form.parameters.items()
+    )
+    further = tuple((fresh[name], parse(entry.equation)) for name, entry in form.states.items())
+    augmented = replace(
+        model,
+        states=(*model.states, *(name for name, _ in further)),
+        units=(*model.units, *(unit_of(entry.unit, units) for entry in form.states.values())),
+        diffusion=model.diffusion.extended(len(further)),
+        domain=np.concatenate([model.limits, np.full((len(further), 2), np.nan)]),  # until a fit tells it
+        parameters=(*model.parameters, *parameters),
+        equations=(*equations.values(), *(formula for _, formula in further)),
+        outputs=tuple(outputs.items()),
+    )
+    shapes = {name: entry.shape for name, entry in form.parameters.items() if entry.shape is not None}
+    return MechanismCandidate(
+        name=mechanism.name,
+        label=label_of(mechanism.name, form.variant, model, augmented),
+        model=augmented,
+        amplitudes=tuple(fresh[name] for name in form.parameters if name not in shapes),
+        shapes=tuple(fresh[name] for name in shapes),
+        positive=frozenset(
+            fresh[name] for name, entry in form.parameters.items() if entry.sign == "positive"
+        ),
+        searches=tuple(_in_names(shape, names, assignment) for shape in shapes.values()),
+        scales=tuple(parse(entry.scale) for entry in form.states.values()),
+        begins=tuple(parse(entry.begin) for entry in form.states.values()),
+        equations=tuple(
+            name
+            for name, before in zip(model.states, model.equations, strict=True)
+            if equations[name] != before
+        ),
+        coordinate=_in_words(form.coordinate, assignment),
+        changes=(*changes, *further),
+        generalises=mechanism.generalises,
+        variant=form.variant,
+    )
+
+
+def fresh_name(name: str, model: Dynamics, taken: set[str] | None = None) -> str:
+    """A name as in the dictionary, numbered so that it collides with none of the card."""
+    used = set(model.names) | (taken or set())
+    return next(f"{name}_{k}" for k in itertools.count(1) if f"{name}_{k}" not in used)
+
+
+def _built_in(
+    form: Form,
+    assignment: Mapping[str, str],
+    parse: Callable[..., sympy.Expr],
+    equations: dict[str, sympy.Expr],
+    outputs: dict[str, sympy.Expr],
+) -> Iterator[tuple[str, sympy.Expr]]:
+    """Change equations and outputs as a form says, and tell what is added, or else the new formula."""
+    before = dict(equations)
+    put = {symbol(assignment[role]): parse(text) for role, text in form.replace.items()}
+    for formulas in (equations, outputs):
+        for name in formulas:
+            formulas[name] = formulas[name].subs(put, simultaneous=True)
+    for role, texts in form.within.items():
+        name = assignment[role]
+        put = {symbol(assignment[other]): parse(text) for other, text in texts.items()}
+        equations[name] = equations[name].subs(put, simultaneous=True)
+    yield from ((name, formula) for name, formula in equations.items() if formula != before[name])
+    for role, text in form.terms.items():
+        added = parse(text)
+        equations[assignment[role]] += added
+        yield assignment[role], added
+    for role, text in form.outputs.items():
+        outputs[assignment[role]] = parse(text, **{role: outputs[assignment[role]]})
+        yield assignment[role], outputs[assignment[role]]
+
+
+def _vocabulary(
+    model: Dynamics, form: Form, assignment: Mapping[str, str], fresh: Mapping[str, str]
+) -> dict[str, sympy.Expr]:
+    """What every name in a form's formulas stands for."""
+    equations = dict(zip(model.states, model.equations, strict=True))
+    names: dict[str, sympy.Expr] = {role: symbol(name) for role, name in assignment.items()}
+    wanted = _words(form)  # the others are not worked out: formulas of many terms take their time
+    for role in (role for role, kind in form.roles.items() if kind == "output"):
+        names[role] = dict(model.outputs)[assignment[role]]
+        if {f"{role}_rate", f"{role}_curvature"} & wanted:
+            names[f"{role}_rate"] = rate_of(names[role], model)
+            names[f"{role}_curvature"] = rate_of(names[f"{role}_rate"], model)
+    states = [role for role, kind in form.roles.items() if kind not in ("input", "parameter", "output")]
+    for one in states:
+        names[f"{one}_rate"] = equations[assignment[one]]
+    for one, other in itertools.permutations(states, 2):
+        if f"{one}_with_{other}" in wanted:
+            names[f"{one}_with_{other}"] = meetings(
+                equations[assignment[one]], assignment[one], assignment[other]
+            )
+    return names | {name: symbol(new) for name, new in fresh.items()} | {"t": TIME}
+
+
+def _words(form: Form) -> set[str]:
+    """The names that a form's formulas use."""
+    within = (text for texts in form.within.values() for text in texts.values())
+    states = (text for each in form.states.values() for text in (each.equation, each.scale, each.begin))
+    texts = (*form.terms.values(), *form.replace.values(), *form.outputs.values(), *within, *states)
+    return set(re.findall(r"[A-Za-z_]\w*", " ".join(map(str, texts))))
+
+
+def rate_of(formula: sympy.Expr, model: Dynamics) -> sympy.Expr:
+    """Time derivative of a formula of states along the equations, inputs being held."""
+    along = zip(model.states, model.equations, strict=True)
+    return formula.diff(TIME) + sum(formula.diff(symbol(name)) * equation for name, equation in along)
+
+
+def _in_names(shape: Shape, names: Mapping[str, sympy.Expr], assignment: Mapping[str, str]) -> Shape:
+    """A search with the system's own names in its formulas."""
+    texts: dict[str, str | None] = {
+        key: None if text is None else str(parse_formula(text, names))
+        for key, text in (
+            ("scale_of", shape.scale_of),
+            ("inverse_scale_of", shape.inverse_scale_of),
+            ("quantiles_of", shape.quantiles_of),
+            ("time_of", shape.time_of),
+        )
+    }
+    for key in ("lattice_of", "top_of", "bottom_of"):
+        if (role := getattr(shape, key)) is not None:
+            texts[key] = assignment[role]
+    return shape.model_copy(update=texts)
+
+
+def _in_words(coordinate: str, assignment: Mapping[str, str]) -> str:
+    return " ".join(assignment.get(word, word) for word in coordinate.split())
+
+
+def _units(model: Dynamics, assignment: Mapping[str, str]) -> dict[str, str]:
+    known = dict(zip(model.states, model.units, strict=True))
+    known |= {entry.name: entry.unit for entry in model.inputs}
+    known |= {entry.name: entry.unit for entry in model.parameters}
+    for name, formula in model.outputs:
+        known.setdefault(name, known.get(str(formula), "1"))
+    return {role: known.get(name, "1") for role, name in assignment.items()} | {"T": model.time_unit}
+
+
+def label_of(name: str, variant: str, model: Dynamics, augmented: Dynamics) -> str:
+    """A mechanism's name, with its variant, and where it changes a simulation."""
+    places = [
+        state
+        for state, before, after in zip(model.states, model.equations, augmented.equations, strict=False)
+        if before != after
+    ]
+    measured = [
+        output
+        for (output, before), (_, after) in zip(model.outputs, augmented.outputs, strict=True)
+        if before != after
+    ]
+    new = ", ".join(entry.name for entry in augmented.parameters[len(model.parameters) :])
+    whole = f"{name} {variant}" if variant else name
+    if places or variant:
+        return f"{whole} in {', '.join(places or measured)}"
+    return f"{whole} in {', '.join(measured)}, by {new}"
+
+
+INDEPENDENT = 1e-6  # of a column's length, left beside others: between rounding and what any shape leaves
+
+
+def beyond_parameters(
+    model: Dynamics, candidates: Sequence[MechanismCandidate]
+) -> list[MechanismCandidate | None]:
+    """Candidates less what the simulation's own parameters can do; None for those of which nothing is left.
+
+    Of several amplitudes those are taken out that the parameters, together with those before, stand for.
+
+    Parameters
+    ----------
+    model
+        The simulation.
+    candidates
+        The simulation with a mechanism built in, each.
+    """
+    count = 2 * (len(model.free) + 6)
+    x, signals = trial_points(model, count, either_sign=True)
+    # A parameter that happens to be zero hides what others do that stand beside it.
+    nonzero = np.random.default_rng(0).uniform(*ANYWHERE, size=len(model.parameters))
+    values = np.where(model.values == 0, nonzero, model.values)
+    by_parameter = model.functions.slopes(x, signals, values)[1]
+    outputs_by_parameter = model.functions.output_slopes(x, signals, values)[1]
+    own = np.concatenate([by_parameter, outputs_by_parameter]).swapaxes(1, 2)
+    own = own.reshape(own.shape[0] * count, len(model.free))
+    result: list[MechanismCandidate | None] = []
+    for each in candidates:
+        new = _new_columns(own, _columns(model, each, x, signals, values))
+        needless = {name for name, is_new in zip(each.amplitudes, new, strict=False) if not is_new}
+        if not any(new):
+            result.append(None)
+        else:
+            result.append(without_amplitudes(each, model, needless) if needless else each)
+    return result
+
+
+def _new_columns(own: np.ndarray, columns: np.ndarray) -> list[bool]:
+    """Which columns are independent of others and of those before; rows that are no numbers tell nothing.
+
+    Where too few rows are left to tell, all count as new: screening says what is the matter with them.
+    """
+    whole = np.isfinite(own).all(axis=1) & np.isfinite(columns).all(axis=1)
+    if whole.sum() <= own.shape[1] + columns.shape[1]:
+        return [True] * columns.shape[1]
+    own, columns = _of_unit_length(own[whole]), _of_unit_length(columns[whole])
+    left, sizes, _ = np.linalg.svd(own, full_matrices=False)
+    basis = left[:, sizes > INDEPENDENT * sizes.max(initial=0.0)]
+    new = []
+    for column in columns.T:
+        rest = column - basis @ (basis.T @ column)
+        size = float(np.linalg.norm(rest))
+        new.append(size > INDEPENDENT)
+        if new[-1]:
+            basis = np.column_stack([basis, rest / size])
+    return new
+
+
+def _of_unit_length(columns: np.ndarray) -> np.ndarray:
+    largest = np.abs(columns).max(axis=0, initial=0.0)  # first, since squares may be beyond all numbers
+    columns = columns / np.where(largest > 0, largest, 1.0)
+    length = np.sqrt((columns**2).sum(axis=0))
+    return columns / np.where(length > 0, length, 1.0)
+
+
+def _columns(
+    model: Dynamics, candidate: MechanismCandidate, x: np.ndarray, signals: Signals, values: np.ndarray
+) -> np.ndarray:
+    """What a little of a mechanism does to f and h at points, shape ``((d + m) n, amplitudes)``.
+
+    Of a mechanism without an amplitude it is the whole change, for a shape such as a search begins with.
+    """
+    augmented, count = candidate.model, x.shape[1]
+    generator = np.random.default_rng(1)
+    # Its further states and delayed inputs may be anything: no parameter of the simulation acts by them.
+    further = generator.normal(size=(augmented.dimension - model.dimension, count)) * np.abs(x).mean()
+    delayed = generator.normal(size=(len(augmented.delays), count))
+    for place, each in enumerate(augmented.delays):
+        if each in model.delays:
+            delayed[place] = signals.delayed[model.delays.index(each)]
+    at = (*x, *further, *signals.inputs, *delayed, *delayed, signals.t)
+    shapes = dict(zip(candidate.shapes, candidate.searches, strict=True))
+    new = [
+        _typical(shapes[each.name], model, x, signals) if each.name in shapes else 0.0
+        for each in augmented.parameters[len(model.parameters) :]
+    ]
+    before = [*model.equations, *dict(model.outputs).values()]
+    after = [*augmented.equations[: model.dimension], *dict(augmented.outputs).values()]
+    result = np.zeros((len(before), count, max(len(candidate.amplitudes), 1)))
+    changed = [place for place, pair in enumerate(zip(before, after, strict=True)) if pair[0] != pair[1]]
+    formulas: list[sympy.Expr] = []
+    for place in changed:
+        formula, known = evaluable(after[place], augmented), evaluable(before[place], model)
+        by_amplitude = [formula.diff(symbol(name)) for name in candidate.amplitudes]
+        formulas += by_amplitude or [formula - known]
+    with np.errstate(all="ignore"):
+        found = compile_values(formulas, arguments_of(augmented), common=False)(*at, *values, *new)
+    for number, value in enumerate(found):
+        place, column = divmod(number, result.shape[2])
+        result[changed[place], :, column] = value
+    return result.reshape(-1, result.shape[2])
+
+
+def _typical(shape: Shape, model: Dynamics, x: np.ndarray, signals: Signals) -> float:
+    """A value of a shape for which a mechanism is what its name says: in the middle of the search."""
+    at = shape.at[len(shape.at) // 2]
+    text = shape.scale_of or shape.inverse_scale_of or shape.quantiles_of
+    if text is None:
+        return at if at > 0 else 1.0
+    names = [*(symbol(name) for name in model.states), *(symbol(entry.name) for entry in model.inputs), TIME]
+    course = compile_values([parse_formula(text, model.names)], names, common=False)(
+        *x, *signals.inputs, signals.t
+    )[0]
+    course = np.broadcast_to(course, x.shape[1:])
+    if shape.quantiles_of is not None:
+        return float(np.quantile(course, at))
+    size = float(np.sqrt(np.mean(course**2))) or 1.0
+    return at * size if shape.scale_of is not None else at / size
+
+
+def without_amplitudes(
+    candidate: MechanismCandidate, model: Dynamics, names: Collection[str]
+) -> MechanismCandidate:
+    """A candidate less some of its amplitudes, which a simulation's own parameters stand for.
+
+    What is left adds to these, so that it may have either sign.
+
+    Parameters
+    ----------
+    candidate, model
+        The mechanism, and the simulation that it is built into.
+    names
+        Of the amplitudes, not all of them.
+    """
+    zero = dict.fromkeys(map(symbol, names), 0)
+
+    def less(formula: sympy.Expr, before: sympy.Expr | None) -> sympy.Expr:
+        left = formula.subs(zero)
+        return before if before is not None and sympy.expand(left - before) == 0 else left
+
+    whole = candidate.model
+    equations = tuple(
+        less(formula, before) for formula, before in itertools.zip_longest(whole.equations, model.equations)
+    )
+    reduced = replace(
+        whole,
+        parameters=tuple(each for each in whole.parameters if each.name not in names),
+        equations=equations,
+        outputs=tuple(
+            (name, less(formula, before))
+            for (name, formula), (_, before) in zip(whole.outputs, model.outputs, strict=True)
+        ),
+    )
+    changes = ((name, formula.subs(zero)) for name, formula in candidate.changes)
+    return replace(
+        candidate,
+        label=label_of(candidate.name, candidate.variant, model, reduced),
+        model=reduced,
+        amplitudes=tuple(name for name in candidate.amplitudes if name not in names),
+        positive=candidate.positive & set(candidate.shapes),
+        equations=tuple(
+            name
+            for name, formula, before in zip(model.states, equations, model.equations, strict=False)
+            if formula != before
+        ),
+        changes=tuple((name, formula) for name, formula in changes if formula != 0),
+    )
+
+
+__all__ = ["GENERIC", "PROCESS_NOISE", "MechanismCandidate", "candidates_of", "generic_candidates"]
+
+GENERIC = "generic monomial"
+PROCESS_NOISE = "process noise"
+
+
+def candidates_of(
+    model: Dynamics, roles: Roles, dictionary: Sequence[Mechanism], *, file: str = "the dictionary"
+) -> list[MechanismCandidate]:
+    """Every place at which a mechanism of the dictionary may be at work in a system.
+
+    Process noise is not among them: it changes no equation (`siq.inference.noise` estimates it). Nor is what
+    the simulation's own parameters can do (`siq.diagnosis.mechanisms`), which no recording could tell from
+    other values of these.
+
+    Raises
+    ------
+    InputError
+        For a formula that the whitelist refuses.
+    """
+    found: list[tuple[MechanismCandidate, str]] = []
+    for mechanism in dictionary:
+        for form in mechanism.forms:
+            if form.noise is not None:
+                continue
+            for assignment in assignments(form, model, roles):
+                try:
+                    candidate = build_candidate(model, mechanism, form, assignment)
+                except FormulaError as error:
+                    raise InputError(file, mechanism.name, error.fault, error.remedy) from None
+                if candidate is not None:
+                    found.append((candidate, ", ".join(assignment.values())))
+    reduced = beyond_parameters(model, [each for each, _ in found])
+    result: list[tuple[MechanismCandidate, str]] = []
+    for each, (_, filled) in zip(reduced, found, strict=True):
+        if each is not None and not any(_same(each, other) for other, _ in result):
+            result.append((each, filled))
+    return _told_apart(result)
+
+
+def _same(one: MechanismCandidate, other: MechanismCandidate) -> bool:
+    """Whether two ways of filling the roles of a mechanism end in one model."""
+    return (
+        one.name == other.name
+        and one.model.equations == other.model.equations
+        and one.model.outputs == other.model.outputs
+    )
+
+
+def _told_apart(found: Sequence[tuple[MechanismCandidate, str]]) -> list[MechanismCandidate]:
+    """Labels that occur once, where needed with what fills the roles, and then with what is added.
+
+    Two parameters of one equation may drift, each of two species be satiated, and a coupling have two forms.
+    """
+    by_label = Counter(each.label for each, _ in found)
+    by_roles = Counter((each.label, roles) for each, roles in found)
+    result = []
+    for each, roles in found:
+        if by_label[each.label] > 1:
+            added = "; ".join(str(formula) for _, formula in each.changes)
+            known = roles if by_roles[each.label, roles] == 1 else added
+            each = replace(each, label=f"{each.label} ({known})")
+        result.append(each)
+    return result
+
+
+def generic_candidates(
+    model: Dynamics, roles: Roles, *, degree: int, named: Sequence[MechanismCandidate] = ()
+) -> list[MechanismCandidate]:
+    """Monomials of the states up to a degree in every equation that says more than a definition.
+
+    Those that the simulation's own parameters can do are left out, and so are those that have a name.
+
+    Parameters
+    ----------
+    model, roles
+        The simulation.
+    degree
+        Highest degree.
+    named
+        Candidates of the dictionary.
+    """
+    states = [symbol(name) for name in model.states]
+    found = []
+    for place, name in enumerate(model.states):
+        if name not in roles.states:
+            continue
+        for powers in itertools.product(range(degree + 1), repeat=len(states)):
+            if sum(powers) > degree:
+                continue
+            monomial = sympy.prod([s**p for s, p in zip(states, powers, strict=True)])
+            new = fresh_name("c", model)
+            units = {f"_{k}": unit for k, unit in enumerate(model.units)}
+            per = "*".join(f"_{k}**{power}" for k, power in enumerate(powers) if power)
+            unit = unit_of(f"_{place}/_t" + (f"/({per})" if per else ""), {**units, "_t": model.time_unit})
+            augmented = replace(
+                model,
+                parameters=(*model.parameters, Parameter(new, 0.0, unit)),
+                equations=tuple(
+                    formula + (symbol(new) * monomial if k == place else 0)
+                    for k, formula in enumerate(model.equations)
+                ),
+            )
+            found.append(
+                MechanismCandidate(
+                    name=GENERIC,
+                    label=f"{GENERIC} {monomial} in {name}",
+                    model=augmented,
+                    amplitudes=(new,),
+                    shapes=(),
+                    positive=frozenset(),
+                    searches=(),
+                    scales=(),
+                    equations=(name,),
+                    coordinate=", ".join(s for s, p in zip(model.states, powers, strict=True) if p)
+                    or "constant",
+                    changes=((name, symbol(new) * monomial),),
+                )
+            )
+    have_names = {_added_square(each) for each in named} - {None}
+    found = [each for each in found if _added_square(each) not in have_names]
+    return [each for each in beyond_parameters(model, found) if each is not None]
+
+
+def _added_square(candidate: MechanismCandidate) -> tuple[str, sympy.Expr] | None:
+    """Where and what a candidate of one term adds, whatever its sign; None for any other."""
+    if candidate.shapes or len(candidate.amplitudes) != 1 or len(candidate.changes) != 1:
+        return None
+    place, formula = candidate.changes[0]
+    if candidate.equations != (place,):
+        return None  # it changes what is measured
+    return place, formula.diff(symbol(candidate.amplitudes[0])) ** 2
+
+
+def once_more(candidate: MechanismCandidate, found: MechanismCandidate) -> bool:
+    """Whether a candidate is what was found already: the same, or in another form at the same place.
+
+    A second threshold beside the first, or a second spring in the same place, is no further physics.
+    """
+    same_place = candidate.coordinate == found.coordinate and set(candidate.equations) & set(found.equations)
+    return candidate.label == found.label or (
+        candidate.name == found.name and candidate.coordinate in found.model.states and bool(same_place)
+    )
+
+
+def rebased(candidate: MechanismCandidate, before: Dynamics, now: Dynamics) -> MechanismCandidate:
+    """A candidate on top of a model that has grown since."""
+    names = {parameter.name for parameter in now.parameters}
+    model = candidate.model
+    renamed = {name: name for name in candidate.new}
+    for name in candidate.new:
+        if name in names:
+            stem, _, number = name.rpartition("_")
+            k = int(number)
+            while f"{stem}_{k}" in names or f"{stem}_{k}" in renamed.values():
+                k += 1
+            renamed[name] = f"{stem}_{k}"
+    change = {symbol(old): symbol(new) for old, new in renamed.items() if old != new}
+
+    def merge(theirs: sympy.Expr, old: sympy.Expr, ours: sympy.Expr) -> sympy.Expr:
+        return ours + (theirs - old).xreplace(change)
+
+    count = len(before.parameters)
+    equations = [
+        merge(t, o, n)
+        for t, o, n in zip(model.equations[: before.dimension], before.equations, now.equations, strict=True)
+    ]
+    outputs = [
+        (name, merge(t, o, n))
+        for (name, t), (_, o), (_, n) in zip(model.outputs, before.outputs, now.outputs, strict=True)
+    ]
+    new = tuple(replace(p, name=renamed[p.name]) for p in model.parameters[count:])
+    return replace(
+        candidate,
+        model=replace(
+            model,
+            equations=(*equations, *(each.xreplace(change) for each in model.equations[before.dimension :])),
+            outputs=tuple(outputs),
+            parameters=(*now.parameters, *new),
+        ),
+        changes=tuple((name, formula.xreplace(change)) for name, formula in candidate.changes),
+        amplitudes=tuple(renamed[name] for name in candidate.amplitudes),
+        shapes=tuple(renamed[name] for name in candidate.shapes),
+        positive=frozenset(renamed[name] for name in candidate.positive),
+    )
+
+
+def completed(model: Dynamics, x: np.ndarray, *, process: np.ndarray | None = None) -> Dynamics:
+    """A fitted simulation as a dynamics of its own.
+
+    Parameters
+    ----------
+    model
+        With the estimates as its parameters' values.
+    x
+        States along the recordings, shape ``(n, d)``: measured ones as they were measured or smoothed, hidden
+        ones as the fit has them. A state without a domain, such as one that a mechanism brings, gets the
+        range of these.
+    process
+        Intensity of random forces on each state, per time, shape ``(d,)``, where they are part of what was
+        found. They become its D, with zeros for states that nothing drives.
+    """
+    limits = np.stack([x.min(axis=0), x.max(axis=0)], axis=1)
+    limits[limits[:, 0] == limits[:, 1]] = np.nan  # of a state that rests nothing is known
+    domain = np.where(np.isfinite(model.limits), model.limits, limits)
+    noise = model.diffusion
+    if process is not None and (process > 0).any():
+        noise = Diffusion(np.diag(process))
+    return replace(model, domain=domain, diffusion=noise)

@@ -1,0 +1,519 @@
+"""Structure in residuals, quantisation, and whether process noise is stationary.
+
+What may be missing is described without naming it: in every equation a piecewise linear function of every
+coordinate - a state, an input, the amplitude of a rotating frame, time - is let in, and the data say how
+large it would be. The same description tells where a mismatch sits, and whether one is left.
+
+Where a sensor's steps are wide beside its noise, what rounding does hangs together for as long as a reading
+stays on a step, and looks like random forces, or like physics that is missing. The steps are known: the
+recorded values lie on them. Of a reading that was rounded it is known that the value lay within its step, and
+a simulation says where: at the mean of a normal distribution that is cut off at the edges of the step. About
+the right simulation the residuals to these values are independent of each other (the generalised residuals of
+Gourieroux, Monfort, Renault and Trognon, Journal of Econometrics 34, 5, 1987), and the fit to them is that
+of highest likelihood of the readings (Dempster, Laird and Rubin's EM algorithm). So they can be asked whether
+anything is left.
+
+Process noise drives a system alike whether it moves or rests. What a simulation lacks of a hidden part - a
+second oscillator, a memory - can pass for random forces, too, where recordings are noisy; but such forces
+fade with the motion that excites them. The likelihood tells the two apart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.stats
+
+from siq.diagnosis.dictionary import Roles, roles_of
+from siq.diagnosis.mechanisms import lattice_step
+from siq.diagnosis.screening import in_portions, probe_response, projected
+from siq.errors import NumericalFailure
+from siq.inference.budget import Budget
+from siq.inference.kalman_filter import Grid, Noise, Whitened, profile_likelihood, solve, whiten
+from siq.inference.maximum_likelihood import Fit, fit_by_multiple_shooting
+from siq.inference.measurements import Measurements
+from siq.inference.noise import first_noise, likelihood_sums
+from siq.inference.recalibration import FAINT, process_noise_needed
+from siq.systems.dynamics import Dynamics
+
+KNOTS = 9  # of the functions that are tried: a choice
+SUBSTEPS = 2  # between samples, for the response to these functions
+LAGS = 12  # of autocorrelations
+
+
+@dataclass(frozen=True)
+class Direction:
+    """In which equations a function of a coordinate may stand, and along which coordinate.
+
+    Attributes
+    ----------
+    equations
+        Names of the states; two of them for a force along or across the amplitude.
+    coordinate
+        Its name.
+    knots
+        Where the piecewise linear function bends, shape ``(k,)``.
+    """
+
+    equations: tuple[str, ...]
+    coordinate: str
+    across: bool
+    knots: np.ndarray
+
+
+@dataclass(frozen=True)
+class Curve:
+    """What is missing in an equation along a coordinate, as far as the data tell.
+
+    Attributes
+    ----------
+    direction
+        Where.
+    values, standard_errors
+        At the knots, less what the parameters can do, in the unit of the equation; shape ``(k,)``.
+    gain
+        Decrease of the sum of squared innovations.
+    p_value
+        Probability of as much by chance.
+    """
+
+    direction: Direction
+    values: np.ndarray
+    standard_errors: np.ndarray
+    gain: float
+    p_value: float
+
+
+@dataclass(frozen=True)
+class Structure:
+    """What residuals show.
+
+    Attributes
+    ----------
+    curves
+        One for every direction, the one that explains most first.
+    p_curves
+        Probability that the best of them is chance, for as many as were tried.
+    p_autocorrelation
+        Probability that innovations are as correlated in time by chance.
+    total, freedom
+        Sum of squared innovations and its degrees of freedom, at the measurement noise of the fit.
+    """
+
+    curves: tuple[Curve, ...]
+    p_curves: float
+    p_autocorrelation: float
+    total: float
+    freedom: int
+
+    @property
+    def p_value(self) -> float:
+        """Probability that nothing is left."""
+        return min(1.0, 2 * min(self.p_curves, self.p_autocorrelation))
+
+
+class HatColumns:
+    """Piecewise linear functions of coordinates, as `siq.inference.kalman_filter.linearise` wants them."""
+
+    def __init__(self, model: Dynamics, grid: Grid, directions: tuple[Direction, ...]) -> None:
+        self._model, self._grid, self._directions = model, grid, directions
+        self.width = sum(len(each.knots) for each in directions)
+
+    def rates(self, x: np.ndarray, values: np.ndarray, node: int) -> np.ndarray:
+        """See `siq.inference.kalman_filter.Columns`."""
+        result = np.zeros((self._model.dimension, self.width, x.shape[1]))
+        signals = self._grid.signals(node, ())
+        place = 0
+        for direction in self._directions:
+            course = coordinate_values(self._model, direction, x, signals.inputs, signals.t)
+            hats = _hats(direction.knots, course)
+            columns = slice(place, place + len(direction.knots))
+            rows = [self._model.states.index(name) for name in direction.equations]
+            if len(rows) == 1:
+                result[rows[0], columns] = hats
+            else:
+                a, b = rows
+                size = np.hypot(x[a], x[b]) + 1e-300
+                first, second = (x[b], -x[a]) if direction.across else (x[a], x[b])
+                result[a, columns] = hats * first / size
+                result[b, columns] = hats * second / size
+            place += len(direction.knots)
+        return result
+
+    def outputs(self, x: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """See `siq.inference.kalman_filter.Columns`."""
+        return np.zeros((len(self._model.outputs), self.width, x.shape[1]))
+
+
+def directions_of(model: Dynamics, roles: Roles, data: Measurements, x: np.ndarray) -> tuple[Direction, ...]:
+    """Every equation that may lack something, with every coordinate."""
+    signals = data.signals(data.t, data.recording, delays=())
+    pairs = {name for pair in roles.amplitudes for name in pair}
+    found: list[Direction] = []
+
+    def add(equations: tuple[str, ...], coordinate: str, across: bool = False) -> None:
+        draft = Direction(equations, coordinate, across, np.empty(0))
+        course = coordinate_values(model, draft, x.T, signals.inputs, signals.t)
+        if np.ptp(course) > 0:
+            knots = np.unique(np.quantile(course, np.linspace(0, 1, KNOTS)))
+            if len(knots) > 3:
+                found.append(Direction(equations, coordinate, across, knots))
+
+    for pair in roles.amplitudes:
+        add(pair, "amplitude")
+        add(pair, "amplitude", across=True)
+    for name in roles.states:
+        coordinates = [*model.states, *(entry.name for entry in model.inputs), "t"]
+        for coordinate in coordinates:
+            if not (name in pairs and coordinate in pairs):
+                add((name,), coordinate)
+    return tuple(found)
+
+
+def coordinate_values(
+    model: Dynamics, direction: Direction, x: np.ndarray, inputs: np.ndarray, t: np.ndarray
+) -> np.ndarray:
+    """The coordinate along trajectories, shape ``(n,)``."""
+    if direction.coordinate == "t":
+        return t
+    if direction.coordinate == "amplitude":
+        a, b = (model.states.index(name) for name in direction.equations)
+        return np.hypot(x[a], x[b])
+    if direction.coordinate in model.states:
+        return x[model.states.index(direction.coordinate)]
+    return inputs[[entry.name for entry in model.inputs].index(direction.coordinate)]
+
+
+def structure_of(
+    model: Dynamics,
+    data: Measurements,
+    fit: Fit,
+    roles: Roles,
+    *,
+    noise: Noise | None = None,
+) -> Structure:
+    """Describe what a fit leaves.
+
+    Parameters
+    ----------
+    model, data, fit
+        The simulation, the recordings, and the fit of the one to the other.
+    roles
+        Of the simulation's states.
+    noise
+        At which the innovations are taken; by default the fit's, which shows what is not random. Without
+        process noise they show all that the simulation does not explain.
+    """
+    directions = directions_of(model, roles, data, fit.x)
+    grid = Grid(data, min(fit.substeps, SUBSTEPS))
+    noise = fit.noise if noise is None else noise
+    parameters = len(fit.model.free)
+
+    def projected_with(some: tuple[Direction, ...]) -> tuple[Whitened, np.ndarray, np.ndarray]:
+        white = whiten(probe_response(model, grid, fit, HatColumns(model, grid, some)), data, noise)
+        return white, *projected(white, parameters)
+
+    white, left, _ = projected_with(())
+    freedom = white.degrees_of_freedom - parameters
+    total = float(left @ left)
+    # Below its measurement noise a fit has no scale of its own; above it errors are as large as they are.
+    scale = 1.0 if noise.process.any() or not fit.has_process_noise else max(total / freedom, 1.0)
+    curves = []
+    for portion in in_portions([len(each.knots) for each in directions], model, data):
+        _, left, columns = projected_with(directions[portion])
+        place = 0
+        for direction in directions[portion]:
+            own = columns[:, place : place + len(direction.knots)]
+            place += len(direction.knots)
+            values, covariance = solve(own, left)
+            gain = total - float(((left - own @ values) ** 2).sum())
+            rank = int((np.linalg.svd(own, compute_uv=False) > 1e-9 * max(np.abs(own).max(), 1e-300)).sum())
+            p_value = float(scipy.stats.chi2.sf(max(gain, 0.0) / scale, max(rank, 1)))
+            errors = np.sqrt(np.diag(covariance) * scale)
+            curves.append(Curve(direction, values, errors, gain, p_value))
+    curves.sort(key=lambda each: -each.gain)
+    best = min((each.p_value for each in curves), default=1.0)
+    return Structure(
+        curves=tuple(curves),
+        p_curves=min(1.0, best * max(len(curves), 1)),
+        p_autocorrelation=_autocorrelation(left, white.recording, white.known, len(model.outputs)),
+        total=total,
+        freedom=freedom,
+    )
+
+
+def _hats(knots: np.ndarray, course: np.ndarray) -> np.ndarray:
+    """Piecewise linear functions that are one at one knot and zero at the others, shape ``(k, n)``."""
+    result = np.empty((len(knots), len(course)))
+    for place in range(len(knots)):
+        result[place] = np.interp(course, knots, np.eye(len(knots))[place])
+    return result
+
+
+def _autocorrelation(left: np.ndarray, recording: np.ndarray, known: np.ndarray, outputs: int) -> float:
+    """Ljung–Box test over all recordings, output by output."""
+    statistic, count = 0.0, 0
+    series = left.reshape(-1, outputs)
+    whole = known.reshape(-1, outputs)
+    owner = recording.reshape(-1, outputs)[:, 0]
+    for output in range(outputs):
+        y = np.where(whole[:, output], series[:, output], 0.0)
+        power = float(y @ y)
+        size = int(whole[:, output].sum())
+        if power == 0 or size < 4 * LAGS:
+            continue
+        for lag in range(1, LAGS + 1):
+            same = owner[lag:] == owner[:-lag]
+            correlation = float((y[lag:] * y[:-lag])[same].sum()) / power
+            pairs = int(same.sum())
+            statistic += correlation**2 * size**2 / max(pairs, 1)
+            count += 1
+    return float(scipy.stats.chi2.sf(statistic, count)) if count else 1.0
+
+
+STRUCTURED = 1e-4  # probability below which residuals are not called random
+DOUBTFUL = 2e-3  # the same for what a mechanism leaves: the burden of proof is on a name
+LEFT = 0.01  # probability that residuals are random, above which no further mechanism is sought
+
+
+@dataclass(frozen=True)
+class Remainder:
+    """What a simulation leaves.
+
+    Attributes
+    ----------
+    before, after
+        Structure of what the recalibrated simulation, and the one with mechanisms, does not explain.
+    share
+        Of the excess that the mechanisms explain.
+    """
+
+    before: Structure
+    after: Structure
+    share: float
+
+    @property
+    def structured(self) -> bool:
+        """Whether what is left is certainly no noise, which speaks of a mismatch by itself."""
+        return self.after.p_value < STRUCTURED
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether what is left is hardly noise: a name has to leave less than that."""
+        return self.after.p_value < DOUBTFUL
+
+
+def what_is_left(
+    model: Dynamics, data: Measurements, recalibrated: Fit, final: Fit, roles: Roles
+) -> Remainder:
+    """Structure before and after mechanisms were added, and the share of the excess that they explain.
+
+    Parameters
+    ----------
+    model, data
+        The simulation as its author believes it, and the recordings.
+    recalibrated, final
+        Its fit, and that with mechanisms.
+    roles
+        Of the simulation's states.
+    """
+    after = structure_of(final.model, data, final, roles)
+    # Random forces that stand for missing physics take measurement noise with them; the final fit's is right.
+    still = Noise(final.noise.measurement, np.zeros(model.dimension))
+    before = structure_of(model, data, recalibrated, roles, noise=still)
+    alone = after
+    if final.has_process_noise:
+        alone = structure_of(final.model, data, final, roles, noise=final.noise.without_process())
+    return Remainder(before, after, explained_share(before, alone))
+
+
+def explained_share(before: Structure, after: Structure) -> float:
+    """Share of the excess over measurement noise that the final simulation explains, without process noise.
+
+    What is left is the excess that remains, or what a function of one coordinate still finds: where a fit
+    without process noise takes a misfit for noise, only the latter shows it.
+    """
+    if not before.total > before.freedom:
+        return 1.0
+    best = after.curves[0] if after.curves else None
+    systematic = 0.0 if best is None else best.gain - 2 * len(best.direction.knots)
+    left = max(after.total - after.freedom, systematic, 0.0)
+    return float(np.clip(1 - left / (before.total - before.freedom), 0.0, 1.0))
+
+
+def something_left(current: Fit, data: Measurements) -> bool:
+    """Whether it is worth looking for something on top of a fit."""
+    model = current.model
+    if current.has_process_noise:
+        return True
+    try:
+        return structure_of(model, data, current, roles_of(model)).p_value < LEFT
+    except NumericalFailure:  # a simulation that runs away lacks something, whatever it is
+        return True
+
+
+ROUNDS = 30  # of fits at most
+STILL = 0.01  # relative change of the noise, at which they have settled
+
+
+@dataclass(frozen=True)
+class Unrounded:
+    """A simulation that explains recordings but for rounding.
+
+    Attributes
+    ----------
+    fit
+        Its parameters and states are those that the values which were rounded are fitted by; its errors are
+        those of the fit to the readings, which rounding makes wider.
+    left
+        What is left of the values that were rounded, which is noise.
+    outputs
+        Names of the outputs that are rounded.
+    """
+
+    fit: Fit
+    left: Remainder
+    outputs: tuple[str, ...]
+
+
+def explained_by_rounding(
+    model: Dynamics,
+    data: Measurements,
+    strict: Fit,
+    roles: Roles,
+    *,
+    least: float = STRUCTURED,
+    budget: Budget | None = None,
+) -> Unrounded | None:
+    """The fit to the values that were rounded, if it leaves noise; None where it does not, or nothing rounds.
+
+    Parameters
+    ----------
+    model, data
+        The simulation as its author believes it, and the recordings.
+    strict
+        Its fit without process noise.
+    roles
+        Of the simulation's states.
+    least
+        Probability of structure by chance, below which it is no noise.
+    budget
+        Charged for every evaluation.
+    """
+    steps = steps_of(data)
+    # What rounding does under noise half as wide as a step is white (Widrow and Kollár 2008), and fitted.
+    coarse = steps > np.sqrt(strict.noise.measurement)
+    if not (strict.converged and coarse.any()):
+        return None
+    deviation, fit = np.sqrt(strict.noise.measurement), strict
+    values = data
+    for _ in range(ROUNDS):
+        before = deviation
+        values, deviation = unrounded(data, simulated(fit, values), steps, before)
+        fit = fit_by_multiple_shooting(
+            fit.model, values, x=fit.x, noise=fit.noise, estimate_process=False, substeps=fit.substeps,
+            budget=budget,
+        )  # fmt: skip
+        if not fit.converged:
+            return None
+        if (np.abs(deviation - before) < STILL * before).all():
+            break
+    faint = Noise(fit.noise.measurement, FAINT * first_noise(model, values, fit.x).process)
+    forced = fit_by_multiple_shooting(
+        fit.model, values, x=fit.x, noise=faint, estimate_process=True, substeps=fit.substeps, budget=budget
+    )
+    if forced.converged and process_noise_needed(forced, fit):
+        return None
+    try:
+        left = what_is_left(model, values, fit, fit, roles)
+    except NumericalFailure:
+        return None
+    if left.after.p_value < least:
+        return None
+    names = tuple(name for name, wide in zip(model.output_names, coarse, strict=True) if wide)
+    return Unrounded(replace(strict, model=fit.model, x=fit.x), left, names)
+
+
+def steps_of(data: Measurements) -> np.ndarray:
+    """The step on whose multiples the values of each output lie, zero where there is none; shape ``(m,)``."""
+    return np.array([lattice_step(column) or 0.0 for column in data.outputs.T])
+
+
+def simulated(fit: Fit, data: Measurements) -> np.ndarray:
+    """What a fit says of the outputs, shape ``(n, m)``."""
+    model = fit.model
+    signals = Grid(data, fit.substeps).at_samples(model.lags(model.values))
+    return model.functions.outputs(np.ascontiguousarray(fit.x.T), signals, model.values).T
+
+
+def unrounded(
+    data: Measurements, simulation: np.ndarray, steps: np.ndarray, deviation: np.ndarray
+) -> tuple[Measurements, np.ndarray]:
+    """Recordings before they were rounded, as far as a simulation tells, and the deviation of their noise.
+
+    Parameters
+    ----------
+    data
+        What was recorded.
+    simulation
+        Outputs without noise, shape ``(n, m)``.
+    steps
+        Of each output, zero where nothing is rounded; shape ``(m,)``.
+    deviation
+        Of the noise of each output before rounding, shape ``(m,)``.
+
+    Returns
+    -------
+    Measurements, numpy.ndarray
+        With the expected values; and the deviation of what they are expected of, shape ``(m,)``.
+    """
+    outputs, wide = data.outputs.copy(), deviation.copy()
+    for place in np.flatnonzero(steps > 0):
+        off = (data.outputs[:, place] - simulation[:, place]) / deviation[place]
+        half = steps[place] / 2 / deviation[place]
+        known = np.isfinite(off)
+        mean, variance = scipy.stats.truncnorm.stats(off[known] - half, off[known] + half, moments="mv")
+        outputs[known, place] = simulation[known, place] + deviation[place] * mean
+        wide[place] = deviation[place] * np.sqrt(np.mean(mean**2 + variance))
+    return replace(data, outputs=outputs), wide
+
+
+SHARES = (0.5, 0.9, 0.99)  # of the forces that follow the motion
+RATIOS = (1 / 8, 1 / 4, 1 / 2, 1 / 1.4, 1.0, 1.4, 2.0, 4.0, 8.0)  # of process noise, to that of the fit
+
+
+def unsteadiness(fit: Fit, data: Measurements) -> float:
+    """How much better random forces fit that follow the motion than steady ones do.
+
+    Parameters
+    ----------
+    fit
+        With process noise.
+    data
+        The measurements it was made for.
+
+    Returns
+    -------
+    float
+        Twice the difference of the log-likelihoods, each with the intensities at their best and, for forces
+        that follow the motion, at least half of them in proportion to the square of its size. Negative
+        where steady forces fit better.
+    """
+    spread = fit.x.std(axis=0)
+    moved = (fit.x - fit.x.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
+    motion = (moved**2).mean(axis=1)
+    following = motion / motion.mean()
+    steady = max(_log_likelihood(fit, data, ratio, np.ones(len(motion))) for ratio in RATIOS)
+    fading = max(
+        _log_likelihood(fit, data, ratio, 1 - share + share * following)
+        for share in SHARES
+        for ratio in RATIOS
+    )
+    return 2 * (fading - steady)
+
+
+def _log_likelihood(fit: Fit, data: Measurements, ratio: float, weight: np.ndarray) -> float:
+    """With both kinds of noise on the best common scale; the weight is of the forces at every sample."""
+    noise = Noise(fit.noise.measurement, ratio * fit.noise.process)
+    return profile_likelihood(*likelihood_sums(fit.linearisation, data, noise, weight=weight))

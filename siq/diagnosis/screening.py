@@ -1,0 +1,591 @@
+"""Screening: how much a little of each mechanism would improve the fit.
+
+A mechanism that is absent from a simulation enters, to first order, by the derivative of f by its amplitudes.
+The responses of all candidates are worked out together, along the trajectories of a fit.
+
+Along the trajectories of one fit everything is linear, so that the likelihood with a probe, its amplitude and
+all parameters at their best, is a matter of least squares. It is worked out for several levels of process
+noise: where physics is missing the fit had to admit such noise, and the right probe makes it needless.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import sympy
+
+from siq.diagnosis.mechanisms import MechanismCandidate, along, places_of
+from siq.diagnosis.significance import BUDGET_SPENT, UNFORESEEN, UntriedMechanism, in_words
+from siq.errors import NumericalFailure
+from siq.inference.budget import Budget, BudgetSpent, evaluation
+from siq.inference.kalman_filter import (
+    Columns,
+    Grid,
+    Linearisation,
+    Whitened,
+    linearise,
+    profile_likelihood,
+    whiten,
+)
+from siq.inference.maximum_likelihood import Fit
+from siq.inference.measurements import Measurements
+from siq.inference.trajectories import EDGE_SUBSTEPS, run_along, spread_edges
+from siq.systems.dynamics import Dynamics, arguments_of, evaluable, symbol
+from siq.systems.formulas import compile_values, tape_of
+
+
+@dataclass(frozen=True)
+class Probe:
+    """A candidate with its shapes set; its amplitudes are what the data are asked for.
+
+    Attributes
+    ----------
+    candidate
+        The mechanism and the model that has it.
+    shapes
+        Values of the shapes, by name.
+    """
+
+    candidate: MechanismCandidate
+    shapes: tuple[tuple[str, float], ...]
+
+    @property
+    def recorded(self) -> bool:
+        """Whether the recordings themselves show its shape.
+
+        States that follow what was recorded never leave the range of a sensor: along them such a mechanism
+        seems to change nothing, and only its fit tells.
+        """
+        return any(search.recorded is not None for search in self.candidate.searches)
+
+    @property
+    def width(self) -> int:
+        """How many columns it has."""
+        return max(len(self.candidate.amplitudes), 1)
+
+
+class ProbeColumns:
+    """The columns of many probes, as `siq.inference.kalman_filter.linearise` wants them.
+
+    Parameters
+    ----------
+    model
+        The simulation that the candidates extend.
+    grid
+        Measurements and substeps.
+    probes
+        The columns stand in their order.
+    x
+        States along which further states of candidates are carried, shape ``(n, d)``.
+    values
+        The simulation's parameters.
+    """
+
+    def __init__(
+        self, model: Dynamics, grid: Grid, probes: Sequence[Probe], x: np.ndarray, values: np.ndarray
+    ) -> None:
+        self._model, self._grid, self._probes = model, grid, probes
+        self._x, self._values = x, values
+        candidates = {id(each.candidate): each.candidate for each in probes}
+        self._compiled = {key: _Compiled(model, each) for key, each in candidates.items()}
+        self.width = sum(probe.width for probe in probes)
+
+    def rates(self, x: np.ndarray, values: np.ndarray, node: int) -> np.ndarray:
+        """See `siq.inference.kalman_filter.Columns`."""
+        result = np.zeros((self._model.dimension, self.width, x.shape[1]))
+        place = 0
+        for index, probe in enumerate(self._probes):
+            compiled = self._compiled[id(probe.candidate)]
+            if compiled.rate_entries:
+                further = self._memory(index)[node] if probe.candidate.scales else x[:0]
+                signals = self._grid.signals(node, compiled.delays_at(probe))
+                at = (*x, *further, *signals.inputs, *signals.delayed, *signals.slopes, signals.t)
+                _fill(
+                    result,
+                    place,
+                    compiled.rate_entries,
+                    compiled.rates(*at, *compiled.numbers(probe, values)),
+                )
+            place += probe.width
+        return result
+
+    def outputs(self, x: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """See `siq.inference.kalman_filter.Columns`."""
+        result = np.zeros((len(self._model.outputs), self.width, x.shape[1]))
+        place = 0
+        for index, probe in enumerate(self._probes):
+            compiled = self._compiled[id(probe.candidate)]
+            if compiled.output_entries:
+                signals = self._grid.at_samples(compiled.delays_at(probe))
+                further = self.further_states(index).T if probe.candidate.scales else x[:0]
+                at = (*x, *further, *signals.inputs, *signals.delayed, *signals.slopes, signals.t)
+                numbers = compiled.numbers(probe, values)
+                _fill(result, place, compiled.output_entries, compiled.outputs(*at, *numbers))
+            place += probe.width
+        return result
+
+    @cached_property
+    def _node_states(self) -> list[np.ndarray]:
+        """States of the simulation at all nodes: between samples cubics that have the slopes of f.
+
+        Straight lines would be early or late by half a sample, as much as what a sensor's lag does.
+        """
+        grid, model = self._grid, self._model
+        rows, substeps = grid.rows, grid.substeps
+        begin, end = self._x[rows].T, self._x[rows + 1].T
+        delays, whole = model.lags(self._values), grid.step * substeps
+        first, last = (
+            whole * model.functions.rates(x, grid.signals(node, delays), self._values)
+            for x, node in ((begin, 0), (end, 3 * substeps - 1))
+        )
+        turn = first + last - 2 * (end - begin)
+        bend = 3 * (end - begin) - 2 * first - last
+        shares = [(node // 3 + (node % 3) / 2) / substeps for node in range(3 * substeps)]
+        return [begin + share * (first + share * (bend + share * turn)) for share in shares]
+
+    def further_states(self, index: int) -> np.ndarray:
+        """The states that a probe brings, at all samples, shape ``(n, k)``."""
+        nodes = self._memory(index)
+        rows = self._grid.rows
+        states = np.zeros((len(self._x), len(nodes[0])))
+        states[rows + 1] = nodes[-1].T
+        states[rows] = nodes[0].T
+        return states
+
+    def _memory(self, index: int) -> list[np.ndarray]:
+        """The further states of a probe at all nodes, carried along each recording from its begin."""
+        cache = self.__dict__.setdefault("_memories", {})
+        if index not in cache:
+            cache[index] = self._carry(self._probes[index])
+        return cache[index]
+
+    def _carry(self, probe: Probe) -> list[np.ndarray]:
+        """Sample after sample along each recording, then within all intervals side by side."""
+        compiled = self._compiled[id(probe.candidate)]
+        grid = self._grid
+        step = grid.step
+        numbers = compiled.numbers(probe, self._values)
+        begin = np.empty((len(grid.data.labels), len(probe.candidate.begins)))
+        model = self._model.with_values(self._values)
+        for place, formula in enumerate(probe.candidate.begins):
+            begin[:, place] = along(str(formula), grid.data, model, self._x)[grid.data.first[:-1]]
+        signals = [
+            np.concatenate([x, s.inputs, s.delayed, s.slopes, s.t[None]])
+            for x, s in (
+                (self._node_states[node], grid.signals(node, compiled.delays_at(probe)))
+                for node in range(3 * grid.substeps)
+            )
+        ]
+
+        def rate(z: np.ndarray, node: int) -> np.ndarray:
+            values = compiled.memory(*z, *signals[node], *numbers)
+            return np.array([np.broadcast_to(value, z.shape[1:]) for value in values])
+
+        z = compiled.carried(grid, np.stack(signals), numbers, begin)[grid.rows].T
+        nodes = []
+        for part in range(grid.substeps):
+            first, middle, last = 3 * part, 3 * part + 1, 3 * part + 2
+            k1 = rate(z, first)
+            k2 = rate(z + step / 2 * k1, middle)
+            k3 = rate(z + step / 2 * k2, middle)
+            k4 = rate(z + step * k3, last)
+            after = z + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+            nodes += [z, z + step / 2 * k2, after]
+            z = after
+        return nodes
+
+
+class _Compiled:
+    """The columns of one candidate as functions; entries without an effect are left out."""
+
+    def __init__(self, model: Dynamics, candidate: MechanismCandidate) -> None:
+        augmented = candidate.model
+        self._candidate, self._count = candidate, len(model.parameters)
+        formulas = [*augmented.equations, *(formula for _, formula in augmented.outputs)]
+        arguments = arguments_of(augmented)
+        written = [evaluable(formula, augmented) for formula in formulas]
+        zero = {symbol(name): 0 for name in candidate.amplitudes}
+
+        def columns(formula: sympy.Expr, before: sympy.Expr) -> list[sympy.Expr]:
+            if not candidate.amplitudes:
+                return [formula - before]
+            return [formula.diff(symbol(name)).subs(zero) for name in candidate.amplitudes]
+
+        base = [evaluable(formula, model) for formula in model.equations]
+        rates = [columns(f, b) for f, b in zip(written[: model.dimension], base, strict=True)]
+        outputs = [
+            columns(f, b) for f, (_, b) in zip(written[augmented.dimension :], model.outputs, strict=True)
+        ]
+        self.rate_entries = [(i, j) for i, row in enumerate(rates) for j, each in enumerate(row) if each != 0]
+        self.output_entries = [
+            (i, j) for i, row in enumerate(outputs) for j, each in enumerate(row) if each != 0
+        ]
+        self.rates = compile_values([rates[i][j] for i, j in self.rate_entries], arguments, common=False)
+        self.outputs = compile_values(
+            [outputs[i][j] for i, j in self.output_entries], arguments, common=False
+        )
+        # Of further states, which come first: they are carried, and all else is known along the recordings.
+        self._further = written[model.dimension : augmented.dimension]
+        own = [symbol(name) for name in augmented.states[model.dimension :]]
+        self._memory_arguments = [*own, *(each for each in arguments if each not in own)]
+        self.memory = compile_values(self._further, self._memory_arguments, common=False)
+
+    def numbers(self, probe: Probe, values: np.ndarray) -> tuple[float, ...]:
+        """All parameters: the simulation's, then the mechanism's."""
+        shapes = dict(probe.shapes)
+        new = self._candidate.model.parameters[self._count :]
+        # As numpy has them: a division by zero is then infinite, and no error.
+        return (*values, *(np.float64(shapes.get(each.name, 0.0)) for each in new))
+
+    def carried(
+        self, grid: Grid, signals: np.ndarray, numbers: tuple[float, ...], begin: np.ndarray
+    ) -> np.ndarray:
+        """The further states at all samples, shape ``(n, k)``.
+
+        Parameters
+        ----------
+        grid, signals
+            What is known at all nodes, shape ``(3 substeps, s, intervals)``.
+        numbers
+            All parameters.
+        begin
+            Where they begin, shape ``(recordings, k)``.
+        """
+        tape = tape_of(self._further, self._memory_arguments)
+        if tape is None:
+            names = ", ".join(map(str, self._further))
+            raise NumericalFailure(f"a state of its own has a formula that cannot be followed: {names}")
+        return run_along(tape, grid, signals, np.array(numbers), begin)
+
+    def delays_at(self, probe: Probe) -> tuple[tuple[int, float], ...]:
+        """Delayed inputs of the candidate's formulas."""
+        shapes = dict(probe.shapes)
+        values = [shapes.get(each.name, each.value) for each in self._candidate.model.parameters]
+        return self._candidate.model.lags(np.array(values))
+
+
+def with_further_states(
+    probe: Probe, model: Dynamics, data: Measurements, x: np.ndarray, *, substeps: int, values: np.ndarray
+) -> np.ndarray:
+    """States along recordings, with those that a probe brings behind them, shape ``(n, d + k)``.
+
+    Parameters
+    ----------
+    probe
+        The mechanism with its shapes.
+    model, data, x
+        The simulation without it, the recordings, and the states along them, shape ``(n, d)``.
+    substeps, values
+        Runge–Kutta steps between samples, and the simulation's parameters.
+    """
+    if not probe.candidate.scales:
+        return x
+    own = ProbeColumns(model, Grid(data, substeps), [probe], x, values)
+    return np.concatenate([x, own.further_states(0)], axis=1)
+
+
+def probes_of(
+    candidate: MechanismCandidate, data: Measurements, model: Dynamics, x: np.ndarray
+) -> list[Probe]:
+    """A candidate with its shapes at all places where they are looked for.
+
+    Parameters
+    ----------
+    candidate
+        The mechanism.
+    data, model, x
+        The recordings, and the simulation along them: sizes of motion are taken from there.
+    """
+    choices: list[tuple[tuple[str, float], ...]] = [()]
+    for name, search in zip(candidate.shapes, candidate.searches, strict=True):
+        found = places_of(search, data, model, x)
+        choices = [(*before, (name, float(place))) for before in choices for place in found]
+    return [Probe(candidate, shapes) for shapes in choices]
+
+
+def _fill(result: np.ndarray, place: int, entries: list[tuple[int, int]], found: Sequence[object]) -> None:
+    for (row, column), value in zip(entries, found, strict=True):
+        result[row, place + column] = value
+
+
+LEVELS = (1.0, 0.1, 1e-2, 1e-3, 1e-4, 0.0)
+"""Process noise, relative to that of the fit."""
+LARGEST_PORTION = 20_000_000  # numbers that are worked out at once; with copies about a gigabyte
+LEAST_PORTION = 10  # columns
+CLEARLY = 2.0  # standard errors below zero, from which on an amplitude is taken for negative
+COLLINEAR = 0.02  # share of a column left beside the parameters, below which its amplitude knows no bounds
+
+
+@dataclass(frozen=True)
+class Screened:
+    """What one group of columns would do.
+
+    Attributes
+    ----------
+    gain
+        Twice the increase of the log-likelihood, each side at its best level of process noise.
+    level
+        The level at which it is best.
+    amplitudes, standard_errors
+        There; shape ``(k,)``.
+    finite
+        Whether what the columns do to what is measured is a number at any level.
+    """
+
+    gain: float
+    level: float
+    amplitudes: np.ndarray
+    standard_errors: np.ndarray
+    finite: bool = True
+
+
+def levels_of(fit: Fit) -> tuple[float, ...]:
+    """The levels of random forces at which something is judged on top of a fit; one where it has none."""
+    return LEVELS if fit.has_process_noise else (1.0,)
+
+
+def in_portions(widths: Sequence[int], model: Dynamics, data: Measurements) -> Iterator[slice]:
+    """Groups of columns, by their widths, divided so that the response to a portion fits into the memory."""
+    most = max(LARGEST_PORTION // (len(data.t) * (model.dimension + len(model.outputs))), LEAST_PORTION)
+    first, columns = 0, 0
+    for place, width in enumerate(widths):
+        if columns and columns + width > most:
+            yield slice(first, place)
+            first, columns = place, 0
+        columns += width
+    if columns:
+        yield slice(first, len(widths))
+
+
+def probe_response(model: Dynamics, grid: Grid, fit: Fit, columns: Columns) -> Linearisation:
+    """The linearisation of a fit, with the columns of probes behind those of its parameters.
+
+    Parameters
+    ----------
+    model, fit
+        The simulation and its fit.
+    grid
+        On which the columns are worked out; it may be coarser than that of the fit.
+    columns
+        The probes.
+    """
+    with np.errstate(all="ignore"):  # what overflows is left out of the screening
+        coarse = linearise(model, grid, fit.model.values, fit.linearised_at, columns=columns)
+    known, parameters = fit.linearisation, len(fit.model.free)
+    return replace(
+        known,
+        response=np.concatenate([known.response, coarse.response[:, :, parameters:]], axis=2),
+        measured_response=np.concatenate(
+            [known.measured_response, coarse.measured_response[:, :, parameters:]], axis=2
+        ),
+    )
+
+
+def projected(white: Whitened, parameters: int) -> tuple[np.ndarray, np.ndarray]:
+    """Innovations and further columns with the parameters' columns projected out.
+
+    A column of which little is left is set to zero, since the parameters can do what it does, and so is one
+    that is not finite.
+
+    Raises
+    ------
+    NumericalFailure
+        When a parameter's column is not finite.
+    """
+    own, further = white.columns[:, :parameters], white.columns[:, parameters:]
+    if not np.isfinite(own).all():
+        raise NumericalFailure("the effect of a parameter on what is measured is beyond all numbers")
+    further = np.where(np.isfinite(further).all(axis=0), further, 0.0)
+    if parameters:
+        scale = np.sqrt((own**2).sum(axis=0))
+        basis, values, _ = np.linalg.svd(own / np.where(scale > 0, scale, 1.0), full_matrices=False)
+        basis = basis[:, values > 1e-9 * values[0]] if values[0] > 0 else basis[:, :0]
+    else:
+        basis = own
+    left = white.innovations - basis @ (basis.T @ white.innovations)
+    size = np.sqrt((further**2).sum(axis=0))
+    further = further - basis @ (basis.T @ further)
+    further[:, np.sqrt((further**2).sum(axis=0)) <= COLLINEAR * size] = 0.0
+    return left, further
+
+
+def screen(
+    linearisation: Linearisation,
+    data: Measurements,
+    fit: Fit,
+    groups: Sequence[slice],
+    *,
+    positive: Sequence[np.ndarray],
+) -> list[Screened]:
+    """Screen groups of columns.
+
+    Parameters
+    ----------
+    linearisation
+        With the columns of all groups behind those of the free parameters.
+    data, fit
+        The fit that is to be improved.
+    groups
+        The columns of each group, counted behind the parameters'.
+    positive
+        For each group which amplitudes must not be negative; one that would be is zero.
+
+    Raises
+    ------
+    NumericalFailure
+        When the simulation runs away at every level.
+    """
+    parameters = len(fit.model.free)
+    base = -np.inf
+    best = [Screened(-np.inf, 1.0, np.zeros(0), np.zeros(0), finite=False)] * len(groups)
+    failure: NumericalFailure | None = None
+    for level in levels_of(fit):
+        try:
+            white = whiten(linearisation, data, fit.noise.scaled(level))
+        except NumericalFailure as error:  # without random forces an unstable simulation does not follow
+            failure = error
+            continue
+        finite = np.isfinite(white.columns[:, parameters:]).all(axis=0)
+        freedom = white.degrees_of_freedom - parameters
+        left, columns = projected(white, parameters)
+        total = float(left @ left)
+        base = max(base, profile_likelihood(total, freedom, white.log_determinant))
+        overlap = columns.T @ left
+        for place, group in enumerate(groups):
+            if not finite[group].all():
+                continue
+            best[place] = replace(best[place], finite=True)
+            gram = columns[:, group].T @ columns[:, group]
+            amplitudes, errors, after = _admissible(gram, overlap[group], total, freedom, positive[place])
+            value = profile_likelihood(after, freedom, white.log_determinant)
+            if amplitudes.any() and value > best[place].gain:
+                best[place] = Screened(value, level, amplitudes, errors)
+    if failure is not None and base == -np.inf:
+        raise failure
+    return [replace(each, gain=2 * (each.gain - base)) for each in best]
+
+
+def _admissible(
+    gram: np.ndarray, overlap: np.ndarray, total: float, freedom: int, positive: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Amplitudes that their signs allow, their standard errors, and the squares that are left.
+
+    Those that would clearly be negative, and must not, are zero, the clearest first: what is left of a
+    mechanism then is a special case of it.
+    """
+    kept = np.ones(len(overlap), dtype=bool)
+    amplitudes, errors, after = np.zeros(len(overlap)), np.zeros(len(overlap)), total
+    while kept.any():
+        solved, covariance = _small_solve(gram[np.ix_(kept, kept)], overlap[kept])
+        after = max(total - float(solved @ overlap[kept]), 1e-12 * total)
+        spread = np.sqrt(np.diag(covariance) * after / max(freedom - len(solved), 1))
+        amplitudes[kept], errors[kept] = solved, spread
+        below = np.where(positive & kept, -amplitudes / np.maximum(errors, np.finfo(float).tiny), 0.0)
+        worst = int(np.argmax(below))
+        if below[worst] <= CLEARLY:
+            break
+        kept[worst] = False
+        amplitudes[worst] = errors[worst] = 0.0
+    return amplitudes, errors, after if kept.any() else total
+
+
+def _small_solve(gram: np.ndarray, overlap: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    scale = np.sqrt(np.diag(gram))
+    scale = np.where(scale > 0, scale, np.inf)
+    values, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
+    kept = values > 1e-10 * max(values[-1], 1e-300)
+    inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T / np.outer(scale, scale)
+    return inverse @ overlap, inverse
+
+
+PROBE_SUBSTEPS = 2  # what a little of a mechanism does need not be known to many digits
+OVERFLOWS = "its effect along the recorded motion is beyond all numbers"
+
+
+def screen_all(
+    model: Dynamics,
+    data: Measurements,
+    current: Fit,
+    candidates: Sequence[MechanismCandidate],
+    *,
+    fruitless: Collection[str] = (),
+    budget: Budget | None = None,
+) -> tuple[list[tuple[Probe, Screened]], list[UntriedMechanism]]:
+    """Screen every candidate, with its shapes at all places where they are looked for.
+
+    One whose shape the recordings themselves show promises as much as the best, unless it was fitted before
+    and gained nothing: see `Probe.recorded`.
+
+    Parameters
+    ----------
+    model, data, current
+        The simulation, the recordings, and the fit that is to be improved.
+    candidates
+        What may be missing.
+    fruitless
+        Labels of those that gained nothing when they were fitted.
+    budget
+        Charged for the work; what it does not reach is not screened.
+
+    Returns
+    -------
+    list of (Probe, Screened), list of UntriedMechanism
+        What each probe would gain; and candidates of which no probe could be screened, with the reason.
+    """
+    budget = budget or Budget()
+    substeps = current.substeps
+    untried: dict[str, UntriedMechanism] = {}
+    probes = []
+    for candidate in candidates:
+        try:
+            sharp = max(substeps, EDGE_SUBSTEPS)
+            spread = replace(candidate, model=spread_edges(candidate.model, data, current.x, substeps=sharp))
+            probes += probes_of(spread, data, model, current.x)
+        except UNFORESEEN as error:
+            untried[candidate.label] = UntriedMechanism(candidate, in_words(error))
+    grid = Grid(data, min(substeps, PROBE_SUBSTEPS))
+    screened: list[tuple[Probe, Screened]] = []
+    for portion in in_portions([probe.width for probe in probes], model, data):
+        some = probes[portion]
+        columns = sum(probe.width for probe in some)
+        try:
+            budget.says(f"screening {len(candidates)} candidates")
+            budget.charge(grid.substeps * evaluation(model, data, columns=columns))
+            screened += _screened(model, data, current, grid, some)
+        except BudgetSpent:
+            break
+        except UNFORESEEN as error:
+            for probe in some:
+                reason = in_words(error)
+                untried[probe.candidate.label] = UntriedMechanism(probe.candidate, reason)
+    most = max((result.gain for _, result in screened), default=0.0)
+    screened = [
+        (probe, replace(result, gain=max(most, result.gain)))
+        if probe.recorded and result.finite and probe.candidate.label not in fruitless
+        else (probe, result)
+        for probe, result in screened
+    ]
+    finite = {probe.candidate.label for probe, result in screened if result.finite}
+    seen = {probe.candidate.label for probe, _ in screened}
+    for candidate in (probe.candidate for probe in probes):  # some have no place where they could be
+        if candidate.label not in finite:
+            why = OVERFLOWS if candidate.label in seen else BUDGET_SPENT
+            untried.setdefault(candidate.label, UntriedMechanism(candidate, why))
+    return screened, [each for label, each in untried.items() if label not in finite]
+
+
+def _screened(
+    model: Dynamics, data: Measurements, current: Fit, grid: Grid, probes: Sequence[Probe]
+) -> list[tuple[Probe, Screened]]:
+    columns = ProbeColumns(model, grid, probes, current.x, current.model.values)
+    response = probe_response(model, grid, current, columns)
+    ends = np.cumsum([probe.width for probe in probes])
+    groups = [slice(end - probe.width, end) for probe, end in zip(probes, ends, strict=True)]
+    positive = [
+        np.array([name in probe.candidate.positive for name in probe.candidate.amplitudes] or [True])
+        for probe in probes
+    ]
+    return list(zip(probes, screen(response, data, current, groups, positive=positive), strict=True))

@@ -1,0 +1,563 @@
+"""The search for missing mechanisms: screen, fit the best, accept what stands every test.
+
+White errors, errors clustered by recording, and the Bayesian information criterion all have to say so; what
+cannot be told from the best is kept as its class of indistinguishables. One that leads to better parameters
+of the simulation itself is held against these, and one on trial has to stand beside what came after it.
+
+Mechanisms are added one at a time, each on top of those before it.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from siq.diagnosis.mechanisms import MechanismCandidate, once_more, rebased
+from siq.diagnosis.options import SearchOptions
+from siq.diagnosis.residual_structure import something_left
+from siq.diagnosis.screening import Probe, Screened, screen_all, with_further_states
+from siq.diagnosis.significance import (
+    BUDGET_SPENT,
+    UNFORESEEN,
+    TriedMechanism,
+    UntriedMechanism,
+    admissible,
+    clustered_probability,
+    in_words,
+    judged,
+    probability_by_chance,
+)
+from siq.errors import NumericalFailure
+from siq.inference.budget import Budget, BudgetSpent
+from siq.inference.maximum_likelihood import Fit
+from siq.inference.measurements import Measurements
+from siq.inference.recalibration import fit_with_process_noise_as_needed, least_to_believe
+from siq.inference.trajectories import sharpened
+from siq.systems.dynamics import Dynamics
+
+
+@dataclass(frozen=True)
+class Found:
+    """A mechanism that stood the tests, and what else was fitted in its place.
+
+    Attributes
+    ----------
+    best
+        The mechanism.
+    indistinguishable
+        Those that explain the recordings as well.
+    needless
+        Those that explain as much, but with further parameters that do not earn their place.
+    lesser
+        Those that explain less.
+    """
+
+    best: TriedMechanism
+    indistinguishable: tuple[TriedMechanism, ...]
+    needless: tuple[TriedMechanism, ...] = ()
+    lesser: tuple[TriedMechanism, ...] = ()
+
+
+@dataclass(frozen=True)
+class Search:
+    """What a search ended with.
+
+    Attributes
+    ----------
+    recalibrated
+        The simulation with its own parameters fitted, and nothing else.
+    found
+        Mechanisms, in the order of their discovery; each was judged with those before it in place.
+    fit
+        Of the simulation with all of them.
+    screened
+        The last screening: every candidate with what it would gain.
+    screened_beside
+        Labels of the mechanisms that were in place for it. Where nothing was left to be explained, nothing
+        was screened on top of the last mechanism.
+    untried
+        Candidates whose fit gave nothing that could be judged, with the reason.
+    fruitless
+        Labels of those that were fitted and gained nothing.
+    """
+
+    recalibrated: Fit
+    found: tuple[Found, ...]
+    fit: Fit
+    screened: tuple[tuple[Probe, Screened], ...]
+    untried: tuple[UntriedMechanism, ...] = ()
+    screened_beside: tuple[str, ...] = ()
+    fruitless: frozenset[str] = frozenset()
+
+
+LOGGER = logging.getLogger(__name__)
+
+
+def accepted(
+    trials: Sequence[TriedMechanism], probes: int, chance: float, *, options: SearchOptions
+) -> Found | None:
+    """The best of the trials that stand every test, with what cannot be told from it.
+
+    Parameters
+    ----------
+    trials
+        Candidates, fitted.
+    probes
+        How many were screened: the white test allows for them.
+    chance
+        Probability by which an effect clustered by recording may be one of chance.
+    options
+        Of the search.
+    """
+    significant = [
+        trial
+        for trial in trials
+        if trial.p_white < options.false_alarms / max(probes, 1)
+        and trial.p_cluster < chance
+        and trial.delta_bic < 0
+    ]
+    if not significant:
+        return None
+    best = min(significant, key=lambda each: each.delta_bic)
+    if best.fit.has_process_noise:
+        # What is left is no noise, and white errors mean little: of equals, what all recordings ask for.
+        equals = [each for each in significant if each.delta_bic < best.delta_bic + options.same]
+        best = min(equals, key=lambda each: each.p_cluster)
+    least = best.delta_chi2 - options.same
+    others = [other for other in trials if other is not best]
+    equals = [other for other in others if other.delta_chi2 > least]
+    return Found(
+        best,
+        indistinguishable=tuple(other for other in equals if not _needless(other, best)),
+        needless=tuple(other for other in equals if _needless(other, best)),
+        lesser=tuple(other for other in others if not other.delta_chi2 > least),
+    )
+
+
+def _needless(other: TriedMechanism, best: TriedMechanism) -> bool:
+    """Whether an alternative needs more parameters than the best, and does not earn them.
+
+    One that fits better by as much as its further parameters would bring by chance twice over (Akaike) is not
+    ruled out, although the simpler is preferred (Bayes).
+    """
+    more = len(other.candidate.new) - len(best.candidate.new)
+    return more > 0 and other.delta_chi2 - best.delta_chi2 < 2 * more
+
+
+def better_without(
+    trial: TriedMechanism,
+    current: Fit,
+    model: Dynamics,
+    data: Measurements,
+    *,
+    least: float,
+    budget: Budget,
+) -> Fit | None:
+    """The simulation alone, fitted from where a mechanism led it, if that explains as much as with it.
+
+    A mechanism may seem to explain much only because its fit found parameters of the simulation that its own
+    fit had missed. Nothing is called missing before the simulation has begun there, too.
+
+    Parameters
+    ----------
+    trial
+        The mechanism.
+    current
+        The fit that it is held against.
+    model, data
+        The simulation without mechanisms, and the recordings.
+    least
+        Twice the difference of log-likelihoods, within which explanations cannot be told apart.
+    budget
+        Charged for the fit; None is the answer where it is spent.
+    """
+    fit = trial.fit
+    known = {each.name: each.value for each in fit.model.parameters}
+    begun = model.with_values(np.array([known[each.name] for each in model.parameters]))
+    d = model.dimension
+    begin = replace(fit, noise=replace(fit.noise, process=fit.noise.process[:d]))
+    try:
+        again = fit_with_process_noise_as_needed(begun, data, begin, x=fit.x[:, :d], budget=budget)
+    except (*UNFORESEEN, BudgetSpent):
+        return None
+    gained = 2 * (again.log_likelihood - current.log_likelihood)
+    return again if again.converged and gained > max(least, trial.delta_chi2 - least) else None
+
+
+def tried_together(
+    progress: Search, before: Search, data: Measurements, *, chance: float, options: SearchOptions
+) -> Search | None:
+    """A search in which a mechanism was taken on trial, if it stands the clustered test in the final fit.
+
+    Parameters
+    ----------
+    progress, before
+        The search with it, and as it was before.
+    data
+        The recordings.
+    chance
+        Probability of as much by chance, below which it stands.
+    options
+        Of the search.
+
+    Returns
+    -------
+    Search or None
+        With the probabilities of the final fit; None where nothing came on top of it, or it does not stand.
+    """
+    place = len(before.found)
+    if len(progress.found) < place + 2:
+        return None
+    on_trial = progress.found[place]
+    p_cluster = _probability_in_place(progress.fit, data, on_trial.best.candidate, options=options)
+    LOGGER.info("%s on trial: p %.1e clustered", on_trial.best.candidate.label, p_cluster)
+    if p_cluster >= chance:
+        return None
+    stands = replace(on_trial, best=replace(on_trial.best, p_cluster=p_cluster))
+    return replace(progress, found=(*progress.found[:place], stands, *progress.found[place + 1 :]))
+
+
+def _probability_in_place(
+    fit: Fit, data: Measurements, candidate: MechanismCandidate, *, options: SearchOptions
+) -> float:
+    """Probability of a mechanism by chance beside those that were found after it."""
+    names = [each.name for each in fit.model.parameters]
+    if not candidate.amplitudes or not set(candidate.new) <= set(names):
+        return clustered_probability(fit, data, candidate, blocks=options.blocks)
+    absent = tuple(
+        replace(each, value=0.0 if each.name in candidate.amplitudes else each.value, fixed=True)
+        if each.name in candidate.new
+        else each
+        for each in fit.model.parameters
+    )
+    without = fit_with_process_noise_as_needed(replace(fit.model, parameters=absent), data, fit)
+    if not without.converged:
+        return clustered_probability(fit, data, candidate, blocks=options.blocks)
+    return probability_by_chance(fit, without, data, candidate, blocks=options.blocks)
+
+
+PROMISING = 0.2  # of the best gain so far; a candidate that promises less is not fitted
+RIVALS = 0.6  # of the best gain, from which on a candidate's jumps are sharpened: that gains up to a quarter
+
+
+def fit_most_promising(
+    data: Measurements,
+    current: Fit,
+    base_model: Dynamics,
+    screened: Sequence[tuple[Probe, Screened]],
+    *,
+    most: int,
+    least_gain: float,
+    blocks: int,
+    budget: Budget | None = None,
+) -> tuple[list[TriedMechanism], list[UntriedMechanism]]:
+    """Fit the candidates that promise most, each from its best probe.
+
+    Parameters
+    ----------
+    data
+        The recordings.
+    current, base_model
+        The fit that is to be improved, and its model.
+    screened
+        Every probe with what it would gain.
+    most
+        So many candidates at most, but for rivals of the best.
+    least_gain
+        Twice the increase of the log-likelihood that a candidate must promise.
+    blocks
+        For clustered errors; see `siq.diagnosis.significance.probability_by_chance`.
+    budget
+        Charged for the work; what it does not reach is not fitted.
+
+    Returns
+    -------
+    list of TriedMechanism, list of UntriedMechanism
+        Those whose fit settled, with signs that their mechanism allows; and the others, with the reason.
+    """
+    budget = budget or Budget()
+    best = best_probes(screened)
+    ranked = sorted(best.values(), key=lambda each: -each[1].gain)
+    trials: dict[str, TriedMechanism] = {}
+    failed: dict[str, UntriedMechanism] = {}
+    begun: list[tuple[Probe, Screened]] = []
+
+    def attempt(probe: Probe, result: Screened, begin: Fit) -> None:
+        candidate = probe.candidate
+        try:
+            trial = _tried(probe, result, begin, current, base_model, data, blocks=blocks, budget=budget)
+        except BudgetSpent:
+            failed.setdefault(candidate.label, UntriedMechanism(candidate, BUDGET_SPENT))
+            return
+        except UNFORESEEN as error:
+            LOGGER.info("%s cannot be fitted: %s", candidate.label, error)
+            failed[candidate.label] = UntriedMechanism(candidate, in_words(error))
+            return
+        known = trials.get(candidate.label)
+        if known is None or trial.fit.log_likelihood > known.fit.log_likelihood:
+            trials[candidate.label] = trial
+
+    # What the recordings themselves show is fitted beside the others, and in the place of none of them.
+    most_promised = ranked[0][1].gain if ranked else 0.0
+    shown = sum(probe.recorded and result.gain >= most_promised for probe, result in ranked)
+    for place, (probe, result) in enumerate(ranked[: shown + 2 * most], start=-shown):
+        # Against what screening foresaw of those that did gain it: some promise much and gain nothing, and
+        # of others the first order shows little.
+        gained = max((min(each.delta_chi2, best[name][1].gain) for name, each in trials.items()), default=0.0)
+        if result.gain < max(least_gain, PROMISING * gained):
+            break
+        if place >= most and result.gain < gained - least_gain:
+            break  # no rival of the best, which the class of indistinguishables must have
+        begun.append((probe, result))
+        budget.says(
+            f"candidate {place + shown + 1} of at most {min(shown + 2 * most, len(ranked))}:"
+            f" {probe.candidate.label}"
+        )
+        attempt(probe, result, current)
+    for probe, result in begun:
+        better = _better_start(probe.candidate, trials)
+        if better is not None:
+            budget.says(f"once more: {probe.candidate.label}")
+            attempt(_with_shapes_on_top(probe, better, base_model, data, budget), result, better.fit)
+    sharp = _with_jumps_followed(list(trials.values()), current, data, blocks=blocks, budget=budget)
+    return sharp, [each for label, each in failed.items() if label not in trials]
+
+
+def best_probes(
+    screened: Sequence[tuple[Probe, Screened]],
+) -> dict[str, tuple[Probe, Screened]]:
+    """Of each candidate the probe that promises most, by label; none that promises nothing."""
+    best: dict[str, tuple[Probe, Screened]] = {}
+    for probe, result in screened:
+        label = probe.candidate.label
+        if result.gain > 0 and (label not in best or result.gain > best[label][1].gain):
+            best[label] = (probe, result)
+    return best
+
+
+def _with_jumps_followed(
+    trials: Sequence[TriedMechanism], current: Fit, data: Measurements, *, blocks: int, budget: Budget
+) -> list[TriedMechanism]:
+    """The same trials, those sharper whose f jumps and which rival the best."""
+    most_gained = max((each.delta_chi2 for each in trials), default=0.0)
+    result = []
+    for trial in trials:
+        better, label = trial, trial.candidate.label
+        if trial.fit.model.edges and trial.delta_chi2 >= RIVALS * most_gained:
+            try:
+                budget.says(f"following the jumps of {label}")
+                sharp = sharpened(trial.fit, data, budget=budget)
+                better = judged(sharp, current, data, trial.candidate, blocks=blocks)
+            except (*UNFORESEEN, BudgetSpent) as error:
+                LOGGER.info("%s stays as sharp as it is: %s", label, error)
+        result.append(better)
+    return result
+
+
+def _tried(
+    probe: Probe,
+    result: Screened,
+    begin: Fit,
+    current: Fit,
+    base_model: Dynamics,
+    data: Measurements,
+    *,
+    blocks: int,
+    budget: Budget,
+) -> TriedMechanism:
+    """A probe's candidate, fitted from a fit and judged.
+
+    Raises
+    ------
+    NumericalFailure
+        When the fit has no result, does not settle, or has a sign that the mechanism does not allow.
+    BudgetSpent
+        When nothing is left of what is allowed.
+    """
+    candidate = probe.candidate
+    x = with_further_states(
+        probe, base_model, data, begin.x[:, : base_model.dimension],
+        substeps=current.substeps, values=current.model.values,
+    )  # fmt: skip
+    start = with_start(probe, result, begin.model)
+    trial = fit_with_process_noise_as_needed(start, data, begin, level=result.level, x=x, budget=budget)
+    if not trial.converged:
+        raise NumericalFailure(trial.fault or "its fit does not settle")
+    # With no effect it would be what it is compared with, but for random forces that are not believed.
+    if 2 * (current.log_likelihood - trial.log_likelihood) > least_to_believe(current.noise):
+        raise NumericalFailure("its fit leads away, to less than without it")
+    if not admissible(trial, candidate):
+        raise NumericalFailure("its best parameters have a sign that the mechanism cannot have")
+    return judged(trial, current, data, candidate, blocks=blocks)
+
+
+def _better_start(
+    candidate: MechanismCandidate, trials: Mapping[str, TriedMechanism]
+) -> TriedMechanism | None:
+    """Where a candidate is begun once more: one that led nowhere, or to less than a special case of it."""
+    own = trials.get(candidate.label)
+    if own is None:
+        rivals = list(trials.values())
+    else:
+        rivals = [
+            each
+            for each in trials.values()
+            if _special_case(each.candidate, candidate) and each.delta_chi2 > own.delta_chi2
+        ]
+    return max(rivals, key=lambda each: each.delta_chi2) if rivals else None
+
+
+def _special_case(one: MechanismCandidate, of: MechanismCandidate) -> bool:
+    return one.name in of.generalises and one.equations == of.equations
+
+
+def _with_shapes_on_top(
+    probe: Probe, better: TriedMechanism, base_model: Dynamics, data: Measurements, budget: Budget
+) -> Probe:
+    """A candidate's probe with the shapes that promise most on top of a special case of it.
+
+    Beside the simulation alone they may all promise the same: the special case. Where the fit is that of
+    another mechanism, and where nothing can be screened, the shapes stay as they are.
+    """
+    candidate = probe.candidate
+    if not (candidate.shapes and _special_case(better.candidate, candidate)):
+        return probe
+    on_top = replace(rebased(candidate, base_model, better.fit.model), positive=frozenset())
+    screened, _ = screen_all(better.fit.model, data, better.fit, [on_top], budget=budget)
+    if not screened:
+        return probe
+    best, _ = max(screened, key=lambda each: each[1].gain)
+    values = [value for _, value in best.shapes]
+    return replace(probe, shapes=tuple(zip(candidate.shapes, values, strict=True)))
+
+
+def with_start(probe: Probe, result: Screened, base: Dynamics) -> Dynamics:
+    """The candidate's model with parameters to begin with: those of the base, and no effect yet.
+
+    What screening found of the amplitudes is a start only where shapes need one: linearised amplitudes can be
+    far off, and a fit that begins there may diverge.
+    """
+    candidate = probe.candidate
+    known = {parameter.name: parameter.value for parameter in base.parameters}
+    known |= dict.fromkeys(candidate.amplitudes, 0.0) | dict(probe.shapes)
+    if candidate.amplitudes and candidate.shapes:
+        known |= dict(zip(candidate.amplitudes, map(float, result.amplitudes), strict=True))
+    return candidate.model.with_values(np.array([known[each.name] for each in candidate.model.parameters]))
+
+
+FOR_FUNCTIONS = 0.4  # of the budget, for functions without a name: a choice
+
+
+def search(
+    model: Dynamics,
+    data: Measurements,
+    recalibrated: Fit,
+    candidates: Sequence[MechanismCandidate],
+    *,
+    options: SearchOptions,
+    budget: Budget | None = None,
+) -> Search:
+    """Look for mechanisms, one after the other, until nothing is found or its part of the budget is spent."""
+    begin, budget = Search(recalibrated, (), recalibrated, ()), budget or Budget()
+    with budget.keeping(FOR_FUNCTIONS):
+        return _extended(begin, model, data, candidates, options=options, budget=budget, on_trial=True)
+
+
+def _extended(
+    progress: Search,
+    model: Dynamics,
+    data: Measurements,
+    candidates: Sequence[MechanismCandidate],
+    *,
+    options: SearchOptions,
+    budget: Budget,
+    on_trial: bool,
+) -> Search:
+    """A search carried on until nothing more is found.
+
+    Where recordings are few, what is still missing may make all errors so large that the best candidate does
+    not stand the clustered test alone. It is then taken on trial, once: another is looked for on top of it,
+    and both count as found if both stand the test together. Where a mechanism leads to better parameters of
+    the simulation itself, the search begins anew from there, once.
+    """
+    begun_anew = False
+    while True:
+        found, current = progress.found, progress.fit
+        base = current.model
+        if found and (len(found) == options.mechanisms or not something_left(current, data)):
+            return progress
+        if base.dimension > model.dimension:
+            return progress  # nothing is sought on top of a mechanism that has states of its own
+        if found and budget.stopped_by is not None:
+            return progress
+        labels = [each.best.candidate.label for each in found]
+        remaining = [
+            rebased(each, model, base) if found else each
+            for each in candidates
+            if not any(once_more(each, other.best.candidate) for other in found)
+        ]
+        screened, unscreened = screen_all(
+            base, data, current, remaining, fruitless=progress.fruitless, budget=budget
+        )
+        trials, failed = fit_most_promising(
+            data, current, base, screened,
+            most=options.fitted, least_gain=options.same, blocks=options.blocks,
+            budget=budget,
+        )  # fmt: skip
+        untried = _together(progress.untried, (*unscreened, *failed), trials)
+        fruitless = {each.candidate.label for each in trials if each.delta_chi2 < options.same}
+        progress = replace(
+            progress, screened=tuple(screened), untried=untried, screened_beside=tuple(labels),
+            fruitless=progress.fruitless | fruitless,
+        )  # fmt: skip
+        for trial in trials:
+            LOGGER.info(
+                "%s: chi2 better by %.1f, BIC %.1f, p %.1e white, %.1e clustered",
+                trial.candidate.label, trial.delta_chi2, trial.delta_bic, trial.p_white, trial.p_cluster,
+            )  # fmt: skip
+        chance = 5 * options.false_alarms / max(len(remaining), 1)
+        stands = accepted(trials, len(screened), chance, options=options)
+        best = accepted(trials, len(screened), 1.0, options=options)
+        if not (found or begun_anew) and best is not None:
+            begun_anew = True
+            better = better_without(best.best, current, model, data, least=options.same, budget=budget)
+            if better is not None:
+                LOGGER.info("%s led to better parameters, without it", best.best.candidate.label)
+                progress = replace(progress, recalibrated=better, fit=better, fruitless=frozenset())
+                continue
+        if (
+            on_trial
+            and len(found) + 1 < options.mechanisms
+            and best is not None
+            and (stands is None or best.best.delta_bic < stands.best.delta_bic - options.same)
+        ):
+            LOGGER.info("%s is on trial", best.best.candidate.label)
+            further = _extended(
+                _with(progress, best), model, data, candidates,
+                options=options, budget=budget, on_trial=False,
+            )  # fmt: skip
+            together = tried_together(further, progress, data, chance=chance, options=options)
+            if together is not None:
+                return together
+            on_trial = False
+        if stands is None:
+            return progress
+        LOGGER.info("found %s, chi2 better by %.1f", stands.best.candidate.label, stands.best.delta_chi2)
+        progress = _with(progress, stands)
+
+
+def _together(
+    before: Sequence[UntriedMechanism], now: Sequence[UntriedMechanism], trials: Sequence[TriedMechanism]
+) -> tuple[UntriedMechanism, ...]:
+    """All that could never be judged, each once, with the last reason."""
+    reasons = {each.candidate.label: each for each in (*before, *now)}
+    for trial in trials:
+        reasons.pop(trial.candidate.label, None)
+    return tuple(reasons.values())
+
+
+def _with(progress: Search, found: Found) -> Search:
+    return replace(progress, found=(*progress.found, found), fit=found.best.fit)

@@ -1,0 +1,247 @@
+"""Studies of mismatch: which simulation, which recordings, which of them are held out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from siq.data.recordings import Recordings, read_recordings
+from siq.diagnosis.dictionary import Mechanism
+from siq.diagnosis.options import SearchOptions
+from siq.errors import InputError
+from siq.inference.budget import DEFAULT_SECONDS, DEFAULT_WORK
+from siq.inference.measurements import Measurements, columns_of, measurements
+from siq.numerics.files import read_document, validate
+from siq.systems.dynamics import Dynamics
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+FEWEST = 8  # samples of a recording that something can be learned from
+
+
+class Allowance(BaseModel):
+    """How much work a case may take.
+
+    Attributes
+    ----------
+    evaluations
+        Of the likelihood for one sample, one state and one column of derivatives
+        (`siq.inference.budget`). The default takes about five minutes of a core.
+    seconds
+        By the clock, a safety net for machines on which that takes far longer.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    evaluations: Annotated[float, Field(gt=0)] = DEFAULT_WORK
+    seconds: Annotated[float, Field(gt=0)] = DEFAULT_SECONDS
+
+
+class MismatchStudy(BaseModel):
+    """The schema of ``config/mismatch/NAME.yaml``, and of ``study.yaml`` in the folder of a case.
+
+    Attributes
+    ----------
+    title
+        What the report is headed.
+    system
+        The simulation: name of a system card, or path of one. In the folder of a case it is ``system.yaml``.
+    recordings
+        Path of the long table. In the folder of a case it is ``recordings.parquet`` or ``.csv``.
+    held_out
+        Recordings that take no part in finding anything: their labels, or their share. Where there is only
+        one recording, the share is its last part.
+    tests
+        Labels of held-out recordings by which somebody else scores: they are shown, and choose nothing. Where
+        all that is held out are tests, a model of what has no name has to foresee the parts of the recordings
+        to learn from, each left out of its fit in turn.
+    noise
+        Standard deviation of the measurement noise by output, where it is known; by default it is estimated.
+    mechanisms
+        Further entries of the dictionary; one of a known name replaces it.
+    without
+        Names of entries that are not to be used.
+    generic
+        Whether a monomial without a name counts as physics; by default only in systems whose states have no
+        roles for which mechanisms have names.
+    degree
+        Highest degree of these monomials.
+    search
+        What counts as found.
+    budget
+        How much work the search may take before the best answer so far is given.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    title: str = ""
+    system: str | None = None
+    recordings: str | None = None
+    held_out: tuple[str, ...] | Annotated[float, Field(gt=0, lt=1)] = 0.25
+    tests: tuple[str, ...] = ()
+    noise: dict[str, Annotated[float, Field(gt=0)]] = {}
+    mechanisms: tuple[Mechanism, ...] = ()
+    without: tuple[str, ...] = ()
+    generic: bool | None = None
+    degree: Annotated[int, Field(ge=1, le=5)] = 3
+    search: SearchOptions = SearchOptions()
+    budget: Allowance = Allowance()
+
+
+def load_mismatch_study(path: str | Path) -> MismatchStudy:
+    """Read a study of mismatch.
+
+    Raises
+    ------
+    InputError
+        With the line of the first entry that cannot be used.
+    """
+    return validate(read_document(path), MismatchStudy)
+
+
+def measurements_of(recordings: Recordings | pd.DataFrame | str | Path, system: Dynamics) -> Measurements:
+    """The recordings that a simulation is to be compared with, laid out for fitting.
+
+    Parameters
+    ----------
+    recordings
+        Read and checked, as a table, or the path of one; with a column for each output and input. Other
+        columns are ignored.
+    system
+        The simulation; what a recording says of units must be what it says.
+
+    Raises
+    ------
+    InputError
+        For anything that cannot be used, a recording that is too short included.
+    """
+    file = str(recordings) if isinstance(recordings, str | Path) else "the recordings"
+    columns, units = columns_of(system), _units_of_columns(system)
+    if isinstance(recordings, Recordings):
+        chosen = _chosen(recordings, columns, units, file=file)
+    elif isinstance(recordings, str | Path):
+        chosen = read_recordings(recordings, columns=columns, units=units, gaps=False)
+    else:
+        chosen = Recordings.from_frame(recordings, columns=columns, units=units)
+    try:
+        data = measurements(chosen, system)
+    except ValueError as error:
+        fault, remedy = str(error).split("; ", 1)
+        raise InputError(file, "", fault, remedy) from None
+    lengths = np.diff(data.first)
+    if (lengths < FEWEST).any():
+        label = data.labels[int((lengths < FEWEST).argmax())]
+        raise InputError(
+            file,
+            f"recording {label}",
+            f"it has fewer than {FEWEST} samples",
+            "leave it out, or join recordings",
+        )
+    return data
+
+
+def _units_of_columns(system: Dynamics) -> dict[str, str]:
+    """The unit of each column, as far as it follows from those of the states and inputs."""
+    states = dict(zip(system.states, system.units, strict=True))
+    known = {name: states[str(formula)] for name, formula in system.outputs if str(formula) in states}
+    known |= {entry.name: entry.unit for entry in system.inputs}
+    return known | {"t": system.time_unit}
+
+
+def _chosen(
+    recordings: Recordings, columns: Sequence[str], units: Mapping[str, str], *, file: str
+) -> Recordings:
+    """The columns that are wanted, in their order."""
+    for name in columns:
+        if name not in recordings.names:
+            remedy = f"the simulation measures or is driven by it; there are {', '.join(recordings.names)}"
+            raise InputError(file, "", f"the column '{name}' is missing", remedy)
+    places = [recordings.names.index(name) for name in columns]
+    said = {"t": recordings.time_unit} | {
+        name: recordings.units[p] for name, p in zip(columns, places, strict=True)
+    }
+    for name, unit in said.items():
+        if unit is not None and name in units and unit != units[name]:
+            fault = f"its unit is {unit}, and in the simulation it is {units[name]}"
+            raise InputError(file, f"column {name}", fault, "convert one of the two")
+    return replace(
+        recordings,
+        names=tuple(columns),
+        units=tuple(recordings.units[place] for place in places),
+        values=np.ascontiguousarray(recordings.values[:, places]),
+    )
+
+
+def with_known_noise(data: Measurements, model: Dynamics, study: MismatchStudy, *, file: str) -> Measurements:
+    """The measurements with the noise of the sensors that the study knows.
+
+    Raises
+    ------
+    InputError
+        For a noise of something that is not measured.
+    """
+    for name in study.noise:
+        if name not in model.output_names:
+            raise InputError(
+                file, "noise", f"'{name}' is no output", f"use one of {', '.join(model.output_names)}"
+            )
+    if not study.noise:
+        return data
+    known = [study.noise.get(name, np.nan) ** 2 for name in model.output_names]
+    return replace(data, sensor_noise=np.array(known))
+
+
+def split(data: Measurements, study: MismatchStudy, *, file: str) -> tuple[Measurements, Measurements]:
+    """Recordings to learn from, and those held out.
+
+    Raises
+    ------
+    InputError
+        When a label is unknown, or nothing is left on one side.
+    """
+    count = len(data.labels)
+    out_by_name = () if isinstance(study.held_out, float) else study.held_out
+    for label in study.tests:
+        if label not in out_by_name:
+            raise InputError(
+                file, "tests", f"the recording '{label}' is not held out", "list it in held_out, too"
+            )
+    if isinstance(study.held_out, float):
+        if count == 1:
+            return _cut(data, study.held_out)
+        # Spread over all of them, so that a drift of the experiment is in both parts.
+        out = min(max(round(study.held_out * count), 1), count - 1)
+        chosen = set(np.linspace(0, count - 1, 2 * out + 1).round().astype(int)[1::2].tolist())
+    else:
+        for label in study.held_out:
+            if label not in data.labels:
+                raise InputError(
+                    file,
+                    "held_out",
+                    f"no recording is called '{label}'",
+                    f"use labels such as {data.labels[0]}",
+                )
+        chosen = {data.labels.index(label) for label in study.held_out}
+        if not chosen or len(chosen) == count:
+            raise InputError(file, "held_out", "one side of the split is empty", "hold out some, not all")
+    return (
+        data.select([place for place in range(count) if place not in chosen]),
+        data.select(sorted(chosen)),
+    )
+
+
+def _cut(data: Measurements, share: float) -> tuple[Measurements, Measurements]:
+    """The first part of a single recording, and its last."""
+    rows = len(data.t)
+    at = min(max(round((1 - share) * rows), FEWEST), rows - FEWEST)
+    if at < FEWEST:
+        at = rows // 2
+    first = data.until(np.array([at]))
+    last = replace(data, first=np.array([0, rows - at]), t=data.t[at:], outputs=data.outputs[at:])
+    return first, last

@@ -1,0 +1,1 @@
+"""Inference: vector fields, diffusion and parameters from recordings."""

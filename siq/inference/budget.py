@@ -1,0 +1,173 @@
+"""How much work may a case take, and what was spent of it?
+
+Work is counted, not timed, so that the same case gives the same answer on every machine. The unit is what the
+likelihood takes for one sample, one state and one column of its derivatives; evaluations of f between samples
+count once for each substep. On one core of today it takes about 20 ns from 5,000 samples on, and less of
+fewer. The clock is a safety net only: a machine may be slower than anybody thinks.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Literal
+
+from siq.inference.measurements import Measurements
+from siq.systems.dynamics import Dynamics
+
+DEFAULT_WORK = 1.5e10  # about five minutes of a core
+DEFAULT_SECONDS = 1800.0  # by the clock; a core that is shared by several still ends by its work
+OVERHEAD = 100  # samples whose work numpy's own for each evaluation is like
+COMPILATION = 5e6  # what it takes to derive and compile the formulas of a model, in the same unit
+
+
+class BudgetSpent(Exception):
+    """What was allowed is spent; what was found so far is the answer, and is said to be partial."""
+
+
+@dataclass(frozen=True)
+class Account:
+    """What a case took.
+
+    Attributes
+    ----------
+    allowed, spent
+        Work, in the unit of this module.
+    seconds
+        By the clock.
+    stopped_by
+        What ran out before all was done; None where nothing was left undone.
+    """
+
+    allowed: float
+    spent: float
+    seconds: float
+    stopped_by: Literal["work", "clock"] | None = None
+
+    @property
+    def partial(self) -> bool:
+        """Whether something was left undone."""
+        return self.stopped_by is not None
+
+
+UNLIMITED = Account(float("inf"), 0.0, 0.0)
+"""Of work that nobody counted."""
+
+
+@dataclass
+class Budget:
+    """Work that is allowed, and work that was done.
+
+    Attributes
+    ----------
+    work
+        Allowed, in the unit of this module; infinite by default.
+    seconds
+        Allowed by the clock.
+    tell
+        Called with what is being done, in words, whenever something new begins.
+    clock
+        Seconds of any clock that does not go back.
+    spent
+        Work done so far.
+    stopped_by
+        What ran out before all was done; None as long as nothing had to be left.
+    """
+
+    work: float = float("inf")
+    seconds: float = float("inf")
+    tell: Callable[[str], None] | None = None
+    clock: Callable[[], float] = time.monotonic
+    spent: float = 0.0
+    stopped_by: Literal["work", "clock"] | None = None
+    _begun: float = field(default=0.0, init=False)
+    _exempt: int = field(default=0, init=False)
+    _kept: float = field(default=0.0, init=False)
+    _limit: float = field(default=float("inf"), init=False)
+
+    def __post_init__(self) -> None:
+        self._begun = self.clock()
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since it was made."""
+        return self.clock() - self._begun
+
+    @property
+    def share(self) -> float:
+        """Of the work allowed, that is spent."""
+        return self.spent / self.work
+
+    @property
+    def exhausted_by(self) -> Literal["work", "clock"] | None:
+        """What ran out, if something did."""
+        if self.spent >= min(self.work * (1 - self._kept), self._limit):
+            return "work"
+        return "clock" if self.elapsed >= self.seconds else None
+
+    def charge(self, work: float) -> None:
+        """Count work that is about to be done.
+
+        Raises
+        ------
+        BudgetSpent
+            When nothing is left of what is allowed, unless what is done is exempt.
+        """
+        if not self._exempt and (gone := self.exhausted_by) is not None:
+            self.stopped_by = gone
+            raise BudgetSpent("the budget of this case is spent")
+        self.spent += work
+
+    @contextmanager
+    def exempt(self) -> Iterator[None]:
+        """Work that is counted, and done in any case: without it there is no answer at all."""
+        self._exempt += 1
+        try:
+            yield
+        finally:
+            self._exempt -= 1
+
+    @contextmanager
+    def keeping(self, share: float) -> Iterator[None]:
+        """Work that leaves a share of what is allowed to what comes after it."""
+        before, self._kept = self._kept, share
+        try:
+            yield
+        finally:
+            self._kept = before
+
+    @contextmanager
+    def part(self, share: float) -> Iterator[None]:
+        """Work that may take a share of what is left, and no more: one fit does not take all of it."""
+        before = self._limit
+        left = min(self.work * (1 - self._kept), before) - self.spent
+        self._limit = self.spent + share * max(left, 0.0)
+        try:
+            yield
+        finally:
+            self._limit = before
+
+    def account(self) -> Account:
+        """What was spent until now, as a verdict records it."""
+        return Account(self.work, self.spent, self.elapsed, self.stopped_by)
+
+    def says(self, what: str) -> None:
+        """Tell what is being done, and how much was spent."""
+        if self.tell is not None:
+            self.tell(f"{what}; {self.share:.0%} of the budget spent" if self.work < float("inf") else what)
+
+
+def evaluation(model: Dynamics, data: Measurements, *, columns: int = 0) -> float:
+    """The work of one evaluation of the likelihood: samples, times states, times columns of derivatives.
+
+    Parameters
+    ----------
+    model, data
+        Which model, and for which recordings.
+    columns
+        Further columns beside those of states and free parameters, such as those of candidates.
+    """
+    width = 1 + model.dimension + len(model.free) + columns
+    return (len(data.t) + OVERHEAD) * model.dimension * width

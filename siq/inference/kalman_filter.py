@@ -1,0 +1,603 @@
+"""The extended Kalman filter: linearisation between samples, and innovations.
+
+Where a state is known to within a covariance P, the mean of f is not f of the mean: to second order it is
+``f + ½ Σ P_jk ∂²f/∂x_j∂x_k``. A filter that leaves this out attributes it to the coefficients of f.
+
+Multiple shooting with a node at every sample: each interval is integrated from the state in hand, all of them
+side by side, and the *gap* to the next state in hand is what the estimation closes
+(`siq.inference.maximum_likelihood`). No long trajectory is integrated, so that a bad start cannot run away,
+nor be trapped on the wrong side of a basin's boundary.
+
+Along the trajectories of a fit everything is linear. The innovations, and what a unit of each parameter
+explains of them, the unknown initial states projected out, are all that estimation, screening and tests need.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+import sympy
+
+from siq.errors import NumericalFailure
+from siq.inference.filter_kernels import carry_linearly, whitened_innovations
+from siq.inference.measurements import Measurements
+from siq.numerics.least_squares import triangle_of
+from siq.systems.dynamics import Dynamics, Input, Signals, symbol
+
+
+class ClosedFunctions:
+    """F with the effect of a spread, its derivatives, and the outputs.
+
+    The methods are those of `siq.systems.dynamics.ParametricFunctions`, for f between samples.
+
+    Parameters
+    ----------
+    model
+        The dynamics without the closure.
+    """
+
+    def __init__(self, model: Dynamics) -> None:
+        d = model.dimension
+        self._pairs = [(j, k) for j in range(d) for k in range(j + 1)]
+        names = [f"_spread_{j}_{k}" for j, k in self._pairs]
+        equations = []
+        for formula in model.equations:
+            bent = sympy.S.Zero
+            for (j, k), name in zip(self._pairs, names, strict=True):
+                second = formula.diff(model.symbols[j], model.symbols[k])
+                bent += second * symbol(name) * (sympy.Rational(1, 2) if j == k else 1)
+            equations.append(formula + bent)
+        further = tuple(Input(name, "1", "zero_order") for name in names)
+        self._closed = replace(
+            model, equations=tuple(equations), inputs=(*model.inputs, *further), covariance=None
+        )
+
+    def at(self, spread: np.ndarray) -> FunctionsAtSpread:
+        """The functions for one covariance at each interval, shape ``(n, d, d)``."""
+        return FunctionsAtSpread(self._closed, np.stack([spread[:, j, k] for j, k in self._pairs]))
+
+
+class FunctionsAtSpread:
+    """`ClosedFunctions` with the covariances inserted."""
+
+    def __init__(self, closed: Dynamics, spread: np.ndarray) -> None:
+        self._closed, self._spread = closed, spread
+
+    def rates(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> np.ndarray:
+        """Mean of f at mean states ``(d, n)``: shape ``(d, n)``."""
+        return self._closed.functions.rates(x, self._with_spread(signals), values)
+
+    def slopes(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Its derivatives by states and by free parameters: ``(d, d, n)`` and ``(d, p, n)``."""
+        return self._closed.functions.slopes(x, self._with_spread(signals), values)
+
+    def at_intervals(self, chosen: np.ndarray) -> FunctionsAtSpread:
+        """Those of some of the intervals, by their places."""
+        return FunctionsAtSpread(self._closed, self._spread[:, chosen])
+
+    def _with_spread(self, signals: Signals) -> Signals:
+        return replace(signals, inputs=np.concatenate([signals.inputs, self._spread]))
+
+
+class Columns(Protocol):
+    """Right-hand sides of candidates, whose response is wanted beside that of the parameters."""
+
+    def rates(self, x: np.ndarray, values: np.ndarray, node: int) -> np.ndarray:
+        """In the equations, at states ``(d, k)`` of a node: shape ``(d, q, k)``."""
+
+    def outputs(self, x: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """In the outputs, at states ``(d, n)`` of all samples: shape ``(m, q, n)``."""
+
+
+class Rates(Protocol):
+    """F and its derivatives, as `siq.systems.dynamics.ParametricFunctions` has them."""
+
+    def rates(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> np.ndarray:
+        """F at states ``(d, n)``: shape ``(d, n)``."""
+
+    def slopes(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """By states and by free parameters: ``(d, d, n)`` and ``(d, p, n)``."""
+
+
+class Drift(Rates, Protocol):
+    """The same where it differs from interval to interval."""
+
+    def at_intervals(self, chosen: np.ndarray) -> Rates:
+        """That of some of the intervals, by their places."""
+
+
+INTERVALS = 1 << 14  # numerical: carried together, since their derivatives at three places are much to keep
+MOST_SUBSTEPS = 16
+INSIDE = 1e-9  # share of a substep by which its ends lie inside, where an input jumps between samples
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The instants at which intervals between samples are worked on.
+
+    Attributes
+    ----------
+    data
+        The measurements.
+    substeps
+        Runge–Kutta steps in every interval.
+    whole, chosen
+        For a part of a grid: the grid, and the places of the intervals; the signals are taken from there.
+    """
+
+    data: Measurements
+    substeps: int
+    whole: Grid | None = None
+    chosen: np.ndarray | None = None
+
+    @cached_property
+    def rows(self) -> np.ndarray:
+        """Rows at which the intervals begin."""
+        return self.data.begins if self.whole is None else self.whole.rows[self.chosen]
+
+    @cached_property
+    def step(self) -> np.ndarray:
+        """Length of a substep of each interval."""
+        if self.whole is not None:
+            return self.whole.step[self.chosen]
+        return (self.data.t[self.rows + 1] - self.data.t[self.rows]) / self.substeps
+
+    def signals(self, node: int, delays: tuple[tuple[int, float], ...]) -> Signals:
+        """Inputs at a node, all intervals: nodes 0, 1, 2 are begin, middle and end of the first substep."""
+        if self.whole is not None:
+            known = self.whole.signals(node, delays)
+            at = self.chosen
+            return Signals(known.inputs[:, at], known.delayed[:, at], known.slopes[:, at], known.t[at])
+        if (node, delays) not in self._known:
+            part, place = divmod(node, 3)
+            fraction = part + (INSIDE, 0.5, 1.0 - INSIDE)[place]
+            t = self.data.t[self.rows] + fraction * self.step
+            recording = self.data.recording[self.rows]
+            self._known[node, delays] = self.data.signals(t, recording, delays=delays, width=self.step)
+        return self._known[node, delays]
+
+    def at_samples(self, delays: tuple[tuple[int, float], ...]) -> Signals:
+        """Inputs at the samples themselves."""
+        return self.data.signals(self.data.t, self.data.recording, delays=delays)
+
+    def at_intervals(self, chosen: np.ndarray) -> Grid:
+        """Some of the intervals only, by their places."""
+        return Grid(self.data, self.substeps, whole=self, chosen=chosen)
+
+    @cached_property
+    def _known(self) -> dict[tuple[int, tuple[tuple[int, float], ...]], Signals]:
+        return {}
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """See `siq.inference.filter_kernels.whitened_innovations` for the attributes.
+
+    Where the simulated output is no number, the residual is infinite; NaN says that nothing was measured.
+    """
+
+    transition: np.ndarray
+    response: np.ndarray
+    gap: np.ndarray
+    measured: np.ndarray
+    measured_response: np.ndarray
+    residual: np.ndarray
+
+    @property
+    def finite(self) -> bool:
+        """Whether every number is one."""
+        return bool(
+            np.isfinite(self.gap).all()
+            and np.isfinite(self.transition).all()
+            and np.isfinite(self.response).all()
+            and np.isfinite(self.measured).all()
+            and not np.isinf(self.residual).any()
+        )
+
+
+def integrate_intervals(model: Dynamics, grid: Grid, values: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """The states at the ends of all intervals: from states ``(d, k)`` at their begins to ``(d, k)``."""
+    delays = model.lags(values)
+    step = grid.step
+    for part in range(grid.substeps):
+        with np.errstate(all="ignore"):  # what runs away is seen by its end
+            x = _runge_kutta(model.functions, grid, values, x, part, step, delays)[0]
+    return x
+
+
+def linearise(
+    model: Dynamics,
+    grid: Grid,
+    values: np.ndarray,
+    x: np.ndarray,
+    *,
+    columns: Columns | None = None,
+    drift: Drift | None = None,
+) -> Linearisation:
+    """Integrate every interval from the state in hand, with the derivatives.
+
+    Parameters
+    ----------
+    model
+        Its free parameters are the first columns of the response.
+    grid
+        Measurements and substeps.
+    values
+        All parameters, shape ``(p,)``.
+    x
+        The states in hand, shape ``(n, d)``.
+    columns
+        Further right-hand sides whose response is wanted behind those of the parameters.
+    drift
+        F where it is another than the model's, such as the mean of f over a spread of states.
+    """
+    data, compiled, delays = grid.data, model.functions, model.lags(values)
+    dimension, rows, count = x.shape[1], grid.rows, len(grid.rows)
+    transition = np.zeros((len(x), dimension, dimension))
+    response = np.zeros((len(x), dimension, 0))
+    gap = np.zeros((len(x), dimension))
+    # Candidates have their own grid, and come as they are.
+    together = count if columns is not None else INTERVALS
+    for begin in range(0, count, together):
+        chosen = np.arange(begin, min(begin + together, count))
+        whole = len(chosen) == count
+        part = grid if whole else grid.at_intervals(chosen)
+        along: Rates = compiled
+        if drift is not None:
+            along = drift if whole else drift.at_intervals(chosen)
+        ends, by_state, by_parameter = _carried(
+            model, part, values, np.array(x[part.rows].T), along, columns=columns
+        )
+        if not begin:
+            response = np.zeros((len(x), *by_parameter.shape[1:]))
+        at = rows[chosen]
+        transition[at], response[at] = by_state, by_parameter
+        with np.errstate(invalid="ignore"):
+            gap[at] = ends.T - x[at + 1]
+    samples = np.ascontiguousarray(x.T)
+    signals = grid.at_samples(delays)
+    by_state, by_parameter = compiled.output_slopes(samples, signals, values)
+    if columns is not None:
+        by_parameter = np.concatenate([by_parameter, columns.outputs(samples, values)], axis=1)
+    simulated = compiled.outputs(samples, signals, values).T
+    return Linearisation(
+        transition=transition,
+        response=response,
+        gap=gap,
+        measured=np.ascontiguousarray(np.moveaxis(by_state, 2, 0)),
+        measured_response=np.ascontiguousarray(np.moveaxis(by_parameter, 2, 0)),
+        residual=data.outputs - np.where(np.isfinite(simulated), simulated, np.inf),
+    )
+
+
+def _carried(
+    model: Dynamics,
+    grid: Grid,
+    values: np.ndarray,
+    state: np.ndarray,
+    drift: Rates,
+    *,
+    columns: Columns | None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """States ``(d, k)`` at the ends of intervals, with their derivatives ``(k, d, d)`` and ``(k, d, p)``."""
+    delays, step = model.lags(values), grid.step
+    dimension, count = state.shape
+    transition = np.broadcast_to(np.eye(dimension), (count, dimension, dimension)).copy()
+    for place in grid.data.restarting:
+        state[place] = 0.0
+        transition[:, place, place] = 0.0
+    response: np.ndarray | None = None
+
+    def slopes(at: np.ndarray, node: int) -> tuple[np.ndarray, np.ndarray]:
+        signals = grid.signals(node, delays)
+        by_state, by_parameter = drift.slopes(at, signals, values)
+        if columns is not None:
+            by_parameter = np.concatenate([by_parameter, columns.rates(at, values, node)], axis=1)
+        return np.moveaxis(by_state, 2, 0), np.moveaxis(by_parameter, 2, 0)
+
+    for part in range(grid.substeps):
+        with np.errstate(all="ignore"):  # what runs away is seen by `Linearisation.finite`
+            after, begin_rate, end_rate = _runge_kutta(drift, grid, values, state, part, step, delays)
+            middle = (state + after) / 2 + step / 8 * (begin_rate - end_rate)
+        at = [slopes(place, 3 * part + node) for node, place in enumerate((state, middle, after))]
+        if response is None:
+            response = np.zeros((count, dimension, at[0][1].shape[2]))
+        carry_linearly(
+            step, np.stack([each[0] for each in at]), np.stack([each[1] for each in at]), transition, response
+        )
+        state = after
+    assert response is not None
+    return state, transition, response
+
+
+def substeps_needed(
+    model: Dynamics, data: Measurements, values: np.ndarray, x: np.ndarray, *, tolerance: float
+) -> int:
+    """Runge–Kutta steps in every interval, so that doubling them changes little.
+
+    Parameters
+    ----------
+    model, data, values
+        The model and what it is compared with.
+    x
+        States, shape ``(n, d)``.
+    tolerance
+        Root mean square change of the increments allowed, relative to the spread of the states.
+    """
+    steps = 1
+    scale = x.std(axis=0) + 1e-300
+    coarse = integrate_intervals(model, Grid(data, 1), values, x[data.begins].T)
+    while steps < MOST_SUBSTEPS:
+        fine = integrate_intervals(model, Grid(data, 2 * steps), values, x[data.begins].T)
+        with np.errstate(all="ignore"):
+            squares = (fine - coarse) ** 2
+            known = np.maximum((~np.isnan(squares)).sum(axis=1), 1)
+            change = np.sqrt(np.nansum(squares, axis=1) / known) / scale
+        if not (change > tolerance).any():
+            break
+        steps, coarse = 2 * steps, fine
+    return steps
+
+
+def _runge_kutta(
+    drift: Rates,
+    grid: Grid,
+    values: np.ndarray,
+    x: np.ndarray,
+    part: int,
+    step: np.ndarray,
+    delays: tuple[tuple[int, float], ...],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """State after a substep, and f at its begin and its end; the inputs differ from stage to stage."""
+    rates = drift.rates
+    begin, middle, end = (grid.signals(3 * part + node, delays) for node in range(3))
+    k1 = rates(x, begin, values)
+    k2 = rates(x + step / 2 * k1, middle, values)
+    k3 = rates(x + step / 2 * k2, middle, values)
+    k4 = rates(x + step * k3, end, values)
+    after = x + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    return after, k1, rates(after, end, values)
+
+
+RANK = 1e-9  # numerical: singular values below this share of the largest are rounding
+
+
+class NoiseField(Protocol):
+    """How strong random forces are at the states at which a filter is."""
+
+    def over(self, x: np.ndarray, spread: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """Their mean intensity over intervals.
+
+        Parameters
+        ----------
+        x, spread
+            Mean state in the middle of each, ``(n, d)``, and its covariance at the begin, ``(n, d, d)``.
+        step
+            Their lengths, shape ``(n,)``.
+
+        Returns
+        -------
+        numpy.ndarray
+            Shape ``(n, d, d)``, per time.
+        """
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Variances of the two kinds of noise.
+
+    Attributes
+    ----------
+    measurement
+        R, per sample, shape ``(m,)``.
+    process
+        Q, per time, shape ``(d,)``; zero where nothing drives the state.
+    shape
+        Of the random forces, where they are no independent ones of constant strength: ``(1, d, d)``, or
+        ``(n, d, d)`` for one at each sample. The intensity is then ``√Q_i shape_ij √Q_j``.
+    field
+        What the shape is at each sample, where it depends on the state; a fit keeps the shape up with it.
+    """
+
+    measurement: np.ndarray
+    process: np.ndarray
+    shape: np.ndarray | None = None
+    field: NoiseField | None = None
+
+    def along(self, x: np.ndarray, spread: np.ndarray | None, step: np.ndarray) -> Noise:
+        """The same noise with the shape that its field has at states; see `NoiseField.over`."""
+        if self.field is None:
+            return self
+        spread = np.zeros((*x.shape, x.shape[1])) if spread is None else spread
+        return replace(self, shape=self.field.over(x, spread, step))
+
+    def without_process(self) -> Noise:
+        """The same measurement noise, and states that follow their equations exactly."""
+        return replace(self, process=np.zeros_like(self.process))
+
+    def of_states(self, dimension: int) -> Noise:
+        """The same noise where there are more states, or fewer: what is added has none of its own."""
+        if len(self.process) == dimension:
+            return self
+        driven = self.process[:dimension]
+        return replace(self, process=np.append(driven, np.zeros(dimension - len(driven))))
+
+    def scaled(self, factor: float) -> Noise:
+        """The same measurement noise, with the process noise multiplied."""
+        return replace(self, process=self.process * factor)
+
+    @property
+    def intensity(self) -> np.ndarray:
+        """Intensity of the random forces, per time: shape ``(1, d, d)``, or ``(n, d, d)``."""
+        if self.shape is None:
+            return np.diag(self.process)[None]
+        return self.shape * np.sqrt(np.outer(self.process, self.process))
+
+
+def profile_likelihood(total: float, freedom: int, log_determinant: float) -> float:
+    """Log-likelihood, up to a constant, with the common scale of both kinds of noise at its best."""
+    return -0.5 * (freedom * np.log(max(total, 1e-300) / freedom) + log_determinant)
+
+
+@dataclass(frozen=True)
+class Whitened:
+    """Innovations in units of their standard deviation, initial states projected out.
+
+    Attributes
+    ----------
+    innovations
+        Shape ``(n·m,)``.
+    columns
+        What a unit of each parameter explains of them, shape ``(n·m, p)``.
+    recording
+        The recording of each, shape ``(n·m,)``.
+    known
+        Which of them were measured, shape ``(n·m,)``.
+    degrees_of_freedom
+        Measured values less initial states.
+    log_determinant
+        Of the innovations' covariance.
+    """
+
+    innovations: np.ndarray
+    columns: np.ndarray
+    recording: np.ndarray
+    known: np.ndarray
+    degrees_of_freedom: int
+    log_determinant: float
+
+    def log_likelihood(self, sum_of_squares: float) -> float:
+        """Log-likelihood where the innovations have the given sum of squares."""
+        return -0.5 * (sum_of_squares + self.log_determinant + self.known.sum() * np.log(2 * np.pi))
+
+
+def whiten(linearisation: Linearisation, data: Measurements, noise: Noise) -> Whitened:
+    """Innovations of the filter in units of their standard deviation, initial states projected out.
+
+    Raises
+    ------
+    NumericalFailure
+        When the simulation, as linearised, runs away along a recording. Columns of parameters may be infinite
+        all the same.
+    """
+    transition = linearisation.transition
+    step = np.append(np.diff(data.t), 0.0)
+    process = process_covariance(transition, step, noise.intensity)
+    innovations, columns, initial, log_determinant = whitened_innovations(
+        data.first,
+        transition,
+        linearisation.response,
+        linearisation.gap,
+        process,
+        linearisation.measured,
+        linearisation.measured_response,
+        linearisation.residual,
+        noise.measurement,
+    )
+    outputs = innovations.shape[1]
+    known = ~np.isnan(linearisation.residual).ravel()
+    innovations = innovations.ravel()
+    columns = columns.reshape(len(innovations), -1)
+    initial = initial.reshape(len(innovations), -1)
+    if not (np.isfinite(innovations).all() and np.isfinite(initial).all() and np.isfinite(log_determinant)):
+        raise NumericalFailure("small deviations from the recorded motion grow beyond all numbers")
+    used = 0
+    for begin, end in zip(data.first[:-1] * outputs, data.first[1:] * outputs, strict=True):
+        basis = _orthonormal(initial[begin:end])
+        innovations[begin:end] -= basis @ (basis.T @ innovations[begin:end])
+        columns[begin:end] -= basis @ (basis.T @ columns[begin:end])
+        used += basis.shape[1]
+    return Whitened(
+        innovations=innovations,
+        columns=columns,
+        recording=np.repeat(data.recording, outputs),
+        known=known,
+        degrees_of_freedom=int(known.sum()) - used,
+        log_determinant=log_determinant,
+    )
+
+
+def process_covariance(transition: np.ndarray, step: np.ndarray, intensity: np.ndarray) -> np.ndarray:
+    """Covariance that noise of the given intensities adds over each interval, by Simpson's rule.
+
+    Parameters
+    ----------
+    transition
+        Φ over the intervals, shape ``(n, d, d)``.
+    step
+        Their lengths, shape ``(n,)``.
+    intensity
+        Per time, shape ``(1, d, d)`` or ``(n, d, d)``.
+    """
+    total = np.zeros_like(transition)
+    dimension = transition.shape[1]
+    unit = np.eye(dimension)
+    for i in range(dimension):
+        for j in range(dimension):
+            strength = intensity[:, i, j]
+            if not strength.any():
+                continue
+            one, other = transition[:, :, i], transition[:, :, j]
+            ends = one[:, :, None] * other[:, None, :] + unit[:, i, None] * unit[None, :, j]
+            middle = (one + unit[i])[:, :, None] * (other + unit[j])[:, None, :]
+            total += strength[:, None, None] * (ends + middle)
+    return total * (step / 6)[:, None, None]
+
+
+def solve(columns: np.ndarray, target: np.ndarray, *, least: float = RANK) -> tuple[np.ndarray, np.ndarray]:
+    """Least squares with columns of any scale; what the data do not tell is left alone.
+
+    Parameters
+    ----------
+    columns, target
+        Shapes ``(n, p)`` and ``(n,)``.
+    least
+        Singular values below this share of the largest tell nothing.
+
+    Returns
+    -------
+    estimate, covariance
+        Shapes ``(p,)`` and ``(p, p)``, for errors of unit variance.
+
+    Raises
+    ------
+    NumericalFailure
+        When a column or the target is not finite.
+    """
+    if columns.shape[1] == 0:
+        return np.zeros(0), np.zeros((0, 0))
+    if not (np.isfinite(columns).all() and np.isfinite(target).all()):
+        raise NumericalFailure("the effect of a parameter on what is measured is beyond all numbers")
+    scale = np.sqrt(np.einsum("np,np->p", columns, columns))
+    scale[scale == 0] = 1.0
+    triangle = triangle_of(columns, target)
+    left, values, right = np.linalg.svd(triangle[:, :-1] / scale, full_matrices=False)
+    kept = values > least * values[0] if values[0] > 0 else np.zeros(len(values), dtype=bool)
+    inverse = right[kept].T / values[kept] / scale[:, None]
+    return inverse @ (left[:, kept].T @ triangle[:, -1]), inverse @ inverse.T
+
+
+def with_parameters_changed(linearisation: Linearisation, change: np.ndarray) -> Linearisation:
+    """The linearisation after a change of the parameters, which are then no longer free."""
+    return replace(
+        linearisation,
+        gap=linearisation.gap + linearisation.response @ change,
+        residual=linearisation.residual - linearisation.measured_response @ change,
+        response=np.zeros((*linearisation.gap.shape, 0)),
+        measured_response=np.zeros((*linearisation.residual.shape, 0)),
+    )
+
+
+def _orthonormal(columns: np.ndarray) -> np.ndarray:
+    """Orthonormal basis of what columns span."""
+    scale = np.sqrt((columns**2).sum(axis=0))
+    scale[scale == 0] = 1.0
+    basis, triangle = np.linalg.qr(columns / scale)
+    values = np.abs(np.diag(triangle))
+    if values.min(initial=1.0) <= RANK * values.max(initial=0.0):
+        basis, values, _ = np.linalg.svd(columns / scale, full_matrices=False)
+        basis = basis[:, values > RANK * max(values[0], 1e-300)]
+    return basis

@@ -1,0 +1,277 @@
+"""The candidate library: functions θ_k, their derivatives, and the constraints among coefficients.
+
+V and g are written as ``Θ(x) Ξ_v`` and ``Θ(x) Ξ_g`` over one library. The derivative of a library function
+is a combination of library functions, ``∂θ_j/∂x_i = Σ_k T_kij θ_k``, which turns ``f = -D∇V + g`` into the
+linear constraint ``C Ξ = 0`` between coefficients (paper, Eqs. form_f and constraint). Functions need not
+be monomials: whatever a study lists is taken in, together with the derivatives that it needs.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import sympy
+
+from siq.errors import NumericalFailure
+from siq.systems.diffusion import Diffusion
+from siq.systems.formulas import FormulaError, compile_formulas, parse_formula
+
+FAR = 10.0  # half ranges from the origin within which powers are alike for other reasons
+
+
+@dataclass(frozen=True)
+class CandidateLibrary:
+    """Functions in which f, V and g are sought.
+
+    Attributes
+    ----------
+    states
+        Names of the d states.
+    symbols
+        The states as sympy symbols.
+    terms
+        The q functions θ_k.
+    in_potential, in_circulatory
+        Shape ``(q,)``: which functions V, and g, may use. f may use all of them.
+    derivatives
+        T, shape ``(q, d, q)``: ``derivatives[k, i, j]`` is the coefficient of θ_k in ∂θ_j/∂x_i. Columns
+        of functions that V may not use are zero.
+    """
+
+    states: tuple[str, ...]
+    symbols: tuple[sympy.Symbol, ...]
+    terms: tuple[sympy.Expr, ...]
+    in_potential: np.ndarray
+    in_circulatory: np.ndarray
+    derivatives: np.ndarray
+
+    @property
+    def size(self) -> int:
+        """Number of functions, q."""
+        return len(self.terms)
+
+    @property
+    def dimension(self) -> int:
+        """Number of states, d."""
+        return len(self.states)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """The functions as text, such as ``x**2*y``; ``1`` for the constant."""
+        return tuple(str(term) for term in self.terms)
+
+    @cached_property
+    def constant(self) -> int:
+        """Index of the constant function."""
+        return self.terms.index(sympy.S.One)
+
+    @cached_property
+    def _function(self) -> Callable[[np.ndarray], np.ndarray]:
+        return compile_formulas(self.terms, self.symbols)
+
+    def downhill(self, diffusion: Diffusion) -> np.ndarray:
+        """D∇V by the coefficients of V, shape ``(d, q, q)``: [i, k, j] is θ_k's share of (D∇θ_j)_i."""
+        return np.asarray(np.einsum("il,klj->ikj", diffusion.matrix, self.derivatives))
+
+    def evaluate(self, x: np.ndarray) -> np.ndarray:
+        """Θ(x): points of shape ``(n, d)`` to values of shape ``(n, q)``."""
+        return self._function(np.ascontiguousarray(x.T)).T
+
+
+def candidate_library(
+    states: Sequence[str],
+    *,
+    degree: int,
+    potential_degree: int | None = None,
+    circulatory_degree: int | None = None,
+    further: Sequence[str] = (),
+) -> CandidateLibrary:
+    """Monomials up to a degree, and whatever further functions a study lists.
+
+    Parameters
+    ----------
+    states
+        Names of the states.
+    degree
+        Highest total degree of the monomials, for f.
+    potential_degree, circulatory_degree
+        Limits for V and g, where they are lower.
+    further
+        Further functions as formulas of the states, such as ``"sqrt(x**2 + 1)"``. V may use all of them;
+        their derivatives are taken into the library for f and g.
+
+    Raises
+    ------
+    siq.systems.formulas.FormulaError
+        When a further function is not a formula of the states, or is there already.
+    """
+    symbols = tuple(sympy.Symbol(name, real=True) for name in states)
+    exponents = monomial_exponents(len(states), degree)
+    terms = [sympy.Mul(*(s**e for s, e in zip(symbols, row, strict=True))) for row in exponents]
+    degrees = [sum(row) for row in exponents]
+    in_potential = [total <= (degree if potential_degree is None else potential_degree) for total in degrees]
+    in_circulatory = [
+        total <= (degree if circulatory_degree is None else circulatory_degree) for total in degrees
+    ]
+    names: Mapping[str, sympy.Expr] = dict(zip(states, symbols, strict=True))
+    for text in further:
+        function = parse_formula(text, names)
+        if not function.free_symbols:
+            raise FormulaError(f"the library function '{text}' is constant", "leave it out")
+        if function in terms:
+            raise FormulaError(f"the library function '{text}' is in the library already", "leave it out")
+        terms.append(function)
+        in_potential.append(True)
+        in_circulatory.append(True)
+    # The library is closed once under differentiation of what V may use; what that adds serves f and g.
+    columns: dict[tuple[int, int], Mapping[sympy.Expr, float]] = {}
+    for j in range(len(terms)):
+        if in_potential[j]:
+            for i, symbol in enumerate(symbols):
+                columns[i, j] = linear_combination(terms[j].diff(symbol))
+    for combination in columns.values():
+        for function in combination:
+            if function not in terms:
+                terms.append(function)
+                in_potential.append(False)
+                in_circulatory.append(True)
+    position = {term: k for k, term in enumerate(terms)}
+    derivatives = np.zeros((len(terms), len(states), len(terms)))
+    for (i, j), combination in columns.items():
+        for function, coefficient in combination.items():
+            derivatives[position[function], i, j] = coefficient
+    return CandidateLibrary(
+        states=tuple(states),
+        symbols=symbols,
+        terms=tuple(terms),
+        in_potential=np.array(in_potential),
+        in_circulatory=np.array(in_circulatory),
+        derivatives=derivatives,
+    )
+
+
+def joint_library(
+    of_field: CandidateLibrary, *, degree: int, potential_degree: int, further: Sequence[str] = ()
+) -> CandidateLibrary:
+    """A library for V that also holds every function of f's library.
+
+    Parameters
+    ----------
+    of_field
+        The functions of f.
+    degree, potential_degree, further
+        As for `candidate_library`. V may also use the functions of f that are no monomials.
+    """
+    highest, others = degree, list(further)
+    for place, (name, term) in enumerate(zip(of_field.names, of_field.terms, strict=True)):
+        if term.is_polynomial(*of_field.symbols):
+            highest = max(highest, total_degree(of_field, place))
+        elif name not in others:
+            others.append(name)
+    return candidate_library(
+        of_field.states, degree=highest, potential_degree=potential_degree, further=others
+    )
+
+
+def check_origin(library: CandidateLibrary, x: np.ndarray, *, names: Sequence[str]) -> None:
+    """Refuse states whose origin is so far from them that their powers are all the same function.
+
+    Parameters
+    ----------
+    library
+        The functions.
+    x
+        Recorded states, shape ``(n, d)``.
+    names
+        What people call them.
+
+    Raises
+    ------
+    NumericalFailure
+        Where errors of coefficients would be rounding. It says what to subtract.
+    """
+    low, high = x.min(axis=0), x.max(axis=0)
+    middle, half = (low + high) / 2, (high - low) / 2
+    if not (np.abs(middle) > FAR * half).any():
+        return
+    columns = library.evaluate(x)
+    size = np.linalg.norm(columns, axis=0)
+    values = np.linalg.svd(np.linalg.qr(columns / np.where(size > 0, size, 1.0), mode="r"), compute_uv=False)
+    # Covariances lose twice the digits that coefficients lose.
+    if values[-1] > np.sqrt(np.finfo(float).eps) * values[0]:
+        return
+    worst = int(np.argmax(np.abs(middle) / np.where(half > 0, half, np.inf)))
+    digits = int(np.floor(np.log10(half[worst])))
+    raise NumericalFailure(
+        f"{names[worst]} stays so far from zero, between {low[worst]:.6g} and {high[worst]:.6g}, that its"
+        f" powers cannot be told apart; subtract {round(float(middle[worst]), -digits):.10g} from it"
+    )
+
+
+def total_degree(library: CandidateLibrary, place: int) -> int:
+    """Total degree of one function of a library, by its place; 0 of one that is no polynomial."""
+    term = library.terms[place]
+    return int(term.as_poly(*library.symbols).total_degree()) if term.is_polynomial(*library.symbols) else 0
+
+
+def monomial_exponents(dimension: int, degree: int) -> list[tuple[int, ...]]:
+    """Exponents of all monomials up to a total degree, by degree and then as a dictionary would."""
+    return [
+        tuple(chosen.count(state) for state in range(dimension))
+        for total in range(degree + 1)
+        for chosen in itertools.combinations_with_replacement(range(dimension), total)
+    ]
+
+
+def constraint_matrix(
+    library: CandidateLibrary, diffusion: Diffusion, *, columns: Sequence[np.ndarray] | None = None
+) -> np.ndarray:
+    """C of ``C Ξ = 0``: the identity f = -D∇V + g, and the functions that V and g may not use.
+
+    Parameters
+    ----------
+    library
+        The q functions of the d states.
+    diffusion
+        D.
+    columns
+        Further coefficients that are zero: for each of the 2d + 1 targets a mask of shape ``(q,)``.
+
+    Returns
+    -------
+    numpy.ndarray
+        Shape ``(rows, (2d + 1) q)``; of full row rank without `columns`. Ξ is flattened by target, in order
+        f_1 … f_d, V, g_1 … g_d, with the library's order within each.
+    """
+    q, d = library.size, library.dimension
+    targets = 2 * d + 1
+    identity = np.zeros((d, q, targets, q))
+    downhill = library.downhill(diffusion)
+    for i in range(d):
+        identity[i, :, i, :] = np.eye(q)
+        identity[i, :, d, :] = downhill[i]
+        identity[i, :, d + 1 + i, :] = -np.eye(q)
+    absent = np.zeros((targets, q), dtype=bool)
+    absent[d] = ~library.in_potential
+    absent[d + 1 :] = ~library.in_circulatory
+    if columns is not None:
+        absent |= np.stack(columns)
+    zeros = np.eye(targets * q)[absent.ravel()]
+    return np.concatenate([identity.reshape(d * q, targets * q), zeros])
+
+
+def linear_combination(expression: sympy.Expr) -> dict[sympy.Expr, float]:
+    """Split a derivative into functions and their numerical coefficients."""
+    combination: dict[sympy.Expr, float] = {}
+    for part in sympy.Add.make_args(sympy.expand(expression)):
+        if not part.free_symbols:
+            coefficient, function = part, sympy.S.One
+        else:  # π and roots belong to the coefficient as well
+            coefficient, function = part.as_independent(*part.free_symbols, as_Add=False)
+        if coefficient != 0:
+            combination[function] = combination.get(function, 0.0) + float(coefficient)
+    return combination

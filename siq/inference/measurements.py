@@ -1,0 +1,381 @@
+"""Measurements: recordings laid out for fitting, with inputs, first states and expectations of parameters.
+
+Whoever writes a value on a card knows its order of magnitude. A parameter of a hidden state may be told by
+nothing else, and a fit without expectations moves it anywhere, along with the hidden state, to gain next to
+nothing. So a value is expected about that of the card, within its own size: a normal prior, as weak as that.
+What recordings do tell, they tell far better.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.interpolate
+import scipy.signal
+import sympy
+
+from siq.data.recordings import Recordings
+from siq.systems.dynamics import Dynamics, Input, Signals, symbol
+
+OVERSAMPLING = 16  # of band-limited inputs, between whose dense samples cubics are exact enough
+PADDING = 64  # samples by which they are continued, mirrored, so that the ends do not ring
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """Recordings, one behind the other.
+
+    Attributes
+    ----------
+    labels
+        One per recording.
+    first
+        Row at which each recording begins, and the number of rows; shape ``(recordings + 1,)``.
+    t
+        Times, shape ``(n,)``.
+    outputs
+        What was measured, shape ``(n, m)``, in the order of the model's outputs.
+    courses
+        For each recording the courses of its inputs in time, see `course_of_input`.
+    sensor_noise
+        Variance of each output's noise where it is known, NaN where it is to be estimated; shape ``(m,)``.
+        None where none is known.
+    restarting
+        Places of the states that begin at zero with every interval, such as a mean over an exposure.
+    """
+
+    labels: tuple[str, ...]
+    first: np.ndarray
+    t: np.ndarray
+    outputs: np.ndarray
+    courses: tuple[tuple[scipy.interpolate.PPoly, ...], ...]
+    sensor_noise: np.ndarray | None = None
+    restarting: tuple[int, ...] = ()
+
+    @property
+    def begins(self) -> np.ndarray:
+        """Rows at which an interval between two samples begins, shape ``(n - recordings,)``."""
+        last = self.first[1:] - 1
+        return np.setdiff1d(np.arange(len(self.t)), last, assume_unique=True)
+
+    @property
+    def roughness(self) -> np.ndarray:
+        """Variance of each output's measurement noise, from third differences, shape ``(m,)``.
+
+        What the motion itself adds is in it: a noise is hardly larger, and can be much smaller.
+        """
+        result = np.empty(self.outputs.shape[1])
+        for place in range(len(result)):
+            differences = np.concatenate(
+                [
+                    np.diff(self.outputs[begin:end, place], n=3)
+                    for begin, end in zip(self.first[:-1], self.first[1:], strict=True)
+                ]
+            )
+            differences = differences[np.isfinite(differences)]
+            spread = np.nanvar(self.outputs[:, place])
+            # The variance of the third difference of white noise is 20 times its own.
+            rough = np.mean(differences**2) / 20 if len(differences) else 0.0
+            result[place] = max(rough, 1e-12 * spread) or 1.0
+        return result
+
+    def with_known_noise(self, measurement: np.ndarray) -> np.ndarray:
+        """Variances of the outputs' noise, shape ``(m,)``, with those that are known in their places."""
+        if self.sensor_noise is None:
+            return measurement
+        return np.where(np.isfinite(self.sensor_noise), self.sensor_noise, measurement)
+
+    @property
+    def recording(self) -> np.ndarray:
+        """Place of each row's recording in `labels`."""
+        return np.repeat(np.arange(len(self.labels)), np.diff(self.first))
+
+    def signals(
+        self,
+        t: np.ndarray,
+        recording: np.ndarray,
+        *,
+        delays: Sequence[tuple[int, float]],
+        width: np.ndarray | float = 0.0,
+    ) -> Signals:
+        """Inputs at instants, each in its recording.
+
+        Parameters
+        ----------
+        t
+            Instants, shape ``(n,)``.
+        recording
+            The place of the recording of each; it never decreases.
+        delays
+            Delayed inputs wanted: the place of the input, and by how much time it lags. What was before a
+            recording is taken to be as it began.
+        width
+            Of time about each instant, over which a delayed input that is held between samples is averaged:
+            a jump within a step of an integration then acts as it should, and the lag has a derivative.
+        """
+        wide = np.broadcast_to(width, t.shape)
+        count = len(self.courses[0]) if self.courses else 0
+        inputs = np.empty((count, len(t)))
+        delayed, slopes = np.empty((len(delays), len(t))), np.empty((len(delays), len(t)))
+        bounds = np.searchsorted(recording, np.arange(len(self.labels) + 1))
+        for place, courses in enumerate(self.courses):
+            rows = slice(bounds[place], bounds[place + 1])
+            begin, end = self.t[self.first[place]], self.t[self.first[place + 1] - 1]
+            for index, course in enumerate(courses):
+                inputs[index, rows] = course(t[rows])
+            for index, (which, lag) in enumerate(delays):
+                course, at, half = courses[which], t[rows] - lag, wide[rows] / 2
+                if course.c.shape[0] == 1 and (half > 0).all():
+                    before, after = (np.clip(at + side, begin, end) for side in (-half, half))
+                    outside = (2 * half - (after - before)) * course(np.clip(at, begin, end))
+                    total = course.antiderivative()
+                    delayed[index, rows] = (total(after) - total(before) + outside) / (2 * half)
+                    slopes[index, rows] = (course(after) - course(before)) / (2 * half)
+                else:
+                    at = np.clip(at, begin, end)
+                    delayed[index, rows], slopes[index, rows] = course(at), course(at, 1)
+        return Signals(inputs=inputs, delayed=delayed, slopes=slopes, t=t)
+
+    def select(self, chosen: Sequence[int]) -> Measurements:
+        """Some of the recordings, by their places."""
+        rows = [np.arange(self.first[place], self.first[place + 1]) for place in chosen]
+        together = np.concatenate(rows)
+        return replace(
+            self,
+            labels=tuple(self.labels[place] for place in chosen),
+            first=np.concatenate([[0], np.cumsum([len(each) for each in rows])]),
+            t=self.t[together],
+            outputs=self.outputs[together],
+            courses=tuple(self.courses[place] for place in chosen),
+        )
+
+    def until(self, rows: np.ndarray) -> Measurements:
+        """The first so many rows of each recording, shape ``(recordings,)``; the inputs stay whole."""
+        kept = [np.arange(begin, begin + count) for begin, count in zip(self.first[:-1], rows, strict=True)]
+        together = np.concatenate(kept)
+        return replace(
+            self,
+            first=np.concatenate([[0], np.cumsum(rows)]),
+            t=self.t[together],
+            outputs=self.outputs[together],
+        )
+
+
+def course_of_input(t: np.ndarray, u: np.ndarray, interpolation: str) -> scipy.interpolate.PPoly:
+    """An input as a function of time, from its samples.
+
+    Parameters
+    ----------
+    t, u
+        Times and samples of one recording, shape ``(n,)`` each.
+    interpolation
+        ``zero_order`` holds each sample until the next; ``linear`` joins them; ``band_limited`` takes the
+        one signal without content above half the sampling rate, which needs regular sampling.
+
+    Raises
+    ------
+    ValueError
+        For a band-limited signal that is sampled irregularly.
+    """
+    if len(t) < 2:
+        return scipy.interpolate.PPoly(np.array([[u[0]]]), np.array([t[0], t[0] + 1.0]))
+    if interpolation == "zero_order":
+        return scipy.interpolate.PPoly(np.append(u[:-1], u[-1])[None, :], np.append(t, 2 * t[-1] - t[-2]))
+    if interpolation == "linear":
+        return scipy.interpolate.PPoly(np.stack([np.diff(u) / np.diff(t), u[:-1]]), t)
+    step = np.diff(t)
+    if np.ptp(step) > 1e-3 * step.mean():
+        raise ValueError("a band-limited input is sampled irregularly; resample it, or call it linear")
+    padding = min(PADDING, len(u) - 1)
+    # Mirrored through its end points the signal goes on without a jump and without a kink.
+    left = 2 * u[0] - u[padding:0:-1]
+    right = 2 * u[-1] - u[-2 : -padding - 2 : -1]
+    longer = np.concatenate([left, u, right])
+    line = np.linspace(longer[0], longer[-1], len(longer))
+    dense = scipy.signal.resample(longer - line, OVERSAMPLING * len(longer))
+    dense_t = t[0] + step.mean() * (np.arange(len(dense)) / OVERSAMPLING - padding)
+    slope = (longer[-1] - longer[0]) / (len(longer) - 1) / step.mean()
+    dense += longer[0] + slope * (dense_t - dense_t[0])
+    kept = slice((padding - 1) * OVERSAMPLING if padding else 0, (padding + len(u)) * OVERSAMPLING)
+    return scipy.interpolate.CubicSpline(dense_t[kept], dense[kept])
+
+
+def measurements(recordings: Recordings, model: Dynamics) -> Measurements:
+    """Lay recordings out as the model needs them: its outputs, and the courses of its inputs.
+
+    Parameters
+    ----------
+    recordings
+        Read with the columns of `columns_of`, in this order.
+    model
+        Says what was measured and what drove the system.
+
+    Raises
+    ------
+    ValueError
+        When an input cannot be interpolated as the model says.
+    """
+    count = len(model.outputs)
+    first = np.searchsorted(recordings.recording, np.arange(len(recordings.labels) + 1))
+    return Measurements(
+        labels=recordings.labels,
+        first=first,
+        t=recordings.t,
+        outputs=np.ascontiguousarray(recordings.values[:, :count]),
+        courses=tuple(
+            tuple(
+                _course(recordings, slice(first[place], first[place + 1]), count + k, entry)
+                for k, entry in enumerate(model.inputs)
+            )
+            for place in range(len(recordings.labels))
+        ),
+    )
+
+
+def columns_of(model: Dynamics) -> tuple[str, ...]:
+    """The columns of recordings that a model needs: outputs, then inputs."""
+    return (*model.output_names, *(entry.name for entry in model.inputs))
+
+
+def _course(recordings: Recordings, rows: slice, column: int, entry: Input) -> scipy.interpolate.PPoly:
+    try:
+        return course_of_input(recordings.t[rows], recordings.values[rows, column], entry.interpolation)
+    except ValueError as error:
+        raise ValueError(f"input {entry.name}: {error}") from None
+
+
+def first_states(model: Dynamics, data: Measurements) -> np.ndarray:
+    """States to begin with: measured ones as measured, velocities by differences, others mid-domain.
+
+    A state that is none of these, and of which no domain is known, begins at zero; at one where f has no
+    slope at zero, such as a square root.
+    """
+    states = np.tile(_middle(model), (len(data.t), 1))
+    from_output = _measured_states(model)
+    derivative_of = {
+        str(equation): name
+        for name, equation, is_definition in zip(model.states, model.equations, model.kinematic, strict=True)
+        if is_definition
+    }
+    for place, name in enumerate(model.states):
+        if name in from_output:
+            states[:, place] = _read_off(data, *from_output[name])
+    for place, name in enumerate(model.states):
+        if name not in from_output and derivative_of.get(name) in from_output:
+            position = _read_off(data, *from_output[derivative_of[name]])
+            for begin, end in zip(data.first[:-1], data.first[1:], strict=True):
+                if end - begin > 1:
+                    states[begin:end, place] = np.gradient(position[begin:end], data.t[begin:end])
+    return states
+
+
+def _measured_states(model: Dynamics) -> dict[str, tuple[int, float, float]]:
+    """States that an output is, up to a factor and an offset: its place, the factor and the offset."""
+    values = {symbol(each.name): each.value for each in model.parameters}
+    found = {}
+    for place, (_, formula) in enumerate(model.outputs):
+        known = formula.xreplace(values)
+        for name in model.states:
+            slope = known.diff(symbol(name))
+            if not slope.is_number or slope == 0:
+                continue
+            # Of a constant slope the rest is what is left at zero: long formulas are never multiplied out.
+            rest = known.xreplace({symbol(name): sympy.S.Zero})
+            if rest.is_number:
+                found[name] = (place, float(slope), float(rest))
+    return found
+
+
+def _read_off(data: Measurements, place: int, slope: float, rest: float) -> np.ndarray:
+    return (_filled(data, data.outputs[:, place]) - rest) / slope
+
+
+def _middle(model: Dynamics) -> np.ndarray:
+    """A value of each state, shape ``(d,)``: the middle of its domain where it has one."""
+    middle = model.limits.mean(axis=1)
+    unknown = np.isnan(middle)
+    if not unknown.any():
+        return middle
+    about = np.where(unknown, 1.0, middle)  # the others somewhere, so that only the unknown ones matter
+    for place in np.flatnonzero(unknown):
+        at = about.copy()
+        at[place] = 0.0
+        if np.isfinite(_slopes(model, at)).all():
+            about = at
+    return about
+
+
+def _slopes(model: Dynamics, x: np.ndarray) -> np.ndarray:
+    """Derivatives of f by the states at a point ``(d,)``, with inputs and time of one."""
+    one, delayed = np.ones((len(model.inputs), 1)), np.ones((len(model.delays), 1))
+    signals = Signals(inputs=one, delayed=delayed, slopes=delayed, t=np.ones(1))
+    return model.functions.slopes(x[:, None], signals, model.values)[0]
+
+
+def _filled(data: Measurements, column: np.ndarray) -> np.ndarray:
+    """A measured column with gaps filled linearly."""
+    known = np.isfinite(column)
+    if known.all() or not known.any():
+        return np.nan_to_num(column)
+    return np.interp(np.arange(len(column)), np.flatnonzero(known), column[known])
+
+
+@dataclass(frozen=True)
+class Expectations:
+    """What is expected of the free parameters of a model: combinations of them are normal, of unit width.
+
+    Attributes
+    ----------
+    rows
+        The combinations, shape ``(r, p)``.
+    middle
+        What is expected of each, shape ``(r,)``.
+    """
+
+    rows: np.ndarray
+    middle: np.ndarray
+
+    @classmethod
+    def of(cls, model: Dynamics) -> Expectations:
+        """Those of a model's free parameters, each by itself, and of several together."""
+        free = {model.parameters[place].name: column for column, place in enumerate(model.free)}
+        values = {each.name: each.value for each in model.parameters}
+        rows, middle = [np.zeros((0, len(free)))], [np.zeros(0)]
+        for column in free.values():
+            expected = model.parameters[model.free[column]].expected
+            if expected:
+                rows.append(np.zeros((1, len(free))))
+                rows[-1][0, column] = 1 / abs(expected)
+                middle.append(np.array([np.sign(expected)]))
+        for each in model.expected_together:
+            mine = [place for place, name in enumerate(each.names) if name in free]
+            if mine:
+                rows.append(np.zeros((len(each.roots), len(free))))
+                roots = np.sqrt(each.weight) * each.roots
+                rows[-1][:, [free[each.names[place]] for place in mine]] = roots[:, mine]
+                known = [0.0 if name in free else values[name] for name in each.names]
+                middle.append(-roots @ np.array(known))
+        return cls(np.concatenate(rows), np.concatenate(middle))
+
+    def deviations(self, values: np.ndarray) -> np.ndarray:
+        """How far values ``(p,)`` of the free parameters fall short, in units of what may be, ``(r,)``."""
+        return self.middle - self.rows @ values
+
+    def beside(
+        self, columns: np.ndarray, innovations: np.ndarray, values: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Columns ``(n, p)`` and innovations ``(n,)`` with one row more for each expectation."""
+        if not len(self.rows):
+            return columns, innovations
+        return np.concatenate([columns, self.rows]), np.concatenate([innovations, self.deviations(values)])
+
+
+def with_expectations(model: Dynamics) -> Dynamics:
+    """A model whose free parameters are expected to be about as they are; zero says nothing of a size."""
+    parameters = (
+        each if each.fixed or each.value == 0 else replace(each, expected=each.value)
+        for each in model.parameters
+    )
+    return replace(model, parameters=tuple(parameters))

@@ -1,0 +1,452 @@
+"""Recalibration: parameters with and without process noise, and what its uncertainty leaves open.
+
+A filter that took a sensor for noisier than it is follows the recordings less, and takes f at other states.
+The coefficients of f depend on the noise, and the noise is an estimate.
+
+Forty samples seldom prove random forces, and a fit without them has errors that are right only if there are
+none. What the recordings do not rule out belongs to the errors: they are averaged over all strengths of the
+random forces, each with its likelihood, and so is how the parameters would change.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.stats
+
+from siq.errors import NumericalFailure
+from siq.inference.budget import COMPILATION, Budget, evaluation
+from siq.inference.kalman_filter import (
+    Grid,
+    Noise,
+    profile_likelihood,
+    solve,
+    whiten,
+    with_parameters_changed,
+)
+from siq.inference.maximum_likelihood import Fit, fit_by_multiple_shooting
+from siq.inference.measurements import Measurements, first_states
+from siq.inference.noise import first_noise, log_likelihood, noise_coordinates
+from siq.inference.trajectories import EDGE_SUBSTEPS, fit_trajectories, jumps_of, run, sharpened, spread_edges
+from siq.systems.dynamics import Dynamics
+
+STEP = 0.05  # numerical: of the logarithm of a variance, for differences of the likelihood
+UNKNOWN = (
+    1.0  # standard error of a logarithm beyond which the likelihood is no parabola: the bound is far off
+)
+
+
+@dataclass(frozen=True)
+class NoiseUncertainty:
+    """Errors of a noise, and of the parameters with it.
+
+    Attributes
+    ----------
+    measurement
+        Standard errors of the logarithms of the sensors' variances, shape ``(m,)``; infinite where a
+        variance is only bounded from above, zero where it was given.
+    process
+        The same of the random forces' intensities, shape ``(d,)``.
+    covariance
+        Of the free parameters, with what the noise leaves open in them, shape ``(p, p)``.
+    """
+
+    measurement: np.ndarray
+    process: np.ndarray
+    covariance: np.ndarray
+
+
+def noise_uncertainty(fit: Fit, data: Measurements) -> NoiseUncertainty:
+    """Errors of the noise of a fit, by the curvature of the likelihood along its trajectories."""
+    coordinates = noise_coordinates(data, fit.noise)
+    line = fit.linearisation
+    white = whiten(line, data, fit.noise)
+    still = with_parameters_changed(line, solve(white.columns, white.innovations)[0])
+    outputs = len(coordinates.known)
+    places = [k for k in range(coordinates.size) if k >= outputs or not coordinates.known[k]]
+
+    def moved(*changes: tuple[int, float]) -> Noise:
+        vector = np.zeros(coordinates.size)
+        for place, change in changes:
+            vector[place] += change
+        return coordinates.noise_at(vector)
+
+    def value(*changes: tuple[int, float]) -> float:
+        return log_likelihood(still, data, moved(*changes))
+
+    middle, h = value(), STEP
+    single = {k: (value((k, h)), value((k, -h))) for k in places}
+    curvature = np.diag([(2 * middle - single[k][0] - single[k][1]) / h**2 for k in places])
+    for row, one in enumerate(places):
+        for column, other in enumerate(places[:row]):
+            both = value((one, h), (other, h)) + value((one, -h), (other, -h))
+            apart = value((one, h), (other, -h)) + value((one, -h), (other, h))
+            curvature[row, column] = curvature[column, row] = (apart - both) / (4 * h**2)
+    told = np.diag(curvature) > 1 / UNKNOWN**2
+    errors = np.full(coordinates.size, np.inf)
+    errors[:outputs][coordinates.known] = 0.0
+    inside = [place for place, known in zip(places, told, strict=True) if known]
+    covariance = fit.covariance
+    if inside:
+        of_noise = np.linalg.pinv(curvature[np.ix_(told, told)], hermitian=True)
+        errors[inside] = np.sqrt(np.maximum(np.diag(of_noise), 0.0))
+        changes = []
+        for place in inside:
+            ends = []
+            for sign in (1, -1):
+                white = whiten(line, data, moved((place, sign * h)))
+                ends.append(solve(white.columns, white.innovations)[0])
+            changes.append((ends[0] - ends[1]) / (2 * h))
+        slope = np.stack(changes, axis=1)
+        covariance = covariance + slope @ of_noise @ slope.T
+    driven = coordinates.driven
+    process = np.zeros_like(fit.noise.process)
+    process[driven] = errors[outputs : outputs + len(driven)]
+    return NoiseUncertainty(errors[:outputs], process, covariance)
+
+
+DECADES = 14  # of strengths that are looked through, downwards from forces that would make all of the motion
+POINTS = 16  # of the average
+UNLIKELY = 8.0  # logarithm of a likelihood, relative to the largest, that adds nothing to an average
+
+
+def covariance_with_unknown_forces(
+    fit: Fit, data: Measurements, *, budget: Budget | None = None
+) -> np.ndarray:
+    """Covariance of the free parameters of a fit, shape ``(p, p)``, whatever the strength of random forces.
+
+    The strength is one factor on the random forces of the fit; on such as would make the motion of each state
+    where it has none. Beforehand every standard deviation of them is as probable (Gelman 2006, Bayesian
+    Analysis 1, 515); the scale of all noise and the parameters are integrated out as linear. A fit without
+    random forces is made once more with those of the average, since its trajectories may be far from those
+    that random forces made.
+
+    Parameters
+    ----------
+    fit
+        Whose linearisation and noise are used.
+    data
+        The recordings.
+    budget
+        Charged for the work.
+    """
+    if not len(fit.model.free) or not np.isfinite(fit.covariance).all():
+        return fit.covariance
+    if fit.has_process_noise:
+        return _average(fit, data, fit.noise.process, budget)[0]
+    process = forces_of_the_motion(fit, data)
+    if not (process > 0).any():
+        return fit.covariance
+    covariance, size = _average(fit, data, process, budget)
+    forced = fit_by_multiple_shooting(
+        fit.model, data, x=fit.x, noise=Noise(fit.noise.measurement, process * size**2),
+        estimate_process=False, substeps=fit.substeps, budget=budget,
+    )  # fmt: skip
+    if not forced.converged or not forced.has_process_noise:
+        return covariance
+    free = np.array(fit.model.free, dtype=int)
+    apart = (forced.model.values - fit.model.values)[free]
+    return _average(forced, data, forced.noise.process, budget)[0] + np.outer(apart, apart)
+
+
+@dataclass(frozen=True)
+class _Strength:
+    """What follows from one strength of random forces: its log-likelihood, change and covariance of θ."""
+
+    size: float
+    value: float
+    change: np.ndarray
+    covariance: np.ndarray
+
+
+def _average(
+    fit: Fit, data: Measurements, process: np.ndarray, budget: Budget | None
+) -> tuple[np.ndarray, float]:
+    """Covariance averaged over factors on the standard deviation of forces; and the mean of that factor."""
+    known = data.sensor_noise is not None and bool(np.isfinite(data.sensor_noise).all())
+    units = np.sqrt(np.diag(fit.covariance))
+    units = np.where(units > 0, units, 1.0)
+
+    def at(size: float) -> _Strength | None:
+        if budget is not None:
+            budget.charge(evaluation(fit.model, data))
+        try:
+            white = whiten(
+                fit.linearisation, data, Noise(fit.noise.measurement, process * size**2, fit.noise.shape)
+            )
+            change, covariance = solve(white.columns, white.innovations)
+        except (NumericalFailure, np.linalg.LinAlgError):
+            return None
+        left = white.innovations - white.columns @ change
+        total, freedom = float(left @ left), white.degrees_of_freedom - len(change)
+        covariance = covariance if known else covariance * (total / freedom)
+        sign, volume = np.linalg.slogdet(covariance / np.outer(units, units))
+        value = profile_likelihood(total, freedom, white.log_determinant)
+        if known:
+            value = -0.5 * (total + white.log_determinant)
+        return _Strength(size, value + (0.5 * volume if sign > 0 else 0.0), change, covariance)
+
+    # Of forces that are estimated the strength is about one, and of others anywhere below.
+    sizes = np.concatenate([[0.0], 10.0 ** (np.arange(-DECADES, 5) / 2)])
+    coarse = np.array([-np.inf if (one := at(size)) is None else one.value for size in sizes])
+    if not np.isfinite(coarse).any():
+        return fit.covariance, 0.0
+    likely = np.flatnonzero(coarse > coarse.max() - UNLIKELY)
+    lowest, highest = sizes[max(likely[0] - 1, 0)], sizes[min(likely[-1] + 1, len(sizes) - 1)]
+    found = [one for size in np.linspace(lowest, highest, POINTS) if (one := at(size)) is not None]
+    if not found:
+        return fit.covariance, 0.0
+    weights = np.exp(np.array([one.value for one in found]) - max(one.value for one in found))
+    weights /= weights.sum()
+    covariance = np.zeros_like(fit.covariance)
+    for weight, one in zip(weights, found, strict=True):
+        covariance += weight * (one.covariance + np.outer(one.change, one.change))
+    return covariance, float(weights @ [one.size for one in found])
+
+
+def forces_of_the_motion(fit: Fit, data: Measurements) -> np.ndarray:
+    """Intensities of random forces that would make the motion of states they can drive, shape ``(d,)``."""
+    rows = data.begins
+    step = (data.t[rows + 1] - data.t[rows])[:, None]
+    process = np.mean((fit.x[rows + 1] - fit.x[rows]) ** 2 / step, axis=0)
+    return np.where(fit.model.kinematic, 0.0, process)
+
+
+THRESHOLD = 1e-4  # probability by chance, below which random forces are believed
+
+
+def fit_with_process_noise_as_needed(
+    model: Dynamics,
+    data: Measurements,
+    begin: Fit,
+    *,
+    level: float = 1.0,
+    x: np.ndarray | None = None,
+    budget: Budget | None = None,
+) -> Fit:
+    """Fit with process noise estimated, and without; the simpler unless the data speak against it.
+
+    A jump that is spread too far leaves errors which random forces stand in for. Before they are believed the
+    jumps of the fit without them are followed more finely.
+    """
+    loose, strict = fit_with_and_without_process_noise(model, data, begin, level=level, x=x, budget=budget)
+    chosen = simpler_fit(loose, strict)
+    if chosen is loose and strict.converged and strict.model.edges:
+        chosen = simpler_fit(loose, sharpened(strict, data, budget=budget))
+    return chosen
+
+
+def simpler_fit(loose: Fit | None, strict: Fit) -> Fit:
+    """The fit without process noise, unless the data speak against it."""
+    return strict if loose is None or not process_noise_needed(loose, strict) else loose
+
+
+def fit_with_and_without_process_noise(
+    model: Dynamics,
+    data: Measurements,
+    begin: Fit,
+    *,
+    level: float = 1.0,
+    x: np.ndarray | None = None,
+    settled: bool = False,
+    budget: Budget | None = None,
+) -> tuple[Fit | None, Fit]:
+    """Fit with process noise estimated, where that was begun with, and without.
+
+    Parameters
+    ----------
+    model
+        With the parameters' values to begin with.
+    data
+        The recordings.
+    begin
+        A fit whose states and noise are begun with.
+    level
+        Factor on its process noise.
+    x
+        States, where the model has more of them.
+    settled
+        Whether `begin` is itself the fit of the model with process noise, and need not be made again.
+    budget
+        Charged for every evaluation.
+
+    Raises
+    ------
+    BudgetSpent
+        When nothing is left of what is allowed.
+    """
+    if budget is not None:
+        budget.charge(COMPILATION)
+    states = begin.x if x is None else x
+    substeps = begin.substeps
+    if jumps_of(model):
+        substeps = max(substeps, EDGE_SUBSTEPS)
+        model = spread_edges(model, data, states, substeps=substeps)
+    noise = begin.noise.of_states(model.dimension)
+    loose: Fit | None = None
+    if settled and not jumps_of(model):
+        loose = begin
+    elif noise.process.any():
+        loose = fit_by_multiple_shooting(
+            model,
+            data,
+            x=states,
+            noise=noise.scaled(max(level, 1e-6)),
+            estimate_process=True,
+            substeps=substeps,
+            budget=budget,
+        )
+    start = loose if loose is not None and loose.converged else None
+    begun = model if start is None else start.model
+    x, still = (states, noise) if start is None else (start.x, start.noise)
+
+    def at_all_samples() -> Fit:
+        return fit_by_multiple_shooting(
+            begun, data, x=x, noise=still.without_process(), estimate_process=False, substeps=substeps,
+            budget=budget,
+        )  # fmt: skip
+
+    def as_trajectories() -> Fit:
+        # Where random forces led to nothing better, they led away.
+        better = start is not None or (loose is not None and loose.log_likelihood > begin.log_likelihood)
+        of = loose if loose is not None and better else None
+        return fit_trajectories(
+            model if of is None else of.model,
+            data,
+            begin=(states if of is None else of.x)[data.first[:-1]],
+            noise=noise if of is None else of.noise,
+            substeps=substeps,
+            budget=budget,
+        )
+
+    # Where f jumps, steps of all samples at once go to and fro.
+    ways = (as_trajectories, at_all_samples) if jumps_of(model) else (at_all_samples, as_trajectories)
+    strict = ways[0]()
+    if not strict.converged:
+        strict = better_of(strict, ways[1]())
+    vanished = None if start is None else without_idle_forces(start, data)
+    return loose, strict if vanished is None else better_of(vanished, strict)
+
+
+def without_idle_forces(fit: Fit, data: Measurements) -> Fit | None:
+    """A fit without its random forces, where these do nothing in it; None where they do something.
+
+    Their intensities may have gone towards zero. The fit without them has then been found already, and may be
+    likelier than the one that another way of fitting ends in.
+    """
+    still = fit.noise.without_process()
+    held = with_parameters_changed(fit.linearisation, np.zeros(len(fit.model.free)))
+    with_them, alone = (log_likelihood(held, data, noise) for noise in (fit.noise, still))
+    if not 2 * (with_them - alone) <= least_to_believe(fit.noise):
+        return None
+    return replace(fit, noise=still, log_likelihood=fit.log_likelihood - (with_them - alone))
+
+
+def better_of(one: Fit, other: Fit) -> Fit:
+    """The one that settled, and of two that did not the likelier."""
+    if one.converged != other.converged:
+        return one if one.converged else other
+    return one if one.log_likelihood > other.log_likelihood else other
+
+
+def process_noise_needed(loose: Fit, strict: Fit) -> bool:
+    """Whether the likelihood ratio speaks for process noise; its null distribution has half its mass at 0."""
+    if not strict.converged:
+        return True
+    return 2 * (loose.log_likelihood - strict.log_likelihood) > least_to_believe(loose.noise)
+
+
+def least_to_believe(noise: Noise) -> float:
+    """Twice the increase of the log-likelihood from which on random forces are believed."""
+    driven = int((noise.process > 0).sum())
+    return float(scipy.stats.chi2.isf(2 * THRESHOLD, driven)) if driven else np.inf
+
+
+FAINT = 1e-4  # process noise, relative to the motion, from which a fit without any is loosened
+BETTER = 0.5  # of a log-likelihood: what half a parameter gains by chance, below which two fits are one
+
+
+def recalibrate(model: Dynamics, data: Measurements, *, budget: Budget | None = None) -> tuple[Fit, Fit]:
+    """Fit the simulation's own parameters: with process noise where the data ask for it, and without.
+
+    The likelihood has more than one maximum where a state is hidden. A fit begins twice, along states that
+    follow the recordings and along the card's own simulation, and the likelier end counts.
+
+    Raises
+    ------
+    NumericalFailure
+        When neither fit can be made.
+    """
+    x = first_states(model, data)
+    noise = first_noise(model, data, x)
+    loose = fit_by_multiple_shooting(model, data, x=x, noise=noise, estimate_process=True, budget=budget)
+    own = fit_from_card(model, data, x=x, noise=noise, substeps=max(loose.substeps, 1), budget=budget)
+    known: Fit | None = None
+    if loose.converged:
+        known, strict = fit_with_and_without_process_noise(
+            loose.model, data, loose, settled=True, budget=budget
+        )
+        if not (own.converged and own.log_likelihood > strict.log_likelihood + BETTER):
+            return simpler_fit(known, strict), strict
+    # Where random forces on a hidden state could explain anything, the fit has no end, or one far off. The
+    # card's own simulation is then the better start.
+    strict = own
+    if not strict.converged:
+        if not np.isfinite(loose.sum_of_squares):
+            raise NumericalFailure(strict.fault or loose.fault)
+        return loose, strict
+    small = Noise(strict.noise.measurement, noise.process * FAINT)
+    again = fit_by_multiple_shooting(
+        strict.model,
+        data,
+        x=strict.x,
+        noise=small,
+        estimate_process=True,
+        substeps=strict.substeps,
+        budget=budget,
+    )
+    if again.converged:
+        idle = without_idle_forces(again, data)
+        strict = strict if idle is None else better_of(idle, strict)
+    loosened = [each for each in (known, again) if each is not None and each.converged]
+    best = max(loosened, key=lambda each: each.log_likelihood, default=None)
+    return simpler_fit(best, strict), strict
+
+
+def fit_from_card(
+    model: Dynamics,
+    data: Measurements,
+    *,
+    x: np.ndarray,
+    noise: Noise,
+    substeps: int,
+    budget: Budget | None = None,
+) -> Fit:
+    """Fit without process noise, beginning along the simulation as the card has it.
+
+    Parameters
+    ----------
+    model, data
+        The simulation, and the recordings.
+    x
+        States read off the recordings, shape ``(n, d)``, whose first ones the simulation begins with.
+    noise
+        Of which only that of the sensors is used.
+    substeps
+        Runge–Kutta steps between samples.
+    budget
+        Charged for every evaluation.
+    """
+    begin = x[data.first[:-1]]
+    followed = run(model, Grid(data, substeps), begin)
+    strict = fit_by_multiple_shooting(
+        model, data, x=np.where(np.isfinite(followed), followed, x), noise=noise.without_process(),
+        estimate_process=False, budget=budget,
+    )  # fmt: skip
+    if strict.converged:
+        return strict
+    # Steps at all samples at once may lead anywhere, from where a search could explain nothing. Damped
+    # steps of whole trajectories never make a fit worse than the card's own simulation is.
+    damped = fit_trajectories(model, data, begin=begin, noise=noise, substeps=substeps, budget=budget)
+    return better_of(strict, damped)

@@ -1,0 +1,695 @@
+"""Whole trajectories: least squares by multiple shooting, free runs, and jumps of f.
+
+`siq.inference.maximum_likelihood.fit_by_multiple_shooting` moves the states at all samples at once and is
+fast, but where f jumps, or nearly, its linearised steps can go to and fro without end. Here only initial
+states and parameters are unknown, every trajectory follows its equations at every step, and no step makes the
+fit worse.
+
+Every simulation runs from the end of a prefix of each recording. From the prefix, which is not scored, it
+estimates its own state at the begin; the prefix is the same for all.
+
+A force that takes another sign in no time, such as dry friction, is spread over a little of its argument when
+it is evaluated, so that an integrator can follow it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import sympy
+
+from siq.inference.budget import Budget, evaluation
+from siq.inference.filter_kernels import whitened_innovations
+from siq.inference.kalman_filter import Grid, Linearisation, Noise, integrate_intervals, linearise
+from siq.inference.maximum_likelihood import Fit, fit_by_multiple_shooting, fit_of_states
+from siq.inference.measurements import Expectations, Measurements, first_states
+from siq.numerics.integration import machine_code
+from siq.systems.dynamics import Dynamics, arguments_of, evaluable, symbol
+from siq.systems.formulas import Tape, compile_values
+
+
+@machine_code
+def run_tape(
+    operations: np.ndarray,
+    registers: np.ndarray,
+    base: int,
+    results: np.ndarray,
+    first: np.ndarray,
+    begin: np.ndarray,
+    signals: np.ndarray,
+    step: np.ndarray,
+    states: np.ndarray,
+) -> int:
+    """Integrate recordings by the Runge–Kutta rule, sample after sample, into `states`.
+
+    Parameters
+    ----------
+    operations, registers, base, results
+        The tape of the rates: its arguments are states, then signals, then parameters, which are filled in.
+    first
+        Row at which each recording begins, and the number of rows; shape ``(recordings + 1,)``.
+    begin
+        Initial states, shape ``(recordings, d)``.
+    signals
+        At begin, middle and end of every substep, shape ``(3 substeps, s, intervals)``.
+    step
+        Length of a substep of each interval, shape ``(intervals,)``.
+    states
+        Shape ``(n, d)``, not a number to begin with: a recording in which the simulation runs away is left
+        so from there on.
+
+    Returns
+    -------
+    int
+        Evaluations of the rates.
+    """
+    dimension = begin.shape[1]
+    known = signals.shape[1]
+    substeps = signals.shape[0] // 3
+    node = (0, 1, 1, 2)
+    reach = (0.0, 0.5, 0.5, 1.0)
+    weight = (1.0, 2.0, 2.0, 1.0)
+    now = np.empty(dimension)
+    slope = np.empty(dimension)
+    total = np.empty(dimension)
+    evaluations = 0
+    interval = 0
+    for recording in range(len(first) - 1):
+        last = interval + first[recording + 1] - first[recording] - 1
+        now[:] = begin[recording]
+        states[first[recording]] = now
+        row = first[recording]
+        alive = True
+        while interval < last and alive:
+            h = step[interval]
+            for part in range(substeps):
+                total[:] = 0.0
+                slope[:] = 0.0
+                for stage in range(4):
+                    for i in range(dimension):
+                        registers[i] = now[i] + reach[stage] * h * slope[i]
+                    for s in range(known):
+                        registers[dimension + s] = signals[3 * part + node[stage], s, interval]
+                    for k in range(len(operations)):
+                        what = operations[k, 0]
+                        a = registers[operations[k, 1]]
+                        if what == 0:
+                            value = a + registers[operations[k, 2]]
+                        elif what == 1:
+                            value = a * registers[operations[k, 2]]
+                        elif what == 2:
+                            value = 1.0 / a if a != 0.0 else np.inf
+                        elif what == 3:
+                            value = a
+                            for _ in range(operations[k, 2] - 1):
+                                value *= a
+                        elif what == 4:
+                            exponent = registers[operations[k, 2]]
+                            value = np.inf if a == 0.0 and exponent < 0.0 else a**exponent
+                        elif what == 5:
+                            value = np.sqrt(a)
+                        elif what == 6:
+                            value = np.sin(a)
+                        elif what == 7:
+                            value = np.cos(a)
+                        elif what == 8:
+                            value = np.tan(a)
+                        elif what == 9:
+                            value = np.exp(a)
+                        elif what == 10:
+                            value = np.log(a)
+                        elif what == 11:
+                            value = np.tanh(a)
+                        elif what == 12:
+                            value = np.arctan(a)
+                        elif what == 13:
+                            value = abs(a)
+                        elif what == 14:
+                            value = np.sign(a)
+                        else:
+                            b = registers[operations[k, 2]]
+                            if np.isnan(a) or np.isnan(b):
+                                value = np.nan
+                            elif what == 15:
+                                value = max(a, b)
+                            else:
+                                value = min(a, b)
+                        registers[base + k] = value
+                    evaluations += 1
+                    for i in range(dimension):
+                        slope[i] = registers[results[i]]
+                        total[i] += weight[stage] * slope[i]
+                for i in range(dimension):
+                    now[i] += h / 6.0 * total[i]
+            for i in range(dimension):
+                if not np.isfinite(now[i]):
+                    alive = False
+            interval += 1
+            row += 1
+            if alive:
+                states[row] = now
+        interval = last
+    return evaluations
+
+
+ACCURACY = 1e-4  # relative change of the sum of squares at which a fit has converged
+SETTLED = 0.1  # the same in χ², which matters where there are many samples
+TRIALS = 25  # simulations of all recordings, at most,
+WORK = 500_000  # or as many as have so many samples together: along a curved valley steps are short
+# Of Levenberg and Marquardt's rule, the usual values; damping is relative to each direction's own square.
+FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-6, 1e4
+EASIER, HARDER = 10.0, 5.0
+NEARLY_FORESEEN = 0.25  # share of what is foreseen that a last step must gain
+RUN = 0.3  # work of a simulation beside that of its derivatives
+SINGULAR = 1e-13  # numerical: of the largest eigenvalue
+
+
+def run(model: Dynamics, grid: Grid, begin: np.ndarray) -> np.ndarray:
+    """Integrate recordings from their initial states, shape ``(recordings, d)``, to all samples ``(n, d)``.
+
+    A simulation that runs away is not a number from there on.
+    """
+    tape = model.functions.tape
+    if tape is None:
+        return _run_side_by_side(model, grid, begin)
+    delays = model.lags(model.values)
+    nodes = [grid.signals(node, delays) for node in range(3 * grid.substeps)]
+    signals = np.stack([np.concatenate([s.inputs, s.delayed, s.slopes, s.t[None]]) for s in nodes])
+    return run_along(tape, grid, signals, model.values, begin)
+
+
+def run_along(
+    tape: Tape, grid: Grid, signals: np.ndarray, values: np.ndarray, begin: np.ndarray
+) -> np.ndarray:
+    """Integrate the rates on a tape, whose arguments are states, signals and parameters, in this order.
+
+    Parameters
+    ----------
+    tape
+        The rates.
+    grid
+        Recordings and substeps.
+    signals
+        What is known at all nodes, shape ``(3 substeps, s, intervals)``.
+    values
+        Of the parameters, shape ``(p,)``.
+    begin
+        Initial states, shape ``(recordings, d)``.
+
+    Returns
+    -------
+    np.ndarray
+        At all samples, shape ``(n, d)``; not a number from where they run away.
+    """
+    states = np.full((len(grid.data.t), begin.shape[1]), np.nan)
+    registers = tape.registers.copy()
+    known = begin.shape[1] + signals.shape[1]
+    registers[known : known + len(values)] = values
+    with np.errstate(all="ignore"):
+        run_tape(
+            tape.operations, registers, tape.base, tape.results, grid.data.first,
+            np.ascontiguousarray(begin, dtype=float), signals, grid.step, states,
+        )  # fmt: skip
+    return states
+
+
+def _run_side_by_side(model: Dynamics, grid: Grid, begin: np.ndarray) -> np.ndarray:
+    """The same in numpy, all recordings side by side: for formulas that no tape can hold."""
+    data = grid.data
+    states = np.full((len(data.t), model.dimension), np.nan)
+    lengths = np.diff(data.first)
+    current = begin.T.copy()
+    states[data.first[:-1]] = begin
+    places = np.concatenate([[0], np.cumsum(lengths - 1)])[:-1]
+    for sample in range(int(lengths.max()) - 1):
+        alive = np.flatnonzero(lengths > sample + 1)
+        one = grid.at_intervals(places[alive] + sample)
+        with np.errstate(all="ignore"):
+            after = integrate_intervals(model, one, model.values, current[:, alive])
+        current[:, alive] = after
+        states[data.first[alive] + sample + 1] = after.T
+    return states
+
+
+def fit_trajectories(
+    model: Dynamics,
+    data: Measurements,
+    *,
+    begin: np.ndarray,
+    noise: Noise,
+    substeps: int,
+    budget: Budget | None = None,
+) -> Fit:
+    """Fit free parameters and initial states, without process noise, by damped steps.
+
+    Slower by far than `siq.inference.maximum_likelihood.fit_by_multiple_shooting`, for it simulates
+    sample after sample, and lost where the motion is chaotic; to be used where that one does not settle.
+
+    Parameters
+    ----------
+    model
+        Its parameters' values are where the fit begins.
+    data
+        The measurements.
+    begin
+        Initial states to begin with, shape ``(recordings, d)``.
+    noise
+        Of which only the measurement noise is used, for the weights of the outputs.
+    substeps
+        Runge–Kutta steps between samples.
+    budget
+        Charged for every evaluation.
+
+    Returns
+    -------
+    Fit
+        Not converged where the simulation runs away at the begin, or where more simulations would be needed
+        than are allowed.
+
+    Raises
+    ------
+    BudgetSpent
+        When nothing is left of what is allowed.
+    """
+    work = substeps * evaluation(model, data)
+    with np.errstate(all="ignore"):
+        grid = Grid(data, substeps)
+        best = _Course.of(model, grid, model.values, begin, noise)
+        converged = False
+        if np.isfinite(best.total):
+            best, converged = _descended(model, grid, best, noise, budget=budget, work=work)
+    return fit_of_states(
+        model.with_values(best.values),
+        data,
+        x=best.states,
+        noise=noise.without_process(),
+        substeps=substeps,
+        converged=converged,
+    )
+
+
+@dataclass(frozen=True)
+class _Course:
+    """Trajectories from parameters and initial states.
+
+    Attributes
+    ----------
+    values, begin, states
+        All parameters; the initial states, shape ``(recordings, d)``; the states at all samples.
+    total
+        Weighted sum of squared residuals, and of what is expected of parameters; not finite where the
+        simulation runs away.
+    """
+
+    values: np.ndarray
+    begin: np.ndarray
+    states: np.ndarray
+    total: float
+
+    @classmethod
+    def of(cls, model: Dynamics, grid: Grid, values: np.ndarray, begin: np.ndarray, noise: Noise) -> _Course:
+        states = run(model.with_values(values), grid, begin)
+        outputs = model.functions.outputs(states.T, grid.at_samples(model.lags(values)), values).T
+        known = np.isfinite(grid.data.outputs)
+        left = ((outputs - grid.data.outputs) / np.sqrt(noise.measurement))[known]
+        expected = Expectations.of(model).deviations(values[list(model.free)])
+        return cls(values, begin, states, float(left @ left + expected @ expected))
+
+
+def _descended(
+    model: Dynamics, grid: Grid, best: _Course, noise: Noise, *, budget: Budget | None, work: float
+) -> tuple[_Course, bool]:
+    """Damped steps downhill (Levenberg and Marquardt), and whether they came to an end."""
+    free = np.array(model.free, dtype=int)
+    values = int(np.isfinite(grid.data.outputs).sum())
+    slightest = min(ACCURACY, SETTLED / max(values, 1))
+    damping, normal = FIRST_DAMPING, None
+    for _ in range(max(TRIALS, WORK // max(values, 1))):
+        if budget is not None:
+            budget.charge(work * (RUN if normal is not None else 1.0 + RUN))
+        if normal is None:
+            along = linearise(model, grid, best.values, best.states)
+            normal = normal_equations(along, grid.data, noise.measurement).with_expectations(
+                Expectations.of(model), best.values[free]
+            )
+        change, begin, foreseen = normal.step(damping)
+        new = best.values.copy()
+        new[free] += change
+        tried = _Course.of(model, grid, new, best.begin + begin, noise)
+        gained = best.total - tried.total
+        if gained > 0:  # which what runs away never is
+            settled = gained < slightest * best.total and gained > NEARLY_FORESEEN * foreseen
+            best, normal = tried, None
+            damping = max(damping / EASIER, LEAST_DAMPING)
+            if settled:
+                return best, True
+        else:
+            if foreseen < slightest * best.total or damping > MOST_DAMPING:
+                return best, True
+            damping *= HARDER
+    return best, False
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """Least squares of parameters and the initial states of every recording.
+
+    Attributes
+    ----------
+    shared
+        Products of the parameters' columns, summed over the recordings, shape ``(p, p)``.
+    own
+        The same of each recording's initial state, shape ``(r, d, d)``.
+    between
+        Of parameters and initial states, shape ``(r, p, d)``.
+    shared_target, own_target
+        With the residuals: shapes ``(p,)`` and ``(r, d)``.
+    """
+
+    shared: np.ndarray
+    own: np.ndarray
+    between: np.ndarray
+    shared_target: np.ndarray
+    own_target: np.ndarray
+
+    def with_expectations(self, expected: Expectations, values: np.ndarray) -> NormalEquations:
+        """The same with what is expected of the parameters, which are at `values`, shape ``(p,)``."""
+        return replace(
+            self,
+            shared=self.shared + expected.rows.T @ expected.rows,
+            shared_target=self.shared_target + expected.rows.T @ expected.deviations(values),
+        )
+
+    def step(self, damping: float) -> tuple[np.ndarray, np.ndarray, float]:
+        """Changes of parameters ``(p,)`` and initial states ``(r, d)``, and what they gain if all is linear.
+
+        Every direction is damped by its own square; initial states are eliminated recording by recording.
+        """
+        scale = _sizes(np.diag(self.shared))
+        own_scale = _sizes(np.einsum("rii->ri", self.own))
+        shared = self.shared / np.outer(scale, scale) + damping * np.eye(len(scale))
+        own = self.own / (own_scale[:, :, None] * own_scale[:, None, :]) + damping * np.eye(
+            own_scale.shape[1]
+        )
+        between = self.between / (scale[None, :, None] * own_scale[:, None, :])
+        target, own_target = self.shared_target / scale, self.own_target / own_scale
+        inverse = np.linalg.pinv(own, rcond=SINGULAR, hermitian=True)
+        through = between @ inverse
+        reduced = shared - (through @ between.transpose(0, 2, 1)).sum(axis=0)
+        rest = target - np.einsum("rpd,rd->p", through, own_target)
+        change = np.linalg.pinv(reduced, rcond=SINGULAR, hermitian=True) @ rest
+        begin = np.einsum("rde,re->rd", inverse, own_target - np.einsum("rpd,p->rd", between, change))
+        linear = float(change @ target + (begin * own_target).sum())
+        length = float(change @ change + (begin**2).sum())
+        return change / scale, begin / own_scale, linear + damping * length
+
+
+def normal_equations(
+    linearisation: Linearisation, data: Measurements, variance: np.ndarray
+) -> NormalEquations:
+    """The normal equations along trajectories without gaps, at the sensors' variances ``(m,)``."""
+    innovations, by_parameters, by_initial, _ = whitened_innovations(
+        data.first,
+        linearisation.transition,
+        linearisation.response,
+        np.zeros_like(linearisation.gap),
+        np.zeros_like(linearisation.transition),
+        linearisation.measured,
+        linearisation.measured_response,
+        linearisation.residual,
+        variance,
+    )
+    dimension, parameters = by_initial.shape[2], by_parameters.shape[2]
+    recordings = len(data.labels)
+    shared, shared_target = np.zeros((parameters, parameters)), np.zeros(parameters)
+    own, own_target = np.zeros((recordings, dimension, dimension)), np.zeros((recordings, dimension))
+    between = np.zeros((recordings, parameters, dimension))
+    for place, (first, end) in enumerate(zip(data.first[:-1], data.first[1:], strict=True)):
+        # As of a root at zero: where a derivative is no number, no direction is known.
+        values = (end - first) * innovations.shape[1]
+        columns = by_parameters[first:end].reshape(values, parameters)
+        columns = np.nan_to_num(columns, posinf=0.0, neginf=0.0)
+        states = np.nan_to_num(by_initial[first:end].reshape(values, dimension), posinf=0.0, neginf=0.0)
+        left = innovations[first:end].ravel()
+        shared += columns.T @ columns
+        shared_target += columns.T @ left
+        between[place], own[place], own_target[place] = columns.T @ states, states.T @ states, states.T @ left
+    return NormalEquations(shared, own, between, shared_target, own_target)
+
+
+def _sizes(squares: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.where(squares > 0, squares, 1.0))
+
+
+SHORTEST_PREFIX = 8  # samples
+PREFIX = 0.2  # of a recording
+
+
+@dataclass(frozen=True)
+class FreeRun:
+    """A simulation of held-out recordings.
+
+    Attributes
+    ----------
+    outputs
+        Shape ``(n, m)``; NaN from where the simulation ran away.
+    scored
+        Rows behind the prefixes, shape ``(n,)``.
+    """
+
+    outputs: np.ndarray
+    scored: np.ndarray
+
+
+@dataclass(frozen=True)
+class UsualStates:
+    """Where a system usually is: what a prefix does not tell of a state that nobody measures.
+
+    Attributes
+    ----------
+    mean, width
+        Of each state: its mean, and how far from there it may well begin; shape ``(d,)``.
+    """
+
+    mean: np.ndarray
+    width: np.ndarray
+
+    @classmethod
+    def along(cls, x: np.ndarray) -> UsualStates:
+        """Of states ``(n, d)`` along recordings: anywhere within their range, as many begin at its ends."""
+        return cls(x.mean(axis=0), np.ptp(x, axis=0))
+
+
+def free_run(
+    model: Dynamics,
+    data: Measurements,
+    *,
+    noise: Noise,
+    substeps: int,
+    told: int | None = None,
+    usual: UsualStates | None = None,
+) -> FreeRun:
+    """Simulate recordings from states that their prefixes tell.
+
+    Parameters
+    ----------
+    model
+        With the parameters' values to be used; nothing but initial states is fitted.
+    data
+        The recordings.
+    noise
+        The measurement noise weighs the outputs; the process noise lets the states follow the prefix first.
+    substeps
+        Runge–Kutta steps between samples.
+    told
+        Samples of each prefix; by default a fifth of the recording, and `SHORTEST_PREFIX` at least.
+    usual
+        Where the states are expected beforehand; by default nothing is.
+    """
+    rows = told_rows(data, told)
+    prefix = data.until(np.maximum(rows, 2))
+    x = initial_states(model, prefix, noise=noise, substeps=substeps, usual=usual)
+    states = run(model, Grid(data, substeps), x)
+    signals = data.signals(data.t, data.recording, delays=model.lags(model.values))
+    within = np.arange(len(data.t)) - data.first[data.recording]
+    return FreeRun(
+        outputs=model.functions.outputs(states.T, signals, model.values).T,
+        scored=within >= rows[data.recording],
+    )
+
+
+def told_rows(data: Measurements, told: int | None = None) -> np.ndarray:
+    """How many rows of each recording tell its initial state, shape ``(recordings,)``; see `free_run`."""
+    lengths = np.diff(data.first)
+    if told is None:
+        rows = np.maximum((PREFIX * lengths).astype(int), SHORTEST_PREFIX)
+    else:
+        rows = np.full(len(lengths), told)
+    return np.minimum(rows, lengths - 1)
+
+
+def initial_states(
+    model: Dynamics,
+    data: Measurements,
+    *,
+    noise: Noise,
+    substeps: int,
+    usual: UsualStates | None = None,
+) -> np.ndarray:
+    """The states in which recordings begin, shape ``(recordings, d)``, with all parameters as they are."""
+    still = replace(model, parameters=tuple(replace(each, fixed=True) for each in model.parameters))
+    process = np.zeros(model.dimension)
+    process[: len(noise.process)] = noise.process
+    start = first_states(still, data)
+    if usual is not None:
+        still, data, noise = _with_usual_states(still, data, noise, usual)
+    follow = fit_by_multiple_shooting(
+        still,
+        data,
+        x=start,
+        noise=Noise(noise.measurement, process),
+        estimate_process=False,
+        substeps=substeps,
+    )
+    x = follow.x if np.isfinite(follow.sum_of_squares) else start
+    strict = fit_by_multiple_shooting(
+        still,
+        data,
+        x=x,
+        noise=Noise(noise.measurement, np.zeros(model.dimension)),
+        estimate_process=False,
+        substeps=substeps,
+    )
+    if strict.converged:
+        return strict.x[data.first[:-1]]
+    # Where f jumps or a reading is cut off, steps of all samples at once may go to and fro. Damped steps of
+    # whole trajectories never make it worse.
+    damped = fit_trajectories(still, data, begin=x[data.first[:-1]], noise=noise, substeps=substeps)
+    best = damped.x if np.isfinite(damped.sum_of_squares) else x
+    return best[data.first[:-1]]
+
+
+def _with_usual_states(
+    model: Dynamics, data: Measurements, noise: Noise, usual: UsualStates
+) -> tuple[Dynamics, Measurements, Noise]:
+    """What is expected of first states, as if it were measured: once, and as inaccurately as it is known."""
+    moving = np.flatnonzero(usual.width > 0)
+    names = [model.states[place] for place in moving]
+    expected = np.full((len(data.t), len(names)), np.nan)
+    expected[data.first[:-1]] = usual.mean[moving]
+    variances = np.concatenate([noise.measurement, usual.width[moving] ** 2])
+    return (
+        replace(model, outputs=(*model.outputs, *((f"usual_{name}", symbol(name)) for name in names))),
+        replace(data, outputs=np.hstack([data.outputs, expected]), sensor_noise=variances),
+        replace(noise, measurement=variances),
+    )
+
+
+def normalised_rms(outputs: np.ndarray, simulated: FreeRun) -> float | None:
+    """Root mean square error over that of the outputs about their mean; None where a simulation ran away.
+
+    Parameters
+    ----------
+    outputs
+        As measured, shape ``(n, m)``.
+    simulated
+        The free run of the same recordings.
+    """
+    squares = squared_errors(outputs, simulated)
+    return None if squares is None else float(np.sqrt(squares.mean()))
+
+
+def squared_errors(outputs: np.ndarray, simulated: FreeRun) -> np.ndarray | None:
+    """Squared errors over the variance of each output, of every value that is scored; see `normalised_rms`.
+
+    Returns
+    -------
+    numpy.ndarray or None
+        Shape ``(values,)``, sample by sample; what was not measured is left out. None where a simulation ran
+        away.
+    """
+    measured = outputs[simulated.scored]
+    error = simulated.outputs[simulated.scored] - measured
+    known = np.isfinite(measured)
+    if not np.isfinite(error[known]).all():
+        return None
+    spread = np.nanvar(measured, axis=0)
+    squares: np.ndarray = (error**2 / np.where(spread > 0, spread, 1.0))[known]
+    return squares
+
+
+EDGE_SUBSTEPS = 12  # between samples, for models whose f jumps
+# A guard, for where the likelihood still changes. Friction that sticks took more than 96 at 40 dB.
+FINEST = 384
+SHARP = 0.5  # change of the log-likelihood by halving the substeps, below which a jump is sharp enough
+EDGE = 0.05  # width of a jump, in what its argument passes in a substep
+
+
+def jumps_of(model: Dynamics) -> list[sympy.Expr]:
+    """What changes its sign where f jumps, each once, in an order that does not change."""
+    signs = {each for formula in model.equations for each in formula.atoms(sympy.sign)}
+    return sorted((each.args[0] for each in signs), key=str)
+
+
+def spread_edges(model: Dynamics, data: Measurements, x: np.ndarray, *, substeps: int) -> Dynamics:
+    """The model with its jumps spread over about what their arguments pass in a substep.
+
+    Parameters
+    ----------
+    model, data
+        The model and what it is compared with.
+    x
+        States along which it is used, shape ``(n, d)``.
+    substeps
+        Runge–Kutta steps between samples.
+    """
+    arguments = jumps_of(model)
+    if not arguments:
+        return model
+    formulas = [evaluable(each, model) for each in arguments]
+    signals = data.signals(data.t, data.recording, delays=model.lags(model.values))
+    function = compile_values(formulas, arguments_of(model), common=False)
+    further = np.zeros((model.dimension - x.shape[1], len(x)))  # states that a mechanism brings
+    along = function(
+        *x.T, *further, *signals.inputs, *signals.delayed, *signals.slopes, signals.t, *model.values
+    )
+    rows = data.begins
+    widths = []
+    for course in along:
+        course = np.broadcast_to(course, data.t.shape)
+        passed = np.sqrt(np.mean((course[rows + 1] - course[rows]) ** 2))
+        widths.append(EDGE * float(passed) / substeps + 1e-300)
+    return replace(model, edges=tuple(zip(arguments, widths, strict=True)))
+
+
+def sharpened(rough: Fit, data: Measurements, *, budget: Budget | None = None) -> Fit:
+    """A fit whose jumps are spread so little that it no longer matters; motion that sticks asks for this.
+
+    Without process noise only: with it the states follow the data anyway.
+    """
+    while (
+        rough.converged and rough.model.edges and not rough.has_process_noise and 2 * rough.substeps <= FINEST
+    ):
+        substeps = 2 * rough.substeps
+        model = spread_edges(rough.model, data, rough.x, substeps=substeps)
+        begin = rough.x[data.first[:-1]]
+        finer = fit_trajectories(
+            model, data, begin=begin, noise=rough.noise, substeps=substeps, budget=budget
+        )
+        if not finer.converged:
+            finer = fit_by_multiple_shooting(
+                model,
+                data,
+                x=rough.x,
+                noise=rough.noise,
+                estimate_process=False,
+                substeps=substeps,
+                budget=budget,
+            )
+        if not finer.converged:
+            break
+        gained, rough = finer.log_likelihood - rough.log_likelihood, finer
+        if abs(gained) < SHARP:
+            break
+    return rough

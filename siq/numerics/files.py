@@ -1,0 +1,296 @@
+"""Files that appear whole or not at all, YAML files read as data with the line of every entry, and folders.
+
+Both system cards and studies are such documents. A document is never code: only YAML's plain types are
+built, a key that stands twice is refused, and whatever the schema refuses is told with its line.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ValidationError
+
+from siq.errors import InputError, suggestion
+
+
+@contextmanager
+def whole_file(path: str | Path) -> Iterator[Path]:
+    """A temporary path beside `path` that takes its place once the block has ended without an error.
+
+    A killed process leaves the old file, or none, and perhaps the temporary one, which the next attempt
+    overwrites. The folder is made if need be.
+
+    Parameters
+    ----------
+    path
+        The file to be written.
+
+    Yields
+    ------
+    pathlib.Path
+        Where to write; it keeps the suffix of `path`, which some writers choose their format by.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".partial-{path.name}")
+    try:
+        yield partial
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")
+Keys = tuple[str | int, ...]
+Model = TypeVar("Model", bound=BaseModel)
+
+
+@dataclass(frozen=True)
+class Document:
+    """A YAML mapping with the line on which every entry stands.
+
+    Attributes
+    ----------
+    file
+        The file as the user named it.
+    data
+        The mapping, of plain types only.
+    lines
+        Line number (from 1) of every entry, by its path of keys: ``("equations", "x")``.
+    """
+
+    file: str
+    data: dict[str, Any]
+    lines: dict[Keys, int]
+
+    def place(self, keys: Keys) -> str:
+        """Say where an entry stands, in words; the nearest parent's line where it has none."""
+        for length in range(len(keys), 0, -1):
+            if keys[:length] in self.lines:
+                return f"line {self.lines[keys[:length]]} ({'.'.join(str(key) for key in keys)})"
+        return ".".join(str(key) for key in keys)
+
+
+def read_document(path: str | Path) -> Document:
+    """Read a YAML mapping and the lines of its entries.
+
+    Parameters
+    ----------
+    path
+        A UTF-8 YAML file whose top level is a mapping.
+
+    Raises
+    ------
+    InputError
+        When the file is missing, is not YAML, is not a mapping, or has a key twice.
+    """
+    file = str(path)
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(
+            file, "", f"it cannot be read ({_reason(error)})", "check the name and permissions"
+        ) from None
+    try:
+        for event in yaml.parse(text, Loader=yaml.SafeLoader):
+            if isinstance(event, yaml.AliasEvent):  # may refer to itself, or multiply without bound
+                raise InputError(
+                    file,
+                    f"line {event.start_mark.line + 1}" if event.start_mark else "",
+                    f"the alias '*{event.anchor}' is not allowed",
+                    "write the value out",
+                )
+        root = yaml.compose(text, Loader=yaml.SafeLoader)
+        data = yaml.safe_load(text)
+    except InputError:
+        raise
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        mark = getattr(error, "problem_mark", None)
+        place = f"line {mark.line + 1}" if mark is not None else ""
+        problem = getattr(error, "problem", None) or "an entry cannot be read"
+        raise InputError(
+            file, place, f"it is not valid YAML ({problem})", "correct the syntax or the indentation"
+        ) from None
+    if not isinstance(data, dict) or root is None:
+        raise InputError(
+            file, "line 1", "the file is not a mapping of keys to values", "write it as 'key: value' lines"
+        )
+    lines: dict[Keys, int] = {}
+    _collect_lines(file, root, (), lines)
+    return Document(file=file, data=data, lines=lines)
+
+
+def validate(document: Document, model: type[Model]) -> Model:
+    """Check a document against a pydantic model and return the model's instance.
+
+    Raises
+    ------
+    InputError
+        For the first entry that the model refuses; a misspelt key is told with the nearest known one.
+    """
+    try:
+        return model.model_validate(document.data)
+    except ValidationError as error:
+        # A misspelt key is also a missing one; the misspelling is what to tell.
+        faults = error.errors(include_url=False)
+        first = next((fault for fault in faults if fault["type"] in UNKNOWN_KEY), faults[0])
+    keys = tuple(first["loc"])
+    # The loc of a union member ends in the member's name; the document has no such entry.
+    while len(keys) > 1 and keys not in document.lines and first["type"] not in ("missing",):
+        keys = keys[:-1]
+    fault, remedy = _explain(first, keys, model)
+    raise InputError(document.file, document.place(keys), fault, remedy)
+
+
+def _explain(error: Any, keys: Keys, model: type[BaseModel]) -> tuple[str, str]:
+    name = keys[-1] if keys else ""
+    kind = error["type"]
+    if kind in UNKNOWN_KEY:
+        known = _known_keys(model, keys[:-1])
+        otherwise = f"remove it or use one of {', '.join(sorted(known))}"
+        return f"the key '{name}' is unknown", suggestion(str(name), known, otherwise=otherwise)
+    if kind in ("missing", "missing_argument"):
+        return f"the key '{name}' is missing", f"add '{name}: ...'"
+    message = error["msg"].removeprefix("Value error, ").removeprefix("Assertion failed, ")
+    message = message[:1].lower() + message[1:]
+    if "; " in message:  # a validator of ours: fault and remedy in one sentence
+        fault, remedy = message.split("; ", 1)
+        return fault, remedy.rstrip(".")
+    return f"the value {error['input']!r} cannot be used", message.rstrip(".")
+
+
+def _known_keys(model: Any, keys: Keys) -> list[str]:
+    schema = model.model_json_schema()
+    node = schema
+    for key in keys:
+        options = [node, *node.get("anyOf", []), *node.get("allOf", [])]
+        options = [_resolve(schema, option) for option in options]
+        found = [option["properties"][key] for option in options if key in option.get("properties", {})]
+        # Entries of a mapping of names, such as the states of a card, share one schema.
+        found += [option["additionalProperties"] for option in options if option.get("additionalProperties")]
+        found += [part for option in options for part in option.get("patternProperties", {}).values()]
+        if isinstance(key, int):
+            found += [option["items"] for option in options if isinstance(option.get("items"), dict)]
+        if not found:
+            return []
+        node = found[0]
+    options = [_resolve(schema, option) for option in [node, *node.get("anyOf", []), *node.get("allOf", [])]]
+    return [name for option in options for name in option.get("properties", {})]
+
+
+def _resolve(schema: dict[str, Any], node: dict[str, Any]) -> dict[str, Any]:
+    while "$ref" in node:
+        node = schema["$defs"][node["$ref"].rsplit("/", 1)[-1]]
+    return node
+
+
+def _collect_lines(file: str, node: yaml.Node, keys: Keys, lines: dict[Keys, int]) -> None:
+    if isinstance(node, yaml.MappingNode):
+        for key_node, value_node in node.value:
+            path = (*keys, key_node.value)
+            if path in lines:
+                raise InputError(
+                    file,
+                    f"line {key_node.start_mark.line + 1}",
+                    f"the key '{key_node.value}' stands twice (first on line {lines[path]})",
+                    "keep one of the two",
+                )
+            lines[path] = key_node.start_mark.line + 1
+            _collect_lines(file, value_node, path, lines)
+    elif isinstance(node, yaml.SequenceNode):
+        for index, value_node in enumerate(node.value):
+            path = (*keys, index)
+            lines[path] = value_node.start_mark.line + 1
+            _collect_lines(file, value_node, path, lines)
+
+
+def _reason(error: Exception) -> str:
+    return getattr(error, "strerror", None) or type(error).__name__
+
+
+SUFFIXES = (".parquet", ".csv", ".tsv", ".txt", ".dat", ".h5", ".hdf5", ".mat", ".npz", ".npy")
+"""Of files that can be read; `siq.data.formats.READERS` has a reader for each."""
+
+
+CARD, RECORDINGS = "system.yaml", ("recordings.parquet", "recordings.csv")
+"""The files of a case: the equations of a simulation, and what was recorded."""
+
+
+def case_folders(folder: Path) -> dict[str, Path]:
+    """The cases of a folder by name: itself where it has a card, or the folders in it that have one.
+
+    Parameters
+    ----------
+    folder
+        Has to be there.
+    """
+    if (folder / CARD).is_file():
+        return {folder.resolve().name: folder}
+    return {
+        path.name: path
+        for path in sorted(folder.iterdir())
+        if path.is_dir() and any((path / name).exists() for name in (CARD, *RECORDINGS))
+    }
+
+
+def missing_file(file: str, looked_at: Sequence[Path]) -> InputError:
+    """What to say of a file that is not there: where it was looked for, and what has nearly its name.
+
+    Parameters
+    ----------
+    file
+        As the user named it.
+    looked_at
+        Every path that was tried.
+    """
+    places = list(dict.fromkeys(str(path.absolute()) for path in looked_at))
+    fault = f"No such file; it was looked for at {' and at '.join(places)}"
+    for path in looked_at:
+        folder = path.parent
+        if not folder.is_dir():
+            continue
+        names = {
+            each.name.casefold(): each.name for each in folder.iterdir() if not each.name.startswith(".")
+        }
+        near = difflib.get_close_matches(path.name.casefold(), names, n=1)
+        near = near or [name for name in names if Path(name).stem == path.stem.casefold()]
+        if near:
+            return InputError(file, "", fault, f"perhaps you meant '{folder / names[near[0]]}'")
+    missing = next((path.parent for path in looked_at if not path.parent.is_dir()), None)
+    remedy = (
+        f"there is no folder '{missing}' either" if missing is not None else "check the name and the folder"
+    )
+    return InputError(file, "", fault, remedy)
+
+
+def files_of(folder: Path) -> list[Path]:
+    """The files of recordings in a folder, in the order of their names.
+
+    Parameters
+    ----------
+    folder
+        Hidden files in it are left out, and those that cannot be read.
+
+    Raises
+    ------
+    InputError
+        When there are none.
+    """
+    found = sorted(
+        path
+        for path in folder.iterdir()
+        if path.is_file() and path.suffix.lower() in SUFFIXES and not path.name.startswith((".", "~"))
+        and path.stem.casefold() not in ("readme", "notes", "license")
+    )  # fmt: skip
+    if not found:
+        raise InputError(
+            str(folder), "", "the folder holds no recordings",
+            f"put one file per recording into it, with one of the suffixes {', '.join(SUFFIXES)}",
+        )  # fmt: skip
+    return found

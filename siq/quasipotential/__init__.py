@@ -1,0 +1,1 @@
+"""The quasipotential: V about attractors, paths, rates, densities, landscapes, and their certificate."""

@@ -1,0 +1,357 @@
+"""Symbolic decompositions: the formulas of V, g and f, and their file `model.json`.
+
+A formula is a sympy expression of the states. `model.json` (`siq.quasipotential.formulas`) is how it travels.
+
+Polynomials stand as ``{"center", "scale", "exponents", "coefficients"}``, meaning
+``Σ c Π ((x - center)/scale)^e`` in the states' own units; anything else as ``{"formula": "text"}``.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.optimize
+import sympy
+
+from siq.errors import InputError, NumericalFailure
+from siq.inference.library import CandidateLibrary, linear_combination
+from siq.numerics.files import whole_file
+from siq.quasipotential.hamilton_jacobi import PowerBasis
+from siq.quasipotential.wells import TOLERANCE, DegreeTrial, Well
+from siq.systems.diffusion import Diffusion, diffusion_of_rows, diffusion_rows_of
+from siq.systems.dynamics import Dynamics
+from siq.systems.formulas import FormulaError, compile_formulas, parse_formula
+
+
+@dataclass(frozen=True)
+class SymbolicDecomposition:
+    """Formulas of ``f = -D∇V + g``.
+
+    Attributes
+    ----------
+    symbols
+        The d states.
+    potential
+        V, zero at its minimum; None where no single formula holds over the wells.
+    circulatory
+        Components of g; none where there is no V.
+    vector_field
+        Components of f.
+    wells
+        V about each attractor, zero there and valid below a level, where it was found.
+    standard_errors
+        Of the coefficients, by component (``U``, ``V``, ``f_x``, ``g_x``) and term, where they are known.
+    """
+
+    symbols: tuple[sympy.Symbol, ...]
+    potential: sympy.Expr | None
+    circulatory: tuple[sympy.Expr, ...]
+    vector_field: tuple[sympy.Expr, ...]
+    wells: tuple[Well, ...] = ()
+    standard_errors: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+
+    @property
+    def quasipotential(self) -> sympy.Expr:
+        """U = 2V, zero at its minimum: the action is ½∫∣φ̇ - f∣²dt, and p ~ exp(-U/ε) for √ε dW."""
+        return sympy.expand(2 * self._potential())
+
+    @property
+    def gradient(self) -> tuple[sympy.Expr, ...]:
+        """∇V."""
+        return tuple(self._potential().diff(symbol) for symbol in self.symbols)
+
+    def _potential(self) -> sympy.Expr:
+        if self.potential is None:
+            raise ValueError("no single formula of V was found; each well has its own")
+        return self.potential
+
+    @cached_property
+    def evaluate(self) -> Callable[[np.ndarray], np.ndarray]:
+        """V, g_1 … g_d, f_1 … f_d: points as components ``(d, ...)`` to values ``(2d + 1, ...)``."""
+        return compile_formulas([self._potential(), *self.circulatory, *self.vector_field], self.symbols)
+
+    @cached_property
+    def evaluate_gradient(self) -> Callable[[np.ndarray], np.ndarray]:
+        """∇V: points as components ``(d, ...)`` to components ``(d, ...)``."""
+        return compile_formulas(self.gradient, self.symbols)
+
+    def components(self) -> dict[str, sympy.Expr]:
+        """The formulas by the names that tables give them: ``U``, ``V``, ``f_x``, ``g_x`` and so on."""
+        formulas = {} if self.potential is None else {"U": self.quasipotential, "V": self.potential}
+        formulas |= {f"f_{s}": f for s, f in zip(self.symbols, self.vector_field, strict=True)}
+        if self.circulatory:
+            formulas |= {f"g_{s}": g for s, g in zip(self.symbols, self.circulatory, strict=True)}
+        return formulas
+
+
+def exact_decomposition(dynamics: Dynamics, quasipotential: sympy.Expr) -> SymbolicDecomposition:
+    """The decomposition of known dynamics with a known U = 2V; g = f + D∇V. For scoring only."""
+    potential = sympy.expand(quasipotential / 2)
+    gradient = [potential.diff(symbol) for symbol in dynamics.symbols]
+    downhill = downhill_formulas(dynamics.diffusion, gradient)
+    return SymbolicDecomposition(
+        symbols=dynamics.symbols,
+        potential=potential,
+        circulatory=tuple(sympy.expand(f + v) for f, v in zip(dynamics.formulas, downhill, strict=True)),
+        vector_field=tuple(sympy.expand(formula) for formula in dynamics.formulas),
+    )
+
+
+def downhill_formulas(diffusion: Diffusion, gradient: Sequence[sympy.Expr]) -> tuple[sympy.Expr, ...]:
+    """D∇V as formulas, from those of ∇V."""
+    return tuple(
+        sum((entry * slope for entry, slope in zip(row, gradient, strict=True)), sympy.S.Zero)
+        for row in diffusion.formulas
+    )
+
+
+def decomposition_from_coefficients(
+    library: CandidateLibrary,
+    *,
+    potential: np.ndarray,
+    circulatory: np.ndarray,
+    vector_field: np.ndarray,
+    points: np.ndarray,
+) -> SymbolicDecomposition:
+    """Formulas from coefficients over a library, with V shifted to be zero at its minimum.
+
+    Parameters
+    ----------
+    library
+        The q functions.
+    potential
+        Coefficients of V, shape ``(q,)``.
+    circulatory, vector_field
+        Coefficients of g and f, shape ``(q, d)``.
+    points
+        Shape ``(n, d)``; the minimum is sought within their box, from the lowest of them.
+
+    Raises
+    ------
+    NumericalFailure
+        When V is nowhere finite on the points.
+    """
+
+    def expression(coefficients: np.ndarray) -> sympy.Expr:
+        chosen = np.flatnonzero(coefficients)
+        return sympy.Add(*(sympy.Float(float(coefficients[k]), 17) * library.terms[k] for k in chosen))
+
+    value = expression(potential)
+    lowest = minimum(value, library.symbols, points)
+    return SymbolicDecomposition(
+        symbols=library.symbols,
+        potential=value - sympy.Float(lowest, 17),
+        circulatory=tuple(expression(column) for column in circulatory.T),
+        vector_field=tuple(expression(column) for column in vector_field.T),
+    )
+
+
+def minimum(
+    expression: sympy.Expr, symbols: Sequence[sympy.Symbol], points: np.ndarray, *, starts: int = 8
+) -> float:
+    """Smallest value of an expression within the box of some points.
+
+    Parameters
+    ----------
+    expression
+        A function of `symbols`.
+    symbols
+        The d states.
+    points
+        Shape ``(n, d)``. Descents start from the lowest of them that do not lie side by side.
+    starts
+        Number of descents.
+
+    Returns
+    -------
+    float
+    """
+    together = compile_formulas([expression, *(expression.diff(s) for s in symbols)], tuple(symbols))
+    values = together(points.T)[0]
+    if not np.isfinite(values).any():
+        raise NumericalFailure("the formula of V is nowhere finite on the recorded points")
+    scale = np.ptp(points, axis=0)
+    scale[scale == 0] = 1.0
+    # Spread over all points, not among the lowest only: one well may be recorded far more often than a
+    # deeper one.
+    order = points[np.argsort(np.where(np.isfinite(values), values, np.inf))]
+    chosen: list[np.ndarray] = []
+    while len(order) and len(chosen) < starts:
+        chosen.append(order[0])
+        order = order[np.linalg.norm((order - order[0]) / scale, axis=1) > 0.15]
+    bounds = np.stack([points.min(axis=0), points.max(axis=0)], axis=1) / scale[:, None]
+    unit = float(np.ptp(values[np.isfinite(values)])) or 1.0
+
+    def function(y: np.ndarray) -> tuple[float, np.ndarray]:
+        result = together((y * scale)[:, None])[:, 0]
+        return result[0] / unit, result[1:] * scale / unit
+
+    best = float(np.nanmin(values))
+    for point in chosen:
+        found = scipy.optimize.minimize(
+            function, point / scale, jac=True, bounds=bounds, method="L-BFGS-B",
+            options={"ftol": 1e-15, "gtol": 1e-12},
+        )  # fmt: skip
+        best = min(best, float(found.fun) * unit)
+    return best
+
+
+def term_coefficients(expression: sympy.Expr) -> dict[str, float]:
+    """Coefficients by term as text, such as ``{"x**2": -2.0, "1": 1.0}``; zeros left out."""
+    return {str(term): value for term, value in linear_combination(expression).items()}
+
+
+def expression_to_data(expression: sympy.Expr, symbols: Sequence[sympy.Symbol]) -> dict[str, Any]:
+    """A formula as plain data: a polynomial by its coefficients, anything else by its text."""
+    # "is polynomial" must not simplify: 1/x*x**2 is what the library said it is.
+    if expression.is_polynomial(*symbols):
+        polynomial = sympy.Poly(expression, *symbols)
+        pairs = [(list(map(int, e)), float(c)) for e, c in polynomial.terms() if c != 0]
+        return {
+            "center": [0.0] * len(symbols),
+            "scale": [1.0] * len(symbols),
+            "exponents": [exponents for exponents, _ in pairs],
+            "coefficients": [coefficient for _, coefficient in pairs],
+        }
+    return {"formula": str(expression)}
+
+
+def expression_from_data(data: Mapping[str, Any], symbols: Sequence[sympy.Symbol]) -> sympy.Expr:
+    """The formula that `expression_to_data` wrote; text goes through the whitelist of formulas."""
+    if "formula" in data:
+        return parse_formula(data["formula"], {symbol.name: symbol for symbol in symbols})
+    scaled = [
+        symbol if (center, scale) == (0, 1) else (symbol - center) / scale
+        for symbol, center, scale in zip(symbols, data["center"], data["scale"], strict=True)
+    ]
+    return sympy.Add(
+        *(
+            sympy.Float(float(coefficient), 17)
+            * sympy.Mul(*(s ** int(e) for s, e in zip(scaled, exponents, strict=True)))
+            for exponents, coefficient in zip(data["exponents"], data["coefficients"], strict=True)
+        )
+    )
+
+
+def model_to_data(
+    decompositions: Mapping[str, SymbolicDecomposition], certificates: Mapping[str, Mapping[str, Any]]
+) -> dict[str, Any]:
+    """Decompositions by method, with a certificate for each, as plain data.
+
+    Certificates of what is no method, such as a randomised network, stand beside them.
+    """
+    if not decompositions:
+        return {"states": [], "methods": {}, "certificate": {}}
+    symbols = next(iter(decompositions.values())).symbols
+    methods = {method: _decomposition_to_data(one) for method, one in decompositions.items()}
+    return {
+        "states": [symbol.name for symbol in symbols],
+        "methods": methods,
+        "certificate": {method: dict(one) for method, one in certificates.items()},
+    }
+
+
+def _decomposition_to_data(one: SymbolicDecomposition) -> dict[str, Any]:
+    symbols = one.symbols
+    data: dict[str, Any] = {
+        "V": None if one.potential is None else expression_to_data(one.potential, symbols),
+        "g": [expression_to_data(component, symbols) for component in one.circulatory],
+        "f": [expression_to_data(component, symbols) for component in one.vector_field],
+    }
+    if one.wells:
+        data["wells"] = [
+            {
+                "attractor": well.attractor.tolist(),
+                "level": well.level,
+                "saddle": None if well.saddle is None else well.saddle.tolist(),
+                "reach": well.reach,
+                "tolerance": well.tolerance,
+                "residual": well.residual,
+                "V": powers_to_data(well),
+                "degrees": [asdict(trial) for trial in well.trials],
+            }
+            for well in one.wells
+        ]
+        data["D"] = diffusion_rows_of(one.wells[0].dynamics.diffusion)
+    if one.standard_errors:
+        data["standard_errors"] = {name: dict(errors) for name, errors in one.standard_errors.items()}
+    return data
+
+
+def powers_to_data(well: Well) -> dict[str, Any]:
+    """V of a well as center, scale, exponents and coefficients."""
+    basis = well.basis
+    return {
+        "center": basis.center.tolist(),
+        "scale": basis.scale.tolist(),
+        "exponents": basis.exponents.tolist(),
+        "coefficients": well.coefficients.tolist(),
+    }
+
+
+def basis_from_data(powers: Mapping[str, Any], symbols: tuple[sympy.Symbol, ...]) -> PowerBasis:
+    """The powers that `powers_to_data` wrote."""
+    return PowerBasis(
+        symbols, np.array(powers["center"]), np.array(powers["scale"]), np.array(powers["exponents"])
+    )
+
+
+def _wells_from_data(method: Mapping[str, Any], symbols: tuple[sympy.Symbol, ...]) -> tuple[Well, ...]:
+    if not method.get("wells"):
+        return ()
+    d = len(symbols)
+    equations = [expression_from_data(part, symbols) for part in method["f"]]
+    diffusion = diffusion_of_rows(symbols, method.get("D", np.eye(d).tolist()))
+    dynamics = Dynamics.of(symbols, equations, diffusion=diffusion)
+    return tuple(
+        Well(
+            dynamics, np.array(one["attractor"]), basis_from_data(one["V"], symbols),
+            np.array(one["V"]["coefficients"], dtype=float), float(one["level"]),
+            None if one.get("saddle") is None else np.array(one["saddle"]),
+            float(one.get("residual", np.nan)), np.zeros((0, d)), float(one.get("reach", one["level"])),
+            float(one.get("tolerance", TOLERANCE)), None,
+            tuple(DegreeTrial(**trial) for trial in one.get("degrees", ())),
+        )
+        for one in method["wells"]
+    )  # fmt: skip
+
+
+def write_model(path: str | Path, model: Mapping[str, Any]) -> None:
+    """Write a model whole or not at all."""
+    with whole_file(path) as partial:
+        partial.write_text(json.dumps(model, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def read_model(path: str | Path) -> tuple[dict[str, SymbolicDecomposition], dict[str, Any]]:
+    """Read a model: its decompositions by method, and their certificates.
+
+    Raises
+    ------
+    InputError
+        When the file is not a model, or a formula in it is refused.
+    """
+    try:
+        data = json.loads(Path(path).read_text(encoding="utf-8"))
+        symbols = tuple(sympy.Symbol(name, real=True) for name in data["states"])
+        decompositions = {
+            method: SymbolicDecomposition(
+                symbols=symbols,
+                potential=None if one["V"] is None else expression_from_data(one["V"], symbols),
+                circulatory=tuple(expression_from_data(part, symbols) for part in one["g"]),
+                vector_field=tuple(expression_from_data(part, symbols) for part in one["f"]),
+                wells=_wells_from_data(one, symbols),
+                standard_errors=one.get("standard_errors", {}),
+            )
+            for method, one in data["methods"].items()
+        }
+        return decompositions, data["certificate"]
+    except FormulaError as error:
+        raise InputError(path, "", error.fault, error.remedy) from None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(path, "", f"it is not a model ({type(error).__name__})", "make it again") from None

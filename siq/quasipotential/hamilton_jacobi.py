@@ -1,0 +1,479 @@
+"""The Hamilton–Jacobi equation ``∇V·(f + D∇V) = 0``, solved by Gauss–Newton for V in a basis.
+
+Both give their functions, gradients and Hessians at points; see `siq.quasipotential.hamilton_jacobi` for what
+is done with them.
+
+The equation has false solutions that are just as exact as the true one: V flat along a direction, V = 0, and
+one for every invariant subspace of the linearisation. Where the iteration ends depends on where it starts;
+what it found must be tested by what does not know of this equation (`siq.quasipotential.certificate_tests`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+import scipy.linalg
+import sympy
+
+from siq.inference.library import CandidateLibrary, monomial_exponents
+from siq.systems.diffusion import Diffusion
+from siq.systems.dynamics import Dynamics
+from siq.systems.equilibria import measure_at
+from siq.systems.formulas import compile_formulas
+
+MOST_POWERS = 260  # more make every Gauss–Newton step take seconds
+
+
+class Basis(Protocol):
+    """m functions of d states."""
+
+    @property
+    def size(self) -> int:
+        """Number of functions, m."""
+
+    def values(self, x: np.ndarray) -> np.ndarray:
+        """Points ``(n, d)`` to values ``(n, m)``."""
+
+    def gradients(self, x: np.ndarray) -> np.ndarray:
+        """Points ``(n, d)`` to gradients ``(n, d, m)``."""
+
+    def hessians(self, x: np.ndarray) -> np.ndarray:
+        """Points ``(n, d)`` to Hessians ``(n, d, d, m)``."""
+
+    def expression(self, coefficients: np.ndarray) -> sympy.Expr:
+        """The sum as a formula of the states."""
+
+
+@dataclass(frozen=True)
+class LibraryBasis:
+    """The functions of a candidate library that V may use, without the constant.
+
+    Attributes
+    ----------
+    library
+        The library.
+    chosen
+        Shape ``(m,)``: which of its functions.
+    """
+
+    library: CandidateLibrary
+    chosen: np.ndarray
+
+    @property
+    def size(self) -> int:
+        """Number of functions, m."""
+        return len(self.chosen)
+
+    def restricted(self, rows: np.ndarray) -> LibraryBasis:
+        """Some of the functions."""
+        return LibraryBasis(self.library, self.chosen[rows])
+
+    def values(self, x: np.ndarray) -> np.ndarray:
+        """Points ``(n, d)`` to values ``(n, m)``."""
+        return self.library.evaluate(x)[:, self.chosen]
+
+    def gradients(self, x: np.ndarray) -> np.ndarray:
+        """Points ``(n, d)`` to gradients ``(n, d, m)``."""
+        d, q = self.library.dimension, self.library.size
+        flat = self.library.derivatives[:, :, self.chosen].reshape(q, d * self.size)
+        return (self.library.evaluate(x) @ flat).reshape(len(x), d, self.size)
+
+    def hessians(self, x: np.ndarray) -> np.ndarray:
+        """Points ``(n, d)`` to Hessians ``(n, d, d, m)``."""
+        d = self.library.dimension
+        flat = self._second(np.ascontiguousarray(x.T))
+        return np.moveaxis(flat.reshape(self.size, d, d, len(x)), (0, 3), (3, 0))
+
+    @cached_property
+    def _second(self):  # type: ignore[no-untyped-def]
+        symbols = self.library.symbols
+        second = [self.library.terms[k].diff(a, b) for k in self.chosen for a in symbols for b in symbols]
+        return compile_formulas(second, symbols)
+
+    def expression(self, coefficients: np.ndarray) -> sympy.Expr:
+        """The sum as a formula of the states."""
+        return sympy.Add(
+            *(
+                sympy.Float(float(c), 17) * self.library.terms[k]
+                for c, k in zip(coefficients, self.chosen, strict=True)
+                if c != 0
+            )
+        )
+
+
+def potential_basis(library: CandidateLibrary) -> LibraryBasis:
+    """All functions that V may use; the constant means nothing to V and is left out."""
+    allowed = library.in_potential.copy()
+    allowed[library.constant] = False
+    return LibraryBasis(library, np.flatnonzero(allowed))
+
+
+@dataclass(frozen=True)
+class PowerBasis:
+    """Products of powers of ``(x - center)/scale``.
+
+    Attributes
+    ----------
+    symbols
+        The d states.
+    center, scale
+        Shape ``(d,)``.
+    exponents
+        Shape ``(m, d)``.
+    """
+
+    symbols: tuple[sympy.Symbol, ...]
+    center: np.ndarray
+    scale: np.ndarray
+    exponents: np.ndarray
+
+    @property
+    def size(self) -> int:
+        """Number of functions, m."""
+        return len(self.exponents)
+
+    def values(self, x: np.ndarray) -> np.ndarray:
+        """Points ``(n, d)`` to values ``(n, m)``."""
+        return self._product(self._powers(x), ())
+
+    def gradients(self, x: np.ndarray) -> np.ndarray:
+        """Points ``(n, d)`` to gradients ``(n, d, m)``."""
+        powers = self._powers(x)
+        d = len(self.symbols)
+        return np.stack([self._product(powers, (i,)) for i in range(d)], axis=1)
+
+    def hessians(self, x: np.ndarray) -> np.ndarray:
+        """Points ``(n, d)`` to Hessians ``(n, d, d, m)``."""
+        powers = self._powers(x)
+        d = len(self.symbols)
+        rows = [np.stack([self._product(powers, (i, j)) for j in range(d)], axis=1) for i in range(d)]
+        return np.stack(rows, axis=1)
+
+    def expression(self, coefficients: np.ndarray) -> sympy.Expr:
+        """The sum as a formula of the states."""
+        scaled = [
+            (symbol - sympy.Float(float(c), 17)) / sympy.Float(float(s), 17)
+            for symbol, c, s in zip(self.symbols, self.center, self.scale, strict=True)
+        ]
+        return sympy.Add(
+            *(
+                sympy.Float(float(c), 17)
+                * sympy.Mul(*(base ** int(e) for base, e in zip(scaled, row, strict=True)))
+                for c, row in zip(coefficients, self.exponents, strict=True)
+                if c != 0
+            )
+        )
+
+    def _powers(self, x: np.ndarray) -> np.ndarray:
+        """Powers of every scaled state, shape ``(highest + 1, d, n)``."""
+        y = ((x - self.center) / self.scale).T
+        powers = np.ones((int(self.exponents.max()) + 1, *y.shape))
+        for exponent in range(1, len(powers)):
+            powers[exponent] = powers[exponent - 1] * y
+        return powers
+
+    def _product(self, powers: np.ndarray, derivatives: tuple[int, ...]) -> np.ndarray:
+        exponents = self.exponents.copy()
+        factor = np.ones(len(exponents))
+        for axis in derivatives:
+            factor = factor * exponents[:, axis] / self.scale[axis]
+            exponents[:, axis] = np.maximum(exponents[:, axis] - 1, 0)
+        result = np.repeat(factor[:, None], powers.shape[2], axis=1)
+        for axis in range(powers.shape[1]):
+            result *= powers[exponents[:, axis], axis]
+        return result.T
+
+
+def affordable_degree(dimension: int, degree: int) -> int:
+    """The highest degree up to `degree`, but at least 2, with no more than `MOST_POWERS` powers."""
+    while degree > 2 and math.comb(dimension + degree, degree) > MOST_POWERS:
+        degree -= 1
+    return degree
+
+
+def power_basis(
+    symbols: tuple[sympy.Symbol, ...], center: np.ndarray, scale: np.ndarray, *, degree: int
+) -> PowerBasis:
+    """All powers of degree 2 up to `degree` about a center; the quadratic ones come first."""
+    exponents = [row for row in monomial_exponents(len(symbols), degree) if sum(row) >= 2]
+    return PowerBasis(symbols, np.asarray(center, dtype=float), scale, np.array(exponents))
+
+
+VANISHING = 1e-8  # of f: where D∇V is smaller, Gauss–Newton is on its way to V = 0, which is a solution, too
+INDEPENDENT = 1e-5  # diagonal of a triangular factor: below this share columns are not independent enough
+
+STEEP = 3.0  # of the median residual: what is larger counts less and less
+UNTOLD = 1e-10  # of the largest singular value: combinations of functions that the points leave open
+
+
+@dataclass(frozen=True)
+class HamiltonJacobi:
+    """The equation at some points.
+
+    Attributes
+    ----------
+    points
+        Shape ``(n, d)``.
+    gradients
+        ∂θ_j/∂x_i at the points, shape ``(n, d, m)``.
+    flow
+        f at the points, shape ``(n, d)``.
+    diffusion
+        D.
+    weight
+        Shape ``(n,)``: one over ∣f∣ in the metric of the noise, so that fast regions do not rule.
+    measure
+        That metric: D, or what stands in for a D without inverse (`siq.systems.equilibria.measure_at`).
+    """
+
+    points: np.ndarray
+    gradients: np.ndarray
+    flow: np.ndarray
+    diffusion: Diffusion
+    weight: np.ndarray
+    measure: Diffusion
+
+    def residual(self, coefficients: np.ndarray) -> np.ndarray:
+        """Weighted ``∇V·(f + D∇V)``, shape ``(n,)``."""
+        gradient = self.slopes(coefficients)
+        return self.weight * (gradient * (self.flow + self.diffusion.push(self.points, gradient))).sum(axis=1)
+
+    def jacobian(self, coefficients: np.ndarray) -> np.ndarray:
+        """Derivative of the residual with respect to the coefficients, shape ``(n, m)``."""
+        gradient = self.slopes(coefficients)
+        along = self.weight[:, None] * (self.flow + 2 * self.diffusion.push(self.points, gradient))
+        return np.einsum("nd,ndm->nm", along, self.gradients)
+
+    def slopes(self, coefficients: np.ndarray) -> np.ndarray:
+        """∇V at the points, shape ``(n, d)``."""
+        n, d, m = self.gradients.shape
+        slopes: np.ndarray = (self.gradients.reshape(n * d, m) @ coefficients).reshape(n, d)
+        return slopes
+
+    def size(self, coefficients: np.ndarray) -> float:
+        """Rms of ∇V over the points, in the metric of the noise."""
+        gradient = self.slopes(coefficients)
+        return float(np.sqrt(self.measure.steepness(self.points, gradient).mean()))
+
+    def size_jacobian(self, coefficients: np.ndarray) -> np.ndarray:
+        """Derivative of the size, which must not be zero, by the coefficients, shape ``(m,)``."""
+        along = self.measure.push(self.points, self.slopes(coefficients))
+        return np.einsum("nd,ndm->m", along, self.gradients) / (len(along) * self.size(coefficients))
+
+    def sizes(self) -> np.ndarray:
+        """Rms of each function's gradient over the points, in the metric of the noise: shape ``(m,)``."""
+        steepness = self.measure.steepness(self.points, self.gradients.transpose(0, 2, 1))
+        return np.sqrt(np.asarray(steepness.mean(axis=0)))
+
+    def restricted(self, rows: np.ndarray) -> HamiltonJacobi:
+        """The equation with some of the functions only."""
+        return replace(self, gradients=self.gradients[:, :, rows])
+
+
+def relative_residuals(equation: HamiltonJacobi, coefficients: np.ndarray) -> np.ndarray:
+    """``∣∇V·(f + D∇V)∣ / (∣∇V∣ ∣f∣)`` at the points, shape ``(n,)``."""
+    slope = equation.slopes(coefficients)
+    size = np.sqrt(equation.measure.steepness(equation.points, slope))
+    return np.asarray(np.abs(equation.residual(coefficients)) / np.where(size > 0, size, np.inf))
+
+
+def robust(equation: HamiltonJacobi, coefficients: np.ndarray, *, finest: float) -> HamiltonJacobi:
+    """The equation with weights that fall with the square of what is left (Cauchy's).
+
+    Parameters
+    ----------
+    equation, coefficients
+        What is left is that of this formula.
+    finest
+        Residual below which nothing is an outlier.
+    """
+    rest = relative_residuals(equation, coefficients)
+    scale = max(STEEP * float(np.median(rest)), finest)
+    return replace(equation, weight=equation.weight / np.sqrt(1 + (rest / scale) ** 2))
+
+
+def orthonormalised(equation: HamiltonJacobi, free: np.ndarray) -> tuple[HamiltonJacobi, np.ndarray]:
+    """The equation in combinations of the free functions whose gradients are orthonormal over the points.
+
+    Powers are all but dependent over a sublevel set that is narrow, or bent; their combinations are not, and
+    Gauss–Newton then gets on by the normal equations. Combinations that the points do not tell are left out.
+
+    Parameters
+    ----------
+    equation
+        At points.
+    free
+        Which functions are combined, as a mask; the others stay and come last.
+
+    Returns
+    -------
+    equation
+        In the k combinations and the functions that stay.
+    turned
+        Shape ``(m, k + s)``: the old coefficients are this times the new ones.
+    """
+    roots = equation.measure.root_at(equation.points)
+    stacked = np.einsum("nij,nim->njm", roots, equation.gradients[:, :, free], optimize=True)
+    scale = np.sqrt((stacked**2).sum(axis=(0, 1)))
+    scale = np.where(scale > 0, scale, 1.0)
+    upper = np.linalg.qr((stacked / scale).reshape(-1, stacked.shape[2]), mode="r")
+    _, sizes, right = np.linalg.svd(upper)
+    told = sizes > UNTOLD * sizes[0]
+    combined = right[told].T / sizes[told] / scale[:, None] * np.sqrt(len(equation.points))
+    m, k, stay = len(free), int(told.sum()), np.flatnonzero(~free)
+    turned = np.zeros((m, k + len(stay)))
+    turned[np.ix_(np.flatnonzero(free), np.arange(k))] = combined
+    turned[stay, k + np.arange(len(stay))] = 1.0
+    n, d = equation.points.shape
+    gradients = (equation.gradients.reshape(n * d, m) @ turned).reshape(n, d, -1)
+    return replace(equation, gradients=gradients), turned
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Where Gauss–Newton ended.
+
+    Attributes
+    ----------
+    coefficients
+        Shape ``(m,)``.
+    residual
+        Root mean square of the weighted residual, divided by that of ∇V: the mean of
+        ``∣∇V·(f + D∇V)∣ / (∣∇V∣ ∣f∣)``.
+    converged
+        Whether the last step was too small to matter.
+    """
+
+    coefficients: np.ndarray
+    residual: float
+    converged: bool
+
+
+def equation_at(
+    basis: Basis, x: np.ndarray, dynamics: Dynamics, *, attractor: np.ndarray | None = None
+) -> HamiltonJacobi:
+    """The equation at those of some points, shape ``(n, d)``, where f does not vanish.
+
+    Where D has no inverse, the attractor, shape ``(d,)``, tells in which metric that is seen.
+    """
+    flow, noise = dynamics.drift(x), dynamics.diffusion
+    measure = noise if attractor is None else measure_at(dynamics, attractor)
+    speed = np.sqrt(measure.squared_speed(x, flow))
+    moving = speed > 1e-9 * speed.max()
+    return HamiltonJacobi(
+        x[moving], basis.gradients(x[moving]), flow[moving], noise, 1 / speed[moving], measure
+    )
+
+
+def gauss_newton(
+    equation: HamiltonJacobi,
+    start: np.ndarray,
+    *,
+    free: np.ndarray | None = None,
+    steps: int = 60,
+    tolerance: float = 1e-13,
+) -> Solution:
+    """Minimise the sum of squares of the residual, relative to the size of ∇V.
+
+    The residual alone would draw a bad start to V = 0, which solves the equation, too.
+
+    Parameters
+    ----------
+    equation
+        At points.
+    start
+        Coefficients to start from, shape ``(m,)``.
+    free
+        Which coefficients may change, as a mask; default all.
+    steps, tolerance
+        Most steps, and the relative change of the coefficients at which to end.
+    """
+    coefficients = start.copy()
+    free = np.ones(len(start), dtype=bool) if free is None else free
+    scale = equation.sizes()
+    scale = np.where(scale > 0, scale, 1.0)
+    residual, size = _relative(equation, coefficients)
+    converged = not free.any()
+    for _ in range(steps if free.any() else 0):
+        if size == 0:
+            converged = True
+            break
+        slant = equation.size_jacobian(coefficients)[free]
+        jacobian = equation.jacobian(coefficients)[:, free] - np.outer(residual, slant)
+        step = _least_squares(jacobian / (size * scale[free]), -residual) / scale[free]
+        length = 1.0
+        while True:
+            trial = coefficients.copy()
+            trial[free] += length * step
+            attempt, size = _relative(equation, trial)
+            if np.linalg.norm(attempt) < np.linalg.norm(residual) or length < 1e-3:
+                break
+            length /= 2
+        improved = np.linalg.norm(attempt) < np.linalg.norm(residual)
+        change = np.linalg.norm(length * step * scale[free])
+        reached = np.linalg.norm(coefficients * scale)
+        if improved:
+            gain = 1 - float(np.linalg.norm(attempt)) / max(float(np.linalg.norm(residual)), 1e-300)
+            coefficients, residual = trial, attempt
+        if not improved or change <= tolerance * reached or gain < 1e-7:
+            converged = True
+            break
+    return Solution(coefficients, relative_residual(equation, coefficients), converged)
+
+
+def _relative(equation: HamiltonJacobi, coefficients: np.ndarray) -> tuple[np.ndarray, float]:
+    """The residual over rms of ∇V, shape ``(n,)``, and that rms."""
+    size = equation.size(coefficients)
+    return equation.residual(coefficients) / max(size, 1e-300), size
+
+
+def _least_squares(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """One step; directions that the points do not determine are left as they are.
+
+    By the normal equations, ten times as fast, where these are good enough: the next step corrects this one.
+    """
+    try:
+        factor, lower = scipy.linalg.cho_factor(matrix.T @ matrix, check_finite=False)
+    except scipy.linalg.LinAlgError:
+        pass
+    else:
+        diagonal = np.diag(factor)
+        if diagonal.min() > INDEPENDENT * diagonal.max():
+            found: np.ndarray = scipy.linalg.cho_solve((factor, lower), matrix.T @ right, check_finite=False)
+            return found
+    return np.linalg.lstsq(matrix, right, rcond=1e-11)[0]
+
+
+def relative_residual(equation: HamiltonJacobi, coefficients: np.ndarray) -> float:
+    """Rms of the weighted residual over rms of ∇V; infinite for V = 0, or all but 0."""
+    gradient = equation.slopes(coefficients)
+    squared = equation.measure.steepness(equation.points, gradient)
+    if not np.sqrt((equation.weight**2 * squared).mean()) > VANISHING:
+        return np.inf
+    return float(np.sqrt((equation.residual(coefficients) ** 2).mean() / squared.mean()))
+
+
+def sensitivity(
+    equation: HamiltonJacobi, coefficients: np.ndarray, *, field_terms: np.ndarray, components: np.ndarray
+) -> np.ndarray:
+    """How the coefficients of V follow those of f, to first order: ∂ξ/∂c, shape ``(m, p)``.
+
+    Parameters
+    ----------
+    equation, coefficients
+        A solution.
+    field_terms
+        The functions of the p coefficients of f at the points, shape ``(n, p)``.
+    components
+        Shape ``(p,)``: the component of f that each belongs to.
+    """
+    gradient = equation.slopes(coefficients)
+    forcing = equation.weight[:, None] * gradient[:, components] * field_terms
+    jacobian = equation.jacobian(coefficients)
+    scale = np.linalg.norm(jacobian, axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    return -np.linalg.lstsq(jacobian / scale, forcing, rcond=1e-11)[0] / scale[:, None]

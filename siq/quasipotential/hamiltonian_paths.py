@@ -1,0 +1,687 @@
+"""Minimum action paths by Hamilton's equations, where noise acts on some states only.
+
+The path is that of `siq.quasipotential.hamiltonian_paths`: it leaves an attractor as the power series of V
+says, and ends at a given state, or as it comes to a saddle.
+
+About an attractor Hamilton's equations are linear, which makes the first guess exact; and about a saddle,
+which continues a solution to it.
+
+A particle whose friction and noise balance everywhere goes up as it comes down, with its velocity reversed:
+``x(-t), -v(-t)`` is the path of least action itself. Where they balance nearly, it is a first guess of the
+whole path. It winds about the attractor as often as the path does, which no curve to the saddle tells at weak
+damping.
+
+Along a motion whose positions have the velocities v, the noise has to push by ``2 D p_v = v̇ - f_v``, and
+Hamilton's equation of p_v, ``ṗ_v = -p_x - J_vvᵀ p_v`` where D is constant along v, gives the momenta of x.
+
+Of a D without inverse no action of a curve can be formed: most curves cannot be followed at all. Its paths of
+least action are still the solutions of
+
+    ẋ = f + 2Dp,    ṗ_k = -(Jᵀp)_k - p·(∂_k D)p,    V̇ = p·Dp,
+
+which leave the attractor A where ``p = ∇V``, V being its power series there, and come to the saddle S along
+what the linearised equations attract to ``(S, 0)``: with w the left eigenvector of J at S to its unstable
+rate λ, and r the right ones to the others,
+
+    p·r = 0,    V_S - V = λ (w·(x - S))² / (2 w·Dw).
+
+The other condition, ``p = -λ w·(x - S)/(w·Dw) w``, follows, as H vanishes from A on; in its place stands how
+close to S the solution ends. Both boundary conditions and the equations are solved together, by collocation
+on a mesh of its own (`scipy.integrate.solve_bvp`).
+
+The first guess is exact: about A the equations are linear. From there the end is moved along a curve to S, in
+steps as long as Newton's method follows, and the solution with it. Curves that differ may lead to paths that
+differ. Where V is smooth along a path, the tangents of its neighbours stay apart (`siq.reference.
+characteristics`); if they do not, it is no minimum.
+
+References
+----------
+M. I. Freidlin and A. D. Wentzell, Random Perturbations of Dynamical Systems, Springer 1984, chapter 4.
+W.-J. Beyn, IMA J. Numer. Anal. 9 (1990) 379: boundary conditions of orbits between equilibria.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+from scipy.integrate import solve_bvp, solve_ivp
+from scipy.interpolate import Akima1DInterpolator, PchipInterpolator
+
+from siq.errors import NumericalFailure
+from siq.quasipotential.characteristics import HamiltonianFlow, crossed
+from siq.quasipotential.power_series import cubic_series, quasipotential_series
+from siq.systems.dynamics import Dynamics
+from siq.systems.equilibria import classify, hessian_at
+
+MOST_STATES = 8  # for a series of degree 4; beyond, of degree 3
+APPROACH = 0.1  # of the distance from A to S, in the metric of M: how far from S the end is at first
+MOST_NODES = 50_000  # numerical, a guard on memory
+FINER, ENOUGH = 6, 1000  # times the nodes of its guess, or so many: a mesh that needs more has no solution
+REST = 1e-5  # |f| at an equilibrium, in units of the flow
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """A solution over backward times, from -T to 0: positions and momenta, and its mesh."""
+
+    at: Callable[[np.ndarray], np.ndarray]
+    times: np.ndarray
+
+
+class HamiltonianProblem:
+    """Hamilton's equations in units in which M is the unit matrix and the end is at the distance one."""
+
+    def __init__(self, dynamics: Dynamics, attractor: np.ndarray, end: np.ndarray) -> None:
+        offset = end - attractor
+        level = 0.5 * float(offset @ hessian_at(dynamics, attractor) @ offset)
+        if not level > 0:
+            raise ValueError(f"the path is to end where it starts, at {attractor.tolist()}")
+        self.flow = HamiltonianFlow(dynamics, attractor, level)
+        self.dimension = dynamics.dimension
+        self.end = self.flow.inverse @ offset
+        many = self.dimension > MOST_STATES
+        self.series = (
+            cubic_series(dynamics, attractor)
+            if many
+            else quasipotential_series(dynamics, attractor, degree=4)
+        )
+        self.growth = self.flow.jacobian + 2 * self.flow.diffusion[0]  # of what leaves A: ẏ = (J + 2DM) y
+        self.fastest = float(np.abs(np.linalg.eigvals(self.growth)).max())
+        self.unstable: float | None = None
+        speed = np.abs(self.flow.inverse @ dynamics.drift(end[None])[0]).max()
+        kind = classify(dynamics, end)
+        if speed < REST * np.linalg.norm(self.flow.jacobian) and kind.kind == "saddle" and kind.unstable == 1:
+            self._about_saddle(end)
+
+    def _about_saddle(self, end: np.ndarray) -> None:
+        jacobian = self.flow.inverse @ self.flow.dynamics.jacobian(end[None])[0] @ self.flow.units
+        values, left, right = scipy.linalg.eig(jacobian, left=True)
+        place = int(np.argmax(values.real))
+        self.unstable, self.left = float(values[place].real), left[:, place].real
+        self.jacobian, self.right = jacobian, right[:, place].real / (self.left @ right[:, place].real)
+        self.noise = self.flow.at(self.end[None])[0]
+        self.push = float(self.left @ self.noise @ self.left)
+        if not self.push > 0:
+            raise NumericalFailure(f"the noise does not move states across the saddle {end.tolist()}")
+        # Where paths come from: ẏ = J (y - S) + 2Dq with q = -λ/(w·Dw) w e^(-λt). What other directions
+        # gather meanwhile is ∫ e^((J + λ)t) dt of what q gives them: since ever, where that is finite, or
+        # since the path was far from S, where they decay about as fast as q.
+        d = self.dimension
+        given = -2 * self.unstable / self.push * self.noise @ self.left
+        given -= self.right * (self.left @ given)
+        block = np.zeros((d + 1, d + 1))
+        block[:d, :d], block[:d, d] = jacobian + self.unstable * np.eye(d), given
+        since_ever = self.right - np.linalg.lstsq(block[:d, :d], given, rcond=None)[0]
+        lately = self.right + scipy.linalg.expm(-np.log(APPROACH) / self.unstable * block)[:d, d]
+        self.arrivals = [since_ever, lately]
+
+    def rates(self, z: np.ndarray) -> np.ndarray:
+        """Velocities of (y, q), ``(2d, n)`` to ``(2d, n)``."""
+        y, q, _ = self.flow.velocities(z[: self.dimension].T, z[self.dimension :].T)
+        return np.concatenate([y, q], axis=1).T
+
+    def matrices(self, z: np.ndarray) -> np.ndarray:
+        """Their derivatives, ``(2d, n)`` to ``(2d, 2d, n)``."""
+        turned, noise, bend = self.flow.linear(z[: self.dimension].T, z[self.dimension :].T)
+        top = np.concatenate([turned, 2 * noise], axis=2)
+        return np.concatenate(
+            [top, np.concatenate([-bend, -turned.transpose(0, 2, 1)], axis=2)], axis=1
+        ).transpose(1, 2, 0)
+
+    def slope(self, y: np.ndarray) -> np.ndarray:
+        """Q of the power series at points, ``(n, d)``."""
+        return np.asarray(self.series.gradient(self.flow.points(y)) @ self.flow.units / (2 * self.flow.level))
+
+    def curvature(self, y: np.ndarray) -> np.ndarray:
+        """∂q/∂y of the power series at points, ``(n, d, d)``."""
+        hessians = self.series.hessian(self.flow.points(y))
+        return np.asarray(self.flow.units.T @ hessians @ self.flow.units / (2 * self.flow.level))
+
+    def fixed(self, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The condition that y ends at a point, as a matrix before (y, q) and what it gives."""
+        return np.eye(self.dimension, 2 * self.dimension), last
+
+    def at_saddle(self, solution: Solution) -> tuple[np.ndarray, np.ndarray]:
+        """The conditions at the saddle, as close to it as a solution ends: one more than unknowns."""
+        d, rate = self.dimension, self.unstable
+        assert rate is not None
+        matrix = np.zeros((d + 1, 2 * d))
+        matrix[0, :d] = self.left
+        matrix[1:, d:] = np.eye(d)
+        matrix[1:, :d] = rate / self.push * np.outer(self.left, self.left)
+        right = matrix[:, :d] @ self.end
+        right[0] = self.left @ solution.at(np.zeros(1))[:d, 0]
+        return matrix, right
+
+    def solved(
+        self, guess: Solution, last: tuple[np.ndarray, np.ndarray], tolerance: float
+    ) -> Solution | None:
+        """The solution with a condition at its end, None where Newton's method does not come to one.
+
+        As H is conserved, a condition at the saddle is one too many. A further unknown k makes up for it,
+        ``ż = F + k ∇H``, along which H would grow: it comes out as zero.
+        """
+        d, (matrix, right) = self.dimension, last
+        further = len(matrix) - d
+
+        def rates(_: np.ndarray, z: np.ndarray, k: np.ndarray | None = None) -> np.ndarray:
+            own = self.rates(z)
+            return own if k is None else own + k[0] * np.concatenate([-own[d:], own[:d]])
+
+        def derivatives(_: np.ndarray, z: np.ndarray, k: np.ndarray | None = None) -> object:
+            own = self.matrices(z)
+            if k is None:
+                return own
+            velocity = self.rates(z)
+            return own + k[0] * np.concatenate([-own[d:], own[:d]]), np.concatenate(
+                [-velocity[d:], velocity[:d]]
+            )[:, None]
+
+        def ends(first: np.ndarray, final: np.ndarray, _: np.ndarray | None = None) -> np.ndarray:
+            return np.concatenate([first[d:] - self.slope(first[None, :d])[0], matrix @ final - right])
+
+        def slopes(first: np.ndarray, _: np.ndarray, k: np.ndarray | None = None) -> tuple[np.ndarray, ...]:
+            own = np.concatenate([-self.curvature(first[None, :d])[0], np.eye(d)], axis=1)
+            begin = np.concatenate([own, np.zeros((d + further, 2 * d))])
+            final = np.concatenate([np.zeros((d, 2 * d)), matrix])
+            return (begin, final) if k is None else (begin, final, np.zeros((2 * d + 1, 1)))
+
+        with np.errstate(all="ignore"):
+            try:
+                found = solve_bvp(
+                    rates, ends, guess.times, guess.at(guess.times), p=np.zeros(1) if further else None,
+                    fun_jac=derivatives, bc_jac=slopes, tol=tolerance, bc_tol=min(tolerance, 1e-6),
+                    max_nodes=min(max(FINER * len(guess.times), ENOUGH), MOST_NODES),
+                )  # fmt: skip
+            except (ValueError, np.linalg.LinAlgError):  # not finite, where a trial has run away
+                return None
+        return Solution(found.sol, found.x) if found.success else None
+
+
+def interpolated(times: np.ndarray, states: np.ndarray) -> Solution:
+    """States ``(n, 2d)`` at times, as a first guess."""
+    curve = Akima1DInterpolator(times, states)
+    return Solution(lambda t: np.asarray(curve(t)).T, times)
+
+
+FIRST = 0.1  # of the distance from A to S, in the metric of M: there the first end lies
+START = 0.003  # of it: where solutions begin, and the power series errs by its fifth power
+ROUGH = 1e-3  # relative residual of collocation, on the way
+LONGEST = 0.3  # of the distance: step of the end; it is halved where Newton's method does not follow ...
+SHORTEST = 0.004  # ... and a curve given up below this: it leaves the well, or V is not smooth there
+BENDS, BEND = 4, 0.4  # curves beside the straight one, and how far they leave it, as a share of the distance
+SPIRAL = 0.3  # of the shortest time of the linear equations: steps of a first guess
+
+
+def last_states(problem: HamiltonianProblem, beside: np.ndarray | None) -> list[np.ndarray]:
+    """Where the end is moved to: itself, or states before the saddle, one of which will do."""
+    if problem.unstable is None:
+        return [problem.end]
+    return [_before(problem, beside, one) for one in problem.arrivals]
+
+
+def curves_to(
+    problem: HamiltonianProblem, last: np.ndarray, further: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    """Along which the end is moved: straight, and bent to some sides."""
+    share = np.linspace(0, 1, 201)[:, None]
+    straight = share * last
+    across = np.linalg.svd(last[None])[2][1 : BENDS // 2 + 1]
+    bent = [straight + BEND * side * np.sin(np.pi * share) * way for way in across for side in (1, -1)]
+    return [straight, *bent, *((one - problem.flow.center) @ problem.flow.inverse.T for one in further)]
+
+
+def way_down(problem: HamiltonianProblem, beside: np.ndarray | None, last: np.ndarray) -> np.ndarray | None:
+    """The way down taken backwards: V falls along it, so that it crosses no ridge, but it may wind."""
+    if beside is None or problem.unstable is None:
+        return None
+    down = (beside - problem.flow.center) @ problem.flow.inverse.T
+    far = down[np.linalg.norm(down - problem.end, axis=1) >= APPROACH]
+    return np.vstack([far[::-1], last])
+
+
+def _before(problem: HamiltonianProblem, beside: np.ndarray | None, arrival: np.ndarray) -> np.ndarray:
+    """A state before the saddle, on the side of A."""
+    side = np.sign(problem.left @ -problem.end)
+    if beside is not None:
+        down = (beside - problem.flow.center) @ problem.flow.inverse.T
+        far = np.flatnonzero(np.linalg.norm(down - problem.end, axis=1) >= APPROACH)
+        side = np.sign(problem.left @ (down[far[0]] - problem.end))
+    return np.asarray(problem.end + side * APPROACH * arrival / np.linalg.norm(arrival))
+
+
+def followed(problem: HamiltonianProblem, curve: np.ndarray) -> Solution | None:
+    """The solution at the end of a curve, None where one of the steps fails."""
+    outside = np.linalg.norm(curve, axis=1) >= FIRST
+    curve = curve[int(np.flatnonzero(~outside).max(initial=0)) + 1 :]
+    along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))]
+
+    def at(place: float) -> np.ndarray:
+        return np.array([np.interp(place, along, column) for column in curve.T])
+
+    solution = problem.solved(_linear(problem, at(0.0)), problem.fixed(at(0.0)), ROUGH)
+    before: tuple[Solution, float] | None = None
+    place, step, failed = 0.0, LONGEST, False
+    while solution is not None and place < along[-1]:
+        ahead = min(place + step, along[-1])
+        guess = longer(problem, solution)
+        if before is not None:
+            guess = _predicted(guess, before[0], (ahead - place) / (place - before[1]))
+        moved = problem.solved(guess, problem.fixed(at(ahead)), ROUGH)
+        if moved is None:
+            step, failed = step / 2, True
+            if step < SHORTEST:
+                return None
+            continue
+        before = solution, place
+        solution, place = moved, ahead
+        step, failed = (step if failed else min(1.5 * step, LONGEST)), False
+    return solution
+
+
+def _linear(problem: HamiltonianProblem, last: np.ndarray) -> Solution:
+    """The way to a point close to A, were f linear: q = y there."""
+    back = scipy.linalg.expm(-SPIRAL / problem.fastest * problem.growth)
+    y = [last]
+    while np.linalg.norm(y[-1]) > START and len(y) < MOST_NODES:
+        y.append(back @ y[-1])
+    states = np.array(y[::-1])
+    times = SPIRAL / problem.fastest * np.arange(1 - len(y), 1)
+    return interpolated(times, np.concatenate([states, states], axis=1))
+
+
+def longer(problem: HamiltonianProblem, solution: Solution) -> Solution:
+    """The same at evenly spaced times, begun so close to A as the power series asks for."""
+    first = solution.at(solution.times[:1])[: problem.dimension, 0]
+    if np.linalg.norm(first) > START:
+        before = _linear(problem, first)
+        times = np.r_[before.times[:-1] + solution.times[0], solution.times]
+        states = np.concatenate([before.at(before.times[:-1]), solution.at(solution.times)], axis=1)
+        solution = interpolated(times, states.T)
+    count = int(-solution.times[0] * problem.fastest / SPIRAL) + 2
+    return Solution(solution.at, np.linspace(solution.times[0], 0.0, count))
+
+
+def onward(problem: HamiltonianProblem, solution: Solution, distance: float) -> Solution:
+    """The same, continued by the linear equations to a distance from the saddle."""
+    d, rate = problem.dimension, problem.unstable
+    assert rate is not None
+    final = solution.at(np.zeros(1))[:, 0]
+    fastest = np.abs(np.linalg.eigvals(problem.jacobian)).max()
+    step = SPIRAL / fastest
+    whole = np.block([[problem.jacobian, 2 * problem.noise], [np.zeros((d, d)), -problem.jacobian.T]])
+    flow = scipy.linalg.expm(step * whole)
+    states = [np.concatenate([final[:d] - problem.end, final[d:]])]
+    height = float(problem.left @ states[0][:d])
+    while np.linalg.norm(states[-1][:d]) > distance and len(states) < MOST_NODES:
+        ahead = flow @ states[-1]
+        height *= np.exp(-step * rate)
+        # What grows is not there: of the two parts along w either follows from the height.
+        ahead[:d] += problem.right * (height - problem.left @ ahead[:d])
+        ahead[d:] = -rate * height / problem.push * problem.left
+        states.append(ahead)
+    further = np.array(states[1:]).reshape(-1, 2 * d) + np.r_[problem.end, np.zeros(d)]
+    times = np.r_[solution.times, step * np.arange(1, len(states))]
+    rows = np.concatenate([solution.at(solution.times).T, further])
+    return interpolated(times - times[-1], rows)
+
+
+def _predicted(guess: Solution, before: Solution, share: float) -> Solution:
+    """A solution moved on by a share of what it has moved from the one before, as far as both go back."""
+
+    def at(times: np.ndarray) -> np.ndarray:
+        own, common = guess.at(times), times >= before.times[0]
+        own[:, common] += share * (own[:, common] - before.at(times[common]))
+        return own
+
+    return Solution(at, guess.times)
+
+
+ACCURACY = 1e-9  # of the way down, relative: it winds often
+PACE = 3  # times as many points as a first guess has: momenta are differences of it
+
+
+def reversed_motion(problem: HamiltonianProblem, beside: np.ndarray | None) -> Solution | None:
+    """A first guess of the path to a saddle: the way down, with velocities reversed.
+
+    Parameters
+    ----------
+    problem
+        From an attractor to a saddle.
+    beside
+        A trajectory of f from the saddle to the attractor, shape ``(k, d)``.
+
+    Returns
+    -------
+    Solution or None
+        It ends before the saddle. None where states are not positions and their velocities, noise acts on
+        others than velocities, or the way down is not known.
+    """
+    dynamics, flow = problem.flow.dynamics, problem.flow
+    places = velocities_of(dynamics)
+    if places is None or beside is None or problem.unstable is None:
+        return None
+    positions, velocities = places
+    down = _way_down(problem, beside)
+    if down is None:
+        return None
+    step = SPIRAL / problem.fastest / PACE
+    x = down.copy()
+    x[:, velocities] *= -1
+    noise = dynamics.diffusion.at(x)[:, velocities[:, None], velocities]
+    # On the way down velocities change by f_v at their own sign; reversed, they change by the same.
+    missing = (dynamics.drift(down) - dynamics.drift(x))[:, velocities]
+    momenta = np.zeros_like(x)
+    try:
+        pushed = np.linalg.solve(2 * noise, missing[:, :, None])[:, :, 0]
+    except np.linalg.LinAlgError:
+        return None
+    momenta[:, velocities] = pushed
+    turned = dynamics.jacobian(x)[:, velocities[:, None], velocities]
+    pulled = np.gradient(pushed, step, axis=0) + (turned.transpose(0, 2, 1) @ pushed[:, :, None])[:, :, 0]
+    momenta[:, positions] = -pulled
+    y = (x - flow.center) @ flow.inverse.T
+    q = momenta @ flow.units / (2 * flow.level)
+    times = step * np.arange(1 - len(x), 1)
+    guess = interpolated(times, np.concatenate([y, q], axis=1))
+    return Solution(guess.at, times[::-PACE][::-1])
+
+
+def velocities_of(dynamics: Dynamics) -> tuple[np.ndarray, np.ndarray] | None:
+    """The places of positions and of their velocities, in the same order; None where there are other states.
+
+    Noise acts on velocities alone.
+    """
+    symbols = list(dynamics.symbols)
+    defined = [
+        (place, symbols.index(formula))
+        for place, formula in enumerate(dynamics.formulas)
+        if formula in symbols
+    ]
+    positions, velocities = np.array(defined, dtype=int).reshape(-1, 2).T
+    if not np.array_equal(np.sort(np.r_[positions, velocities]), np.arange(len(symbols))):
+        return None
+    noise = dynamics.diffusion.formulas
+    return None if any(noise[place][place] != 0 for place in positions) else (positions, velocities)
+
+
+def _way_down(problem: HamiltonianProblem, beside: np.ndarray) -> np.ndarray | None:
+    """The way down in reverse, from close to A to before the saddle: states at even times, ``(n, d)``."""
+    dynamics, flow = problem.flow.dynamics, problem.flow
+    y = (beside - flow.center) @ flow.inverse.T
+    far = np.flatnonzero(np.linalg.norm(y - problem.end, axis=1) >= APPROACH)
+    if not len(far):
+        return None
+
+    def arrives(_: float, x: np.ndarray) -> float:
+        return float(np.linalg.norm(flow.inverse @ (x - flow.center))) - START
+
+    arrives.terminal = True  # type: ignore[attr-defined]
+    step = SPIRAL / problem.fastest / PACE
+    motion = solve_ivp(
+        lambda _, x: dynamics.drift(x[None])[0],
+        (0.0, step * MOST_NODES),
+        beside[far[0]],
+        events=arrives,
+        method="DOP853",
+        rtol=ACCURACY,
+        atol=ACCURACY * np.abs(beside - flow.center).max(axis=0),
+        dense_output=True,
+    )
+    if motion.status != 1:  # it does not come to A
+        return None
+    times = np.arange(0.0, motion.t[-1], step)
+    return np.asarray(motion.sol(times[::-1]).T)
+
+
+LAST = 0.002  # of the distance from A to S, in the metric of M: how far from S the end is in the answer
+LEAST_SHARE = 0.05  # numerical: of the way to the conditions at the saddle, in one step
+NEARER = 3.0  # by so much in one step
+SWITCHED, FINE = 1e-5, 1e-6  # relative residuals of collocation, at the saddle and of the answer
+APART, COMPARED = 0.03, 400  # of the distance, at so many times: solutions further apart are two
+CENTRAL = 0.005  # of the distance to the end: nearer to A points lie no closer together
+TURN = 0.05  # of this distance, or of that from A: between two points of the answer
+FEWEST, MOST = 400, 20_000  # points of the answer
+GAUSS = np.polynomial.legendre.leggauss(3)  # exact to the order of collocation
+
+
+@dataclass(frozen=True, eq=False)
+class HamiltonianPath:
+    """A solution of Hamilton's equations from an attractor to a state.
+
+    Attributes
+    ----------
+    points, momenta
+        Shape ``(n, d)``, in the states' units, from the attractor to the end.
+    values
+        Shape ``(n,)``: V, not U, up to each point.
+    times
+        Shape ``(n,)``: zero at the last point of the solution; infinite at equilibria, where it does not
+        come to.
+    error
+        By how much V at the end differs from that of the mesh before.
+    residual
+        Largest ``|p·f + p·Dp|``, as a share of the largest ``|p·f| + p·Dp``.
+    smooth
+        Whether no neighbour crosses it: only then it is a minimum.
+    """
+
+    points: np.ndarray
+    momenta: np.ndarray
+    values: np.ndarray
+    times: np.ndarray
+    error: float
+    residual: float
+    smooth: bool
+
+    @property
+    def action(self) -> float:
+        """Of the whole path, the barrier of U if the end is a saddle."""
+        return 2 * float(self.values[-1])
+
+
+def hamiltonian_paths(
+    dynamics: Dynamics,
+    attractor: np.ndarray,
+    end: np.ndarray,
+    *,
+    beside: np.ndarray | None = None,
+    tolerance: float = 1e-5,
+    curves: Sequence[np.ndarray] = (),
+) -> list[HamiltonianPath]:
+    """Solutions from an attractor to a state, by rising action, those that are minima first.
+
+    Parameters
+    ----------
+    dynamics
+        f and D, twice differentiable.
+    attractor, end
+        Shape ``(d,)``; the end is mostly a saddle.
+    beside
+        A trajectory of f from the saddle to the attractor, shape ``(k, d)``: tells from where the saddle is
+        approached, and is itself a curve for the end to move along.
+    tolerance
+        Of the action, relative.
+    curves
+        Further curves from the attractor to the end, shape ``(k, d)`` each.
+
+    Raises
+    ------
+    NumericalFailure
+        When the start is no attractor, or no curve leads to a solution.
+    """
+    if classify(dynamics, attractor).kind != "attractor":
+        raise NumericalFailure(
+            f"{attractor.tolist()} is no stable equilibrium; where noise acts on some states only, paths are"
+            " sought from stable equilibria alone"
+        )
+    problem = HamiltonianProblem(dynamics, attractor, end)
+    found: list[HamiltonianPath] = []
+    backwards = _of_reversed_motion(problem, beside)
+    known = [] if backwards is None else [backwards]
+    path = None if backwards is None else _finished(problem, backwards, tolerance)
+    found += [] if path is None else [path]
+    for last in last_states(problem, beside):
+        solutions = list(known)
+        for curve in curves_to(problem, last, curves):
+            solution = followed(problem, curve)
+            if solution is None or any(not _apart(solution, one, problem.dimension) for one in solutions):
+                continue
+            solutions.append(solution)
+            path = _finished(problem, solution, tolerance)
+            found += [] if path is None else [path]
+        way = None if found else way_down(problem, beside, last)
+        if way is not None and (solution := followed(problem, way)) is not None:
+            path = _finished(problem, solution, tolerance)
+            found += [] if path is None else [path]
+        if found:
+            break
+    if not found:
+        raise NumericalFailure(
+            f"no solution of Hamilton's equations was found from {attractor.tolist()} to {end.tolist()}"
+        )
+    return sorted(found, key=lambda path: (not path.smooth, path.action))
+
+
+def _of_reversed_motion(problem: HamiltonianProblem, beside: np.ndarray | None) -> Solution | None:
+    """The solution next to the way down with velocities reversed, which ends where that does."""
+    guess = reversed_motion(problem, beside)
+    if guess is None:
+        return None
+    return problem.solved(guess, problem.fixed(guess.at(np.zeros(1))[: problem.dimension, 0]), ROUGH)
+
+
+def _apart(one: Solution, two: Solution, dimension: int) -> bool:
+    """Whether two solutions that end at one state come from different sides."""
+    times = np.linspace(max(one.times[0], two.times[0]), 0.0, COMPARED)
+    return bool(np.abs(one.at(times)[:dimension] - two.at(times)[:dimension]).max() > APART)
+
+
+def _finished(problem: HamiltonianProblem, solution: Solution, tolerance: float) -> HamiltonianPath | None:
+    """The path of a solution that ends close to the end: on to it, and solved as finely as is asked."""
+    if problem.unstable is None:
+        ended: Solution | None = solution
+        last = problem.fixed(problem.end)
+    else:
+        # What winds has to be known better than on the way, or H is not zero where the condition changes.
+        known = problem.solved(
+            solution, problem.fixed(solution.at(np.zeros(1))[: problem.dimension, 0]), SWITCHED
+        )
+        if known is None:
+            return None
+        ended = _as_at_saddle(problem, known)
+        distance = APPROACH
+        while ended is not None and distance > LAST:
+            distance /= NEARER
+            ended = onward(problem, ended, distance)
+            ended = problem.solved(ended, problem.at_saddle(ended), ROUGH)
+        if ended is None:
+            return None
+        last = problem.at_saddle(ended)
+    rough = None if ended is None else problem.solved(longer(problem, ended), last, ROUGH / 10)
+    if rough is None:
+        return None
+    fine: Solution | None = None
+    value = _values(problem, rough)[-1]
+    for fineness in (FINE, FINE / 10, FINE / 100):
+        fine = problem.solved(rough, last, fineness)
+        if fine is None:
+            return None
+        before, value, rough = value, _values(problem, fine)[-1], fine
+        if abs(value - before) <= tolerance * value:
+            break
+    return _path(problem, rough, abs(value - before))
+
+
+def _as_at_saddle(problem: HamiltonianProblem, solution: Solution) -> Solution | None:
+    """A solution that ends somewhere before the saddle, moved to where those end that come to it.
+
+    In steps as long as Newton's method follows: of what other directions have gathered on the way the ends
+    that are tried know little, least where they decay about as fast as the path comes to the saddle.
+    """
+    matrix, right = problem.at_saddle(solution)
+    own = matrix @ solution.at(np.zeros(1))[:, 0]
+    share, step, moved = 0.0, 1.0, solution
+    while share < 1:
+        ahead = min(share + step, 1.0)
+        new = problem.solved(moved, (matrix, own + ahead * (right - own)), SWITCHED)
+        if new is None:
+            step /= 2
+            if step < LEAST_SHARE:
+                return None
+            continue
+        moved, share = new, ahead
+    return moved
+
+
+def _values(problem: HamiltonianProblem, solution: Solution) -> np.ndarray:
+    """V at the nodes of the mesh, and at the end: the last one twice if that is where the mesh ends."""
+    length = np.diff(solution.times)
+    total = np.zeros(len(length))
+    for place, weight in zip(*GAUSS, strict=True):
+        z = solution.at(solution.times[:-1] + (1 + place) / 2 * length).T
+        y, q = z[:, : problem.dimension], z[:, problem.dimension :]
+        total += weight / 2 * length * problem.flow.velocities(y, q)[2]
+    first, final = (solution.at(solution.times[[place]])[: problem.dimension].T for place in (0, -1))
+    begin = 0.0  # of the power series, v = 2 ∫ q·dy from A on
+    for place, weight in zip(*GAUSS, strict=True):
+        share = (1 + place) / 2
+        begin += weight * float(problem.slope(share * first)[0] @ first[0])
+    values = begin + np.r_[0.0, np.cumsum(total)]
+    rest = 0.0
+    if problem.unstable is not None:
+        rest = problem.unstable * float(problem.left @ (final[0] - problem.end)) ** 2 / problem.push
+    return np.append(values, values[-1] + rest)
+
+
+def _path(problem: HamiltonianProblem, solution: Solution, error: float) -> HamiltonianPath:
+    d, flow = problem.dimension, problem.flow
+    z = solution.at(solution.times).T
+    velocity = np.linalg.norm(problem.rates(z.T)[:d].T, axis=1)
+    # About A the path may wind: points lie as close as their distance from it, and from the end, asks for.
+    pace = velocity / (np.linalg.norm(z[:, :d], axis=1) + CENTRAL)
+    measure = np.r_[0.0, np.cumsum((pace[1:] + pace[:-1]) / 2 * np.diff(solution.times))]
+    count = int(np.clip(measure[-1] / TURN, FEWEST, MOST))
+    times = PchipInterpolator(measure, solution.times)(np.linspace(0.0, measure[-1], count))
+    times[0], times[-1] = solution.times[0], 0.0
+    z = solution.at(times).T
+    places = np.union1d(times, solution.times)
+    whole = _values(problem, Solution(solution.at, places))
+    values = np.append(whole[np.searchsorted(places, times)], whole[-1])
+    y, q = z[:, :d], z[:, d:]
+    force = flow.dynamics.drift(flow.points(y)) @ flow.inverse.T
+    drift, push = np.sum(q * force, axis=1), problem.flow.velocities(y, q)[2] / 2
+    residual = float(np.abs(drift + push).max() / (np.abs(drift) + push).max())
+    times = np.r_[-np.inf, times]
+    if problem.unstable is not None:
+        y, q, times = np.vstack([y, problem.end]), np.vstack([q, np.zeros(d)]), np.append(times, np.inf)
+    else:
+        values = values[:-1]
+    y, q, values = np.vstack([np.zeros(d), y]), np.vstack([np.zeros(d), q]), np.r_[0.0, values]
+    return HamiltonianPath(
+        flow.points(y), 2 * flow.level * q @ flow.inverse, flow.level * values, times,
+        flow.level * error, residual, _smooth(problem, solution),
+    )  # fmt: skip
+
+
+def _smooth(problem: HamiltonianProblem, solution: Solution) -> bool:
+    """Whether no neighbour crosses the path, by the tangents of those that leave A beside it."""
+    d, times = problem.dimension, solution.times
+    middles = (times[1:] + times[:-1]) / 2
+    at_nodes, between = (problem.matrices(solution.at(t)).transpose(2, 0, 1) for t in (times, middles))
+    first = solution.at(times[:1])[:d].T
+    frame = np.linalg.qr(np.concatenate([np.eye(d), problem.curvature(first)[0]]))[0]
+    for index, step in enumerate(np.diff(times)):
+        k1 = at_nodes[index] @ frame
+        k2 = between[index] @ (frame + step / 2 * k1)
+        k3 = between[index] @ (frame + step / 2 * k2)
+        moved = frame + step / 6 * (k1 + 2 * k2 + 2 * k3 + at_nodes[index + 1] @ (frame + step * k3))
+        new, upper = np.linalg.qr(moved)
+        new *= np.sign(np.diag(upper))
+        if crossed(frame[None, :d], new[None, :d])[0]:
+            return False
+        frame = new
+    return True

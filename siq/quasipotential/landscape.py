@@ -1,0 +1,573 @@
+"""The landscape of a vector field: attractors, wells, transitions, and U over all of them.
+
+About each attractor i the quasipotential is ``U_i(x)``, zero there. The one that the invariant distribution
+follows, ``p ~ exp(-U/ε)``, is
+
+    U(x) = min_i (W_i + U_i(x)) - min_i W_i,
+
+where W_i is the least total of barriers over all trees of transitions that end in i (M. Freidlin,
+A. Wentzell, *Random Perturbations of Dynamical Systems*, chapter 6). For two wells this says that both local
+formulas have the same value at the saddle between them.
+
+It is found by `siq.quasipotential.landscape_assembly`; here is what can be asked of it.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+import pandas as pd
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass as pydantic_dataclass
+
+from siq.data.inspection import seen_states
+from siq.data.recordings import Recordings, recordings_of
+from siq.data.selection import joined
+from siq.data.two_states import RecordStates
+from siq.errors import NumericalFailure
+from siq.inference.field_estimate import IdentifiedField
+from siq.quasipotential.certificate import Certificate
+from siq.quasipotential.occupancy import VisitTest
+from siq.quasipotential.rates import Exit, NoiseStrength, dwell_time
+from siq.quasipotential.transitions import Transition, missing_diffusion
+from siq.quasipotential.uncertainty import potential_errors
+from siq.quasipotential.wells import Well
+from siq.systems.cycles import Cycle
+from siq.systems.dynamics import Dynamics
+from siq.systems.equilibria import Equilibrium
+
+
+@pydantic_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class LandscapeOptions:
+    """With what formulas are compared, and what is said of transitions.
+
+    Attributes
+    ----------
+    compare_below
+        U below which formulas are compared with the references, where there is a card; by default 1.1 of the
+        highest saddle.
+    noise_intensities
+        ε of √ε dW for which mean escape times are given, in the units of U, and held against a simulation
+        where there is a card.
+    """
+
+    compare_below: Annotated[float, Field(gt=0)] | None = None
+    noise_intensities: tuple[Annotated[float, Field(gt=0)], ...] = ()
+
+
+class NoLandscape(NumericalFailure):
+    """Recordings that no landscape was found of; what they show by themselves is kept.
+
+    The message says why, what would make it an answer, and what is known all the same.
+
+    Parameters
+    ----------
+    reason
+        Why there is none and what to do about it, without a full stop.
+    states
+        The two states between which the recordings hop by themselves; None where nothing is known of that.
+    dynamics
+        f and D, where these were identified and only their landscape is missing.
+    """
+
+    def __init__(
+        self, reason: str, states: RecordStates | None = None, dynamics: Dynamics | None = None
+    ) -> None:
+        super().__init__(" ".join(told_without_landscape(reason, states)))
+        self.reason = reason
+        self.states = states
+        self.dynamics = dynamics
+
+
+def told_without_landscape(reason: str, states: RecordStates | None) -> list[str]:
+    """The sentences that stand where a landscape would: what is known without one, and why there is none."""
+    seen = "" if states is None else states.sentence()
+    missing = f"{'But no' if seen else 'No'} landscape was found: {reason}."
+    return [seen, missing] if seen else [missing]
+
+
+MOST_WELLS = 6  # of which all trees can be counted
+
+
+@dataclass(frozen=True)
+class GlobalQuasipotential:
+    """U over all wells, where it is known.
+
+    Attributes
+    ----------
+    wells
+        V about the attractors.
+    heights
+        U at the attractors, shape ``(k,)``; the lowest is zero.
+    """
+
+    wells: tuple[Well, ...]
+    heights: np.ndarray
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        """U at points ``(n, d)``: shape ``(n,)``, NaN where it is not known."""
+        return least_over_wells(self.by_well(x))
+
+    def by_well(self, x: np.ndarray) -> np.ndarray:
+        """``W_i + U_i`` at points, shape ``(k, n)``, NaN where the formula of a well is not believed."""
+        return np.stack(
+            [h + 2 * one.known_values(x) for h, one in zip(self.heights, self.wells, strict=True)]
+        )
+
+
+def least_over_wells(values: np.ndarray) -> np.ndarray:
+    """The least of ``(k, n)`` values that are known, shape ``(n,)``; NaN where none is."""
+    least = np.where(np.isfinite(values), values, np.inf).min(axis=0)
+    return np.where(np.isfinite(least), least, np.nan)
+
+
+def matched(wells: Sequence[Well | None], heights: np.ndarray) -> GlobalQuasipotential | None:
+    """U over all wells, None where a well has no formula or no height."""
+    known = tuple(one for one in wells if one is not None)
+    if not known or len(known) < len(wells) or not np.isfinite(heights).all():
+        return None
+    return GlobalQuasipotential(known, heights)
+
+
+def heights_of_attractors(barriers: np.ndarray) -> np.ndarray:
+    """U at the attractors from the barriers between them.
+
+    Parameters
+    ----------
+    barriers
+        Shape ``(k, k)``: the lowest barrier of U on the way from i to j in one step, infinite where there
+        is none.
+
+    Returns
+    -------
+    numpy.ndarray
+        Shape ``(k,)``, the lowest being zero.
+
+    Raises
+    ------
+    NumericalFailure
+        When transitions do not connect the attractors, or there are too many of them.
+    """
+    count = len(barriers)
+    if count > MOST_WELLS:
+        raise NumericalFailure(f"there are {count} attractors; heights are found for {MOST_WELLS} at most")
+    totals = np.array([_least_tree(barriers, root) for root in range(count)])
+    if not np.isfinite(totals).all():
+        raise NumericalFailure(
+            "no transitions over known saddles connect all attractors: their heights are not known"
+        )
+    return np.asarray(totals - totals.min())
+
+
+def _least_tree(barriers: np.ndarray, root: int) -> float:
+    """The least total of barriers over trees in which every attractor leads to the root."""
+    others = [i for i in range(len(barriers)) if i != root]
+    least = np.inf
+    for targets in itertools.product(range(len(barriers)), repeat=len(others)):
+        step = dict(zip(others, targets, strict=True))
+        total = sum(barriers[i, j] for i, j in step.items())
+        if total < least and all(_arrives(step, i, root) for i in others):
+            least = float(total)
+    return 0.0 if not others else least
+
+
+def _arrives(step: dict[int, int], start: int, root: int) -> bool:
+    seen: set[int] = set()
+    while start != root:
+        if start in seen:
+            return False
+        seen.add(start)
+        start = step[start]
+    return True
+
+
+def global_quasipotential(wells: Sequence[Well], barriers: np.ndarray) -> GlobalQuasipotential:
+    """Match local formulas; `barriers` as for `heights_of_attractors`."""
+    return GlobalQuasipotential(tuple(wells), heights_of_attractors(barriers))
+
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from siq.workflow.equations_step import EquationSettings
+    from siq.workflow.pipeline import PipelineSettings
+
+SAME = 1e-6  # numerical, of the level of a well: two values of U are one
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Landscape:
+    """What is known of a landscape: wells, the ways out of them, and U = 2V over all of them.
+
+    Main attributes
+    ---------------
+    attractors
+        Those that recorded states lead to, in the order of everything below. Limit cycles follow after
+        points; of equations alone.
+    wells
+        V about each attractor, None where none was found.
+    transitions
+        Every way out of every well.
+    certificate
+        Whether the wells may be believed; None where no test was made.
+    dynamics
+        f and D.
+
+    Other attributes
+    ----------------
+    equilibria
+        All that were found in the recorded region.
+    basins
+        Share of the evenly spread recorded states from which f leads to each attractor, shape ``(k,)``.
+    heights
+        U at the attractors, shape ``(k,)``; NaN where transitions do not connect them.
+
+    Notes
+    -----
+        What could not be done, in words.
+    position_errors
+        Standard error of each attractor's position, shape ``(k, d)``; None where not known.
+    noise
+        Strength of the noise that drives the system, None where nobody knows it.
+    found
+        The identified f with its uncertainty, None where f is given.
+    visits
+        How long visits to the wells last, as counted on the recordings and as f and D say; empty where this
+        was not compared.
+    seen
+        The two states between which the recordings hop by themselves, without any formula; None where
+        nothing is known of them, or several wells are certified.
+    given
+        Whether f was given as equations: the region is their domain then, and nothing of f is uncertain.
+    parting
+        Unstable cycles, which part wells.
+    """
+
+    dynamics: Dynamics
+    equilibria: tuple[Equilibrium, ...]
+    attractors: tuple[Equilibrium | Cycle, ...]
+    basins: np.ndarray
+    wells: tuple[Well | None, ...]
+    transitions: tuple[Transition, ...]
+    heights: np.ndarray
+    notes: tuple[str, ...]
+    certificate: Certificate | None = None
+    position_errors: np.ndarray | None = None
+    noise: NoiseStrength | None = None
+    found: IdentifiedField | None = None
+    visits: tuple[VisitTest, ...] = ()
+    seen: RecordStates | None = None
+    given: bool = False
+    parting: tuple[Cycle, ...] = ()
+
+    @classmethod
+    def from_recordings(
+        cls,
+        recordings: str | Path | Recordings | pd.DataFrame,
+        settings: PipelineSettings | None = None,
+        *,
+        hidden_velocities: bool = False,
+    ) -> Landscape:
+        r"""The landscape that recordings show: f identified, V refined and certified, transitions found.
+
+        Parameters
+        ----------
+        recordings
+            Trajectories: a file, a folder of files, `siq.Recordings`, or a table as
+            `siq.Recordings.from_frame` takes it.
+        settings
+            Of all steps; see `siq.workflow.pipeline.PipelineSettings`. By default V comes from f alone,
+            without networks.
+        hidden_velocities
+            Whether the recorded states are positions whose velocities were not recorded, as
+            ``identification.hidden_velocities`` of the settings.
+
+        Raises
+        ------
+        InputError
+            For the first thing that cannot be read.
+        NoLandscape
+            When f cannot be identified, or it has no landscape. It says why, and what would make it an
+            answer; its `states` are what the recordings show by themselves all the same.
+
+        Examples
+        --------
+        >>> from siq.data.recordings import Recordings
+        >>> t, starts = np.linspace(0, 3, 61), np.random.default_rng(0).uniform(-1.5, 1.5, (2, 60, 1))
+        >>> x = starts[0] / np.sqrt(starts[0] ** 2 + (1 - starts[0] ** 2) * np.exp(-2 * t))  # dx/dt = x - x³
+        >>> y = starts[1] * np.exp(-t)  # dy/dt = -y
+        >>> recordings = Recordings.from_arrays(t, np.stack([x, y], axis=2), names=["x", "y"])
+        >>> landscape = Landscape.from_recordings(recordings)
+        >>> landscape.barriers().round(3)[["start", "end", "barrier"]]
+           start  end  barrier
+        0      0    1      0.5
+        1      1    0      0.5
+        >>> print(landscape.potential(well=1).to_latex(digits=3))
+        \begin{aligned}
+        \Delta_{x} &= x - 1.0 \\
+        V &= 0.25 \Delta_{x}^{4} + 1.0 \Delta_{x}^{3} + 1.0 \Delta_{x}^{2} + 0.5 y^{2}
+        \end{aligned}
+        """
+        from siq.workflow.outcomes import why_no_landscape
+        from siq.workflow.pipeline import PipelineSettings, analyse
+
+        settings, trajectories = settings or PipelineSettings(), recordings_of(recordings)
+        if hidden_velocities:
+            settings = replace(
+                settings, identification=replace(settings.identification, hidden_velocities=True)
+            )
+        analysis = analyse(trajectories, settings)
+        found = None if analysis.landscape is None else analysis.landscape.landscape
+        certified = found is not None and found.certificate is not None and found.certificate.certified
+        whole = certified and found is not None and len(found.attractors) > 1
+        seen = None if whole else seen_states(joined(trajectories))
+        if found is None:
+            raise NoLandscape(why_no_landscape(analysis.outcomes), seen, analysis.dynamics)
+        return replace(found, seen=seen)
+
+    @classmethod
+    def from_equations(
+        cls, system: str | Path | Dynamics, settings: EquationSettings | None = None
+    ) -> Landscape:
+        """The landscape of given equations: no recordings, no sampling, no training.
+
+        Parameters
+        ----------
+        system
+            A system card, or `siq.Dynamics` with its domain.
+        settings
+            Of all steps; see `siq.workflow.equations_step.EquationSettings`.
+
+        Raises
+        ------
+        InputError
+            For a card that cannot be read, or a system that has no quasipotential: driven, without a domain,
+            or with a state that noise does not even reach by way of others.
+        NoLandscape
+            When there is no stable equilibrium in the domain. It says why.
+
+        Examples
+        --------
+        >>> import sympy
+        >>> x, y = sympy.symbols("x y", real=True)
+        >>> wells = Dynamics.of((x, y), (x - x**3, -y), domain=[(-2, 2), (-1, 1)])
+        >>> landscape = Landscape.from_equations(wells)
+        >>> landscape.barriers().round(3)[["start", "end", "barrier"]]
+           start  end  barrier
+        0      0    1      0.5
+        1      1    0      0.5
+        >>> landscape.certificate.certified
+        True
+        """
+        from siq.workflow.equations_step import EquationSettings, landscape_of_equations, usable_system
+
+        return landscape_of_equations(usable_system(system), settings or EquationSettings())
+
+    @property
+    def cycles(self) -> tuple[Cycle, ...]:
+        """The stable limit cycles among the attractors, with period and Floquet multipliers."""
+        return tuple(one for one in self.attractors if isinstance(one, Cycle))
+
+    def in_units(self, units: Sequence[str], *, time: str = "1") -> Landscape:
+        """The same with the units of the states and of the time said; nothing is converted."""
+        dynamics = replace(self.dynamics, units=tuple(units), time_unit=time)
+        wells = tuple(None if well is None else replace(well, dynamics=dynamics) for well in self.wells)
+        return replace(self, dynamics=dynamics, wells=wells)
+
+    @cached_property
+    def over_wells(self) -> GlobalQuasipotential | None:
+        """U over all wells, None where a well has no formula or no height."""
+        return matched(self.wells, self.heights)
+
+    def quasipotential(self, points: np.ndarray) -> np.ndarray:
+        """U at points ``(n, d)``, zero at the deepest attractor: shape ``(n,)``, NaN where not known."""
+        x = np.asarray(points, dtype=float)
+        if x.ndim != 2 or x.shape[1] != self.dynamics.dimension:
+            raise ValueError(f"the points have the shape {x.shape}; give (n, {self.dynamics.dimension})")
+        return np.full(len(x), np.nan) if self.over_wells is None else self.over_wells(x)
+
+    def quasipotential_errors(self, points: np.ndarray) -> np.ndarray:
+        """Standard errors of U at points ``(n, d)``, above the attractor of the well that each lies in.
+
+        Returns
+        -------
+        numpy.ndarray
+            Shape ``(n,)``, from the uncertainty of f (`siq.quasipotential.uncertainty`); zero where
+            recordings carry no noise, NaN where U is not known, or f was not identified.
+        """
+        x = np.asarray(points, dtype=float)
+        errors = np.full(len(x), np.nan)
+        if self.found is None or self.over_wells is None:
+            return errors
+        whole = self.over_wells(x)
+        for well, height in zip(self.wells, self.heights, strict=True):
+            if well is None:
+                continue
+            mine = np.isfinite(whole) & (2 * well.known_values(x) + height <= whole + SAME * well.level)
+            if mine.any():
+                errors[mine] = 2 * potential_errors(self.found, well.gradients, well.attractor, x[mine])
+        return errors
+
+    def potential(self, well: int = 0) -> Well:
+        """V about an attractor, zero there, as a formula with where it holds; U is 2V.
+
+        Raises
+        ------
+        NumericalFailure
+            Where no formula was found.
+        """
+        found = self.wells[well]
+        if found is None:
+            raise NumericalFailure(f"no formula was found about attractor {well}: {'; '.join(self.notes)}")
+        return found
+
+    def barriers(self) -> pd.DataFrame:
+        """ΔU on every way out of every well, one row each.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Columns ``start end barrier standard_error``: attractors by their place in `attractors`, the end
+            missing where the way leads out of the recorded region; ΔU in the unit of ε with its standard
+            error from the uncertainty of f, NaN where it is not known.
+        """
+        return pd.DataFrame(
+            {
+                "start": np.array([way.start for way in self.transitions], dtype=int),
+                "end": pd.array([way.end for way in self.transitions], dtype="Int64"),
+                "barrier": np.array([way.barrier for way in self.transitions], dtype=float),
+                "standard_error": np.array([way.standard_error for way in self.transitions], dtype=float),
+            }
+        )
+
+    def dwell_times(self, *, noise: float | None = None) -> pd.DataFrame:
+        """How long each well lasts in the mean, one row for every attractor.
+
+        Parameters
+        ----------
+        noise
+            ε, in the unit of U; by default as the recordings show it.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Columns ``attractor mean_time data_error law_error``: the time, NaN where it is not known, its
+            relative standard error from the uncertainty of f and of the noise, and the relative error of the
+            law itself (`siq.quasipotential.rates`).
+
+        Raises
+        ------
+        ValueError
+            When no noise is known.
+        """
+        strength = self.noise if noise is None else NoiseStrength(noise)
+        if strength is None:
+            raise ValueError("no noise is known, and how long a well lasts follows from it; give 'noise'")
+        rows = []
+        for index in range(len(self.attractors)):
+            found = dwell_time(self.exits(index), strength)
+            said = (np.nan,) * 3 if found is None else (found.value, found.data_error, found.law_error)
+            rows.append((index, *said))
+        return pd.DataFrame(rows, columns=["attractor", "mean_time", "data_error", "law_error"])
+
+    def exits(self, well: int) -> list[Exit]:
+        """The ways out of a well with what its times follow from."""
+        return [way.exit for way in self.transitions if way.start == well]
+
+    def escape_times(self, *, noise: float) -> pd.DataFrame:
+        """Mean times until noise has led from each attractor to the next, one row for every way out.
+
+        Parameters
+        ----------
+        noise
+            ε of ``dx = f dt + √ε σ dW``, in the unit of U.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Columns ``start end mean_time note``: the mean time by the law of Eyring and Kramers with its
+            prefactor (`siq.quasipotential.rates`), NaN with a note that says why where the law does not hold.
+
+        Raises
+        ------
+        ValueError
+            When D is the unit matrix although a state is but the derivative of another: no noise drives
+            ``dx/dt = v``, and the times follow from D.
+        """
+        if (missing := missing_diffusion(self.dynamics)) is not None:
+            raise ValueError(missing)
+        rows = [(way.start, way.end, *_mean_time(way, noise)) for way in self.transitions]
+        table = pd.DataFrame(rows, columns=["start", "end", "mean_time", "note"])
+        return table.astype({"start": int, "end": "Int64", "mean_time": float})
+
+    def beside(self, equations: Landscape, *, noise: float | None = None) -> pd.DataFrame:
+        """Barriers, prefactors and mean times of trajectories beside those of the equations behind them.
+
+        Parameters
+        ----------
+        equations
+            From `from_equations`, of the same states. U is in the unit of D, which has to be the same, but
+            for the errors of one that was estimated: tell the recordings that of the equations
+            (`siq.workflow.settings.StateSpace`), or read ΔU/ε of both.
+        noise
+            ε for which mean times are compared; left out, none are.
+
+        Returns
+        -------
+        pandas.DataFrame
+            One row for each number, with the columns ``item quantity noise equations trajectories
+            standard_error relative_difference in_errors note`` (`siq.quasipotential.landscape_comparison`).
+
+        Raises
+        ------
+        ValueError
+            When the states are not the same, or D is not.
+        """
+        from siq.workflow.comparison_steps import compared
+
+        return compared(equations, self, noise=noise)
+
+    def report(self) -> str:
+        """What was found, as text."""
+        from siq.report.landscape_answer import landscape_text
+
+        return landscape_text(self)
+
+    def __repr__(self) -> str:
+        """One line: a landscape holds thousands of numbers, which `report` makes readable."""
+        named = ", ".join(self.dynamics.states)
+        return (
+            f"<Landscape of ({named}): {len(self.attractors)} attractors, {len(self.transitions)} ways out>"
+        )
+
+    def _repr_html_(self) -> str:
+        from siq.report.landscape_answer import landscape_html
+
+        return landscape_html(self)
+
+    def plot(self, ax: Axes | None = None) -> Axes:
+        """Draw U with its wells, passes and paths; see `siq.plot_quasipotential`, which this calls.
+
+        Parameters
+        ----------
+        ax
+            Where; by default new axes.
+        """
+        from siq.report.plots.quasipotential import plot_quasipotential
+
+        return plot_quasipotential(self, ax=ax)
+
+
+def _mean_time(way: Transition, noise: float) -> tuple[float, str]:
+    if way.rate is None:
+        return np.nan, "; ".join(way.notes)
+    try:
+        return way.rate.mean_time(noise), "; ".join(way.notes)
+    except NumericalFailure as error:
+        return np.nan, str(error)

@@ -1,0 +1,994 @@
+"""V about one attractor: the local route from f alone, grown outwards to the lowest saddle.
+
+No single formula can hold over several wells, since V has a kink between them; about one attractor it is
+smooth, below its lowest saddle and often beyond. Away from recorded states that lead to the attractor, and
+where the formula does not solve the Hamilton–Jacobi equation, nothing is claimed.
+
+At the attractor the Hessian of V is M, which follows from the Jacobian of f, and it is kept. The higher
+powers are found by Gauss–Newton on the Hamilton–Jacobi equation, in a sublevel set that grows from a small
+ellipsoid. No network takes part. Beyond the lowest saddle the well ends, and nothing is claimed there.
+
+For given equations the path of least action to the lowest saddle comes first, so that the depth of the well
+is known. V is grown once, in the lowest powers that follow it up there (`siq.quasipotential.wells`). From
+there every higher degree starts on the whole sublevel set, from the formula of the degree below: grown by
+itself it would be an extrapolation at each level, which of high powers is bad. The fits are made in
+combinations of powers that are orthonormal over the sublevel set.
+
+A formula grown to its saddle (`siq.quasipotential.wells`) is taken on to a higher level by a robust fit of
+the Hamilton–Jacobi equation: where V stops to be smooth, by caustics or by a kink, the residual is large and
+counts for nothing, instead of spoiling the formula elsewhere. Where it stays large, nothing is claimed. This
+is the V of an attractor for all that follows: certificate, landscape, files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Annotated
+
+import numpy as np
+import sympy
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass as pydantic_dataclass
+from scipy.spatial import cKDTree
+
+from siq.errors import NumericalFailure
+from siq.quasipotential.hamilton_jacobi import (
+    UNTOLD,
+    HamiltonJacobi,
+    PowerBasis,
+    affordable_degree,
+    equation_at,
+    gauss_newton,
+    orthonormalised,
+    power_basis,
+    relative_residuals,
+    robust,
+)
+from siq.systems.basins import Basin
+from siq.systems.cycles import Cycle
+from siq.systems.diffusion import Diffusion
+from siq.systems.dynamics import Dynamics
+from siq.systems.equilibria import Equilibrium, hessian_at, measure_at
+from siq.systems.export import Formula, as_latex, as_sympy, as_text, c_source, julia_source, numpy_source
+from siq.systems.formulas import DIGITS
+from siq.systems.phase_portrait import PhasePortrait
+
+TOLERANCE = 0.05  # residual at a point up to which a formula is believed: V is then off by some per cent
+ROUNDING = 1e-16  # of what is usual: |∇V| |f| so close to the attractor says nothing
+NEGATIVE = 1e-9  # of the level: V so far below zero is rounding
+NOTHING = 1e-14  # of the largest coefficient, or of the size of a well: rounding of the fit
+NEAR = 2.5  # of the spacing of the points: further away there were no points
+
+
+@dataclass(frozen=True)
+class DegreeTrial:
+    """One degree that was tried about an attractor.
+
+    Attributes
+    ----------
+    degree, terms
+        Highest power, and number of coefficients.
+    residual
+        Median relative Hamilton–Jacobi residual on points that took no part in the fit.
+    covered
+        Points among them below the lowest level of all degrees at which the formula is believed, as a share
+        of those that the degree which reaches most of them has there.
+    """
+
+    degree: int
+    terms: int
+    residual: float
+    covered: float
+
+
+@dataclass(frozen=True, eq=False)
+class Well:
+    """V about an attractor. U is 2V.
+
+    Main attributes
+    ---------------
+    dynamics
+        f and D.
+    attractor
+        Shape ``(d,)``. V is zero there.
+    basis, coefficients
+        The powers about the attractor, and their coefficients, shape ``(m,)``.
+    level
+        V of the lowest saddle, or, where there is none, of the last point that recordings reach.
+    saddle
+        Position of that saddle, None where recordings end before one.
+
+    Other attributes
+    ----------------
+    residual
+        Relative Hamilton–Jacobi residual on the points of the fit.
+    points
+        Those, shape ``(n, d)``; none where only the formula was kept.
+    reach
+        V up to which the formula was sought, which may lie beyond the saddle; by default the level.
+    tolerance
+        Largest relative Hamilton–Jacobi residual at a point where the formula is believed.
+    elsewhere
+        Recorded states from which f leads to other attractors, shape ``(m, d)``; None for none.
+    trials
+        The degrees that were tried.
+    """
+
+    dynamics: Dynamics
+    attractor: np.ndarray
+    basis: PowerBasis
+    coefficients: np.ndarray
+    level: float
+    saddle: np.ndarray | None
+    residual: float
+    points: np.ndarray
+    reach: float = 0.0
+    tolerance: float = TOLERANCE
+    elsewhere: np.ndarray | None = None
+    trials: tuple[DegreeTrial, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.reach:
+            object.__setattr__(self, "reach", self.level)
+
+    @property
+    def degree(self) -> int:
+        """Highest power."""
+        return int(self.basis.exponents.sum(axis=1).max())
+
+    @property
+    def inside(self) -> np.ndarray:
+        """The points of the fit below the level, shape ``(m, d)``."""
+        return np.asarray(self.points[self.values(self.points) < self.level])
+
+    def values(self, x: np.ndarray) -> np.ndarray:
+        """The formula at points ``(n, d)``, believed there or not: shape ``(n,)``."""
+        return self.basis.values(x) @ self.coefficients
+
+    def gradients(self, x: np.ndarray) -> np.ndarray:
+        """∇V at points, shape ``(n, d)``."""
+        return self.basis.gradients(x) @ self.coefficients
+
+    def hessians(self, x: np.ndarray) -> np.ndarray:
+        """∇²V at points, shape ``(n, d, d)``."""
+        return self.basis.hessians(x) @ self.coefficients
+
+    def known_values(self, x: np.ndarray) -> np.ndarray:
+        """V at points ``(n, d)``: shape ``(n,)``, NaN where the formula is not to be believed."""
+        return np.where(self.believed(x), self.values(x), np.nan)
+
+    def believed(self, x: np.ndarray) -> np.ndarray:
+        """Mask of the points that the formula reaches, and where it solves the Hamilton–Jacobi equation.
+
+        That has no meaning where a formula of D is no covariance.
+        """
+        believed = self.reaches(x) & self.dynamics.diffusion.positive_at(x)
+        believed[believed] = self.residual_at(x[believed]) <= self.tolerance
+        return believed
+
+    def residual_at(self, x: np.ndarray) -> np.ndarray:
+        """∣∇V·(f + D∇V)∣ / (∣∇V∣ ∣f∣) at points ``(n, d)``, in the metric of the noise: shape ``(n,)``.
+
+        At the attractor, where both vanish, it is zero.
+        """
+        numerator, size = self._terms(x)
+        # At the attractor both vanish, and what is left of them is rounding.
+        return np.asarray(numerator / np.maximum(size, ROUNDING * self._size))
+
+    def reaches(self, x: np.ndarray) -> np.ndarray:
+        """Mask of the points below `reach`, and among recorded states that lead to the attractor.
+
+        V is zero at the attractor and nowhere lower. Where a formula is, it runs away between two of its
+        points. One state has nothing beside its points: what lies between two of them is reached, and so is
+        the saddle, to which they lead as close as recordings do.
+        """
+        values = self.values(x)
+        reached: np.ndarray = (values <= self.reach) & (values >= -NEGATIVE * self.reach)
+        if not len(self.points):
+            return reached
+        if x.shape[1] == 1:
+            known = self.points if self.saddle is None else np.append(self.points, self.saddle[None], axis=0)
+            return reached & (x[:, 0] >= known.min()) & (x[:, 0] <= known.max())
+        tree, spacing = self._places
+        own, nearest = tree.query(x / self._width)
+        reached &= own <= NEAR * spacing[nearest]
+        if self._others is not None:  # behind the ridge the formula would go on down to the other attractor
+            reached &= own < self._others.query(x / self._width)[0]
+        return reached
+
+    def _terms(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        slope, flow, noise = self.gradients(x), self.dynamics.drift(x), self.dynamics.diffusion
+        numerator = np.abs((slope * (flow + noise.push(x, slope))).sum(axis=1))
+        measure = self._measure
+        return numerator, np.sqrt(measure.steepness(x, slope) * measure.squared_speed(x, flow))
+
+    @cached_property
+    def _measure(self) -> Diffusion:
+        return measure_at(self.dynamics, self.attractor)
+
+    @cached_property
+    def _size(self) -> float:
+        size = float(np.median(self._terms(self.points)[1])) if len(self.points) else 0.0
+        return size if size > 0 else float(np.finfo(float).tiny) / ROUNDING
+
+    @cached_property
+    def _others(self) -> cKDTree | None:
+        if self.elsewhere is None or not len(self.elsewhere):
+            return None
+        return cKDTree(self.elsewhere / self._width)
+
+    @cached_property
+    def _width(self) -> np.ndarray:
+        width: np.ndarray = np.ptp(self.points, axis=0)
+        return width
+
+    @cached_property
+    def _places(self) -> tuple[cKDTree, np.ndarray]:
+        places = self.points / self._width
+        tree = cKDTree(places)
+        # Of the d-th neighbour: points on one descent lie closer to each other than descents do.
+        spacing = tree.query(places, k=2 * places.shape[1] + 1)[0][:, -1]
+        return tree, spacing
+
+    # The formula for others.
+
+    @property
+    def expression(self) -> sympy.Expr:
+        """V as a formula of the states, in powers of ``(x - center)/scale``."""
+        return self.basis.expression(self.coefficients)
+
+    @property
+    def formula(self) -> Formula:
+        """V in powers of the offsets from the attractor, in the units of the states, without rounding."""
+        size, basis = np.abs(self.coefficients), self.basis
+        return Formula.of_powers(
+            "V", basis.symbols, scale=basis.scale, exponents=basis.exponents,
+            center=np.where(np.abs(basis.center) > NOTHING * basis.scale, basis.center, 0.0),
+            coefficients=np.where(size > NOTHING * size.max(), self.coefficients, 0.0),
+            units=self.dynamics.units, title=f"U = 2V is the quasipotential, known up to V = {self.reach!r}",
+        )  # fmt: skip
+
+    def to_text(self) -> str:
+        """The formula as text, a line for each definition."""
+        return as_text(self.formula)
+
+    def to_latex(self, *, digits: int = DIGITS) -> str:
+        """The formula as LaTeX, with so many significant digits."""
+        return as_latex(self.formula, digits=digits)
+
+    def to_sympy(self) -> sympy.Expr:
+        """The formula as a sympy expression of the states."""
+        return as_sympy(self.formula)
+
+    def to_numpy(self) -> str:
+        """Source of the functions ``V`` and ``V_gradient`` in numpy."""
+        return numpy_source(self.formula)
+
+    def to_c(self) -> str:
+        """Source of the functions ``V`` and ``V_gradient`` in C."""
+        return c_source(self.formula)
+
+    def to_julia(self) -> str:
+        """Source of the functions ``V`` and ``V_gradient`` in Julia."""
+        return julia_source(self.formula)
+
+
+FIRST_SHARE = 0.05  # of a known depth: the first level
+GROWTH = 1.5  # of the level, from one fit to the next
+REACH = 0.25  # of the distance at which the level lies: how far new points may be from those of the last fit
+MOST_POINTS = 6000  # of one fit
+HIGHEST = 0.9  # share of the recorded starts below the level, where no saddle limits it
+SETTLED = 0.01  # change of the level, and of the number of points, with which growing ends
+REPEATED = 1e-4  # of a level: one that was tried before, and from which the next would follow again
+AT_LEVEL = 0.05  # of a level: by so much V of the saddle that set it may change with the next fit
+MOST_ROUNDS = 80  # of growing
+ON_THE_WAY = 1e-6  # relative change of the coefficients with which Gauss–Newton ends before the last level
+STARTS = (0.5, 0.25, 1.0)  # of the networks' level: where the network route starts, one after the other
+LOW = 4  # powers up to this one are fitted to a network's V, and those above begin at zero
+NO_SOLUTION = 0.2  # relative residual from which on a start has led nowhere
+FLAT = 1e-6  # of the largest curvature at an attractor: V with a smaller one has no minimum there
+CLOSE = 0.1  # of the recorded box: a saddle so close to the points of the fit has been reached
+
+
+def grow_well(
+    dynamics: Dynamics,
+    attractor: Equilibrium,
+    basin: Basin,
+    saddles: Sequence[Equilibrium | Cycle],
+    *,
+    degree: int,
+    generator: np.random.Generator,
+    depth: float | None = None,
+) -> Well:
+    """V about an attractor up to its lowest saddle.
+
+    Parameters
+    ----------
+    dynamics
+        f and D.
+    attractor
+        Where V is zero.
+    basin
+        Recorded points that lead to it; the well cannot reach beyond them.
+    saddles
+        The saddles next to it.
+    degree
+        Highest power.
+    generator
+        Decides which points are used where there are too many.
+    depth
+        V at the lowest of the saddles, which then is the only one given, where the path of least action has
+        told it before; by default V itself has to find its lowest saddle.
+
+    Raises
+    ------
+    NumericalFailure
+        When too few recorded states lead to the attractor, or the powers can follow V neither up to a
+        saddle nor to the end of the recorded region.
+    """
+    hessian = hessian_at(dynamics, attractor.position)
+    extent = np.sqrt(np.diag(np.linalg.inv(hessian)))
+    flat = basin.states.reshape(-1, basin.states.shape[2])
+    offsets = flat - attractor.position
+    quadratic = 0.5 * np.einsum("ni,ij,nj->n", offsets, hessian, offsets).reshape(basin.states.shape[:2])
+    size = np.quantile(quadratic[:, 0], 0.5) if depth is None else depth
+    basis = power_basis(dynamics.symbols, attractor.position, extent * np.sqrt(2 * size), degree=degree)
+    order = basis.exponents.sum(axis=1)
+    free = order > 2
+    coefficients = np.zeros(basis.size)
+    for index in np.flatnonzero(~free):
+        i, j = np.repeat(np.arange(len(extent)), basis.exponents[index])
+        factor = 0.5 if i == j else 1.0
+        coefficients[index] = factor * hessian[i, j] * basis.scale[i] * basis.scale[j]
+    values = basis.values(flat) @ coefficients
+    # The first level has points enough for all coefficients.
+    reached = np.sort(basin.highest(values.reshape(basin.states.shape[:2]))[tuple(basin.chosen.T)])
+    level = float(reached[min(4 * basis.size, len(reached) - 1)])
+    if depth is not None:
+        level = min(level, FIRST_SHARE * depth)
+    return _grown(
+        dynamics, basin, saddles, basis, coefficients, free=free, metric=hessian,
+        level=level, fitted=np.zeros(0, dtype=int), generator=generator,
+        depth=depth,
+    )  # fmt: skip
+
+
+def _grown(
+    dynamics: Dynamics,
+    basin: Basin,
+    saddles: Sequence[Equilibrium | Cycle],
+    basis: PowerBasis,
+    coefficients: np.ndarray,
+    *,
+    free: np.ndarray,
+    metric: np.ndarray,
+    level: float,
+    fitted: np.ndarray,
+    generator: np.random.Generator,
+    depth: float | None = None,
+) -> Well:
+    """V grown from a start, level by level, to its lowest saddle or to the end of the recorded region.
+
+    Parameters
+    ----------
+    basis, coefficients
+        The start.
+    free
+        Which coefficients may change, as a mask.
+    metric
+        In which distances are measured, shape ``(d, d)``: the Hessian of V at the attractor.
+    level
+        The first one.
+    fitted
+        Rows of ``basin.chosen`` on which the start was fitted, as far as it was.
+    dynamics, basin, saddles, generator, depth
+        As for `grow_well`.
+    """
+    attractor = basis.center
+    flat = basin.states.reshape(-1, len(attractor))
+    functions = basis.values(flat)
+
+    def along(current: np.ndarray) -> np.ndarray:
+        return (functions @ current).reshape(basin.states.shape[:2])
+
+    tops = np.array([one.position for one in saddles]).reshape(-1, len(attractor))
+    width = np.ptp(flat, axis=0)
+    values = along(coefficients)
+    residual, points, last, recorded = np.inf, np.zeros((0, len(attractor))), False, 0.0
+    places = basin.points(np.arange(len(basin.chosen))) @ np.linalg.cholesky(metric)
+    spacing = cKDTree(places).query(places, k=2)[0][:, 1]
+    ends: list[float] = []
+    for _ in range(MOST_ROUNDS):
+        rows = basin.below(values, level)
+        before = len(fitted)
+        if before:  # far from the last fit V is an extrapolation, and may be low by mistake
+            away = cKDTree(places[fitted]).query(places[rows])[0]
+            rows = rows[away < REACH * np.sqrt(2 * level) + 2 * spacing[rows]]
+        fitted = rows
+        if len(rows) > MOST_POINTS:
+            rows = np.sort(generator.choice(rows, MOST_POINTS, replace=False))
+        points = basin.points(rows)
+        if len(points) < 2 * basis.size:
+            raise NumericalFailure(_too_few(attractor, len(points), before=before, needed=2 * basis.size))
+        equation = equation_at(basis, points, dynamics, attractor=attractor)
+        steps, tolerance = (40, 1e-13) if last else (8, ON_THE_WAY)
+        solution = gauss_newton(equation, coefficients, free=free, steps=steps, tolerance=tolerance)
+        coefficients, residual = solution.coefficients, solution.residual
+        values = along(coefficients)
+        recorded = _recorded(basin.starts(values), len(attractor))
+        limit = depth or min(_lowest(basis.values(tops) @ coefficients, tops, points, width, level), recorded)
+        if last and abs(limit - level) < SETTLED * level and len(fitted) <= (1 + SETTLED) * before:
+            break
+        if any(abs(limit - one) < REPEATED * level for one in ends):  # from here on in circles
+            break
+        if last:
+            ends.append(level)
+        last = GROWTH * level >= limit
+        level = limit if last else GROWTH * level
+    if depth is not None:
+        saddle = tops[0] if level == depth and residual < NO_SOLUTION else None
+    else:
+        saddle, level = _end(basis.values(tops) @ coefficients, tops, points, width, level)
+    # A V that vanishes is a solution too, and the end of what starts far from any other.
+    if not (np.isfinite(residual) and level > 0) or (saddle is None and level < (1 - SETTLED) * recorded):
+        degree = int(basis.exponents.sum(axis=1).max())
+        raise NumericalFailure(
+            f"powers of degree {degree} do not follow V from the attractor near {attractor.round(4)} up to a"
+            " saddle"
+        )
+    return Well(dynamics, attractor, basis, coefficients, level, saddle, residual, points)
+
+
+def _end(
+    heights: np.ndarray, tops: np.ndarray, points: np.ndarray, width: np.ndarray, level: float
+) -> tuple[np.ndarray | None, float]:
+    """The saddle at which growing has ended, with V there; None where it ended before one."""
+    if not len(tops):
+        return None, level
+    nearest = int(np.argmin(np.abs(heights - level)))
+    beside = _distances(tops[nearest : nearest + 1], points, width)[0] < CLOSE
+    if abs(heights[nearest] - level) < (4 if beside else 1) * AT_LEVEL * level:
+        return tops[nearest], float(heights[nearest])
+    return None, level
+
+
+def _too_few(attractor: np.ndarray, count: int, *, before: int, needed: int) -> str:
+    """Why a fit cannot go on, in words: few states lead to the attractor, or V has left them."""
+    place = f"the attractor near {attractor.round(4)}"
+    if not before:
+        return f"only {count} recorded states lead to {place}"
+    return f"V about {place} leaves the recorded states: it came from {before} to {count} and needs {needed}"
+
+
+def _lowest(
+    heights: np.ndarray, tops: np.ndarray, points: np.ndarray, width: np.ndarray, level: float
+) -> float:
+    """V of the lowest saddle, as far as the current V can be believed there.
+
+    Far from the points of the fit it is an extrapolation: a saddle that seems to lie lower than points
+    already reached does not count, unless they are close to it.
+    """
+    believed = (heights > (1 - AT_LEVEL) * level) | (_distances(tops, points, width) < CLOSE)
+    return float(heights[believed & (heights > 0)].min(initial=np.inf))
+
+
+def _recorded(starts: np.ndarray, dimension: int) -> float:
+    """The level that recordings reach, of V at the starts of descents, shape ``(n,)``.
+
+    Below it there may be states to every side without a start; but of one state whatever lies below its
+    highest start lies on the way down from it.
+    """
+    return float(np.quantile(starts, HIGHEST if dimension > 1 else 1.0))
+
+
+def _distances(tops: np.ndarray, points: np.ndarray, width: np.ndarray) -> np.ndarray:
+    """Of each saddle from the nearest point of a fit, as a share of the recorded box."""
+    return np.array([np.abs((points - top) / width).max(axis=1).min() for top in tops])
+
+
+def fit_well(
+    dynamics: Dynamics,
+    attractor: Equilibrium,
+    basin: Basin,
+    saddles: Sequence[Equilibrium],
+    potential: Callable[[np.ndarray], np.ndarray],
+    *,
+    degree: int,
+    generator: np.random.Generator,
+    steps: int = 60,
+) -> Well:
+    """V about an attractor by the network route: from values of V, refined without M.
+
+    Where one formula cannot hold over several wells, the network route takes each for itself. It starts on
+    the states where the network says that V is low, since networks are worst far out, and which are low is
+    all that it has of them in the end: from there V grows by itself, as in the local route, but with all
+    powers free. Were it fitted on what the network takes for the well, it would have to be compared with the
+    local route at states beyond, where it says nothing.
+
+    Parameters
+    ----------
+    potential
+        V_θ, points ``(n, d)`` to values ``(n,)``, up to a constant.
+    dynamics, attractor, basin, saddles, degree, generator
+        As for `grow_well`.
+    steps
+        Most steps of Gauss–Newton at the start.
+
+    Raises
+    ------
+    NumericalFailure
+        When the networks leave too few states for a start, or no start grows to a well.
+    """
+    lowest = float(potential(attractor.position[None])[0])
+    flat = basin.states.reshape(-1, basin.states.shape[2])
+    along = (potential(flat) - lowest).reshape(basin.states.shape[:2])
+    tops = np.array([one.position for one in saddles]).reshape(-1, flat.shape[1])
+    highest = _recorded(basin.starts(along), flat.shape[1])
+    level = min(float((potential(tops) - lowest).min(initial=np.inf)), highest)
+    failure: NumericalFailure | None = None
+    for share in STARTS:
+        rows = basin.below(along, share * level)
+        if len(rows) > MOST_POINTS:
+            rows = np.sort(generator.choice(rows, MOST_POINTS, replace=False))
+        points = basin.points(rows)
+        scale = np.abs(points - attractor.position).max(axis=0, initial=0.0)
+        basis = power_basis(
+            dynamics.symbols, attractor.position, np.where(scale > 0, scale, 1.0), degree=degree
+        )
+        if len(points) < 2 * basis.size:
+            failure = failure or NumericalFailure(
+                f"the networks leave only {len(points)} recorded states below the saddle of the attractor"
+                f" near {attractor.position.round(4)}"
+            )
+            continue
+        # The low powers first: what points on slow manifolds leave open of the high ones would run away.
+        low = basis.exponents.sum(axis=1) <= LOW
+        start = np.zeros(basis.size)
+        start[low] = np.linalg.lstsq(basis.values(points)[:, low], potential(points) - lowest, rcond=1e-10)[0]
+        equation = equation_at(basis, points, dynamics)
+        start = gauss_newton(equation, start, free=low, steps=steps).coefficients
+        solution = gauss_newton(equation, start, steps=steps)
+        start = solution.coefficients
+        metric = basis.hessians(attractor.position[None])[0] @ start
+        curvature = np.linalg.eigvalsh(metric * np.outer(basis.scale, basis.scale))
+        # Up to half of these states, but no fewer than the coefficients need: a start that just has enough of
+        # them would otherwise be refused for want of states.
+        ways = basin.highest((basis.values(flat) @ start).reshape(along.shape))
+        heights = np.sort(ways[tuple(basin.chosen[rows].T)])
+        enough = max(len(heights) // 2, 2 * basis.size)
+        first = float(heights[min(enough, len(heights) - 1)]) * (1 + ON_THE_WAY)
+        # V = 0 is a solution too, and what tends to it has a residual as large as itself.
+        if not solution.residual < NO_SOLUTION or curvature[0] <= FLAT * curvature[-1] or first <= 0:
+            failure = NumericalFailure(
+                f"the networks' V leads to none with a minimum at the attractor near"
+                f" {attractor.position.round(4)}"
+            )
+            continue
+        try:
+            return _grown(
+                dynamics, basin, saddles, basis, start,
+                free=np.ones(basis.size, dtype=bool), metric=metric, level=first, fitted=rows,
+                generator=generator,
+            )  # fmt: skip
+        except NumericalFailure as error:
+            failure = error
+    assert failure is not None  # there is at least one start
+    raise failure
+
+
+STEP = 1.06  # of the level, from one fit to the next
+REWEIGHTINGS = 3
+ITERATIONS = 8  # of Gauss–Newton between two reweightings
+FINEST = 0.01  # residual below which nothing is an outlier: few points lie where a well is narrow
+BESIDE = 0.05  # of the extent of the well: states so close to the path are below a level where the path is
+PATH_FROM, PATH_TO = 0.02, 0.98  # of the depth: where the path tells ∇V
+RAISED_WELLS_MOST_POINTS = 5000  # of one fit
+RUNAWAY = 1.5  # of a level: where the formula of the degree below is higher, a lower V is an extrapolation
+GAP = 0.25  # of the distance at which the level lies: as far new points may be from those of the last fit
+WORSE = 3.0  # times the residual of the degree below: a higher one that is worse by that has run away
+ENDED = 2  # higher degrees in a row that do not improve: there is nothing more to be had
+
+
+@dataclass(frozen=True, eq=False)
+class Depth:
+    """How deep a well is, as the path of least action to its lowest saddle tells.
+
+    Attributes
+    ----------
+    saddle
+        That saddle, or the unstable cycle that bounds the well.
+    points
+        Along the path, shape ``(n, d)``.
+    values, slopes
+        V and ∇V there, shape ``(n,)`` and ``(n, d)``.
+    """
+
+    saddle: Equilibrium | Cycle
+    points: np.ndarray
+    values: np.ndarray
+    slopes: np.ndarray
+
+    @property
+    def value(self) -> float:
+        """V at the saddle."""
+        return float(self.values[-1])
+
+
+def raised_wells(
+    dynamics: Dynamics,
+    attractor: Equilibrium,
+    basin: Basin,
+    depth: Depth,
+    *,
+    options: WellOptions,
+    rows: np.ndarray,
+    seed: int = 0,
+) -> list[Well]:
+    """V about an attractor by rising degree, each sought up to ``options.reach`` of the depth.
+
+    Parameters
+    ----------
+    dynamics
+        f and D.
+    attractor
+        Where V is zero.
+    basin
+        States that lead there.
+    depth
+        Of the well.
+    options
+        Degrees, accuracy and reach.
+    rows
+        Rows of ``basin.chosen`` that may be used.
+    seed
+        Decides which points are used where there are too many.
+
+    Raises
+    ------
+    NumericalFailure
+        When no degree follows V up to the saddle.
+    """
+    wells: list[Well] = []
+    failure, idle = NumericalFailure("no degree is affordable"), 0
+    for degree in options.degrees:
+        if wells and affordable_degree(dynamics.dimension, degree) < degree:
+            break
+        generator = np.random.default_rng(seed)
+        try:
+            if wells:
+                start = _embedded(wells[-1], degree)
+            else:
+                start = grow_well(
+                    dynamics, attractor, basin, [depth.saddle], degree=degree, generator=generator,
+                    depth=depth.value,
+                )  # fmt: skip
+            well = _raised(start, basin, depth, options.reach, rows, generator)
+            if wells and not well.residual < WORSE * wells[-1].residual:  # the path may start it too far off
+                again = _raised(start, basin, depth, options.reach, rows, generator, by_path=False)
+                well = min(well, again, key=lambda one: one.residual)
+        except NumericalFailure as error:  # of one degree: another may do
+            failure = error
+            continue
+        if wells and not well.residual < wells[-1].residual:
+            idle += 1
+            if idle == ENDED or not well.residual < WORSE * wells[-1].residual:
+                break
+            continue
+        wells.append(well)
+        idle = 0
+        if well.residual < options.accuracy:
+            break
+    if not wells:
+        raise failure
+    return wells
+
+
+def _embedded(well: Well, degree: int) -> Well:
+    """The same formula in powers up to a higher degree; the lower ones come first."""
+    basis = power_basis(well.basis.symbols, well.basis.center, well.basis.scale, degree=degree)
+    coefficients = np.zeros(basis.size)
+    coefficients[: well.basis.size] = well.coefficients
+    return replace(well, basis=basis, coefficients=coefficients)
+
+
+def _raised(
+    start: Well,
+    basin: Basin,
+    depth: Depth,
+    reach: float,
+    rows: np.ndarray,
+    generator: np.random.Generator,
+    *,
+    by_path: bool = True,
+) -> Well:
+    """A formula fitted from 0.9 of the depth to its reach, level by level; begun on the path, or not."""
+    goal, level = reach * depth.value, min(0.9 * start.level, reach * depth.value)
+    shape, flat = basin.states.shape[:2], basin.states.reshape(-1, basin.states.shape[2])
+    functions = start.basis.values(flat)
+    before = (functions @ start.coefficients).reshape(shape)
+    free = start.basis.exponents.sum(axis=1) > 2
+    metric = np.linalg.cholesky(hessian_at(start.dynamics, start.attractor))
+    places = basin.points(np.arange(len(basin.chosen))) @ metric
+    fitted = basin.below(before, level)
+    # Where the well narrows towards its saddle, V in lower powers may be far off, and few states be below it.
+    way = depth.points @ metric
+    distance, nearest = cKDTree(way).query(places)
+    beside = np.where(distance < BESIDE * np.sqrt(2 * depth.value), depth.values[nearest], np.inf)
+    coefficients = start.coefficients
+    if by_path:
+        coefficients = _towards_path(start, basin.points(fitted), depth, free)
+    while True:
+        along = (functions @ coefficients).reshape(shape)
+        chosen = np.intersect1d(basin.below(along, level), basin.below(before, RUNAWAY * level))
+        if len(fitted) and len(chosen):
+            away = cKDTree(places[fitted]).query(places[chosen])[0]
+            chosen = chosen[away < GAP * np.sqrt(2 * level)]
+        fitted = chosen = np.union1d(chosen, np.flatnonzero(beside < level))
+        used = np.intersect1d(chosen, rows)
+        if len(used) > RAISED_WELLS_MOST_POINTS:
+            used = np.sort(generator.choice(used, RAISED_WELLS_MOST_POINTS, replace=False))
+        if len(used) < 2 * start.basis.size:
+            raise NumericalFailure(
+                f"V about the attractor near {start.attractor.round(4)} is told by {len(used)} states alone"
+            )
+        equation = equation_at(start.basis, basin.points(used), start.dynamics, attractor=start.attractor)
+        last = level >= goal
+        coefficients = _robust(equation, coefficients, free, rounds=REWEIGHTINGS if last else 1)
+        if last:
+            break
+        level = min(goal, STEP * level)
+    residual = float(np.median(relative_residuals(equation, coefficients)))
+    if not np.isfinite(residual):
+        raise NumericalFailure(f"powers of degree {start.degree} do not follow V to its saddle")
+    return replace(
+        start, coefficients=coefficients, level=depth.value, reach=goal, residual=residual,
+        points=basin.points(np.intersect1d(fitted, rows)),
+    )  # fmt: skip
+
+
+def _towards_path(well: Well, x: np.ndarray, depth: Depth, free: np.ndarray) -> np.ndarray:
+    """Coefficients of a formula that is left as it is at points, but for the path, whose ∇V is known.
+
+    They are but a start: what is fitted from there is the equation alone.
+    """
+    noise = measure_at(well.dynamics, well.attractor)
+    rising = (depth.values > PATH_FROM * depth.value) & (depth.values < PATH_TO * depth.value)
+    where, slopes = depth.points[rising], depth.slopes[rising]
+    if not len(where) or not len(x):
+        return well.coefficients
+    old, along = well.basis.gradients(x), well.basis.gradients(where)
+    size = np.sqrt(noise.steepness(where, slopes))
+    weight = np.sqrt(len(x) / len(where)) / size
+    rest = slopes - along @ well.coefficients
+    steep = np.sqrt(noise.steepness(x, old @ well.coefficients))
+    steep = np.maximum(steep, np.median(steep))
+    roots = noise.root_at(where), noise.root_at(x)
+    rows = [
+        np.einsum("n,nij,nim->njm", weight, roots[0], along[:, :, free], optimize=True),
+        np.einsum("n,nij,nim->njm", 1 / steep, roots[1], old[:, :, free], optimize=True),
+    ]
+    wanted = np.einsum("n,nij,ni->nj", weight, roots[0], rest).ravel()
+    matrix = np.concatenate([one.reshape(-1, one.shape[2]) for one in rows])
+    right = np.concatenate([wanted, np.zeros(len(matrix) - len(wanted))])
+    scale = np.linalg.norm(matrix, axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    coefficients = well.coefficients.copy()
+    coefficients[free] += np.linalg.lstsq(matrix / scale, right, rcond=UNTOLD)[0] / scale
+    return coefficients
+
+
+def _robust(
+    equation: HamiltonJacobi, coefficients: np.ndarray, free: np.ndarray, *, rounds: int
+) -> np.ndarray:
+    """Gauss–Newton in orthonormal combinations, with weights that fall with what is left."""
+    turned_equation, turned = orthonormalised(equation, free)
+    stay = int((~free).sum())
+    moving = np.arange(turned.shape[1]) < turned.shape[1] - stay
+    theta = np.linalg.lstsq(turned[free], coefficients[free], rcond=None)[0]
+    theta[~moving] = coefficients[~free]
+    for _ in range(rounds):
+        weighted = robust(turned_equation, theta, finest=FINEST)
+        theta = gauss_newton(weighted, theta, free=moving, steps=ITERATIONS).coefficients
+    return np.asarray(turned @ theta)
+
+
+LOCAL_WELLS_REWEIGHTINGS = 4
+LOCAL_WELLS_FINEST = 1e-5  # residual below which nothing is an outlier
+HELD_OUT = 4  # every so manieth point is kept for choosing the degree
+
+Degree = Annotated[int, Field(ge=2, le=16)]
+
+
+@pydantic_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class WellOptions:
+    """How V about an attractor is sought, and where it is believed.
+
+    Attributes
+    ----------
+    degrees
+        Highest powers that are tried, one after the other.
+    accuracy
+        Relative Hamilton–Jacobi residual below which no higher power is tried.
+    reach
+        Level up to which a formula is sought, as a share of V at the lowest saddle.
+    tolerance
+        Largest relative Hamilton–Jacobi residual at a point where a formula is believed.
+    """
+
+    degrees: Annotated[tuple[Degree, ...], Field(min_length=1)] = (4, 6, 8, 10, 12)
+    accuracy: Annotated[float, Field(gt=0)] = LOCAL_WELLS_FINEST
+    reach: Annotated[float, Field(gt=0, le=3)] = 1.2
+    tolerance: Annotated[float, Field(gt=0, lt=1)] = TOLERANCE
+
+
+def local_well(
+    dynamics: Dynamics,
+    portrait: PhasePortrait,
+    index: int,
+    *,
+    options: WellOptions,
+    seed: int = 0,
+    depth: Depth | None = None,
+) -> Well:
+    """V about one attractor, of the lowest degree that no other betters by much.
+
+    Parameters
+    ----------
+    dynamics
+        f and D.
+    portrait
+        Attractors, saddles and basins.
+    index
+        Which attractor.
+    options
+        Degrees, reach and tolerance.
+    seed
+        Decides which points are used where there are too many.
+    depth
+        The lowest saddle with V there, where the path of least action has told it before, as it does for
+        given equations.
+
+    Raises
+    ------
+    NumericalFailure
+        When no degree gives a formula.
+    """
+    basin = portrait.basins[index]
+    rows = np.arange(len(basin.chosen))
+    elsewhere = states_elsewhere(portrait, index)
+    kept = rows[rows % HELD_OUT != 0]
+    if depth is None:
+        grown = _grown_wells(dynamics, portrait, index, options, seed)
+        # No formula tells V of the saddle as well as the finest does.
+        goal = options.reach * grown[-1].level
+        extended = [extend_well(well, basin, goal=goal, rows=kept) for well in grown]
+    else:
+        extended = raised_wells(
+            dynamics, portrait.attractors[index], basin, depth, options=options, rows=kept, seed=seed
+        )
+    wells = [replace(well, tolerance=options.tolerance, elsewhere=elsewhere) for well in extended]
+    trials = _trials(wells, basin.points(rows[rows % HELD_OUT == 0]))
+    return replace(wells[best_trial(trials)], trials=trials)
+
+
+def states_elsewhere(portrait: PhasePortrait, index: int) -> np.ndarray | None:
+    """Recorded states from which f leads to other attractors, shape ``(m, d)``; None for none."""
+    others = [one for number, one in enumerate(portrait.basins) if number != index]
+    return np.concatenate([one.points(np.arange(len(one.chosen))) for one in others]) if others else None
+
+
+def surveyed(well: Well, dynamics: Dynamics, portrait: PhasePortrait, index: int) -> Well:
+    """A formula read from a file, with the recorded states that tell where it holds.
+
+    Parameters
+    ----------
+    well
+        The formula; it stays as it is.
+    dynamics
+        f and D.
+    portrait, index
+        Of the recordings, and which of its attractors is the well's.
+    """
+    basin = portrait.basins[index]
+    along = well.values(basin.states.reshape(-1, basin.states.shape[2])).reshape(basin.states.shape[:2])
+    return replace(
+        well,
+        dynamics=dynamics,
+        points=basin.points(basin.below(along, well.reach)),
+        elsewhere=states_elsewhere(portrait, index),
+    )
+
+
+def _grown_wells(
+    dynamics: Dynamics, portrait: PhasePortrait, index: int, options: WellOptions, seed: int
+) -> list[Well]:
+    """V up to the saddle by the degrees in their order, until one is exact or the next is too many powers."""
+    wells: list[Well] = []
+    failure = NumericalFailure("no degree is affordable")
+    for degree in options.degrees:
+        if wells and affordable_degree(dynamics.dimension, degree) < degree:
+            break
+        try:
+            well = grow_well(
+                dynamics, portrait.attractors[index], portrait.basins[index], portrait.saddles[index],
+                degree=degree, generator=np.random.default_rng(seed),
+            )  # fmt: skip
+        except NumericalFailure as error:  # of one degree: another may do
+            failure = error
+            continue
+        wells.append(well)
+        if well.residual < options.accuracy:
+            break
+    if not wells:
+        raise failure
+    return wells
+
+
+def extend_well(well: Well, basin: Basin, *, goal: float, rows: np.ndarray | None = None) -> Well:
+    """Take a formula on, from its well to a higher level, by robust fits of the Hamilton–Jacobi equation.
+
+    Parameters
+    ----------
+    well
+        V up to the lowest saddle; see `grow_well`.
+    basin
+        What leads to the attractor. Only such states are asked: across the ridge another well begins.
+    goal
+        Level of V to be reached.
+    rows
+        Rows of ``basin.chosen`` that may be used; default all.
+    """
+    allowed = np.arange(len(basin.chosen)) if rows is None else rows
+    functions = well.basis.values(basin.states.reshape(-1, basin.states.shape[2]))
+    free = well.basis.exponents.sum(axis=1) > 2
+    coefficients = well.coefficients
+    level = min(0.9 * well.level, goal)
+    while True:
+        along = (functions @ coefficients).reshape(basin.states.shape[:2])
+        points = basin.points(np.intersect1d(basin.below(along, level), allowed))
+        equation = equation_at(well.basis, points, well.dynamics, attractor=well.attractor)
+        # On the way up one round keeps the formula close enough to be taken further.
+        coefficients = _robust_local_wells(
+            equation, coefficients, free, rounds=LOCAL_WELLS_REWEIGHTINGS if level >= goal else 1
+        )
+        if level >= goal:
+            break
+        level = min(goal, STEP * level)
+    residual = float(np.median(relative_residuals(equation, coefficients)))
+    top = well.level
+    if well.saddle is not None:  # a formula that goes on smoothly behind a kink is above V, never below
+        top = min(top, float(well.basis.values(well.saddle[None])[0] @ coefficients))
+    return replace(well, coefficients=coefficients, level=top, reach=goal, residual=residual, points=points)
+
+
+def _robust_local_wells(
+    equation: HamiltonJacobi, coefficients: np.ndarray, free: np.ndarray, *, rounds: int
+) -> np.ndarray:
+    """Gauss–Newton with weights that fall with what is left."""
+    for _ in range(rounds):
+        weighted = robust(equation, coefficients, finest=LOCAL_WELLS_FINEST)
+        coefficients = gauss_newton(weighted, coefficients, free=free, steps=6).coefficients
+    return coefficients
+
+
+def _trials(wells: Sequence[Well], x: np.ndarray) -> tuple[DegreeTrial, ...]:
+    """What each degree is worth on points that took no part in its fit."""
+    reached = [well.reaches(x) for well in wells]
+    most = max(int(mask.sum()) for mask in reached)
+    trials = []
+    for well, mask in zip(wells, reached, strict=True):
+        residual = well.residual_at(x[mask])
+        believed = int((residual <= well.tolerance).sum())
+        median = float(np.median(residual)) if len(residual) else np.inf
+        trials.append(DegreeTrial(well.degree, well.basis.size, median, believed / max(most, 1)))
+    return tuple(trials)
+
+
+def best_trial(trials: Sequence[DegreeTrial]) -> int:
+    """Index of the first trial whose coverage and residual no other betters by much."""
+    coverage = max(trial.covered for trial in trials)
+    good = [index for index, trial in enumerate(trials) if trial.covered >= coverage - 0.005]
+    finest = min(trials[index].residual for index in good)
+    return next(index for index in good if trials[index].residual <= max(2 * finest, LOCAL_WELLS_FINEST))

@@ -1,0 +1,439 @@
+"""Figures of the error of U, and of escape times."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import BoundaryNorm, LogNorm
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Rectangle
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import FuncFormatter, MaxNLocator
+
+from siq.numerics.text import unit_text
+from siq.report.landscape_summary import well_name
+from siq.report.plots.style import (
+    BLACK,
+    BLUE,
+    COLUMN_WIDTH,
+    GREEN,
+    GREY,
+    ORANGE,
+    PAGE_WIDTH,
+    PURPLE,
+    VERMILLION,
+    counted,
+    drawn_in_style,
+    magnitude_label,
+    name_label,
+    unit_label,
+)
+
+CURVE_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, BLACK)
+MARKERS = ("o", "s", "^", "D", "v", "P")
+LINE_STYLES = ("-", "--", "-.", ":")
+
+
+@drawn_in_style
+def plot_degrees(table: pd.DataFrame) -> Figure | None:
+    """Draw how formulas about the attractors improve with their number of terms.
+
+    Parameters
+    ----------
+    table
+        Columns ``run attractor degree terms residual covered chosen`` (further ones are ignored), one row per
+        run × attractor × degree: the median relative Hamilton–Jacobi residual on points that took no part in
+        the fit, the share of them at which the formula is believed, and whether this degree was chosen.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Two panels against the number of terms, None where no residual is known: the residual on a logarithmic
+        axis, and the share covered. A thin line a run, a thick one for the median, wherever at least half of
+        the runs are; a dot marks the degree that was chosen in a run, a ring the one that was chosen most
+        often.
+    """
+    if not (table["residual"] > 0).any():
+        return None
+    figure = Figure(figsize=(COLUMN_WIDTH, 6.6))
+    left, right = figure.subplots(2, 1, sharex=True)
+    names = list(dict.fromkeys(table["attractor"]))
+    left.set_yscale("log")
+    for place, name in enumerate(names):
+        rows = table[table["attractor"] == name]
+        _draw_runs(left, rows[rows["residual"] > 0], "residual", place)
+        _draw_runs(right, rows, "covered", place)
+    degrees = table.drop_duplicates("terms").sort_values("terms")
+    for axes in (left, right):
+        axes.set_xlabel("number of terms")
+        top = axes.secondary_xaxis("top")
+        top.set_xticks(degrees["terms"].tolist(), [str(degree) for degree in degrees["degree"]])
+        top.set_xlabel("degree")
+        axes.spines["top"].set_visible(True)
+        axes.grid(axis="y", linewidth=0.3, color="#CCCCCC")
+        axes.set_axisbelow(True)
+    left.set_ylabel("Hamilton–Jacobi residual\n(median over held-out points, relative)")
+    right.set_ylabel("share of the held-out points\nat which the formula is believed")
+    runs = table["run"].nunique()
+    handles = [
+        Line2D(
+            [],
+            [],
+            color=colour,
+            linestyle=style,
+            marker=marker,
+            markersize=3.5,
+            linewidth=1.6,
+            label=by_letters(name),
+        )
+        for name, (colour, style, marker) in zip(names, map(_look, range(len(names))), strict=True)
+    ]
+    handles.append(_ring(GREY, label="chosen" if runs == 1 else "chosen most often"))
+    if runs > 1:
+        thin: dict[str, Any] = {"color": GREY, "linewidth": 0.5, "alpha": 0.7}
+        handles.append(Line2D([], [], marker="o", markersize=2, label=f"each of {runs} runs", **thin))
+        handles.append(Line2D([], [], color=GREY, linewidth=1.6, label="their median"))
+    figure.legend(handles=handles, loc="outside upper center", ncols=2)
+    return figure
+
+
+def _look(place: int) -> tuple[str, str, str]:
+    return (
+        CURVE_COLOURS[place % len(CURVE_COLOURS)],
+        LINE_STYLES[place % len(LINE_STYLES)],
+        MARKERS[place % len(MARKERS)],
+    )
+
+
+def _ring(colour: str, **options: Any) -> Line2D:
+    return Line2D(
+        [], [], linestyle="none", marker="o", markersize=8, markerfacecolor="none", markeredgecolor=colour,
+        markeredgewidth=1.2, **options,
+    )  # fmt: skip
+
+
+def _draw_runs(axes: Axes, rows: pd.DataFrame, column: str, place: int) -> None:
+    rows = rows[np.isfinite(rows[column])]
+    if rows.empty:
+        return
+    colour, style, marker = _look(place)
+    courses = rows.pivot_table(index="terms", columns="run", values=column)
+    chosen = rows[rows["chosen"].astype(bool)]
+    if courses.shape[1] > 1:
+        for run in courses:
+            course = courses[run].dropna()
+            axes.plot(course.index, course, color=colour, linewidth=0.4, alpha=0.4)
+        axes.plot(
+            chosen["terms"], chosen[column], linestyle="none", marker="o", markersize=2, color=colour,
+            markeredgewidth=0, alpha=0.6,
+        )  # fmt: skip
+    median = courses[courses.notna().sum(axis=1) >= courses.shape[1] / 2].median(axis=1)
+    axes.plot(
+        median.index, median, color=colour, linestyle=style, linewidth=1.6, marker=marker, markersize=3.5
+    )
+    if len(chosen):
+        terms = chosen["terms"].mode().iloc[0]
+        if terms in median.index:
+            ring = _ring(colour)
+            ring.set_data([terms], [median[terms]])
+            axes.add_line(ring)
+
+
+@drawn_in_style
+def plot_escape(table: pd.DataFrame, *, time_unit: str = "1", energy_unit: str = "1") -> Figure | None:
+    """Draw mean escape times against the inverse of the noise intensity.
+
+    Parameters
+    ----------
+    table
+        Columns ``transition intensity predicted simulated simulated_error`` (further ones are ignored), one
+        row per transition × ε: the mean time by the law, and in a simulation with its standard error, both in
+        time units. What was not simulated is missing or not finite.
+    time_unit, energy_unit
+        Units of time and of ε; ``1`` and the empty text mean none.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        The law as lines, which are straight where the time is logarithmic; simulations as points with bars
+        of one standard error.
+    """
+    rows = table[table["predicted"] > 0] if len(table) else table
+    if rows.empty:
+        return None
+    figure = Figure(figsize=(COLUMN_WIDTH, 3.8))
+    axes = figure.add_subplot()
+    axes.set_yscale("log")
+    handles, missing = [], 0
+    for place, (name, unsorted) in enumerate(rows.groupby("transition", sort=False)):
+        ways = unsorted.sort_values("intensity", ascending=False)
+        colour, style, marker = _look(place)
+        inverse = 1 / ways["intensity"].to_numpy(float)
+        axes.plot(inverse, ways["predicted"].to_numpy(float), color=colour, linestyle=style, linewidth=1.2)
+        times, errors = (ways[column].to_numpy(float) for column in ("simulated", "simulated_error"))
+        seen = np.isfinite(times) & (times > 0)
+        missing += int((~seen).sum())
+        # An error as large as the mean has no lower end on a logarithmic axis: its bar runs out of sight.
+        errors = np.where(np.isfinite(errors), errors, 0.0)
+        bars = np.stack([np.minimum(errors, (1 - 1e-9) * times), errors])[:, seen]
+        axes.errorbar(
+            inverse[seen], times[seen], yerr=bars, linestyle="none", marker=marker,
+            markersize=4, markerfacecolor="white", color=colour, elinewidth=1.0, capsize=2,
+        )  # fmt: skip
+        handles.append(
+            Line2D([], [], color=colour, linestyle=style, marker=marker, markersize=4,
+                   markerfacecolor="white", label=by_letters(str(name)))
+        )  # fmt: skip
+    _limit(axes, rows)
+    largest = float((1 / rows["intensity"]).max())
+    inverse_unit = "" if energy_unit in ("1", "") else f"1/({energy_unit})"
+    axes.set_xlabel(scaled_label(axes.xaxis, r"$1/\varepsilon$", inverse_unit, largest))
+    axes.set_ylabel(
+        "mean escape time " + ("(time units)" if time_unit in ("1", "") else f"({unit_text(time_unit)})")
+    )
+    figure.legend(
+        handles=handles, loc="outside upper center", ncols=2,
+        title="lines: law, points: simulation ± standard error",
+    )  # fmt: skip
+    if missing:
+        figure.supxlabel(f"{missing} of {counted(len(rows), 'time')} without a simulation")
+    return figure
+
+
+def _limit(axes: Axes, rows: pd.DataFrame) -> None:
+    """Limits by the times themselves: an error bar that runs to zero would leave them no room."""
+    times = rows[["predicted", "simulated"]].to_numpy(float)
+    times = times[np.isfinite(times) & (times > 0)]
+    room = max((times.max() / times.min()) ** 0.08, 1.3)
+    axes.set_ylim(times.min() / room, times.max() * room)
+
+
+def by_letters(name: str) -> str:
+    """The letters by which pages call wells, for the numbers that tables have: ``A1 to A2`` as A to B."""
+    return re.sub(r"\bA(\d+)\b", lambda found: well_name(int(found[1]) - 1), name)
+
+
+def power_of_ten(largest: float) -> int:
+    """The power that is written once at an axis and not at every tick: zero for numbers that are handy."""
+    if not math.isfinite(largest) or largest == 0 or 0.1 <= abs(largest) < 1e4:
+        return 0
+    return math.floor(math.log10(abs(largest)))
+
+
+def scaled_label(axis: Axis, symbol: str, unit: str, largest: float) -> str:
+    """The label of an axis with its unit, and with the power of ten that its ticks leave out from now on.
+
+    Parameters
+    ----------
+    axis
+        The axis; its label is left to the caller.
+    symbol
+        What is shown, typeset.
+    unit
+        Its unit; ``1`` and the empty text mean a plain number.
+    largest
+        The largest number that occurs.
+    """
+    power = power_of_ten(largest)
+    plain = unit in ("1", "")
+    if not power:
+        return symbol if plain else f"{symbol} {unit_label(unit)}"
+    axis.set_major_formatter(FuncFormatter(_without(power)))
+    factor = rf"$10^{{{power}}}$"
+    return f"{symbol} ({factor})" if plain else f"{symbol} ({factor} {unit_text(unit)})"
+
+
+def _without(power: int) -> Callable[[float, object], str]:
+    return lambda value, _: f"{value / 10.0**power:.6g}".replace("-", "−")
+
+
+__all__ = ["plot_degrees", "plot_error_maps", "plot_escape"]
+
+Extend = Literal["neither", "both", "min", "max"]
+
+COLOUR_MAP = "viridis"
+DIFFERENCE_MAP = "magma"
+LEVELS = 14
+DECADES = 4  # of differences, below the largest one
+MARGIN = 0.06  # of what is known: shown around it
+UNKNOWN: dict[str, Any] = {"facecolor": "#F0F0F0", "edgecolor": "#C8C8C8", "hatch": "////", "linewidth": 0}
+RIM: dict[str, Any] = {"path_effects": [withStroke(linewidth=2.0, foreground="white")]}
+
+
+def _shades(values: np.ndarray, level: float | None) -> dict[str, Any]:
+    """Round levels from the lowest value to the top, and what colours they have."""
+    lowest = float(np.nanmin(values))
+    top = float(np.nanmax(values)) if level is None else level
+    top = top if top > lowest else lowest + (abs(lowest) or 1.0)  # a flat landscape has levels, too
+    # The bottom is zero to rounding, and a level below it would have no meaning.
+    levels = MaxNLocator(LEVELS).tick_values(0.0 if abs(lowest) < 1e-3 * (top - lowest) else lowest, top)
+    extend: Extend = "max" if np.nanmax(values) > levels[-1] else "neither"
+    norm = BoundaryNorm(levels, 256, extend=extend)
+    return {"levels": levels, "norm": norm, "extend": extend, "cmap": COLOUR_MAP}
+
+
+def _draw_values(
+    axes: Axes,
+    axes_values: Sequence[np.ndarray],
+    values: np.ndarray,
+    shades: dict[str, Any],
+    *,
+    as_image: bool = False,
+) -> None:
+    _draw_unknown(axes)
+    heights = values.T if shades["extend"] == "both" else np.maximum(values, shades["levels"][0]).T
+    drawn = [
+        axes.contourf(*axes_values, heights, **shades),
+        axes.contour(*axes_values, heights, levels=shades["levels"], colors="white", linewidths=0.25),
+    ]
+    for one in drawn:
+        one.set_rasterized(as_image)
+
+
+def _draw_unknown(axes: Axes) -> None:
+    axes.add_patch(Rectangle((0, 0), 1, 1, transform=axes.transAxes, zorder=-1, **UNKNOWN))
+
+
+def _limit_landscape(
+    axes: Axes, axes_values: Sequence[np.ndarray], values: np.ndarray, places: np.ndarray | None = None
+) -> None:
+    """Show what is known, and some places, as far as the grid goes: the rest of it would only be hatched."""
+    known = np.isfinite(values)
+    limits = []
+    for index, nodes in enumerate(axes_values):
+        shown = nodes[known.any(axis=1 - index)]
+        if places is not None:
+            shown = np.concatenate([shown, places[:, index]])
+        room = MARGIN * (shown.max() - shown.min())
+        limits.append((max(shown.min() - room, nodes[0]), min(shown.max() + room, nodes[-1])))
+    axes.set_xlim(*limits[0])
+    axes.set_ylim(*limits[1])
+
+
+def _name_axes(
+    axes: Axes, axes_values: Sequence[np.ndarray], names: Sequence[str], units: Sequence[str]
+) -> None:
+    for axis, place, name, unit in zip((axes.xaxis, axes.yaxis), axes_values, names, units, strict=True):
+        label = scaled_label(axis, f"${name_label(name)}$", unit, float(np.abs(place).max()))
+        axis.set_label_text(label)
+
+
+def _add_bar(figure: Figure, panels: Sequence[Axes], shades: dict[str, Any], energy_unit: str) -> None:
+    levels = shades["levels"]
+    power = power_of_ten(float(np.abs(levels).max()))
+    factor = f"$10^{{{power}}}$" if power else ""
+    unit = f"{factor} {unit_text(energy_unit) or 'unit of ε'}".strip()
+    bar = figure.colorbar(
+        ScalarMappable(norm=shades["norm"], cmap=shades["cmap"]), ax=list(panels), location="bottom",
+        pad=0.02, aspect=25,
+        label=f"$U$ ({unit})", spacing="proportional",
+    )  # fmt: skip
+    shown = levels[:: 4 if len(levels) > 8 else 2]
+    bar.set_ticks(shown.tolist())
+    bar.minorticks_off()
+    bar.ax.set_xticklabels([f"{one / 10.0**power:.4g}".replace("-", "−") for one in shown])
+
+
+@drawn_in_style
+def plot_error_maps(
+    axes_values: Sequence[np.ndarray],
+    maps: Mapping[str, np.ndarray],
+    *,
+    names: Sequence[str],
+    units: Sequence[str],
+    energy_unit: str,
+) -> Figure | None:
+    """Draw U by several sources, and how far each is from the first one.
+
+    Parameters
+    ----------
+    axes_values
+        The grid, shapes ``(nx,)`` and ``(ny,)``, ascending, in the states' units.
+    maps
+        U by each source, shape ``(nx, ny)``, NaN where it says nothing. The first one is the reference.
+    names, units
+        Of the two states.
+    energy_unit
+        Unit of U and ε; ``1`` and the empty text mean that of ε.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        A row for each source: on the left U in the colours of the reference; on the right the absolute
+        difference as a share of the reference's highest value, on a logarithmic scale, with its root mean
+        square. None where there is nothing to compare.
+    """
+    fields = {name: np.asarray(values, dtype=float) for name, values in maps.items()}
+    fields = {name: values for name, values in fields.items() if np.isfinite(values).any()}
+    if len(fields) < 2 or next(iter(fields)) != next(iter(maps)):
+        return None
+    reference_name, reference = next(iter(fields.items()))
+    highest = float(np.nanmax(np.abs(reference))) or 1.0
+    figure = Figure(figsize=(PAGE_WIDTH, 1.9 * len(fields) + 0.9))
+    panels = figure.subplots(len(fields), 2, sharex=True, sharey=True)
+    shades = _shades(reference, None) | {"extend": "both"}
+    shades["norm"] = BoundaryNorm(shades["levels"], 256, extend="both")
+    differences = [np.abs(values - reference) / highest for values in list(fields.values())[1:]]
+    for axes, (name, values) in zip(panels[:, 0], fields.items(), strict=True):
+        axes.set_title(name, loc="left")
+        _draw_values(axes, axes_values, values, shades, as_image=True)
+    _add_bar(figure, list(panels[:, 0]), shades, energy_unit)
+    _draw_differences(figure, list(panels[:, 1]), axes_values, differences, np.isfinite(reference).sum())
+    corner = panels[0, 1]
+    corner.set_axis_off()
+    text = f"right: difference\nfrom {reference_name}\n/ highest $U$"
+    corner.text(0.5, 0.65, text, transform=corner.transAxes, ha="center", va="center")
+    corner.legend(handles=[Patch(label="not known", **UNKNOWN)], loc="lower center", borderpad=0)
+    _limit_landscape(panels[0, 0], axes_values, reference)
+    for axes in panels.ravel().tolist():
+        axes.xaxis.set_major_locator(MaxNLocator(3))
+        axes.yaxis.set_major_locator(MaxNLocator(4))
+        _name_axes(axes, axes_values, names, units)
+        axes.label_outer()
+    return figure
+
+
+def _draw_nothing(axes: Axes) -> None:
+    _draw_unknown(axes)
+    axes.text(0.5, 0.5, "not known", transform=axes.transAxes, ha="center", va="center", **RIM)
+
+
+def _draw_differences(
+    figure: Figure,
+    panels: Sequence[Axes],
+    axes_values: Sequence[np.ndarray],
+    differences: Sequence[np.ndarray],
+    compared: int,
+) -> None:
+    known = [one[np.isfinite(one)] for one in differences]
+    largest = max((float(one.max(initial=0.0)) for one in known), default=0.0) or 1.0
+    norm = LogNorm(largest / 10**DECADES, largest)
+    for axes, difference, found in zip(panels[1:], differences, known, strict=True):
+        if not found.size:
+            _draw_nothing(axes)
+            continue
+        _draw_unknown(axes)
+        # As an image: thousands of small rectangles would make a megabyte of vector graphics. What is less
+        # than the scale shows, zero included, has its lowest colour.
+        axes.pcolormesh(
+            *axes_values, np.maximum(difference, largest / 10**DECADES).T, norm=norm, cmap=DIFFERENCE_MAP,
+            shading="nearest", rasterized=True,
+        )  # fmt: skip
+        title = f"rms {magnitude_label(float(np.sqrt((found**2).mean())))}"
+        if found.size < compared:
+            title += f", at {100 * found.size / compared:.3g} %"
+        axes.set_title(title, loc="left")
+    bar = figure.colorbar(
+        ScalarMappable(norm=norm, cmap=DIFFERENCE_MAP), ax=panels, label="difference / highest $U$",
+        location="bottom", pad=0.02, aspect=25, extend="min",
+    )  # fmt: skip
+    bar.minorticks_off()

@@ -1,0 +1,39 @@
+"""The sentences of remarks: one template for each code, in `siq/report/templates/remarks/`."""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib.resources import files
+
+import jinja2
+import yaml
+
+from siq.numerics.text import number_text, percent
+from siq.remarks import Remark
+
+
+@cache
+def templates() -> dict[str, jinja2.Template]:
+    """The templates of all remarks, by code, from the files of all packages.
+
+    In a template ``{{ value | number }}`` writes a number for readers, ``{{ value | share }}`` a share in
+    per cent. A value that a template names and a remark lacks is an error.
+    """
+    environment = jinja2.Environment(undefined=jinja2.StrictUndefined, autoescape=False)
+    environment.filters |= {"number": number_text, "share": percent}
+    found: dict[str, jinja2.Template] = {}
+    for file in files("siq.report").joinpath("templates", "remarks").iterdir():
+        entries = yaml.safe_load(file.read_text(encoding="utf-8")) or {}
+        found |= {code: environment.from_string(str(text)) for code, text in entries.items()}
+    return found
+
+
+def sentence(remark: Remark) -> str:
+    """A remark as a sentence.
+
+    Raises
+    ------
+    KeyError
+        If no template has its code.
+    """
+    return templates()[remark.code].render(remark.values)

@@ -1,0 +1,747 @@
+"""Basins of attraction: where trajectories end, and the saddles on the edges between basins.
+
+Two states on either side of the boundary between two basins are bisected until they all but agree, and
+followed until they have come apart; then they are bisected again. What they approach is a state on the
+boundary that attracts along it: mostly a saddle with one unstable direction, at which Newton's method ends.
+
+References
+----------
+J. D. Skufca, J. A. Yorke, B. Eckhardt, Phys. Rev. Lett. 96 (2006) 174101: edge tracking.
+
+A trajectory is followed from return to return through a section, the plane across f at its start. From a
+close return Newton's method seeks the periodic orbit,
+
+    Φ_T(x) = x,    f(x₀)·(x - x₀) = 0,
+
+whose stability the eigenvalues of ``∂Φ_T/∂x`` decide: one of them is 1, and on a limit cycle all others lie
+within the unit circle. Chaos has periodic orbits too, but unstable ones; what tells it is that small
+differences grow from return to return, at the rate of the largest Lyapunov exponent.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+import scipy.optimize
+from scipy.integrate import solve_ivp
+
+from siq.errors import NumericalFailure
+from siq.numerics.integration import dormand_prince_step, next_step
+from siq.numerics.least_squares import representative_subset
+from siq.systems.cycles import Cycle
+from siq.systems.dynamics import Dynamics
+from siq.systems.equilibria import Equilibrium, classify, distinct_roots, hessian_at
+
+SLOWEST_TIMES = 200.0  # trajectories are followed for so many of the slowest relaxation times, ...
+UNSETTLED_TIMES = 25.0  # ... or times to cross the box where there is no attractor
+MOST_STEPS = 3000
+SPACING = 0.04  # of the recorded box: longest step
+ACCURACY = 1e-7  # of the recorded box: local error of a step
+NEXT_TO = 0.02  # of the domain: a trajectory that has been followed for long is so close to its cycle
+ARRIVED_ON = 1e-3  # of the domain: and one so close to a cycle stays with it
+ASKED = 10  # steps after which trajectories are asked whether they are on a cycle
+ARRIVED = 1e-4  # of the recorded box: trajectories so close to an attractor end there
+
+
+@dataclass(frozen=True)
+class Descents:
+    """Trajectories of f from recorded points to where they end.
+
+    Attributes
+    ----------
+    paths
+        Shape ``(n, k, d)``: k states along each of the n trajectories, the first being the start.
+    ends
+        Shape ``(n,)``: index of the attractor at which each ends, -1 where it ends at none.
+    escaped
+        Shape ``(n,)``: whether it left the recorded box for good.
+    """
+
+    paths: np.ndarray
+    ends: np.ndarray
+    escaped: np.ndarray
+
+
+def follow(
+    dynamics: Dynamics,
+    starts: np.ndarray,
+    attractors: Sequence[Equilibrium],
+    *,
+    box: np.ndarray,
+    states: int = 48,
+    patience: int = 1,
+    cycles: Sequence[Cycle] = (),
+) -> Descents:
+    """Follow f from some points to the attractors.
+
+    Parameters
+    ----------
+    dynamics
+        f.
+    starts
+        Shape ``(n, d)``.
+    attractors
+        Where trajectories may end.
+    box
+        Shape ``(d, 2)``: the recorded region. What leaves a box of three times this size has escaped.
+    states
+        States kept along each trajectory, about evenly spread.
+    patience
+        How many times longer than usual trajectories are followed: what spreads from one state to the next
+        takes as long in each.
+    cycles
+        Stable cycles on which trajectories may end, too: their numbers follow on those of the attractors.
+
+    Raises
+    ------
+    NumericalFailure
+        When nothing moves: f is zero at most of the starts.
+    """
+    width = box[:, 1] - box[:, 0]
+    middle = box.mean(axis=1)
+    rates = [-one.eigenvalues.real.max() for one in attractors]
+    slowest = (
+        min(rates) if rates else float(np.median(np.linalg.norm(dynamics.drift(starts) / width, axis=1)))
+    )
+    if not slowest > 0:
+        raise NumericalFailure("f is zero at most of the states: nothing moves, and there is no landscape")
+    horizon = patience * (SLOWEST_TIMES if rates else UNSETTLED_TIMES) / slowest
+    count = len(starts)
+    x, times, steps = starts.copy(), np.zeros(count), np.full(count, 0.01 / slowest)
+    ends, escaped = np.full(count, -1), np.zeros(count, dtype=bool)
+    passed, whose = [starts], [np.arange(count)]
+    running = np.arange(count)
+    for number in range(patience * MOST_STEPS):
+        speed = np.abs(dynamics.drift(x[running]) / width).max(axis=1)
+        step = np.minimum(steps[running], np.minimum(0.5 / slowest, SPACING / np.maximum(speed, 1e-300)))
+        with np.errstate(over="ignore", invalid="ignore"):
+            moved, error = dormand_prince_step(dynamics.drift, x[running], step)
+            relative = np.abs(error / width).max(axis=1) / ACCURACY
+        steps[running] = next_step(step, relative)
+        on, moved, step = running[relative <= 1], moved[relative <= 1], step[relative <= 1]
+        inside = (np.abs((moved - middle) / width) < 1.5).all(axis=1)
+        escaped[on[~inside]] = True
+        on, moved, step = on[inside], moved[inside], step[inside]
+        x[on] = moved
+        times[on] += step
+        passed.append(moved)
+        whose.append(on)
+        for index, one in enumerate(attractors):
+            ends[on[np.abs((moved - one.position) / width).max(axis=1) < ARRIVED]] = index
+        if cycles and number % ASKED == 0:
+            near = settled_on(moved, cycles, box=box, distance=ARRIVED_ON)
+            ends[on[near >= 0]] = len(attractors) + near[near >= 0]
+        running = running[~escaped[running] & (ends[running] < 0) & (times[running] < horizon)]
+        if not len(running):
+            break
+    order = np.argsort(np.concatenate(whose), kind="stable")
+    last = np.cumsum(np.bincount(np.concatenate(whose), minlength=count)) - 1
+    first = np.append(0, last[:-1] + 1)
+    kept = np.round(np.linspace(first, last, states, axis=1)).astype(int)
+    return Descents(np.concatenate(passed)[order][kept], ends, escaped)
+
+
+def settled_on(
+    x: np.ndarray, cycles: Sequence[Cycle], *, box: np.ndarray, distance: float = NEXT_TO
+) -> np.ndarray:
+    """The first of some cycles next to which each state lies, -1 where there is none: shape ``(n,)``."""
+    width = np.ptp(box, axis=1)
+    near = np.full(len(x), -1)
+    for index, one in enumerate(cycles):
+        near[(near < 0) & (one.distances(x, scale=width) < distance)] = index
+    return near
+
+
+def neighbours(
+    dynamics: Dynamics,
+    saddle: Equilibrium,
+    attractors: Sequence[Equilibrium],
+    *,
+    box: np.ndarray,
+    cycles: Sequence[Cycle] = (),
+) -> set[int]:
+    """The attractors below a saddle, on either side of its unstable directions; cycles after points."""
+    return {int(end) for end in _sides(dynamics, saddle, attractors, box=box, cycles=cycles) if end >= 0}
+
+
+def leads_back(
+    dynamics: Dynamics,
+    saddle: Equilibrium,
+    attractors: Sequence[Equilibrium],
+    *,
+    box: np.ndarray,
+    cycles: Sequence[Cycle] = (),
+) -> bool:
+    """Whether f leads from all sides of a saddle to one and the same attractor: it parts no wells."""
+    ends = _sides(dynamics, saddle, attractors, box=box, cycles=cycles)
+    return bool(ends[0] >= 0 and (ends == ends[0]).all())
+
+
+def _sides(
+    dynamics: Dynamics,
+    saddle: Equilibrium,
+    attractors: Sequence[Equilibrium],
+    *,
+    box: np.ndarray,
+    cycles: Sequence[Cycle],
+) -> np.ndarray:
+    """Where f leads from both sides of each unstable direction of a saddle: attractors, cycles, or -1."""
+    values, vectors = np.linalg.eig(dynamics.jacobian(saddle.position[None])[0])
+    width = box[:, 1] - box[:, 0]
+    starts = []
+    for vector in vectors[:, values.real > 0].T:
+        direction = vector.real / np.abs(vector.real / width).max()
+        starts += [saddle.position + 1e-3 * direction, saddle.position - 1e-3 * direction]
+    return ends_of(dynamics, np.array(starts), attractors, cycles, box=box)
+
+
+def ends_of(
+    dynamics: Dynamics,
+    starts: np.ndarray,
+    attractors: Sequence[Equilibrium],
+    cycles: Sequence[Cycle],
+    *,
+    box: np.ndarray,
+) -> np.ndarray:
+    """Where f leads from some states: the number of an attractor, or of a cycle after these; -1 elsewhere."""
+    ways = follow(dynamics, starts, attractors, box=box, states=2, cycles=cycles, patience=dynamics.dimension)
+    near = settled_on(ways.paths[:, -1], cycles, box=box)
+    return np.where((ways.ends < 0) & ~ways.escaped & (near >= 0), len(attractors) + near, ways.ends)
+
+
+SECTIONS = 16  # of a segment, whose ends are followed side by side
+CLOSE, APART = 1e-7, 1e-3  # of the box: when two states all but agree, and when they have come apart
+ROUNDS = 40
+BENT = 0.05  # of the box, by which the first way leaves the straight line, where symmetry may hold it
+EDGE_TRACKING_MOST_STEPS = 20_000  # of integration, until two states have come apart
+EDGE_TRACKING_ACCURACY = 1e-9  # of the box: local error of a step
+# Of the box: how far beside a root with two unstable directions saddles are sought. Enough in chains of 24
+# and 50 units, coupling 2 and tilt 0.1; with a tilt of 0.03 not always.
+ASIDE = (0.02, 0.05, 0.1)
+LEVENBERG_STEPS = 200
+BESIDE = 0.2  # of the box: so close to the edge a root of f has to be its saddle
+
+
+def edge_saddle(
+    dynamics: Dynamics,
+    one: int,
+    two: int,
+    attractors: Sequence[Equilibrium],
+    *,
+    box: np.ndarray,
+    generator: np.random.Generator,
+) -> Equilibrium | None:
+    """A saddle on the boundary of a basin, between two attractors; None where tracking comes to none.
+
+    Parameters
+    ----------
+    dynamics
+        f.
+    one, two, attractors
+        Which of the attractors; the boundary is that of the basin of `one`.
+    box
+        Shape ``(d, 2)``: the domain.
+    generator
+        Bends the first way.
+    """
+    width = np.ptp(box, axis=1)
+
+    def ends(x: np.ndarray) -> np.ndarray:
+        # Where a front has to cross a chain, states are still on their way after any relaxation time.
+        return follow(dynamics, x, attractors, box=box, states=2, patience=dynamics.dimension).ends
+
+    start, end = attractors[one].position, attractors[two].position
+    pair = bisected(start, end, one, ends, width=width, generator=generator)
+    for _ in range(ROUNDS):
+        found = _saddle_near(dynamics, pair.mean(axis=0), box, width)
+        if found is not None:
+            return found
+        tracked = apart_of(dynamics, pair, width)
+        if tracked is None:
+            return None
+        pair = bisected(tracked[0][0], tracked[0][1], one, ends, width=width)
+    return None
+
+
+def bisected(
+    low: np.ndarray,
+    high: np.ndarray,
+    one: int,
+    ends: Callable[[np.ndarray], np.ndarray],
+    *,
+    width: np.ndarray,
+    generator: np.random.Generator | None = None,
+) -> np.ndarray:
+    """Two states on either side of the boundary of a basin that all but agree, shape ``(2, d)``.
+
+    Parameters
+    ----------
+    low, high
+        Shape ``(d,)``: a state within the basin, and one beyond it.
+    one
+        The number of the basin.
+    ends
+        At which attractor each of some states ends.
+    width
+        Shape ``(d,)``: of the domain.
+    generator
+        Bends the way between both; without it, it is straight.
+    """
+    share = np.linspace(0, 1, SECTIONS + 2)[:, None]
+    bend = np.zeros(len(width)) if generator is None else BENT * width * generator.standard_normal(len(width))
+    way = low + share * (high - low) + np.sin(np.pi * share) * bend
+    while True:
+        other = np.flatnonzero(ends(way[1:-1]) != one)
+        last = int(other[0]) if len(other) else len(way) - 2
+        low, high = way[last], way[last + 1]
+        if (np.abs(high - low) / width).max() <= CLOSE:
+            return np.stack([low, high])
+        way = low + share * (high - low)
+
+
+def _saddle_near(dynamics: Dynamics, x: np.ndarray, box: np.ndarray, width: np.ndarray) -> Equilibrium | None:
+    """The saddle with one unstable direction beside a state of the edge; None where none is found.
+
+    A front in a long chain may stand at every site: then the edge hardly moves, and the root next to it may
+    have a second direction that is all but neutral. Along this lie the saddles on either side.
+    """
+
+    def beside(start: np.ndarray) -> Equilibrium | None:
+        for place in _roots_near(dynamics, start, box, width):
+            if (np.abs(place - x) / width).max() < BESIDE:
+                return classify(dynamics, place)
+        return None
+
+    one = beside(x)
+    if one is None or one.unstable == 1:
+        return one if one is not None and one.kind == "saddle" else None
+    values, vectors = np.linalg.eig(dynamics.jacobian(one.position[None])[0] * width / width[:, None])
+    weakest = np.argmin(np.where(values.real > 0, values.real, np.inf))
+    along = vectors[:, weakest].real
+    along *= width / np.abs(along).max()
+    for size, sign in itertools.product(ASIDE, (1, -1)):
+        other = beside(one.position + sign * size * along)
+        if other is not None and other.kind == "saddle" and other.unstable == 1:
+            return other
+    return None
+
+
+def _roots_near(dynamics: Dynamics, x: np.ndarray, box: np.ndarray, width: np.ndarray) -> list[np.ndarray]:
+    """Where Newton's method comes from a state, or else Levenberg and Marquardt's, which may not run away."""
+    found = distinct_roots(dynamics, x[None], box=box, margin=0.0)
+    if found:
+        return found
+    with np.errstate(all="ignore"):  # a step may lead to where f is beyond all numbers, and is taken back
+        solved = scipy.optimize.root(
+            lambda share: dynamics.drift((share * width)[None])[0] / width,
+            x / width,
+            jac=lambda share: dynamics.jacobian((share * width)[None])[0] * width / width[:, None],
+            method="lm",
+            options={"xtol": 1e-12, "ftol": 1e-12, "maxiter": LEVENBERG_STEPS},
+        )
+    return distinct_roots(dynamics, (solved.x * width)[None], box=box, margin=0.0)
+
+
+def apart_of(
+    dynamics: Dynamics, pair: np.ndarray, width: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Two states followed for the same time until they have come apart; None where they do not.
+
+    Returns
+    -------
+    tuple
+        The two states, shape ``(2, d)``; the times that have passed at each step, ``(n,)``, and their
+        middles there, ``(n, d)``.
+    """
+    speed = float(np.abs(dynamics.drift(pair) / width).max())
+    step, now = 1e-3 / max(speed, 1e-300), 0.0
+    times, middles = [], []
+    for _ in range(EDGE_TRACKING_MOST_STEPS):
+        with np.errstate(over="ignore", invalid="ignore"):  # a step that is too long is taken again
+            moved, error = dormand_prince_step(dynamics.drift, pair, np.full(2, step))
+        relative = np.abs(error / width).max(axis=1) / EDGE_TRACKING_ACCURACY
+        if relative.max() <= 1:
+            pair, now = moved, now + step
+            times.append(now)
+            middles.append(pair.mean(axis=0))
+            if (np.abs(pair[1] - pair[0]) / width).max() > APART:
+                return pair, np.array(times), np.array(middles)
+        step = float(next_step(np.full(2, step), relative).min())
+    return None
+
+
+NEAREST = 600  # descents that start close to the attractor, where recordings leave directions out
+POINTS = 6000  # chosen in a basin, about: as many as a fit of V takes
+
+
+@dataclass(frozen=True)
+class Focus:
+    """Further starts about an attractor: how many, and up to which level of ``½ (x - A)·M (x - A)``."""
+
+    count: int
+    level: float
+
+
+@dataclass(frozen=True)
+class Basin:
+    """Points along descents to one attractor; what follows each point on its way is known.
+
+    Attributes
+    ----------
+    states
+        Shape ``(n, k, d)``: descents that end at the attractor.
+    chosen
+        Shape ``(s, 2)``: descent and place of evenly spread points among them.
+    spread
+        How many of the descents, the first ones, start evenly over the region; None for all. The others
+        start close to the attractor.
+    """
+
+    states: np.ndarray
+    chosen: np.ndarray
+    spread: int | None = None
+
+    def starts(self, values: np.ndarray) -> np.ndarray:
+        """Of values along descents, ``(n, k)``, those at the starts that are evenly spread."""
+        return np.asarray(values[: self.spread, 0])
+
+    def below(self, values: np.ndarray, level: float) -> np.ndarray:
+        """Rows of `chosen` from which the way down stays below a level.
+
+        Parameters
+        ----------
+        values
+            V along the descents, shape ``(n, k)``.
+        level
+            The level.
+        """
+        return np.flatnonzero(self.highest(values)[self.chosen[:, 0], self.chosen[:, 1]] < level)
+
+    @staticmethod
+    def highest(values: np.ndarray) -> np.ndarray:
+        """The highest of the values from each place of a descent on, ``(n, k)`` to ``(n, k)``."""
+        return np.maximum.accumulate(values[:, ::-1], axis=1)[:, ::-1]
+
+    def points(self, rows: np.ndarray) -> np.ndarray:
+        """The states of some rows of `chosen`."""
+        return self.states[self.chosen[rows, 0], self.chosen[rows, 1]]
+
+
+def basin_of(
+    dynamics: Dynamics,
+    descents: Descents,
+    index: int,
+    attractors: Sequence[Equilibrium],
+    *,
+    box: np.ndarray,
+    generator: np.random.Generator,
+    focus: Focus | None = None,
+) -> Basin:
+    """The points from which f leads to an attractor.
+
+    Parameters
+    ----------
+    dynamics
+        f and D.
+    descents
+        From recorded points.
+    index, attractors
+        Which of the attractors.
+    box
+        Shape ``(d, 2)``: the recorded region.
+    generator
+        Draws further starts close to the attractor.
+    focus
+        How many of these, and how far; by default as recordings need it.
+    """
+    center, d = attractors[index].position, len(box)
+    width = box[:, 1] - box[:, 0]
+    recorded = descents.paths[descents.ends == index]
+    # Recordings approach an attractor along its slow directions; V needs all of them. Of one state there is
+    # but one, and more starts close by would only make light of those far out.
+    hessian = hessian_at(dynamics, center)
+    offsets = recorded[:, 0] - center
+    if focus is None:
+        reach = np.quantile(np.einsum("ni,ij,nj->n", offsets, hessian, offsets), 0.3)
+        count = NEAREST if d > 1 else 0
+    else:
+        reach, count = 2 * focus.level, focus.count
+        # A well may be small in its domain.
+        width = np.minimum(width, 2 * np.sqrt(reach * np.diag(np.linalg.inv(hessian))))
+    directions = generator.standard_normal((count, d))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    radii = np.sqrt(reach) * generator.uniform(0.02, 1.0, (count, 1))
+    starts = center + (radii * directions) @ np.linalg.inv(np.linalg.cholesky(hessian))
+    starts = starts[((starts > box[:, 0]) & (starts < box[:, 1])).all(axis=1)]
+    near = follow(dynamics, starts, attractors, box=box)
+    states = np.concatenate([recorded, near.paths[near.ends == index]])
+    spread = None if focus is None else len(recorded)
+    return Basin(states, _chosen(states, center, width, generator), spread)
+
+
+def enlarged(
+    dynamics: Dynamics,
+    basin: Basin,
+    index: int,
+    attractors: Sequence[Equilibrium],
+    starts: np.ndarray,
+    *,
+    box: np.ndarray,
+    generator: np.random.Generator,
+) -> Basin:
+    """A basin with further descents, which begin where evenly spread ones are too few.
+
+    Parameters
+    ----------
+    dynamics, index, attractors, box, generator
+        As of `basin_of`.
+    basin
+        Of the attractor.
+    starts
+        Shape ``(n, d)``; those that lead elsewhere are left out.
+    """
+    further = follow(dynamics, starts, attractors, box=box)
+    mine = further.paths[further.ends == index]
+    spread = len(basin.states) if basin.spread is None else basin.spread
+    if not len(mine):
+        return basin
+    states = np.concatenate([basin.states, mine])
+    # Points lie about as dense as before, also where the new ones are.
+    center, width = attractors[index].position, np.ptp(mine.reshape(-1, len(box)), axis=0)
+    added = _chosen(mine, center, width, generator) + np.array([len(basin.states), 0])
+    return Basin(states, np.concatenate([basin.chosen, added]), spread)
+
+
+def _chosen(
+    states: np.ndarray, center: np.ndarray, width: np.ndarray, generator: np.random.Generator
+) -> np.ndarray:
+    """Descent and place of points of descents, evenly spread, and denser towards the attractor."""
+    d = states.shape[2]
+    flat = (states.reshape(-1, d) - center) / width
+    warped = flat / np.sqrt(np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-6))
+    rows = representative_subset(warped, distance=0.6 * POINTS ** (-1 / d), generator=generator)
+    return np.stack(np.divmod(rows, states.shape[1]), axis=1)
+
+
+RETURNS = 40  # through the section, within which chaos has to have lost what was known at the start
+LOOKED = (4, 12, RETURNS)  # returns after which a cycle is sought: most are told long before chaos can be
+RECURRENCE_CLOSE = (
+    2.0  # times the distance of the closest return: one as close may be earlier, and the period shorter
+)
+SAME = 1e-6  # of the recorded box: returns as close are at the same place; chaos tears them a box apart
+STARTS = 3  # trajectories that are followed until one returns
+WAITED = 50.0  # crossings of the box, in which there has to be a return
+MOST_EVALUATIONS = 1_000_000  # of f, in all: some ten times what the equations of Lorenz and Rössler need
+FAR = 1.5  # of the box from its middle: what comes so far has escaped, as in `follow`
+LONGEST = 12  # returns of one period: longer cycles than the doubled ones of doubled ones are not looked for
+NEWTON_STEPS = 12
+LOST = 2.0  # times the first gap: from there Newton's method no longer leads to what is close by
+CLOSED = 1e-8  # of the recorded box: by so much a periodic orbit may fail to close, with integrals to 1e-10
+NEUTRAL = 1e-6  # of 1: closer to it a multiplier is not told from 1 by these integrals
+RESTING = 1e-4  # of the rate: a trajectory so slow at its end is coming to rest
+
+Kind = Literal["cycle", "chaos", "aperiodic", "none"]
+
+
+@dataclass(frozen=True)
+class Recurrence:
+    """What becomes of a trajectory that comes to rest nowhere.
+
+    Attributes
+    ----------
+    kind
+        ``cycle``: it ends on a limit cycle. ``chaos``: it returns, never to the same place, and small
+        differences grow. ``aperiodic``: it returns, and neither can be said. ``none``: it does not return.
+    period
+        Of the cycle, in units of time; NaN of anything else.
+    exponent
+        Mean rate at which small differences grow, per unit of time: the largest Lyapunov exponent. NaN where
+        it was not asked for.
+    place
+        A state on the cycle, shape ``(d,)``; None of anything else.
+    """
+
+    kind: Kind
+    period: float = float("nan")
+    exponent: float = float("nan")
+    place: np.ndarray | None = field(default=None, compare=False)
+
+    def sentence(self) -> str:
+        """In words that follow a colon."""
+        if self.kind == "cycle":
+            return f"they end on a limit cycle of period {self.period:.4g}"
+        if self.kind == "chaos":
+            return (
+                "they settle neither on an equilibrium nor on a cycle: aperiodic motion, as of chaos (small"
+                f" differences grow at a rate of {self.exponent:.3g} per unit of time)"
+            )
+        if self.kind == "aperiodic":
+            return "they settle neither on an equilibrium nor on a cycle: aperiodic motion"
+        return "within the time for which they were followed they neither rest nor return"
+
+
+class _TooLongError(Exception):
+    """f was evaluated so often that the trajectory is given up."""
+
+
+def recurrence_of(dynamics: Dynamics, starts: np.ndarray, *, box: np.ndarray, rate: float) -> Recurrence:
+    """What becomes of the first of some trajectories that returns.
+
+    Parameters
+    ----------
+    dynamics
+        f.
+    starts
+        Shape ``(n, d)``, n ≥ 1: where trajectories are that have come to rest for a long time nowhere.
+    box
+        Shape ``(d, 2)``: the recorded region.
+    rate
+        At which f crosses it, per unit of time. What is far slower is coming to rest.
+    """
+    chosen = np.linspace(0, len(starts) - 1, min(STARTS, len(starts))).astype(int)
+    found = Recurrence("none")
+    for start in starts[chosen]:
+        found = _Motion(dynamics, start, box, rate).recurrence()
+        if found.kind != "none":
+            break
+    return found
+
+
+class _Motion:
+    """One trajectory, in units of the box, so that states of any size count alike."""
+
+    def __init__(self, dynamics: Dynamics, start: np.ndarray, box: np.ndarray, rate: float) -> None:
+        self.dynamics, self.dimension = dynamics, len(start)
+        self.width = box[:, 1] - box[:, 0]
+        self.middle = box.mean(axis=1) / self.width
+        self.start = start / self.width
+        self.across = self.drift(self.start)
+        self.speed, self.rate, self.evaluations = float(np.linalg.norm(self.across)), rate, 0
+
+    def drift(self, y: np.ndarray) -> np.ndarray:
+        return np.asarray(self.dynamics.drift((y * self.width)[None])[0] / self.width)
+
+    def count(self) -> None:
+        """Give up what takes too long: f may be too stiff to be followed so."""
+        self.evaluations += 1
+        if self.evaluations > MOST_EVALUATIONS:
+            raise _TooLongError
+
+    def jacobian(self, y: np.ndarray) -> np.ndarray:
+        jacobian = self.dynamics.jacobian((y * self.width)[None])[0]
+        return np.asarray(jacobian * self.width / self.width[:, None])
+
+    def recurrence(self) -> Recurrence:
+        """From return to return, until there are enough of them."""
+        if not self.speed > RESTING * self.rate:
+            return Recurrence("none")
+        try:
+            return self._followed()
+        except _TooLongError:
+            return Recurrence("none")
+
+    def _followed(self) -> Recurrence:
+        draw = np.random.default_rng(0)  # any direction grows as the fastest does
+        state, tangent = self.start, draw.standard_normal(self.dimension)
+        tangent /= np.linalg.norm(tangent)
+        growth, times, places = [], [], []
+        for _ in range(RETURNS):
+            step = self._next(state, tangent)
+            if step is None:
+                break
+            state, grown, time = step
+            size = float(np.linalg.norm(grown))
+            tangent = grown / size
+            growth.append(np.log(size))
+            times.append(time)
+            places.append(state)
+            if len(places) in LOOKED and (found := self._cycle(places, np.cumsum(times))) is not None:
+                return Recurrence("cycle", found[1], place=found[0] * self.width)
+        if not places:
+            return Recurrence("none")
+        exponent = float(np.sum(growth) / np.sum(times))
+        # Regular motion tears two states apart in proportion to the time, forty returns by some forty times.
+        chaotic = np.sum(growth) > -np.log(SAME)
+        return Recurrence("chaos" if chaotic else "aperiodic", exponent=exponent)
+
+    def _next(self, state: np.ndarray, tangent: np.ndarray) -> tuple[np.ndarray, np.ndarray, float] | None:
+        """State, tangent and time at the next return through the section; None where there is none."""
+        d = self.dimension
+
+        def rates(_: float, z: np.ndarray) -> np.ndarray:
+            self.count()
+            return np.concatenate([self.drift(z[:d]), self.jacobian(z[:d]) @ z[d:]])
+
+        def returns(_: float, z: np.ndarray) -> float:
+            return float(self.across @ (z[:d] - self.start))
+
+        def escapes(_: float, z: np.ndarray) -> float:
+            return float(FAR - np.abs(z[:d] - self.middle).max())
+
+        returns.terminal, returns.direction = True, 1.0  # type: ignore[attr-defined]
+        escapes.terminal = True  # type: ignore[attr-defined]
+        # Away from the section first, on which it begins: what is zero there would be taken for a return.
+        away = CLOSED / self.speed
+        begin = np.concatenate([state + away * self.drift(state), tangent])
+        way = solve_ivp(
+            rates, (0.0, WAITED / self.rate), begin, method="DOP853", rtol=1e-8, atol=1e-10,
+            events=[returns, escapes],
+        )  # fmt: skip
+        if not len(way.t_events[0]):
+            return None
+        end = way.y_events[0][0]
+        return end[:d], end[d:], float(way.t_events[0][0]) + away
+
+    def _cycle(self, places: Sequence[np.ndarray], times: np.ndarray) -> tuple[np.ndarray, float] | None:
+        """A state and the period of a stable periodic orbit close by, None where there is none."""
+        # Backwards from the last place, where a trajectory is closest to the cycle on which it ends.
+        away = np.array([np.linalg.norm(place - places[-1]) for place in places[-2 : -2 - LONGEST : -1]])
+        first = int(np.flatnonzero(away <= max(RECURRENCE_CLOSE * away.min(), SAME))[0])
+        return self._closed(places[-1], float(times[-1] - times[-2 - first]))
+
+    def _closed(self, base: np.ndarray, period: float) -> tuple[np.ndarray, float] | None:
+        d, x, longest, widest = self.dimension, base, 2 * period, np.inf
+        across = self.drift(base)
+        for _ in range(NEWTON_STEPS):
+            flowed = self._flowed(x, period)
+            if flowed is None:
+                return None
+            end, monodromy = flowed
+            gap = end - x
+            away = float(np.abs(gap).max())
+            if away < CLOSED:
+                return (x, period) if self._stable(monodromy) else None
+            if away > widest:
+                return None
+            widest = min(widest, LOST * away)
+            matrix = np.zeros((d + 1, d + 1))
+            matrix[:d, :d], matrix[:d, d], matrix[d, :d] = monodromy - np.eye(d), self.drift(end), across
+            step = np.linalg.lstsq(matrix, -np.append(gap, across @ (x - base)), rcond=None)[0]
+            step *= min(1.0, 0.2 / max(float(np.abs(step[:d]).max()), 1e-300))  # a fifth of the box at most
+            x, period = x + step[:d], period + float(step[d])
+            if not 0 < period < longest:
+                return None
+        return None
+
+    def _flowed(self, x: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray] | None:
+        d = self.dimension
+
+        def rates(_: float, z: np.ndarray) -> np.ndarray:
+            self.count()
+            return np.concatenate([self.drift(z[:d]), (self.jacobian(z[:d]) @ z[d:].reshape(d, d)).ravel()])
+
+        begin = np.concatenate([x, np.eye(d).ravel()])
+        way = solve_ivp(rates, (0.0, period), begin, method="DOP853", rtol=1e-10, atol=1e-12)
+        if not way.success or not np.isfinite(way.y[:, -1]).all():
+            return None
+        return way.y[:d, -1], way.y[d:, -1].reshape(d, d)
+
+    def _stable(self, monodromy: np.ndarray) -> bool:
+        """Whether all multipliers but the one of the motion along the orbit lie within the unit circle."""
+        multipliers = np.linalg.eigvals(monodromy)
+        others = np.delete(multipliers, np.argmin(np.abs(multipliers - 1)))
+        return bool((np.abs(others) < 1 - NEUTRAL).all())

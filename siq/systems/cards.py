@@ -1,0 +1,338 @@
+"""System cards: the equations of a simulation as a file, and the dynamics that they describe.
+
+A *system card* (``config/systems/NAME.yaml``) declares states, parameters, the vector field f, and the
+covariance D of the noise in ``dx = f dt + sqrt(ε) D^(1/2) dW``, in numbers or formulas. D belongs to
+the system because the orthogonality ``∇V·g = 0`` of the decomposition ``f = -D∇V + g`` depends on it: the
+same equations in other units are another problem unless D is carried along.
+"""
+
+from __future__ import annotations
+
+import keyword
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import sympy
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from siq.errors import InputError
+from siq.numerics.files import Document, read_document, validate
+from siq.systems.diffusion import Diffusion, state_noise
+from siq.systems.dynamics import TIME, Dynamics, Input, Parameter, symbol
+from siq.systems.formulas import CONSTANTS, FUNCTIONS, FormulaError, exact_number, parse_formula
+
+
+def check_name(text: str) -> str:
+    """Return a name that formulas can use; raises ValueError for any other."""
+    if not text.isidentifier() or keyword.iskeyword(text):
+        raise ValueError(f"'{text}' cannot be a name in a formula; use letters, digits and underscores")
+    if text in FUNCTIONS or text in CONSTANTS or text in ("recording", "t", "delay"):
+        raise ValueError(f"the name '{text}' is reserved; choose another")
+    return text
+
+
+Name = Annotated[str, AfterValidator(check_name)]
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Formula = str | Number
+DiffusionEntry = Literal["identity"] | list[Formula] | list[list[Formula]]
+
+
+class _CardPart(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class StateEntry(_CardPart):
+    """One state of a card: its unit, and the interval in which initial states are drawn.
+
+    Attributes
+    ----------
+    unit
+        Compared with the units of recordings; nothing is converted.
+    domain
+        The interval ``[lower, upper]``, in this unit: initial states are drawn from it, and scores use it.
+        Only a simulation needs it. Where there are recordings to compare with, they tell it.
+    """
+
+    unit: str = "1"
+    domain: tuple[Number, Number] | None = None
+
+    @field_validator("domain")
+    @classmethod
+    def _ordered(cls, domain: tuple[float, float] | None) -> tuple[float, float] | None:
+        if domain is not None and not domain[0] < domain[1]:
+            raise ValueError("the domain is empty; write it as [lower, upper] with lower < upper")
+        return domain
+
+
+class ParameterEntry(_CardPart):
+    """One parameter of a card.
+
+    Attributes
+    ----------
+    value
+        Its value.
+    unit
+        Its unit, for people.
+    fixed
+        ``true`` when you are sure of the value: no recalibration changes it then.
+    """
+
+    value: Number
+    unit: str = "1"
+    fixed: bool = False
+
+
+class InputEntry(_CardPart):
+    """An exogenous signal u(t), a column of the recordings.
+
+    Attributes
+    ----------
+    unit
+        Compared with the units of recordings.
+    interpolation
+        How it runs between samples: ``zero_order`` for what a converter puts out, ``linear``, or
+        ``band_limited`` for what was filtered before it was sampled.
+    """
+
+    unit: str = "1"
+    interpolation: Literal["zero_order", "linear", "band_limited"] = "linear"
+
+
+class ExactEntry(_CardPart):
+    """Exact answers, where known. They serve scoring only; no method reads them.
+
+    Attributes
+    ----------
+    quasipotential
+        U as a formula of the states.
+    """
+
+    quasipotential: Formula | None = None
+
+
+class SystemCard(_CardPart):
+    """The schema of a system card.
+
+    A state that is in no output is hidden. The time is called ``t`` in formulas of a system with inputs or
+    of a mismatch study; see `siq.systems.dynamics`.
+
+    Attributes
+    ----------
+    name
+        Letters, digits, ``_``, ``.`` and ``-``; in ``config/systems/`` the file is called the same.
+    title
+        What people call the system; by default the name.
+    time_unit
+        Unit of t.
+    states
+        The states by name. Their order is that of the state vector.
+    inputs
+        Signals that drive the system, by name. Only a diagnosis reads them.
+    parameters
+        Constants of the equations, by name.
+    equations
+        The time derivative of each state, as a formula.
+    outputs
+        What a recording measures, as formulas by name; by default the states. Only a diagnosis reads them.
+    diffusion
+        D of ``dx = f dt + √ε D^(1/2) dW``: ``identity``, the diagonal as a list, or the whole matrix as a
+        list of rows, in squared units of the states per unit of time. An entry is a number, or a formula of
+        the states and parameters in the sense of Itô, such as ``[1 + 0.8*x, 1]``; parameters count with the
+        values of the card. A zero says that no noise acts on a state. Where a landscape is asked for, noise
+        has to act on every state if f comes from trajectories, and to reach it at least by way of other
+        states if the equations are given.
+    exact
+        Exact answers, where they are known.
+    """
+
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
+    title: str = ""
+    time_unit: str = "1"
+    states: dict[Name, StateEntry] = Field(min_length=1)
+    inputs: dict[Name, InputEntry] = {}
+    parameters: dict[Name, ParameterEntry] = {}
+    equations: dict[str, Formula]
+    outputs: Annotated[dict[Name, Formula], Field(min_length=1)] | None = None
+    diffusion: DiffusionEntry = "identity"
+    exact: ExactEntry = ExactEntry()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> SystemCard:
+        for name in self.states:
+            if name not in self.equations:
+                raise ValueError(f"the state '{name}' has no equation; add 'equations: {{{name}: ...}}'")
+            if name in self.parameters:
+                raise ValueError(f"'{name}' is both a state and a parameter; rename one of them")
+        for name in self.inputs:
+            if name in self.states or name in self.parameters:
+                kind = "a state" if name in self.states else "a parameter"
+                raise ValueError(f"'{name}' is both an input and {kind}; rename one of them")
+        for name in self.equations:
+            if name not in self.states:
+                raise ValueError(f"the equation of '{name}' belongs to no state; declare it under states")
+        diffusion_rows(self.diffusion, len(self.states))
+        return self
+
+
+def domain_of(card: SystemCard) -> np.ndarray:
+    """The domain of each state, shape ``(d, 2)``; NaN for a state of which the card does not say it."""
+    return np.array([entry.domain or (np.nan, np.nan) for entry in card.states.values()], dtype=float)
+
+
+def diffusion_rows(diffusion: DiffusionEntry, dimension: int) -> list[list[Formula]]:
+    """D as rows of numbers and formulas.
+
+    Parameters
+    ----------
+    diffusion
+        ``"identity"``, the diagonal, or the whole matrix, in the units of the states squared per time.
+    dimension
+        Number of states, d.
+
+    Raises
+    ------
+    ValueError
+        When the shape is wrong, or numbers are not symmetric and positive semi-definite.
+    """
+    if diffusion == "identity":
+        return [[float(i == j) for j in range(dimension)] for i in range(dimension)]
+    lengths = {len(row) for row in diffusion if isinstance(row, list)}
+    if len(diffusion) != dimension or (lengths and lengths != {dimension}):
+        raise ValueError(f"the diffusion does not fit {dimension} states; give a diagonal or a square matrix")
+    rows = [
+        row if isinstance(row, list) else [row if i == j else 0.0 for j in range(dimension)]
+        for i, row in enumerate(diffusion)
+    ]
+    if not _has_formulas(rows):
+        Diffusion(np.array(rows, dtype=float))
+    return rows
+
+
+def read_diffusion(
+    diffusion: DiffusionEntry, symbols: Sequence[sympy.Symbol], parse: Callable[[Formula], sympy.Expr] | None
+) -> Diffusion:
+    """D as a card or a study gives it.
+
+    Parameters
+    ----------
+    diffusion
+        The entry.
+    symbols
+        The d states as they stand in formulas.
+    parse
+        What reads a formula; by default it may have the states in it, and nothing else.
+
+    Returns
+    -------
+    Diffusion
+        Symmetric and, where it is constant, positive semi-definite: a zero says that no noise reaches a
+        state.
+
+    Raises
+    ------
+    ValueError
+        When the shape is wrong, or D is not symmetric and positive semi-definite.
+    """
+    names = {each.name: each for each in symbols}
+    rows = diffusion_rows(diffusion, len(symbols))
+    if not _has_formulas(rows):
+        return Diffusion(np.array(rows, dtype=float))
+    read = parse if parse is not None else (lambda text: parse_formula(text, names))
+    return state_noise(symbols, [[read(entry) for entry in row] for row in rows])
+
+
+def _has_formulas(rows: list[list[Formula]]) -> bool:
+    return any(isinstance(entry, str) for row in rows for entry in row)
+
+
+def load_system(path: str | Path) -> Dynamics:
+    """Read and check a system card.
+
+    Raises
+    ------
+    InputError
+        With the card, the line and the offending name, for anything that the schema or the whitelist of
+        formulas refuses.
+    """
+    document = read_document(path)
+    return build_system(document, validate(document, SystemCard))
+
+
+def build_system(document: Document, card: SystemCard) -> Dynamics:
+    """The dynamics that a checked card describes; `document` says where its formulas stand.
+
+    Parameters stay symbols, so that they can be fitted; `Dynamics.formulas` has their values inserted.
+
+    Raises
+    ------
+    InputError
+        For a formula that is refused, as it stands or with the parameters' values.
+    """
+    outputs = card.outputs if card.outputs is not None else {name: name for name in card.states}
+    parse = _parser(document, card)
+    numbers = {symbol(name): exact_number(entry.value) for name, entry in card.parameters.items()}
+    of_noise: set[str] = set()
+
+    def inserted(text: Formula) -> sympy.Expr:
+        formula = parse(("diffusion",), text)
+        of_noise.update(each.name for each in formula.free_symbols & set(numbers))
+        return formula.xreplace(numbers)
+
+    try:
+        diffusion = read_diffusion(card.diffusion, [symbol(name) for name in card.states], inserted)
+    except ValueError as error:
+        fault, remedy = str(error).split("; ", 1)
+        raise InputError(document.file, document.place(("diffusion",)), fault, remedy) from None
+    return Dynamics(
+        name=card.name,
+        title=card.title or card.name,
+        time_unit=card.time_unit,
+        states=tuple(card.states),
+        units=tuple(entry.unit for entry in card.states.values()),
+        diffusion=diffusion,
+        domain=domain_of(card),
+        inputs=tuple(Input(name, entry.unit, entry.interpolation) for name, entry in card.inputs.items()),
+        parameters=tuple(
+            Parameter(name, entry.value, entry.unit, entry.fixed) for name, entry in card.parameters.items()
+        ),
+        equations=tuple(parse(("equations", name), card.equations[name]) for name in card.states),
+        outputs=tuple((name, parse(("outputs", name), text)) for name, text in outputs.items()),
+        parameters_of_noise=tuple(sorted(of_noise)),
+    )
+
+
+def load_exact(path: str | Path) -> sympy.Expr | None:
+    """The exact U that a card knows, its parameters inserted; None for none. For scoring only.
+
+    Raises
+    ------
+    InputError
+        As `load_system`.
+    """
+    document = read_document(path)
+    card = validate(document, SystemCard)
+    text = card.exact.quasipotential
+    if text is None:
+        return None
+    exact = _parser(document, card)(("exact", "quasipotential"), text)
+    return exact.xreplace(
+        {symbol(name): exact_number(entry.value) for name, entry in card.parameters.items()}
+    )
+
+
+def _parser(document: Document, card: SystemCard) -> Callable[[tuple[str, ...], Formula], sympy.Expr]:
+    """What reads the formulas of a card, and refuses them with their line."""
+    names = {name: symbol(name) for name in (*card.states, *card.inputs, *card.parameters)} | {"t": TIME}
+    numbers = names | {name: exact_number(entry.value) for name, entry in card.parameters.items()}
+
+    def parse(keys: tuple[str, ...], text: Formula) -> sympy.Expr:
+        try:
+            # A power may be too high, or a divisor zero, at the parameters' values alone.
+            parse_formula(text, numbers, inputs=tuple(card.inputs))
+            return parse_formula(text, names, inputs=tuple(card.inputs))
+        except FormulaError as error:
+            raise InputError(document.file, document.place(keys), error.fault, error.remedy) from None
+
+    return parse

@@ -1,0 +1,639 @@
+"""Dynamics: drift, noise, inputs and outputs of a system as one object.
+
+Where parameters are fitted they stay symbols, and inputs, their delays and the time are arguments. Compare
+`siq.systems.dynamics.Dynamics.drift`, in which the parameters' values are inserted.
+
+``dx = f(x, u, t; θ) dt + √ε σ(x) dW`` with ``D = σσᵀ`` (Itô), of which ``y = h(x, u, t; θ)`` is measured. A
+card describes it, identification returns it with the covariance of its parameters, a diagnosis changes it;
+simulation, landscape and references take it.
+
+Two ways lead to numbers. Without inputs, `Dynamics.drift` and its derivatives take points as rows, with the
+parameters' values inserted. Where parameters are fitted and inputs drive the system, `Dynamics.functions`
+takes components, signals and the values of the parameters (`siq.systems.dynamics`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import sympy
+import yaml
+
+from siq.systems.diffusion import Diffusion, StateNoise, diffusion_rows_of, state_noise
+from siq.systems.formulas import Tape, compile_formulas, compile_values, delay, exact_number, tape_of
+
+TIME = sympy.Symbol("t", real=True)
+Compiled = Callable[..., Sequence[np.ndarray | float]]
+SMOOTHER = 30.0  # widths of a jump over which its derivative is spread
+
+
+def symbol(name: str) -> sympy.Symbol:
+    """The symbol that stands for a name in every formula of a dynamics."""
+    return TIME if name == "t" else sympy.Symbol(name, real=True)
+
+
+@dataclass(frozen=True)
+class Signals:
+    """Inputs and times at n instants.
+
+    Attributes
+    ----------
+    inputs
+        Shape ``(i, n)``, in the order of the model's inputs.
+    delayed, slopes
+        The delayed inputs of the compiled model and their time derivatives, shape ``(j, n)`` each.
+    t
+        Shape ``(n,)``.
+    """
+
+    inputs: np.ndarray
+    delayed: np.ndarray
+    slopes: np.ndarray
+    t: np.ndarray
+
+
+class ParametricFunctions:
+    """Dynamics as functions of arrays, with derivatives by states and by free parameters.
+
+    Parameters
+    ----------
+    dynamics
+        What is compiled.
+    """
+
+    def __init__(self, dynamics: Dynamics) -> None:
+        formulas = [*dynamics.equations, *(formula for _, formula in dynamics.outputs)]
+        self._delays = dynamics.delays
+        self._arguments = arguments_of(dynamics)
+        written = [evaluable(formula, dynamics) for formula in formulas]
+        self._equations, self._measured = written[: dynamics.dimension], written[dynamics.dimension :]
+        # A jump's derivative is a spike. Spread over more than a step it is seen in full by every rule of
+        # integration, and carries deviations across the jump as they are carried in the mean.
+        self._smooth = [evaluable(formula, dynamics, wider=SMOOTHER) for formula in dynamics.equations]
+        self._states = [symbol(name) for name in dynamics.states]
+        self._free = [symbol(dynamics.parameters[place].name) for place in dynamics.free]
+        self._shapes = (dynamics.dimension, len(self._measured), len(self._free))
+
+    @cached_property
+    def _rates(self) -> Compiled:
+        return compile_values(self._equations, self._arguments)
+
+    @cached_property
+    def _outputs(self) -> Compiled:
+        return compile_values(self._measured, self._arguments)
+
+    @cached_property
+    def _slopes(self) -> Compiled:
+        return compile_values(
+            [each.diff(state) for each in self._smooth for state in self._states]
+            + [by_parameter(each, one, self._delays) for each in self._equations for one in self._free],
+            self._arguments,
+        )
+
+    @cached_property
+    def _output_slopes(self) -> Compiled:
+        return compile_values(
+            [without_teeth(each).diff(state) for each in self._measured for state in self._states]
+            + [by_parameter(each, one, self._delays) for each in self._measured for one in self._free],
+            self._arguments,
+        )
+
+    @cached_property
+    def tape(self) -> Tape | None:
+        """F as a tape in the same arguments; None where it has a function that no tape knows."""
+        return tape_of(self._equations, self._arguments)
+
+    def rates(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> np.ndarray:
+        """F at states ``(d, n)``, for parameters' values ``(p,)``: shape ``(d, n)``."""
+        return _stacked(self._rates, self._shapes[0], x, signals, values)
+
+    def outputs(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> np.ndarray:
+        """H at states ``(d, n)``: shape ``(m, n)``."""
+        return _stacked(self._outputs, self._shapes[1], x, signals, values)
+
+    def slopes(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives of f by states and by free parameters: ``(d, d, n)`` and ``(d, p, n)``."""
+        d, _, p = self._shapes
+        flat = _stacked(self._slopes, d * d + d * p, x, signals, values)
+        return flat[: d * d].reshape(d, d, x.shape[1]), flat[d * d :].reshape(d, p, x.shape[1])
+
+    def output_slopes(
+        self, x: np.ndarray, signals: Signals, values: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives of h by states and by free parameters: ``(m, d, n)`` and ``(m, p, n)``."""
+        d, m, p = self._shapes
+        flat = _stacked(self._output_slopes, m * d + m * p, x, signals, values)
+        return flat[: m * d].reshape(m, d, x.shape[1]), flat[m * d :].reshape(m, p, x.shape[1])
+
+
+def delays_of(formulas: Sequence[sympy.Expr]) -> tuple[sympy.Expr, ...]:
+    """The delayed inputs in formulas, each once, in an order that does not change."""
+    found = {each for formula in formulas for each in formula.atoms(delay)}
+    return tuple(sorted(found, key=str))
+
+
+def arguments_of(dynamics: Dynamics) -> list[sympy.Symbol]:
+    """The arguments of a compiled model: states, inputs, delayed inputs and slopes, time, parameters."""
+    return [
+        *(symbol(name) for name in dynamics.states),
+        *(symbol(each.name) for each in dynamics.inputs),
+        *(_delayed(k) for k in range(len(dynamics.delays))),
+        *(_slope(k) for k in range(len(dynamics.delays))),
+        TIME,
+        *(symbol(each.name) for each in dynamics.parameters),
+    ]
+
+
+def evaluable(formula: sympy.Expr, dynamics: Dynamics, *, wider: float = 1.0) -> sympy.Expr:
+    """A formula with its jumps spread, over a multiple of their widths, and symbols for delayed inputs."""
+    spread = {sympy.sign(at): sympy.tanh(at / (wider * width)) for at, width in dynamics.edges}
+    return formula.xreplace(spread).xreplace({each: _delayed(k) for k, each in enumerate(dynamics.delays)})
+
+
+def without_teeth(formula: sympy.Expr) -> sympy.Expr:
+    """A formula whose sawtooth ``atan(tan(z))``, as of rounding, is taken for its mean, zero.
+
+    A reading that is rounded stands still and jumps: its slope is nothing almost everywhere, and says nothing
+    of what it follows, step by step. On the whole it follows with the slope that it has without the teeth.
+    """
+    return formula.replace(
+        lambda each: isinstance(each, sympy.atan) and isinstance(each.args[0], sympy.tan),
+        lambda each: sympy.Integer(0),
+    )
+
+
+def by_parameter(formula: sympy.Expr, parameter: sympy.Symbol, delays: Sequence[sympy.Expr]) -> sympy.Expr:
+    """Derivative of an evaluable formula by a parameter, which may stand in a delay as well."""
+    result = formula.diff(parameter)
+    for k, each in enumerate(delays):
+        # u(t - τ) depends on τ through the slope of u, backwards.
+        result -= formula.diff(_delayed(k)) * _slope(k) * each.args[1].diff(parameter)
+    return result
+
+
+def _delayed(place: int) -> sympy.Symbol:
+    return sympy.Symbol(f"_delayed_{place}", real=True)
+
+
+def _slope(place: int) -> sympy.Symbol:
+    return sympy.Symbol(f"_slope_{place}", real=True)
+
+
+def _stacked(
+    function: Callable[..., Sequence[np.ndarray | float]],
+    count: int,
+    x: np.ndarray,
+    signals: Signals,
+    values: np.ndarray,
+) -> np.ndarray:
+    result = np.empty((count, x.shape[1]))
+    arguments = (*x, *signals.inputs, *signals.delayed, *signals.slopes, signals.t, *values)
+    with np.errstate(all="ignore"):  # a trial state may lie where a formula has no value; the fit steps back
+        for place, value in enumerate(function(*arguments)):
+            result[place] = value
+    return result
+
+
+UNNAMED = "system"
+WIDTH = 110  # of a line of the card
+
+
+def card_of(dynamics: Dynamics) -> str:
+    """Write a dynamics as a system card.
+
+    Parameters
+    ----------
+    dynamics
+        Its parameters' values are those of the card; a domain that nobody knows is left out.
+
+    Returns
+    -------
+    str
+        YAML.
+    """
+    name = dynamics.name or UNNAMED
+    data: dict[str, Any] = {
+        "name": name,
+        "title": "" if dynamics.title == name else dynamics.title,
+        "time_unit": dynamics.time_unit,
+        "states": {
+            state: {"unit": unit} | _domain(limits)
+            for state, unit, limits in zip(dynamics.states, dynamics.units, dynamics.limits, strict=True)
+        },
+    }
+    if dynamics.inputs:
+        data["inputs"] = {
+            entry.name: {"unit": entry.unit, "interpolation": entry.interpolation}
+            for entry in dynamics.inputs
+        }
+    if dynamics.parameters:
+        data["parameters"] = {
+            entry.name: {"value": float(entry.value), "unit": entry.unit}
+            | ({"fixed": True} if entry.fixed else {})
+            for entry in dynamics.parameters
+        }
+    data["equations"] = {
+        state: str(formula) for state, formula in zip(dynamics.states, dynamics.equations, strict=True)
+    }
+    data["outputs"] = {output: str(formula) for output, formula in dynamics.outputs}
+    data["diffusion"] = _diffusion(dynamics.diffusion)
+    return yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=WIDTH)
+
+
+def _domain(limits: np.ndarray) -> dict[str, list[float]]:
+    return {"domain": [float(limit) for limit in limits]} if limits[0] < limits[1] else {}
+
+
+def _diffusion(diffusion: Diffusion) -> str | list[str | float] | list[list[str | float]]:
+    """``identity``, the diagonal, or the whole matrix."""
+    rows = diffusion_rows_of(diffusion)
+    places = range(len(rows))
+    if any(rows[i][j] not in (0.0, "0") for i in places for j in places if i != j):
+        return rows
+    diagonal = [rows[i][i] for i in places]
+    return "identity" if all(entry == 1.0 for entry in diagonal) else diagonal
+
+
+@dataclass(frozen=True)
+class Input:
+    """An exogenous signal: its name, unit, and how it holds between samples."""
+
+    name: str
+    unit: str
+    interpolation: str
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter with its value; a fixed one is never recalibrated.
+
+    Where a value is expected, estimates are about that, within its own size, unless recordings tell more
+    (`siq.inference.measurements`).
+    """
+
+    name: str
+    value: float
+    unit: str = "1"
+    fixed: bool = False
+    expected: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class JointExpectation:
+    """What is expected of several parameters together: ``roots @ values`` are standard normal.
+
+    Attributes
+    ----------
+    names
+        Of the parameters.
+    roots
+        Shape ``(r, k)``; the inverse of their covariance is ``roots.T @ roots``.
+    weight
+        How often it counts against the data: of errors that hang together over τ samples, n count as n/τ, and
+        a fit that takes them for independent has to count what it expects τ times.
+    """
+
+    names: tuple[str, ...]
+    roots: np.ndarray
+    weight: float = 1.0
+
+
+COMPILED = ("functions", "delays", "_lags")
+"""What a dynamics works out once, and what does not depend on its parameters' values."""
+
+
+@dataclass(frozen=True, eq=False)
+class Dynamics:
+    """A system: ``dx = f dt + √ε σ dW``, with what is known of its units, inputs and outputs.
+
+    Main attributes
+    ---------------
+    states
+        Names of the d states, in the order of the state vector.
+    equations
+        Components of f, in symbols for states, inputs, parameters and the time ``t``.
+    diffusion
+        D.
+
+    Other attributes
+    ----------------
+    name, title, time_unit
+        As a card says.
+    units
+        Of each state; ``1`` by default.
+    domain
+        Shape ``(d, 2)``: where the states are expected, in their units; NaN for a state, or None for all of
+        them, where nobody said.
+    inputs
+        The signals that drive it.
+
+    Parameters
+    ----------
+        θ, in the order of the parameter vector.
+    covariance
+        Of the free parameters' estimates, shape ``(p, p)``; None where they are not estimates.
+    outputs
+        What a recording measures, by the name of its column; by default the states.
+    edges
+        Arguments of ``sign`` in f and the widths over which the jump is spread when f is evaluated, so that
+        an integrator can follow it: ``sign(e)`` is taken as ``tanh(e/w)``. The formulas keep the sign.
+    parameters_of_noise
+        Names of the parameters of a card that stand in D, where they count with the card's values.
+    expected_together
+        What is expected of several parameters at a time.
+
+    Raises
+    ------
+    ValueError
+        When equations, units, domain or D do not fit the states.
+
+    Examples
+    --------
+    >>> x, y = sympy.symbols("x y", real=True)
+    >>> well = Dynamics.of((x, y), (x - x**3, -y))
+    >>> well.drift(np.array([[0.5, 1.0]]))
+    array([[ 0.375, -1.   ]])
+    >>> well.jacobian(np.array([[0.0, 0.0]]))[0]
+    array([[ 1.,  0.],
+           [ 0., -1.]])
+    """
+
+    states: tuple[str, ...]
+    equations: tuple[sympy.Expr, ...]
+    diffusion: Diffusion
+    name: str = ""
+    title: str = ""
+    time_unit: str = "1"
+    units: tuple[str, ...] = ()
+    domain: np.ndarray | None = None
+    inputs: tuple[Input, ...] = ()
+    parameters: tuple[Parameter, ...] = ()
+    covariance: np.ndarray | None = None
+    outputs: tuple[tuple[str, sympy.Expr], ...] = ()
+    edges: tuple[tuple[sympy.Expr, float], ...] = ()
+    parameters_of_noise: tuple[str, ...] = ()
+    expected_together: tuple[JointExpectation, ...] = ()
+
+    def __post_init__(self) -> None:
+        d = len(self.states)
+        if not self.units:
+            object.__setattr__(self, "units", ("1",) * d)
+        if not self.outputs:
+            object.__setattr__(self, "outputs", tuple((name, symbol(name)) for name in self.states))
+        for what, count in (("equations", len(self.equations)), ("units", len(self.units)),
+                            ("rows of D", self.diffusion.dimension)):  # fmt: skip
+            if count != d:
+                raise ValueError(f"there are {count} {what} for {d} states; give one for each")
+        if isinstance(self.diffusion, StateNoise) and self.diffusion.symbols != self.symbols:
+            raise ValueError("D is one of other states; give it with these in their order")
+        if self.domain is not None and np.shape(self.domain) != (d, 2):
+            raise ValueError(f"the domain has the shape {np.shape(self.domain)}; give two limits a state")
+
+    @classmethod
+    def of(
+        cls,
+        symbols: Sequence[sympy.Symbol],
+        equations: Sequence[sympy.Expr],
+        *,
+        diffusion: Diffusion | np.ndarray | Sequence[Sequence[sympy.Expr | float]] | None = None,
+        domain: Sequence[Sequence[float]] | np.ndarray | None = None,
+        parameters: Mapping[sympy.Symbol, float] | None = None,
+    ) -> Dynamics:
+        """Dynamics of formulas alone, with D = 1 unless another is given.
+
+        Parameters
+        ----------
+        symbols
+            The d states, real symbols.
+        equations
+            The components of f.
+        diffusion
+            D, as `Diffusion`, as a matrix ``(d, d)``, or as rows of formulas.
+        domain
+            Two limits a state, where somebody says them.
+        parameters
+            Real symbols of f that may take other values, with the values that they have.
+        """
+        if diffusion is None:
+            diffusion = Diffusion.identity(len(symbols))
+        elif isinstance(diffusion, np.ndarray):
+            diffusion = Diffusion(np.asarray(diffusion, dtype=float))
+        elif not isinstance(diffusion, Diffusion):
+            diffusion = state_noise(symbols, diffusion)
+        names, formulas = tuple(each.name for each in symbols), tuple(map(sympy.sympify, equations))
+        box = None if domain is None else np.asarray(domain, dtype=float)
+        named = tuple(Parameter(each.name, float(value)) for each, value in (parameters or {}).items())
+        return cls(names, formulas, diffusion, domain=box, parameters=named)
+
+    @property
+    def dimension(self) -> int:
+        """Number of states, d."""
+        return len(self.states)
+
+    @cached_property
+    def symbols(self) -> tuple[sympy.Symbol, ...]:
+        """The states as they stand in the formulas."""
+        return tuple(symbol(name) for name in self.states)
+
+    @property
+    def box(self) -> np.ndarray:
+        """The domain, shape ``(d, 2)``, where it has to be known.
+
+        Raises
+        ------
+        ValueError
+            Where nobody said it.
+        """
+        unknown = [name for name, ends in zip(self.states, self.limits, strict=True) if np.isnan(ends).any()]
+        if unknown:
+            raise ValueError(f"no domain of {', '.join(unknown)} is known; give the limits of each state")
+        return self.limits
+
+    @property
+    def limits(self) -> np.ndarray:
+        """The domain as far as it is known, shape ``(d, 2)``: NaN for a state of which nobody said it."""
+        return np.full((self.dimension, 2), np.nan) if self.domain is None else self.domain
+
+    @property
+    def output_names(self) -> tuple[str, ...]:
+        """The measured columns."""
+        return tuple(name for name, _ in self.outputs)
+
+    @property
+    def values(self) -> np.ndarray:
+        """The parameters' values, shape ``(p,)``."""
+        return np.array([parameter.value for parameter in self.parameters], dtype=float)
+
+    @cached_property
+    def free(self) -> tuple[int, ...]:
+        """Places of the parameters that may be recalibrated."""
+        used = set().union(*(each.free_symbols for each in (*self.equations, *dict(self.outputs).values())))
+        return tuple(
+            place
+            for place, parameter in enumerate(self.parameters)
+            if not parameter.fixed and symbol(parameter.name) in used
+        )
+
+    @property
+    def names(self) -> dict[str, sympy.Symbol]:
+        """What the names in its formulas stand for."""
+        known = [*self.states, *(each.name for each in self.inputs), *(each.name for each in self.parameters)]
+        return {name: symbol(name) for name in known} | {"t": TIME}
+
+    @property
+    def kinematic(self) -> tuple[bool, ...]:
+        """Which equations only define a state as the derivative of another, ``dx/dt = v``.
+
+        Such an equation holds by definition: no physics can be missing in it, and no noise drives it.
+        """
+        return tuple(equation in self.symbols for equation in self.equations)
+
+    def with_values(self, values: np.ndarray) -> Dynamics:
+        """The same dynamics with other parameters' values, shape ``(p,)``."""
+        changed = (
+            replace(parameter, value=float(value))
+            for parameter, value in zip(self.parameters, values, strict=True)
+        )
+        result = replace(self, parameters=tuple(changed))
+        # Formulas and names are the same, and compiling them takes longer than most uses.
+        for name in COMPILED:
+            if name in self.__dict__:
+                result.__dict__[name] = self.__dict__[name]
+        return result
+
+    def with_diffusion(self, diffusion: Diffusion) -> Dynamics:
+        """The same drift under another noise."""
+        return replace(self, diffusion=diffusion)
+
+    def to_card(self) -> str:
+        """The text of a system card that is read back as the same dynamics."""
+        return card_of(self)
+
+    # Values and derivatives without inputs, parameters inserted: points come as rows.
+
+    @property
+    def autonomous(self) -> bool:
+        """Whether f depends on the states alone."""
+        return not self.inputs and not any(TIME in each.free_symbols for each in self.equations)
+
+    @cached_property
+    def formulas(self) -> tuple[sympy.Expr, ...]:
+        """Components of f with the parameters' values inserted."""
+        inserted = {symbol(each.name): exact_number(each.value) for each in self.parameters}
+        return tuple(equation.xreplace(inserted) if inserted else equation for equation in self.equations)
+
+    def drift(self, x: np.ndarray) -> np.ndarray:
+        """F at points: ``(n, d)`` to ``(n, d)``."""
+        return self.drift_of_components(_components(x)).T
+
+    def jacobian(self, x: np.ndarray) -> np.ndarray:
+        """∂f_i/∂x_j at points: ``(n, d)`` to ``(n, d, d)``, i before j."""
+        d = self.dimension
+        result = np.zeros((len(x), d, d))
+        places, compiled = self._first
+        if len(places):
+            result[:, places[:, 0], places[:, 1]] = compiled(_components(x)).T
+        return result
+
+    def hessian(self, x: np.ndarray) -> np.ndarray:
+        """∂²f_i/∂x_j∂x_k at points: ``(n, d)`` to ``(n, d, d, d)``, i first."""
+        d = self.dimension
+        result = np.zeros((len(x), d, d, d))
+        places, compiled = self._second
+        if len(places):
+            i, j, k = places.T
+            result[:, i, j, k] = result[:, i, k, j] = compiled(_components(x)).T
+        return result
+
+    def bend(self, x: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """``Σ_i w_i ∂²f_i`` at points and weights ``(n, d)``: to ``(n, d, d)``, without all of `hessian`."""
+        d = self.dimension
+        result = np.zeros((len(x), d, d))
+        places, compiled = self._second
+        if len(places):
+            for (i, j, k), values in zip(places, compiled(_components(x)), strict=True):
+                result[:, j, k] += weights[:, i] * values
+                if j != k:
+                    result[:, k, j] += weights[:, i] * values
+        return result
+
+    @cached_property
+    def drift_of_components(self) -> Callable[[np.ndarray], np.ndarray]:
+        """F of components ``(d, ...)``, for loops over many states at once: contiguous in memory.
+
+        Raises
+        ------
+        ValueError
+            Where inputs or the time stand in f.
+        """
+        return compile_formulas(self._autonomous_formulas(), self.symbols)
+
+    @cached_property
+    def _derivatives(self) -> dict[tuple[int, int], sympy.Expr]:
+        """∂f_i/∂x_j by (i, j), those that vanish left out: in many states most of them do."""
+        number = {symbol: place for place, symbol in enumerate(self.symbols)}
+        found = {
+            (i, number[symbol]): formula.diff(symbol)
+            for i, formula in enumerate(self._autonomous_formulas())
+            for symbol in sorted(formula.free_symbols & set(self.symbols), key=number.__getitem__)
+        }
+        return {place: one for place, one in found.items() if one != 0}
+
+    @cached_property
+    def _first(self) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
+        """Places (i, j) of the derivatives that do not vanish, shape ``(m, 2)``, and these as a function."""
+        places = np.array(list(self._derivatives), dtype=int).reshape(-1, 2)
+        return places, compile_formulas(list(self._derivatives.values()), self.symbols)
+
+    @cached_property
+    def _second(self) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
+        """The same of second derivatives: places (i, j, k), k not below j."""
+        found = {
+            (i, j, k): second
+            for (i, j), first in self._derivatives.items()
+            for k, symbol in enumerate(self.symbols)
+            if k >= j and symbol in first.free_symbols and (second := first.diff(symbol)) != 0
+        }
+        places = np.array(list(found), dtype=int).reshape(-1, 3)
+        return places, compile_formulas(list(found.values()), self.symbols)
+
+    def _autonomous_formulas(self) -> tuple[sympy.Expr, ...]:
+        if not self.autonomous:
+            raise ValueError(f"{self.name or 'the system'} is driven: its drift is no function of x alone")
+        return self.formulas
+
+    # What inputs and fitted parameters need.
+
+    @cached_property
+    def functions(self) -> ParametricFunctions:
+        """F, h and their derivatives as functions of states, signals and parameters."""
+        return ParametricFunctions(self)
+
+    @cached_property
+    def delays(self) -> tuple[sympy.Expr, ...]:
+        """The delayed inputs in its formulas, each once, in an order that does not change."""
+        return delays_of([*self.equations, *(formula for _, formula in self.outputs)])
+
+    @cached_property
+    def _lags(self) -> Callable[..., Sequence[np.ndarray | float]]:
+        return compile_values(
+            [each.args[1] for each in self.delays], [symbol(each.name) for each in self.parameters]
+        )
+
+    def lags(self, values: np.ndarray) -> tuple[tuple[int, float], ...]:
+        """Delayed inputs at parameters' values: the place of the input, and by how much time it lags."""
+        if not self.delays:
+            return ()
+        places = {entry.name: place for place, entry in enumerate(self.inputs)}
+        times = self._lags(*values)
+        return tuple(
+            (places[str(each.args[0])], float(time)) for each, time in zip(self.delays, times, strict=True)
+        )
+
+
+def _components(x: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(x.T)

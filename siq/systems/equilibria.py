@@ -1,0 +1,433 @@
+"""Equilibria: all of them in a domain, their stability, and the Hessian of V there.
+
+Equilibria of an identified f are sought from the recorded points alone; nobody says how many there are, or
+where.
+
+Noise that acts on velocities alone moves positions all the same: dx/dt = v. It *reaches* a state if it acts
+on it, or on a state that stands in its equation, or on one that stands in the equation of that one, and so
+on. About an equilibrium with Jacobian J this is Kalman's condition: the linear dynamics can be steered
+everywhere by D = σσᵀ if ``(σ, Jσ, J²σ, …)`` has full rank, and then, and only then, W of ``J W + W Jᵀ =
+-2D`` is regular (`hessian_at`).
+
+References
+----------
+J. Zabczyk, SIAM J. Control Optim. 23 (1985) 278: exit problems where noise acts on some states only.
+
+Newton's method starts from a low-discrepancy sequence over the domain, more and more densely until nothing
+new is found; then again with the known roots deflated, which leads to roots with a small neighbourhood of
+their own. In one and two dimensions the topological degree of f on the boundary of the domain is the sum of
+the indices ``sign det J`` of all roots within: where this fails a root was missed, and that is said. No
+search in more dimensions proves that nothing was missed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import scipy.linalg
+from scipy.stats import qmc
+
+from siq.errors import NumericalFailure
+from siq.systems.diffusion import Diffusion
+from siq.systems.dynamics import Dynamics
+
+EquilibriumKind = Literal["attractor", "saddle", "repeller", "degenerate"]
+
+NEWTON_STEPS = 60
+MARGIN = 0.05  # of the recorded box, by which an equilibrium may lie outside
+SAME = 1e-6  # of the recorded box: closer equilibria are one
+MARGINAL = 1e-6  # of the fastest rate: multiple roots are only found to the root of rounding
+UNREACHED = 1e-12  # numerical, of the largest eigenvalue of W in units of its diagonal: rounding
+
+
+@dataclass(frozen=True, eq=False)
+class Equilibrium:
+    """A state at which f vanishes.
+
+    Attributes
+    ----------
+    position
+        Shape ``(d,)``.
+    eigenvalues
+        Of the Jacobian, by falling real part.
+    kind
+        ``attractor``: all real parts are negative. ``saddle``: some of each, or of one state the positive
+        one: the top between two wells is the pass between them. ``repeller``: all positive, of several
+        states. ``degenerate``: a real part is zero to rounding, and the linearisation decides nothing.
+    """
+
+    position: np.ndarray
+    eigenvalues: np.ndarray
+    kind: EquilibriumKind
+
+    @property
+    def unstable(self) -> int:
+        """Number of unstable directions."""
+        return int((self.eigenvalues.real > 0).sum())
+
+
+def find_equilibria(dynamics: Dynamics, points: np.ndarray) -> list[Equilibrium]:
+    """All equilibria in the box of some points that Newton's method finds from these.
+
+    Parameters
+    ----------
+    dynamics
+        f.
+    points
+        Shape ``(n, d)``: recorded states, from all over the recorded region.
+
+    Returns
+    -------
+    list of Equilibrium
+        By their position along the first state. Only roots of f that are isolated are found.
+    """
+    box = np.stack([points.min(axis=0), points.max(axis=0)], axis=1)
+    found = distinct_roots(dynamics, points, box=box, margin=MARGIN)
+    return classified(dynamics, found, box=box, rate=rate_of(dynamics, points))
+
+
+def distinct_roots(
+    dynamics: Dynamics,
+    starts: np.ndarray,
+    *,
+    box: np.ndarray,
+    margin: float,
+    known: Sequence[np.ndarray] = (),
+) -> list[np.ndarray]:
+    """Where f vanishes, as far as Newton's method comes there from some starts; each root once.
+
+    Parameters
+    ----------
+    dynamics
+        f.
+    starts
+        Shape ``(n, d)``.
+    box
+        Shape ``(d, 2)``: the region of interest.
+    margin
+        Share of the box by which a root may lie outside.
+    known
+        Roots that are deflated: f is multiplied by ``Π (1 + 1/∣x - r∣²)``, so that Newton's method is kept
+        away from them and comes to others. They are not given again.
+
+    References
+    ----------
+    P. E. Farrell, Á. Birkisson, S. W. Funke, SIAM J. Sci. Comput. 37 (2015) A2026: deflation.
+    """
+    low, high = box.T
+    width = np.where(high > low, high - low, 1.0)
+    x = _newton(dynamics, starts, low, width, known)
+    if known:
+        x = _newton(dynamics, x, low, width, ())
+    if not len(x):
+        return []
+    inside = ((x >= low - margin * width) & (x <= high + margin * width)).all(axis=1)
+    with np.errstate(all="ignore"):
+        # Few starts may all be at rest: then it is the slopes of f that tell what is small.
+        speed = np.nanmedian(np.linalg.norm(dynamics.drift(starts) / width, axis=1))
+        rate = np.nanmedian(np.linalg.norm(dynamics.jacobian(x[:1]), axis=(1, 2)))
+        small = max(1e-9 * speed, 1e-12 * rate)
+        converged = np.linalg.norm(dynamics.drift(x) / width, axis=1) < small
+    found = list(known)
+    # Zero but for what is left of Newton's last step reads better as zero.
+    x = np.where(np.abs(x) < np.finfo(float).eps * width, 0.0, x)
+    for candidate in x[inside & converged]:
+        if all(np.abs((candidate - other) / width).max() > SAME for other in found):
+            found.append(candidate)
+    return found[len(known) :]
+
+
+def _newton(
+    dynamics: Dynamics, starts: np.ndarray, low: np.ndarray, width: np.ndarray, known: Sequence[np.ndarray]
+) -> np.ndarray:
+    """Where Newton's method has come from some starts; what has run away is left out."""
+    x = starts.copy()
+    for _ in range(NEWTON_STEPS):
+        if not len(x):
+            break
+        # In shares of the box, or states in very different units would damp each other.
+        value, jacobian = dynamics.drift(x) / width, dynamics.jacobian(x) * width / width[:, None]
+        size = np.linalg.norm(jacobian, axis=(1, 2))[:, None, None] + 1e-100  # its square counts
+        # A little damping keeps singular Jacobians harmless and does not spoil convergence to rounding.
+        normal = np.einsum("nji,njk->nik", jacobian, jacobian) + 1e-14 * size**2 * np.eye(x.shape[1])
+        step = -np.linalg.solve(normal, np.einsum("nji,nj->ni", jacobian, value)[..., None])[..., 0]
+        if known:
+            step *= _deflation((x[:, None] - np.array(known)) / width, step)
+        longest = np.abs(step).max(axis=1, keepdims=True)
+        x = x + width * step * np.minimum(1.0, 0.2 / np.maximum(longest, 1e-300))
+        x = x[np.isfinite(x).all(axis=1) & (np.abs((x - low) / width - 0.5) < 2.0).all(axis=1)]
+    return x
+
+
+def _deflation(offset: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Factor of Newton's step, ``(n, 1)``, that deflation makes, from offsets to known roots ``(n, k, d)``.
+
+    With ``m f`` in the place of f, Newton's step s becomes ``s/(1 - s·∇m/m)``.
+    """
+    square = np.maximum((offset**2).sum(axis=2), 1e-24)
+    slope = (-2 * offset / (square * (square + 1))[:, :, None]).sum(axis=1)
+    return np.asarray(1 / (1 - (slope * step).sum(axis=1) + 1e-12))[:, None]
+
+
+def classified(
+    dynamics: Dynamics, positions: Sequence[np.ndarray], *, box: np.ndarray, rate: float
+) -> list[Equilibrium]:
+    """Equilibria at positions, by these along the first state; see `classify` for the rate."""
+    width = np.where(box[:, 1] > box[:, 0], box[:, 1] - box[:, 0], 1.0)
+    ordered = sorted(positions, key=lambda position: tuple(np.round(position / width, 6)))
+    return [classify(dynamics, position, rate=rate) for position in ordered]
+
+
+def rate_of(dynamics: Dynamics, points: np.ndarray) -> float:
+    """At which f crosses the box of some points ``(n, d)``, per unit of time: the median over them."""
+    width = np.ptp(points, axis=0)
+    speed = np.linalg.norm(dynamics.drift(points) / np.where(width > 0, width, 1.0), axis=1)
+    return float(np.median(speed))
+
+
+def classify(dynamics: Dynamics, position: np.ndarray, *, rate: float = 0.0) -> Equilibrium:
+    """The equilibrium at a position, by the eigenvalues of the Jacobian there.
+
+    Parameters
+    ----------
+    dynamics
+        f.
+    position
+        Where it vanishes, shape ``(d,)``.
+    rate
+        At which f crosses the region of interest, per unit of time. An eigenvalue counts as zero by it, or by
+        the largest eigenvalue if that is faster: a single eigenvalue can only be told from zero by another
+        rate.
+    """
+    eigenvalues = np.linalg.eigvals(dynamics.jacobian(position[None])[0])
+    eigenvalues = eigenvalues[np.argsort(-eigenvalues.real)]
+    kind: EquilibriumKind = "saddle"
+    if np.abs(eigenvalues.real).min() <= MARGINAL * max(np.abs(eigenvalues).max(), rate):
+        kind = "degenerate"
+    elif eigenvalues.real.max() < 0:
+        kind = "attractor"
+    elif eigenvalues.real.min() > 0 and len(eigenvalues) > 1:
+        kind = "repeller"
+    return Equilibrium(position, eigenvalues, kind)
+
+
+def hessian_at(dynamics: Dynamics, equilibrium: np.ndarray) -> np.ndarray:
+    """M, the Hessian of V at an equilibrium: ``M = W⁻¹`` with ``J W + W Jᵀ = -2D``, shape ``(d, d)``.
+
+    It follows from f near the equilibrium alone, and at an attractor is what tells the true V from false
+    solutions of the Hamilton–Jacobi equation. D may be singular, if the noise reaches every state through J.
+
+    Raises
+    ------
+    NumericalFailure
+        Where it does not: W is singular then.
+    """
+    # In units of the noise: where the states' units differ much, rounding would swallow the smaller ones.
+    diffusion = dynamics.diffusion.frozen(equilibrium)  # p vanishes here, and with it what D's change does
+    jacobian, scale = dynamics.jacobian(equilibrium[None])[0], diffusion.scale
+    if not diffusion.regular:  # the noise has no unit for a state that it does not act on, and f has one
+        pushed = np.diag(diffusion.matrix) > 0
+        own = scipy.linalg.matrix_balance(jacobian, permute=False, separate=True)[1][0]
+        if pushed.any():
+            scale = np.where(pushed, scale, own * np.exp(np.log(scale / own)[pushed].mean()))
+    covariance = _covariance(jacobian, diffusion.matrix, scale)
+    if not diffusion.regular:
+        spread = np.sqrt(np.abs(np.diag(covariance)))
+        scale = np.where(spread > 0, spread, scale)
+        covariance = _covariance(jacobian, diffusion.matrix, scale)
+        values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+        least = int(np.argmin(np.abs(values)))
+        if not abs(values[least]) > UNREACHED * np.abs(values).max():
+            still = np.abs(vectors[:, least])
+            named = [
+                name for name, size in zip(dynamics.states, still, strict=True) if size > 0.1 * still.max()
+            ]
+            raise NumericalFailure(
+                f"the noise does not reach {' and '.join(named)} about the equilibrium"
+                f" {equilibrium.round(4).tolist()}: no quasipotential is finite there; give a diffusion that"
+                f" acts on {named[0]}, or leave out what no noise moves"
+            )
+    hessian = np.linalg.inv(covariance / np.outer(scale, scale)) / np.outer(scale, scale)
+    return (hessian + hessian.T) / 2
+
+
+def _covariance(jacobian: np.ndarray, diffusion: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """W of ``J W + W Jᵀ = -2D``, solved in units of the scales."""
+    own = np.outer(scale, scale)
+    found = scipy.linalg.solve_continuous_lyapunov(jacobian * scale / scale[:, None], -2 * diffusion / own)
+    return np.asarray((found + found.T) / 2 * own)
+
+
+def unreached_states(dynamics: Dynamics) -> tuple[str, ...]:
+    """The states that no noise reaches, directly or through the equations; none of them if all is well.
+
+    Examples
+    --------
+    >>> import sympy
+    >>> x, v, w = sympy.symbols("x v w", real=True)
+    >>> pushed = [[0, 0, 0], [0, 1, 0], [0, 0, 0]]
+    >>> unreached_states(Dynamics.of((x, v, w), (v, -x - v + w, -w), diffusion=pushed))
+    ('w',)
+    """
+    rows = dynamics.diffusion.formulas
+    reached = {
+        own for own, row in zip(dynamics.symbols, rows, strict=True) if any(entry != 0 for entry in row)
+    }
+    while True:
+        further = {
+            own
+            for own, formula in zip(dynamics.symbols, dynamics.formulas, strict=True)
+            if own not in reached and formula.free_symbols & reached
+        }
+        if not further:
+            return tuple(
+                name
+                for name, own in zip(dynamics.states, dynamics.symbols, strict=True)
+                if own not in reached
+            )
+        reached |= further
+
+
+def measure_at(dynamics: Dynamics, attractor: np.ndarray) -> Diffusion:
+    """In which metric speeds and slopes are measured about an attractor: D, or what stands in for it.
+
+    Where D has no inverse, ``|f|² = f·D⁻¹f`` has no meaning. In its place stands ``K = -(tr J / d) W``: the
+    mean rate of relaxation times the spread of states per noise. For ``f = -D∇V`` with relaxation as fast in
+    every direction it is D.
+
+    Parameters
+    ----------
+    dynamics
+        f and D.
+    attractor
+        Shape ``(d,)``.
+
+    Raises
+    ------
+    NumericalFailure
+        When noise does not reach every state about the attractor, or it is none.
+    """
+    if dynamics.diffusion.regular:
+        return dynamics.diffusion
+    if classify(dynamics, attractor).kind != "attractor":
+        raise NumericalFailure(
+            f"{attractor.tolist()} is no stable equilibrium; where noise acts on some states only, speeds"
+            " have a measure about stable equilibria alone"
+        )
+    relaxation = -float(np.trace(dynamics.jacobian(attractor[None])[0])) / dynamics.dimension
+    return Diffusion(relaxation * np.linalg.inv(hessian_at(dynamics, attractor)))
+
+
+FIRST = 128  # starts of the first round, times the number of states
+ROUNDS = 5  # of search, each with twice as many starts, ...
+QUIET = 2  # ... until as many in a row found nothing new
+DEFLATED = 256  # starts of each round with deflation
+MOST_DEFLATIONS = 8
+EDGE = 1e-6  # of the domain, by which a root on its boundary may be off: a double one is found to 1e-8
+BOUNDARY = 4096  # points on the boundary, for its degree
+TURN = 2.0  # radian: f that turns by more from one of them to the next is not followed
+NEAR_EDGE = 1e-3  # of the domain: so close to the boundary a root leaves the degree undefined
+
+
+@dataclass(frozen=True)
+class FoundEquilibria:
+    """Equilibria of a domain.
+
+    Attributes
+    ----------
+    equilibria
+        By their position along the first state.
+    notes
+        What speaks against their being all, in words.
+    """
+
+    equilibria: tuple[Equilibrium, ...]
+    notes: tuple[str, ...] = ()
+
+
+def spread_evenly(box: np.ndarray, count: int, *, generator: np.random.Generator) -> np.ndarray:
+    """Points of a scrambled Sobol sequence in a box ``(d, 2)``: shape ``(n, d)``, n not below `count`."""
+    sequence = qmc.Sobol(len(box), scramble=True, seed=generator)
+    share = sequence.random_base2(max(int(np.ceil(np.log2(count))), 1))
+    return np.asarray(box[:, 0] + share * (box[:, 1] - box[:, 0]))
+
+
+def all_equilibria(dynamics: Dynamics, *, generator: np.random.Generator) -> FoundEquilibria:
+    """Equilibria in the domain of a system.
+
+    Parameters
+    ----------
+    dynamics
+        f, with its domain.
+    generator
+        Scrambles the sequences of starts.
+    """
+    box, d = dynamics.box, dynamics.dimension
+    found: list[np.ndarray] = []
+    quiet, count, starts = 0, FIRST * d, np.zeros((0, d))
+    for _ in range(ROUNDS):
+        starts = spread_evenly(box, count, generator=generator)
+        new = _new(found, distinct_roots(dynamics, starts, box=box, margin=EDGE), box)
+        found, quiet, count = [*found, *new], 0 if new else quiet + 1, 2 * count
+        if quiet == QUIET:
+            break
+    for _ in range(MOST_DEFLATIONS if found else 0):
+        some = spread_evenly(box, DEFLATED, generator=generator)
+        new = distinct_roots(dynamics, some, box=box, margin=EDGE, known=found)
+        if not new:
+            break
+        found += new
+    width = np.ptp(box, axis=1)
+    rate = float(np.median(np.linalg.norm(dynamics.drift(starts) / width, axis=1)))
+    equilibria = tuple(classified(dynamics, found, box=box, rate=rate))
+    degree = boundary_degree(dynamics, equilibria)
+    if degree is None or degree == _indices(dynamics, equilibria):
+        return FoundEquilibria(equilibria)
+    note = (
+        "an equilibrium of the domain was missed: the directions of f along the boundary of the domain turn"
+        f" {degree} times, which the {len(equilibria)} that were found do not explain"
+    )
+    return FoundEquilibria(equilibria, (note,))
+
+
+def boundary_degree(dynamics: Dynamics, equilibria: tuple[Equilibrium, ...]) -> int | None:
+    """How often f turns along the boundary of the domain: the sum of the indices of all roots within.
+
+    None in more than two dimensions, and where a root on the boundary, or a degenerate one, leaves it open.
+    """
+    box, d = dynamics.box, dynamics.dimension
+    width = np.ptp(box, axis=1)
+    places = [one.position for one in equilibria]
+    near = any(
+        (np.minimum(place - box[:, 0], box[:, 1] - place) / width < NEAR_EDGE).any() for place in places
+    )
+    if d > 2 or near or any(one.kind == "degenerate" for one in equilibria):
+        return None
+    if d == 1:
+        low, high = np.sign(dynamics.drift(box.T)[:, 0])
+        return round(float(high - low) / 2)
+    share = np.linspace(0, 1, BOUNDARY // 4, endpoint=False)
+    zero, one = np.zeros_like(share), np.ones_like(share)
+    along = [(share, zero), (one, share), (1 - share, one), (zero, 1 - share)]
+    around = np.concatenate([np.stack(side, axis=1) for side in along])
+    flow = dynamics.drift(box[:, 0] + around * width) / width
+    angle = np.arctan2(flow[:, 1], flow[:, 0])
+    turn = np.diff(np.append(angle, angle[0]))
+    turn -= 2 * np.pi * np.round(turn / (2 * np.pi))
+    if not np.abs(turn).max() < TURN:  # also where f is not finite
+        return None
+    return int(np.round(turn.sum() / (2 * np.pi)))
+
+
+def _indices(dynamics: Dynamics, equilibria: tuple[Equilibrium, ...]) -> int:
+    """Sum of ``sign det J``."""
+    jacobians = [dynamics.jacobian(one.position[None])[0] for one in equilibria]
+    return int(sum(np.sign(np.linalg.det(one)) for one in jacobians))
+
+
+def _new(known: list[np.ndarray], found: list[np.ndarray], box: np.ndarray) -> list[np.ndarray]:
+    width = np.ptp(box, axis=1)
+    return [one for one in found if all(np.abs((one - other) / width).max() > EDGE for other in known)]

@@ -1,0 +1,455 @@
+"""Formulas of people: text, checked against a whitelist, to sympy, numpy and machine code.
+
+A formula is data. The text is parsed by Python's own parser into a syntax tree, of which only numbers,
+declared names, ``+ - * / **`` and named functions are accepted; the sympy expression is then built node
+by node. Nothing is ever evaluated as code.
+
+A trajectory is a long chain of small steps. Numpy needs microseconds for each operation of each step, and to
+compile every formula of every candidate would take seconds. A tape is made in no time, and one compiled loop
+runs all tapes (`siq.inference.trajectories`).
+"""
+
+from __future__ import annotations
+
+import ast
+import builtins
+import functools
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+import sympy
+from sympy.printing.numpy import NumPyPrinter
+
+from siq.errors import suggestion
+
+FUNCTIONS: Mapping[str, Callable[..., sympy.Expr]] = {
+    "sin": sympy.sin,
+    "cos": sympy.cos,
+    "tan": sympy.tan,
+    "exp": sympy.exp,
+    "log": sympy.log,
+    "sqrt": sympy.sqrt,
+    "tanh": sympy.tanh,
+    "atan": sympy.atan,
+    "Abs": sympy.Abs,
+    "sign": sympy.sign,
+    "Max": sympy.Max,
+    "Min": sympy.Min,
+}
+"""The functions that a formula may use, by the names that it uses for them."""
+
+
+class delay(sympy.Function):  # noqa: N801 (the name that formulas use)
+    """``delay(u, tau)``: the input u as it was a time tau ago.
+
+    It stands for itself; only what knows the course of the input can evaluate it, see
+    `siq.systems.dynamics`.
+    """
+
+    nargs = 2
+    is_real = True
+
+
+CONSTANTS: Mapping[str, sympy.Expr] = {"pi": sympy.pi}
+
+LARGEST_EXPONENT = 32  # numerical: several such powers of states of the order of 10 stay doubles
+LARGEST_BASE = 1e9  # numerical: the same for numbers in formulas; (1e9)^32 = 1e288 is still a double
+LARGEST_VALUE = 1e300  # numerical: below the largest double, 1.8e308
+KEPT = 4096  # compiled formulas that are kept: each takes some kilobytes
+DIGITS = 17  # of decimal digits, that a double is read back exactly
+LONGEST_FORMULA = 20_000  # characters, a guard against files that are no formulas
+
+_OPERATORS: Mapping[type[ast.operator], Callable[[sympy.Expr, sympy.Expr], sympy.Expr]] = {
+    ast.Add: lambda left, right: left + right,
+    ast.Sub: lambda left, right: left - right,
+    ast.Mult: lambda left, right: left * right,
+    ast.Div: lambda left, right: left / right,
+}
+
+
+class FormulaError(ValueError):
+    """A formula that the whitelist refuses; the message names the offending part and the remedy.
+
+    Attributes
+    ----------
+    fault, remedy
+        The two halves of the message, for `siq.errors.InputError`.
+    """
+
+    def __init__(self, fault: str, remedy: str) -> None:
+        super().__init__(f"{fault}; {remedy}")
+        self.fault = fault
+        self.remedy = remedy
+
+
+def parse_formula(
+    text: str | float, names: Mapping[str, sympy.Expr], *, inputs: Collection[str] = ()
+) -> sympy.Expr:
+    """Build a sympy expression from the text of a formula.
+
+    Parameters
+    ----------
+    text
+        The formula, such as ``"-2*(x**3 - x) - y"``; a plain number is a formula as well.
+    names
+        What every name in the formula stands for: states as symbols, parameters as numbers.
+    inputs
+        Those of the names that may be delayed, ``delay(u, tau)``.
+
+    Returns
+    -------
+    sympy.Expr
+        The expression; numbers with a decimal point become floating-point numbers.
+
+    Raises
+    ------
+    FormulaError
+        For anything outside the whitelist: attributes, comparisons, strings, undeclared names, powers
+        above `LARGEST_EXPONENT`, a division by zero, the root of a negative number.
+    """
+    text = str(text)
+    if len(text) > LONGEST_FORMULA:
+        raise FormulaError(f"the formula has {len(text)} characters", f"keep it below {LONGEST_FORMULA}")
+    try:
+        tree = ast.parse(text.strip(), mode="eval")
+        expression = _build(tree.body, names, inputs)
+    except (ArithmeticError, SyntaxError, TypeError, ValueError, MemoryError, RecursionError) as error:
+        if isinstance(error, FormulaError):
+            raise
+        raise FormulaError(f"'{_short(text)}' is not a formula", "check brackets and operators") from None
+    if expression.has(sympy.zoo, sympy.nan, sympy.oo, -sympy.oo, sympy.I):
+        raise FormulaError(f"'{_short(text)}' is not a real number somewhere", "correct the formula")
+    return expression
+
+
+def _build(node: ast.expr, names: Mapping[str, sympy.Expr], inputs: Collection[str]) -> sympy.Expr:
+    def build(part: ast.expr) -> sympy.Expr:
+        return _build(part, names, inputs)
+
+    match node:
+        case ast.Constant(value=bool() as value):
+            raise FormulaError(f"'{value}' is not a number", "write 0 or 1")
+        case ast.Constant(value=int() as value):
+            return sympy.Integer(value) if abs(value) < LARGEST_BASE else sympy.Float(float(value), DIGITS)
+        case ast.Constant(value=float() as value):
+            if not np.isfinite(value):
+                raise FormulaError("a number is too large", "write a finite number")
+            return sympy.Float(value, DIGITS)
+        case ast.Name(id=name):
+            return _look_up(name, names)
+        case ast.UnaryOp(op=ast.USub(), operand=operand):
+            return -build(operand)
+        case ast.UnaryOp(op=ast.UAdd(), operand=operand):
+            return build(operand)
+        case ast.BinOp(op=ast.Pow(), left=left, right=right):
+            return _power(build(left), build(right))
+        case ast.BinOp(op=operator) if type(operator) in _OPERATORS:
+            return _OPERATORS[type(operator)](build(node.left), build(node.right))
+        case ast.BinOp(op=ast.BitXor()):
+            raise FormulaError("'^' is not an operator", "write '**' for powers")
+        case ast.Call(func=ast.Name(id="delay"), args=arguments, keywords=[]) if inputs:
+            return _delay([build(argument) for argument in arguments], inputs)
+        case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]):
+            return _call(name, [build(argument) for argument in arguments])
+    raise FormulaError(
+        f"'{_short(ast.unparse(node))}' is not allowed in a formula",
+        f"use numbers, declared names, + - * / ** and the functions {', '.join(FUNCTIONS)}",
+    )
+
+
+def _look_up(name: str, names: Mapping[str, sympy.Expr]) -> sympy.Expr:
+    if name in names:
+        return names[name]
+    if name in CONSTANTS:
+        return CONSTANTS[name]
+    remedy = suggestion(name, names, otherwise="declare it, or correct the spelling")
+    raise FormulaError(f"the name '{name}' is not declared", remedy)
+
+
+def _power(base: sympy.Expr, exponent: sympy.Expr) -> sympy.Expr:
+    # An unbounded power such as 9**9**9, or (10**32)**32 repeated, would be worked out digit by digit.
+    if exponent.is_number:
+        if not exponent.is_real or abs(float(exponent)) > LARGEST_EXPONENT:
+            raise FormulaError(f"the exponent {exponent} is too large", f"keep it below {LARGEST_EXPONENT}")
+        if base.is_number and abs(complex(base)) > LARGEST_BASE:
+            raise FormulaError("a power of a very large number is taken", "write the number out as a float")
+        if base.is_number and base.is_negative and not exponent.is_integer:
+            raise FormulaError(
+                f"the power {exponent} of the negative number {base} is not real", "correct it"
+            )
+    return base**exponent
+
+
+def _call(name: str, arguments: Sequence[sympy.Expr]) -> sympy.Expr:
+    if name not in FUNCTIONS:
+        remedy = suggestion(name, FUNCTIONS, otherwise=f"use one of {', '.join(FUNCTIONS)}")
+        raise FormulaError(f"the function '{name}' is not allowed in a formula", remedy)
+    wanted = "at least two arguments" if name in ("Max", "Min") else "one argument"
+    if (len(arguments) < 2) if name in ("Max", "Min") else (len(arguments) != 1):
+        raise FormulaError(f"'{name}' has {len(arguments)} arguments", f"give it {wanted}")
+    if all(argument.is_number for argument in arguments):
+        # Worked out at once: sympy would keep a tower such as exp(exp(exp(100))) and choke on it later.
+        value = complex(FUNCTIONS[name](*(sympy.Float(float(a), DIGITS) for a in arguments)))
+        if value.imag != 0 or not np.isfinite(value.real) or abs(value.real) > LARGEST_VALUE:
+            raise FormulaError(f"'{name}' of a number is not a real number of usable size", "correct it")
+    return FUNCTIONS[name](*arguments)
+
+
+def _delay(arguments: Sequence[sympy.Expr], inputs: Collection[str]) -> sympy.Expr:
+    if len(arguments) != 2 or str(arguments[0]) not in inputs:
+        raise FormulaError(
+            "'delay' needs an input and a time", f"write delay(u, tau) with one of {', '.join(inputs)} as u"
+        )
+    return delay(*arguments)
+
+
+def compile_formulas(
+    expressions: Sequence[sympy.Expr], variables: Sequence[sympy.Symbol]
+) -> Callable[[np.ndarray], np.ndarray]:
+    """Turn expressions into one vectorised numpy function.
+
+    Integer powers become products and common parts are worked out once, which makes polynomial vector
+    fields several times faster than numpy's power function.
+
+    Parameters
+    ----------
+    expressions
+        What to evaluate, ``m`` expressions in `variables`.
+    variables
+        The ``d`` symbols, in the order of the components of a point.
+
+    Returns
+    -------
+    callable
+        Maps components of shape ``(d, ...)`` to values of shape ``(m, ...)``: components first, so that
+        each is contiguous in memory.
+    """
+    function = compile_values(expressions, variables)
+
+    def evaluate(components: np.ndarray) -> np.ndarray:
+        values = np.empty((len(expressions), *components.shape[1:]))
+        for index, value in enumerate(function(*components)):
+            values[index] = value
+        return values
+
+    return evaluate
+
+
+def compile_values(
+    expressions: Sequence[sympy.Expr], variables: Sequence[sympy.Symbol], *, common: bool = True
+) -> Callable[..., Sequence[np.ndarray | float]]:
+    """Turn expressions into a function of as many arguments as there are variables.
+
+    Compare `compile_formulas`, whose argument is one array: here some variables may be arrays and others,
+    such as parameters, numbers.
+
+    Parameters
+    ----------
+    expressions, variables
+        See `compile_formulas`.
+    common
+        Whether parts that several expressions share are worked out once. Finding them takes longer than it
+        saves for a few short ones.
+
+    Returns
+    -------
+    callable
+        Gives one value for each expression: an array, or a number where only numbers stand in it.
+    """
+    return _compiled(tuple(expressions), tuple(variables), common)
+
+
+@functools.lru_cache(maxsize=KEPT)
+def _compiled(
+    expressions: tuple[sympy.Expr, ...], variables: tuple[sympy.Symbol, ...], common: bool
+) -> Callable[..., Sequence[np.ndarray | float]]:
+    """The same, once for the same formulas: a diagnosis asks for those of a hundred mechanisms ten times."""
+    return sympy.lambdify(
+        list(variables),
+        list(expressions),
+        modules=[{"integer_power": _integer_power}, "numpy"],
+        printer=_ProductPrinter(),
+        cse=common,
+        # Renaming is slow, and needed only for names that the generated code may use itself.
+        dummify=any(hasattr(np, str(each)) or hasattr(builtins, str(each)) for each in variables),
+    )
+
+
+def exact_number(value: float) -> sympy.Expr:
+    """A float as an integer where it is one, so that exact formulas stay exact."""
+    return sympy.Integer(int(value)) if float(value).is_integer() else sympy.Float(float(value), DIGITS)
+
+
+class _ProductPrinter(NumPyPrinter):
+    """Writes integer powers as products: numpy's own power is tens of times slower."""
+
+    def __init__(self) -> None:
+        super().__init__({"fully_qualified_modules": False, "inline": True, "allow_unknown_functions": True})
+
+    def _print_Pow(self, expr: sympy.Pow, rational: bool = False) -> str:  # noqa: N802 (sympy's name)
+        base, exponent = expr.args
+        if exponent.is_Integer and 2 <= abs(exponent) <= LARGEST_EXPONENT:
+            power = f"integer_power({self._print(base)}, {abs(int(exponent))})"
+            return power if exponent > 0 else f"(1.0/{power})"
+        return super()._print_Pow(expr, rational=rational)
+
+    def _print_DiracDelta(self, expr: sympy.Expr) -> str:  # noqa: N802
+        # The derivative of sign, which a Jacobian has; it is zero but on a set of measure zero.
+        return "0.0"
+
+    # Conditions that are numbers and such that are arrays are joined one by one; numpy wants equal shapes.
+    def _print_And(self, expr: sympy.And) -> str:  # noqa: N802
+        return self._joined("logical_and", expr)
+
+    def _print_Or(self, expr: sympy.Or) -> str:  # noqa: N802
+        return self._joined("logical_or", expr)
+
+    def _joined(self, operation: str, expr: sympy.Basic) -> str:
+        parts = ", ".join(self._print(each) for each in expr.args)
+        one_by_one = self._module_format("functools.reduce")
+        return f"{one_by_one}({self._module_format(f'numpy.{operation}')}, [{parts}])"
+
+
+def _integer_power(base: np.ndarray, exponent: int) -> np.ndarray:
+    product = base
+    for _ in range(exponent - 1):
+        product = product * base
+    return product
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+class Operation(IntEnum):
+    """What a step of a tape does with one register, or two."""
+
+    ADD = 0
+    MULTIPLY = 1
+    INVERT = 2
+    WHOLE_POWER = 3
+    POWER = 4
+    SQRT = 5
+    SIN = 6
+    COS = 7
+    TAN = 8
+    EXP = 9
+    LOG = 10
+    TANH = 11
+    ATAN = 12
+    ABS = 13
+    SIGN = 14
+    MAX = 15
+    MIN = 16
+
+
+_FUNCTIONS = {
+    sympy.sin: Operation.SIN,
+    sympy.cos: Operation.COS,
+    sympy.tan: Operation.TAN,
+    sympy.exp: Operation.EXP,
+    sympy.log: Operation.LOG,
+    sympy.tanh: Operation.TANH,
+    sympy.atan: Operation.ATAN,
+    sympy.Abs: Operation.ABS,
+    sympy.sign: Operation.SIGN,
+}
+_CHAINS = {
+    sympy.Add: Operation.ADD,
+    sympy.Mul: Operation.MULTIPLY,
+    sympy.Max: Operation.MAX,
+    sympy.Min: Operation.MIN,
+}
+
+
+@dataclass(frozen=True)
+class Tape:
+    """Formulas as operations on registers.
+
+    Attributes
+    ----------
+    operations
+        Shape ``(k, 3)``: an `Operation`, and the registers of its arguments; the second is the exponent
+        itself of a whole power. The result goes to the register ``base + k``.
+    registers
+        To begin with, shape ``(base + k,)``: arguments, which are to be filled in, then constants.
+    base
+        How many arguments and constants there are.
+    results
+        Registers that hold the values of the formulas in the end.
+    """
+
+    operations: np.ndarray
+    registers: np.ndarray
+    base: int
+    results: np.ndarray
+
+
+def tape_of(formulas: Sequence[sympy.Expr], arguments: Sequence[sympy.Symbol]) -> Tape | None:
+    """The tape of formulas in some arguments; None where a formula has a function that no tape knows.
+
+    What occurs twice is worked out once.
+    """
+    writer = _Writer(arguments, formulas)
+    try:
+        results = [writer.register(formula) for formula in formulas]
+    except NotImplementedError:
+        return None
+    return Tape(
+        operations=np.array(writer.operations, dtype=np.int64).reshape(-1, 3),
+        registers=np.concatenate([writer.start, np.zeros(len(writer.operations))]),
+        base=len(writer.start),
+        results=np.array(results, dtype=np.int64),
+    )
+
+
+class _Writer:
+    """A tape in the making."""
+
+    def __init__(self, arguments: Sequence[sympy.Symbol], formulas: Sequence[sympy.Expr]) -> None:
+        self.operations: list[tuple[int, int, int]] = []
+        self._known: dict[sympy.Expr, int] = {each: place for place, each in enumerate(arguments)}
+        constants: dict[sympy.Expr, float] = {}
+        for formula in formulas:
+            for part in sympy.preorder_traversal(sympy.sympify(formula)):
+                if part.is_number and not part.free_symbols:
+                    constants.setdefault(part, float(part) if part.is_real else np.nan)
+        self._known |= {each: len(arguments) + place for place, each in enumerate(constants)}
+        self.start = np.concatenate([np.zeros(len(arguments)), list(constants.values())])
+
+    def register(self, formula: sympy.Expr) -> int:
+        """Where the value of a formula is, once the tape has run so far."""
+        formula = sympy.sympify(formula)
+        if formula not in self._known:
+            self._known[formula] = self._written(formula)
+        return self._known[formula]
+
+    def _written(self, formula: sympy.Expr) -> int:
+        if formula.func in _CHAINS:
+            operation = _CHAINS[formula.func]
+            place = self.register(formula.args[0])
+            for other in formula.args[1:]:
+                place = self._add(operation, place, self.register(other))
+            return place
+        if formula.func in _FUNCTIONS:
+            return self._add(_FUNCTIONS[formula.func], self.register(formula.args[0]), 0)
+        if isinstance(formula, sympy.Pow):
+            return self._power(*formula.args)
+        raise NotImplementedError(str(formula.func))
+
+    def _power(self, base: sympy.Expr, exponent: sympy.Expr) -> int:
+        place = self.register(base)
+        if exponent.is_Integer:
+            if abs(int(exponent)) > 1:
+                place = self._add(Operation.WHOLE_POWER, place, abs(int(exponent)))
+            return place if exponent > 0 else self._add(Operation.INVERT, place, 0)
+        if abs(exponent) == sympy.S.Half:
+            place = self._add(Operation.SQRT, place, 0)
+            return place if exponent > 0 else self._add(Operation.INVERT, place, 0)
+        return self._add(Operation.POWER, place, self.register(exponent))
+
+    def _add(self, operation: Operation, one: int, other: int) -> int:
+        self.operations.append((int(operation), one, other))
+        return len(self.start) + len(self.operations) - 1

@@ -1,0 +1,435 @@
+"""Simulation of trajectories, and how a system is sampled by its own rates (paper, Appendix B).
+
+Time runs in steps of the Runge–Kutta rule, or of Euler and Maruyama's where there is noise, all trajectories
+at once; the arrays hold components first, ``(d, trajectories)``, so that each component is contiguous.
+
+The step of a pair follows from the fastest rate of the Jacobian over the card's domain, the length of a
+trajectory from the slowest relaxation to an attractor.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Annotated
+
+import numpy as np
+import sympy
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from siq.data.recordings import Recordings
+from siq.errors import NumericalFailure
+from siq.systems.diffusion import Diffusion
+from siq.systems.dynamics import Dynamics
+from siq.systems.equilibria import find_equilibria
+from siq.systems.formulas import compile_formulas
+
+Drift = Callable[[np.ndarray], np.ndarray]
+"""F of components: ``(d, n)`` to ``(d, n)``."""
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class SimulationOptions:
+    """What is sampled from a simulated system; the defaults are the paper's (its Table B1).
+
+    Attributes
+    ----------
+    trajectories
+        N, the number of trajectories, with initial states uniform over the card's domain Ω.
+    pairs
+        M, the number of snapshot pairs along each trajectory.
+    pair_step
+        h, the time between the two snapshots of a pair, in the card's time unit.
+    interval
+        The time between pairs: they start at t_j = interval·j, j = 1 … M.
+    substeps
+        Steps of the fourth-order Runge–Kutta rule within h; the paper has 5. With noise they are steps of
+        the Euler–Maruyama rule, whose drift is that of the continuous process but for O(h/substeps).
+    noise_intensity
+        ε of ``dx = f dt + sqrt(ε) D^(1/2) dW``; 0 is the equation without noise. The paper's section 3.1.1
+        has another convention, ``⟨ξ_j(t) ξ_k(0)⟩ = 2ε δ_jk δ(t)`` with ε = 0.01: that is 0.02 here.
+    """
+
+    trajectories: Annotated[int, Field(ge=2)] = 5000
+    pairs: Annotated[int, Field(ge=1)] = 50
+    pair_step: Annotated[float, Field(gt=0)] = 0.01
+    interval: Annotated[float, Field(gt=0)] = 0.1
+    substeps: Annotated[int, Field(ge=1)] = 5
+    noise_intensity: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+
+
+def sampling_stride(options: SimulationOptions) -> int:
+    """Number of integrator steps between the starts of two pairs.
+
+    Raises
+    ------
+    ValueError
+        When the interval is not a multiple of the integrator's step, or does not exceed h.
+    """
+    step = options.pair_step / options.substeps
+    stride = round(options.interval / step)
+    if abs(stride * step - options.interval) > 1e-9 * options.interval or stride <= options.substeps:
+        raise ValueError(
+            f"simulation.interval ({options.interval}) is not a multiple of the step"
+            f" pair_step/substeps ({step}) that exceeds pair_step; change one of them"
+        )
+    return stride
+
+
+def runge_kutta_step(drift: Drift, x: np.ndarray, step: float | np.ndarray) -> np.ndarray:
+    """One step of the classical fourth-order Runge–Kutta rule.
+
+    Parameters
+    ----------
+    drift
+        f, mapping components ``(d, n)`` to components ``(d, n)``.
+    x
+        States, shape ``(d, n)``.
+    step
+        Time step, one for all or one for each, shape ``(n,)``.
+
+    Returns
+    -------
+    numpy.ndarray
+        States one step later, shape ``(d, n)``; the local error is O(step⁵).
+    """
+    k1 = drift(x)
+    k2 = drift(x + (step / 2) * k1)
+    k3 = drift(x + (step / 2) * k2)
+    k4 = drift(x + step * k3)
+    k2 += k3
+    k2 *= 2
+    k2 += k1
+    k2 += k4
+    k2 *= step / 6
+    k2 += x
+    return k2
+
+
+def euler_maruyama_step(drift: Drift, x: np.ndarray, step: float, increments: np.ndarray) -> np.ndarray:
+    """One step of the Euler–Maruyama rule, ``x + f(x) Δt + sqrt(ε) D^(1/2) ΔW``.
+
+    Parameters
+    ----------
+    drift
+        f, mapping components ``(d, n)`` to components ``(d, n)``.
+    x
+        States, shape ``(d, n)``.
+    step
+        Time step Δt.
+    increments
+        ``sqrt(ε) D^(1/2) ΔW``, shape ``(d, n)``: the noise over the step, see `noise_source`.
+
+    Returns
+    -------
+    numpy.ndarray
+        States one step later, shape ``(d, n)``. The rule is of strong order 1 where the noise is additive,
+        and of ½ where D depends on the state; its weak order is 1.
+    """
+    result = step * drift(x)
+    result += x
+    result += increments
+    return result
+
+
+def noise_source(
+    diffusion: Diffusion, *, intensity: float, step: float, generator: np.random.Generator
+) -> Callable[[np.ndarray], np.ndarray]:
+    """What draws the noise over one step of states: ``sqrt(ε) σ(x) ΔW``, in the sense of Itô.
+
+    Parameters
+    ----------
+    diffusion
+        D.
+    intensity
+        ε of ``dx = f dt + sqrt(ε) D^(1/2) dW``.
+    step
+        Time step Δt.
+    generator
+        Source of the noise.
+
+    Returns
+    -------
+    callable
+        Maps the components of states ``(d, n)`` to increments ``(d, n)``, new ones with every call. Every
+        root of D gives the same process in law.
+
+    Raises
+    ------
+    ValueError
+        When ε or Δt is negative.
+    """
+    factor = noise_factor(intensity=intensity, step=step)
+    if diffusion.constant:
+        whole = factor * diffusion.root
+        return lambda x: np.asarray(whole @ generator.standard_normal(x.shape))
+    return lambda x: factor * diffusion.kicks(x, generator.standard_normal(x.shape))
+
+
+def noise_factor(*, intensity: float, step: float) -> float:
+    """``sqrt(ε Δt)``: the size of the noise over one step where D = 1; raises as `noise_source`."""
+    if intensity < 0 or step < 0:
+        raise ValueError(f"the noise intensity ({intensity}) and the step ({step}) must not be negative")
+    return float(np.sqrt(intensity * step))
+
+
+def simulate_snapshots(
+    dynamics: Dynamics, *, options: SimulationOptions, generator: np.random.Generator
+) -> Recordings:
+    """Simulate trajectories from random initial states and keep their snapshot pairs.
+
+    Parameters
+    ----------
+    dynamics
+        What is simulated; its domain Ω is where the initial states are drawn, uniformly.
+    options
+        Sampling (paper, Appendix B).
+    generator
+        Source of the initial states, and then of the noise; a run passes its own. The initial states are
+        the same with and without noise.
+
+    Returns
+    -------
+    Recordings
+        Every trajectory as one recording of 2·M samples at t_j and t_j + h. Consecutive samples no
+        further apart than h are the pairs (X0, Xh); see `siq.data.recordings.snapshot_pairs`.
+
+    Raises
+    ------
+    ValueError
+        When the sampling does not fit the integrator's step.
+    NumericalFailure
+        When trajectories run to infinity.
+    """
+    step = options.pair_step / options.substeps
+    stride = sampling_stride(options)
+    lower, upper = dynamics.box.T
+    count = options.trajectories
+    x = generator.uniform(lower[:, None], upper[:, None], size=(dynamics.dimension, count))
+    samples = np.empty((count, 2 * options.pairs, dynamics.dimension))
+    noise = noise_source(
+        dynamics.diffusion, intensity=options.noise_intensity, step=step, generator=generator
+    )
+    drift = dynamics.drift_of_components
+
+    def advance(x: np.ndarray) -> np.ndarray:
+        if options.noise_intensity == 0:
+            return runge_kutta_step(drift, x, step)
+        return euler_maruyama_step(drift, x, step, noise(x))
+
+    with np.errstate(over="ignore", invalid="ignore"):  # a runaway trajectory is told below, by name
+        for pair in range(options.pairs):
+            for _ in range(stride - (options.substeps if pair else 0)):
+                x = advance(x)
+            samples[:, 2 * pair] = x.T
+            for _ in range(options.substeps):
+                x = advance(x)
+            samples[:, 2 * pair + 1] = x.T
+    lost = ~np.isfinite(samples).all(axis=(1, 2))
+    if lost.any():
+        raise NumericalFailure(
+            f"{lost.sum()} of {count} trajectories of {dynamics.name} run to infinity (the first is number"
+            f" {int(lost.argmax())}); narrow the domains of the card or take more substeps"
+        )
+    starts = options.interval * np.arange(1, options.pairs + 1)
+    times = np.stack([starts, starts + options.pair_step], axis=1).ravel()
+    width = len(str(count - 1))
+    return Recordings(
+        names=dynamics.states,
+        units=dynamics.units,
+        labels=tuple(f"trajectory{index:0{width}d}" for index in range(count)),
+        recording=np.repeat(np.arange(count), 2 * options.pairs),
+        t=np.tile(times, count),
+        values=samples.reshape(-1, dynamics.dimension),
+    )
+
+
+def simulate_stationary(
+    dynamics: Dynamics,
+    *,
+    intensity: float,
+    start: np.ndarray,
+    step: float,
+    burn_in: int,
+    steps: int,
+    thin: int = 1,
+    generator: np.random.Generator,
+) -> np.ndarray:
+    """Simulate walkers in noise for a long time, to compare with the invariant distribution.
+
+    The walkers share nothing but the equation ``dx = f dt + sqrt(ε) D^(1/2) dW``; the spread among them
+    therefore tells the sampling error, whatever the correlation in time. Where ε is small a walker stays
+    in the well in which it starts, and the shares of the wells are then those of `start`.
+
+    Parameters
+    ----------
+    dynamics
+        f and D.
+    intensity
+        ε, in the unit of U.
+    start
+        Initial states, shape ``(d, walkers)``.
+    step
+        Step of the Euler–Maruyama rule; the samples' distribution is biased by O(step).
+    burn_in
+        Number of steps before the first sample.
+    steps
+        Number of steps from then on.
+    thin
+        Every how many steps a sample is kept.
+    generator
+        Source of the noise.
+
+    Returns
+    -------
+    numpy.ndarray
+        Samples, shape ``(d, steps // thin, walkers)``, in the states' units.
+
+    Raises
+    ------
+    ValueError
+        When ε is negative, or no sample would be kept.
+    NumericalFailure
+        When walkers run to infinity.
+    """
+    if not 1 <= thin <= steps or burn_in < 0:
+        raise ValueError(f"of {steps} steps after {burn_in}, every {thin}th leaves no sample")
+    noise = noise_source(dynamics.diffusion, intensity=intensity, step=step, generator=generator)
+    x = np.array(start, dtype=float)
+    samples = np.empty((len(x), steps // thin, x.shape[1]))
+    with np.errstate(over="ignore", invalid="ignore"):  # told below
+        for index in range(1 - burn_in, samples.shape[1] * thin + 1):
+            x = euler_maruyama_step(dynamics.drift_of_components, x, step, noise(x))
+            if index > 0 and index % thin == 0:
+                samples[:, index // thin - 1] = x
+    lost = int((~np.isfinite(x).all(axis=0)).sum())  # what once is not finite stays so
+    if lost:
+        raise NumericalFailure(f"{lost} of {x.shape[1]} walkers run to infinity; take a smaller step")
+    return samples
+
+
+TRAJECTORIES = 1000  # enough for every state of a box in three dimensions, and simulated in seconds
+STATES = 400  # of the domain, at which rates are asked for
+TURNED = 0.1  # of a time constant in the step of a pair: the flow differs from f by so much, and is known
+FASTEST = 0.9  # quantile of the rates: the corners of a domain are left at once
+RELAXED = 3.0  # slowest time constants that a trajectory lasts: then 95 % of the way is done
+MOST_STEPS = 100  # of a pair, between pairs: beyond, a slow system would cost minutes
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class SimulationEntry:
+    """What a study says of its simulation; what it leaves out follows from the system, see `complete`.
+
+    The fields are those of `SimulationOptions`.
+
+    Attributes
+    ----------
+    trajectories
+        How many trajectories are simulated.
+    pairs
+        Pairs along each trajectory.
+    pair_step
+        h, the time between the two states of a pair, in the card's unit of time; by default a tenth of the
+        fastest time constant, rounded down.
+    interval
+        Time between the starts of pairs; by default such that a trajectory lasts three of the slowest time
+        constants at an attractor.
+    substeps
+        Runge–Kutta steps within h; with noise, steps of Euler and Maruyama.
+    noise_intensity
+        ε of ``√ε D^(1/2) dW``. The paper's ε = 0.01 in section 3.1.1 is 0.02 here.
+    """
+
+    trajectories: Annotated[int, Field(ge=2)] = TRAJECTORIES
+    pairs: Annotated[int, Field(ge=1)] = 50
+    pair_step: Annotated[float, Field(gt=0)] | None = None
+    interval: Annotated[float, Field(gt=0)] | None = None
+    substeps: Annotated[int, Field(ge=1)] = 5
+    noise_intensity: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+
+    def options(self) -> SimulationOptions:
+        """The same, once nothing is left out.
+
+        Raises
+        ------
+        ValueError
+            When something is left out, or the interval does not fit the step.
+        """
+        if self.pair_step is None or self.interval is None:
+            raise ValueError("the step and the interval of the pairs are not known without the system")
+        options = SimulationOptions(
+            self.trajectories, self.pairs, self.pair_step, self.interval, self.substeps, self.noise_intensity
+        )
+        sampling_stride(options)
+        return options
+
+
+def complete(entry: SimulationEntry, dynamics: Dynamics) -> SimulationEntry:
+    """What a study says, and what follows from the system where the study says nothing.
+
+    Parameters
+    ----------
+    entry
+        What the study says.
+    dynamics
+        What is simulated, from its domain.
+    """
+    if entry.pair_step is not None and entry.interval is not None:
+        return entry
+    fastest, slowest = rates(dynamics)
+    step = entry.pair_step
+    if step is None:
+        step = round_down(TURNED / fastest)
+        if entry.interval is not None:
+            step = entry.interval / max(math.ceil(entry.interval / step), 2)
+    interval = entry.interval
+    if interval is None:
+        steps = RELAXED / slowest / entry.pairs / step
+        interval = step * round(min(max(steps, 2.0), float(MOST_STEPS)))
+    return replace(entry, pair_step=step, interval=interval)
+
+
+def rates(dynamics: Dynamics) -> tuple[float, float]:
+    """The fastest rate over the domain, and the slowest relaxation to an attractor, per unit of time.
+
+    Eigenvalues of the Jacobian, which no choice of the states' units can alter. Where there is no attractor
+    the slow rates of the domain stand in for its relaxation.
+    """
+    low, high = dynamics.box.T
+    x = np.random.default_rng(0).uniform(low, high, size=(STATES, dynamics.dimension))
+    sizes = np.abs(np.linalg.eigvals(dynamics.jacobian(x))).max(axis=1)
+    fastest = float(np.quantile(sizes, FASTEST)) or 1.0
+    relaxing = [
+        -float(one.eigenvalues.real.max()) for one in find_equilibria(dynamics, x) if one.kind == "attractor"
+    ]
+    slowest = min(relaxing, default=float(np.quantile(sizes, 1 - FASTEST)))
+    return fastest, max(slowest, 1e-6 * fastest)
+
+
+def fault_over_domain(dynamics: Dynamics) -> tuple[str, str] | None:
+    """A state whose equation has no value somewhere in the domain, with what is wrong; None for none.
+
+    States at random and the corners tell what overflows; a divisor that changes its sign between them is zero
+    somewhere, though no state of a sample meets it.
+    """
+    low, high = dynamics.box.T
+    x = np.random.default_rng(0).uniform(low, high, size=(STATES, dynamics.dimension))
+    x = np.concatenate([x, low[None], high[None]])
+    with np.errstate(all="ignore"):
+        flow, slopes = dynamics.drift(x), dynamics.jacobian(x)
+        for index, (name, formula) in enumerate(zip(dynamics.states, dynamics.formulas, strict=True)):
+            bases = [one.base for one in formula.atoms(sympy.Pow) if one.exp.is_negative]
+            divisors = compile_formulas(bases, dynamics.symbols)(np.ascontiguousarray(x.T))
+            if any(values.min() <= 0 <= values.max() for values in divisors):
+                return name, "divides by zero within the domain"
+            if not (np.isfinite(flow[:, index]).all() and np.isfinite(slopes[:, index]).all()):
+                return name, "is too large for a number, or not defined, in a part of the domain"
+    return None
+
+
+def round_down(value: float) -> float:
+    """The largest of 1, 2 and 5 times a power of ten that is not above a value: numbers that people read."""
+    power = 10.0 ** math.floor(math.log10(value))
+    return float(f"{max(one for one in (1, 2, 5) if one * power <= value * (1 + 1e-9)) * power:.1g}")

@@ -1,0 +1,455 @@
+"""Reference systems whose quasipotential is known, and how well.
+
+The two are Newton's method on the geometric action of a chain of points (`siq.quasipotential.paths`), and
+collocation of Hamilton's equations (`siq.quasipotential.hamiltonian_paths`). The error is their difference,
+or one in the last figure given.
+
+The noise is ``dX = f dt + √ε σ dW`` in the sense of Itô, with ``D = σσᵀ``; U is the quasipotential, so that
+states are found with a density that goes as ``exp(-U/ε)`` and are left after times that go as ``exp(ΔU/ε)``.
+U solves ``f·∇U + ½ ∇U·D∇U = 0``. Other texts have ``√(2ε) dW``: their ε is half of this one, and their V is
+U/2.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import scipy.optimize
+import scipy.stats.qmc
+import sympy
+
+from siq.systems.dynamics import Dynamics
+from siq.systems.formulas import compile_formulas
+
+TWO_METHODS = "least action of a chain of points, and Hamilton's equations"
+
+
+@dataclass(frozen=True, eq=False)
+class KnownBarrier:
+    """How high U rises between two attractors, and how long it takes to leave the first.
+
+    Attributes
+    ----------
+    start, saddle, end
+        Shape ``(d,)``: the attractor, the pass, and the attractor behind it.
+    value, error
+        ``ΔU = U(saddle) - U(start)``, and by how much it may be wrong.
+    prefactor
+        Of the law ``E[τ] = prefactor · exp(ΔU/ε)`` for small ε; NaN where it is not known.
+    how
+        How it is known.
+    """
+
+    start: np.ndarray
+    saddle: np.ndarray
+    end: np.ndarray
+    value: float
+    error: float
+    prefactor: float
+    how: str
+
+
+def barrier_of(
+    dynamics: Dynamics, quasipotential: sympy.Expr, start: np.ndarray, saddle: np.ndarray, end: np.ndarray
+) -> KnownBarrier:
+    """The barrier of a system whose U is a formula, with the law of Eyring and Kramers.
+
+    ``(2π/λ) √(|det H_S| / det H_A)`` with the unstable eigenvalue λ at the saddle and the Hessians of U,
+    where the circulatory component has no divergence; in one state with D(x), times ``D_S/D_A`` (Bouchet and
+    Reygner, Annales Henri Poincaré 17, 3499 (2016)). Elsewhere the prefactor is NaN.
+
+    Parameters
+    ----------
+    dynamics
+        The system.
+    quasipotential
+        U.
+    start, saddle, end
+        Equilibria, shape ``(d,)``.
+    """
+    symbols = dynamics.symbols
+    places = np.stack([start, saddle])
+    levels = compile_formulas([quasipotential], symbols)(places.T)[0]
+    second = [quasipotential.diff(a, b) for a in symbols for b in symbols]
+    curvatures = compile_formulas(second, symbols)(places.T).T.reshape(2, len(symbols), len(symbols))
+    bottom, top = np.abs(np.linalg.det(curvatures))
+    unstable = float(np.linalg.eigvals(dynamics.jacobian(saddle[None])[0]).real.max())
+    noise = dynamics.diffusion.at(places)
+    share = (
+        noise[1, 0, 0] / noise[0, 0, 0]
+        if len(symbols) == 1
+        else 1.0
+        if _divergence_free(dynamics, quasipotential)
+        else np.nan
+    )
+    prefactor = 2 * np.pi / unstable * np.sqrt(top / bottom) * share
+    return KnownBarrier(start, saddle, end, float(levels[1] - levels[0]), 0.0, float(prefactor), "exact")
+
+
+def _divergence_free(dynamics: Dynamics, quasipotential: sympy.Expr) -> bool:
+    """Whether ``g = f + ½D∇U`` has no divergence, D being constant."""
+    if not dynamics.diffusion.constant:
+        return False
+    slope = sympy.Matrix([quasipotential.diff(each) for each in dynamics.symbols])
+    circulation = sympy.Matrix(dynamics.formulas) + sympy.Matrix(dynamics.diffusion.matrix) * slope / 2
+    divergence = sum(
+        (g.diff(each) for g, each in zip(circulation, dynamics.symbols, strict=True)), sympy.S.Zero
+    )
+    return bool(sympy.nsimplify(sympy.expand(divergence), rational=True) == 0)
+
+
+def _computed(
+    start: tuple[float, float],
+    saddle: tuple[float, float],
+    end: tuple[float, float],
+    value: float,
+    error: float,
+) -> KnownBarrier:
+    return KnownBarrier(
+        np.array(start), np.array(saddle), np.array(end), value, error, float("nan"), TWO_METHODS
+    )
+
+
+_LOW, _PASS, _HIGH = (1.40491203, 2.80807973), (4.20080731, 4.00388242), (4.90395384, 4.06187119)
+_ON, _OFF, _EVEN = (2.61803399, 0.38196601), (0.38196601, 2.61803399), (1.21341166, 1.21341166)
+_UP, _DOWN = (0.81649658, 0.27216553), (-0.81649658, -0.27216553)
+DOUBLY_COMPUTED: Mapping[str, tuple[KnownBarrier, ...]] = {
+    "maier-stein-5": (_computed((-1.0, 0.0), (0.0, 0.0), (1.0, 0.0), 0.4830697094, 1e-9),),
+    "maier-stein-10": (_computed((-1.0, 0.0), (0.0, 0.0), (1.0, 0.0), 0.3400414034, 1e-9),),
+    "consumer-resource": (
+        _computed(_LOW, _PASS, _HIGH, 0.0122596486, 1e-9),
+        _computed(_HIGH, _PASS, _LOW, 0.0018932179, 1e-9),
+    ),
+    "fitzhugh-nagumo": (
+        _computed(_UP, (0.0, 0.0), _DOWN, 0.1788869290, 1e-9),
+        _computed(_DOWN, (0.0, 0.0), _UP, 0.1788869290, 1e-9),
+    ),
+    "toggle": (
+        _computed(_ON, _EVEN, _OFF, 0.1767588206, 1e-9),
+        _computed(_OFF, _EVEN, _ON, 0.1767588206, 1e-9),
+    ),
+}
+"""By name of the system. Saddles and attractors are given to 1e-8."""
+
+
+X, Y, Z, V = sympy.symbols("x y z v", real=True)
+HALF, TENTH = sympy.Rational(1, 2), sympy.Rational(1, 10)
+
+
+@dataclass(frozen=True)
+class ReferenceSystem:
+    """A system, and what is known of its landscape.
+
+    Attributes
+    ----------
+    name, about
+        In a word, and in a sentence.
+    source
+        Where it comes from.
+    dynamics
+        f, D and the domain.
+    quasipotential
+        U as a formula that holds in the whole domain, up to a constant; None where nobody knows one.
+    barriers
+        Between attractors, known exactly or by two methods.
+    """
+
+    name: str
+    about: str
+    source: str
+    dynamics: Dynamics
+    quasipotential: sympy.Expr | None
+    barriers: tuple[KnownBarrier, ...]
+
+
+def reference_systems() -> dict[str, ReferenceSystem]:
+    """Every system whose landscape is known exactly, or was computed by two methods, by name.
+
+    Returns
+    -------
+    dict
+        New objects at every call.
+
+    Examples
+    --------
+    >>> import siq
+    >>> systems = siq.reference_systems()
+    >>> systems["maier-stein"].quasipotential
+    x**4/2 - x**2 + y**2*(x**2 + 1) + 1/2
+    >>> systems["maier-stein"].barriers[0].value
+    0.5
+    """
+    return {name: build(name) for name, build in _BUILDERS.items()}
+
+
+def _exact(
+    name: str,
+    about: str,
+    source: str,
+    dynamics: Dynamics,
+    quasipotential: sympy.Expr,
+    ways: tuple[tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]], ...] = (),
+) -> ReferenceSystem:
+    """A system whose U is a formula; ways are attractor, saddle and the attractor behind it, about where."""
+    barriers = tuple(
+        barrier_of(dynamics, quasipotential, *(_settled(dynamics, place) for place in way)) for way in ways
+    )
+    return ReferenceSystem(name, about, source, dynamics, quasipotential, barriers)
+
+
+def _computed_systems(name: str, about: str, source: str, dynamics: Dynamics) -> ReferenceSystem:
+    """A system of which nobody knows a formula of U, and two methods the barriers."""
+    return ReferenceSystem(name, about, source, dynamics, None, DOUBLY_COMPUTED[name])
+
+
+def _settled(dynamics: Dynamics, place: tuple[float, ...]) -> np.ndarray:
+    """The equilibrium near a place, shape ``(d,)``, to rounding."""
+    found = scipy.optimize.root(
+        lambda x: dynamics.drift(x[None])[0],
+        np.array(place, dtype=float),
+        jac=lambda x: dynamics.jacobian(x[None])[0],
+        tol=1e-14,
+    )
+    return np.asarray(found.x)
+
+
+def _linear(name: str) -> ReferenceSystem:
+    hessian = sympy.Matrix([[2, 1], [1, 3]]) / 2
+    noise = sympy.Matrix([[2, HALF], [HALF, 1]])
+    turning = sympy.Matrix([[0, -3], [3, 0]])
+    states = sympy.Matrix([X, Y])
+    field = (turning - noise) * hessian * states
+    dynamics = Dynamics.of(
+        (X, Y), tuple(map(sympy.expand, field)), diffusion=_numbers(noise), domain=[(-2, 2)] * 2
+    )
+    potential = sympy.expand((states.T * hessian * states)[0])
+    return _exact(
+        name, "A linear system that turns, with a full D.", "Lyapunov's equation", dynamics, potential
+    )
+
+
+def _double_well(name: str) -> ReferenceSystem:
+    potential = (X**2 - 1) ** 2 / 2 - X / 5
+    dynamics = Dynamics.of((X,), (X - X**3 + TENTH,), domain=[(-2, 2)])
+    ways = (((-1.0,), (0.0,), (1.0,)), ((1.0,), (0.0,), (-1.0,)))
+    return _exact(
+        name,
+        "A tilted double well of one state.",
+        "Kramers, Physica 7, 284 (1940)",
+        dynamics,
+        potential,
+        ways,
+    )
+
+
+def _growing_noise(name: str) -> ReferenceSystem:
+    potential = X**2 - 2 * sympy.log(1 + X**2)
+    dynamics = Dynamics.of((X,), (X - X**3,), diffusion=[[1 + X**2]], domain=[(-2, 2)])
+    ways = (((-1.0,), (0.0,), (1.0,)),)
+    return _exact(
+        name, "A double well whose noise grows with the state.", "U' = -2f/D", dynamics, potential, ways
+    )
+
+
+def _archetype(name: str) -> ReferenceSystem:
+    potential = (X**2 - 1) ** 2 + Y**2 + Z**2
+    slope = [potential.diff(each) / 2 for each in (X, Y, Z)]
+    field = (-slope[0] - slope[1] - slope[2], -slope[1] + slope[0], -slope[2] + slope[0])
+    dynamics = Dynamics.of(
+        (X, Y, Z), tuple(map(sympy.expand, field)), domain=[(-2, 2), (-1.5, 1.5), (-1.5, 1.5)]
+    )
+    ways = (((-1.0, 0.0, 0.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0)),)
+    return _exact(
+        name, "Two wells of three states with a circulation.",
+        "the archetype of the paper that siq implements", dynamics, potential, ways,
+    )  # fmt: skip
+
+
+def _maier_stein(beta: int) -> Dynamics:
+    return Dynamics.of((X, Y), (X - X**3 - beta * X * Y**2, -(1 + X**2) * Y), domain=[(-2, 2), (-1, 1)])
+
+
+def _maier_stein_exact(name: str) -> ReferenceSystem:
+    potential = X**4 / 2 - X**2 + (1 + X**2) * Y**2 + HALF
+    ways = (((-1.0, 0.0), (0.0, 0.0), (1.0, 0.0)),)
+    return _exact(
+        name, "Maier and Stein's system with β = 1, where its drift has a potential.",
+        "Maier and Stein, Phys. Rev. Lett. 71, 1783 (1993)", _maier_stein(1), potential, ways,
+    )  # fmt: skip
+
+
+def _maier_stein_computed(beta: int) -> Callable[[str], ReferenceSystem]:
+    def build(name: str) -> ReferenceSystem:
+        return _computed_systems(
+            name,
+            f"Maier and Stein's system with β = {beta}: paths leave the axis, and U has a kink on it.",
+            "Maier and Stein, Phys. Rev. Lett. 71, 1783 (1993)",
+            _maier_stein(beta),
+        )
+
+    return build
+
+
+def _consumer_resource(name: str) -> ReferenceSystem:
+    alpha, beta, gamma, mu = (
+        sympy.Rational(*each) for each in ((154, 100), (1014, 100), (476, 1000), (112509, 1000000))
+    )
+    eaten = X**2 * Y / (1 + X**2)
+    return _computed_systems(
+        name,
+        "A consumer with a resource; predation levels off (Holling's type III).",
+        "Collie and Spencer (1994), as Moore et al., The R Journal 8, 19 (2016) take it, with D = 1",
+        Dynamics.of(
+            (X, Y), (alpha * X * (1 - X / beta) - eaten, gamma * eaten - mu * Y**2), domain=[(0, 8)] * 2
+        ),
+    )
+
+
+def _toggle(name: str) -> ReferenceSystem:
+    return _computed_systems(
+        name,
+        "Two genes that switch each other off, with D = 1.",
+        "Gardner, Cantor and Collins, Nature 403, 339 (2000)",
+        Dynamics.of((X, Y), (3 / (1 + Y**2) - X, 3 / (1 + X**2) - Y), domain=[(0, 4)] * 2),
+    )
+
+
+def _fitzhugh_nagumo(name: str) -> ReferenceSystem:
+    return _computed_systems(
+        name,
+        "FitzHugh and Nagumo's system where it is bistable, with D = 1.",
+        "FitzHugh, Biophysical Journal 1, 445 (1961)",
+        Dynamics.of((X, Y), (X - X**3 - Y, X - 3 * Y), domain=[(-1.5, 1.5), (-0.8, 0.8)]),
+    )
+
+
+def _chain(name: str) -> ReferenceSystem:
+    count = 10
+    states = sympy.symbols(f"x:{count}", real=True)
+    well = sum(((s**2 - 1) ** 2 / 4 for s in states), sympy.S.Zero)
+    potential = well + sum((HALF * (a - b) ** 2 for a, b in itertools.pairwise(states)), sympy.S.Zero)
+    slope = [potential.diff(s) for s in states]
+    field = [-each for each in slope]
+    for place in range(count - 1):
+        field[place] += slope[place + 1]
+        field[place + 1] -= slope[place]
+    dynamics = Dynamics.of(states, tuple(map(sympy.expand, field)), domain=[(-2, 2)] * count)
+    return _exact(
+        name, "Ten bistable units in a row that turn about each other: f = (A - 1)∇Φ, U = 2Φ.",
+        "any f = (A - 1)∇Φ with A constant and antisymmetric", dynamics, 2 * potential,
+    )  # fmt: skip
+
+
+def _particle(name: str) -> ReferenceSystem:
+    place = (X**2 - 1) ** 2 / 4 - X / 10
+    friction = HALF
+    dynamics = Dynamics.of(
+        (X, V),
+        (V, sympy.expand(-place.diff(X) - friction * V)),
+        diffusion=[[0, 0], [0, 1]],
+        domain=[(-2, 2)] * 2,
+    )
+    ways = (((-1.0, 0.0), (0.0, 0.0), (1.0, 0.0)), ((1.0, 0.0), (0.0, 0.0), (-1.0, 0.0)))
+    potential = 2 * friction * (V**2 / 2 + place)
+    return _exact(
+        name, "A damped particle in a tilted double well, with noise on its velocity alone.",
+        "Kramers, Physica 7, 284 (1940)", dynamics, potential, ways,
+    )  # fmt: skip
+
+
+def _point_and_cycle(name: str) -> ReferenceSystem:
+    inner, outer, turns = sympy.Rational(1, 4), sympy.S.One, 2
+    square = X**2 + Y**2
+    half = square**3 / 6 - (inner + outer) * square**2 / 4 + inner * outer * square / 2
+    field = (-half.diff(X) - turns * Y, -half.diff(Y) + turns * X)
+    dynamics = Dynamics.of((X, Y), tuple(map(sympy.expand, field)), domain=[(-1.5, 1.5)] * 2)
+    value = float(2 * half.subs({X: HALF, Y: 0}))
+    beyond = value - float(2 * half.subs({X: 1, Y: 0}))
+    origin, edge, circle = np.zeros(2), np.array([0.5, 0.0]), np.array([1.0, 0.0])
+    how = "exact; any point of the circles"
+    barriers = (
+        KnownBarrier(origin, edge, circle, value, 0.0, np.nan, how),
+        KnownBarrier(circle, edge, origin, beyond, 0.0, np.nan, how),
+    )
+    return ReferenceSystem(
+        name, "A stable point within a stable limit cycle, and an unstable cycle between them.",
+        "V' = r(r² - a²)(r² - b²) with a turn", dynamics, 2 * half, barriers,
+    )  # fmt: skip
+
+
+_BUILDERS: Mapping[str, Callable[[str], ReferenceSystem]] = {
+    "linear": _linear,
+    "double-well": _double_well,
+    "growing-noise": _growing_noise,
+    "archetype": _archetype,
+    "maier-stein": _maier_stein_exact,
+    "maier-stein-5": _maier_stein_computed(5),
+    "maier-stein-10": _maier_stein_computed(10),
+    "consumer-resource": _consumer_resource,
+    "toggle": _toggle,
+    "fitzhugh-nagumo": _fitzhugh_nagumo,
+    "chain": _chain,
+    "particle": _particle,
+    "point-and-cycle": _point_and_cycle,
+}
+
+
+def _numbers(matrix: sympy.Matrix) -> np.ndarray:
+    return np.array(matrix.tolist(), dtype=float)
+
+
+def reference_table(*, points: int = 100) -> pd.DataFrame:
+    """What is known of the reference systems, as a table that other codes can read.
+
+    Parameters
+    ----------
+    points
+        In the domain of each system whose U is a formula.
+
+    Returns
+    -------
+    pandas.DataFrame
+        A row for every number: ``system``; ``quantity`` (``U``, ``barrier``, ``prefactor``); ``at``, the
+        state, or the attractor that is left; ``by`` and ``to``, the saddle and the attractor behind it;
+        ``value``, ``error`` and ``how``. States are lists, in the order of ``states``.
+
+    Examples
+    --------
+    >>> import siq
+    >>> table = siq.reference_table()
+    >>> table.to_parquet("references.parquet")  # doctest: +SKIP
+    """
+    rows: list[dict[str, Any]] = []
+    for each in reference_systems().values():
+        own: dict[str, Any] = {
+            "system": each.name,
+            "states": list(each.dynamics.states),
+            "by": None,
+            "to": None,
+        }
+        if each.quasipotential is not None:
+            lower, upper = each.dynamics.box.T
+            drawn = scipy.stats.qmc.Halton(len(lower), scramble=False).random(points)
+            at = lower + (upper - lower) * drawn
+            values = compile_formulas([each.quasipotential], each.dynamics.symbols)(at.T)[0]
+            rows += [
+                own | {"quantity": "U", "at": list(x), "value": value, "error": 0.0, "how": "exact"}
+                for x, value in zip(at, values, strict=True)
+            ]
+        for barrier in each.barriers:
+            way = {
+                "at": list(barrier.start),
+                "by": list(barrier.saddle),
+                "to": list(barrier.end),
+                "how": barrier.how,
+            }
+            rows.append(own | way | {"quantity": "barrier", "value": barrier.value, "error": barrier.error})
+            if np.isfinite(barrier.prefactor):
+                rows.append(own | way | {"quantity": "prefactor", "value": barrier.prefactor, "error": 0.0})
+    columns = ["system", "states", "quantity", "at", "by", "to", "value", "error", "how"]
+    return pd.DataFrame(rows, columns=columns)

@@ -1,0 +1,116 @@
+"""Regress: which sparse formulas are the networks of a run? The published method, by constrained SR3."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass as plain_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic.dataclasses import dataclass
+
+from siq.data.recordings import Recordings, snapshot_pairs
+from siq.errors import NumericalFailure
+from siq.inference.library import candidate_library
+from siq.networks.regression import RegressionOptions, RegressionResult, points_below, sparse_decomposition
+from siq.networks.trained import TrainedNetworks
+from siq.quasipotential.formulas import (
+    SymbolicDecomposition,
+    decomposition_from_coefficients,
+    model_to_data,
+    write_model,
+)
+from siq.systems.diffusion import Diffusion
+from siq.workflow.outcomes import Method, Outcome, Status, Step, write_outcomes
+from siq.workflow.settings import STRICT, Sampling, StateSpace
+from siq.workflow.training_step import TrainedRun
+
+UNCERTIFIED = {
+    "certified": False,
+    "tests": {},
+    "reason": "no certificate is computed for this method; the formula may belong to a false decomposition",
+}
+
+
+@dataclass(frozen=True, config=STRICT)
+class RegressSettings:
+    """What the regression depends on."""
+
+    space: StateSpace
+    sampling: Sampling
+    regression: RegressionOptions
+
+
+@plain_dataclass(frozen=True)
+class Regressed:
+    """The formulas of a run, None where there are none."""
+
+    formulas: SymbolicDecomposition | None
+    outcome: Outcome
+
+
+def run(settings: RegressSettings, recordings: Recordings | None, trained: TrainedRun) -> Regressed:
+    """Formulas of the networks of one run."""
+    number = trained.outcome.run
+    if trained.networks is None or recordings is None:
+        return Regressed(None, Outcome(number, Step.REGRESS, Status.SKIPPED, trained.missing))
+    try:
+        formulas, found = _regressed(settings, recordings, trained.networks)
+    except NumericalFailure as error:
+        return Regressed(None, Outcome(number, Step.REGRESS, Status.FAILED, str(error)))
+    status = Status.OK if found.converged else Status.WARNING
+    reason = "" if found.converged else f"SR3 did not settle in {found.iterations - 1} iterations"
+    return Regressed(formulas, Outcome(number, Step.REGRESS, status, reason, _quality(found)))
+
+
+def _regressed(
+    settings: RegressSettings, recordings: Recordings, networks: TrainedNetworks
+) -> tuple[SymbolicDecomposition, RegressionResult]:
+    options = settings.regression
+    points = snapshot_pairs(recordings, pair_step=settings.sampling.pair_step).x0
+    values = networks.evaluate(points)
+    below = points_below(values.potential, level=options.level)
+    library = candidate_library(
+        recordings.names,
+        degree=options.degree,
+        potential_degree=options.potential_degree,
+        circulatory_degree=options.circulatory_degree,
+        further=options.functions,
+    )
+    result = sparse_decomposition(
+        library,
+        points[below],
+        values.potential[below],
+        values.circulatory[below],
+        values.vector_field[below],
+        # D that nobody gave is that of the networks, in their precision.
+        diffusion=settings.space.constant_noise(points.shape[1]) or Diffusion(networks.diffusion),
+        options=options,
+    )
+    formulas = decomposition_from_coefficients(
+        library,
+        potential=result.potential,
+        circulatory=result.circulatory,
+        vector_field=result.vector_field,
+        points=points[below],
+    )
+    return formulas, result
+
+
+def _quality(result: RegressionResult) -> dict[str, Any]:
+    """What the regression says of itself, for the outcome."""
+    return {
+        "points": result.points,
+        "converged": result.converged,
+        "iterations": result.iterations,
+        "constraint_residual": result.constraint_residual,
+        "sparse_constraint_residual": result.sparse_constraint_residual,
+        "misfit": np.round(result.misfit, 12).tolist(),
+    }
+
+
+def write(regressed: Regressed, *, model: str | Path, outcome: str | Path) -> None:
+    """Write the formulas, as `model.json` has them, and what became of the step."""
+    models = {} if regressed.formulas is None else {str(Method.REGRESSION): regressed.formulas}
+    write_model(model, model_to_data(models, dict.fromkeys(models, UNCERTIFIED)))
+    write_outcomes(outcome, [regressed.outcome])

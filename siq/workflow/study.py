@@ -1,0 +1,473 @@
+"""Studies: what is asked, of which data, with which parameters at every step.
+
+A study (``config/studies/NAME.yaml``) is checked against this schema before any job starts; what it leaves
+out takes the schema's defaults. The options of a step stand beside the step (`siq.systems.simulation`,
+`siq.networks`, `siq.networks.regression`), so that neither can drift from the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from decimal import Decimal
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from siq.data.columns import read_heading, usable_name
+from siq.errors import InputError, suggestion
+from siq.inference.identification import IdentificationOptions
+from siq.inference.library import candidate_library
+from siq.inference.observation import velocity_names
+from siq.networks.options import TrainingOptions
+from siq.networks.regression import RegressionOptions
+from siq.numerics.files import read_document, validate
+from siq.quasipotential.certificate_tests import CertificateOptions
+from siq.quasipotential.landscape import LandscapeOptions
+from siq.quasipotential.refinement import RefinementOptions
+from siq.systems.cards import DiffusionEntry, Name, Number, SystemCard, build_system, read_diffusion
+from siq.systems.dynamics import Dynamics, symbol
+from siq.systems.equilibria import unreached_states
+from siq.systems.formulas import FormulaError
+from siq.systems.simulation import SimulationEntry, complete, fault_over_domain
+
+MOST_POINTS = 10_000  # values of one parameter, or of two together: a slip of the step would ask for more
+
+
+class SweptParameter(BaseModel):
+    """The values of one parameter.
+
+    Attributes
+    ----------
+    parameter
+        Name of a parameter of the card.
+    from, to, step
+        The first and the last value, and how far they are apart; in Python `first` and `last`.
+    values
+        The values one by one, in the place of these three.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
+
+    parameter: Name
+    first: Annotated[Number | None, Field(alias="from")] = None
+    last: Annotated[Number | None, Field(alias="to")] = None
+    step: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    values: Annotated[tuple[Number, ...], Field(min_length=1)] | None = None
+
+    @model_validator(mode="after")
+    def _said_once(self) -> SweptParameter:
+        ends = (self.first, self.last, self.step)
+        if self.values is not None and any(one is not None for one in ends):
+            raise ValueError("values are given twice; write either 'values' or 'from', 'to' and 'step'")
+        if self.values is None and any(one is None for one in ends):
+            raise ValueError(
+                f"the values of {self.parameter} are not known; write 'from', 'to' and 'step', or 'values'"
+            )
+        if self.first is not None and self.last is not None and not self.first < self.last:
+            raise ValueError("'from' does not lie below 'to'; exchange them")
+        if self.first is not None and self.last is not None and self.step is not None:
+            if self.step > self.last - self.first:
+                raise ValueError("the step is longer than the range; shorten it")
+            if (self.last - self.first) / self.step > MOST_POINTS:
+                raise ValueError(f"these are more than {MOST_POINTS} values; lengthen the step")
+        return self
+
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """The values in rising order, each as somebody would write it: 8.1, and not 8.100000000000001."""
+        if self.values is not None:
+            return tuple(sorted(set(self.values)))
+        first, last, step = (Decimal(repr(one)) for one in (self.first, self.last, self.step))
+        return tuple(float(first + k * step) for k in range(int((last - first) / step) + 1))
+
+
+class SweepOptions(SweptParameter):
+    """One parameter, or two for a map.
+
+    Attributes
+    ----------
+    second
+        A second parameter: then every value of the first one is combined with every value of this one, and
+        there is a map in the place of branches.
+    """
+
+    second: SweptParameter | None = None
+
+    @model_validator(mode="after")
+    def _two(self) -> SweepOptions:
+        if self.second is None:
+            return self
+        if self.second.parameter == self.parameter:
+            raise ValueError(f"'{self.parameter}' is swept twice; name another parameter as the second")
+        if len(self.numbers) * len(self.second.numbers) > MOST_POINTS:
+            raise ValueError(f"the map has more than {MOST_POINTS} points; lengthen a step")
+        return self
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the parameters."""
+        return (self.parameter,) if self.second is None else (self.parameter, self.second.parameter)
+
+    @property
+    def points(self) -> tuple[tuple[float, ...], ...]:
+        """The values of all parameters at every point."""
+        if self.second is None:
+            return tuple((one,) for one in self.numbers)
+        return tuple((one, other) for one in self.numbers for other in self.second.numbers)
+
+
+def point_name(names: tuple[str, ...], values: tuple[float, ...]) -> str:
+    """How the file of a point is called: ``K=8.1``, or ``K=8.1,h=0.5``."""
+    return ",".join(f"{name}={value:.12g}" for name, value in zip(names, values, strict=True))
+
+
+def point_values(name: str) -> tuple[tuple[str, ...], tuple[float, ...]]:
+    """Names and values of a point from the name of its file."""
+    parts = [one.partition("=") for one in name.split(",")]
+    return tuple(part[0] for part in parts), tuple(float(part[2]) for part in parts)
+
+
+Entrance = Literal["trajectories", "equations"]
+
+NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"
+
+
+class RecordingsOptions(BaseModel):
+    """Recordings in the place of a simulation.
+
+    Attributes
+    ----------
+    file
+        Parquet, CSV, HDF5, MATLAB or NumPy file with columns ``recording``, ``t`` and the states, or a
+        folder with one such file for each recording; a relative path starts from the folder of the study, or
+        else from the folder in which you work, or from the one that the environment variable
+        ``SIQ_RESOURCES`` names.
+    states
+        The columns that are states, in order, by their headings or by their names in formulas; by default the
+        system's, or all of the file's.
+    units
+        The unit of each state, and of the time as ``t``, where the file does not say; nothing is converted,
+        and another unit in the file is refused.
+    pair_step
+        Consecutive samples no further apart than this are pairs; by default those no further apart than
+        one and a half of their median distance, since what is longer is a gap.
+    diffusion
+        D, in the recordings' units, where no system gives it, in numbers or formulas of the states; by
+        default as the noise of the recordings shows it, or else the identity, which states of different units
+        refuse. See `siq.inference.field_estimate`.
+    integrator_step
+        Step of the Euler–Maruyama simulation that made the recordings, where one did: its increments are
+        those of a map, from which the continuous process is then found. Leave it out for measurements.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    file: str
+    states: Annotated[tuple[Name, ...], Field(min_length=1)] | None = None
+    units: dict[str, str] | None = None
+    pair_step: Annotated[float, Field(gt=0)] | None = None
+    diffusion: DiffusionEntry | None = None
+    integrator_step: Annotated[float, Field(gt=0)] | None = None
+
+    @field_validator("states", mode="before")
+    @classmethod
+    def _as_in_formulas(cls, states: object) -> object:
+        # Somebody who copies "bead x (µm)" from the file means the state that is called bead_x in formulas.
+        if not isinstance(states, list | tuple) or not all(isinstance(each, str) for each in states):
+            return states
+        return [
+            each if each in ("t", "recording") else usable_name(read_heading(each).title) for each in states
+        ]
+
+    @field_validator("states")
+    @classmethod
+    def _distinct(cls, states: tuple[str, ...] | None) -> tuple[str, ...] | None:
+        if states is not None and len(set(states)) < len(states):
+            raise ValueError("a state is named twice; name each once")
+        return states
+
+
+OF_TRAJECTORIES = (
+    "recordings", "runs", "published", "simulation", "identification", "regression", "training",
+    "beside_equations",
+)  # fmt: skip
+"""Keys of a study that equations have no use for."""
+
+
+class Study(BaseModel):
+    """The schema of a study.
+
+    Attributes
+    ----------
+    name
+        Names the folder of the results.
+    title
+        What the report is headed.
+    system
+        Name of a system card, or path of one. Simulated, unless there are recordings; then it only lends
+        its states, units, D and exact answers.
+    from
+        Where the landscape comes from, in Python `entrance`. ``trajectories``: recordings, or a simulation of
+        the system. ``equations``: the system's equations alone; nothing is simulated, identified or trained.
+    recordings
+        Measured trajectories in the place of a simulation.
+    runs
+        Number of independent runs: fresh initial states, or resampled recordings, and fresh networks. One
+        is an answer; what the answer varies by is seen in several.
+    seed
+        Seed of everything random.
+    published
+        Published figures to be set beside the results: name of a file in ``config/published``, or path of
+        one.
+    simulation, identification, regression, refinement, certificate
+        The parameters of the steps.
+    training
+        How two networks are trained; ``{}`` takes the defaults. Left out, no networks take part: V comes
+        from the local route alone, and the published regression of networks is not made.
+    invariant
+        Noise intensities ε for which the invariant distribution is computed, and simulated.
+    landscape
+        How the landscape is found: equilibria, a formula for each well, barriers, paths and escape times;
+        by default with the options' own defaults. ``false`` finds none, but for the run that
+        the page shows.
+    beside_equations
+        Whether the landscape of the card's own equations is found, too, and stands beside that of the
+        trajectories: barriers, prefactors and mean times. It scores, and is no input of the method.
+    sweep
+        A control parameter against which the landscape of equations is found, too, or two of them.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
+
+    name: str = Field(pattern=NAME)
+    title: str = ""
+    system: str | None = None
+    entrance: Annotated[Entrance, Field(alias="from")] = "trajectories"
+    recordings: RecordingsOptions | None = None
+    runs: Annotated[int, Field(ge=1, le=10_000)] = 1
+    seed: Annotated[int, Field(ge=0)] = 0
+    published: str | None = None
+    simulation: SimulationEntry = SimulationEntry()
+    identification: IdentificationOptions = IdentificationOptions()
+    training: TrainingOptions | None = None
+    regression: RegressionOptions = RegressionOptions()
+    refinement: RefinementOptions = RefinementOptions()
+    certificate: CertificateOptions = CertificateOptions()
+    invariant: tuple[Annotated[float, Field(gt=0)], ...] = ()
+    landscape: LandscapeOptions | None = LandscapeOptions()
+    beside_equations: bool = False
+    sweep: SweepOptions | None = None
+
+    @field_validator("training", "landscape", mode="before")
+    @classmethod
+    def _switched_off(cls, value: object) -> object:
+        return None if value is False else value
+
+    @field_validator("published")
+    @classmethod
+    def _plain_name(cls, value: str | None) -> str | None:
+        if value is None or value.endswith((".yaml", ".yml")):
+            return value
+        if not value.replace("-", "").replace("_", "").isalnum():
+            raise ValueError(f"'{value}' is no name of published figures; use letters, digits, '-' and '_'")
+        return value
+
+    @model_validator(mode="after")
+    def _has_data(self) -> Study:
+        if self.system is None and self.recordings is None:
+            raise ValueError("the study names no data; add 'system: NAME' or 'recordings: {file: ...}'")
+        if self.system is not None and self.recordings is not None and self.recordings.diffusion is not None:
+            raise ValueError("the diffusion is the system's; remove 'recordings.diffusion'")
+        if self.identification.hidden_velocities and (self.recordings is None or self.training is not None):
+            raise ValueError(
+                "'identification.hidden_velocities' is of recordings, and networks know recorded states only;"
+                " remove it, or give 'recordings' and leave 'training' out"
+            )
+        if self.training is None and "network" in (self.refinement.routes or ()):
+            raise ValueError(
+                "'refinement.routes' names the network route, but no networks are asked for; add"
+                " 'training: {}', or leave the routes out"
+            )
+        if self.beside_equations and (self.system is None or self.landscape is None):
+            remedy = "add 'system: NAME'" if self.system is None else "remove 'landscape: false'"
+            raise ValueError(
+                "'beside_equations' compares the landscape of every run with that of the equations, and one"
+                f" of both is missing; {remedy}, or remove it"
+            )
+        if self.entrance == "equations":
+            self._check_equations()
+        elif self.sweep is not None:
+            raise ValueError("'sweep' belongs to studies of equations; add 'from: equations', or remove it")
+        if self.simulation.pair_step is not None and self.simulation.interval is not None:
+            self.simulation.options()
+        return self
+
+    def _check_equations(self) -> None:
+        """Whether a study of equations asks for what only trajectories can give."""
+        if self.system is None:
+            raise ValueError("'from: equations' needs equations; add 'system: NAME'")
+        if self.landscape is None:
+            raise ValueError(
+                "'from: equations' finds a landscape and nothing else; remove 'landscape: false'"
+            )
+        for key in OF_TRAJECTORIES:
+            if getattr(self, key) != type(self).model_fields[key].get_default():
+                raise ValueError(
+                    f"'{key}' belongs to studies of trajectories; remove it, or 'from: equations'"
+                )
+
+
+def completed(study: Study, system: Dynamics | None) -> Study:
+    """A study with what follows from its system where it says nothing: how this is simulated."""
+    if system is None or study.recordings is not None or study.entrance == "equations":
+        return study
+    return study.model_copy(update={"simulation": complete(study.simulation, system)})
+
+
+def load_study(path: str | Path) -> Study:
+    """Read and check a study file.
+
+    Raises
+    ------
+    InputError
+        With the file, the line and the remedy, for whatever the schema refuses.
+    """
+    return validate(read_document(path), Study)
+
+
+def load_study_system(study: Study, *, file: str, systems: Path) -> Dynamics | None:
+    """The system of a study, checked together with what the study asks of it.
+
+    Parameters
+    ----------
+    study
+        The study.
+    file
+        Its file, for messages.
+    systems
+        Folder of the cards that studies name.
+
+    Raises
+    ------
+    InputError
+        When the card is missing or refused, inputs or the time drive the system, or the study's library or D
+        does not fit the states.
+    """
+    directly = study.entrance != "equations"
+    system = None
+    if study.system is not None:
+        system = _with_landscape(system_path(study.system, systems=systems), directly=directly)
+    states = system.states if system is not None else None
+    if study.recordings is not None and study.recordings.states is not None:
+        if system is not None and study.recordings.states != system.states:
+            raise InputError(
+                file, "recordings.states", f"the states are not those of the system '{system.name}'",
+                f"name {', '.join(system.states)}, in this order, or leave them out",
+            )  # fmt: skip
+        states = study.recordings.states
+    if states is not None:
+        check_states(study, states, file=file)
+    if study.sweep is not None and system is not None:
+        check_sweep(study.sweep, system, file=file)
+    return system
+
+
+def check_sweep(sweep: SweepOptions, system: Dynamics, *, file: str) -> None:
+    """Whether a system has the parameters that a study sweeps.
+
+    Raises
+    ------
+    InputError
+        When it has not.
+    """
+    known = [each.name for each in system.parameters]
+    places = ("sweep.parameter", "sweep.second.parameter")
+    for name, place in zip(sweep.names, places, strict=False):
+        if name not in known:
+            otherwise = f"use one of {', '.join(known)}" if known else "write it on the card as a parameter"
+            fault = f"the card of '{system.name}' has no parameter '{name}'"
+            raise InputError(file, place, fault, suggestion(name, known, otherwise=otherwise))
+
+
+def _with_landscape(path: Path, *, directly: bool) -> Dynamics:
+    """The system of a card that can be simulated by itself, and has a landscape that we can work out."""
+    document = read_document(path)
+    system = build_system(document, validate(document, SystemCard))
+    if (fault := fault_for_landscape(system, directly=directly)) is not None:
+        keys, what, remedy = fault
+        raise InputError(document.file, document.place(keys), what, remedy)
+    return system
+
+
+def fault_for_landscape(system: Dynamics, *, directly: bool) -> tuple[tuple[str, ...], str, str] | None:
+    """Why no landscape of a system can be worked out: the place in its card, the fault and the remedy.
+
+    Parameters
+    ----------
+    system
+        As its card says.
+    directly
+        Whether noise has to act on every state, as trajectories ask for, or may reach it by way of others.
+    """
+    if not system.autonomous:
+        key, what = ("inputs", "inputs") if system.inputs else ("equations", "time")
+        remedy = f"leave the {what} out, or use the card in a study of mismatch"
+        return (key,), "a driven system has no quasipotential", remedy
+    for name, limits in zip(system.states, system.limits, strict=True):
+        if np.isnan(limits).any():
+            what = f"the state '{name}' has no domain, in which a simulation could begin"
+            return ("states", name), what, "add 'domain: [lower, upper]' to it"
+    if directly and not system.diffusion.regular:
+        what = "the noise does not reach every state directly, as it has to where f comes from trajectories"
+        remedy = (
+            "give a positive definite matrix, or ask for the landscape of these equations: 'from: equations'"
+        )
+        return ("diffusion",), what, remedy
+    if still := unreached_states(system):
+        what = f"the noise does not reach {' and '.join(still)}, neither directly nor by way of other states"
+        return (
+            ("diffusion",),
+            what,
+            f"let it act on {still[0]} or on a state in its equation, or leave it out",
+        )
+    if (found := fault_over_domain(system)) is not None:
+        remedy = "choose a domain in which it has a value"
+        return ("equations", found[0]), f"the equation {found[1]}", remedy
+    return None
+
+
+def check_states(study: Study, states: Sequence[str], *, file: str) -> None:
+    """Check what a study says of its states, once these are known.
+
+    Raises
+    ------
+    InputError
+        When the library's functions or D do not fit the states.
+    """
+    try:
+        if study.recordings is not None and study.recordings.diffusion is not None:
+            noise = read_diffusion(study.recordings.diffusion, [symbol(name) for name in states], None)
+            if not noise.regular:
+                raise ValueError("the noise does not reach every state; give a positive definite matrix")
+    except ValueError as error:
+        fault, remedy = str(error).split("; ", 1)
+        raise InputError(file, "recordings.diffusion", fault, remedy) from None
+    for step, functions in (
+        ("identification", study.identification.functions),
+        ("regression", study.regression.functions),
+    ):
+        try:
+            hidden = step == "identification" and study.identification.hidden_velocities
+            known = (*states, *velocity_names(states)) if hidden else states
+            candidate_library(known, degree=1, further=functions)
+        except FormulaError as error:
+            raise InputError(file, f"{step}.functions", error.fault, error.remedy) from None
+
+
+def system_path(system: str, *, systems: Path) -> Path:
+    """The card that a study means: a path as it stands, a name within the folder of cards."""
+    if system.endswith((".yaml", ".yml")):
+        return Path(system)
+    return systems / f"{system}.yaml"

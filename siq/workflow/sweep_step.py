@@ -1,0 +1,706 @@
+"""The step that follows landscapes along control parameters.
+
+Equilibria, paths of least action and escape times by `siq.workflow.equations_step`, without formulas of U. A
+point knows of no noise and of no other point, so that a change of the range, or of the noise, leaves those
+that there are.
+
+Those on one stable stretch of a branch of equilibria that does not turn back. A stretch ends at a fold, at a
+Hopf point, and where branches meet.
+
+Along each row and each column of the map branches of equilibria are followed through those that its points
+know. What folds or begins to oscillate there is a point of a curve, which is followed through the plane
+(`siq.systems.bifurcation_curves`).
+
+Barriers and prefactors are those of the point; times and shares follow from them for a noise
+(`siq.quasipotential.rates`, `siq.quasipotential.invariant_density`).
+
+Points (`siq.workflow.sweep_step`) become tables here: equilibria are joined to branches by continuation
+(`siq.systems.continuation`), a well is a stable stretch of a branch, and its times and weights follow for a
+noise (`siq.workflow.sweep_step`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from dataclasses import dataclass as plain_dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+import sympy
+from pydantic import ConfigDict, TypeAdapter
+from pydantic.dataclasses import dataclass as pydantic_dataclass
+
+from siq.errors import InputError, NumericalFailure, suggestion
+from siq.numerics.files import read_document, validate, whole_file
+from siq.numerics.randomness import Purpose, generator
+from siq.quasipotential.invariant_density import shares_by_rates
+from siq.quasipotential.landscape import LandscapeOptions, NoLandscape
+from siq.quasipotential.rates import Exit, NoiseStrength, dwell_time
+from siq.quasipotential.transitions import Transition
+from siq.systems.bifurcation_curves import BifurcationCurve, CurveSeed, follow_curves
+from siq.systems.cards import ParameterEntry, SystemCard, build_system, load_system
+from siq.systems.continuation import Branch, Branches, ParameterFamily, follow_branches, place_on
+from siq.systems.dynamics import Dynamics
+from siq.systems.equilibria import all_equilibria
+from siq.systems.phase_portrait import MOST_SEARCHED, UNSETTLED
+from siq.workflow.equations_step import EquationSettings, landscape_of_equations, usable_system
+from siq.workflow.settings import STRICT
+from siq.workflow.study import SweepOptions
+from siq.workflow.tables import as_table, write_table
+
+PLAIN = ConfigDict(extra="forbid", ser_json_inf_nan="constants")
+
+
+@pydantic_dataclass(frozen=True, config=STRICT)
+class PointSettings:
+    """What a point depends on, beside the equations at its value."""
+
+    seed: int = 0
+
+
+@pydantic_dataclass(frozen=True, config=PLAIN)
+class SweptWell:
+    """An attractor at a point: its state, and the slowest rate at which f leads back to it."""
+
+    state: tuple[float, ...]
+    relaxation: float
+
+
+@pydantic_dataclass(frozen=True, config=PLAIN)
+class SweptWay:
+    """A way out: wells by their place, `end` None where it leads out of the domain; barrier and prefactor."""
+
+    start: int
+    end: int | None
+    barrier: float | None
+    prefactor: float | None
+    note: str = ""
+
+    def as_exit(self) -> Exit:
+        """What its time follows from."""
+        return Exit(np.nan if self.barrier is None else self.barrier, 0.0, self.prefactor)
+
+
+@pydantic_dataclass(frozen=True, config=PLAIN)
+class SweptPoint:
+    """The landscape at one value of the parameters.
+
+    Attributes
+    ----------
+    values
+        Of the parameters, in their order.
+    equilibria
+        All that were found, the unstable ones too.
+    wells, ways
+        Attractors and the ways out of them.
+    settled
+        Share of the states of the domain from which f leads to one of the wells.
+    reason
+        Why there is no landscape, in words; empty where there is one.
+    notes
+        What could not be done, in words.
+    """
+
+    values: tuple[float, ...]
+    equilibria: tuple[tuple[float, ...], ...]
+    wells: tuple[SweptWell, ...] = ()
+    ways: tuple[SweptWay, ...] = ()
+    settled: float = 0.0
+    reason: str = ""
+    notes: tuple[str, ...] = ()
+
+
+def check_noise(system: Dynamics, names: Iterable[str]) -> None:
+    """Refuse parameters on which D depends: a dynamics has it with their values inserted.
+
+    Raises
+    ------
+    InputError
+        With what to give instead.
+    """
+    if of_noise := sorted(set(names) & set(system.parameters_of_noise)):
+        raise InputError(
+            system.name or "the system", "diffusion",
+            f"D depends on {', '.join(of_noise)}, and was made with the value of the card",
+            "give the card instead of the dynamics",
+        )  # fmt: skip
+
+
+def with_parameters(system: str | Path | Dynamics, names: Sequence[str], values: Sequence[float]) -> Dynamics:
+    """A system with other values of some parameters, those in D included.
+
+    Raises
+    ------
+    InputError
+        Where the system has no landscape at these values.
+    """
+    changed = dict(zip(names, map(float, values), strict=True))
+    if not isinstance(system, Dynamics):
+        document = read_document(system)
+        card = validate(document, SystemCard)
+        entries = {
+            name: ParameterEntry(value=changed.get(name, entry.value), unit=entry.unit, fixed=entry.fixed)
+            for name, entry in card.parameters.items()
+        }
+        return usable_system(build_system(document, card.model_copy(update={"parameters": entries})))
+    replaced = np.array([changed.get(each.name, each.value) for each in system.parameters], dtype=float)
+    at_values = system.with_values(replaced)
+    for name, formula in zip(system.states, at_values.formulas, strict=True):
+        if formula.has(sympy.zoo, sympy.nan, sympy.oo):
+            raise InputError(
+                system.name or "the system", f"equations.{name}", f"the equation of {name} has no value",
+                "leave this value of the parameter out",
+            )  # fmt: skip
+    return usable_system(at_values)
+
+
+def point_at(
+    system: str | Path | Dynamics, names: Sequence[str], values: tuple[float, ...], settings: PointSettings
+) -> SweptPoint:
+    """The landscape at values of the parameters; where there is none, or f has no value, the reason."""
+    try:
+        system = with_parameters(system, names, values)
+    except InputError as error:
+        return SweptPoint(values, (), reason=f"{error.fault}; {error.remedy}")
+    try:
+        found = landscape_of_equations(system, EquationSettings(seed=settings.seed), formulas=False)
+    except (NumericalFailure, np.linalg.LinAlgError) as error:
+        reason = error.reason if isinstance(error, NoLandscape) else str(error)
+        return SweptPoint(values, _resting(system, settings), reason=reason)
+    return SweptPoint(
+        values,
+        tuple(tuple(map(float, one.position)) for one in found.equilibria),
+        tuple(
+            SweptWell(tuple(map(float, one.position)), float(-one.eigenvalues.real.max()))
+            for one in found.attractors
+        ),
+        tuple(map(_as_way, found.transitions)),
+        settled=float(found.basins.sum()),
+        notes=found.notes,
+    )
+
+
+def _resting(system: Dynamics, settings: PointSettings) -> tuple[tuple[float, ...], ...]:
+    """Equilibria where there is no landscape: a branch may pass through them all the same."""
+    if system.dimension > MOST_SEARCHED:
+        return ()
+    try:
+        draw = generator(settings.seed, Purpose.LANDSCAPE)
+        found = all_equilibria(system, generator=draw).equilibria
+    except (NumericalFailure, np.linalg.LinAlgError):
+        return ()
+    return tuple(tuple(map(float, one.position)) for one in found)
+
+
+def _as_way(way: Transition) -> SweptWay:
+    barrier = float(way.barrier) if np.isfinite(way.barrier) else None
+    prefactor = None if way.rate is None else float(way.rate.prefactor)
+    return SweptWay(way.start, way.end, barrier, prefactor, "; ".join(way.notes))
+
+
+def write_point(path: str | Path, point: SweptPoint) -> None:
+    """Write a point as JSON."""
+    with whole_file(path) as partial:
+        partial.write_bytes(TypeAdapter(SweptPoint).dump_json(point))
+
+
+def read_point(path: str | Path) -> SweptPoint:
+    """Read what `write_point` wrote."""
+    return TypeAdapter(SweptPoint).validate_json(Path(path).read_bytes())
+
+
+DIGITS = 10  # of positions in tables
+
+
+@dataclass(frozen=True)
+class Wells:
+    """Wells as stable stretches of branches.
+
+    Attributes
+    ----------
+    family
+        f against the parameter.
+    branches
+        Its equilibria.
+    number
+        For each branch the well that each of its points belongs to, -1 where it is unstable.
+    """
+
+    family: ParameterFamily
+    branches: Branches
+    number: tuple[np.ndarray, ...]
+
+    @classmethod
+    def along(cls, family: ParameterFamily, branches: Branches) -> Wells:
+        """Each stretch that is stable and does not turn back is a well, by the first states."""
+        stretches = []
+        for index, branch in enumerate(branches.branches):
+            kind = np.where(branch.unstable == 0, np.where(branch.tangents[:, -1] > 0, 1, -1), 0)
+            ends = [*(np.flatnonzero(np.diff(kind)) + 1), len(kind)]
+            starts = [0, *ends[:-1]]
+            stretches += [
+                (index, first, last) for first, last in zip(starts, ends, strict=True) if kind[first] != 0
+            ]
+
+        def place(stretch: tuple[int, int, int]) -> tuple[float, ...]:
+            index, first, last = stretch
+            branch = branches.branches[index]
+            at = np.argmin(branch.values[first:last]) + first
+            return tuple(np.round(branch.states[at], 6))
+
+        number = [np.full(len(branch.values), -1) for branch in branches.branches]
+        for well, (index, first, last) in enumerate(sorted(stretches, key=place)):
+            number[index][first:last] = well
+        return cls(family, branches, tuple(number))
+
+    def numbers(self, point: SweptPoint) -> tuple[int, ...]:
+        """Which wells the attractors of a point are; -1 for one that is on no branch."""
+        return tuple(self._number(np.array(well.state), point.values[0]) for well in point.wells)
+
+    def _number(self, state: np.ndarray, value: float) -> int:
+        z = self.family.shares(state[None], np.array([value]))[0]
+        for branch, number in zip(self.branches.branches, self.number, strict=True):
+            place = place_on(self.family, branch, z)
+            if place is not None:
+                return self._stable_beside(branch, number, place)
+        return -1
+
+    @staticmethod
+    def _stable_beside(branch: Branch, number: np.ndarray, place: int) -> int:
+        """Next to a fold the nearest point of the branch may lie behind it."""
+        beside = number[max(place - 1, 0) : place + 2]
+        return int(number[place]) if number[place] >= 0 else int(beside.max())
+
+    def branch_rows(self) -> list[dict[str, object]]:
+        """The table of branches."""
+        return [
+            {
+                "branch": index,
+                "well": int(number[k]),
+                "value": branch.values[k],
+                "position": position_text(branch.states[k]),
+                "unstable": int(branch.unstable[k]),
+                "growth": branch.eigenvalues[k, 0].real,
+                "frequency": abs(branch.eigenvalues[k, 0].imag),
+            }
+            for index, (branch, number) in enumerate(zip(self.branches.branches, self.number, strict=True))
+            for k in range(len(branch.values))
+        ]
+
+
+def bifurcation_rows(found: Branches) -> list[dict[str, object]]:
+    """The table of bifurcations."""
+    return [
+        {
+            "kind": one.kind,
+            "value": one.value,
+            "position": position_text(one.state),
+            "branch": one.branch,
+            "frequency": one.frequency,
+            "residual": one.residual,
+        }
+        for one in found.bifurcations
+    ]
+
+
+def position_text(state: np.ndarray | Sequence[float]) -> str:
+    """A state as tables have it."""
+    return str([float(f"{one:.{DIGITS}g}") for one in state])
+
+
+def curves_of_map(
+    system: Dynamics, names: tuple[str, ...], points: Sequence[SweptPoint]
+) -> list[BifurcationCurve]:
+    """Curves of folds and of Hopf points within the ranges of a map.
+
+    Parameters
+    ----------
+    system
+        The system at any of the points.
+    names
+        Of the two parameters.
+    points
+        Of the map. A curve that none of its rows and columns crosses is not found.
+
+    Returns
+    -------
+    list of BifurcationCurve
+        Empty where one of the parameters has a single value, and the map is a line.
+    """
+    values = np.array([point.values for point in points])
+    limits = list(zip(values.min(axis=0).tolist(), values.max(axis=0).tolist(), strict=True))
+    if any(low == high for low, high in limits):
+        return []
+    seeds = [
+        seed for along in range(len(names)) for seed in _seeds(system, names, points, limits[along], along)
+    ]
+    return follow_curves(system, dict(zip(names, limits, strict=True)), seeds)
+
+
+def _seeds(
+    system: Dynamics,
+    names: tuple[str, ...],
+    points: Sequence[SweptPoint],
+    limits: tuple[float, float],
+    along: int,
+) -> Iterator[CurveSeed]:
+    """Folds and Hopf points on all lines along one parameter."""
+    other = 1 - along
+    for value in sorted({point.values[other] for point in points}):
+        known = [
+            (point.values[along], np.array(one))
+            for point in points
+            if point.values[other] == value
+            for one in point.equilibria
+        ]
+        changed = [value if each.name == names[other] else each.value for each in system.parameters]
+        line = system.with_values(np.array(changed, dtype=float))
+        for one in follow_branches(line, names[along], limits, known).bifurcations:
+            if one.kind != "branch point":
+                place = np.array([one.value, value] if along == 0 else [value, one.value])
+                yield CurveSeed(one.kind, place, one.state)
+
+
+def curve_rows(curves: Sequence[BifurcationCurve]) -> list[dict[str, object]]:
+    """The table of curves, a row for each of their points."""
+    return [
+        {
+            "curve": index,
+            "kind": curve.kind,
+            "value": value,
+            "second_value": second,
+            "position": position_text(state),
+            "frequency": frequency,
+        }
+        for index, curve in enumerate(curves)
+        for (value, second), state, frequency in zip(
+            curve.values, curve.states, curve.frequencies, strict=True
+        )
+    ]
+
+
+def curve_notes(names: Sequence[str], curves: Sequence[BifurcationCurve]) -> list[str]:
+    """Which curves could not be followed to their ends, in words."""
+    return [
+        f"the curve of {curve_name(curve.kind)} through {names[0]} = {curve.values[0, 0]:g},"
+        f" {names[1]} = {curve.values[0, 1]:g} {curve.fault}"
+        for curve in curves
+        if curve.fault
+    ]
+
+
+def curve_name(kind: str) -> str:
+    """What lies along a curve."""
+    return "folds" if kind == "fold" else "Hopf points"
+
+
+ALONE = "it is the only stable state, and no way leads out of it"
+UNKNOWN = "no way out was found"
+
+
+def well_rows(point: SweptPoint, number: Sequence[int], noise: float | None) -> list[dict[str, object]]:
+    """One row for every well of a point; one that says why where there is none.
+
+    Parameters
+    ----------
+    point
+        What was found there.
+    number
+        Of each of its wells along their branches.
+    noise
+        ε; None for neither times nor weights.
+    """
+    if not point.wells:
+        return [_place(point) | {"well": -1, "noise": noise, "note": point.reason or "; ".join(point.notes)}]
+    weights = _weights(point, noise)
+    return [
+        _place(point)
+        | {"well": number[index], "attractor": position_text(well.state), "relaxation": well.relaxation}
+        | _exits(point, index, number, noise)
+        | {"noise": noise, "weight": weights[index]}
+        for index, well in enumerate(point.wells)
+    ]
+
+
+def way_rows(point: SweptPoint, number: Sequence[int]) -> list[dict[str, object]]:
+    """One row for every way out of a well, the arguments as `well_rows` has them."""
+    return [
+        _place(point)
+        | {
+            "well": number[way.start],
+            "exit": None if way.end is None else number[way.end],
+            "barrier": way.barrier,
+            "prefactor": way.prefactor,
+            "relaxation": point.wells[way.start].relaxation,
+            "note": way.note,
+        }
+        for way in point.ways
+    ]
+
+
+def _place(point: SweptPoint) -> dict[str, object]:
+    first, second = (*point.values, np.nan)[:2]
+    return {"value": first, "second_value": second}
+
+
+def _weights(point: SweptPoint, noise: float | None) -> np.ndarray:
+    """Shares of time in the long run; NaN where a rate is not known, or the noise is not below a barrier."""
+    count = len(point.wells)
+    between = [way for way in point.ways if way.end is not None]
+    known = noise is not None and all(way.barrier is not None and noise < way.barrier for way in between)
+    # What leads elsewhere has a share of the time, too.
+    if noise is None or not known or point.settled < 1 - UNSETTLED:
+        return np.full(count, np.nan)
+    if count == 1:
+        return np.ones(1)
+    listed = [
+        {"start": way.start, "end": way.end, "barrier": way.barrier, "prefactor": way.prefactor}
+        for way in between
+    ]
+    return shares_by_rates(listed, count, intensity=noise)
+
+
+def _exits(point: SweptPoint, index: int, number: Sequence[int], noise: float | None) -> dict[str, object]:
+    """The lowest way out of a well, and its time over all ways."""
+    mine = [way for way in point.ways if way.start == index]
+    known = [way for way in mine if way.barrier is not None]
+    if not known:
+        # Beside a limit cycle, or another well, it can be left although nobody knows how.
+        alone = len(point.wells) == 1 and not point.notes and not mine
+        told = "; ".join(dict.fromkeys(way.note for way in mine if way.note))
+        return {"note": ALONE if alone else told or "; ".join(point.notes) or UNKNOWN}
+    lowest = min(known, key=lambda way: np.inf if way.barrier is None else way.barrier)
+    notes = [way.note for way in mine if way.note]
+    time = dwell_time([way.as_exit() for way in mine], None if noise is None else NoiseStrength(noise))
+    if noise is not None and time is None:
+        notes.append(f"no time: the noise {noise:g} is not below the barrier, or the law has no prefactor")
+    if time is not None and not time.complete:
+        notes.append("a way out has no rate: the well lasts no longer than this")
+    return {
+        "barrier": lowest.barrier,
+        "exit": None if lowest.end is None else number[lowest.end],
+        "mean_time": np.nan if time is None else time.value,
+        "law_error": np.nan if time is None else time.law_error,
+        "note": "; ".join(dict.fromkeys(notes)),
+    }
+
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+MOST_PARAMETERS = 2
+
+
+@pydantic_dataclass(frozen=True, config=STRICT)
+class SweepSettings:
+    """What the tables of a sweep depend on, beside its points."""
+
+    sweep: SweepOptions
+    landscape: LandscapeOptions
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the parameters."""
+        return self.sweep.names
+
+    @property
+    def noise(self) -> float | None:
+        """ε, the first of those that the study gives."""
+        return next(iter(self.landscape.noise_intensities), None)
+
+
+@plain_dataclass(frozen=True, eq=False, repr=False)
+class Sweep:
+    """A landscape against one parameter, or two.
+
+    Attributes
+    ----------
+    parameters, states
+        Their names.
+    table
+        One row for every value and well: see ``sweep`` in `siq.workflow.tables`.
+    ways
+        One row for every value and way out of a well, barrier and prefactor; what
+        `siq.probability_of_tipping` reads.
+    branches
+        Equilibria along their branches, stable or not; empty for two parameters.
+    bifurcations
+        Folds, Hopf points and branch points; empty for two parameters.
+    notes
+        What could not be done, in words.
+    units
+        Of the states, by name; of the time as ``t``, and of the parameters by their names.
+    curves
+        Of two parameters, the curves of folds and of Hopf points in their plane, a row for each point; empty
+        for one.
+    """
+
+    parameters: tuple[str, ...]
+    states: tuple[str, ...]
+    table: pd.DataFrame
+    ways: pd.DataFrame
+    branches: pd.DataFrame
+    bifurcations: pd.DataFrame
+    notes: tuple[str, ...] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
+    curves: pd.DataFrame = field(default_factory=lambda: as_table("bifurcation_curves", []))
+
+    def plot(self) -> Figure:
+        """Equilibria, barriers and times against the parameter; of two, a map with its curves."""
+        from siq.report.plots.sweep import plot_sweep
+
+        return plot_sweep(
+            self.table, self.branches, self.bifurcations, parameters=self.parameters, states=self.states,
+            units=self.units, curves=self.curves,
+        )  # fmt: skip
+
+    def __repr__(self) -> str:
+        """One line."""
+        return f"<Sweep of {', '.join(self.parameters)}: {len(self.table.drop_duplicates('value'))} values>"
+
+
+def sweep(
+    system: str | Path | Dynamics,
+    parameter: str,
+    values: Sequence[float] | np.ndarray,
+    *,
+    second: tuple[str, Sequence[float] | np.ndarray] | None = None,
+    noise: float | None = None,
+    seed: int = 0,
+) -> Sweep:
+    """The landscape of equations against a parameter: equilibria, barriers, escape times and weights.
+
+    Parameters
+    ----------
+    system
+        A system card, or `siq.Dynamics` with its domain and parameters.
+    parameter
+        Name of the parameter.
+    values
+        Which values it takes, shape ``(n,)``.
+    second
+        Name and values of a second parameter, for a map.
+    noise
+        ε, in the unit of U; without it there are no times and no weights.
+    seed
+        Of the sequences of states that stand for the domain.
+
+    Returns
+    -------
+    Sweep
+        A value at which nothing was found has a row that says why.
+
+    Raises
+    ------
+    InputError
+        For a card that cannot be read, a system that has no landscape, and a parameter that is not there.
+
+    Examples
+    --------
+    >>> import sympy
+    >>> h, x = sympy.symbols("h x", real=True)
+    >>> cusp = Dynamics.of((x,), (h + x - x**3,), domain=[(-2, 2)], parameters={h: 0.0})
+    >>> found = sweep(cusp, "h", [0.0, 0.2, 0.5])
+    >>> found.table[["value", "well", "barrier", "exit"]].round(4)
+       value  well  barrier  exit
+    0    0.0     0   0.5000     1
+    1    0.0     1   0.5000     0
+    2    0.2     0   0.1634     1
+    3    0.2     1   0.9592     0
+    4    0.5     1      NaN  <NA>
+    >>> found.bifurcations[["kind", "value"]].round(6)
+       kind   value
+    0  fold  0.3849
+    """
+    named = {parameter: np.asarray(values, dtype=float)}
+    if second is not None:
+        named[second[0]] = np.asarray(second[1], dtype=float)
+    for name, given in named.items():
+        if given.ndim != 1 or not len(given) or not np.isfinite(given).all():
+            raise ValueError(f"the values of {name} have to be finite numbers, at least one")
+    base = system if isinstance(system, Dynamics) else load_system(system)
+    check_names(base, named)
+    if isinstance(system, Dynamics):
+        check_noise(system, named)
+    grid = np.stack(np.meshgrid(*named.values(), indexing="ij"), axis=-1).reshape(-1, len(named))
+    names, settings = tuple(named), PointSettings(seed)
+    points = [point_at(system, names, tuple(map(float, one)), settings) for one in grid]
+    return collected(base, names, points, noise=noise)
+
+
+def check_names(system: Dynamics, names: Iterable[str]) -> None:
+    """Refuse parameters that a system has not.
+
+    Raises
+    ------
+    InputError
+        With those that it has.
+    """
+    known = [each.name for each in system.parameters]
+    for name in names:
+        if name not in known:
+            otherwise = f"use one of {', '.join(known)}" if known else "make the number a parameter"
+            raise InputError(
+                system.name or "the system", "parameters", f"there is no parameter '{name}'",
+                suggestion(name, known, otherwise=otherwise),
+            )  # fmt: skip
+
+
+def write_tables(found: Sweep, files: Mapping[str, str | Path]) -> None:
+    """Write ``sweep``, ``sweep_ways``, ``branches``, ``bifurcations`` and ``bifurcation_curves``."""
+    tables = {
+        "sweep": found.table, "sweep_ways": found.ways, "branches": found.branches,
+        "bifurcations": found.bifurcations, "bifurcation_curves": found.curves,
+    }  # fmt: skip
+    for name, path in files.items():
+        write_table(path, tables[name])
+
+
+def collected(
+    system: Dynamics, names: tuple[str, ...], points: Sequence[SweptPoint], *, noise: float | None = None
+) -> Sweep:
+    """Tables of all points.
+
+    Parameters
+    ----------
+    system
+        The system at any of the points.
+    names
+        Of the one or two parameters.
+    points
+        In any order.
+    noise
+        ε; None for neither times nor weights.
+    """
+    points = sorted(points, key=lambda point: point.values)
+    notes: list[str] = []
+    branches: Branches | None = None
+    curves: list[BifurcationCurve] = []
+    values = [point.values[0] for point in points]
+    if len(names) == 1 and min(values) < max(values):
+        limits = (min(values), max(values))
+        seeds = [(point.values[0], np.array(one)) for point in points for one in point.equilibria]
+        branches = follow_branches(system, names[0], limits, seeds)
+        notes += branches.notes
+        wells = Wells.along(ParameterFamily(system, {names[0]: limits}), branches)
+        numbers = [wells.numbers(point) for point in points]
+    else:
+        numbers = [tuple(range(len(point.wells))) for point in points]
+    if len(names) == MOST_PARAMETERS:
+        curves = curves_of_map(system, names, points)
+        notes += curve_notes(names, curves)
+    rows, ways = [], []
+    for point, number in zip(points, numbers, strict=True):
+        rows += well_rows(point, number, noise)
+        ways += way_rows(point, number)
+    units = dict(zip(system.states, system.units, strict=True)) | {"t": system.time_unit}
+    units |= {each.name: each.unit for each in system.parameters if each.name in names}
+    return Sweep(
+        names, system.states, as_table("sweep", rows), as_table("sweep_ways", ways),
+        as_table("branches", [] if branches is None else wells.branch_rows()),
+        as_table("bifurcations", [] if branches is None else bifurcation_rows(branches)),
+        tuple(dict.fromkeys(notes)), units, as_table("bifurcation_curves", curve_rows(curves)),
+    )  # fmt: skip

@@ -1,0 +1,255 @@
+"""What is left beside a name: correlated errors, a function for both rivals, and parts that are left out."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from siq.data.recordings import Recordings
+from siq.diagnosis import naming
+from siq.diagnosis.evidence import Missing
+from siq.diagnosis.held_out_fit import first_better
+from siq.diagnosis.holdout import errors_left_out, parts_left_out
+from siq.diagnosis.naming import beside_a_remainder
+from siq.diagnosis.significance import correlation_time_of
+from siq.diagnosis.unnamed_models import Material, Model, runs_freely
+from siq.inference.kalman_filter import Whitened
+from siq.inference.measurements import Measurements, measurements
+from siq.inference.recalibration import recalibrate
+from siq.systems.diffusion import Diffusion
+from siq.systems.dynamics import Dynamics, Parameter, symbol
+
+DECAY = Dynamics(
+    ("x",),
+    (-symbol("k") * symbol("x"),),
+    Diffusion.identity(1),
+    parameters=(Parameter("k", 1.2),),
+    outputs=(("x", symbol("x")),),
+)
+
+
+def autoregressive(memory: float, shape: tuple[int, ...]) -> np.ndarray:
+    kicks = np.random.default_rng(7).normal(size=shape)
+    for before, now in itertools.pairwise(kicks):
+        now += memory * before
+    return kicks
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.5, 0.9])
+def test_the_correlation_time_is_that_of_all_recordings_and_outputs(memory: float) -> None:
+    series = autoregressive(memory, (200, 100, 2))  # samples, recordings, outputs
+    recording = np.repeat(np.arange(100), 400)
+    found = correlation_time_of(np.swapaxes(series, 0, 1).ravel(), recording, outputs=2)
+    # Up to where autocorrelations are those of noise: a little less than the whole sum.
+    assert found == pytest.approx((1 + memory) / (1 - memory), rel=0.1)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_white_errors_of_many_short_recordings_count_in_full(seed: int) -> None:
+    left = np.random.default_rng(seed).normal(size=40 * 30)
+    assert correlation_time_of(left, np.repeat(np.arange(30), 40), outputs=1) < 1.2
+
+
+def test_evidence_counts_errors_that_hang_together_as_one() -> None:
+    """Each error ten times over tells no more than once."""
+    draw = np.random.default_rng(3)
+    course = draw.uniform(-1, 1, size=300)
+    columns = np.stack([course, course**3], axis=1)
+    target = draw.normal(size=300) + columns @ [0.0, 3.0]
+
+    def evidence(times: int) -> float:
+        rows = np.repeat(np.arange(300), times)
+        white = Whitened(
+            target[rows], columns[rows], np.zeros(len(rows), dtype=int), np.ones(len(rows), dtype=bool),
+            len(rows), 0.0,
+        )  # fmt: skip
+        parameters = (Parameter("k", 0.0), Parameter("c", 0.0))
+        values = np.zeros(2)
+        fit = SimpleNamespace(
+            model=SimpleNamespace(free=(0, 1), parameters=parameters, values=values, outputs=("x",))
+        )
+        cubic = SimpleNamespace(amplitudes=("c",), shapes=())
+        return Missing(white, fit, [cubic]).log_evidence_of_mechanisms()
+
+    alone, repeated = evidence(1), evidence(10)
+    assert alone > 2
+    assert repeated == pytest.approx(alone, rel=0.25)
+
+
+def trial_of(fit: SimpleNamespace) -> SimpleNamespace:
+    candidate = SimpleNamespace(name="overflow", label="overflow in h", positive=frozenset())
+    return SimpleNamespace(fit=fit, candidate=candidate)
+
+
+def fit_of(evidence: float, *, forces: bool = False, dimension: int = 1) -> SimpleNamespace:
+    model = SimpleNamespace(dimension=dimension, parameters=(), free=())
+    return SimpleNamespace(evidence=evidence, has_process_noise=forces, model=model, noise=None)
+
+
+@pytest.mark.parametrize(
+    ("on_top", "instead", "pairs", "given", "foreseen"),
+    [
+        (30.0, 10.0, 20.0, True, 0.5),
+        # Another function in its place does as well, and so does one alone.
+        (30.0, 10.0, 30.0, False, 0.5),
+        (30.0, 27.0, 20.0, False, 0.5),
+        # Nothing is likelier on top of it than nothing; alone it is not likely enough.
+        (0.0, 10.0, 15.0, False, 0.5),
+        # Where the odds decide nothing, parts left out do: foreseen with it better, worse, or not at all.
+        (30.0, 10.0, 30.0, False, 2.0),
+        (30.0, 10.0, 30.0, False, None),
+    ],
+)
+def test_a_name_stands_beside_a_rest_where_no_function_does_as_well_in_its_place(
+    on_top: float,
+    instead: float,
+    pairs: float,
+    given: bool,
+    foreseen: float | None,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    own, base = fit_of(12.0), fit_of(0.0)
+    draw = np.random.default_rng(2)
+    known = {id(own): None if foreseen is None else squares(draw, foreseen)}
+    without = squares(draw, 1.0)
+    monkeypatch.setattr(naming, "errors_left_out", lambda fit, *_, **__: known.get(id(fit), without))
+    part = SimpleNamespace(cost=1.0)
+
+    def functions(parts: tuple, fit: SimpleNamespace, _: object) -> list[Model]:
+        if fit is own:
+            return [Model((part,), fit_of(on_top))] if on_top else []
+        return [Model((*parts, part), fit_of(pairs if parts else instead))]
+
+    monkeypatch.setattr(naming, "with_a_function", functions)
+    monkeypatch.setattr(naming, "runs_freely", lambda *_: True)
+    monkeypatch.setattr(naming, "correlation_time_left", lambda *_: 5.0)
+    monkeypatch.setattr(naming, "log_evidence_of", lambda fit, *_, **__: fit.evidence)
+    material = SimpleNamespace(data=None)
+    considered = [SimpleNamespace(name=name) for name in ("overflow", "overflow", "leak")]
+    found = beside_a_remainder(trial_of(own), base, material, considered=considered, unnamed=0.1, least=2.9)
+    # Each function costs what it was chosen among, and the probability that something has no name.
+    cost = 1.0 + np.log(10)
+    best = max(on_top - cost if on_top else 0.0, 12.0)
+    expected = best + np.log(0.9) - np.log(2 * 2) - max(instead - cost, pairs - 2 * cost)
+    assert found is not None and found.log_odds == pytest.approx(expected)
+    assert bool(found.log_odds >= np.log(19)) is given
+    undecided = abs(found.log_odds) < 2.9
+    # Functions on top of the mechanism foresee as badly as those in its place here.
+    assert found.foresees is (undecided and foreseen == 0.5)
+
+
+def test_what_random_forces_stand_in_for_has_no_model_beside_which_a_name_could_stand() -> None:
+    material = Material(SimpleNamespace(), SimpleNamespace(), 3, 10, 5)
+    for fit in (fit_of(50.0, forces=True), fit_of(50.0, dimension=2)):
+        assert (
+            beside_a_remainder(trial_of(fit), fit_of(0.0), material, considered=(), unnamed=0.1, least=2.9)
+            is None
+        )
+
+
+def decays(count: int, samples: int, *, rate: float = 1.0) -> Measurements:
+    draw = np.random.default_rng(5)
+    t = np.linspace(0, 2, samples)
+    x = np.concatenate([np.exp(-rate * t) * start for start in np.geomspace(0.5, 2.0, count)])
+    table = Recordings(
+        ("x",), (None,), tuple(f"r{place}" for place in range(count)), np.repeat(np.arange(count), samples),
+        np.tile(t, count), (x + 0.01 * draw.normal(size=len(x)))[:, None],
+    )  # fmt: skip
+    return measurements(table, DECAY)
+
+
+@pytest.mark.parametrize(("count", "samples", "parts"), [(1, 203, 4), (2, 20, 2), (7, 20, 4)])
+def test_every_row_is_left_out_once_and_never_fitted_then(count: int, samples: int, parts: int) -> None:
+    data = decays(count, samples)
+    seen = []
+    every = list(parts_left_out(data))
+    for part in every:
+        np.testing.assert_array_equal(part.rest.outputs, data.outputs[part.rows])
+        assert len(part.out.t) + len(part.rest.t) == len(data.t)
+        others = np.setdiff1d(np.arange(len(data.t)), part.rows)
+        np.testing.assert_array_equal(part.out.outputs, data.outputs[others])
+        assert part.out.first[-1] == len(part.out.t) and part.rest.first[-1] == len(part.rest.t)
+        # A stretch of time that was cut out is no gap that the rest runs across.
+        steps = [
+            np.diff(part.rest.t[a:b]) for a, b in zip(part.rest.first, part.rest.first[1:], strict=False)
+        ]
+        assert np.concatenate(steps).max() < 1.5 * (data.t[1] - data.t[0])
+        seen.append(others)
+    assert len(every) == parts
+    np.testing.assert_array_equal(np.sort(np.concatenate(seen)), np.arange(len(data.t)))
+
+
+def test_what_is_left_out_is_foreseen_up_to_noise_and_parameters_are_fitted_to_the_rest() -> None:
+    data = decays(4, 60)
+    fit, _ = recalibrate(DECAY, data)
+    squares = errors_left_out(fit, data, noise=fit.noise)
+    assert squares is not None and len(squares) > 150
+    right = np.sqrt(squares.mean())
+    # A fifth of each tells where it begins.
+    spread = np.array([part.out.outputs[12:].std() for part in parts_left_out(data)])
+    assert right == pytest.approx(np.sqrt(np.mean((0.01 / spread) ** 2)), rel=0.3)
+    # From wrong parameters it ends the same, since they are fitted again, but where they may not be.
+    off = replace(fit, model=fit.model.with_values(np.array([1.3])))
+    again = errors_left_out(off, data, noise=fit.noise)
+    assert again is not None and np.sqrt(again.mean()) == pytest.approx(right, rel=1e-3)
+    fixed = replace(off.model, parameters=(replace(off.model.parameters[0], fixed=True),))
+    wrong = errors_left_out(replace(off, model=fixed), data, noise=fit.noise)
+    assert wrong is not None and np.sqrt(wrong.mean()) > 2 * right
+
+
+def test_a_sign_that_cannot_be_is_nothing_where_the_rest_alone_would_have_it() -> None:
+    x = symbol("x")
+    faster = replace(
+        DECAY,
+        equations=(DECAY.equations[0] - symbol("c") * x**2,),
+        parameters=(*DECAY.parameters, Parameter("c", 0.1)),
+    )
+    fixed = replace(faster, parameters=(DECAY.parameters[0], Parameter("c", 0.0, fixed=True)))
+    data = decays(4, 60)
+    loses = SimpleNamespace(positive=frozenset({"c"}), amplitudes=("c",))
+    # A sensor that grows by its square bends a decay as a loss does, and one that falls short as a gain does.
+    for bend, bound in ((-0.1, True), (0.1, False)):
+        bent = replace(data, outputs=data.outputs + bend * data.outputs**2)
+        fit, _ = recalibrate(faster, bent)
+        free = errors_left_out(fit, bent, noise=fit.noise)
+        signed = errors_left_out(fit, bent, noise=fit.noise, candidates=[loses])
+        without = errors_left_out(replace(fit, model=fixed), bent, noise=fit.noise)
+        assert free is not None and signed is not None and without is not None
+        np.testing.assert_allclose(signed, without if bound else free, rtol=1e-3, atol=1e-9)
+        assert abs(free.mean() - without.mean()) > 0.01 * free.mean()
+
+
+def test_a_model_that_runs_away_from_where_it_is_held_is_none() -> None:
+    data = decays(2, 40)
+    fit, _ = recalibrate(DECAY, data)
+    steeper = replace(fit, model=fit.model.with_values(np.array([-40.0])))
+    assert runs_freely(fit, replace(fit, model=fit.model.with_values(np.array([1.3]))), data)
+    assert not runs_freely(steeper, fit, data)
+
+
+def squares(draw: np.random.Generator, size: float) -> np.ndarray:
+    return size * draw.chisquare(1, 400)
+
+
+@pytest.mark.parametrize(
+    ("without", "models", "certain", "place"),
+    [
+        (1.0, [0.95, 0.5, 0.1], False, 1),  # the first by more than chance, not the least
+        (1.0, [0.95], False, None),
+        (1.0, [0.95], True, 0),  # what is certain where it was found has to be better, by however little
+        (1.0, [1.2], True, None),
+        (1.0, [None, 0.5], False, 1),  # one that runs away is none
+        (None, [3.0], False, 0),  # without, it runs away
+        (1.0, [], False, None),
+    ],
+)
+def test_the_likeliest_model_that_foresees_better_is_adopted(
+    without: float | None, models: list, certain: bool, place: int | None
+) -> None:
+    draw = np.random.default_rng(1)
+    runs = [None if size is None else squares(draw, size) for size in (without, *models)]
+    assert first_better(runs[0], runs[1:], [runs[0].mean() if certain else 0.0] * len(models)) == place

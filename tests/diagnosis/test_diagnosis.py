@@ -1,0 +1,478 @@
+"""Verdicts on recordings of a driven oscillator whose truth is known."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+from tests.mismatch.foreign_cases import falling_ball
+
+from siq.diagnosis import held_out_fit, investigation, search
+from siq.diagnosis.diagnosis import Diagnosis, anything_else, solve_case, withdrawn
+from siq.diagnosis.dictionary import standard_dictionary
+from siq.diagnosis.held_out_fit import held_out_runs
+from siq.diagnosis.investigation import read_case
+from siq.diagnosis.naming import Naming
+from siq.diagnosis.options import MismatchVerdict
+from siq.diagnosis.residual_structure import Remainder
+from siq.diagnosis.screening import Probe
+from siq.diagnosis.search import Search
+from siq.diagnosis.significance import TriedMechanism
+from siq.diagnosis.unnamed_models import MECHANISM, Material, Model, Part
+from siq.errors import InputError, NumericalFailure
+from siq.inference.budget import Budget
+from siq.systems.cards import load_system
+from siq.systems.dynamics import Dynamics, Signals
+
+CARD = {
+    "name": "oscillator",
+    "time_unit": "s",
+    "states": {"x": {"unit": "m", "domain": [-2, 2]}, "v": {"unit": "m/s", "domain": [-4, 4]}},
+    "inputs": {"u": {"unit": "N", "interpolation": "linear"}},
+    "parameters": {
+        "k": {"value": 4.0, "unit": "N/m"},
+        "d": {"value": 0.3, "unit": "N*s/m"},
+        "m": {"value": 1.0, "unit": "kg", "fixed": True},
+    },
+    "equations": {"x": "v", "v": "(-k*x - d*v + u)/m"},
+    "outputs": {"x": "x"},
+}
+STEP, SAMPLES, FINE = 0.15, 120, 20
+Force = Callable[[np.ndarray, np.ndarray, float], np.ndarray]
+
+
+def recordings_of(
+    force: Force,
+    *,
+    count: int = 8,
+    noise: float = 0.01,
+    drive: float = 0.0,
+    fading: bool = False,
+    seed: int = 1,
+) -> pd.DataFrame:
+    """Driven oscillators of different strength, by Heun's rule; random forces may follow their motion."""
+    generator = np.random.default_rng(seed)
+    t = np.arange(SAMPLES) * STEP
+    strength = np.geomspace(0.4, 2.0, count)[:, None]
+    phase = generator.uniform(0, 2 * np.pi, size=(count, 4, 1))
+    omega = generator.uniform(0.8, 3.0, size=(count, 4, 1))
+    u = strength * np.cos(omega * t + phase).sum(axis=1)
+    state = np.stack([generator.normal(size=count) * 0.3, np.zeros(count)])
+    seen = np.empty((count, SAMPLES))
+    h = STEP / FINE
+
+    def rate(y: np.ndarray, now: float, at: float) -> np.ndarray:
+        left = np.minimum(int(at), SAMPLES - 2)
+        push = u[:, left] + (u[:, left + 1] - u[:, left]) * (at - left)
+        return np.stack([y[1], -4.0 * y[0] - 0.3 * y[1] + push + force(y[0], y[1], now)])
+
+    for sample in range(SAMPLES):
+        seen[:, sample] = state[0]
+        for part in range(FINE if sample + 1 < SAMPLES else 0):
+            at = sample + part / FINE
+            first = rate(state, at * STEP, at)
+            second = rate(state + h * first, at * STEP + h, at + 1 / FINE)
+            state = state + h / 2 * (first + second)
+            kick = np.sqrt(drive * h) * generator.normal(size=count)
+            state[1] += kick * np.hypot(*state) if fading else kick
+    size = noise * seen.std()
+    return pd.DataFrame(
+        {
+            "recording": np.repeat([f"r{index}" for index in range(count)], SAMPLES),
+            "t": np.tile(t, count),
+            "x": (seen + size * generator.normal(size=seen.shape)).ravel(),
+            "u": u.ravel(),
+        }
+    )
+
+
+def solved(folder: Path, table: pd.DataFrame, *, card: dict = CARD, study: dict | None = None) -> Diagnosis:
+    (folder / "system.yaml").write_text(yaml.safe_dump(card, sort_keys=False), encoding="utf-8")
+    (folder / "study.yaml").write_text(yaml.safe_dump(study or {"held_out": ["r2", "r5"]}), encoding="utf-8")
+    table.to_parquet(folder / "recordings.parquet")
+    case = read_case(folder / "system.yaml", folder / "recordings.parquet", folder / "study.yaml")
+    return solve_case(case)
+
+
+def nothing(x: np.ndarray, v: np.ndarray, t: float) -> np.ndarray:
+    return np.zeros_like(x)
+
+
+def said(diagnosis: Diagnosis) -> dict[str, Any]:
+    return diagnosis.statement.as_data()
+
+
+def names(diagnosis: Diagnosis) -> list[str]:
+    return [each["name"] for each in said(diagnosis)["mechanisms"]]
+
+
+def test_nothing_is_missing_and_what_could_be_is_bounded(tmp_path: Path) -> None:
+    diagnosis = solved(tmp_path, recordings_of(nothing))
+    assert said(diagnosis)["verdict"] == "no mismatch"
+    bound = said(diagnosis)["excluded"]["cubic stiffness in v"]
+    assert 0 < bound["upper_bound_95"] < 0.05 and bound["unit"] == "1/(m**2*s**2)"
+    assert said(diagnosis)["fit"]["augmented"] == pytest.approx(
+        said(diagnosis)["fit"]["noise_floor"], rel=0.3
+    )
+
+
+def test_a_noise_that_is_known_is_not_estimated(tmp_path: Path) -> None:
+    table = recordings_of(nothing)
+    # Of half the true size: then noise itself is more than the simulation explains.
+    for factor, verdict in ((1.0, "no mismatch"), (0.5, "unexplained")):
+        size = factor * 0.01 * table["x"].std()
+        diagnosis = solved(tmp_path, table, study={"held_out": ["r2", "r5"], "noise": {"x": float(size)}})
+        assert diagnosis.investigation.search.fit.noise.measurement == pytest.approx([size**2])
+        assert said(diagnosis)["verdict"] == verdict
+
+
+def test_wrong_parameters_are_no_missing_physics(tmp_path: Path) -> None:
+    card = {**CARD, "parameters": {**CARD["parameters"], "k": {"value": 3.4, "unit": "N/m"}}}
+    diagnosis = solved(tmp_path, recordings_of(nothing), card=card)
+    assert said(diagnosis)["verdict"] == "parameter shift"
+    shift = said(diagnosis)["recalibration"]["k"]
+    assert shift["before"] == 3.4
+    assert abs(shift["after"] - 4.0) < 3 * shift["standard_error"]
+
+
+def test_a_hardening_spring_is_named_measured_and_located(tmp_path: Path) -> None:
+    diagnosis = solved(tmp_path, recordings_of(lambda x, v, t: -0.6 * x**3))
+    verdict = said(diagnosis)
+    assert verdict["verdict"] == "missing physics" and names(diagnosis) == ["cubic stiffness"]
+    found = verdict["mechanisms"][0]
+    assert found["terms"] == {"v": "-c_1*x**3"} and found["indistinguishable_from"] == []
+    parameter = found["parameters"]["c_1"]
+    assert abs(parameter["estimate"] - 0.6) < 3 * parameter["standard_error"] < 0.06
+    assert list(verdict["location"]["equations"]) == ["v"] and verdict["location"]["coordinate"] == "x"
+    fit = verdict["fit"]
+    assert fit["augmented"] < 1.3 * fit["noise_floor"] < fit["recalibrated"] / 5
+    path = tmp_path / "augmented.yaml"
+    path.write_text(diagnosis.to_card(), encoding="utf-8")
+    assert "x**3" in str(load_system(path).equations[1])
+    json.dumps(verdict, allow_nan=False)
+
+
+def test_a_mechanism_that_is_not_certain_enough_is_described_but_not_named(tmp_path: Path) -> None:
+    table = recordings_of(lambda x, v, t: -0.03 * x**3)
+    study = {"held_out": ["r2", "r5"], "search": {"wrong_names": 1e-200}}
+    diagnosis = solved(tmp_path, table, study=study)
+    assert said(diagnosis)["verdict"] == "unexplained" and names(diagnosis) == []
+    assert said(diagnosis)["description"]["by"][0]["name"] == "cubic stiffness"
+    assert "a name takes odds of" in said(diagnosis)["remarks"][-1]
+    # It is in the new card all the same, since the card foresees more with it.
+    (part,) = said(diagnosis)["described"]
+    assert part["equations"] == ["v"] and part["coordinates"] == ["x"]
+    assert said(diagnosis)["fit"]["augmented"] < 0.9 * said(diagnosis)["fit"]["recalibrated"]
+
+
+def test_the_later_part_of_a_single_recording_is_not_called_independent(tmp_path: Path) -> None:
+    table = recordings_of(lambda x, v, t: -0.5 * x**3)
+    diagnosis = solved(tmp_path, table[table["recording"] == "r6"], study={"held_out": 0.3})
+    assert names(diagnosis) == ["cubic stiffness"]
+    assert "no independent recording" in said(diagnosis)["remarks"][-1]
+
+
+@pytest.mark.parametrize("drag", [0.005, 0.5])
+def test_drag_is_named_from_one_drop_of_45_heights(drag: float, tmp_path: Path) -> None:
+    """Free fall is off by a tenth, or by nearly all; random forces could explain any 45 heights."""
+    diagnosis = solve_case(falling_ball(drag).read(tmp_path))
+    (found,) = said(diagnosis)["mechanisms"]
+    assert found["name"] == "quadratic drag"
+    (parameter,) = found["parameters"].values()
+    assert abs(parameter["estimate"] - drag) < 3 * parameter["standard_error"]
+    # Random forces explain more than free fall alone, and drag without any explains more than they do.
+    said_of = {each["what"]: each["log_evidence"] for each in said(diagnosis)["explanations"]}
+    assert said_of["quadratic drag in w"] == 0
+    assert said_of["other parameters"] < said_of["other parameters and random forces"] < -10
+
+
+def test_dry_friction_is_told_from_other_friction(tmp_path: Path) -> None:
+    diagnosis = solved(tmp_path, recordings_of(lambda x, v, t: -0.25 * np.tanh(v / 1e-3)))
+    assert names(diagnosis) == ["dry friction"]
+    assert said(diagnosis)["mechanisms"][0]["parameters"]["c_1"]["estimate"] == pytest.approx(0.25, rel=0.05)
+
+
+def test_random_forces_are_no_mechanism_with_a_formula(tmp_path: Path) -> None:
+    # They drive the velocity, and the augmented card says so, though D is singular then.
+    diagnosis = solved(tmp_path, recordings_of(nothing, drive=0.05))
+    np.testing.assert_allclose(diagnosis.augmented.diffusion.matrix, np.diag([0, 0.05]), rtol=0.3)
+    path = tmp_path / "augmented.yaml"
+    path.write_text(diagnosis.to_card(), encoding="utf-8")
+    np.testing.assert_array_equal(load_system(path).diffusion.matrix, diagnosis.augmented.diffusion.matrix)
+    assert said(diagnosis)["verdict"] == "missing physics" and names(diagnosis) == ["process noise"]
+    intensity = said(diagnosis)["mechanisms"][0]["parameters"]["intensity_v"]["estimate"]
+    assert intensity == pytest.approx(0.05, rel=0.3)
+
+
+def test_random_forces_are_no_noise_where_a_function_beside_them_is_likelier(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def models(search: Search, _: Material) -> tuple[Model, ...]:
+        # A function of a sensor that leaves random forces, and is likelier than forces alone.
+        assert search.recalibrated.has_process_noise
+        candidate = next(each.candidate for each, _ in search.screened if not each.candidate.equations)
+        part = Part(TriedMechanism(candidate, search.recalibrated, 50.0, 40.0, 0.0, 0.0), MECHANISM, 0.0)
+        return (Model((part,), search.recalibrated, 5.0),)
+
+    monkeypatch.setattr(investigation, "models_of_the_nameless", models)
+    monkeypatch.setattr(held_out_fit, "first_better", lambda *_: None)
+    diagnosis = solved(tmp_path, recordings_of(nothing, drive=0.05, count=4), study={"held_out": ["r2"]})
+    assert said(diagnosis)["verdict"] == "unexplained" and names(diagnosis) == []
+    # It is located where the likeliest function stands.
+    place = said(diagnosis)["location"]
+    assert place["outputs"] == ["x"] and place["coordinate"] == "measurement" and not place["equations"]
+
+
+def test_random_forces_that_follow_the_motion_are_not_those_of_surroundings(tmp_path: Path) -> None:
+    diagnosis = solved(tmp_path, recordings_of(nothing, count=6, drive=0.03, fading=True))
+    assert said(diagnosis)["verdict"] == "unexplained"
+    assert any("hidden state" in remark for remark in said(diagnosis)["remarks"])
+    # No function foresees them: the card stays as it was, and this is said.
+    assert said(diagnosis)["described"] == []
+    assert "the simulation stays as it was" in said(diagnosis)["sentence"]
+
+
+def test_unequal_friction_is_found_though_its_first_fit_may_lead_nowhere(tmp_path: Path) -> None:
+    def force(x: np.ndarray, v: np.ndarray, t: float) -> np.ndarray:
+        return -np.where(v > 0, 0.25, 0.1) * np.tanh(v / 1e-3)
+
+    diagnosis = solved(tmp_path, recordings_of(force, noise=0.03))
+    assert names(diagnosis) == ["asymmetric friction"]
+    assert diagnosis.investigation.search.fit.substeps > 12  # the jump was made sharp enough
+
+
+def test_random_forces_stand_for_no_jump_that_is_spread_too_far(tmp_path: Path) -> None:
+    def force(x: np.ndarray, v: np.ndarray, t: float) -> np.ndarray:
+        return -(0.1 + 0.25 * np.exp(-((v / 0.6) ** 2))) * np.tanh(v / 1e-3)
+
+    diagnosis = solved(tmp_path, recordings_of(force, noise=0.003))
+    assert names(diagnosis) == ["Stribeck friction"]
+    assert not diagnosis.investigation.search.fit.has_process_noise
+
+
+@pytest.mark.slow
+def test_a_function_of_a_sensor_is_located_in_what_is_measured(tmp_path: Path) -> None:
+    table = recordings_of(nothing, count=4)
+    table["x"] += 0.15 * np.exp(-(((table["x"] - 0.3) / 0.2) ** 2))
+    diagnosis = solved(tmp_path, table, study={"held_out": ["r2"]})
+    place = said(diagnosis)["location"]
+    assert said(diagnosis)["verdict"] == "unexplained"
+    assert place["outputs"] == ["x"] and place["coordinate"] == "measurement" and not place["equations"]
+    assert said(diagnosis)["described"][0]["outputs"] == ["x"]
+
+
+def test_what_the_dictionary_lacks_stays_unexplained(tmp_path: Path) -> None:
+    diagnosis = solved(tmp_path, recordings_of(lambda x, v, t: 1.5 * np.exp(-(((x - 0.5) / 0.15) ** 2))))
+    assert said(diagnosis)["verdict"] == "unexplained" and said(diagnosis)["mechanisms"] == []
+    assert said(diagnosis)["location"]["coordinate"] == "x"
+    # And gets a model: its function of x, which foresees recordings that had no part in it.
+    part = said(diagnosis)["described"][0]
+    assert part["kind"] == "curve" and part["equations"] == ["v"] and part["coordinates"] == ["x"]
+    assert said(diagnosis)["fit"]["augmented"] < 0.5 * said(diagnosis)["fit"]["recalibrated"]
+    assert " it. With it, the error on held-out recordings falls from" in said(diagnosis)["sentence"]
+    path = tmp_path / "augmented.yaml"
+    path.write_text(diagnosis.to_card(), encoding="utf-8")
+    again = load_system(path)
+    at = np.linspace(-1.5, 1.5, 61)
+    states = np.stack([at, np.zeros_like(at)])
+    before = diagnosis.recalibrated
+    signals = Signals(np.zeros((1, 61)), np.zeros((0, 61)), np.zeros((0, 61)), at)
+    missing = again.functions.rates(states, signals, again.values)[1]
+    missing = missing - before.functions.rates(states, signals, before.values)[1]
+    assert abs(at[np.argmax(missing)] - 0.5) <= 0.1
+
+
+def test_what_a_name_leaves_is_described_and_no_sample_of_a_test_chooses_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def the_first_alone(whole: Search, left: list[Remainder], *_: Any, **__: Any) -> Naming:
+        first = replace(whole, found=whole.found[:1], fit=whole.found[0].best.fit)
+        return Naming(first, left[0], (9.0,), 9.0, None, convincing=True, likely=True)
+
+    monkeypatch.setattr("siq.diagnosis.naming.naming_of", the_first_alone)
+    table = recordings_of(lambda x, v, t: -2.0 * x**3 - 0.1 * v * np.abs(v), count=6)
+    study = {"held_out": ["r2", "r4"], "tests": ["r2", "r4"], "search": {"mechanisms": 2}}
+    diagnosis = solved(tmp_path, table, study=study)
+    verdict = said(diagnosis)
+    assert verdict["verdict"] == "missing physics" and names(diagnosis) == ["cubic stiffness"]
+    (part,) = verdict["described"]
+    assert part["kind"] == "mechanism" and part["equations"] == ["v"] and "v" in part["coordinates"]
+    assert part["beside"] == [verdict["mechanisms"][0]["label"]]
+    # The card has both, and its error is shown beside that of the name alone.
+    assert verdict["fit"]["augmented"] < verdict["fit"]["named"] < verdict["fit"]["recalibrated"]
+    assert set(part["parameters"]) <= {entry.name for entry in diagnosis.augmented.parameters}
+    assert f"What is left has no name; {part['name']} in the equation of v desc" in verdict["sentence"]
+    # Whatever stands in the tests, the card is the same.
+    case = diagnosis.case
+    other = replace(case.kept, outputs=case.kept.outputs[::-1] + 0.3)
+    again = held_out_runs(diagnosis.investigation, case.learn, other, certain=3.0, tests=study["tests"])
+    assert again.model == diagnosis.held_out.model
+    assert again.errors.augmented != diagnosis.held_out.errors.augmented
+
+
+def test_a_bias_and_an_offset_of_the_sensor_are_one_class(tmp_path: Path) -> None:
+    diagnosis = solved(tmp_path, recordings_of(lambda x, v, t: np.full_like(x, 0.4)))
+    first = said(diagnosis)["mechanisms"][0]
+    assert {first["name"], *first["indistinguishable_from"]} == {"constant bias", "sensor gain or offset"}
+
+
+def test_units_and_order_change_nothing_but_numbers(tmp_path: Path) -> None:
+    table = recordings_of(lambda x, v, t: -0.5 * np.abs(v) * v)
+    metres = solved(tmp_path, table)
+    shuffled = pd.concat([part for _, part in list(table.groupby("recording"))[::-1]])
+    shuffled["x"] *= 1000
+    card = json.loads(json.dumps(CARD))
+    card["states"] = {
+        "x": {"unit": "mm", "domain": [-2e3, 2e3]},
+        "v": {"unit": "mm/s", "domain": [-4e3, 4e3]},
+    }
+    card["equations"]["v"] = "(-k*x - d*v + 1000*u)/m"
+    millimetres = solved(tmp_path, shuffled, card=card)
+    assert names(metres) == names(millimetres) == ["quadratic drag"]
+    ours, theirs = (said(each)["mechanisms"][0]["parameters"]["c_1"] for each in (metres, millimetres))
+    assert theirs["estimate"] == pytest.approx(ours["estimate"] / 1000, rel=1e-3)
+    assert (ours["unit"], theirs["unit"]) == ("1/m", "1/mm")
+
+
+def test_domains_that_a_card_does_not_give_are_those_of_the_recordings(tmp_path: Path) -> None:
+    table = recordings_of(nothing, count=4)
+    known = {**CARD, "states": {"x": {"unit": "m", "domain": [-1, 1]}, "v": {"unit": "m/s"}}}
+    diagnosis = solved(tmp_path, table, card=known, study={"held_out": ["r2"]})
+    assert diagnosis.verdict == "no mismatch"
+    learned = diagnosis.investigation.final.x
+    np.testing.assert_array_equal(diagnosis.augmented.domain[0], [-1, 1])  # as declared
+    np.testing.assert_array_equal(diagnosis.augmented.domain[1], [learned[:, 1].min(), learned[:, 1].max()])
+    assert np.isnan(diagnosis.case.system.limits[1]).all()
+
+
+@pytest.mark.parametrize(
+    "equation",
+    [
+        "(-k*x + u)/m + 60*v",  # unstable: exp(60 · 0.15) from sample to sample, then beyond all numbers
+        "(-k*x - d*v + u)/m + 1e-3*exp(400*x)",
+        "(-k*x - d*v + u)/m + sqrt(x)",
+    ],
+)
+def test_a_simulation_that_runs_away_is_told_as_such(equation: str, tmp_path: Path) -> None:
+    card = {**CARD, "equations": {"x": "v", "v": equation}}
+    with pytest.raises(NumericalFailure, match="cannot be fitted to the recordings: "):
+        solved(tmp_path, recordings_of(nothing, count=3), card=card, study={"held_out": ["r2"]})
+
+
+def test_a_mechanism_that_overflows_ends_itself_and_not_the_diagnosis(tmp_path: Path) -> None:
+    further = [
+        {
+            "name": name,
+            "sentence": "It grows beyond all numbers.",
+            "forms": [
+                {
+                    "roles": {"x": "position", "v": "velocity"},
+                    "terms": {"v": term},
+                    "parameters": {"c": {}},
+                    "coordinate": "x",
+                }
+            ],
+        }
+        for name, term in (("explosion", "c*exp(1000*x)"), ("chain", "c*exp(exp(30*x))"))
+    ]
+    kept = {"cubic stiffness", "dry friction"}
+    without = [each.name for each in standard_dictionary() if each.name not in kept]
+    study = {"held_out": ["r2"], "mechanisms": further, "without": without}
+    diagnosis = solved(tmp_path, recordings_of(lambda x, v, t: -0.6 * x**3, count=4), study=study)
+    assert names(diagnosis) == ["cubic stiffness"]
+    assert "explosion" in {each.mechanism for each in diagnosis.statement.not_fitted}
+    assert all(each.reason for each in diagnosis.statement.not_fitted)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        ValueError("array must not contain infs or NaNs"),
+        *[
+            pytest.param(one, marks=pytest.mark.slow)
+            for one in (ZeroDivisionError(), FloatingPointError(), np.linalg.LinAlgError("SVD"))
+        ],
+    ],
+)
+def test_a_candidate_whose_fit_fails_unforeseen_is_recorded_with_the_reason(
+    error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    right = search.with_start
+
+    def failing(probe: Probe, *further: Any) -> Dynamics:
+        if probe.candidate.name == "cubic stiffness":
+            raise error
+        return right(probe, *further)
+
+    monkeypatch.setattr(search, "with_start", failing)
+    kept = {"cubic stiffness", "quintic stiffness"}
+    without = [each.name for each in standard_dictionary() if each.name not in kept]
+    study = {"held_out": ["r2"], "without": without}
+    diagnosis = solved(tmp_path, recordings_of(lambda x, v, t: -0.6 * x**3, count=4), study=study)
+    (failed,) = (each for each in diagnosis.statement.not_fitted if each.mechanism == "cubic stiffness")
+    assert type(error).__name__ in failed.reason and str(error) in failed.reason
+
+
+@pytest.mark.parametrize(
+    ("study", "message"),
+    [
+        ({"held_out": ["r9"]}, "no recording is called 'r9'"),
+        ({"held_out": [f"r{index}" for index in range(8)]}, "one side of the split is empty"),
+        ({"held_out": ["r2"], "tests": ["r3"]}, "the recording 'r3' is not held out"),
+        ({"without": ["friction"]}, "no mechanism is called 'friction'"),
+        ({"noise": {"v": 0.1}}, "'v' is no output"),
+        ({"held_oud": 0.2}, "perhaps you meant 'held_out'"),
+    ],
+)
+def test_a_study_that_cannot_be_used_is_refused_in_a_sentence(
+    study: dict, message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        solved(tmp_path, recordings_of(nothing), study=study)
+    assert "study.yaml" in str(caught.value)
+
+
+def test_a_missing_column_is_told(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="u"):
+        solved(tmp_path, recordings_of(nothing).drop(columns="u"))
+
+
+def test_a_name_that_misleads_on_recordings_held_out_is_withdrawn(tmp_path: Path) -> None:
+    def tilted(x: np.ndarray, v: np.ndarray, t: float) -> np.ndarray:
+        return np.where(np.arange(len(x)) % 4 == 2, 0.0, 0.4)  # r2 and r6 are level
+
+    table = recordings_of(tilted)
+    diagnosis = solved(tmp_path, table, study={"held_out": ["r2", "r6"]})
+    verdict = said(diagnosis)
+    assert verdict["verdict"] == "unexplained" and names(diagnosis) == []
+    assert verdict["description"]["misleading"] and verdict["description"]["by"][0]["name"] == "constant bias"
+    assert "looks like a constant bias in the equation of v" in verdict["sentence"]
+    assert "but recordings held out are foreseen worse with that" in verdict["sentence"]
+    assert any("stands in for something else" in line for line in verdict["words"]["left"])
+    # Nothing that was found is put into the card that would make it worse.
+    assert verdict["described"] == [] and verdict["fit"]["before"] < verdict["fit"]["augmented"]
+    # Held out otherwise, the same recordings show the bias and nothing against it.
+    diagnosis = solved(tmp_path, table[~table["recording"].isin(["r2", "r6"])], study={"held_out": ["r1"]})
+    assert said(diagnosis)["verdict"] == "missing physics"
+
+
+def test_where_nothing_speaks_of_a_mismatch_but_a_refuted_name_there_is_none(tmp_path: Path) -> None:
+    diagnosis = solved(tmp_path, recordings_of(nothing))
+    found = diagnosis.investigation
+    assert said(diagnosis)["verdict"] == "no mismatch"
+    refuted = replace(found, verdict=MismatchVerdict.MISSING_PHYSICS)
+    again = withdrawn(refuted, diagnosis.case, Budget())
+    assert str(again.verdict) == "no mismatch" and not again.withdrawn and not again.search.found
+    assert "nothing else speaks of a mismatch" in again.remarks[-1]
+    # Random forces that are needed speak of one by themselves.
+    fit = found.search.recalibrated
+    forced = replace(fit, noise=replace(fit.noise, process=np.array([0.0, 1e-3])))
+    search = replace(found.search, recalibrated=forced)
+    assert anything_else(replace(refuted, search=search), (), diagnosis.case)

@@ -1,0 +1,280 @@
+"""The dictionary as physics: where entries apply, what is no candidate, and that each is found at home."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+import pytest
+import sympy
+from homes_of_mechanisms import HOMES, RESIDENTS, model_of, numbers, recorded, states, truth_of
+
+from siq.diagnosis.dictionary import Mechanism, Shape, roles_of, standard_dictionary
+from siq.diagnosis.mechanisms import (
+    MechanismCandidate,
+    candidates_of,
+    generic_candidates,
+    lattice_step,
+    places_of,
+    plateau,
+)
+from siq.diagnosis.options import SearchOptions
+from siq.diagnosis.screening import screen_all
+from siq.inference.recalibration import recalibrate
+from siq.systems.dynamics import Dynamics, without_teeth
+
+OSCILLATOR = {
+    "time_unit": "s",
+    "states": states(x="m", v="m/s"),
+    "inputs": {"u": {"unit": "N"}},
+    "outputs": {"x": "x"},
+}
+
+
+@cache
+def dictionary() -> tuple[Mechanism, ...]:
+    return standard_dictionary()
+
+
+def candidates(model: Dynamics) -> Sequence[MechanismCandidate]:
+    return candidates_of(model, roles_of(model), dictionary())
+
+
+def names(model: Dynamics) -> set[str]:
+    return {each.name for each in candidates(model)}
+
+
+def oscillator(equation: str, **parameters: float) -> Dynamics:
+    return model_of(
+        {**OSCILLATOR, "parameters": numbers(**parameters), "equations": {"x": "v", "v": equation}}
+    )
+
+
+# What the file says
+
+
+def test_entries_refer_to_entries_and_to_sources() -> None:
+    known = {each.name for each in dictionary()}
+    for each in dictionary():
+        assert {*each.look_alikes, *each.generalises} <= known - {each.name}, each.name
+        assert re.search(r"\b(1[67]\d\d|1[89]\d\d|20\d\d)\b", each.reference), each.name
+        assert each.sentence.endswith("."), each.name
+
+
+def test_every_parameter_is_used() -> None:
+    for each in dictionary():
+        for form in each.forms:
+            within = [text for texts in form.within.values() for text in texts.values()]
+            further = [text for state in form.states.values() for text in (state.equation,)]
+            texts = [*form.terms.values(), *form.replace.values(), *form.outputs.values(), *within, *further]
+            used = set(re.findall(r"\w+", " ".join(map(str, texts))))
+            assert set(form.parameters) <= used, each.name
+
+
+def test_every_form_has_a_home() -> None:
+    at_home = {resident.name for resident in RESIDENTS}
+    assert at_home == {each.name for each in dictionary()} - {"process noise"}
+
+
+# Where entries apply
+
+
+def test_angles_are_told_from_displacements() -> None:
+    assert roles_of(HOMES["pendulum"].model).angles == ("q",)
+    assert roles_of(HOMES["mass"].model).angles == ()
+    by_sine = model_of({"states": states(a="1", w="1"), "equations": {"a": "w", "w": "-sin(a)"}})
+    assert roles_of(by_sine).angles == ("a",)
+
+
+def test_who_feeds_on_whom_follows_from_the_meetings() -> None:
+    assert roles_of(HOMES["prey and predator"].model).feeding == (("n", "p"),)
+    rivals = model_of({"states": states(n="1", m="1"), "equations": {"n": "n - n*m", "m": "m - 2*n*m"}})
+    assert roles_of(rivals).feeding == () and roles_of(rivals).populations == ("n", "m")
+
+
+def test_a_store_has_a_unit() -> None:
+    assert roles_of(HOMES["heat"].model).stores == ("s", "r")
+    bare = model_of({"states": states(s="1", r="1"), "equations": {"s": "1 - s", "r": "0.2*(s - r) + 1"}})
+    assert roles_of(bare).stores == ()
+
+
+@pytest.mark.parametrize(
+    ("home", "strangers"),
+    [
+        ("mass", {"gravity", "moment of inertia", "overflow", "mortality", "harvest", "Allee effect",
+                  "decay or leakage", "delayed response", "linear coupling", "prey refuge"}),
+        ("pendulum", {"added mass", "preload", "geometric stiffness", "input delay", "clock offset and drift",
+                      "saturation", "overflow"}),
+        ("rotating frame", {"dry friction in a", "backlash", "decay or leakage", "mortality", "overflow",
+                            "hysteresis", "added mass"}),
+        ("crop", {"prey refuge", "sigmoid functional response", "predator interference", "delayed response",
+                  "overflow", "linear damping", "clock offset and drift"}),
+        ("heat", {"overflow", "mortality", "harvest", "linear damping", "linear stiffness", "gravity"}),
+        ("two tanks", {"decay or leakage", "mortality", "linear damping", "dry friction", "gravity"}),
+    ],
+)  # fmt: skip
+def test_no_entry_is_tried_where_it_makes_no_sense(home: str, strangers: set[str]) -> None:
+    assert not names(HOMES[home].model) & strangers
+
+
+# What a free parameter can do is no candidate
+
+
+@pytest.mark.parametrize(
+    ("equation", "parameters"),
+    [
+        ("-k*x - d*v + u", {"k": 4.0, "d": 0.3}),
+        ("(-k*x - d*v + u)/m", {"k": 4.0, "d": 0.3, "m_": 2.0}),
+        ("u - r**2*x - 2*z*r*v", {"r": 2.0, "z": 0.1}),  # a frequency and a damping ratio
+        ("u - k*x - k*d*v", {"k": 4.0, "d": 0.0}),  # that happens to be zero
+        ("u - (k + d)*(x + v) + d*x", {"k": 4.0, "d": 0.3}),  # in combinations only
+    ],
+)
+def test_linear_damping_and_stiffness_are_no_mechanisms_beside_free_parameters_like_them(
+    equation: str, parameters: dict[str, float]
+) -> None:
+    assert not {"linear damping", "linear stiffness"} & names(oscillator(equation, **parameters))
+
+
+def test_they_are_where_the_parameter_is_fixed_or_missing() -> None:
+    assert "linear damping" in names(oscillator("u - k*x - d*v", k=4.0, d_=0.3))
+    assert "linear damping" in names(oscillator("u - k*x", k=4.0))
+    assert "linear stiffness" in names(oscillator("u - d*v", d=0.3))
+    # One parameter that turns both up together does not stand for either of them.
+    assert {"linear damping", "linear stiffness"} <= names(oscillator("u - k*(x + v)", k=4.0))
+
+
+def test_it_is_the_formula_that_counts_and_not_the_sign_of_what_was_recorded() -> None:
+    # On positive speeds alone v² could not be told from |v| v.
+    assert "quadratic drag" in names(oscillator("u - k*x - q*v**2", k=4.0, q=0.1))
+    assert "quadratic drag" not in names(oscillator("u - k*x - q*v*Abs(v)", k=4.0, q=0.1))
+
+
+def test_an_amplitude_that_a_parameter_stands_for_is_taken_out_of_its_mechanism() -> None:
+    (coupling,) = (each for each in candidates(HOMES["heat"].model) if each.name == "linear coupling")
+    assert coupling.equations == ("s",) and len(coupling.amplitudes) == 1
+    assert coupling.positive == frozenset()  # it adds to what the parameter does
+    assert [place for place, _ in coupling.changes] == ["s"]
+    assert coupling.new == coupling.amplitudes
+
+
+def test_monomials_that_parameters_can_do_or_that_have_a_name_are_left_out() -> None:
+    model = model_of(
+        {
+            "states": states(s="K", r="1"),
+            "parameters": numbers(a=1.0),
+            "equations": {"s": "1 + r**3 - 2*r", "r": "a*s - r + 1"},
+        }
+    )
+    named = candidates(model)
+    left = {each.label for each in generic_candidates(model, roles_of(model), degree=1, named=named)}
+    # a stands for s in r; s in s is a decay, and constants are a bias.
+    assert left == {"generic monomial r in s", "generic monomial r in r"}
+
+
+# What the formulas of entries may name
+
+
+def test_a_mass_that_is_added_divides_all_forces() -> None:
+    truth = truth_of(next(each for each in RESIDENTS if each.name == "added mass"))
+    c = sympy.Symbol(truth.amplitudes[0], real=True)
+    before = HOMES["mass"].model.equations[1]
+    assert sympy.simplify(truth.model.equations[1] - before / (1 + c)) == 0
+
+
+def test_two_joints_with_inertia_of_their_own() -> None:
+    """With M the mass matrix of a double pendulum, M a = F, and with I on its diagonal (M + I) a = F."""
+    model = HOMES["double pendulum"].model
+    resident = next(each for each in RESIDENTS if each.home == "double pendulum")
+    truth = truth_of(resident).model
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        x = rng.normal(size=(1, 4))
+        mixed = np.cos(x[0, 0] - x[0, 2])
+        mass = np.array([[2.0, mixed], [mixed, 1.0]])  # equal masses and lengths
+        own = np.diag([2.0 * resident.values["c"], 1.0 * resident.values["d"]])
+        before, after = model.drift(x)[0, [1, 3]], truth.drift(x)[0, [1, 3]]
+        np.testing.assert_allclose(after, np.linalg.solve(mass + own, mass @ before), rtol=1e-10)
+
+
+def test_a_delay_acts_within_one_equation_only() -> None:
+    truth = truth_of(next(each for each in RESIDENTS if each.name == "delayed response"))
+    before = HOMES["prey with limits and predator"].model
+    assert truth.equations == ("p",) and truth.model.equations[0] == before.equations[0]
+    assert truth.begins == (sympy.Symbol("n", real=True),)
+
+
+def test_a_clock_that_is_late_shows_what_was_before() -> None:
+    truth = truth_of(next(each for each in RESIDENTS if each.name == "clock offset and drift"))
+    x, v, o = (sympy.Symbol(name, real=True) for name in ("x", "v", truth.amplitudes[0]))
+    late = dict(truth.model.outputs)["x"]
+    assert sympy.expand(late.subs(o, 0)) == x
+    assert sympy.expand(late.diff(o).subs(o, 0)) == -v
+    assert sympy.expand(late.diff(o, 2) - HOMES["mass"].model.equations[1]) == 0
+
+
+def test_the_step_of_a_sensor_is_read_off_what_it_recorded() -> None:
+    rng = np.random.default_rng(0)
+    values = rng.normal(size=500)
+    assert lattice_step(0.25 * np.rint(values / 0.25)) == pytest.approx(0.25)
+    assert lattice_step(np.append(0.1 * np.rint(values / 0.1), np.nan)) == pytest.approx(0.1)
+    assert lattice_step(values) is None
+    assert lattice_step(0.25 * np.rint(values / 0.25) + 0.1) is None  # not through zero
+    assert lattice_step(np.zeros(50)) is None
+
+
+def test_a_sensor_ends_where_recorded_values_stay() -> None:
+    rng = np.random.default_rng(0)
+    wave = np.sin(0.3 * np.arange(200))
+    one = np.zeros(200, dtype=int)
+    noise = 0.01 * rng.normal(size=200)
+    assert plateau(np.minimum(wave, 0.7) + noise, one, noise=0.01) == pytest.approx(0.7, abs=0.01)
+    assert plateau(-np.maximum(wave, -0.5) + noise, one, noise=0.01) == pytest.approx(0.5, abs=0.01)
+    assert plateau(wave + noise, one, noise=0.01) is None
+    # Three in a row belong to one recording.
+    assert plateau(np.array([0.0, 1.0, 1.0, 1.0, 0.0]), np.array([0, 0, 0, 1, 1]), noise=1e-3) is None
+
+
+def test_a_sawtooth_rounds_and_its_slope_is_that_of_what_it_rounds() -> None:
+    y, q = sympy.symbols("y q", real=True)
+    rounded = y - q / sympy.pi * sympy.atan(sympy.tan(sympy.pi * y / q))
+    at = np.linspace(-2.03, 2.11, 50)
+    np.testing.assert_allclose(sympy.lambdify((y, q), rounded)(at, 0.3), 0.3 * np.rint(at / 0.3), atol=1e-12)
+    assert without_teeth(rounded).diff(y) == 1
+    assert without_teeth(sympy.atan(y)) == sympy.atan(y)
+
+
+def test_the_time_of_a_course_is_that_in_which_it_changes() -> None:
+    data = recorded(next(each for each in RESIDENTS if each.name == "constant bias"))
+    model = HOMES["mass"].model
+    wave = np.stack([np.sin(2.0 * data.t), 2.0 * np.cos(2.0 * data.t)], axis=1)
+    places = places_of(Shape(time_of="x", at=(1.0, 3.0)), data, model, wave)
+    np.testing.assert_allclose(places, [0.5, 1.5], rtol=0.03)  # 1/ω, less what straight lines cut off
+
+
+# Each is found at home
+
+
+SCREENED = (
+    "linear stiffness", "geometric stiffness", "preload", "backlash", "added mass", "moment of inertia",
+    "linear damping", "linear coupling", "mortality", "harvest", "Allee effect", "prey refuge",
+    "sigmoid functional response", "predator interference", "decay or leakage", "delayed response",
+    "thermal drift", "sensor lag", "quantisation", "clipping", "clock offset and drift",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SCREENED)
+def test_each_mechanism_is_among_those_that_are_fitted(name: str) -> None:
+    """One form each; `tests/slow/test_every_mechanism.py` has whole diagnoses, of all forms of all."""
+    resident = next(each for each in RESIDENTS if each.name == name)
+    model, truth = HOMES[resident.home].model, truth_of(resident)
+    data = recorded(resident)
+    best: dict[str, float] = {}
+    screened, _ = screen_all(model, data, recalibrate(model, data)[0], candidates(model))
+    for probe, result in screened:
+        label = probe.candidate.label
+        best[label] = max(best.get(label, 0.0), result.gain)
+    ranked = sorted(best, key=lambda label: -best[label])[: SearchOptions().fitted]
+    assert truth.label in ranked and best[truth.label] > SearchOptions().same

@@ -1,0 +1,131 @@
+"""Evidence for names and for functions without one, held against what linear algebra and scipy say."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import sympy
+
+from siq.diagnosis.evidence import best_shares, evidence_of_function, log_evidence, orthonormal, smooth_prior
+from siq.diagnosis.function_sites import Place, Power, fresh_names, powers, simplest, with_formula
+from siq.diagnosis.options import SearchOptions
+from siq.systems.diffusion import Diffusion
+from siq.systems.dynamics import Dynamics, symbol
+from siq.systems.formulas import compile_values
+
+OSCILLATOR = Dynamics(
+    ("x", "v"),
+    (symbol("v"), -4 * symbol("x")),
+    Diffusion.identity(2),
+    units=("m", "m/s"),
+    time_unit="s",
+    outputs=(("x", symbol("x")),),
+)
+KNOTS = np.array([-2.0, -1.0, -0.2, 0.3, 1.5, 4.0])
+
+
+def test_the_evidence_is_that_of_a_normal_distribution() -> None:
+    """p(y) ∝ det(C)^-½ (yᵀ C⁻¹ y)^-ν/2 with C = 1 + H K Hᵀ, over that with C = 1."""
+    draw = np.random.default_rng(4)
+    columns, target = draw.normal(size=(40, 3)), 3 * draw.normal(size=40)
+    root = draw.normal(size=(3, 3))
+    prior = root @ root.T
+    covariance = np.eye(40) + columns @ prior @ columns.T
+    expected = -0.5 * np.linalg.slogdet(covariance)[1] - 20 * np.log(
+        (target @ np.linalg.solve(covariance, target)) / (target @ target)
+    )
+    found = log_evidence(
+        columns.T @ columns, columns.T @ target, prior, total=float(target @ target), freedom=40
+    )
+    assert found == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("size", [5.0, 20.0, 100.0])
+def test_a_smooth_function_is_believed_where_there_is_one_and_not_in_noise(size: float) -> None:
+    draw = np.random.default_rng(2)
+    course = draw.uniform(-2, 4, size=400)
+    hats = np.stack([np.interp(course, KNOTS, row) for row in np.eye(len(KNOTS))], axis=1)
+    noise = draw.normal(size=400)
+    values = np.sin(KNOTS)
+    effect = hats @ values * size / np.linalg.norm(hats @ values)
+    assert evidence_of_function(hats, noise, KNOTS, freedom=400) < 0
+    found = evidence_of_function(hats, noise + effect, KNOTS, freedom=400)
+    # No more than what it explains, and less: it could have been anything.
+    assert found < size**2 / 2
+    assert found > 0 or size < 10
+
+
+def test_smooth_functions_are_smooth() -> None:
+    prior = smooth_prior(KNOTS, 0.5)
+    correlation = prior[0] / prior[0, 0]
+    assert (np.diff(correlation) < 0).all() and np.linalg.eigvalsh(prior).min() > 0
+
+
+def test_the_best_mechanisms_of_each_effect_are_chosen_one_beside_the_other() -> None:
+    draw = np.random.default_rng(1)
+    groups = [orthonormal(draw.normal(size=(30, width))) for width in (1, 2, 1, 1)]
+    effects = draw.normal(size=(30, 5))
+    effects[:, 0] = groups[1] @ [1.0, -2.0] + 0.5 * groups[3][:, 0]
+    one, two = best_shares(effects, groups, 1), best_shares(effects, groups, 2)
+    alone = max(float(((g.T @ effects[:, 1]) ** 2).sum()) for g in groups) / float(
+        effects[:, 1] @ effects[:, 1]
+    )
+    assert one[1] == pytest.approx(alone)
+    assert two[0] == pytest.approx(1.0) and one[0] < 0.99
+    assert (two >= one - 1e-12).all()
+
+
+def test_odds_of_a_name_follow_from_how_many_may_be_wrong() -> None:
+    options = SearchOptions(wrong_names=0.05, unnamed=0.2)
+    assert np.exp(options.least_log_odds) == pytest.approx(19)
+    # A right name beside something without one, or only this, which is matched as well.
+    right, wrong = 0.8 * 0.2, 0.2 * options.most_alike
+    assert wrong / (wrong + right) == pytest.approx(0.05)
+
+
+def place(*words: str) -> Place:
+    factor = symbol(words[1]) if len(words) > 1 else sympy.Integer(1)
+    return Place((("v", factor),), (), symbol(words[0]), words, KNOTS)
+
+
+@pytest.mark.parametrize(
+    ("words", "terms", "unit"),
+    [
+        (("x",), "c_1*x**3", "1/(s**2*m**2)"),
+        (("x", "v"), "c_1*x**2*v", "1/(s*m**2)"),
+        (("t", "x"), "c_1*t*x", "s**(-3)"),
+    ],
+)
+def test_coefficients_of_formulas_have_units(words: tuple[str, ...], terms: str, unit: str) -> None:
+    where = place(*words)
+    wanted = sympy.sympify(terms, {name: symbol(name) for name in ("c_1", "x", "v", "t")})
+    term = next(each for each in powers(where, degree=3) if symbol("c_1") * each.formula == wanted)
+    candidate = with_formula(OSCILLATOR, where, [term])
+    assert candidate.model.equations[1] - OSCILLATOR.equations[1] == wanted
+    assert candidate.model.parameters[-1].unit == unit
+    assert candidate.changes == (("v", wanted),)
+
+
+def test_a_formula_without_its_first_coordinate_is_one_of_the_second() -> None:
+    t, w = symbol("t"), symbol("v")
+    alone, terms = simplest(place("t", "v"), [Power(w, 0, 1), Power(w**2, 0, 2)])
+    assert alone.words == ("v",) and alone.coordinate == w and alone.equations == (("v", sympy.Integer(1)),)
+    assert [each.first for each in terms] == [1, 2]
+    both, _ = simplest(place("t", "v"), [Power(t * w, 1, 1)])
+    assert both.words == ("t", "v")
+
+
+def test_new_names_are_new() -> None:
+    assert fresh_names("c", 2, OSCILLATOR) == ["c_1", "c_2"]
+    again = with_formula(OSCILLATOR, place("x"), powers(place("x"), degree=2)[:2]).model
+    assert fresh_names("c", 1, again) == ["c_3"]
+
+
+def test_derivatives_of_clearances_take_numbers_beside_arrays() -> None:
+    """Conditions on a parameter alone stand beside those on a state."""
+    x, a = symbol("x"), symbol("a")
+    slope = sympy.Max(0, sympy.Min(x, x + a, a)).diff(x) + sympy.Piecewise(
+        (1.0, (a > 0) & (x > a)), (0.0, True)
+    )
+    at = np.array([-1.0, 0.2, 2.0])
+    assert np.isfinite(compile_values([slope], [x, a], common=False)(at, 0.5)[0]).all()

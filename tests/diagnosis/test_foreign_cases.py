@@ -1,0 +1,146 @@
+"""An answer to everything, within what a case may take: recordings like those that others bring."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.mismatch.foreign_cases import (
+    ForeignCase,
+    chain_of_masses,
+    double_pendulum,
+    falling_ball,
+    long_relaxation,
+    motor_axis,
+    polynomial_on_the_brink,
+)
+
+from siq.diagnosis.diagnosis import Diagnosis, solve_case
+from siq.diagnosis.study import Allowance
+from siq.diagnosis.tables import tables_of
+from siq.errors import NumericalFailure
+from siq.inference.budget import Budget, BudgetSpent
+from siq.systems.cards import load_system
+
+SMALL: dict[str, Callable[[], ForeignCase]] = {
+    "falling ball, drag": lambda: falling_ball(0.03),
+    "falling ball, gravity free": lambda: falling_ball(0.3, fixed=False),
+    "falling ball, linear drag": lambda: falling_ball(0.3, linear=True),
+    "polynomial on the brink": lambda: polynomial_on_the_brink(samples=60, recordings=3),
+    "eight states": lambda: chain_of_masses(samples=150, recordings=3),
+}
+LARGE: dict[str, Callable[[], ForeignCase]] = {
+    "motor axis, one recording": lambda: motor_axis(recordings=1),
+    "motor axis, asymmetric": lambda: motor_axis(asymmetry=6.0),
+    "double pendulum": double_pendulum,
+    "double pendulum, fast camera": lambda: double_pendulum(rate_of_camera=400.0),
+    "eight states, 10⁵ samples": chain_of_masses,
+    "random forces, 10⁵ samples": long_relaxation,
+}
+
+
+def answered(case: ForeignCase, folder: Path, **allowance: float) -> Diagnosis:
+    """A diagnosis, with everything that files have of it."""
+    read = case.read(folder)
+    settings = read.settings.model_copy(update={"budget": Allowance(**allowance)})
+    found = solve_case(replace(read, settings=settings))
+    said = found.statement.as_data()
+    json.dumps(said, allow_nan=False)
+    assert said["sentence"] and said["partial"] == bool(said["budget"]["stopped_by"])
+    assert all(len(table.columns) for table in tables_of(found).values())
+    (folder / "augmented.yaml").write_text(found.to_card(), encoding="utf-8")
+    load_system(folder / "augmented.yaml")
+    return found
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name == "eight states" else name for name in SMALL]
+)
+def test_there_is_an_answer(name: str, tmp_path: Path) -> None:
+    found = answered(SMALL[name](), tmp_path)
+    assert found.verdict.mismatch and not found.statement.partial
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", LARGE)
+def test_there_is_an_answer_to_what_is_large(name: str, tmp_path: Path) -> None:
+    found = answered(LARGE[name](), tmp_path)
+    account = found.statement.account
+    print(f"{name}: {found.verdict}, {account.spent / account.allowed:.0%}, {account.seconds:.0f} s")
+    assert found.verdict.mismatch
+
+
+def test_dry_friction_of_a_motor_is_named(tmp_path: Path) -> None:
+    found = answered(motor_axis(samples=1200), tmp_path)
+    names = [each.name for each in found.mechanisms]
+    assert names == ["dry friction"] or "dry friction" in found.mechanisms[0].indistinguishable_from
+    assert found.mechanisms[0].parameters["c_1"].estimate == pytest.approx(20 / 95, rel=2e-3)
+
+
+def test_what_the_budget_does_not_reach_is_named(tmp_path: Path) -> None:
+    whole = answered(falling_ball(0.3), tmp_path / "whole")
+    work = whole.statement.account.spent
+    parts = [answered(falling_ball(0.3), tmp_path / f"{s}", evaluations=s * work) for s in (0.01, 0.5)]
+    for part in parts:
+        said = part.statement.as_data()
+        assert said["partial"] and said["budget"]["stopped_by"] == "work"
+        assert any(each.startswith("This answer is partial") for each in said["remarks"])
+    labels = {each.label for each in whole.investigation.candidates}
+    # Of the first only the simulation's own parameters were fitted; the second had half of what it takes.
+    assert len(parts[1].statement.not_tried) < len(parts[0].statement.not_tried) <= len(labels)
+    assert not parts[0].investigation.search.screened and parts[1].investigation.search.screened
+    # Work is counted, not timed: the same case takes the same.
+    again = answered(falling_ball(0.3), tmp_path / "again")
+    assert again.statement.account.spent == work
+
+
+def test_a_clock_that_runs_out_is_said(tmp_path: Path) -> None:
+    found = answered(falling_ball(0.3), tmp_path, seconds=1e-3)
+    assert found.statement.as_data()["budget"]["stopped_by"] == "clock"
+    assert "the time allowed" in found.statement.remarks[-1]
+
+
+def test_progress_is_told(tmp_path: Path) -> None:
+    told: list[str] = []
+    solve_case(falling_ball(0.3).read(tmp_path), tell=told.append)
+    assert told[0].startswith("fitting the simulation's own parameters; 0% of the budget")
+    assert any(text.startswith("candidate 2 of at most") for text in told)
+    shares = [int(text.rpartition("; ")[2].partition("%")[0]) for text in told]
+    assert shares == sorted(shares)
+
+
+def test_a_budget_ends_what_exceeds_it_and_lets_pass_what_is_exempt() -> None:
+    now = [0.0]
+    budget = Budget(work=10.0, seconds=5.0, clock=lambda: now[0])
+    budget.charge(8.0)
+    budget.charge(8.0)  # begun while something was left
+    with pytest.raises(BudgetSpent):
+        budget.charge(1.0)
+    assert budget.stopped_by == "work" and budget.account().partial
+    with budget.exempt():
+        budget.charge(1.0)
+    assert budget.spent == 17.0
+    late = Budget(seconds=5.0, clock=lambda: now[0])
+    now[0] = 6.0
+    with pytest.raises(BudgetSpent):
+        late.charge(1.0)
+    assert late.stopped_by == "clock"
+
+
+def test_a_candidate_that_overflows_ends_itself_and_not_the_case(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Screening that has no numbers leaves what can be said without it."""
+    from siq.diagnosis import screening as promises
+
+    def overflow(*_: object, **__: object) -> None:
+        raise NumericalFailure("it runs away")
+
+    monkeypatch.setattr(promises, "_screened", overflow)
+    found = answered(falling_ball(0.3), tmp_path)
+    assert {each.reason for each in found.statement.not_fitted} == {"it runs away"}
+    assert not found.statement.partial and np.isfinite(found.statement.errors.recalibrated or 0.0)

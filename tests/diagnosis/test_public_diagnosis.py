@@ -1,0 +1,138 @@
+"""`siq.diagnose`: from Python, in all forms of recordings, and what the diagnosis says for people."""
+
+from __future__ import annotations
+
+import doctest
+import json
+from collections.abc import Callable
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import sympy
+
+import siq
+from siq.diagnosis import diagnosis as module
+from siq.diagnosis.investigation import comparison_of
+from siq.diagnosis.tables import tables_of, tables_of_failure
+from siq.diagnosis.verdict import statement_of_failure
+from siq.numerics.text import value_text
+from siq.report.diagnosis_page import diagnosis_html, diagnosis_text
+from siq.systems.dynamics import Dynamics, Parameter
+
+n, r = sympy.symbols("n r", real=True)
+GROWTH = Dynamics(
+    ("n",), (r * n,), siq.Diffusion.identity(1),
+    units=("kg",), time_unit="d", parameters=(Parameter("r", 1.0, "1/d"),),
+)  # fmt: skip
+
+
+def logistic() -> pd.DataFrame:
+    """Populations that level off at 2 kg, exactly but for the sensor's noise."""
+    t, noise = np.arange(0, 8, 0.4), np.random.default_rng(1)
+    table = pd.concat(
+        pd.DataFrame({"recording": f"r{k}", "t": t, "n": 2 / (1 + (2 / start - 1) * np.exp(-0.9 * t))})
+        for k, start in enumerate([0.05, 0.2, 1.0, 5.0])
+    )
+    table["n"] += 0.005 * noise.normal(size=len(table))
+    return table
+
+
+@pytest.fixture(scope="module")
+def diagnosis() -> siq.Diagnosis:
+    return siq.diagnose(GROWTH, logistic())
+
+
+def test_the_example_is_right() -> None:
+    assert doctest.testmod(module).failed == 0
+
+
+def test_what_is_found_is_a_dynamics_with_the_true_parameters(diagnosis: siq.Diagnosis) -> None:
+    assert diagnosis.verdict == "missing physics"
+    (found,) = diagnosis.mechanisms
+    for name, truth in (("c_1", 0.45), ("r", 0.9)):
+        value = next(each.value for each in diagnosis.augmented.parameters if each.name == name)
+        assert value == pytest.approx(truth, rel=0.01)
+    assert found.parameters["c_1"].unit == "1/(kg*d)"
+    # No domain was given: it is that of the recordings.
+    low, high = diagnosis.augmented.domain[0]
+    assert low == pytest.approx(0.05, abs=0.02) and high == pytest.approx(5, abs=0.02)
+
+
+def test_the_report_says_all_of_it(diagnosis: siq.Diagnosis) -> None:
+    text = diagnosis.report()
+    (found,) = diagnosis.mechanisms
+    size = found.parameters["c_1"]
+    assert f"c_1 = {value_text(size.estimate, size.standard_error, unit=size.unit)} (" in text
+    assert "1/(kg·d)" in text
+    r = diagnosis.statement.recalibration["r"]
+    assert f"r = {value_text(r.after, r.standard_error, unit='1/d')} (" in text and "(on the card: 1)" in text
+    # It opens with the sentence that the page opens with.
+    assert text.splitlines()[1].strip() == diagnosis.statement.sentence
+    for heading in ("Verdict", "Mechanisms", "Location", "Error (normalised rms", "How sure it is"):
+        assert f"[[{heading}" in text
+    assert f"noise alone: {diagnosis.held_out.errors.noise_floor:.3g}" in text
+
+
+def test_the_report_in_a_notebook_has_the_same_lines(diagnosis: siq.Diagnosis) -> None:
+    lines: list[str] = []
+
+    class Text(HTMLParser):
+        def handle_data(self, data: str) -> None:
+            lines.append(data)
+
+    Text().feed(diagnosis._repr_html_())
+    shown = [line.strip().removeprefix("[[").removesuffix("]]") for line in diagnosis.report().splitlines()]
+    assert lines == shown
+
+
+def test_the_card_is_read_back(diagnosis: siq.Diagnosis, tmp_path: Path) -> None:
+    (tmp_path / "found.yaml").write_text(diagnosis.to_card(), encoding="utf-8")
+    again = siq.load_system(tmp_path / "found.yaml")
+    assert again.equations == diagnosis.augmented.equations
+    np.testing.assert_array_equal(again.values, diagnosis.augmented.values)
+    np.testing.assert_array_equal(again.box, diagnosis.augmented.box)
+
+
+def test_table_file_and_recordings_are_the_same_to_it(tmp_path: Path) -> None:
+    table = logistic()
+    table.to_csv(tmp_path / "recordings.csv", index=False)
+    forms = [table, tmp_path / "recordings.csv", siq.Recordings.from_frame(table.assign(more=1.0))]
+    first, *others = (comparison_of(GROWTH, form) for form in forms)
+    for other in others:
+        np.testing.assert_allclose(other.learn.outputs, first.learn.outputs, rtol=1e-15)
+        assert other.kept.labels == first.kept.labels
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda table: table.rename(columns={"n": "m"}), "the column 'n' is missing"),
+        (lambda table: table.rename(columns={"n": "n [g]"}), "unit"),
+        (lambda table: table.iloc[:5], "fewer than 8 samples"),
+    ],
+)
+def test_recordings_that_do_not_fit_are_refused(
+    change: Callable[[pd.DataFrame], pd.DataFrame], message: str
+) -> None:
+    with pytest.raises(siq.InputError, match=message):
+        siq.diagnose(GROWTH, change(logistic()))
+    if "fewer" not in message:
+        with pytest.raises(siq.InputError, match=message):
+            siq.diagnose(GROWTH, siq.Recordings.from_frame(change(logistic())))
+
+
+def test_what_cannot_be_fitted_has_a_verdict_and_tables_all_the_same(diagnosis: siq.Diagnosis) -> None:
+    statement = statement_of_failure("the simulation runs away")
+    data = json.loads(json.dumps(statement.as_data(), allow_nan=False))
+    assert data["verdict"] == "unexplained" and data["remarks"] == ["The simulation runs away."]
+    assert set(data) == set(diagnosis.statement.as_data())
+    assert data["fit"]["augmented"] is None and data["location"] is None
+    assert "The simulation runs away." in diagnosis_text(statement, GROWTH)
+    assert "The simulation runs away." in diagnosis_html(statement, GROWTH)
+    full, empty = tables_of(diagnosis), tables_of_failure(diagnosis.case)
+    assert {name: list(table.columns)[:3] for name, table in full.items()} == {
+        name: list(table.columns)[:3] for name, table in empty.items()
+    }

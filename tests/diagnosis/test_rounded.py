@@ -1,0 +1,86 @@
+"""Rounding that can be seen explains what it does, and nothing else."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.stats
+
+from siq.diagnosis.diagnosis import diagnose
+from siq.diagnosis.dictionary import roles_of
+from siq.diagnosis.options import MismatchVerdict
+from siq.diagnosis.residual_structure import Unrounded, explained_by_rounding, steps_of, unrounded
+from siq.diagnosis.study import measurements_of
+from siq.inference.measurements import Measurements, with_expectations
+from siq.inference.recalibration import recalibrate
+from siq.systems.diffusion import Diffusion
+from siq.systems.dynamics import Dynamics, Parameter, symbol
+
+STEP, NOISE = 0.1, 0.012
+
+
+def decaying(*, quadratic: float) -> Dynamics:
+    x, rate, c = symbol("x"), symbol("rate"), symbol("c")
+    parameters = (Parameter("rate", 0.8), *((Parameter("c", quadratic),) if quadratic else ()))
+    return Dynamics(
+        ("x",), (-rate * x - (c * x**2 if quadratic else 0),), Diffusion.identity(1), parameters=parameters
+    )
+
+
+def readings(*, quadratic: float, step: float = STEP) -> pd.DataFrame:
+    """Six slow decays, read in steps eight times as wide as the noise."""
+    rng, t, frames = np.random.default_rng(5), np.arange(0, 4, 0.05), []
+    for place, begin in enumerate((1.1, 1.43, 1.78, 2.05, 2.49, 2.9)):
+        over = np.exp(0.7 * t)
+        # The exact solution of Bernoulli's equation x' = -0.7 x - c x².
+        exact = begin / (over + quadratic * begin / 0.7 * (over - 1))
+        read = exact + NOISE * rng.normal(size=len(t))
+        read = step * np.rint(read / step) if step else read
+        frames.append(pd.DataFrame({"recording": f"r{place}", "t": t, "x": read}))
+    return pd.concat(frames)
+
+
+def asked(model: Dynamics, data: Measurements) -> Unrounded | None:
+    model = with_expectations(model)
+    _, strict = recalibrate(model, data)
+    return explained_by_rounding(model, data, strict, roles_of(model))
+
+
+def test_values_before_rounding_are_means_of_a_normal_distribution_cut_off() -> None:
+    model = decaying(quadratic=0.0)
+    data = measurements_of(readings(quadratic=0.0), model)
+    assert steps_of(data) == pytest.approx([STEP])
+    exact = np.concatenate(
+        [b * np.exp(-0.7 * np.arange(0, 4, 0.05)) for b in (1.1, 1.43, 1.78, 2.05, 2.49, 2.9)]
+    )[:, None]
+    values, deviation = unrounded(data, exact, steps_of(data), np.array([NOISE]))
+    left = (values.outputs - exact)[:, 0] / NOISE
+    # Independent, about zero, and as the truth goes the noise comes out as it was.
+    assert abs(left.mean()) < 4 * left.std() / np.sqrt(len(left))
+    assert abs(left[1:] @ left[:-1]) < 4 * left @ left / np.sqrt(len(left))
+    assert deviation == pytest.approx([NOISE], rel=0.15)
+    row = int(np.abs(data.outputs[:, 0] - exact[:, 0]).argmax())
+    low, high = ((data.outputs[row, 0] + side * STEP / 2 - exact[row, 0]) / NOISE for side in (-1, 1))
+    expected = scipy.stats.norm.expect(lambda u: u, lb=low, ub=high, conditional=True)
+    assert left[row] == pytest.approx(expected, rel=1e-6)
+
+
+def test_the_right_simulation_is_cleared_and_a_wrong_one_is_not() -> None:
+    model = decaying(quadratic=0.0)
+    cleared = asked(model, measurements_of(readings(quadratic=0.0), model))
+    assert cleared is not None and cleared.outputs == ("x",)
+    assert cleared.fit.model.values == pytest.approx([0.7], abs=0.005)
+    assert asked(model, measurements_of(readings(quadratic=0.1), model)) is None
+
+
+def test_without_steps_there_is_nothing_to_explain() -> None:
+    model = decaying(quadratic=0.0)
+    assert asked(model, measurements_of(readings(quadratic=0.0, step=0.0), model)) is None
+
+
+def test_a_diagnosis_raises_no_alarm_where_sensors_round() -> None:
+    diagnosis = diagnose(decaying(quadratic=0.0), readings(quadratic=0.0))
+    assert not diagnosis.verdict.mismatch or [each.name for each in diagnosis.mechanisms] == ["quantisation"]
+    diagnosis = diagnose(decaying(quadratic=0.0), readings(quadratic=0.1))
+    assert diagnosis.verdict is not MismatchVerdict.NO_MISMATCH

@@ -1,0 +1,308 @@
+"""Parts of the search: blocks for clustered errors, and what tells most where nothing has a name."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import scipy.stats
+import sympy
+
+from siq.data.recordings import Recordings
+from siq.diagnosis import naming
+from siq.diagnosis.dictionary import Roles, Shape
+from siq.diagnosis.location import most_telling
+from siq.diagnosis.mechanisms import once_more
+from siq.diagnosis.naming import Naming, named_or_not, naming_of
+from siq.diagnosis.options import SearchOptions
+from siq.diagnosis.residual_structure import Curve, Direction, Remainder, Structure
+from siq.diagnosis.screening import screen
+from siq.diagnosis.search import Found, Search, accepted, better_without
+from siq.diagnosis.significance import TriedMechanism, blocks_of, correlated_probability, correlation_time
+from siq.inference.budget import Budget
+from siq.inference.maximum_likelihood import Fit
+from siq.inference.measurements import Measurements, measurements
+from siq.inference.recalibration import recalibrate
+from siq.systems.diffusion import Diffusion
+from siq.systems.dynamics import Dynamics, Parameter
+
+
+def autoregressive(memory: float, size: int) -> np.ndarray:
+    kicks = np.random.default_rng(3).normal(size=size)
+    series = np.empty(size)
+    now = 0.0
+    for place, kick in enumerate(kicks):
+        now = memory * now + kick
+        series[place] = now
+    return series
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.5, 0.9])
+def test_the_correlation_time_of_an_autoregressive_series(memory: float) -> None:
+    found = correlation_time(autoregressive(memory, 40_000))
+    assert found == pytest.approx((1 + memory) / (1 - memory), rel=0.15)
+
+
+def test_blocks_are_long_compared_with_correlations_and_never_span_recordings() -> None:
+    recording = np.repeat([0, 1], [3000, 6000])
+    block = blocks_of(recording, autoregressive(0.9, 9000), least=10)
+    count = block.max() + 1
+    assert sorted(set(block)) == list(range(count))
+    assert 10 < count < 9000 / (3 * 19)
+    for place in range(count):
+        rows = np.flatnonzero(block == place)
+        assert len(set(recording[rows])) == 1 and (np.diff(rows) == 1).all()
+
+
+def test_there_are_at_least_so_many_blocks() -> None:
+    assert blocks_of(np.zeros(400, dtype=int), autoregressive(0.99, 400), least=10).max() == 9
+
+
+@pytest.fixture(scope="module")
+def decaying() -> Dynamics:
+    x, k = sympy.symbols("x k", real=True)
+    return Dynamics(("x",), (-k * x,), Diffusion.identity(1), parameters=(Parameter("k", 1.0),))
+
+
+def fit_with_errors(model: Dynamics, errors: np.ndarray) -> tuple[Fit, Measurements]:
+    """A simulation fitted to one recording that is off by given errors."""
+    t = np.linspace(0, 3, len(errors))
+    table = Recordings(
+        ("x",), (None,), ("a",), np.zeros(len(t), dtype=int), t, (np.exp(-t) + errors)[:, None]
+    )
+    data = measurements(table, model)
+    return recalibrate(model, data)[1], data
+
+
+def test_a_gain_weighs_as_much_as_there_are_independent_errors(decaying: Dynamics) -> None:
+    """Likelihood weighs n errors; of those that hang together over τ samples it may count n/τ."""
+    candidate = SimpleNamespace(searches=(), new=("c",))
+    found = {}
+    for memory in (0.0, 0.9):
+        fit, data = fit_with_errors(decaying, 0.01 * autoregressive(memory, 2000))
+        found[memory] = correlated_probability(fit, data, candidate, gained=60.0)
+    assert found[0.0] == pytest.approx(scipy.stats.chi2.sf(60.0, 1), rel=30)
+    assert 1e-3 < found[0.9] < 0.5  # about χ² of 60/19
+
+
+def test_every_place_at_which_a_shape_was_looked_for_is_a_chance(decaying: Dynamics) -> None:
+    fit, data = fit_with_errors(decaying, 0.01 * autoregressive(0.0, 400))
+    once = SimpleNamespace(searches=(), new=("c", "w"))
+    often = SimpleNamespace(
+        searches=(Shape(frequencies=90), Shape(scale_of="x", at=(1.0, 2.0))), new=("c", "w")
+    )
+    alone = correlated_probability(fit, data, once, gained=30.0)
+    assert correlated_probability(fit, data, often, gained=30.0) == pytest.approx(180 * alone)
+
+
+def test_an_amplitude_that_may_not_be_negative_is_zero_and_leaves_the_special_case(
+    decaying: Dynamics,
+) -> None:
+    t = np.linspace(0, 3, 400)
+    shapes = np.stack([np.sin(6 * t), np.cos(9 * t)], axis=1)
+    noise = 0.01 * np.random.default_rng(5).normal(size=400)
+    fit, data = fit_with_errors(decaying, shapes @ [0.05, -0.05] + noise)
+    known = fit.linearisation
+    with_shapes = replace(
+        known,
+        measured_response=np.concatenate([known.measured_response, shapes[:, None, :]], axis=2),
+        response=np.concatenate([known.response, np.zeros((*known.response.shape[:2], 2))], axis=2),
+    )
+    either, first, both = screen(
+        with_shapes, data, fit, [slice(0, 2), slice(0, 1), slice(0, 2)],
+        positive=[np.array([True, True]), np.array([True]), np.array([False, False])],
+    )  # fmt: skip
+    assert either.amplitudes[1] == 0
+    assert either.amplitudes[0] == pytest.approx(first.amplitudes[0])
+    assert either.gain == pytest.approx(first.gain)
+    assert both.amplitudes[1] < 0 and both.gain > either.gain > 0
+
+
+def test_a_mechanism_that_was_found_is_not_found_once_more_in_another_form() -> None:
+    def one(name: str, label: str, equations: tuple[str, ...], coordinate: str) -> SimpleNamespace:
+        model = SimpleNamespace(states=("h", "g"))
+        return SimpleNamespace(
+            name=name, label=label, equations=equations, coordinate=coordinate, model=model
+        )
+
+    found = one("overflow", "overflow in h, g", ("h", "g"), "h")
+    assert once_more(one("overflow", "overflow in h", ("h",), "h"), found)
+    assert not once_more(one("overflow", "overflow in g", ("g",), "g"), found)
+    assert not once_more(one("leak", "leak in h", ("h",), "h"), found)
+    # Two parameters may drift in time, each by its own.
+    drift = one("parameter drift", "parameter drift in h (a)", ("h",), "t")
+    assert not once_more(one("parameter drift", "parameter drift in h (b)", ("h",), "t"), drift)
+
+
+def structure(excess: float, *gains: tuple[str, str, float]) -> Structure:
+    curves = [
+        Curve(Direction((equation,), coordinate, False, np.zeros(4)), np.zeros(4), np.ones(4), gain, 0.0)
+        for equation, coordinate, gain in gains
+    ]
+    return Structure(tuple(curves), 0.0, 0.0, excess + 100, 100)
+
+
+def remainder(share: float, p_curves: float = 1.0) -> Remainder:
+    """What is left, of which only the share and the probability count here."""
+    return Remainder(structure(0), Structure((), p_curves, 1.0, 100, 100), share)
+
+
+def found_with(number: int) -> Search:
+    """A search that found so many mechanisms, one after the other."""
+
+    def found(place: int) -> Found:
+        candidate = SimpleNamespace(name=f"mechanism {place}", label=f"mechanism {place}", number=place)
+        fit = SimpleNamespace(number=place, has_process_noise=False, noise=SimpleNamespace(measurement=1.0))
+        return Found(TriedMechanism(candidate, fit, 100.0, -90.0, 0.0, 0.0), ())
+
+    each = tuple(found(place) for place in range(1, number + 1))
+    return Search(SimpleNamespace(number=0, x=None), each, each[-1].best.fit, ())
+
+
+MOTION = Roles(motions=(("x", "v"),), states=("v",))
+FRAME = Roles(amplitudes=(("P", "Q"),), states=("P", "Q"))
+POPULATIONS = Roles(populations=("prey", "predator"), states=("prey", "predator"))
+
+
+@pytest.mark.parametrize(
+    ("roles", "found", "expected"),
+    [
+        # The best coordinate is that of the motion itself.
+        (MOTION, structure(1000, ("v", "x", 700.0), ("v", "u", 400.0)), "x"),
+        # The input tells hardly more than the velocity.
+        (MOTION, structure(1000, ("v", "u", 990.0), ("v", "v", 950.0)), "v"),
+        # The input tells nearly all, and the motion does not.
+        (MOTION, structure(1000, ("v", "u", 990.0), ("v", "v", 400.0)), "u"),
+        # No coordinate tells nearly all.
+        (MOTION, structure(1000, ("v", "u", 500.0), ("v", "v", 200.0)), "x, v"),
+        (POPULATIONS, structure(1000, ("prey", "t", 990.0), ("prey", "prey", 985.0)), "prey"),
+        # The time tells less than a third more than a state, of whatever equation.
+        (POPULATIONS, structure(1000, ("prey", "t", 155.0), ("prey", "predator", 122.0)), "predator"),
+        (POPULATIONS, structure(1000, ("prey", "t", 155.0), ("prey", "predator", 100.0)), "t"),
+        (POPULATIONS, structure(1000, ("prey", "t", 155.0), ("predator", "prey", 150.0)), "t"),
+        (POPULATIONS, structure(1000, ("prey", "predator", 500.0), ("prey", "prey", 200.0)), "predator"),
+    ],
+)
+def test_the_coordinate_that_tells_most(roles: Roles, found: Structure, expected: str) -> None:
+    equations, coordinate = most_telling(found, roles)
+    assert equations == (found.curves[0].direction.equations)
+    assert coordinate == expected
+
+
+def test_of_a_rotating_frame_the_motion_is_its_amplitude() -> None:
+    across = Curve(Direction(("P", "Q"), "amplitude", True, np.zeros(4)), np.zeros(4), np.ones(4), 128.0, 0.0)
+    found = structure(370, ("Q", "t", 150.0))
+    found = replace(found, curves=(*found.curves, across))
+    assert most_telling(found, FRAME) == (("P", "Q"), "amplitude")
+
+
+def judged(
+    monkeypatch: pytest.MonkeyPatch,
+    odds: tuple[float, ...],
+    left: list[Remainder],
+    *,
+    together: float = 20.0,
+    p_alike: float = 0.5,
+) -> Naming:
+    """A search of so many mechanisms, judged by odds and matches that are given."""
+
+    def of_a_name(
+        fit: SimpleNamespace, data: object, candidates: list[SimpleNamespace], *rest: object, **_: object
+    ) -> float:
+        return odds[candidates[0].number - 1] if len(candidates) == 1 else together
+
+    monkeypatch.setattr(naming, "log_odds_of_a_name", of_a_name)
+    monkeypatch.setattr(naming, "probability_of_a_match", lambda *_, **__: p_alike)
+    data = SimpleNamespace()
+    return naming_of(
+        found_with(len(odds)), left, data, SimpleNamespace(), MOTION, (),
+        options=SearchOptions(wrong_names=0.05, unnamed=0.2), generator=np.random.default_rng(0),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("odds", "shares", "kept"),
+    [
+        ((9.0, 5.0), (0.998, 0.9999), 2),
+        ((9.0, 2.0), (0.998, 0.9999), 1),  # a function without a name would do as well
+        ((9.0, 5.0), (0.9993, 0.9991), 1),  # leaves more than without it
+        ((9.0, 2.0, 5.0), (0.998, 0.999, 0.9999), 1),  # what came after a patch goes with it
+    ],
+)
+def test_further_mechanisms_stay_as_long_as_each_is_likely_and_leaves_less(
+    odds: tuple[float, ...], shares: tuple[float, ...], kept: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = judged(monkeypatch, odds, [remainder(share) for share in shares])
+    assert len(found.search.found) == kept
+    assert found.search.fit.number == kept
+    assert found.left.share == shares[kept - 1]
+
+
+@pytest.mark.parametrize(
+    ("odds", "together", "p_alike", "p_left", "verdict", "said"),
+    [
+        ((9.0,), 20.0, 0.5, 1.0, "missing physics", None),
+        ((2.5,), 20.0, 0.5, 1.0, "unexplained", "nearly as likely (odds of 12 to 1)"),
+        ((-1.0,), 20.0, 0.5, 1.0, "unexplained", "a function without a name is likelier"),
+        # Two that are a description of one function.
+        ((9.0, 9.0), 1.0, 0.5, 1.0, "unexplained", "mechanism 1 and mechanism 2"),
+        # Of what leaves something, the share has to be more than mechanisms reach by chance.
+        ((9.0,), 20.0, 0.5, 1e-9, "unexplained", None),
+        ((9.0,), 20.0, 0.01, 1e-9, "missing physics", None),
+    ],
+)
+def test_a_name_has_to_be_likelier_than_none(
+    odds: tuple[float, ...],
+    together: float,
+    p_alike: float,
+    p_left: float,
+    verdict: str,
+    said: str | None,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    left = [remainder(0.99 + 0.001 * place, p_left) for place in range(len(odds))]
+    found = judged(monkeypatch, odds, left, together=together, p_alike=p_alike)
+    given, remarks = named_or_not(found, SearchOptions(wrong_names=0.05, unnamed=0.2))
+    assert given == (verdict == "missing physics")
+    assert said is None or said in remarks[-1]
+
+
+def test_a_name_has_to_leave_less_than_what_speaks_of_a_mismatch_by_itself() -> None:
+    clear, hardly, noise = remainder(0.9, 1e-6), remainder(0.9, 3e-4), remainder(0.9, 0.2)
+    assert (clear.structured, clear.doubtful) == (True, True)
+    assert (hardly.structured, hardly.doubtful) == (False, True)
+    assert (noise.structured, noise.doubtful) == (False, False)
+
+
+@pytest.mark.parametrize(("random_forces", "expected"), [(False, "better"), (True, "steadier")])
+def test_of_equals_the_one_that_all_recordings_ask_for_where_white_errors_mean_little(
+    random_forces: bool, expected: str
+) -> None:
+    def trial(name: str, gain: float, p_cluster: float) -> TriedMechanism:
+        fit = SimpleNamespace(has_process_noise=random_forces)
+        return TriedMechanism(SimpleNamespace(name=name, new=("c",)), fit, gain, 7.0 - gain, 0.0, p_cluster)
+
+    trials = [trial("better", 331, 1e-9), trial("steadier", 325, 1e-49), trial("worse", 276, 1e-60)]
+    found = accepted(trials, 50, 1e-4, options=SearchOptions())
+    assert found is not None and found.best.candidate.name == expected
+    assert {each.candidate.name for each in found.indistinguishable} == {"better", "steadier"} - {expected}
+
+
+def test_nothing_is_missing_where_its_fit_only_found_better_parameters(decaying: Dynamics) -> None:
+    _, data = fit_with_errors(decaying, 0.01 * autoregressive(0.0, 400))
+    x, c = sympy.symbols("x c", real=True)
+    wider = replace(
+        decaying,
+        equations=(decaying.equations[0] - c * x**2,),
+        parameters=(*decaying.parameters, Parameter("c", 0.0)),
+    )
+    right, with_c = recalibrate(decaying, data)[0], recalibrate(wider, data)[0]
+    trial = TriedMechanism(SimpleNamespace(label="c"), with_c, 80.0, -70.0, 1e-9, 1e-9)
+    missed = replace(
+        right, model=right.model.with_values(np.array([9.0])), log_likelihood=right.log_likelihood - 40
+    )
+    found = better_without(trial, missed, decaying, data, least=10.0, budget=Budget())
+    assert found is not None and found.model.values == pytest.approx(right.model.values, rel=1e-3)
+    assert better_without(trial, right, decaying, data, least=10.0, budget=Budget()) is None

@@ -1,0 +1,284 @@
+"""Sentences and tables of a diagnosis never contradict each other, whatever the numbers are."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from siq.diagnosis.holdout import HeldOutErrors
+from siq.diagnosis.location import where_it_sits
+from siq.diagnosis.mechanisms import PROCESS_NOISE
+from siq.diagnosis.options import MismatchVerdict
+from siq.diagnosis.statement import Description, Recalibrated, Statement, sentence_of, words_of
+from siq.diagnosis.verdict import statement_of_failure
+from siq.diagnosis.wording import Estimate, Evidence, Rival, StatedFunction, StatedMechanism
+from siq.numerics.text import p_text, percent
+
+NAMES = ("dry friction", "Stribeck friction", "hysteresis", "quadratic drag", "cubic damping", "input delay")
+SAME = 10.0
+CASES = range(300)
+
+
+def mechanism_of(draw: np.random.Generator, number: int) -> StatedMechanism:
+    """A mechanism with rivals whose gains are drawn, and classed by them as the search does."""
+    gain = float(draw.uniform(20, 5000))
+    rivals = []
+    for name in draw.permutation(NAMES)[: draw.integers(0, 5)]:
+        further, other = int(draw.integers(-1, 3)), gain + float(draw.normal(0, 15))
+        if other <= gain - SAME:
+            standing = "less"
+        else:
+            standing = "needless" if further > 0 and other - gain < 2 * further else "same"
+        rivals.append(Rival(str(name), f"{name} in w{number}", other, further, standing))
+    parameters = {
+        f"c_{k}": Estimate(float(draw.normal()), float(draw.uniform(1e-3, 1)), "m/s**2")
+        for k in range(draw.integers(0, 3))
+    }
+    name = str(draw.choice(NAMES))
+    return StatedMechanism(
+        name, f"{name} in v", {"v": "-c_1*sign(v)"}, parameters,
+        Evidence(gain, 7 - gain, 0.0, 0.0), float(draw.choice([0.0, 0.4, 0.9994, 0.99997, 1.0])),
+        equations=("v",), rivals=tuple(rivals),
+    )  # fmt: skip
+
+
+def errors_of(draw: np.random.Generator) -> HeldOutErrors:
+    floor = float(10 ** draw.uniform(-4, 0))
+
+    def error() -> float | None:
+        choices = (None, floor, floor * 1.02, floor * float(10 ** draw.uniform(0, 2)))
+        return choices[draw.integers(0, 4)]
+
+    before, recalibrated = error(), error()
+    augmented = recalibrated if draw.random() < 0.3 else error()
+    values = int(10 ** draw.uniform(1, 4))
+    runs = {"before": before, "recalibrated": recalibrated, "augmented": augmented}
+    return errors_with(runs, floor, draw.chisquare(1, values))
+
+
+def errors_with(
+    runs: dict[str, float | None], floor: float, shape: np.ndarray | float = 1.0
+) -> HeldOutErrors:
+    """Errors of given sizes, whose squares vary alike from value to value."""
+    alike = np.full(1000, 1.0) * shape if np.ndim(shape) == 0 else np.asarray(shape)
+    squares = {
+        name: None if error is None else error**2 * alike / alike.mean() for name, error in runs.items()
+    }
+    return HeldOutErrors.of(squares, noise_floor=floor)
+
+
+def statement_from(number: int, verdict: MismatchVerdict, **changes: Any) -> Statement:
+    draw = np.random.default_rng(number)
+    mechanisms = tuple(mechanism_of(draw, k) for k in range(draw.integers(1, 3)))
+    missing = verdict is MismatchVerdict.MISSING_PHYSICS
+    by = mechanisms if draw.random() < 0.8 else ()
+    description = Description(
+        float(mechanisms[0].share_of_excess if by else 0.0), by, float(10 ** -draw.uniform(0, 20)),
+        bool(draw.integers(2)), too_faint=bool(by) and bool(draw.integers(2)),
+    )  # fmt: skip
+    recalibration = {
+        name: Recalibrated(1.0, 1.0 + float(draw.normal()), float(10 ** draw.uniform(-3, 1)))
+        for name in ("k", "d", "m", "tau", "a")[: draw.integers(1, 6)]
+    }
+    given = {
+        "mechanisms": mechanisms if missing else (),
+        "description": description if verdict is MismatchVerdict.UNEXPLAINED else None,
+        "recalibration": recalibration,
+        "errors": errors_of(draw),
+    }
+    return Statement(verdict, "", **{**given, **changes})
+
+
+def said(statement: Statement) -> str:
+    words = words_of(statement)
+    return " ".join(
+        [sentence_of(statement, {"k": "N/m"}), *(line for lines in words.values() for line in lines)]
+    )
+
+
+def percentages(text: str) -> list[float]:
+    """All numbers in per cent, as a reader takes them."""
+    superscripts = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
+    found = re.findall(r"([\d.]+)(?: × 10([⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+))? %", text)
+    return [float(number) * 10.0 ** int(power.translate(superscripts) or 0) for number, power in found]
+
+
+def mechanisms_in(statement: Statement) -> tuple[StatedMechanism, ...]:
+    return statement.mechanisms if statement.description is None else statement.description.by
+
+
+@pytest.mark.parametrize("verdict", [MismatchVerdict.MISSING_PHYSICS, MismatchVerdict.UNEXPLAINED])
+def test_no_other_is_said_only_where_none_is_as_good(verdict):
+    denied = 0
+    for number in CASES:
+        statement = statement_from(number, verdict)
+        lines = words_of(statement)["alternatives"]
+        for each in mechanisms_in(statement):
+            alone = any(f"as well as {own}:" in line for line in lines for own in (each.name, each.label))
+            others = [m for m in mechanisms_in(statement) if m is not each and m.name == each.name]
+            if alone and not others:
+                denied += 1
+                assert each.rivals
+                assert all(rival.delta_chi2 <= each.evidence.delta_chi2 - SAME for rival in each.rivals)
+            for rival in each.rivals:
+                if rival.standing != "less":
+                    name = rival.label if rival.name == each.name else rival.name
+                    assert any(name.lower() in line.lower() for line in lines), (number, name, lines)
+    assert denied > 5
+
+
+def test_a_class_of_equals_is_part_of_the_first_sentence():
+    for number in CASES:
+        statement = statement_from(number, MismatchVerdict.MISSING_PHYSICS)
+        text = sentence_of(statement, {})
+        open_ended = [m for m in statement.mechanisms if any(r.standing == "same" for r in m.rivals)]
+        assert text.count("the recordings as well") == len(open_ended)
+
+
+@pytest.mark.parametrize("verdict", list(MismatchVerdict))
+def test_a_gain_is_said_only_where_the_held_out_error_falls(verdict):
+    for number in CASES:
+        statement = statement_from(number, verdict)
+        text, errors = sentence_of(statement, {}), statement.errors
+        assert "nan" not in text and "None" not in text and "unknown" not in text
+        pair = {
+            MismatchVerdict.MISSING_PHYSICS: ("without", "augmented"),
+            MismatchVerdict.PARAMETER_SHIFT: ("before", "recalibrated"),
+        }.get(verdict)
+        falls = "falls from" in text
+        if pair is None or None in [errors.error(name) for name in pair]:
+            assert not falls
+            continue
+        first, second = pair
+        by_chance = "no more than it may by chance" in text
+        assert falls == (errors.change(first, second) == "better" or by_chance)
+        assert not by_chance or errors.change(first, second) == "same"
+        if falls and not by_chance:
+            *before, after, _noise = percentages(text.split("falls from")[1])
+            assert after < min(before)
+        elif errors.at_noise(first) and errors.change(first, second) != "worse":
+            assert "too noisy to show it" in text
+        else:
+            assert "does not improve" in text or "worse" in text
+
+
+def test_missing_physics_without_a_gain_cannot_be_read_as_one():
+    same = errors_with({"before": 0.103, "recalibrated": 0.103, "augmented": 0.103}, 0.020)
+    text = sentence_of(statement_from(3, MismatchVerdict.MISSING_PHYSICS, errors=same), {})
+    assert "does not improve the prediction of recordings held out" in text
+    assert text.count("10.3 %") == 2
+
+
+def test_a_parameter_shift_names_its_parameters_with_both_values():
+    for number in CASES:
+        statement = statement_from(number, MismatchVerdict.PARAMETER_SHIFT)
+        text = sentence_of(statement, {"k": "N/m"})
+        assert statement.recalibration is not None
+        z = {n: abs(e.after - e.before) / e.standard_error for n, e in statement.recalibration.items()}
+        certain = sorted((n for n in z if z[n] > 1.96), key=lambda n: -z[n])
+        for name in certain[:3] or [max(z, key=z.__getitem__)]:
+            assert re.search(rf"\b{name} is .* ± .*, where the card has 1", text)
+        for name in set(z) - set(certain[:3]) - {max(z, key=z.__getitem__)}:
+            assert f"{name} is " not in text
+
+
+def test_all_of_it_is_never_said_of_what_is_not_explained():
+    for number in CASES:
+        statement = statement_from(number, MismatchVerdict.UNEXPLAINED)
+        text = said(statement)
+        description = statement.description
+        assert description is not None
+        assert "Nothing accounts" not in text and "probability that" not in text
+        assert ("no mechanism in the dictionary accounts" in text) == (not description.by)
+        if description.share_described < 1:
+            assert " all of " not in text
+        if description.share_described > 0.999:
+            assert "nothing explains it fully" not in text
+        assert ("looks like noise (p =" in text) == (description.p_residuals_random >= 2e-3)
+
+
+@pytest.mark.parametrize("described", [False, True])
+def test_a_model_without_a_name_is_said_with_its_gain_or_that_nothing_was_gained(described):
+    part = StatedFunction(
+        "a function of x", "a function of x in v", "curve", {}, {}, Evidence(90.0, -80.0, 0.0, 0.0), ("v",)
+    )
+    augmented = 0.05 if described else 0.31
+    errors = errors_with({"before": 0.5, "recalibrated": 0.3, "augmented": augmented}, 0.04)
+    description = Description(0.0, (), 0.0, False)
+    text = sentence_of(
+        Statement(
+            MismatchVerdict.UNEXPLAINED, "", description=description, errors=errors,
+            described=(part,) if described else (),
+        ),
+        {},
+    )  # fmt: skip
+    if described:
+        assert "A function of x in the equation of v describes it. With it, the error" in text
+        assert percentages(text.split("falls from")[1])[:3] == [50.0, 30.0, 5.0]
+    else:
+        assert "the simulation stays as it was" in text and "falls from" not in text
+
+
+def test_what_describes_a_rest_is_told_from_what_has_a_name():
+    part = StatedFunction(
+        "a function of x", "a function of x in v", "curve", {}, {}, Evidence(90.0, -80.0, 0.0, 0.0), ("v",)
+    )
+    statement = statement_from(3, MismatchVerdict.MISSING_PHYSICS)
+    runs = {"before": 0.5, "recalibrated": 0.3, "augmented": 0.05, "named": 0.2}
+    errors = errors_with(runs, 0.04)
+    text = sentence_of(replace(statement, errors=errors, described=(part,)), {})
+    named, rest = text.split("What is left has no name; a function of x in the equation of v describes it. ")
+    assert percentages(named.split("falls from")[1])[:3] == [50.0, 30.0, 20.0]
+    assert percentages(rest.split("falls from")[1])[:2] == [20.0, 5.0] and "refitted" not in rest
+
+
+def test_random_forces_are_a_verdict_of_their_own():
+    forces = StatedMechanism(
+        PROCESS_NOISE, PROCESS_NOISE, {}, {"intensity_v": Estimate(0.02, None, "m**2/s**3")},
+        Evidence(None, None, None, None), 1.0, indistinguishable_from=(),
+    )  # fmt: skip
+    text = said(statement_from(1, MismatchVerdict.MISSING_PHYSICS, mechanisms=(forces,))).replace(
+        "\u00a0", " "
+    )
+    assert "driven by random forces" in text and "0.0200 m²/s³ on v" in text
+    assert "lacks" not in text and "falls from" not in text and "explains" not in text
+
+
+def test_a_failure_keeps_its_sentence():
+    statement = statement_of_failure("it runs away")
+    assert statement.sentence == sentence_of(statement, {})
+
+
+@pytest.mark.parametrize("recordings", range(1, 6))
+def test_recordings_are_counted_only_where_there_are_several(recordings):
+    for affected in range(1, recordings + 1):
+        text = where_it_sits(
+            ("v",), "x", {"x": (-2.0, 1.5)}, affected=affected, recordings=recordings, units={"x": "mm"}
+        )
+        assert "between −2.00 and 1.50 mm" in text
+        assert ("all" in text) == (affected == recordings > 1)
+        assert ("recording" in text) == (recordings > 1)
+        assert "1 recordings" not in text.replace("of 1 recordings", "")
+
+
+@pytest.mark.parametrize(
+    ("share", "text"),
+    [
+        (0, "none"), (1, "all"), (0.99996, "more than 99.9 %"), (0.9996, "more than 99.9 %"),
+        (0.99899, "99.8 %"), (0.5, "50 %"), (0.0004, "less than 0.1 %"), (0.996, "99.6 %"), (0.263, "26 %"),
+    ],
+)  # fmt: skip
+def test_a_share_is_not_rounded_to_all_or_nothing(share, text):
+    assert percent(share) == text
+
+
+@pytest.mark.parametrize(
+    ("p", "text"),
+    [(0.4, "0.4"), (0.034, "0.034"), (2.9e-3, "2.9 × 10⁻³"), (0.0, "less than 10⁻¹²"), (1e-9, "1.0 × 10⁻⁹")],
+)
+def test_p_values_are_written_as_people_do(p, text):
+    assert p_text(p) == text

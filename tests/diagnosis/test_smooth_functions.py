@@ -1,0 +1,229 @@
+"""Functions of two coordinates without a name: found, fitted, stated and drawn."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import scipy.stats
+import sympy
+from tests.mismatch.foreign_cases import ForeignCase, course, table_of
+
+from siq.diagnosis import unnamed_models
+from siq.diagnosis.diagnosis import solve_case
+from siq.diagnosis.evidence import evidences_by_size, log_evidence_of
+from siq.diagnosis.function_sites import Ground, Place
+from siq.diagnosis.held_out_fit import simplest_of
+from siq.diagnosis.smooth_functions import (
+    ProductFunction,
+    Smooth,
+    product_of,
+    smooth_function,
+    triangle_of,
+    with_smooth_function,
+)
+from siq.diagnosis.unnamed_models import SHARES
+from siq.inference.budget import Budget, BudgetSpent
+from siq.inference.kalman_filter import Noise
+from siq.inference.maximum_likelihood import fit_by_multiple_shooting
+from siq.inference.measurements import Measurements
+from siq.report.plots.diagnosis import plot_described
+from siq.systems.dynamics import TIME, Diffusion, Dynamics, Signals
+
+X, V = sympy.symbols("x v", real=True)
+ONE = sympy.Integer(1)
+MODEL = Dynamics(("x", "v"), (V, -X), Diffusion.identity(2))
+
+
+def ground(*coordinates: sympy.Symbol, count: int = 400) -> Ground:
+    """Where a function of some coordinates stands, and recordings that have been everywhere."""
+    courses = np.random.default_rng(3).uniform(-1, 3, size=(len(coordinates), count))
+    words = tuple(map(str, coordinates))
+    place = Place((("v", ONE),), (), coordinates[0], words, np.empty(0))
+    return Ground(place, coordinates, words, courses)
+
+
+def product() -> ProductFunction:
+    first, second = (smooth_function(ground(z), (0.25,)) for z in (X, V))
+    return ProductFunction(ground(X, V), first, second, np.ones(first.width + second.width))
+
+
+@pytest.mark.parametrize("function", [smooth_function(ground(X, V), (0.25, 0.5)), product()])
+def test_a_formula_says_what_the_function_does(function: Smooth) -> None:
+    candidate = with_smooth_function(MODEL, function)
+    assert candidate.equations == ("v",) and candidate.coordinate == "x, v"
+    heights = np.random.default_rng(1).normal(size=function.width)
+    known = dict(zip(candidate.amplitudes, heights, strict=True))
+    values = np.array([known.get(each.name, each.value) for each in candidate.model.parameters])
+    states = np.random.default_rng(3).normal(size=(2, 40))
+    empty = np.zeros((0, 40))
+    rates = candidate.model.functions.rates(states, Signals(empty, empty, empty, np.zeros(40)), values)
+    found, derivatives = function.along(heights, states)
+    np.testing.assert_allclose(rates[1] + states[0], found, rtol=1e-4, atol=1e-4)
+    np.testing.assert_array_equal(rates[0], states[1])
+    for place, moved in enumerate(1e-6 * np.eye(function.width)):
+        slope = (function.along(heights + moved, states)[0] - found) / 1e-6
+        np.testing.assert_allclose(slope, derivatives[:, place], atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("where", "shares", "off"), [(ground(X), (0.25,), 1e-4), (ground(X, V), (0.5, 0.25), 0.05)]
+)
+def test_a_sum_of_bumps_is_the_process_where_the_recordings_have_been(
+    where: Ground, shares: tuple[float, ...], off: float
+) -> None:
+    function = smooth_function(where, shares, deviation=1.7)
+    (expected,) = function.expected(tuple(f"b{k}" for k in range(function.width)))
+    along = np.linalg.solve(expected.roots.T, function.values(where.courses))
+    scaled = where.courses / function.lengths[:, None]
+    away = ((scaled[:, :, None] - scaled[:, None, :]) ** 2).sum(axis=0)
+    np.testing.assert_allclose(along.T @ along, 1.7**2 * np.exp(-0.5 * away), atol=off * 1.7**2)
+
+
+def test_a_length_beyond_the_recordings_a_function_is_zero() -> None:
+    function = smooth_function(ground(X), (0.125,))
+    heights = function.heights_of(np.ones(function.width))
+    values, _ = function.along(heights, np.array([[1.0, 2.9, 3.5, 5.0]]))
+    np.testing.assert_allclose(values[:2], 1.0, atol=0.03)
+    assert 0.5 < values[2] < 0.9 and abs(values[3]) < 0.01
+
+
+def test_length_and_size_of_a_function_are_told() -> None:
+    """Of functions that are such processes, over lengths from a sixteenth of the range to half of it."""
+    draw = np.random.default_rng(7)
+    where, noise, found = ground(X), 0.05, []
+    fine = smooth_function(where, (1 / 32,))
+    for share in np.repeat([1 / 16, 1 / 8, 1 / 4, 1 / 2], 5):
+        heights = fine.heights_of(
+            triangle_of(fine.centres, share * where.ranges) @ draw.normal(size=fine.width)
+        )
+        left = fine.along(heights, where.courses)[0] / noise + draw.normal(size=400)
+        told = []
+        for each in SHARES:
+            function = smooth_function(where, (each,))
+            along = np.linalg.solve(function.triangle, function.values(where.courses)).T / noise
+            total = float(left @ left)
+            odds, variance, rest = evidences_by_size(along.T @ along, along.T @ left, total, freedom=400)
+            best = int(np.argmax(odds))
+            told.append((odds[best], each / share, np.sqrt(variance[best] * rest[best] / 400)))
+        found.append(max(told)[1:])
+    ratios, sizes = np.array(found).T
+    assert (np.abs(np.log2(ratios)) <= 1).all() and (ratios == 1).mean() >= 0.75
+    assert 0.5 < np.exp(np.log(sizes).mean()) < 2.0
+
+
+def test_a_product_is_told_where_both_coordinates_were_never_large_at_a_time() -> None:
+    draw = np.random.default_rng(5)
+    x, y = draw.uniform(-1, 3, size=(2, 600))
+    seen = (x < 1) | (y < 1)
+    where = replace(ground(X, V), courses=np.stack([x, y])[:, seen])
+
+    def true(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return np.tanh(2 * x - 2) * np.exp(-((y - 1.5) ** 2))
+
+    told = true(*where.courses) + 0.02 * draw.normal(size=seen.sum())
+    weights = np.eye(len(told)) / 0.02**2
+    found = product_of(
+        where, SHARES, points=where.courses.T, gram=weights, overlap=weights @ told, deviation=1.0
+    )
+    corner = draw.uniform(1.2, 2.8, size=(2, 200))
+    values, _ = found.along(found.begin, corner)
+    np.testing.assert_allclose(values, true(*corner), atol=0.08)
+
+
+def test_evidence_of_parameters_expected_together_is_the_marginal_likelihood() -> None:
+    """Exact for a linear model with normal errors: log N(y; 0, ΦKΦᵀ + σ²)."""
+    t, noise = np.arange(0, 8, 0.1), 0.1**2
+    place = Place((), (("y", ONE),), TIME, ("t",), np.empty(0))
+    function = smooth_function(Ground(place, (TIME,), ("t",), t[None]), (0.125,), deviation=0.8)
+    still = Dynamics(("y",), (sympy.Integer(0),), Diffusion.identity(1))
+    along = 0.8 * np.linalg.solve(function.triangle, function.values(t[None]))
+    exact = [along.T @ along + noise * np.eye(len(t)), noise * np.eye(len(t))]
+    y = np.random.default_rng(2).multivariate_normal(np.zeros(len(t)), exact[0])
+    data = Measurements(("r",), np.array([0, len(t)]), t, y[:, None], ((),), sensor_noise=np.array([noise]))
+    found = []
+    for model in (with_smooth_function(still, function).model, still):
+        fit = fit_by_multiple_shooting(
+            model, data, x=np.zeros((len(t), 1)), noise=Noise(np.array([noise]), np.zeros(1)),
+            estimate_process=False, substeps=1,
+        )  # fmt: skip
+        found.append(log_evidence_of(fit, data))
+    # The first state is a constant of any size; what is the same for both does not count.
+    wide = [scipy.stats.multivariate_normal(np.zeros(len(t)), each + 1e4).logpdf(y) for each in exact]
+    constant = [np.log(np.linalg.solve(each, np.ones(len(t))).sum()) / 2 for each in exact]
+    wanted = wide[0] + constant[0] - wide[1] - constant[1]
+    assert found[0] - found[1] == pytest.approx(wanted, abs=0.02 * abs(wanted))
+
+
+def test_what_is_beyond_all_numbers_ends_a_function_and_not_the_case(monkeypatch: pytest.MonkeyPatch) -> None:
+    def singular(*_: object, **__: object) -> None:
+        raise np.linalg.LinAlgError("singular matrix")
+
+    where = SimpleNamespace(usable=True, words=("x",), along=lambda *_: where)
+    fit, material = SimpleNamespace(model=MODEL, x=np.zeros((3, 2))), SimpleNamespace(data=None)
+    monkeypatch.setattr(unnamed_models, "smoothness_of", singular)
+    assert unnamed_models.with_a_smooth_function((), fit, where, 0.0, material) == []
+    asked = SimpleNamespace(considered=9, told=SimpleNamespace(level=1.0))
+    monkeypatch.setattr(unnamed_models, "smoothness_of", lambda *_, **__: asked)
+    monkeypatch.setattr(unnamed_models, "likeliest_product", singular)
+    assert unnamed_models.with_a_smooth_function((), fit, where, 0.0, material, product=True) == []
+
+
+def test_the_model_of_fewest_coordinates_is_taken_that_foresees_no_worse() -> None:
+    assert simplest_of([1.0, 0.9, 1.1], [2, 1, 1], 0) == 1
+    assert simplest_of([1.0, 1.1, 1.2], [2, 1, 1], 0) == 0
+    assert simplest_of([1.0, 0.5], [1, 1], 0) == 0  # the likeliest of as many
+
+
+def test_a_fit_takes_no_more_than_its_part_of_the_budget() -> None:
+    budget = Budget(work=100.0)
+    with pytest.raises(BudgetSpent), budget.part(0.25):
+        for _ in range(100):
+            budget.charge(1.0)
+    assert budget.spent == 25
+    budget.charge(1.0)  # what comes after has the rest
+
+
+CARD = {
+    "name": "swirl",
+    "states": {"x": {"unit": "mm"}, "y": {"unit": "mm"}},
+    "parameters": {"a": {"value": 0.2, "unit": "1/s"}, "w": {"value": 2.0, "unit": "1/s"}},
+    "equations": {"x": "-a*x + w*y", "y": "-a*y - w*x"},
+}
+
+
+def bumps(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Two bumps in x and y, which are no function of x times y, nor one of y times x."""
+    return 1.5 * np.exp(-(((x - 0.4) / 0.5) ** 2) - ((y - 0.5) / 0.4) ** 2) - 1.2 * np.exp(
+        -(((x + 0.5) / 0.4) ** 2) - ((y - 0.3) / 0.5) ** 2
+    )
+
+
+def test_what_depends_on_two_coordinates_gets_a_surface(tmp_path: Path) -> None:
+    rng = np.random.default_rng(2)
+    t = np.arange(0, 6, 0.1)
+    begin = rng.uniform(-1.5, 1.5, size=(2, 10))
+    x, y = course(
+        lambda t, s: np.stack([-0.2 * s[0] + 2.0 * s[1] + bumps(*s), -0.2 * s[1] - 2.0 * s[0]]), begin, t,
+        within=8,
+    ).transpose(1, 2, 0)  # fmt: skip
+    noisy = {name: each + 0.01 * rng.normal(size=each.shape) for name, each in (("x", x), ("y", y))}
+    case = ForeignCase(CARD, table_of(t, noisy), {"generic": False}).read(tmp_path)
+    verdict = solve_case(case).statement.as_data()
+    assert verdict["verdict"] == "unexplained"
+    (part,) = verdict["described"]
+    assert part["kind"] == "surface" and part["coordinates"] == ["x", "y"]
+    assert verdict["location"]["coordinate"] == "x, y" and list(verdict["location"]["equations"]) == ["x"]
+    assert verdict["fit"]["augmented"] < 0.3 * verdict["fit"]["recalibrated"]
+    surface = part["surface"]
+    x, y = np.meshgrid(*map(np.array, surface["at"]), indexing="ij")
+    value = np.array(surface["value"])
+    near = (np.abs(x) < 0.8) & (np.abs(y) < 0.8)
+    assert np.sqrt(np.mean((value - bumps(x, y))[near] ** 2)) < 0.15
+    figure = plot_described(verdict["described"], units={"x": "mm"}, time_unit="s")
+    assert figure is not None
+    assert figure.axes[0].get_xlabel() == "$x$ (mm)"
+    assert figure.axes[1].get_ylabel() == "added in the equation of $x$"

@@ -1,0 +1,154 @@
+"""D that nobody gave: estimated from the noise, the unit matrix in words, or asked for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from known_systems import as_system, linear_system
+
+from siq.data.recordings import Recordings, snapshot_pairs
+from siq.errors import NumericalFailure
+from siq.inference.field_estimate import DiffusionSource, IdentifiedField, check_units, estimated_diffusion
+from siq.inference.identification import (
+    IdentificationOptions,
+    field_library,
+    identify_vector_field,
+    read_field,
+    write_field,
+)
+from siq.quasipotential.certificate_tests import PredictionLimits
+from siq.quasipotential.landscape import Landscape
+from siq.quasipotential.landscape_comparison import check_same_noise
+from siq.systems.diffusion import Diffusion
+from siq.systems.simulation import SimulationOptions, simulate_snapshots
+from siq.workflow import identification_step, landscape_step
+from siq.workflow.outcomes import Status
+from siq.workflow.pipeline import PipelineSettings
+from siq.workflow.settings import Sampling, StateSpace
+
+D = np.array([[1.0, 0.3], [0.3, 0.5]])
+NORMALISED = D / np.sqrt(np.linalg.det(D))
+LINEAR = IdentificationOptions(degree=1)
+
+
+def recorded(
+    *, noise: float, units: tuple[str | None, str | None] = (None, None), diffusion: np.ndarray = D
+) -> Recordings:
+    options = SimulationOptions(
+        trajectories=40, pairs=100, pair_step=0.01, interval=0.02, noise_intensity=noise
+    )
+    known = as_system(linear_system(2).with_diffusion(diffusion))
+    found = simulate_snapshots(known, options=options, generator=np.random.default_rng(4))
+    return replace(found, units=units)
+
+
+def identified(recordings: Recordings, space: StateSpace | None = None) -> identification_step.Identified:
+    sampling = Sampling(integrator_step=0.002)
+    settings = identification_step.IdentifySettings(
+        0, space or StateSpace(), sampling, LINEAR, PredictionLimits()
+    )
+    return identification_step.run(settings, recordings, number=0)
+
+
+def test_an_estimated_d_is_compared_within_its_errors() -> None:
+    """With the D behind the recordings it agrees, scaled alike; with any other, or another scale, not."""
+    field, states = field_of(identified(recorded(noise=0.02))), np.zeros((1, 2))
+    learned = field.dynamics
+    assert np.abs(field.diffusion.matrix - NORMALISED).max() > 1e-3  # by far more than rounding
+    check_same_noise(learned.with_diffusion(Diffusion(NORMALISED)), learned, states, found=field)
+    for other in (D, 1.2 * NORMALISED, np.eye(2)):
+        with pytest.raises(ValueError, match="D is not the same"):
+            check_same_noise(learned.with_diffusion(Diffusion(other)), learned, states, found=field)
+
+
+def field_of(found: identification_step.Identified) -> IdentifiedField:
+    assert found.record is not None
+    return found.record.found
+
+
+def test_d_is_estimated_from_white_noise_at_determinant_one() -> None:
+    # Of units that differ, too: noise shows what a unit matrix could not.
+    found = identified(recorded(noise=0.02, units=("m", "s")))
+    assert found.outcome.status == Status.OK and found.record is not None
+    assert found.outcome.reason == DiffusionSource.ESTIMATED.note
+    own = field_of(found).diffusion.matrix
+    assert np.linalg.det(own) == pytest.approx(1, rel=1e-12)
+    # 4000 pairs: a relative standard error of √(2/4000) = 2 % in each entry of the diagonal.
+    np.testing.assert_allclose(own, NORMALISED, atol=0.1)
+    assert found.record.noise["intensity"] == pytest.approx(0.02 * np.sqrt(np.linalg.det(D)), rel=0.1)
+
+
+def test_noises_without_a_significant_correlation_have_none() -> None:
+    own = field_of(identified(recorded(noise=0.02, diffusion=np.diag([1.0, 0.5])))).diffusion.matrix
+    assert own[0, 1] == own[1, 0] == 0
+    assert own[0, 0] / own[1, 1] == pytest.approx(2, rel=0.1)
+
+
+def test_a_change_of_units_changes_the_estimate_as_a_covariance() -> None:
+    first = recorded(noise=0.02)
+    units = np.array([1e3, 1e-2])
+    one = field_of(identified(first)).diffusion.matrix
+    other = field_of(identified(replace(first, values=first.values * units))).diffusion.matrix
+    scaled = one * np.outer(units, units)
+    np.testing.assert_allclose(other, scaled / np.sqrt(np.linalg.det(scaled)), rtol=1e-6)
+
+
+@pytest.mark.parametrize("given", ["identity", [2.0, 3.0]])
+def test_d_that_is_given_is_used_and_nothing_is_said(given: str | list[float]) -> None:
+    found = identified(recorded(noise=0.0, units=("m", "s")), StateSpace(diffusion=given))
+    expected = np.eye(2) if given == "identity" else np.diag([2.0, 3.0])
+    np.testing.assert_array_equal(field_of(found).diffusion.matrix, expected)
+    assert found.outcome.reason == ""
+
+
+@pytest.mark.parametrize("units", [(None, None), ("m", None), ("m", "m")])
+def test_without_noise_units_that_are_alike_or_unknown_have_the_unit_matrix_and_it_is_said(
+    units: tuple[str | None, str | None],
+) -> None:
+    found = identified(recorded(noise=0.0, units=units))
+    np.testing.assert_array_equal(field_of(found).diffusion.matrix, np.eye(2))
+    assert found.outcome.status == Status.OK and found.outcome.reason == DiffusionSource.UNIT.note
+
+
+def test_without_noise_d_of_different_units_is_asked_for() -> None:
+    found = identified(recorded(noise=0.0, units=("m", "s")))
+    assert found.record is None and found.outcome.status == Status.FAILED
+    assert "x is in m and y is in s" in found.outcome.reason
+    assert "'recordings.diffusion'" in found.outcome.reason
+    settings = PipelineSettings(identification=LINEAR)
+    with pytest.raises(NumericalFailure, match="D is not known"):
+        Landscape.from_recordings(recorded(noise=0.0, units=("m", "s")), settings)
+
+
+def test_units_that_nobody_knows_are_not_compared() -> None:
+    check_units(["x", "y", "z"], [None, "m", ""])
+    with pytest.raises(NumericalFailure, match="y is in m and z is in s"):
+        check_units(["x", "y", "z"], [None, "m", "s"])
+
+
+def test_the_derivative_of_another_state_shows_no_noise_of_its_own() -> None:
+    draw = np.random.default_rng(0)
+    t, x, path = 0.02 * np.arange(3001), np.array([0.5, 0.0]), []
+    for _ in range(10 * 3000 + 1):
+        path.append(x)
+        push = draw.normal() * np.sqrt(0.1 * 0.002)
+        x = x + 0.002 * np.array([x[1], -x[0] - x[1]]) + np.array([0.0, push])
+    recordings = Recordings.from_arrays(t, np.array(path[::10]), names=["x", "v"])
+    pairs = snapshot_pairs(recordings)
+    found = identify_vector_field(field_library(["x", "v"], LINEAR), pairs, options=LINEAR)
+    assert not found.noise_free and estimated_diffusion(found, pairs=3000) is None
+
+
+def test_where_d_is_from_is_kept_with_the_field_and_said_of_the_landscape(tmp_path) -> None:
+    recordings = recorded(noise=0.0)
+    found = identified(recordings)
+    assert found.record is not None
+    write_field(tmp_path / "vector_field.json", found.record, LINEAR)
+    kept = read_field(tmp_path / "vector_field.json")
+    assert kept is not None and kept.diffusion_source == DiffusionSource.UNIT
+    settings = PipelineSettings(identification=LINEAR).of(landscape_step.LandscapeSettings)
+    seen = landscape_step.run(settings, recordings, kept, number=0)
+    assert seen.landscape is not None and seen.outcome.status == Status.OK
+    assert DiffusionSource.UNIT.note in seen.landscape.notes

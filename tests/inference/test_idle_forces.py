@@ -1,0 +1,70 @@
+"""Random forces whose intensities have gone towards zero are none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+import sympy
+
+from siq.diagnosis.investigation import comparison_of
+from siq.inference.kalman_filter import Noise
+from siq.inference.maximum_likelihood import Fit
+from siq.inference.measurements import Measurements
+from siq.inference.recalibration import (
+    fit_with_and_without_process_noise,
+    recalibrate,
+    simpler_fit,
+    without_idle_forces,
+)
+from siq.systems.diffusion import Diffusion
+from siq.systems.dynamics import Dynamics, Parameter
+
+RATE, STEP = 0.7, 0.1
+
+
+def relaxations(*, driven: float) -> Measurements:
+    """Ten relaxations with a noisy sensor, driven by random forces or not."""
+    rng = np.random.default_rng(3)
+    x, frames = rng.uniform(1, 3, size=10), []
+    for row in range(60):
+        frames.append(pd.DataFrame({"recording": [f"r{k}" for k in range(10)], "t": row * STEP, "x": x}))
+        x = x * np.exp(-RATE * STEP) + driven * np.sqrt(STEP) * rng.normal(size=10)
+    table = pd.concat(frames).sort_values(["recording", "t"], kind="stable")
+    table["x"] += 0.01 * rng.normal(size=len(table))
+    x_, rate = sympy.symbols("x rate", real=True)
+    model = Dynamics(("x",), (-rate * x_,), Diffusion.identity(1), parameters=(Parameter("rate", 1.0),))
+    return comparison_of(model, table).learn
+
+
+def fitted(data: Measurements) -> Fit:
+    x, rate = sympy.symbols("x rate", real=True)
+    model = Dynamics(("x",), (-rate * x,), Diffusion.identity(1), parameters=(Parameter("rate", 1.0),))
+    return recalibrate(model, data)[0]
+
+
+def test_what_does_nothing_is_left_out() -> None:
+    data = relaxations(driven=0.0)
+    fit = fitted(data)
+    assert not fit.has_process_noise
+    idle = replace(fit, noise=Noise(fit.noise.measurement, np.array([1e-22])))
+    without = without_idle_forces(idle, data)
+    assert without is not None and not without.has_process_noise
+    assert without.log_likelihood == pytest.approx(idle.log_likelihood, abs=1e-3)
+
+
+def test_what_drives_the_motion_is_kept() -> None:
+    data = relaxations(driven=0.05)
+    fit = fitted(data)
+    assert fit.has_process_noise and without_idle_forces(fit, data) is None
+
+
+def test_idle_forces_are_not_believed_where_another_way_of_fitting_ends_lower() -> None:
+    data = relaxations(driven=0.0)
+    fit = fitted(data)
+    idle = replace(fit, noise=Noise(fit.noise.measurement, np.array([1e-22])))
+    loose, strict = fit_with_and_without_process_noise(fit.model, data, idle, settled=True)
+    assert loose is idle and not simpler_fit(loose, strict).has_process_noise
+    assert strict.log_likelihood >= idle.log_likelihood - 1e-3

@@ -1,0 +1,220 @@
+"""f beside the noise of a sensor: the right terms, unbiased, and held-out recordings that can refuse it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from remembering import STEP as TIME
+from remembering import double_wells
+
+from siq.data.correlation import markov_lag
+from siq.data.recordings import Recordings, snapshot_pairs
+from siq.data.selection import select_recordings
+from siq.inference.identification import IdentificationOptions, identify_vector_field
+from siq.inference.instrumental_variables import possible_exposures
+from siq.inference.kalman_filter import Noise
+from siq.inference.library import candidate_library
+from siq.inference.noisy_sensor import (
+    FilteredField,
+    filtered_recordings,
+    held_out_evidence,
+    identify_by_likelihood,
+)
+from siq.inference.observation import View, unbroken
+from siq.systems.diffusion import Diffusion
+from siq.workflow import identification_step
+from siq.workflow.identification_step import means_over_exposures
+from siq.workflow.outcomes import Status
+from siq.workflow.pipeline import PipelineSettings
+
+STEP, FORCES, SENSOR = 0.02, 0.3, 0.1
+
+
+def recorded(values: np.ndarray) -> Recordings:
+    return Recordings.from_arrays(TIME * np.arange(values.shape[1]), values, names=["x"])
+
+
+def double_well(seed: int, *, samples: int = 3000, records: int = 6) -> tuple[Recordings, np.ndarray]:
+    """Records of dx = (x - x³) dt + √0.3 dW with sensor noise 0.1, and the states without it."""
+    generator = np.random.default_rng(seed)
+    x, now = np.empty((samples, records)), np.sign(generator.standard_normal(records))
+    for row in range(samples):
+        x[row] = now
+        for _ in range(10):
+            push = np.sqrt(FORCES * STEP / 10) * generator.standard_normal(records)
+            now = now + STEP / 10 * (now - now**3) + push
+    measured = x + SENSOR * generator.standard_normal(x.shape)
+    recordings = Recordings.from_arrays(STEP * np.arange(samples), measured.T[:, :, None], names=["x"])
+    return recordings, x.T.reshape(-1, 1)
+
+
+def identified(recordings: Recordings, *, degree: int) -> FilteredField:
+    library = candidate_library(["x"], degree=degree)
+    begin = identify_vector_field(
+        library, snapshot_pairs(recordings), options=IdentificationOptions(degree=degree)
+    )
+    return identify_by_likelihood(
+        library, recordings, begin.diffusion, Noise(np.array([0.003]), np.array([0.5])),
+        false_terms=0.05, generator=np.random.default_rng(0),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def found() -> tuple[FilteredField, Recordings, np.ndarray]:
+    recordings, x = double_well(1)
+    return identified(recordings, degree=5), recordings, x
+
+
+def test_terms_and_noises_are_found(found: tuple[FilteredField, Recordings, np.ndarray]) -> None:
+    field = found[0].found
+    assert [field.library.names[k] for _, k in field.support] == ["x", "x**3"]
+    errors = np.sqrt(np.diag(field.covariance))
+    assert (np.abs(field.values - [1, -1]) < 3 * errors).all()
+    assert np.sqrt(found[0].sensor[0]) == pytest.approx(SENSOR, rel=0.03)
+    assert field.noise_rate[0, 0] == pytest.approx(FORCES, rel=0.1)
+    assert field.stability is not None and (field.stability > 0.5).all()
+    assert found[0].gain > 100 and abs(found[0].score) < 4
+
+
+def test_where_the_origin_is_does_not_matter(found: tuple[FilteredField, Recordings, np.ndarray]) -> None:
+    """Five states away from its wells a cubic is four monomials that are nearly alike."""
+    one, recordings, _ = found
+    away = identified(replace(recordings, values=recordings.values + 5), degree=5)
+    assert [away.found.library.names[k] for _, k in away.found.support] == ["1", "x", "x**2", "x**3"]
+    x = np.linspace(-1.3, 1.3, 14)[:, None]
+    functions = away.found.library.evaluate(x + 5)[:, away.found.support[:, 1]]
+    error = np.sqrt(np.einsum("np,pq,nq->n", functions, away.found.covariance, functions))
+    change = away.found.dynamics.drift(x + 5)[:, 0] - one.found.dynamics.drift(x)[:, 0]
+    assert (np.abs(change) < 3 * error).all() and error.max() < 0.5
+    assert (np.abs(away.found.values) < 50 * np.sqrt(np.diag(away.found.covariance))).all()
+    assert away.sensor[0] == pytest.approx(one.sensor[0], rel=0.02)
+
+
+def test_filtered_states_are_nearer_and_keep_the_mean_of_f(
+    found: tuple[FilteredField, Recordings, np.ndarray],
+) -> None:
+    one, recordings, x = found
+    filtered = filtered_recordings(one.found, one.sensor, recordings)
+    assert np.std(filtered.values - x) < 0.75 * SENSOR
+    for values, unbiased in ((filtered, True), (recordings, False)):
+        pairs = snapshot_pairs(values)
+        terms = np.column_stack([pairs.x0, pairs.x0**3])
+        slopes = np.linalg.lstsq(terms, (pairs.xh - pairs.x0)[:, 0] / STEP, rcond=None)[0]
+        assert (np.abs(slopes - [1, -1]).max() < 0.3) == unbiased
+
+
+def test_held_out_recordings_refuse_an_f_that_lacks_a_term(
+    found: tuple[FilteredField, Recordings, np.ndarray],
+) -> None:
+    one, recordings, _ = found
+    parts = select_recordings(recordings, [0, 1, 2, 3]), select_recordings(recordings, [4, 5])
+    probability, ratio = held_out_evidence(one, *parts)
+    assert probability > 1e-3 and ratio == pytest.approx(1.0, abs=0.05)
+    field = one.found
+    linear = replace(field, support=field.support[:1], covariance=field.covariance[:1, :1])
+    probability, _ = held_out_evidence(replace(one, found=linear), *parts)
+    assert probability < 1e-6
+
+
+def test_relaxations_without_random_forces_are_whole_trajectories() -> None:
+    """Errors do not add up along a trajectory that nothing drives: f is known far better than by pairs."""
+    generator = np.random.default_rng(3)
+    t = 0.05 * np.arange(80)
+    start = generator.uniform(-1.5, 1.5, 30)
+    # x' = x - x³ from x(0): x² = 1/(1 + (1/x(0)² - 1) exp(-2t))
+    x = np.sign(start)[:, None] / np.sqrt(1 + (1 / start[:, None] ** 2 - 1) * np.exp(-2 * t))
+    measured = x + 0.02 * generator.standard_normal(x.shape)
+    recordings = Recordings.from_arrays(t, measured[:, :, None], names=["x"])
+    one = identified(recordings, degree=5)
+    assert [one.found.library.names[k] for _, k in one.found.support] == ["x", "x**3"]
+    errors = np.sqrt(np.diag(one.found.covariance))
+    assert (np.abs(one.found.values - [1, -1]) < 3 * errors).all() and errors.max() < 0.02
+    assert not one.found.noise_rate.any()
+    assert np.sqrt(one.sensor[0]) == pytest.approx(0.02, rel=0.05)
+    filtered = filtered_recordings(one.found, one.sensor, recordings)
+    assert np.std(filtered.values - x.reshape(-1, 1)) < 0.2 * 0.02
+
+
+def test_means_over_an_exposure_are_treated_as_such() -> None:
+    """f from means is off by the path that two of them share; with the running mean as a state it is not."""
+    generator, within = np.random.default_rng(11), 10
+    samples, step = 12_000, 0.04
+    x, means = np.sign(generator.standard_normal(3)), np.empty((samples, 3))
+    for row in range(samples):
+        total = np.zeros(3)
+        for _ in range(within):
+            push = np.sqrt(FORCES * step / within) * generator.standard_normal(3)
+            before, x = x, x + step / within * (x - x**3) + push
+            total += (before + x) / 2
+        means[row] = total / within
+    means += 0.03 * generator.standard_normal(means.shape)
+    recordings = Recordings.from_arrays(step * np.arange(samples), means.T[:, :, None], names=["x"])
+    settings = PipelineSettings().of(identification_step.IdentifySettings)
+    done = identification_step.run(settings, recordings, number=0)
+    assert done.record is not None and done.record.exposure == pytest.approx(step)
+    field = done.record.found
+    assert [field.library.names[k] for _, k in field.support] == ["x", "x**3"]
+    assert (np.abs(field.values - [1, -1]) < 3.5 * np.sqrt(np.diag(field.covariance))).all()
+    assert field.noise_rate[0, 0] == pytest.approx(FORCES, rel=0.05)
+    assert done.record.sensor_variance is not None
+    assert np.sqrt(done.record.sensor_variance[0]) == pytest.approx(0.03, rel=0.1)
+    assert "as the mean over the 0.04 before it" in done.outcome.reason
+
+
+def test_a_gap_begins_another_recording() -> None:
+    t = np.concatenate([np.arange(5), np.arange(20, 26)]).astype(float)
+    data = unbroken(Recordings.from_arrays(t, np.zeros((11, 1)), names=["x"]))
+    np.testing.assert_array_equal(data.first, [0, 5, 11])
+    assert data.labels == ("0", "0")
+
+
+def test_the_step_asks_the_likelihood_where_sensors_are_noisy() -> None:
+    recordings, _ = double_well(2, samples=2000)
+    settings = PipelineSettings().of(identification_step.IdentifySettings)
+    done = identification_step.run(settings, recordings, number=0)
+    assert done.record is not None and done.outcome.status == Status.OK
+    assert done.record.sensor_variance is not None
+    assert np.sqrt(done.record.sensor_variance[0]) == pytest.approx(SENSOR, rel=0.1)
+    assert "the noise of the sensor" in done.outcome.reason
+
+
+@pytest.mark.parametrize(("steps", "kept", "rows"), [(0.4, 1, 2), (1.0, 1, 1), (1.5, 2, 2), (10.0, 10, 1)])
+def test_exposures_do_not_overlap_and_begin_at_rows_of_their_own(steps: float, kept: int, rows: int) -> None:
+    t = np.concatenate([0.1 * np.arange(101), 20 + 0.1 * np.arange(41)])
+    recordings = Recordings.from_arrays(t, np.sin(t)[:, None], names=["x"])
+    view = View(candidate_library(["x"], degree=1), Diffusion.identity(1), 0.1 * steps)
+    data = view.measured(recordings, None)
+    known = ~np.isnan(data.outputs[:, 0])
+    assert view.every(recordings) == kept
+    assert len(data.first) == 3 and known[data.first[:-1]].all()
+    np.testing.assert_allclose(data.outputs[known, 0], np.sin(data.t[known]))
+    intervals = np.diff(data.t)[data.begins]
+    lengths = {round(float(one), 9) for one in intervals}
+    assert round(0.1 * steps, 9) in lengths and len(lengths) == rows
+    assert np.isfinite(view.states(data)).all()
+    assert data.restarting == (1,)
+
+
+@pytest.mark.parametrize("steps", [0.5, pytest.param(3.0, marks=pytest.mark.slow)])
+def test_means_over_an_exposure_of_another_length_are_treated_as_such(steps: float) -> None:
+    recordings = recorded(double_wells(1, exposure=steps, samples=4_000, sensor=0.01))
+    library = candidate_library(["x"], degree=3)
+    found = means_over_exposures(
+        recordings, steps * TIME, library=library, options=IdentificationOptions(degree=3), pair_step=None,
+        generator=np.random.default_rng(0),
+    )  # fmt: skip
+    assert found is not None and found.exposure == steps * TIME
+    field = found.found
+    assert [field.library.names[k] for _, k in field.support] == ["x", "x**3"]
+    assert (np.abs(field.values - [1, -1]) < 3.5 * np.sqrt(np.diag(field.covariance))).all()
+    assert field.noise_rate[0, 0] == pytest.approx(0.2, rel=0.06)
+
+
+def test_exposures_that_are_tried_are_those_that_residuals_show() -> None:
+    memory = markov_lag(recorded(double_wells(1, exposure=10.0, samples=6_000)))
+    first, second = possible_exposures(memory)
+    assert first == pytest.approx(0.1) and second == memory.memory == pytest.approx(0.1, rel=0.03)
+    assert possible_exposures(replace(memory, kind="either")) == [memory.step]
+    assert possible_exposures(replace(memory, kind="coloured")) == []

@@ -1,0 +1,84 @@
+"""Recalibration where steps at all samples at once lead away, elsewhere, or to and fro."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import sympy
+
+from siq.diagnosis.study import measurements_of
+from siq.inference import maximum_likelihood, recalibration
+from siq.inference.kalman_filter import Noise
+from siq.inference.maximum_likelihood import Fit, Iterate, Shooting, fit_by_multiple_shooting
+from siq.inference.measurements import Measurements
+from siq.systems.diffusion import Diffusion
+from siq.systems.dynamics import Dynamics, Parameter
+
+
+def decays() -> tuple[Dynamics, Measurements]:
+    """Three decays at a rate of 0.7, and a simulation that has it at 1."""
+    n, r = sympy.symbols("n r", real=True)
+    decay = Dynamics(("n",), (-r * n,), Diffusion.identity(1), parameters=(Parameter("r", 1.0),))
+    t, generator = np.arange(0, 4, 0.1), np.random.default_rng(3)
+    data = measurements_of(
+        pd.concat(
+            pd.DataFrame(
+                {"recording": str(k), "t": t, "n": k * np.exp(-0.7 * t) + generator.normal(0, 0.01, len(t))}
+            )
+            for k in (1.0, 2.0, 3.0)
+        ),
+        decay,
+    )
+    return decay, data
+
+
+def test_a_fit_that_leads_away_is_made_again_by_damped_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    decay, data = decays()
+    shooting = recalibration.fit_by_multiple_shooting
+
+    def led_away(model: Dynamics, *given: Any, **named: Any) -> Fit:
+        fit = shooting(model, *given, **named)
+        return replace(fit, model=model.with_values(np.array([1e6])), converged=False, log_likelihood=-1e9)
+
+    monkeypatch.setattr(recalibration, "fit_by_multiple_shooting", led_away)
+    fit, exact = recalibration.recalibrate(decay, data)
+    assert fit.converged and exact.converged and not fit.has_process_noise
+    assert fit.model.values == pytest.approx([0.7], abs=0.01)
+    assert np.sqrt(fit.noise.measurement) == pytest.approx([0.01], rel=0.2)
+
+
+def test_of_two_basins_the_likelier_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    decay, data = decays()
+    from_states_of_the_recordings = recalibration.fit_with_and_without_process_noise
+
+    def elsewhere(model: Dynamics, *given: Any, **named: Any) -> tuple[Fit | None, Fit]:
+        _, fit = from_states_of_the_recordings(model, *given, **named)
+        far = replace(fit, model=model.with_values(np.array([9.0])), log_likelihood=fit.log_likelihood - 40)
+        return None, far
+
+    monkeypatch.setattr(recalibration, "fit_with_and_without_process_noise", elsewhere)
+    fit, exact = recalibration.recalibrate(decay, data)
+    assert not fit.has_process_noise
+    assert [fit.model.values[0], exact.model.values[0]] == pytest.approx([0.7, 0.7], abs=0.01)
+
+
+def test_a_fit_has_not_settled_while_it_foresees_more_than_it_has() -> None:
+    decay, data = decays()
+    x = data.outputs.copy()
+    noise = Noise(np.array([1e-4]), np.zeros(1))
+    fit = fit_by_multiple_shooting(decay, data, x=x, noise=noise, estimate_process=False)
+    assert fit.converged
+
+    def idle(self: Shooting, now: Iterate, change: np.ndarray, noise: Noise) -> tuple[Iterate, float]:
+        return now, 1.0  # a whole step that does nothing of what it promised
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Shooting, "stepped", idle)
+        patch.setattr(maximum_likelihood, "_stands_still", lambda totals: False)
+        stuck = fit_by_multiple_shooting(decay, data, x=x, noise=noise, estimate_process=False)
+        settled = fit_by_multiple_shooting(fit.model, data, x=fit.x, noise=noise, estimate_process=False)
+    assert not stuck.converged and settled.converged

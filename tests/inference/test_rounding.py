@@ -1,0 +1,91 @@
+"""Values written to few decimals: known for what they are, used where it does no harm, and said."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from siq.data.recordings import Recordings, snapshot_pairs
+from siq.inference.identification import IdentificationOptions, identify_vector_field
+from siq.inference.library import candidate_library
+from siq.inference.noisy_sensor import HARMLESS, decimals_needed, is_rounding, rounding_bias, rounding_errors
+from siq.inference.residuals import residual_noise
+from siq.workflow import identification_step
+from siq.workflow.outcomes import Status
+from siq.workflow.pipeline import PipelineSettings
+
+STEP = 0.02
+
+
+def settling(decimals: int | None, *, sensor: float = 0.0, seed: int = 0) -> Recordings:
+    """x' = -x, y' = -2y from many starts, rounded."""
+    generator = np.random.default_rng(seed)
+    start = generator.uniform(-1, 1, (120, 1, 2))
+    t = np.arange(60) * STEP
+    values = start * np.exp(-t[None, :, None] * np.array([1.0, 2.0]))
+    values += sensor * generator.normal(size=values.shape)
+    if decimals is not None:
+        values = values.round(decimals)
+    return Recordings.from_arrays(t, values, names=["x", "y"], units=["µm", "µm"])
+
+
+def identified(recordings: Recordings):  # type: ignore[no-untyped-def]
+    library = candidate_library(["x", "y"], degree=1)
+    return identify_vector_field(library, snapshot_pairs(recordings), options=IdentificationOptions(degree=1))
+
+
+@pytest.mark.parametrize("decimals", [3, 5])
+def test_rounded_recordings_give_formulas_and_it_is_said(decimals: int) -> None:
+    settings = PipelineSettings().of(identification_step.IdentifySettings)
+    found = identification_step.run(settings, settling(decimals), number=0)
+    assert found.record is not None and found.outcome.status == Status.OK
+    error = {3: "0.0003", 5: "3e-06"}[decimals]
+    said = f"'x' and 'y' are written to {decimals} decimals, an error of {error} µm in each value"
+    assert said in found.outcome.reason
+    assert found.record.noise["kind"] == "rounding" and found.record.noise["intensity"] == 0.0
+    field = found.record.found
+    np.testing.assert_array_equal(field.support[:, 0], [0, 1])
+    errors = np.sqrt(np.diag(field.covariance))
+    assert (np.abs(field.values - [-1, -2]) < 3 * errors).all()
+
+
+def test_noise_of_a_sensor_is_not_taken_for_rounding() -> None:
+    noisy = settling(4, sensor=1e-3)
+    noise = residual_noise(identified(noisy), noisy, pair_step=None)
+    assert noise.kind == "measurement" and "measurement noise" in str(noise.fault(("x", "y")))
+    assert not is_rounding(np.array([3e-4, 0.1]), np.array([3e-4, 0.0]), correlation=-0.5)
+    assert is_rounding(np.array([3e-4, 1e-5]), np.array([3e-4, 0.0]), correlation=-0.5)
+
+
+def test_the_bias_of_rounding_is_the_one_that_is_foreseen() -> None:
+    """Over many drawings of a noise, since the error of rounding is not random where steps are small."""
+    sensor = 0.02
+    rounding = np.full(2, sensor)
+    biases, foreseen, errors = [], [], []
+    for seed in range(40):
+        noisy = settling(None, sensor=sensor, seed=seed)
+        found = identified(noisy)
+        if len(found.support) != 2:
+            continue
+        errors.append(np.sqrt(np.diag(found.covariance)))
+        biases.append(found.values - [-1, -2])
+        foreseen.append(rounding_bias(found, snapshot_pairs(noisy), rounding))
+    measured = np.abs(np.mean(biases, axis=0) / np.mean(errors, axis=0)).max()
+    assert np.mean(foreseen) == pytest.approx(measured, rel=0.25)
+    assert np.mean(foreseen) > HARMLESS
+
+
+def test_rounding_that_is_too_coarse_is_refused_with_the_decimals_that_it_takes() -> None:
+    coarse = settling(4)
+    found, pairs = identified(coarse), snapshot_pairs(coarse)
+    noise = residual_noise(found, coarse, pair_step=None)
+    assert noise.kind == "rounding" and noise.fault(("x", "y")) is None and noise.note is not None
+    needed = decimals_needed(coarse, pairs)
+    assert identified(settling(needed)).noise_free and not identified(settling(needed - 2)).noise_free
+    worse = type(noise)(**{**vars(noise), "rounding_bias": 2.0})
+    assert "2.0 standard errors; write at least" in str(worse.fault(("x", "y"))) and worse.note is None
+
+
+def test_what_was_not_rounded_has_no_rounding_error() -> None:
+    assert rounding_errors(settling(None)).tolist() == [0.0, 0.0]
+    np.testing.assert_allclose(rounding_errors(settling(2)), 0.01 / np.sqrt(12))

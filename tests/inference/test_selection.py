@@ -1,0 +1,106 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+from siq.inference.library import CandidateLibrary, candidate_library
+from siq.inference.selection import Equation, best_support, critical_values, improved_support, lacks_terms
+
+LIBRARY = candidate_library(["x", "y"], degree=5)
+NAMES = list(LIBRARY.names)
+
+
+def equation(seed: int, terms: dict[str, float], *, library: CandidateLibrary = LIBRARY) -> Equation:
+    """States about x = ±1, as in two wells, with one unit of noise on what the terms make."""
+    draw = np.random.default_rng(seed)
+    count = 4000
+    side = draw.choice([-1.0, 1.0], count)
+    x = np.stack([side + 0.2 * draw.standard_normal(count), 0.2 * draw.standard_normal(count)], axis=1)
+    functions = library.evaluate(x)
+    goal = draw.standard_normal(count)
+    for name, value in terms.items():
+        goal = goal + value * functions[:, list(library.names).index(name)]
+    return of_rows(np.column_stack([functions, goal]), library)
+
+
+def of_rows(rows: np.ndarray, library: CandidateLibrary) -> Equation:
+    """The equation of functions and, in the last column, what they are to explain."""
+    critical = critical_values(library, false_terms=0.05)
+    return Equation.of_triangle(np.linalg.qr(rows, mode="r"), 0, samples=len(rows), critical=critical)
+
+
+def named(support: tuple[int, ...]) -> set[str]:
+    return {NAMES[place] for place in support}
+
+
+def test_terms_of_low_degree_need_the_least_evidence_and_all_keep_the_probability() -> None:
+    critical = critical_values(LIBRARY, false_terms=0.05)
+    degrees = np.array([sum(map(int, power)) for power in _exponents()])
+    assert all(np.ptp(critical[degrees == one]) == 0 for one in range(6))
+    assert (np.diff([critical[degrees == one][0] for one in range(6)]) > 0).all()
+    assert 2 * LIBRARY.dimension * ndtr(-critical).sum() == pytest.approx(0.05)
+
+
+def _exponents() -> list[tuple[int, ...]]:
+    return [(total - k, k) for total in range(6) for k in range(total + 1)]
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_term_that_elimination_mistook_is_exchanged(seed: int) -> None:
+    made = equation(seed, {"y": -2.0, "x**2*y": -2.0})
+    start = [NAMES.index("y"), NAMES.index("x**4*y")]
+    assert named(improved_support(made, start)) == {"y", "x**2*y"}
+
+
+def test_many_terms_that_make_up_a_few_are_left_for_these() -> None:
+    made = equation(1, {"x": 2.0, "x**2": -2.0, "x*y": -3.0})
+    assert named(best_support(made)) == {"x", "x**2", "x*y"}
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_states_far_from_the_origin_hide_no_better_support(seed: int) -> None:
+    """Where all monomials are nearly alike, exchanges of single terms end far from the best."""
+    draw = np.random.default_rng(seed)
+    functions = LIBRARY.evaluate(1.5 + 0.5 * draw.standard_normal((4000, 2)))
+    terms = {"x": 1.0, "y": -1.0, "x**2*y": 1.0, "y**3": -0.5}
+    true = tuple(sorted(NAMES.index(name) for name in terms))
+    goal = functions[:, true] @ [terms[NAMES[place]] for place in true] + draw.standard_normal(4000)
+    made = of_rows(np.column_stack([functions, goal]), LIBRARY)
+    assert made.score(best_support(made)) <= made.score(true) + 1e-6
+
+
+ONE_STATE = candidate_library(["x"], degree=5)
+
+
+def away_from_the_origin(seed: int, *, bend: float) -> Equation:
+    draw = np.random.default_rng(seed)
+    x = draw.uniform(3.0, 6.3, 4800)
+    goal = -(x - 4.6) + bend * (x - 3.8) * (x - 4.6) * (x - 5.5) + 8 * draw.standard_normal(len(x))
+    return of_rows(np.column_stack([ONE_STATE.evaluate(x[:, None]), goal]), ONE_STATE)
+
+
+def test_terms_that_are_needed_together_are_taken_together() -> None:
+    """None of the four monomials of a cubic far from the origin does much without the others."""
+    made = [away_from_the_origin(seed, bend=1.5) for seed in range(10)]
+    assert all(lacks_terms(one, (0, 1)) for one in made)
+    assert all(len(best_support(one)) >= 3 for one in made)
+    assert not any(lacks_terms(one, best_support(one)) for one in made)
+
+
+def test_a_straight_line_lacks_nothing() -> None:
+    lacking = [lacks_terms(away_from_the_origin(seed, bend=0.0), (0, 1)) for seed in range(100)]
+    assert sum(lacking) <= 9  # 5 expected at most
+
+
+def test_noise_alone_brings_few_terms() -> None:
+    false = [improved_support(equation(seed, {}), ()) for seed in range(60)]
+    # One equation of two: 2.5 % of the seeds are expected to have one.
+    assert sum(map(bool, false)) <= 4
+
+
+def test_scores_of_neighbours_are_those_of_fits() -> None:
+    made = equation(3, {"y": -1.0})
+    support = (NAMES.index("y"), NAMES.index("x"))
+    for score, other in made.neighbours(support):
+        assert score == pytest.approx(made.score(other), rel=1e-6)

@@ -1,0 +1,110 @@
+"""Visits and densities by the Fokker–Planck operator: quadrature in one state, simulation in two."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import sympy
+from scipy.integrate import cumulative_trapezoid
+
+from siq.data.recordings import Recordings
+from siq.data.stationarity import runs_of
+from siq.data.two_states import continued_visits, dwell_counts
+from siq.errors import NumericalFailure
+from siq.quasipotential.occupancy import cell_process, cores_of
+from siq.systems.diffusion import Diffusion, StateNoise
+from siq.systems.dynamics import Dynamics
+
+x, y = sympy.symbols("x y", real=True)
+TILTED = Dynamics(("x",), (x - x**3 + sympy.Rational(1, 10),), Diffusion.identity(1))
+WELLS = np.sort(np.roots([-1, 0, 1, 0.1]).real)[[0, 2]]
+BOX = np.array([[-2.0, 2.0]])
+HALF = 0.1  # width of a core
+
+
+def cores(points: np.ndarray) -> np.ndarray:
+    return cores_of(points, WELLS[:, None], np.ones((2, 1, 1)), np.full(2, HALF**2))
+
+
+class Graded(Diffusion):
+    """D = (1 + x²/2)², as an object that depends on the state."""
+
+    def at(self, points: np.ndarray) -> np.ndarray:
+        return ((1 + points[:, 0] ** 2 / 2) ** 2)[:, None, None]
+
+
+@pytest.mark.parametrize("intensity", [0.05, 0.15, 0.4])
+@pytest.mark.parametrize("graded", [False, True])
+def test_one_state_by_quadrature(intensity: float, graded: bool) -> None:
+    system = TILTED.with_diffusion(Graded(np.eye(1))) if graded else TILTED
+    process = cell_process(system, intensity, BOX)
+    grid = np.linspace(*BOX[0], 200_001)
+    spread = (1 + grid**2 / 2) ** 2 if graded else np.ones_like(grid)
+    force = 2 * (grid - grid**3 + 0.1) / (intensity * spread)
+    scale = np.exp(cumulative_trapezoid(force, grid, initial=0))  # of p D
+    density = scale / spread
+    below = cumulative_trapezoid(density, grid, initial=0)
+    width = process.points[1, 0] - process.points[0, 0]
+    expected = np.interp(process.points[:, 0], grid, density / below[-1])
+    assert np.abs(process.density / width - expected).max() < 1e-4 * expected.max()
+    between = (grid >= WELLS[0] + HALF) & (grid <= WELLS[1] - HALF)
+    core = cores(process.points)
+    for well, mass in enumerate((below, below[-1] - below)):
+        exact = 2 / intensity * np.trapezoid((mass / scale)[between], grid[between])
+        assert process.mean_visit(core, well) == pytest.approx(exact, rel=3e-3)
+
+
+def test_cells_where_a_formula_of_the_noise_is_none_are_left_out() -> None:
+    """D = 1 - x² on a wider box: Jacobi's process, with the density (1 - x²)^(1/ε - 1)."""
+    system = Dynamics(("x",), (-x,), StateNoise((x,), ((1 - x**2,),)))
+    intensity = 0.4
+    process = cell_process(system, intensity, BOX)
+    place = process.points[:, 0]
+    assert np.abs(place).max() < 1 and np.abs(place).max() > 0.99
+    expected = (1 - place**2) ** (1 / intensity - 1)
+    assert process.density == pytest.approx(expected / expected.sum(), rel=1e-3, abs=1e-6)
+    beyond = system.with_diffusion(StateNoise((x,), ((x**2 - 9,),)))
+    with pytest.raises(NumericalFailure, match="does not reach every state"):
+        cell_process(beyond, intensity, BOX)
+
+
+@pytest.mark.parametrize("mixed", [0.0, 0.5])
+def test_two_states_with_mixed_noise_have_the_density_of_a_linear_system(mixed: float) -> None:
+    matrix = np.array([[1.0, mixed], [mixed, 1.0]])
+    system = Dynamics(("x", "y"), (-x, -y), Diffusion(matrix))
+    process = cell_process(system, 0.5, np.array([[-2.5, 2.5], [-2.5, 2.5]]), cells=80)
+    covariance = np.cov(process.points.T, aweights=process.density)
+    assert np.abs(covariance - 0.25 * matrix).max() < 0.005
+
+
+def test_two_states_against_a_simulation() -> None:
+    system = Dynamics(("x", "y"), (x - x**3 - x * y**2, -(1 + x**2) * y), Diffusion.identity(2))
+    intensity, step, steps, walkers = 0.4, 0.01, 20_000, 100
+    generator = np.random.default_rng(3)
+    state = np.stack([np.sign(generator.standard_normal(walkers)), np.zeros(walkers)], axis=1)
+    seen = np.empty((steps, walkers, 2))
+    for k in range(steps):
+        seen[k] = state
+        kick = np.sqrt(intensity * step) * generator.standard_normal(state.shape)
+        state = state + step * system.drift(state) + kick
+    attractors, hessians = np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([2 * np.eye(2)] * 2)
+    levels = np.full(2, 0.4)
+    recordings = Recordings.from_arrays(step * np.arange(steps), seen.transpose(1, 0, 2), names=["x", "y"])
+    visits = continued_visits(cores_of(recordings.values, attractors, hessians, levels), runs_of(recordings))
+    counts = dwell_counts(recordings.t, visits, runs_of(recordings))
+    process = cell_process(system, intensity, np.array([[-2.4, 2.4], [-2.2, 2.2]]), cells=100)
+    core = cores_of(process.points, attractors, hessians, levels)
+    for well, count in enumerate(counts):
+        error = np.hypot(count.relative_error, 0.03)  # of the simulation's own step, and of the cells
+        assert process.mean_visit(core, well) == pytest.approx(count.mean, rel=3 * error)
+
+
+def test_noise_that_is_too_weak_is_refused() -> None:
+    with pytest.raises(NumericalFailure, match="too weak"):
+        cell_process(TILTED, 1e-9, BOX)
+
+
+def test_noise_that_does_not_reach_a_state_is_refused() -> None:
+    system = Dynamics(("x", "y"), (y, x - x**3 - y), Diffusion(np.diag([0.0, 1.0])))
+    with pytest.raises(NumericalFailure, match="does not reach"):
+        cell_process(system, 0.1, np.array([[-2.0, 2.0], [-2.0, 2.0]]))

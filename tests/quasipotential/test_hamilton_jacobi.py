@@ -1,0 +1,159 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import sympy
+from known_systems import (
+    KnownSystem,
+    archetype,
+    double_well,
+    exact_field,
+    linear_system,
+    maier_stein,
+    polynomial_system,
+    uniform_points,
+)
+
+from siq.inference.library import candidate_library
+from siq.quasipotential.hamilton_jacobi import (
+    HamiltonJacobi,
+    LibraryBasis,
+    equation_at,
+    gauss_newton,
+    potential_basis,
+    relative_residual,
+    sensitivity,
+)
+from siq.quasipotential.refinement import field_terms
+from siq.systems.dynamics import Dynamics
+
+SYSTEMS = {
+    "archetype": archetype(3),
+    "Maier-Stein": maier_stein(1),
+    "double well": double_well(2),
+    "linear": linear_system(3),
+    "polynomial": polynomial_system(2, seed=1),
+}
+
+
+def setting(
+    known: KnownSystem, count: int = 400, degree: int = 4
+) -> tuple[HamiltonJacobi, LibraryBasis, np.ndarray]:
+    """The equation at random points, its basis, and the coefficients of the true V."""
+    names = [symbol.name for symbol in known.dynamics.symbols]
+    basis = potential_basis(candidate_library(names, degree=degree))
+    x = uniform_points(known, count, share=0.6)
+    powers = {
+        sympy.Mul(*(s**e for s, e in zip(known.dynamics.symbols, row, strict=True))): float(value)
+        for row, value in sympy.Poly(known.potential, *known.dynamics.symbols).terms()
+    }
+    exact = np.array([powers.get(basis.library.terms[k], 0.0) for k in basis.chosen])
+    return equation_at(basis, x, known.dynamics), basis, exact
+
+
+@pytest.mark.parametrize("known", SYSTEMS.values(), ids=SYSTEMS)
+def test_the_true_v_has_no_residual(known: KnownSystem) -> None:
+    equation, _, exact = setting(known)
+    assert relative_residual(equation, exact) < 1e-13
+
+
+@pytest.mark.parametrize("known", SYSTEMS.values(), ids=SYSTEMS)
+def test_the_jacobian_is_the_derivative_of_the_residual(known: KnownSystem) -> None:
+    equation, _, exact = setting(known, count=60)
+    at = exact + np.random.default_rng(0).normal(size=len(exact))
+    found = equation.jacobian(at)
+    assert found.shape == (len(equation.points), len(exact))
+    step = 1e-6
+    for column, shift in enumerate(step * np.eye(len(exact))):
+        slope = (equation.residual(at + shift) - equation.residual(at - shift)) / (2 * step)
+        np.testing.assert_allclose(found[:, column], slope, rtol=1e-6, atol=1e-6 * np.abs(found).max())
+
+
+@pytest.mark.parametrize("known", SYSTEMS.values(), ids=SYSTEMS)
+def test_gauss_newton_finds_the_true_v_from_near(known: KnownSystem) -> None:
+    equation, _, exact = setting(known)
+    draw = np.random.default_rng(2)
+    for _ in range(3):
+        start = exact * (1 + 0.1 * draw.uniform(-1, 1, size=len(exact)))
+        solution = gauss_newton(equation, start)
+        assert solution.converged
+        assert solution.residual < 1e-12
+        np.testing.assert_allclose(solution.coefficients, exact, atol=1e-9)
+
+
+def test_coefficients_that_are_not_free_stay() -> None:
+    equation, _, exact = setting(SYSTEMS["Maier-Stein"])
+    free = np.arange(len(exact)) % 2 == 0
+    start = np.where(free, 1.1 * exact, exact)
+    solution = gauss_newton(equation, start, free=free)
+    np.testing.assert_array_equal(solution.coefficients[~free], exact[~free])
+    np.testing.assert_allclose(solution.coefficients, exact, atol=1e-10)
+    none = gauss_newton(equation, start, free=np.zeros(len(exact), dtype=bool))
+    assert none.converged
+    np.testing.assert_array_equal(none.coefficients, start)
+
+
+def test_zero_has_an_infinite_residual_though_it_solves_the_equation() -> None:
+    equation, _, exact = setting(SYSTEMS["archetype"])
+    zero = np.zeros_like(exact)
+    assert np.abs(equation.residual(zero)).max() == 0
+    assert relative_residual(equation, zero) == np.inf
+    assert gauss_newton(equation, zero).residual == np.inf
+
+
+def test_the_relative_residual_does_not_depend_on_units_or_time() -> None:
+    known = SYSTEMS["Maier-Stein"]
+    equation, basis, exact = setting(known)
+    wrong = exact * 1.1
+    units, speed = np.array([1e-2, 30.0]), 1e-3
+    powers = np.array([sympy.Poly(basis.library.terms[k], *known.dynamics.symbols).monoms()[0]
+                       for k in basis.chosen])  # fmt: skip
+    back = {s: s / float(u) for s, u in zip(known.dynamics.symbols, units, strict=True)}
+    dynamics = Dynamics.of(
+        known.dynamics.symbols,
+        tuple(speed * float(u) * f.subs(back) for u, f in zip(units, known.dynamics.formulas, strict=True)),
+        diffusion=speed * np.diag(units**2),
+    )
+    scaled = equation_at(basis, equation.points * units, dynamics)
+    other = wrong / np.prod(units**powers, axis=1)
+    assert relative_residual(scaled, other) == pytest.approx(relative_residual(equation, wrong), rel=1e-9)
+
+
+def test_points_where_f_vanishes_are_left_out() -> None:
+    known = SYSTEMS["archetype"]
+    _, basis, exact = setting(known)
+    x = np.concatenate([known.attractors, np.zeros((1, 3)), uniform_points(known, 20)])
+    equation = equation_at(basis, x, known.dynamics)
+    assert len(equation.points) == 20
+    assert np.isfinite(equation.weight).all()
+    assert relative_residual(equation, exact) < 1e-13
+
+
+@pytest.mark.parametrize("name", ["archetype", "Maier-Stein", "double well"])
+def test_the_sensitivity_is_what_solving_again_gives(name: str) -> None:
+    known = SYSTEMS[name]
+    equation, _, exact = setting(known)
+    found = exact_field(known, 5)
+    terms = field_terms(found, equation.points)
+    response = sensitivity(equation, exact, field_terms=terms, components=found.support[:, 0])
+    assert response.shape == (len(exact), len(found.support))
+    step = 1e-5
+    for column in range(len(found.support)):
+        moved = []
+        for sign in (1, -1):
+            values = found.values.copy()
+            values[column] += sign * step
+            flow = found.dynamics.with_values(values).drift(equation.points)
+            moved.append(gauss_newton(replace(equation, flow=flow), exact).coefficients)
+        # The perturbed f has no exact V: the terms of second order are not negligible in every direction.
+        np.testing.assert_allclose(response[:, column], (moved[0] - moved[1]) / (2 * step), atol=2e-3)
+
+
+def test_restricted_equations_know_the_chosen_functions_only() -> None:
+    equation, _, exact = setting(SYSTEMS["double well"])
+    rows = np.flatnonzero(exact)
+    part = equation.restricted(rows)
+    assert part.gradients.shape[2] == len(rows)
+    np.testing.assert_allclose(part.residual(exact[rows]), equation.residual(exact), atol=1e-12)

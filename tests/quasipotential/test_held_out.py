@@ -1,0 +1,74 @@
+"""On which states a formula about one attractor is tested: none that a fit saw."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from known_systems import maier_stein, portrait_of, uniform_points
+
+from siq.data.recordings import SnapshotPairs
+from siq.quasipotential.certificate import HeldOut, part_of
+from siq.quasipotential.certificate_characteristics import FEWEST, Reference, follow_well
+from siq.quasipotential.certificate_tests import basin_region
+from siq.quasipotential.wells import Well, grow_well
+
+KNOWN = maier_stein(1)
+PORTRAIT = portrait_of(KNOWN, 300, share=0.6)
+REGION = basin_region(PORTRAIT, 0)
+
+
+@pytest.fixture(scope="module")
+def well() -> Well:
+    return grow_well(
+        KNOWN.dynamics, PORTRAIT.attractors[0], PORTRAIT.basins[0], PORTRAIT.saddles[0],
+        degree=4, generator=np.random.default_rng(0),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def reference() -> Reference:
+    return follow_well(KNOWN.dynamics, PORTRAIT, 0)
+
+
+def held_out(count: int) -> HeldOut:
+    x0 = uniform_points(KNOWN, count, seed=7, share=0.6)
+    xh = x0 + 0.01 * KNOWN.dynamics.drift(x0)
+    return HeldOut(x0, SnapshotPairs(x0, xh, np.full(count, 0.01), np.arange(count)))
+
+
+def test_a_basin_is_told_by_recorded_descents() -> None:
+    side = PORTRAIT.attractors[0].position[0]  # -1 or 1; the ridge is at x = 0
+    x = uniform_points(KNOWN, 300, seed=8, share=0.55)
+    x = x[np.abs(x[:, 0]) > 0.2]
+    assert (REGION.across(x) == (x[:, 0] * side < 0)).all()
+    assert not REGION.recorded(np.array([[30.0 * side, 0.0]])).any()
+
+
+def test_they_are_held_out_states_of_the_well_and_of_no_other(well: Well, reference: Reference) -> None:
+    given = held_out(400)
+    part = part_of(given, well, REGION, reference)
+    rows = {tuple(row) for row in given.points}
+    assert len(part.points) >= FEWEST and all(tuple(row) in rows for row in part.points)
+    assert (part.points[:, 0] * well.attractor[0] > 0).all()
+    assert (well.values(part.points) < 0.9 * well.level).all()
+    assert part.claimed == 1.0 and "all held out" in part.described
+    # Pairs count by their first sample alone.
+    inside = {tuple(row) for row in part.points}
+    assert {tuple(row) for row in part.pairs.x0} == inside
+
+
+def test_where_they_are_few_characteristics_give_more_and_it_is_said(
+    well: Well, reference: Reference
+) -> None:
+    part = part_of(held_out(40), well, REGION, reference)
+    assert len(part.points) > FEWEST
+    assert "reached by characteristics" in part.described
+    alone = part_of(held_out(40), well, REGION, None)
+    assert 0 < len(alone.points) < FEWEST and "characteristics" not in alone.described
+
+
+def test_a_formula_answers_where_it_claims_to_hold(well: Well, reference: Reference) -> None:
+    # An other curvature across: the residual is large, and the formula claims hardly anything.
+    wrong = np.where(well.basis.exponents[:, 1] == 2, 3.0, 1.0) * well.coefficients
+    other = Well(well.dynamics, well.attractor, well.basis, wrong, well.level, well.saddle, 1.0, well.points)
+    assert part_of(held_out(400), other, REGION, reference).claimed < 0.5

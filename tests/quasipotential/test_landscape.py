@@ -1,0 +1,163 @@
+"""The landscape as an object."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import sympy
+from known_systems import (
+    double_well,
+    exact_field,
+    maier_stein,
+    portrait_of,
+    potential_values,
+    uniform_points,
+)
+from matplotlib.figure import Figure
+
+from siq.errors import NumericalFailure
+from siq.quasipotential.certificate import Certificate
+from siq.quasipotential.certificate_tests import Verdict
+from siq.quasipotential.formulas import model_to_data, read_model, write_model
+from siq.quasipotential.landscape import Landscape
+from siq.quasipotential.landscape_assembly import find_landscape
+from siq.quasipotential.landscape_files import read_landscape, write_landscape
+from siq.quasipotential.refinement import RefinementOptions, refine, refined_decomposition
+from siq.quasipotential.wells import WellOptions
+from siq.systems.diffusion import Diffusion
+from siq.systems.dynamics import Dynamics
+
+
+@functools.cache
+def double() -> Landscape:
+    """Two wells of different depth, from the exact f as if it were known to a thousandth."""
+    known = double_well(2)
+    return find_landscape(
+        exact_field(known, 3, relative_error=1e-3), portrait_of(known, 250, share=0.8),
+        options=WellOptions(degrees=(4,)),
+    )  # fmt: skip
+
+
+def test_the_wells_of_both_files_are_the_same(tmp_path: Path) -> None:
+    known = maier_stein(3)
+    found, points = exact_field(known, 3), uniform_points(known, 300)
+    refined = refine(
+        found, portrait_of(known), library=found.library, formula=None, network=None, points=points,
+        options=RefinementOptions(routes=("local",), degrees=(4, 6)),
+    )  # fmt: skip
+    model = tmp_path / "model.json"
+    write_model(model, model_to_data({"refined": refined_decomposition(refined, points)}, {}))
+    # Another portrait, from other recorded states, as the landscape's own.
+    landscape = find_landscape(found, portrait_of(known, 350), wells=read_model(model)[0]["refined"].wells)
+    write_landscape(tmp_path / "quasipotential.json", landscape, dynamics=found.dynamics)
+    stored = read_landscape(tmp_path / "quasipotential.json", dynamics=found.dynamics)
+    assert stored is not None and len(landscape.wells) == 2 and not landscape.notes
+    for ours, theirs in zip(refined.wells, stored.wells, strict=True):
+        assert theirs is not None
+        np.testing.assert_array_equal(theirs.coefficients, ours.coefficients)
+        assert (theirs.level, theirs.reach) == (ours.level, ours.reach)
+        x = ours.points[::20]
+        known_there = np.isfinite(ours.known_values(x)) & np.isfinite(theirs.known_values(x))
+        assert known_there.mean() > 0.9
+
+
+def test_an_attractor_without_a_refined_well_is_said() -> None:
+    known = maier_stein(1)
+    landscape = find_landscape(exact_field(known, 3), portrait_of(known, 250, share=0.8), wells=())
+    assert landscape.wells == (None, None)
+    assert any("refinement found no formula" in note for note in landscape.notes)
+    assert all(np.isfinite(way.barrier) for way in landscape.transitions)  # by the path alone
+
+
+def test_barriers_are_a_table_in_the_order_of_the_attractors() -> None:
+    known, table = double_well(2), double().barriers()
+    assert list(table.columns) == ["start", "end", "barrier", "standard_error"]
+    assert list(table["start"]) == [0, 1] and list(table["end"]) == [1, 0]
+    saddle = double().transitions[0].saddle.position
+    places = np.stack([saddle, *(one.position for one in double().attractors)])
+    top, *bottoms = potential_values(known, places)
+    np.testing.assert_allclose(table["barrier"], [2 * (top - bottom) for bottom in bottoms], rtol=1e-6)
+    assert (table["standard_error"] > 0).all()
+
+
+def test_u_is_known_over_the_wells_and_nowhere_else() -> None:
+    known, landscape = double_well(2), double()
+    x = np.concatenate([landscape.potential(well).points[::40] for well in (0, 1)])
+    u = landscape.quasipotential(x)
+    assert np.isfinite(u).mean() > 0.9
+    exact = 2 * potential_values(known, x)
+    at = np.isfinite(u)
+    np.testing.assert_allclose(u[at], exact[at] - exact[at].min() + u[at].min(), atol=1e-5)
+    assert np.isnan(landscape.quasipotential(np.full((1, 2), 50.0))).all()
+    with pytest.raises(ValueError, match=r"give \(n, 2\)"):
+        landscape.quasipotential(np.zeros(2))
+
+
+def test_escape_times_follow_the_law_and_say_where_there_is_none() -> None:
+    landscape = double()
+    barrier = landscape.barriers()["barrier"].to_numpy()
+    few, many = (landscape.escape_times(noise=noise) for noise in (barrier.min() / 20, barrier.min() / 10))
+    assert list(few.columns) == ["start", "end", "mean_time", "note"]
+    np.testing.assert_allclose(
+        few["mean_time"] / many["mean_time"], np.exp(10 * barrier / barrier.min()), rtol=1e-3
+    )
+    loud = landscape.escape_times(noise=2 * barrier.max())
+    assert loud["mean_time"].isna().all() and loud["note"].str.contains("far below the barrier").all()
+
+
+def test_no_escape_times_without_d_of_a_system_of_second_order() -> None:
+    x, v = sympy.symbols("x v", real=True)
+    motion = Dynamics.of((x, v), (0.999 * v, x - x**3 - v))
+    with pytest.raises(ValueError, match=r"the equation of x is of the form dx/dt = v.*give the D"):
+        replace(double(), dynamics=motion).escape_times(noise=0.01)
+    given = motion.with_diffusion(Diffusion(np.diag([1e-3, 1.0])))
+    assert len(replace(double(), dynamics=given).escape_times(noise=0.01)) == 2
+
+
+def test_a_well_that_was_not_found_is_asked_for_in_vain() -> None:
+    nothing = replace(double(), wells=(None, double().wells[1]), notes=("too few states",))
+    with pytest.raises(NumericalFailure, match="about attractor 0: too few states"):
+        nothing.potential()
+    assert np.isnan(nothing.quasipotential(np.zeros((3, 2)))).all()
+
+
+def test_the_formula_of_a_well_can_be_taken_elsewhere() -> None:
+    well = double().potential(well=1)
+    x = well.points[:5]
+    module: dict[str, object] = {}
+    exec(well.to_numpy(), module)
+    assert callable(module["V"])
+    np.testing.assert_allclose(module["V"](*x.T), well.values(x), atol=1e-12)
+    values = sympy.lambdify(well.basis.symbols, well.to_sympy())(*x.T)
+    np.testing.assert_allclose(values, well.values(x), atol=1e-12)
+    for source in (well.to_text(), well.to_latex(digits=4), well.to_c(), well.to_julia()):
+        assert "V" in source and "nan" not in source
+
+
+def test_the_report_has_verdict_attractors_and_barriers() -> None:
+    certificate = Certificate({"characteristics": Verdict(0.0, 0.01, True)}, 0.01, "")
+    text = replace(double(), certificate=certificate, notes=("a limit cycle <x>",)).report()
+    assert "The formulas are certified: U is right to within 1 % of its height." in text
+    assert repr(double()) == "<Landscape of (x, y): 2 attractors, 2 ways out>"
+    assert "a limit cycle <x>" in text and "Ways out, and their barriers of U:" in text and "A  B" in text
+    page = replace(double(), notes=("a limit cycle <x>",))._repr_html_()
+    assert "No test was made" in page and "&lt;x&gt;" in page and page.count("<table") == 2
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_landscape_is_drawn_on_given_axes_and_on_new_ones(dimension: int) -> None:
+    axes = Figure().add_subplot()
+    known = double_well(dimension)
+    landscape = double()
+    if dimension == 3:
+        landscape = find_landscape(
+            exact_field(known, 3), portrait_of(known, 250, share=0.8), options=WellOptions(degrees=(4,))
+        )
+    assert landscape.plot(axes) is axes
+    assert axes.get_xlabel() == "$x$" and axes.get_ylabel() in ("$y$", "$z$")
+    assert len(axes.collections) >= 1  # contours
+    assert bool(axes.get_title(loc="left")) == (dimension == 3)

@@ -1,0 +1,138 @@
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+import sympy
+from known_systems import (
+    KnownSystem,
+    archetype,
+    linear_system,
+    maier_stein,
+    polynomial_system,
+    potential_gradient,
+    potential_values,
+)
+
+from siq.quasipotential.power_series import PowerSeries, quasipotential_series
+from siq.systems.dynamics import Dynamics
+
+x, y = (sympy.Symbol(name, real=True) for name in "xy")
+
+
+def series_of(known: KnownSystem, degree: int, which: int = -1) -> PowerSeries:
+    return quasipotential_series(known.dynamics, known.attractors[which], degree=degree)
+
+
+def around(center: np.ndarray, radius: float, count: int = 200) -> np.ndarray:
+    directions = np.random.default_rng(0).normal(size=(count, len(center)))
+    return center + radius * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+EXACT = {
+    **{f"linear {d}": linear_system(d) for d in range(2, 7)},
+    **{f"archetype {d}": archetype(d) for d in (2, 3, 4)},
+    "Maier-Stein": maier_stein(1),
+    "polynomial 2": polynomial_system(2, seed=1),
+    "polynomial 3": polynomial_system(3, seed=1),
+}
+
+
+@pytest.mark.parametrize("known", EXACT.values(), ids=EXACT)
+def test_a_polynomial_quasipotential_is_found_exactly(known: KnownSystem) -> None:
+    series = series_of(known, 5)
+    points = around(series.center, 1.0)
+    at_attractor = potential_values(known, series.center[None])
+    expected = potential_values(known, points) - at_attractor
+    np.testing.assert_allclose(series.evaluate(points), expected, rtol=1e-11, atol=1e-12)
+    np.testing.assert_allclose(
+        series.gradient(points), potential_gradient(known, points), rtol=1e-11, atol=1e-11
+    )
+
+
+def test_the_second_derivatives_are_those_of_the_gradient() -> None:
+    series = series_of(maier_stein(3), 6)
+    points, step = around(series.center, 0.5, 20), 1e-5
+    for state, shift in enumerate(step * np.eye(2)):
+        slope = (series.gradient(points + shift) - series.gradient(points - shift)) / (2 * step)
+        np.testing.assert_allclose(series.hessian(points)[:, state], slope, rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize("degree", [2, 3, 5, 6, 8])
+def test_the_residual_falls_as_the_power_after_the_degree(degree: int) -> None:
+    known = maier_stein(3)  # of which V is no polynomial
+    series = series_of(known, degree)
+
+    def residual(radius: float) -> float:
+        points = around(series.center, radius)
+        slope = series.gradient(points)
+        return float(np.abs(np.sum(slope * (known.dynamics.drift(points) + slope), axis=1)).max())
+
+    # Small enough that the next power rules, large enough that it stands above rounding.
+    assert np.log2(residual(0.04) / residual(0.02)) == pytest.approx(degree + 1, abs=0.4)
+
+
+def test_the_series_turns_with_the_states() -> None:
+    known = maier_stein(3)
+    angle = 0.7
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    u, v = (sympy.Symbol(name, real=True) for name in "uv")
+    back = dict(zip(known.dynamics.symbols, turn.T @ np.array([u, v]), strict=True))
+    turned = Dynamics.of((u, v), tuple(turn @ np.array([f.subs(back) for f in known.dynamics.formulas])))
+    series = series_of(known, 6)
+    other = quasipotential_series(turned, turn @ series.center, degree=6)
+    points = around(series.center, 0.5)
+    np.testing.assert_allclose(other.evaluate(points @ turn.T), series.evaluate(points), rtol=1e-11)
+
+
+def test_the_series_scales_with_the_states_and_the_time() -> None:
+    known = maier_stein(3)
+    scale, speed = np.array([1e-2, 1e3]), 1e-4
+    u, v = (sympy.Symbol(name, real=True) for name in "uv")
+    back = {x: u / scale[0], y: v / scale[1]}
+    equations = tuple(speed * s * f.subs(back) for s, f in zip(scale, known.dynamics.formulas, strict=True))
+    diffusion = speed * np.diag(scale**2)
+    series = series_of(known, 6)
+    other = quasipotential_series(
+        Dynamics.of((u, v), equations, diffusion=diffusion), scale * series.center, degree=6
+    )
+    points = around(series.center, 0.5)
+    np.testing.assert_allclose(other.evaluate(points * scale), series.evaluate(points), rtol=1e-11)
+
+
+def test_a_field_that_is_no_polynomial_is_expanded_by_its_derivatives() -> None:
+    # ∇V·g = 0 for any V and g = 2 (-∂V/∂y, ∂V/∂x).
+    potential = sympy.cosh(x) + sympy.exp(y) - y + x * sympy.sin(y) / 3
+    slope = [potential.diff(x), potential.diff(y)]
+    dynamics = Dynamics.of((x, y), (-slope[0] - 2 * slope[1], -slope[1] + 2 * slope[0]))
+    series = quasipotential_series(dynamics, np.zeros(2), degree=7)
+    points = around(np.zeros(2), 0.1)
+    expected = sympy.lambdify([x, y], potential)(*points.T) - 2
+    np.testing.assert_allclose(series.evaluate(points), expected, atol=1e-11)
+
+
+@pytest.mark.parametrize(("dimension", "degree"), [(3, 6), (4, 5)])
+def test_the_series_is_found_quickly(dimension: int, degree: int) -> None:
+    known = archetype(dimension)
+    began = time.perf_counter()
+    series_of(known, degree)
+    assert time.perf_counter() - began < 2
+
+
+def test_a_saddle_has_no_series() -> None:
+    known = maier_stein(1)
+    with pytest.raises(ValueError, match="no attractor"):
+        quasipotential_series(known.dynamics, np.zeros(2), degree=4)
+
+
+def test_a_point_that_is_no_equilibrium_has_no_series() -> None:
+    known = maier_stein(1)
+    with pytest.raises(ValueError, match="no equilibrium"):
+        quasipotential_series(known.dynamics, np.array([1.001, 0]), degree=4)
+
+
+def test_a_kink_at_the_attractor_is_refused() -> None:
+    dynamics = Dynamics.of((x, y), (-x + sympy.sqrt(sympy.Abs(y)) ** 3, -y))
+    with pytest.raises(ValueError, match="no finite derivatives"):
+        quasipotential_series(dynamics, np.zeros(2), degree=4)

@@ -1,0 +1,124 @@
+"""What was identified is held against the record's own hops and histogram."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from siq.data.recordings import Recordings
+from siq.data.selection import held_out_recordings
+from siq.data.two_states import DwellCount
+from siq.inference.identification import FieldRecord
+from siq.quasipotential.certificate_tests import Verdict
+from siq.quasipotential.occupancy import (
+    RecordTest,
+    cores_about,
+    predicted_visits,
+    probability_of,
+    record_test,
+)
+from siq.quasipotential.rates import NoiseStrength
+from siq.systems.phase_portrait import PhasePortrait, phase_portrait
+from siq.workflow import identification_step
+from siq.workflow.pipeline import PipelineSettings
+
+STEP, WITHIN, SAMPLES, RECORDS, INTENSITY = 0.05, 5, 4000, 10, 0.25
+RECORDED = tuple[Recordings, FieldRecord, PhasePortrait, np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def recorded() -> RECORDED:
+    """Ten recordings of ``dx = (x - x³) dt + √0.25 dW``, f as identified, its portrait, what is held out."""
+    generator, step = np.random.default_rng(11), STEP / WITHIN
+    state, values = np.sign(generator.standard_normal(RECORDS)), np.empty((RECORDS, SAMPLES, 1))
+    for sample in range(SAMPLES):
+        values[:, sample, 0] = state
+        for _ in range(WITHIN):
+            kick = np.sqrt(INTENSITY * step) * generator.standard_normal(RECORDS)
+            state = state + step * (state - state**3) + kick
+    recordings = Recordings.from_arrays(STEP * np.arange(SAMPLES), values, names=["x"])
+    found = identification_step.run(
+        PipelineSettings().of(identification_step.IdentifySettings), recordings, number=0
+    )
+    assert found.record is not None
+    portrait = phase_portrait(found.record.found.dynamics, recordings.values[::40], seed=0)
+    return recordings, found.record, portrait, held_out_recordings(recordings, generator=generator)
+
+
+def compared(recorded: RECORDED, intensity: float = INTENSITY) -> RecordTest:
+    recordings, record, portrait, held_out = recorded
+    return record_test(record.found, portrait, NoiseStrength(intensity), recordings, held_out)
+
+
+def verdict_of(found: RecordTest) -> Verdict:
+    verdict = found.verdict(false_alarms=1e-4)
+    assert verdict is not None
+    return verdict
+
+
+def test_what_is_right_passes(recorded: RECORDED) -> None:
+    found = compared(recorded)
+    assert found.hops > 30 and len(found.visits) == 2 and found.densities
+    assert verdict_of(found).passed
+    for one in found.visits:
+        assert one.method == "operator"
+        error = np.hypot(one.error, one.whole.relative_error)
+        assert abs(np.log(one.whole.mean / one.predicted)) < 3 * error
+
+
+@pytest.mark.parametrize("intensity", [0.1, 0.8])
+def test_a_wrong_strength_of_the_noise_is_refused(recorded: RECORDED, intensity: float) -> None:
+    verdict = verdict_of(compared(recorded, intensity))
+    assert not verdict.passed and verdict.reason
+
+
+def test_a_wrong_depth_is_refused(recorded: RECORDED) -> None:
+    recordings, record, portrait, held_out = recorded
+    deeper = replace(record.found, coefficients=2.5 * record.found.coefficients)
+    found = record_test(deeper, portrait, NoiseStrength(INTENSITY), recordings, held_out)
+    assert not verdict_of(found).passed
+
+
+def test_without_noise_there_is_no_test(recorded: RECORDED) -> None:
+    recordings, record, portrait, held_out = recorded
+    found = record_test(record.found, portrait, None, recordings, held_out)
+    assert found.verdict(false_alarms=1e-4) is None and "strength of the random forces" in str(found.missing)
+
+
+def test_a_record_too_short_to_hop_is_no_test(recorded: RECORDED) -> None:
+    recordings, record, portrait, _ = recorded
+    rows = np.arange(40)
+    short = replace(
+        recordings, labels=("0",), recording=recordings.recording[rows], t=recordings.t[rows],
+        values=recordings.values[rows],
+    )  # fmt: skip
+    found = record_test(record.found, portrait, NoiseStrength(INTENSITY), short, np.array([True]))
+    assert found.missing is not None and "nor should they" in found.missing
+
+
+def test_cores_keep_clear_of_the_saddle(recorded: RECORDED) -> None:
+    _, record, portrait, _ = recorded
+    cores = cores_about(record.found.dynamics, portrait, 10.0)
+    places = np.array([[0.0], [-1.0], [1.0], [-0.7]])
+    assert cores.of(places).tolist()[0] == -1 and set(cores.of(places[1:3]).tolist()) == {0, 1}
+
+
+def test_a_distribution_function_rises_from_nothing_to_all(recorded: RECORDED) -> None:
+    _, record, portrait, _ = recorded
+    noise = NoiseStrength(INTENSITY)
+    cores = cores_about(record.found.dynamics, portrait, INTENSITY)
+    found = predicted_visits(record.found, portrait, noise, cores)
+    along = found.distribution(0, 0, np.linspace(-3, 3, 50), blur=0.1)
+    assert along[0] < 1e-6 and along[-1] > 1 - 1e-6 and (np.diff(along) >= -1e-12).all()
+
+
+def test_probabilities_of_counts_are_those_of_chance() -> None:
+    generator = np.random.default_rng(1)
+    true = np.exp(0.2 * generator.standard_normal(1000))
+    counts = generator.poisson(15 / true)
+    found = [probability_of(DwellCount(int(n), 15.0), 1.0, 0.2) for n in counts]
+    assert np.mean(np.array(found) < 0.05) < 0.06
+    assert probability_of(DwellCount(0, 15.0), 1.0, 0.0) < 1e-5
+    assert probability_of(DwellCount(0, 0.0), 1.0, 0.1) == 1.0

@@ -1,0 +1,282 @@
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from known_systems import (
+    KnownSystem,
+    archetype,
+    exact_archetype,
+    linear_system,
+    maier_stein,
+    polynomial_system,
+    potential_gradient,
+    potential_values,
+)
+from scipy.integrate import solve_ivp
+
+from siq.quasipotential.characteristics import (
+    End,
+    Fan,
+    adapted_fan,
+    characteristics,
+    even_directions,
+    first_caustic,
+    join,
+    lowest_sheet,
+    value_near,
+)
+from siq.systems.dynamics import Dynamics
+from siq.workflow.scoring import exact_values
+
+WELL = np.array([[-2.0, 0.0], [-1.5, 1.5]])  # of Maier–Stein's system, up to the separatrix
+SADDLE_LEVEL = 0.25  # of V along the axis; the barrier itself is lower for β > 4
+
+
+def fan_of(known: KnownSystem, *, level: float, count: int = 32, which: int = 0, **options: Any) -> Fan:
+    directions = even_directions(known.dynamics.dimension, count, generator=np.random.default_rng(0))
+    options = {"box": known.domain, "directions": directions} | options
+    return characteristics(known.dynamics, known.attractors[which], level=level, **options)
+
+
+def escape(beta: float, *, level: float) -> Fan:
+    known = maier_stein(beta)
+    return adapted_fan(
+        known.dynamics,
+        known.attractors[0],
+        level=level,
+        box=WELL,
+        generator=np.random.default_rng(0),
+        count=48,
+        most=200,
+        rounds=4,
+    )
+
+
+@pytest.fixture(scope="module")
+def strong() -> Fan:
+    """Maier–Stein's well for β = 10."""
+    return escape(10, level=0.18)
+
+
+@pytest.mark.parametrize("dimension", [2, 3, 4])
+@pytest.mark.parametrize("start_degree", [2, 4])
+def test_a_linear_system_has_its_quadratic_form(dimension: int, start_degree: int) -> None:
+    known = linear_system(dimension)
+    fan = fan_of(known, level=0.5, count=6, box=100 * known.domain, start_degree=start_degree)
+    assert (fan.ends == End.LEVEL).all()
+    np.testing.assert_allclose(fan.values, potential_values(known, fan.points), rtol=1e-8)
+    np.testing.assert_allclose(fan.momenta, potential_gradient(known, fan.points), rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(fan.hessians, np.broadcast_to(fan.hessian, fan.hessians.shape), atol=1e-8)
+    np.testing.assert_allclose(fan.values[fan.last], 0.5, rtol=1e-7)
+    assert first_caustic(fan) is None
+
+
+def test_the_archetype_has_its_exact_values(archetype: Dynamics) -> None:
+    fan = adapted_fan(
+        archetype,
+        np.array([1.0, 0, 0]),
+        level=0.499,  # of V, whose saddle is at 1/2
+        box=archetype.box,
+        generator=np.random.default_rng(0),
+        most=120,
+        rounds=1,
+    )
+    np.testing.assert_allclose(2 * fan.values, exact_values(exact_archetype(), fan.points.T), atol=2e-7)
+    assert first_caustic(fan) is None
+    assert lowest_sheet(fan).all()
+
+
+def test_momenta_and_curvatures_are_the_derivatives_of_the_value() -> None:
+    known = polynomial_system(2, seed=1)
+    fan = fan_of(known, level=0.05, count=8)
+    np.testing.assert_allclose(fan.momenta, potential_gradient(known, fan.points), rtol=1e-7, atol=1e-8)
+    step = 1e-5
+    for state, shift in enumerate(step * np.eye(2)):
+        slope = potential_gradient(known, fan.points + shift) - potential_gradient(known, fan.points - shift)
+        np.testing.assert_allclose(fan.hessians[:, state], slope / (2 * step), rtol=1e-5, atol=1e-5)
+
+
+def test_units_of_the_states_and_of_time_change_nothing() -> None:
+    known = maier_stein(5)
+    scale, speed = np.array([1e-2, 1e2]), 1e-4
+    back = {symbol: symbol / s for symbol, s in zip(known.dynamics.symbols, scale, strict=True)}
+    equations = tuple(speed * s * f.subs(back) for s, f in zip(scale, known.dynamics.formulas, strict=True))
+    scaled = KnownSystem(
+        Dynamics.of(known.dynamics.symbols, equations, diffusion=speed * np.diag(scale**2)),
+        None,
+        known.attractors * scale,
+        known.domain * scale[:, None],
+    )
+    fan, other = fan_of(known, level=0.2, count=8), fan_of(scaled, level=0.2, count=8)
+    assert len(fan.points) == len(other.points)
+    # The step widths follow rounding errors, so that the two agree as the integrator does with the truth.
+    np.testing.assert_allclose(other.values, fan.values, rtol=1e-6)
+    np.testing.assert_allclose(other.points / scale, fan.points, atol=1e-6)
+
+
+def focus_on_the_axis(beta: float) -> float:
+    """Where ∂²V/∂y² = tan(a) diverges along the path on the axis, from its own equation."""
+
+    def rates(_: float, state: np.ndarray) -> list[float]:
+        x, (sine, cosine) = state[0], (np.sin(state[1]), np.cos(state[1]))
+        bend = 2 * beta * x * (x**3 - x)  # -p ∂²f_x/∂y² with p = x³ - x
+        return [x**3 - x, 2 * (1 + x**2) * sine * cosine - 2 * sine**2 + bend * cosine**2]
+
+    def diverges(_: float, state: np.ndarray) -> float:
+        return float(state[1] + np.pi / 2)
+
+    diverges.terminal = True  # type: ignore[attr-defined]
+    start = [-1 + 1e-7, np.arctan(2)]
+    path = solve_ivp(rates, [0, 40], start, events=diverges, method="DOP853", rtol=1e-11, atol=1e-13)
+    return float(path.y_events[0][0, 0])
+
+
+@pytest.mark.parametrize("beta", [1, 2, 3])
+def test_no_caustic_below_the_saddle_where_the_path_keeps_to_the_axis(beta: float) -> None:
+    fan = fan_of(maier_stein(beta), level=0.999 * SADDLE_LEVEL, box=WELL)
+    assert (fan.ends == End.LEVEL).all()
+    assert first_caustic(fan) is None
+    assert lowest_sheet(fan).all()
+
+
+@pytest.mark.parametrize("beta", [5, 10])
+def test_the_caustic_is_found_on_the_axis(beta: float) -> None:
+    fan = fan_of(maier_stein(beta), level=0.999 * SADDLE_LEVEL, box=WELL)
+    caustic = first_caustic(fan)
+    assert caustic is not None
+    x = focus_on_the_axis(beta)
+    np.testing.assert_allclose(caustic.position, [x, 0], atol=1e-6)
+    assert caustic.value == pytest.approx((x**4 / 2 - x**2 + 0.5) / 2, abs=1e-6)
+    on_axis = fan.curve == int(fan.caustic_curves[np.argmin(fan.caustic_values)])
+    assert fan.values[on_axis].max() < caustic.value  # nothing beyond it is handed on
+
+
+@pytest.mark.parametrize(("beta", "caustic"), [(3, False), (10, True)])
+def test_directions_that_focus_at_once_are_seen_though_the_determinant_keeps_its_sign(
+    beta: float, caustic: bool
+) -> None:
+    flat = maier_stein(beta).dynamics
+    x, y = flat.symbols
+    z = type(y)("z", real=True)
+    # The same system turned about its axis: on it both directions across focus at the same point.
+    equations = (flat.equations[0] - beta * x * z**2, flat.equations[1], -(1 + x**2) * z)
+    fan = characteristics(
+        Dynamics.of((x, y, z), equations),
+        np.array([-1.0, 0, 0]),
+        level=0.999 * SADDLE_LEVEL,
+        box=np.vstack([WELL, [-1.5, 1.5]]),
+        directions=np.array([[1.0, 0, 0], [0.5, 0.5, 0.5]]),
+    )
+    assert (fan.ends[0] == End.CAUSTIC) == caustic
+    if caustic:
+        assert fan.caustic_points[0, 0] == pytest.approx(focus_on_the_axis(beta), abs=1e-6)
+
+
+def test_the_barrier_beyond_the_caustic_is_that_of_minimum_action(strong: Fan) -> None:
+    barrier = 2 * value_near(strong, np.zeros((1, 2)), sheet=lowest_sheet(strong), distance=0.2)[0]
+    assert barrier == pytest.approx(0.34004, rel=1e-3)
+
+
+@pytest.mark.slow
+def test_the_barrier_a_little_above_the_critical_strength() -> None:
+    fan = escape(5, level=0.245)
+    barrier = 2 * value_near(fan, np.zeros((1, 2)), sheet=lowest_sheet(fan), distance=0.2)[0]
+    assert barrier == pytest.approx(0.4831, rel=1e-3)
+
+
+def test_curves_that_have_crossed_the_axis_are_not_on_the_lowest_sheet(strong: Fan) -> None:
+    caustic = first_caustic(strong)
+    assert caustic is not None
+    sheet = lowest_sheet(strong)
+    side = np.sign((strong.points - strong.attractor) @ strong.metric.T[:, 1])
+    began = side[np.searchsorted(strong.curve, np.arange(len(strong.directions)))]
+    past = (strong.points[:, 0] > caustic.position[0]) & (strong.values > caustic.value)
+    crossed = past & (side * began[strong.curve] < 0)
+    deep = crossed & (np.abs(strong.points[:, 1]) > 0.03)
+    assert deep.sum() > 20
+    assert not sheet[deep].any()
+    assert sheet.mean() > 0.9
+    # By symmetry V is even in y, and so must be what is left.
+    kept = strong.points[sheet]
+    mirrored = value_near(strong, kept * [1, -1], sheet=sheet)
+    off_axis = np.isfinite(mirrored) & (np.abs(kept[:, 1]) > 0.03)
+    np.testing.assert_allclose(mirrored[off_axis], strong.values[sheet][off_axis], atol=2e-3)
+
+
+@pytest.mark.slow
+def test_values_near_a_fan_are_of_second_order() -> None:
+    known = polynomial_system(2, seed=1)
+    fan = adapted_fan(
+        known.dynamics,
+        known.attractors[0],
+        level=0.05,
+        box=known.domain,
+        generator=np.random.default_rng(0),
+        rounds=1,
+    )
+    sheet = lowest_sheet(fan)
+    assert sheet.all()
+    within = np.random.default_rng(1).uniform(-0.5, 0.5, size=(200, 2))
+    x = fan.attractor + within @ np.linalg.inv(fan.metric).T
+    exact = potential_values(known, x) - potential_values(known, fan.attractor[None])
+    np.testing.assert_allclose(value_near(fan, x, sheet=sheet), exact, atol=1e-4)
+    assert np.isnan(value_near(fan, fan.attractor[None] + 50, sheet=sheet)).all()
+
+
+def test_curves_end_at_the_box() -> None:
+    box = np.array([[-1.1, -0.9], [-0.1, 0.1]])
+    fan = fan_of(maier_stein(1), level=0.2, box=box)
+    assert (fan.ends == End.BOX).all()
+    assert np.all((fan.points >= box[:, 0]) & (fan.points <= box[:, 1]))
+    reached = fan.points[fan.last]
+    np.testing.assert_allclose(np.abs((reached - [-1, 0]) / 0.1).max(axis=1), 1, atol=1e-6)
+
+
+def test_curves_end_at_a_time_limit_and_at_another_equilibrium() -> None:
+    known = maier_stein(1)
+    assert (fan_of(known, level=0.2, time_limit=0.5).ends == End.TIME).all()
+    to_the_saddle = fan_of(known, level=0.3, directions=np.array([[1.0, 0.0]]))
+    assert to_the_saddle.ends[0] == End.REST
+    assert to_the_saddle.values[-1] == pytest.approx(SADDLE_LEVEL, abs=1e-5)
+
+
+@pytest.mark.slow
+def test_new_curves_are_put_where_neighbours_part() -> None:
+    known = archetype(2)  # whose rates differ, so that evenly spread starts end in bundles
+
+    def widest(fan: Fan) -> float:
+        order = np.argsort(np.arctan2(fan.directions[:, 1], fan.directions[:, 0]))
+        ends = fan.points[fan.last][order] @ fan.metric.T
+        return float(np.linalg.norm(ends - np.roll(ends, 1, axis=0), axis=1).max())
+
+    even = fan_of(known, level=0.4, which=1)
+    adapted = adapted_fan(
+        known.dynamics,
+        known.attractors[1],
+        level=0.4,
+        box=known.domain,
+        generator=np.random.default_rng(0),
+        count=32,
+    )
+    assert len(adapted.directions) <= 512
+    assert widest(adapted) < 0.11 < widest(even)
+
+
+def test_one_state_has_two_curves() -> None:
+    known = linear_system(1)
+    fan = fan_of(known, level=0.5)
+    assert len(fan.ends) == 2
+    np.testing.assert_allclose(fan.values, potential_values(known, fan.points), rtol=1e-9)
+
+
+def test_joined_fans_count_their_curves_on() -> None:
+    known = maier_stein(10)
+    first = fan_of(known, level=0.24, box=WELL, count=8)
+    second = fan_of(known, level=0.24, box=WELL, directions=np.array([[1.0, 0.0], [1.0, 0.1]]))
+    both = join(first, second)
+    assert both.curve.max() == 9
+    assert (np.diff(both.curve) >= 0).all()
+    np.testing.assert_array_equal(both.points[both.curve == 9], second.points[second.curve == 1])
+    assert set(second.caustic_curves + 8) <= set(both.caustic_curves)

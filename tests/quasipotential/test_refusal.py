@@ -1,0 +1,96 @@
+"""Where there is no landscape, what the recordings show by themselves is said all the same."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+import siq
+from siq.data.inspection import inspection_of
+from siq.data.recordings import Recordings
+from siq.data.two_states import RecordStates
+from siq.inference.identification import IdentificationOptions
+from siq.quasipotential.landscape import Landscape, NoLandscape
+from siq.report.landscape_answer import with_seen_states
+from siq.workflow.outcomes import Outcome, Status, Step, why_no_landscape
+from siq.workflow.pipeline import PipelineSettings
+
+LASTS = 60  # samples, in the mean
+
+
+def telegraph() -> Recordings:
+    """Two levels, hops between them, and about each level values that know nothing of each other."""
+    draw = np.random.default_rng(3)
+    hops = draw.random(12_000) < 1 / LASTS
+    x = 2.0 * (np.cumsum(hops) % 2) - 1 + 0.2 * draw.standard_normal(len(hops))
+    table = Recordings.from_arrays(0.5 * np.arange(len(x)), x[:, None], names=["x"])
+    return table
+
+
+def double_well() -> Recordings:
+    draw = np.random.default_rng(1)
+    x = np.empty((20_000, 1))
+    x[0] = 1.0
+    for before in range(len(x) - 1):
+        kick = np.sqrt(0.25 * 0.05) * draw.standard_normal()
+        x[before + 1] = x[before] + 0.05 * (x[before] - x[before] ** 3) + kick
+    return Recordings.from_arrays(0.05 * np.arange(len(x)), x, names=["x"])
+
+
+@pytest.mark.filterwarnings("ignore:invalid value")  # the root is what f is refused for
+def test_a_refusal_carries_the_states_of_the_record() -> None:
+    few = PipelineSettings(identification=IdentificationOptions(functions=("sqrt(x)",)))
+    record = telegraph()
+    with pytest.raises(NoLandscape) as refused:
+        siq.Landscape.from_recordings(record, few)
+    states, seen = refused.value.states, inspection_of(record).seen
+    assert states is not None and seen is not None
+    assert states.as_data() == seen.as_data()  # what the page is made of
+    times = states.dwell_times()
+    for row in times.itertuples():
+        assert row.lowest < LASTS * 0.5 < row.highest
+    assert times["visits"].sum() == states.transitions == pytest.approx(200, abs=45)
+    assert states.levels == pytest.approx((-1, 1), abs=0.3)
+    assert (states.density * np.diff(states.edges)).sum() == pytest.approx(1)
+    said = str(refused.value)
+    assert said.startswith("The recordings hop between two states of x")
+    assert said.endswith(f"But no landscape was found: {refused.value.reason}.")
+    assert said.count(refused.value.reason) == 1
+
+
+def test_a_landscape_that_misses_the_states_says_so_as_the_page_does() -> None:
+    line = PipelineSettings(identification=IdentificationOptions(degree=1))
+    landscape = Landscape.from_recordings(double_well(), line)
+    assert len(landscape.attractors) == 1 and landscape.seen is not None and landscape.seen.supported
+    first, _, second, *_ = landscape.report().splitlines()
+    assert first == landscape.seen.sentence()
+    assert second.startswith("What was identified misses them: the recordings show one stable state")
+
+
+def test_states_of_a_record_come_back_from_plain_data() -> None:
+    seen = inspection_of(telegraph()).seen
+    assert seen is not None
+    again = RecordStates.from_data(json.loads(json.dumps(seen.as_data())))
+    assert again.as_data() == seen.as_data() and again.sentence() == seen.sentence()
+
+
+def test_nothing_is_added_to_what_is_certified() -> None:
+    seen = inspection_of(telegraph()).seen
+    two = {"wells": [{}, {}]}
+    assert with_seen_states(["Two."], two, seen, certified=True) == ["Two."]
+    assert with_seen_states(["Two."], two, None, certified=False) == ["Two."]
+    assert with_seen_states(["Two."], two, seen, certified=False)[1].startswith("Without any formula: the")
+
+
+def test_the_reason_is_that_of_the_step_that_failed() -> None:
+    outcomes = [
+        Outcome(0, Step.IDENTIFY, Status.FAILED, "no term is significant"),
+        Outcome(0, Step.REFINE, Status.SKIPPED, "no vector field was identified (no term is significant)"),
+        Outcome(0, Step.LANDSCAPE, Status.SKIPPED, "no vector field was identified"),
+    ]
+    assert why_no_landscape(outcomes) == "no term is significant"
+    later = Outcome(0, Step.LANDSCAPE, Status.FAILED, "no path was found.")
+    assert why_no_landscape([Outcome(0, Step.REFINE, Status.FAILED, "no V"), later]) == "no path was found"
+    assert why_no_landscape([Outcome(0, Step.IDENTIFY)]) == "the recorded states lead to no stable state"

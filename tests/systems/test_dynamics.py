@@ -1,0 +1,66 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import sympy
+
+from siq.systems.diffusion import Diffusion
+from siq.systems.dynamics import Dynamics, Parameter
+
+x, y, a, b, t = sympy.symbols("x y a b t", real=True)
+POINTS = np.random.default_rng(0).normal(size=(7, 2))
+
+
+def fitted() -> Dynamics:
+    return Dynamics(
+        ("x", "y"), (a * x - b * x**3, -y / a + sympy.sin(x * y)), Diffusion.identity(2),
+        parameters=(Parameter("a", 2.0), Parameter("b", 0.3)),
+    )  # fmt: skip
+
+
+def test_values_stand_in_the_formulas_and_symbols_in_the_equations() -> None:
+    found = fitted()
+    assert found.equations[0].free_symbols == {a, b, x}
+    assert found.formulas[0].free_symbols == {x}
+    assert found.formulas[0].is_polynomial(x)
+    other = found.with_values(np.array([1.0, 0.5]))
+    np.testing.assert_array_equal(other.values, [1.0, 0.5])
+    expected = POINTS[:, 0] - 0.5 * POINTS[:, 0] ** 3
+    np.testing.assert_allclose(other.drift(POINTS)[:, 0], expected, rtol=1e-14)
+
+
+def test_derivatives_are_those_of_the_drift() -> None:
+    found, step = fitted(), 1e-6
+    for j, shift in enumerate(step * np.eye(2)):
+        slope = (found.drift(POINTS + shift) - found.drift(POINTS - shift)) / (2 * step)
+        np.testing.assert_allclose(found.jacobian(POINTS)[:, :, j], slope, atol=1e-8)
+        bend = (found.jacobian(POINTS + shift) - found.jacobian(POINTS - shift)) / (2 * step)
+        np.testing.assert_allclose(found.hessian(POINTS)[..., j], bend, atol=1e-7)
+    np.testing.assert_array_equal(found.drift_of_components(POINTS.T), found.drift(POINTS).T)
+
+
+def test_a_drift_that_depends_on_the_time_is_no_function_of_the_state() -> None:
+    driven = Dynamics.of((x,), (sympy.cos(t) - x,))
+    assert not driven.autonomous
+    with pytest.raises(ValueError, match="no function of x alone"):
+        driven.drift(POINTS[:, :1])
+
+
+@pytest.mark.parametrize(
+    ("change", "fault"),
+    [
+        ({"equations": (-x,)}, "1 equations for 2 states"),
+        ({"units": ("m",)}, "1 units for 2 states"),
+        ({"diffusion": Diffusion.identity(3)}, "3 rows of D for 2 states"),
+        ({"domain": np.zeros((3, 2))}, r"the domain has the shape \(3, 2\)"),
+    ],
+)
+def test_what_does_not_fit_the_states_is_refused(change: dict[str, object], fault: str) -> None:
+    good = {"states": ("x", "y"), "equations": (-x, -y), "diffusion": Diffusion.identity(2)}
+    with pytest.raises(ValueError, match=fault):
+        Dynamics(**(good | change))  # type: ignore[arg-type]
+
+
+def test_a_domain_that_nobody_said_is_asked_for() -> None:
+    with pytest.raises(ValueError, match="no domain of x, y is known"):
+        _ = fitted().box

@@ -1,0 +1,240 @@
+"""All steps of a run in memory, on systems whose answer is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from known_settings import PAPER
+from known_systems import as_system, double_well, potential_gradient, potential_values
+
+from siq.data.recordings import Recordings
+from siq.errors import NumericalFailure
+from siq.networks.options import CheckOptions, TrainingOptions
+from siq.networks.regression import RegressionOptions
+from siq.quasipotential.formulas import exact_decomposition, model_to_data
+from siq.quasipotential.refinement import RefinementOptions
+from siq.systems.simulation import SimulationOptions
+from siq.workflow import identification_step, recordings_step, refinement_step, scoring_step, training_step
+from siq.workflow.outcomes import Method, Outcome, Status, Step
+from siq.workflow.pipeline import Analysis, PipelineSettings, analyse
+from siq.workflow.settings import Sampling, StateSpace
+from siq.workflow.tables import COLUMNS
+from siq.workflow.training_step import TrainedRun, not_trained
+
+KNOWN = double_well(2)
+SYSTEM = as_system(KNOWN)
+SIMULATION = SimulationOptions(trajectories=60, pairs=20, pair_step=0.01, interval=0.05)
+SETTINGS = PipelineSettings(
+    seed=3,
+    space=StateSpace(diffusion=KNOWN.diffusion.tolist()),
+    sampling=Sampling(pair_step=0.01),
+)
+BRIEF = replace(
+    PAPER,
+    widths=(6,),
+    steps=20,
+    batch_size=32,
+    matching="symmetric",
+    thinning_distance=0.3,
+    precision="float32",
+)
+
+
+def drawn(*, number: int = 0) -> recordings_step.Drawn:
+    settings = recordings_step.DrawSettings(3, StateSpace(), SETTINGS.sampling, SIMULATION)
+    return recordings_step.run(settings, SYSTEM, number=number)
+
+
+@pytest.fixture(scope="module")
+def recordings() -> Recordings:
+    found = drawn().recordings
+    assert found is not None
+    return found
+
+
+@pytest.fixture(scope="module")
+def analysis(recordings: Recordings) -> Analysis:
+    return analyse(recordings, SETTINGS)
+
+
+def test_every_step_that_was_asked_for_has_an_outcome(analysis: Analysis) -> None:
+    said = {one.step: one.status for one in analysis.outcomes}
+    assert said == {
+        Step.IDENTIFY: Status.OK, Step.TRAIN: Status.SKIPPED, Step.REFINE: said[Step.REFINE],
+        Step.LANDSCAPE: Status.OK,
+    }  # fmt: skip
+    assert said[Step.REFINE] in (Status.OK, Status.WARNING) and analysis.regressed is None
+
+
+def test_v_and_its_barriers_are_right(analysis: Analysis) -> None:
+    refined = analysis.refined.formulas[Method.REFINED]
+    assert refined.potential is not None
+    x = np.random.default_rng(0).uniform(-1, 1, size=(50, 2))
+    ours = refined.evaluate_gradient(np.ascontiguousarray(x.T)).T
+    assert np.abs(ours - potential_gradient(KNOWN, x)).max() < 1e-5
+    assert analysis.landscape is not None and analysis.landscape.landscape is not None
+    found = analysis.landscape.landscape
+    for way in found.transitions:
+        saddle, bottom = way.saddle.position, found.attractors[way.start].position
+        top, low = potential_values(KNOWN, np.stack([saddle, bottom]))
+        assert way.barrier == pytest.approx(2 * (top - low), rel=1e-4)
+
+
+def test_the_same_seed_gives_the_same_and_another_run_another_answer(recordings: Recordings) -> None:
+    settings = replace(SETTINGS, landscape=None)
+    one, same = analyse(recordings, settings), analyse(recordings, settings)
+    assert one.landscape is None
+    assert one.refined.certificates == same.refined.certificates
+    first, second = drawn(number=0).recordings, drawn(number=1).recordings
+    assert first is not None and second is not None and not np.array_equal(first.values, second.values)
+
+
+def test_networks_take_part_where_settings_ask_for_them(recordings: Recordings) -> None:
+    settings = replace(SETTINGS, training=BRIEF, published_method=False, landscape=None)
+    found = analyse(recordings, settings, device="cpu")
+    assert found.trained.networks is not None and found.trained.outcome.status == Status.OK
+    # Here refinement finds the true V from random weights too: no false solution, and it says so.
+    control = found.refined.certificates[Method.CONTROL]
+    assert control["certified"] is True and control["tests"]["same_as_refined"]["passed"] is True
+    assert control["reason"] == "refinement from random weights led to the same V"
+
+
+@pytest.mark.parametrize(
+    "training",
+    [
+        pytest.param(None, id="without networks"),
+        pytest.param(BRIEF, id="with networks", marks=pytest.mark.slow),
+    ],
+)
+def test_the_regression_does_not_steer_the_refined_formulas(
+    recordings: Recordings, training: TrainingOptions | None
+) -> None:
+    # Of a degree too low for V, of one that is high enough, and where hardly a point is below the level.
+    told = (RegressionOptions(degree=2, level=1e6), RegressionOptions(degree=5, level=0.5))
+    settings = replace(SETTINGS, training=training, landscape=None)
+    one, other = (
+        analyse(recordings, replace(settings, regression=each), device="cpu").refined for each in told
+    )
+    first, second = (
+        model_to_data({"refined": each.formulas[Method.REFINED]}, {"refined": {}})["methods"]["refined"]
+        for each in (one, other)
+    )
+    assert first["V"]["exponents"] == second["V"]["exponents"]
+    # With networks the regression is where the search begins; it ends at the same V, to its own rounding.
+    np.testing.assert_allclose(first["V"]["coefficients"], second["V"]["coefficients"], rtol=1e-8)
+    assert [each["exponents"] for each in first["g"]] == [each["exponents"] for each in second["g"]]
+    reports = [each.certificates[Method.REFINED] for each in (one, other)]
+    assert reports[0]["certified"] == reports[1]["certified"]
+    assert (training is not None) or first == second
+
+
+def test_networks_are_trained_with_the_d_that_the_noise_shows() -> None:
+    noisy = replace(SIMULATION, pairs=40, noise_intensity=0.02)
+    found = recordings_step.run(
+        recordings_step.DrawSettings(3, StateSpace(), Sampling(), noisy), SYSTEM, number=0
+    ).recordings
+    assert found is not None
+    settings = PipelineSettings(
+        sampling=Sampling(0.01, 0.002), training=replace(BRIEF, matching="explicit", steps=2)
+    )
+    record = identification_step.run(
+        settings.of(identification_step.IdentifySettings), found, number=0
+    ).record
+    runs = {0: training_step.RunToTrain(found, record)}
+    networks = training_step.run(settings.of(training_step.TrainSettings), runs, device="cpu").of(0).networks
+    assert record is not None and networks is not None
+    np.testing.assert_allclose(networks.diffusion, record.found.diffusion.matrix, rtol=1e-6)
+    shape = KNOWN.diffusion / np.sqrt(np.linalg.det(KNOWN.diffusion))
+    np.testing.assert_allclose(networks.diffusion, shape, atol=0.2)
+
+
+def test_a_run_without_trajectories_is_skipped_by_every_step_after() -> None:
+    settings = SETTINGS.of(identification_step.IdentifySettings)
+    nothing = identification_step.run(settings, None, number=5)
+    assert (nothing.outcome.run, nothing.outcome.status) == (5, Status.SKIPPED)
+    told = replace(SETTINGS, training=BRIEF).of(training_step.TrainSettings)
+    trained = training_step.run(told, {5: training_step.RunToTrain(None, None)})
+    assert not trained.networks and trained.of(5).networks is None
+    assert trained.outcomes[0].reason == "the run has no trajectories"
+
+
+def test_a_simulation_that_runs_to_infinity_fails_and_says_so() -> None:
+    away = replace(SYSTEM, equations=tuple(symbol**3 for symbol in SYSTEM.symbols))
+    settings = recordings_step.DrawSettings(0, StateSpace(), Sampling(), replace(SIMULATION, interval=2.0))
+    found = recordings_step.run(settings, away, number=2)
+    assert found.recordings is None
+    assert (found.outcome.step, found.outcome.status) == (Step.SIMULATE, Status.FAILED)
+
+
+def test_recordings_are_taken_whole_by_the_first_run_and_resampled_by_others(
+    recordings: Recordings,
+) -> None:
+    settings = recordings_step.DrawSettings(0, StateSpace(), Sampling(), None)
+    first, second = (recordings_step.run(settings, recordings, number=number) for number in (0, 1))
+    assert first.recordings is recordings and second.recordings is not recordings
+    assert first.outcome.step == second.outcome.step == Step.RESAMPLE
+
+
+def test_why_a_check_could_not_be_prepared_is_the_reason(
+    recordings: Recordings, analysis: Analysis, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*arguments: object, **named: object) -> None:
+        raise NumericalFailure("the attractors cannot be told apart")
+
+    monkeypatch.setattr("siq.quasipotential.refinement.training_check", refuse)
+    options = replace(BRIEF, check=CheckOptions(first=10, every=10, attempts=2))
+    settings = replace(SETTINGS, training=options).of(training_step.TrainSettings)
+    runs = {0: training_step.RunToTrain(recordings, analysis.identified.record)}
+    said = training_step.run(settings, runs, device="cpu").outcomes[0]
+    assert said.status == Status.WARNING
+    assert said.reason.endswith("could not be prepared: the attractors cannot be told apart")
+
+
+@pytest.mark.parametrize(
+    "routes", [None, pytest.param(("local", "network"), marks=pytest.mark.slow), ("network",)]
+)
+def test_why_a_training_failed_is_what_refinement_says_first(
+    recordings: Recordings, analysis: Analysis, routes: tuple[str, ...] | None
+) -> None:
+    failed = TrainedRun(None, Outcome(0, Step.TRAIN, Status.FAILED, "the loss became infinite"))
+    options = replace(SETTINGS, refinement=RefinementOptions(routes=routes, degrees=(2,)))
+    found = refinement_step.run(
+        options.of(refinement_step.RefineSettings),
+        refinement_step.RunToRefine(recordings, analysis.identified, failed),
+    )
+    assert found.outcome.status != Status.OK
+    assert found.outcome.reason.startswith("the training gave no networks (the loss became infinite)")
+
+
+def test_where_refinement_needs_no_networks_their_failure_is_a_note(
+    recordings: Recordings, analysis: Analysis
+) -> None:
+    failed = TrainedRun(None, Outcome(0, Step.TRAIN, Status.FAILED, "the loss became infinite"))
+    found = refinement_step.run(
+        SETTINGS.of(refinement_step.RefineSettings),
+        refinement_step.RunToRefine(recordings, analysis.identified, failed),
+    )
+    assert found.outcome.status == Status.OK
+    notes = found.certificates[Method.REFINED]["notes"]
+    assert notes[0] == "the training gave no networks (the loss became infinite)"
+
+
+def test_scores_are_in_the_columns_of_the_contract(analysis: Analysis) -> None:
+    settings = scoring_step.ScoreSettings(3, SETTINGS.regression, None)
+    certificates = {str(name): one for name, one in analysis.refined.certificates.items()}
+    formulas = {str(name): one for name, one in analysis.refined.formulas.items()}
+    assert KNOWN.potential is not None
+    exact = exact_decomposition(SYSTEM, 2 * KNOWN.potential)
+    given = scoring_step.RunToScore(formulas, certificates, not_trained(0), SYSTEM, exact)
+    found = scoring_step.run(settings, given)
+    assert found.outcome == Outcome(0, Step.SCORE)
+    for name in ("coefficients", "rrmse", "prediction", "certificates"):
+        assert list(getattr(found, name).columns) == list(COLUMNS[name])
+    errors = found.rrmse.set_index("method")["rrmse"]
+    assert errors["refined"] < 1e-5 and np.isnan(errors["regression"])
+    skipped = scoring_step.run(
+        settings, scoring_step.RunToScore({}, {}, TrainedRun(None, Outcome(0, Step.TRAIN)))
+    )
+    assert skipped.outcome.reason == "there is no formula to score"

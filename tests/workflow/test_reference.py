@@ -1,0 +1,82 @@
+"""The reference of a card without wells is empty and says why; nothing after it fails."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import sympy
+from known_systems import as_system, limit_cycle
+
+from siq.quasipotential.landscape import LandscapeOptions
+from siq.quasipotential.landscape_comparison import read_reference, write_reference
+from siq.report.landscape_tables import landscape_sentences
+from siq.report.settings import LandscapeFiguresSettings
+from siq.report.study_figures import LandscapeComparisons, landscape_figures
+from siq.systems.dynamics import Dynamics
+from siq.workflow import comparison_steps
+from siq.workflow.comparison_steps import LandscapeErrorsSettings
+from siq.workflow.outcomes import Status, Step
+from siq.workflow.settings import StateSpace
+from siq.workflow.tables import COLUMNS, as_table
+
+X, Y = sympy.symbols("x y", real=True)
+SETTINGS = comparison_steps.ReferenceSettings(seed=1)
+
+
+def system(formulas: tuple[sympy.Expr, ...], domain: list[list[float]]) -> Dynamics:
+    """A system with a domain, as a card gives it."""
+    return replace(Dynamics.of((X, Y)[: len(formulas)], formulas), domain=np.array(domain))
+
+
+CYCLE = as_system(limit_cycle())
+VAN_DER_POL = system((Y, (1 - X**2) * Y - X), [[-3.0, 3.0], [-4.0, 4.0]])
+ONE_WELL = system((-X, -2 * Y), [[-1.0, 1.0], [-1.0, 1.0]])
+
+
+@pytest.mark.parametrize(
+    ("card", "reason"),
+    [
+        (CYCLE, "limit cycle of period 3.142"),
+        (VAN_DER_POL, "limit cycle of period 6.663"),
+        (ONE_WELL, "no saddle parts the attractors"),
+        (system((0 * X, 0 * Y), [[-1.0, 1.0], [-1.0, 1.0]]), "nothing moves"),
+    ],
+)
+def test_without_wells_there_is_a_reason_and_no_rows(card: Dynamics, reason: str, tmp_path: Path) -> None:
+    write_reference(tmp_path / "reference.npz", comparison_steps.run(SETTINGS, card))
+    found = read_reference(tmp_path / "reference.npz")
+    assert reason in found.reason and found.attractors.shape == (0, 2)
+    settings = LandscapeErrorsSettings(seed=1, space=StateSpace(), landscape=LandscapeOptions())
+    table = comparison_steps.run_landscape_errors(settings, found, [], None)
+    assert list(table.columns) == list(COLUMNS["landscape_errors"]) and table.empty
+    beside = LandscapeComparisons(found, as_table("escape", []), as_table("degrees", []), {}, None)
+    drawn = landscape_figures(
+        LandscapeFiguresSettings(space=StateSpace(), landscape=LandscapeOptions()), None, beside
+    )
+    assert "landscape_errors" not in drawn
+
+
+def test_a_reference_that_exists_has_no_reason(tmp_path: Path) -> None:
+    wells = system((X - X**3,), [[-1.6, 1.6]])
+    write_reference(tmp_path / "reference.npz", comparison_steps.run(SETTINGS, wells))
+    found = read_reference(tmp_path / "reference.npz")
+    assert found.reason == "" and len(found.attractors) == 2
+
+
+def test_the_answer_says_that_there_is_no_landscape_and_why() -> None:
+    outcomes = pd.DataFrame(
+        {
+            "run": [0, 1],
+            "step": [Step.LANDSCAPE] * 2,
+            "status": [Status.WARNING, Status.OK],
+            "reason": ["a cycle", ""],
+        }
+    )
+    wells = as_table("landscape", [{"run": 1, "kind": "attractor"}])
+    assert landscape_sentences(wells, outcomes) == ["There is no landscape of 1 of 2 runs: a cycle."]
+    assert landscape_sentences(wells.iloc[:0], outcomes.iloc[:1]) == ["There is no landscape: a cycle."]
+    assert landscape_sentences(wells, outcomes.iloc[1:]) == []

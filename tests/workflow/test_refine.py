@@ -1,0 +1,73 @@
+"""What refuses one formula for all wells refuses not the wells."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import sympy
+
+from siq.data.recordings import SnapshotPairs
+from siq.quasipotential.certificate import Certificate
+from siq.quasipotential.certificate_tests import Verdict
+from siq.quasipotential.refinement import Refined, RefinementOptions
+from siq.systems.dynamics import Dynamics
+from siq.systems.phase_portrait import phase_portrait
+from siq.workflow import refinement_step
+from siq.workflow.refinement_step import every_well_held_out
+
+PASSED, REFUSED = Verdict(0.0, 1.0, True), Verdict(2.0, 1.0, False, "it is no solution")
+
+
+def certificate(verdict: Verdict, scope: str) -> Certificate:
+    return Certificate({"characteristics": verdict}, 0.01, verdict.reason, scope)
+
+
+@pytest.mark.parametrize(
+    ("formula", "wells", "scope", "whole"),
+    [
+        (PASSED, PASSED, "region", True),
+        (REFUSED, PASSED, "wells", False),
+        (REFUSED, REFUSED, "region", True),
+    ],
+)
+def test_the_wells_carry_the_certificate_where_one_formula_is_refused(
+    monkeypatch: pytest.MonkeyPatch, formula: Verdict, wells: Verdict, scope: str, whole: bool
+) -> None:
+    well: Any = object()
+    found = Refined(
+        None, None, np.ones(1), np.ones((1, 1)), np.eye(1), np.ones((1, 1)), 0.01, True, (well,), (), (),  # type: ignore[arg-type]
+    )  # fmt: skip
+    monkeypatch.setattr(refinement_step, "refine", lambda *_, **__: found)
+    monkeypatch.setattr(refinement_step, "formula_library", lambda *_: None)
+    monkeypatch.setattr(refinement_step, "relative_error_of", lambda *_: 0.0)
+    monkeypatch.setattr(
+        refinement_step, "refined_decomposition", lambda one, _: SimpleNamespace(potential=one.potential)
+    )
+    ground: Any = SimpleNamespace(
+        found=None, portrait=None, points=None, number=0,
+        certify=lambda *_, **__: certificate(formula, "region"),
+        certify_wells=lambda *_, **__: certificate(wells, "wells"),
+    )  # fmt: skip
+    refined, formulas, made = refinement_step.refined_by_routes(ground, RefinementOptions(), None, None)
+    assert made.scope == scope
+    assert (formulas.potential is not None) == whole
+    assert made.certified == (PASSED in (formula, wells))
+    assert any("no single formula" in note for note in refined.notes) == (not whole)
+
+
+def test_recordings_of_every_well_are_held_out_where_they_stay_in_theirs() -> None:
+    x, y = sympy.symbols("x y", real=True)
+    draw = np.random.default_rng(0)
+    states = draw.uniform([-1.6, -0.8], [1.6, 0.8], (600, 2))
+    portrait = phase_portrait(Dynamics.of((x, y), (x - x**3, -y)), states)
+    places = np.repeat([-1.0, -1.0, 1.0, 1.0, 1.0], 200)
+    x0 = np.stack([places, np.zeros(1000)], axis=1) + 0.1 * draw.standard_normal((1000, 2))
+    recording = np.repeat(np.arange(5), 200)
+    pairs = SnapshotPairs(x0=x0, xh=x0, h=np.full(1000, 0.1), recording=recording)
+    mask = np.array([True, False, False, False, False])
+    found = every_well_held_out(portrait, pairs, mask)
+    assert found.tolist()[:2] == [True, False] and found[2:].sum() == 1
+    assert every_well_held_out(portrait, pairs, found).tolist() == found.tolist()

@@ -1,0 +1,107 @@
+"""The training of a block of runs: attempts, checks, and what a killed job goes on from."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from known_settings import PAPER
+
+from siq.data.recordings import SnapshotPairs
+from siq.networks.options import CheckOptions
+from siq.networks.trained import TrainedNetworks, pack
+from siq.networks.training import prepare_data
+from siq.systems.diffusion import Diffusion
+from siq.workflow.outcomes import Status
+from siq.workflow.training_step import Block, Kept, clean
+
+TRAINING = replace(
+    PAPER,
+    widths=(6,),
+    steps=60,
+    batch_size=16,
+    thinning_distance=0.3,
+    check=CheckOptions(first=20, every=20, attempts=2),
+)
+
+
+def data(run: int):
+    x0 = np.random.default_rng(run).uniform(-2, 2, size=(200, 2))
+    pairs = SnapshotPairs(x0, x0 * np.exp(-0.05), np.full(200, 0.05), np.repeat(np.arange(10), 20))
+    return prepare_data(pairs, options=TRAINING, generator=np.random.default_rng(run))
+
+
+class Check:
+    """Passes at its n-th call, or for the networks given, and may be told to die at a call."""
+
+    def __init__(self, passes_at: int = -1, *, like: TrainedNetworks | None = None, dies_at: int = -1):
+        self.calls, self.passes_at, self.like, self.dies_at = 0, passes_at, like, dies_at
+
+    def hopeless(self) -> None:
+        return None
+
+    def passes(self, networks: TrainedNetworks) -> bool:
+        self.calls += 1
+        if self.calls == self.dies_at:
+            raise KeyboardInterrupt
+        if self.like is not None:  # a pure function of the networks, as the real check is
+            return same(networks, self.like)
+        return self.calls == self.passes_at
+
+
+def same(left: TrainedNetworks, right: TrainedNetworks) -> bool:
+    one, other = pack([left]), pack([right])
+    return all(np.array_equal(one[name], other[name]) for name in one)
+
+
+def block(folder: Path | None, checks: dict[int, Check], **further) -> Block:
+    return Block(
+        {run: data(run) for run in (0, 1)}, checks, options=TRAINING, diffusion=Diffusion.identity(2), seed=3,
+        kept=Kept(folder, "m" * 20), device=torch.device("cpu"), **further,
+    )  # type: ignore[arg-type]  # fmt: skip
+
+
+def test_each_run_stops_where_its_check_passed_and_only_the_others_start_afresh(tmp_path: Path) -> None:
+    one = block(tmp_path, {0: Check(2), 1: Check(5)})  # run 1 passes in its second training
+    one.train()
+    assert set(one.passed) == {0, 1}
+    assert one.outcome(0).status == one.outcome(1).status == Status.OK
+    assert [one.outcome(run).details["position"] for run in (0, 1)] == [0, 1]
+    history = one.history()
+    assert set(history["run"]) == {0, 1}
+    assert list(tmp_path.glob("kept-*"))
+    clean(tmp_path)
+    assert not list(tmp_path.glob("kept-*"))
+
+
+def test_a_run_whose_check_never_passes_is_shown_as_such(tmp_path: Path) -> None:
+    one = block(tmp_path, {0: Check(1), 1: Check(99)})
+    one.train()
+    said = one.outcome(1)
+    assert said.status == Status.WARNING and "passed in none of 2 trainings" in said.reason
+
+
+def test_why_a_run_has_no_check_is_said() -> None:
+    one = block(None, {0: Check(1)}, faults={1: "the check could not be prepared: no attractor"})
+    one.train()
+    assert one.outcome(0).status == Status.OK
+    said = one.outcome(1)
+    assert (said.status, said.reason) == (Status.WARNING, "the check could not be prepared: no attractor")
+
+
+def test_a_killed_job_ends_with_the_same_networks(tmp_path: Path) -> None:
+    whole = block(tmp_path / "whole", {0: Check(2), 1: Check(5)})
+    whole.train()
+    goals = whole.passed
+    for dies_at in (2, 3, 4, 5):
+        folder = tmp_path / f"killed at {dies_at}"
+        killed = block(folder, {0: Check(like=goals[0]), 1: Check(like=goals[1], dies_at=dies_at)})
+        with pytest.raises(KeyboardInterrupt):
+            killed.train()
+        resumed = block(folder, {0: Check(like=goals[0]), 1: Check(like=goals[1])})
+        resumed.train()
+        assert set(resumed.passed) == {0, 1}
+        assert all(same(resumed.last[run], whole.last[run]) for run in (0, 1))
