@@ -12,13 +12,14 @@ import html
 import math
 import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 from xml.dom.minidom import Document
 
 import numpy as np
 import pandas as pd
 import sympy
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import ChoiceLoader, Environment, FileSystemLoader, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from sympy.printing.mathml import MathMLPresentationPrinter
 from sympy.printing.precedence import PRECEDENCE
@@ -350,14 +351,14 @@ SHORT_TEXT, LINE = 24, 34  # characters: longer texts wrap, to lines no shorter 
 PHONE, PAGE = 360, 950  # pixels that a table may fill
 
 
-def render_template(name: str, content: object) -> str:
-    """Render a page as HTML; all text is escaped, but for what is `markupsafe.Markup`."""
-    return _environment().get_template(name).render(content=content)
+def render_template(name: str, content: object, *, folder: Path | None = None) -> str:
+    """Render a page as HTML; all text is escaped, but for what is `markupsafe.Markup`.
 
-
-def _environment() -> Environment:
+    A `folder` may have templates of its own beside those of this package.
+    """
+    package = PackageLoader("siq.report")
     environment = Environment(
-        loader=PackageLoader("siq.report"),
+        loader=package if folder is None else ChoiceLoader([FileSystemLoader(folder), package]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -377,7 +378,7 @@ def _environment() -> Environment:
         "unbroken": lambda text: text.replace(" × 10", "\u00a0×\u00a010"),
         "records": lambda frame: list(frame.itertuples(index=False, name=None)),
     }
-    return environment
+    return environment.get_template(name).render(content=content)
 
 
 def kept_columns(frame: pd.DataFrame) -> pd.DataFrame:

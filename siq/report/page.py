@@ -208,60 +208,6 @@ def render_report(content: ReportContent) -> str:
     return render_template("report.html.j2", content)
 
 
-@dataclass(frozen=True)
-class ReproductionSection:
-    """One place of a publication, with ours beside it.
-
-    Attributes
-    ----------
-    place
-        The place: ``Fig. 8 (fig2b)``.
-    text
-        What it shows, and what of it is not shown here, in paragraphs.
-    tables, figures
-        Its numbers with ours, and our figures.
-    """
-
-    place: str
-    text: Sequence[str] = ()
-    tables: Sequence[ReportTable] = ()
-    figures: Sequence[ReportFigure] = ()
-
-
-@dataclass(frozen=True)
-class ReproductionContent:
-    """All that the page of a reproduction says.
-
-    Attributes
-    ----------
-    title, introduction
-        Title, and paragraphs below it.
-    overview
-        Tables over everything.
-    contradictions
-        Sentences.
-    sections
-        The places of the publication, in its order.
-    commands
-        Command lines that make everything again.
-    language
-        Language of the page, for hyphenation and screen readers.
-    """
-
-    title: str
-    introduction: Sequence[str] = ()
-    overview: Sequence[ReportTable] = ()
-    contradictions: Sequence[str] = ()
-    sections: Sequence[ReproductionSection] = ()
-    commands: Sequence[str] = ()
-    language: str = "en"
-
-
-def render_reproduction(content: ReproductionContent) -> str:
-    """Render a reproduction as one HTML page; all text is escaped."""
-    return render_template("reproduction.html.j2", content)
-
-
 NODES = 64_000  # of the grid: 85 kB in the page
 MOST_NODES = 128  # along one state
 MOST_STATES = 4  # a grid of more would be too coarse to show a well

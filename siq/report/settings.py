@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pydantic.dataclasses import dataclass
 
-from siq.networks.options import TrainingOptions
 from siq.networks.regression import RegressionOptions
 from siq.quasipotential.landscape import LandscapeOptions
 from siq.systems.simulation import SimulationOptions
@@ -36,14 +35,3 @@ class PageSettings:
     """Of the page: the whole study, which it prints."""
 
     study: Study
-
-
-@dataclass(frozen=True, config=STRICT)
-class ReproductionSettings:
-    """Of the page that has everything of the paper: what the paper's parameters are set beside."""
-
-    runs: int
-    simulation: SimulationOptions | None
-    training: TrainingOptions | None
-    regression: RegressionOptions
-    domain: tuple[tuple[float, float], ...] | None

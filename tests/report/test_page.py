@@ -19,11 +19,9 @@ from siq.report.page import (
     ReportFigure,
     ReportSection,
     ReportTable,
-    ReproductionContent,
-    ReproductionSection,
     render_report,
-    render_reproduction,
 )
+from workflow.reproduction.page import ReproductionContent, ReproductionSection, render_reproduction
 
 HOSTILE = "<script>alert('x')</script> & \"quoted\""
 EMPTY_ELEMENTS = {"meta", "img"}

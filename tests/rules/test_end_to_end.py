@@ -7,15 +7,14 @@ import pandas as pd
 import pytest
 
 from siq.quasipotential.formulas import read_model
-from siq.report.page import render_reproduction
-from siq.report.reproduction_page import Paper, Results, reproduction_page
-from siq.report.settings import ReproductionSettings
 from siq.systems.cards import load_system
 from siq.workflow.published import load_published
 from siq.workflow.reproduction import Parameters, Place
 from siq.workflow.settings import settings_of
 from siq.workflow.study import completed, load_study
 from siq.workflow.tables import COLUMNS
+from workflow.reproduction import ReproductionSettings
+from workflow.reproduction.page import Paper, Results, render_reproduction, reproduction_page
 
 pytestmark = pytest.mark.workflow
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
-from siq.report.settings import FiguresSettings, PageSettings, ReproductionSettings
+from siq.report.settings import FiguresSettings, PageSettings
 from siq.systems.dynamics import Dynamics
 from siq.workflow.identification_step import IdentifySettings
 from siq.workflow.landscape_step import LandscapeSettings
@@ -19,6 +19,7 @@ from siq.workflow.scoring_step import ScoreSettings
 from siq.workflow.settings import Sampling, StateSpace, StudyParts, card_content, settings_of
 from siq.workflow.study import Study, load_study
 from siq.workflow.training_step import TrainSettings
+from workflow.reproduction import ReproductionSettings
 
 Write = Callable[..., Path]
 CLASSES = (

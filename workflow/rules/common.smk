@@ -12,7 +12,6 @@ from siq.report.settings import (
     FiguresSettings,
     LandscapeFiguresSettings,
     PageSettings,
-    ReproductionSettings,
 )
 from siq.report.study_figures import CAPTIONS as STUDY_CAPTIONS
 from siq.report.study_figures import Part, figure_place
@@ -35,6 +34,7 @@ from siq.workflow.training_step import TrainSettings
 from siq.workflow.published import load_published
 from siq.workflow.study import point_name
 from workflow.code_digest import code_digest
+from workflow.reproduction import ReproductionSettings
 from workflow.places import BASE, config_path, find_file
 from workflow.settings import Studies, prepare_environment
 from workflow.warm import start

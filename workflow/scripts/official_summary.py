@@ -13,10 +13,10 @@ from siq.data.public_recordings import BENCHMARKS
 from siq.numerics.files import whole_file
 from siq.report.plots.proof import plot_official_tests
 from siq.report.plots.style import save_figure
-from siq.report.reproduction_page import official_page, official_rows
 from siq.systems.cards import load_system
 from siq.workflow.tables import read_table, write_table
 from step import job, read_json
+from workflow.reproduction.official_tests import official_page, official_rows
 
 
 def main(snakemake: Any) -> None:

@@ -10,13 +10,12 @@ import yaml
 from pydantic import TypeAdapter
 
 from siq.numerics.files import whole_file
-from siq.report.page import render_reproduction
-from siq.report.reproduction_page import Paper, Results, reproduction_page
-from siq.report.settings import ReproductionSettings
 from siq.systems.cards import load_system
 from siq.workflow.published import load_published
 from siq.workflow.reproduction import load_contents, load_parameters
 from step import job
+from workflow.reproduction import ReproductionSettings
+from workflow.reproduction.page import Paper, Results, render_reproduction, reproduction_page
 
 if __name__ == "__main__":
     with job() as now:

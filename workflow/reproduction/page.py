@@ -1,4 +1,4 @@
-"""The page beside a publication, and the table of official tests."""
+"""Every table, figure and number of the paper, in its order, with ours and the difference."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ import pandas as pd
 from siq.inference.identification import read_field
 from siq.networks.regression import points_below
 from siq.numerics.randomness import Purpose, generator
-from siq.numerics.text import number_text, value_text
+from siq.numerics.text import number_text
+from siq.report.formatting import render_template
 from siq.report.landscape_tables import errors_table, invariant_tables, readable
-from siq.report.page import ReportFigure, ReportTable, ReproductionContent, ReproductionSection
-from siq.report.settings import ReproductionSettings
+from siq.report.page import ReportFigure, ReportTable
 from siq.systems.dynamics import Dynamics
 from siq.workflow.collection_steps import ModelFiles, shown_formula
 from siq.workflow.outcomes import Method
@@ -35,6 +35,7 @@ from siq.workflow.reproduction import (
 )
 from siq.workflow.scoring import summary_row, summary_table
 from siq.workflow.tables import as_table, read_table
+from workflow.reproduction import ReproductionSettings
 
 POINTS = 20_000  # of the domain, on which published formulas are held against their own equations
 SHOWN = 60  # rows of a table
@@ -42,6 +43,60 @@ EXPLAINED = {
     "ours": "mean and standard deviation over the runs, of formulas that solve the Hamilton–Jacobi equation",
     "regression": "the same by the published method, from our short training",
 }
+
+
+@dataclass(frozen=True)
+class ReproductionSection:
+    """One place of a publication, with ours beside it.
+
+    Attributes
+    ----------
+    place
+        The place: ``Fig. 8 (fig2b)``.
+    text
+        What it shows, and what of it is not shown here, in paragraphs.
+    tables, figures
+        Its numbers with ours, and our figures.
+    """
+
+    place: str
+    text: Sequence[str] = ()
+    tables: Sequence[ReportTable] = ()
+    figures: Sequence[ReportFigure] = ()
+
+
+@dataclass(frozen=True)
+class ReproductionContent:
+    """All that the page of a reproduction says.
+
+    Attributes
+    ----------
+    title, introduction
+        Title, and paragraphs below it.
+    overview
+        Tables over everything.
+    contradictions
+        Sentences.
+    sections
+        The places of the publication, in its order.
+    commands
+        Command lines that make everything again.
+    language
+        Language of the page, for hyphenation and screen readers.
+    """
+
+    title: str
+    introduction: Sequence[str] = ()
+    overview: Sequence[ReportTable] = ()
+    contradictions: Sequence[str] = ()
+    sections: Sequence[ReproductionSection] = ()
+    commands: Sequence[str] = ()
+    language: str = "en"
+
+
+def render_reproduction(content: ReproductionContent) -> str:
+    """Render a reproduction as one HTML page; all text is escaped."""
+    return render_template("page.html.j2", content, folder=Path(__file__).parent)
 
 
 @dataclass(frozen=True)
@@ -284,61 +339,3 @@ def reproduction_page(
         commands=[command],
     )
     return content, pd.concat(every, ignore_index=True)
-
-
-OURS = {
-    "recalibrated": "the card’s equations, refitted",
-    "augmented": "the card with what the diagnosis found",
-}
-
-
-def official_rows(benchmark: str, table: pd.DataFrame) -> pd.DataFrame:
-    """The errors of a benchmark, ready to stand in one table with others.
-
-    Parameters
-    ----------
-    benchmark
-        Its name.
-    table
-        Of `siq.diagnosis.official_tests.official_tables`.
-
-    Returns
-    -------
-    pandas.DataFrame
-        Columns ``benchmark test by error unit scored source``.
-    """
-    return pd.DataFrame(
-        {
-            "benchmark": benchmark,
-            "test": table["test"],
-            "by": table["simulation"].map(OURS).fillna(table["simulation"]),
-            "error": table["error"],
-            "unit": table["unit"],
-            "scored": table["scored"],
-            "source": table["source"],
-        }
-    )
-
-
-def official_page(rows: pd.DataFrame, verdicts: Mapping[str, Mapping[str, Any]]) -> str:
-    """The table as Markdown, below what the diagnosis says of each benchmark.
-
-    Parameters
-    ----------
-    rows
-        Of `official_rows`, of all benchmarks.
-    verdicts
-        What ``verdict.json`` says, by benchmark.
-    """
-    lines = ["# Official tests of public benchmarks", ""]
-    for name, verdict in verdicts.items():
-        lines += [f"**{name}**: {verdict['sentence']}", ""]
-    lines += [
-        "| benchmark | test | by | error | how it was scored | who says so |",
-        "|---|---|---|---|---|---|",
-    ]
-    for row in rows.to_dict("records"):
-        error = f"{value_text(float(row['error']), digits=3)} {row['unit']}"
-        cells = (row["benchmark"], row["test"], row["by"], error, row["scored"], row["source"])
-        lines.append(f"| {' | '.join(map(str, cells))} |")
-    return "\n".join(lines) + "\n"
