@@ -21,6 +21,8 @@ from siq.certificate.descent import check_descent
 from siq.certificate.tests import Candidate, CertificateOptions
 from siq.data.recordings import SnapshotPairs
 
+pytestmark = pytest.mark.portable
+
 OPTIONS = CertificateOptions()
 NOISE = 0.02  # ε: the noise per unit of time is ε D
 

@@ -18,6 +18,8 @@ from known_systems import (
 from siq.certificate.error_bound import SAFETY, residual_integral
 from siq.dynamics.dynamics import Dynamics
 
+pytestmark = pytest.mark.portable
+
 Gradient = Callable[[np.ndarray], np.ndarray]
 
 

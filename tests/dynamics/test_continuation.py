@@ -8,6 +8,8 @@ from siq.dynamics.continuation import follow_branches, place_on
 from siq.dynamics.dynamics import Dynamics
 from siq.dynamics.parameter_family import ParameterFamily
 
+pytestmark = pytest.mark.portable
+
 x, y, z, k, mu = sympy.symbols("x y z k mu", real=True)
 
 

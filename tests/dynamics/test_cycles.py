@@ -10,6 +10,8 @@ from siq.dynamics.cycles import Cycle, closed_orbit, hessians_along, unstable_di
 from siq.dynamics.dynamics import Dynamics
 from siq.errors import NumericalFailure
 
+pytestmark = pytest.mark.portable
+
 x, y, z = (sympy.Symbol(name, real=True) for name in "xyz")
 INNER, OUTER, TURN = 0.6, 1.0, 2.0
 

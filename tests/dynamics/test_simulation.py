@@ -23,6 +23,8 @@ from siq.dynamics.simulation import (
 from siq.errors import NumericalFailure
 from siq.numerics.randomness import generator
 
+pytestmark = pytest.mark.portable
+
 SMALL = SimulationOptions(trajectories=6, pairs=4, pair_step=0.02, interval=0.1, substeps=5)
 
 

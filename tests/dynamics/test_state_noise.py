@@ -14,6 +14,8 @@ from siq.dynamics.simulation import simulate_stationary
 from siq.dynamics.state_noise import StateNoise, state_noise
 from siq.errors import InputError, NumericalFailure
 
+pytestmark = pytest.mark.portable
+
 Write = Callable[..., Path]
 X, Y = sympy.symbols("x y", real=True)
 ROWS = ((1 + X**2 / 2, X * Y / 4), (X * Y / 4, 2 + sympy.sin(Y) / 2))

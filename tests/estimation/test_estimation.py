@@ -21,6 +21,8 @@ from siq.estimation.noise import estimate_noise, first_noise, log_likelihood
 from siq.estimation.noise_kernel import noise_likelihood
 from siq.files.documents import Document, validate
 
+pytestmark = pytest.mark.portable
+
 OSCILLATOR = {
     "name": "oscillator",
     "time_unit": "s",

@@ -17,6 +17,8 @@ from siq.estimation.innovations import Noise
 from siq.estimation.measurements import Measurements, measurements
 from siq.estimation.noise_uncertainty import noise_uncertainty
 
+pytestmark = pytest.mark.portable
+
 STEP, FORCES = 0.02, 0.3
 WELLS = np.array([0.0, 1.0, 0.0, -1.0])  # x - x³, by powers
 

@@ -20,6 +20,8 @@ from siq.estimation.process_noise import fit_with_and_without_process_noise
 from siq.estimation.trajectories import _run_side_by_side, fit_trajectories, normal_equations, run
 from siq.files.documents import Document, validate
 
+pytestmark = pytest.mark.portable
+
 PENDULUM = {
     "name": "pendulum",
     "time_unit": "s",

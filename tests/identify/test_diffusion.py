@@ -24,6 +24,8 @@ from siq.steps.outcomes import Status
 from siq.steps.pipeline import PipelineSettings
 from siq.steps.settings import Sampling, StateSpace
 
+pytestmark = pytest.mark.portable
+
 D = np.array([[1.0, 0.3], [0.3, 0.5]])
 NORMALISED = D / np.sqrt(np.linalg.det(D))
 LINEAR = IdentificationOptions(degree=1)

@@ -13,6 +13,8 @@ from siq.identify.selection import (
     lacks_terms,
 )
 
+pytestmark = pytest.mark.portable
+
 LIBRARY = candidate_library(["x", "y"], degree=5)
 NAMES = list(LIBRARY.names)
 

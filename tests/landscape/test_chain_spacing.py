@@ -11,6 +11,8 @@ from siq.dynamics.dynamics import Dynamics
 from siq.landscape.chain_spacing import spaced
 from siq.landscape.discretised_paths import PathProblem
 
+pytestmark = pytest.mark.portable
+
 x, y = sympy.symbols("x y", real=True)
 ROUNDING = 1e-16  # by which points that are one may differ
 

@@ -16,6 +16,8 @@ from siq.landscape.paths import minimum_action_path
 from siq.landscape.rates import escape_rate
 from siq.potential.local_wells import WellOptions, local_well
 
+pytestmark = pytest.mark.portable
+
 
 def saddle_of(known: KnownSystem) -> np.ndarray:
     points = np.random.default_rng(0).uniform(*known.domain.T, size=(200, len(known.domain)))

@@ -27,6 +27,8 @@ from siq.mismatch.nameless_models import Material, weighed
 from siq.mismatch.roles import roles_of
 from tests.mismatch.decays import DECAY, X
 
+pytestmark = pytest.mark.portable
+
 COUNT = 80
 FLOW = np.array([[-1.0, 0.8], [0.5, -0.5]])  # of x and of what is remembered
 

@@ -13,6 +13,8 @@ from siq.networks.regression import RegressionOptions, RegressionResult, points_
 from siq.potential.symbolic import term_coefficients
 from siq.study.scoring import exact_values
 
+pytestmark = pytest.mark.portable
+
 FULL = np.array([[1.0, 0.4], [0.4, 2.0]])
 Values = tuple[np.ndarray, np.ndarray, np.ndarray]
 

@@ -28,6 +28,8 @@ from siq.potential.hamilton_jacobi import (
     sensitivity,
 )
 
+pytestmark = pytest.mark.portable
+
 SYSTEMS = {
     "archetype": archetype(3),
     "Maier-Stein": maier_stein(1),

@@ -21,6 +21,8 @@ from siq.identify.identified_field import IdentifiedField
 from siq.potential.global_route import refine_globally
 from siq.potential.orthogonal_fit import OrthogonalFit, fit_orthogonal
 
+pytestmark = pytest.mark.portable
+
 SYSTEMS = {
     "archetype": archetype(3),
     "Maier-Stein": maier_stein(1),

@@ -11,6 +11,8 @@ from siq.dynamics.equilibria import hessian_at
 from siq.potential.local_wells import WellOptions, local_well
 from siq.potential.symbolic import downhill_formulas
 
+pytestmark = pytest.mark.portable
+
 
 @pytest.mark.parametrize("dimension", [2, 3, pytest.param(4, marks=pytest.mark.slow)])
 def test_the_given_potential_is_found(dimension: int) -> None:

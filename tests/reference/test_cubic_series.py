@@ -11,6 +11,8 @@ from siq.dynamics.dynamics import Dynamics
 from siq.reference.cubic_series import cubic_series
 from siq.reference.power_series import quasipotential_series
 
+pytestmark = pytest.mark.portable
+
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_it_is_the_power_series_of_degree_three(dimension: int) -> None:

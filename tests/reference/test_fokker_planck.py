@@ -16,6 +16,8 @@ from siq.dynamics.state_noise import StateNoise
 from siq.errors import NumericalFailure
 from siq.reference.fokker_planck import cell_process, cores_of
 
+pytestmark = pytest.mark.portable
+
 x, y = sympy.symbols("x y", real=True)
 TILTED = Dynamics(("x",), (x - x**3 + sympy.Rational(1, 10),), Diffusion.identity(1))
 WELLS = np.sort(np.roots([-1, 0, 1, 0.1]).real)[[0, 2]]

@@ -18,6 +18,8 @@ from known_systems import (
 from siq.dynamics.dynamics import Dynamics
 from siq.reference.power_series import PowerSeries, quasipotential_series
 
+pytestmark = pytest.mark.portable
+
 x, y = (sympy.Symbol(name, real=True) for name in "xy")
 
 
