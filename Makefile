@@ -7,7 +7,7 @@ CORES ?= 2
 # takes that one.
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 
-.PHONY: statistics examples test full untuned noise wheel test-pages newcomer laboratories coverage supports discrepancies \
+.PHONY: statistics examples test test-portable full untuned noise wheel test-pages newcomer laboratories coverage supports discrepancies \
         official docs docs-full lint format environment clean
 
 statistics: environment
@@ -18,6 +18,14 @@ examples: environment
 
 test: environment lint
 	$(BIN)/pytest --numprocesses logical --dist loadgroup --no-loadscope-reorder
+
+# Quick numerical tests as on a processor without AVX-512: sums are rounded otherwise there, and no answer may hang on
+# that. On other processors than those of x86 there is nothing to switch off.
+WITHOUT_AVX512 := NPY_DISABLE_CPU_FEATURES="X86_V4 AVX512_ICL AVX512_SPR" OPENBLAS_CORETYPE=Haswell \
+                  ATEN_CPU_CAPABILITY=avx2 NUMBA_CPU_NAME=haswell
+test-portable: environment
+	test "$$(uname -m)" != x86_64 || $(WITHOUT_AVX512) $(BIN)/pytest -m "portable and not slow" \
+	  --numprocesses logical --dist loadgroup --no-loadscope-reorder
 
 # Everything: the tests of `make test` and the full-size checks, minutes each.
 full: environment lint

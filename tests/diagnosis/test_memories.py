@@ -30,6 +30,8 @@ from siq.inference.recalibration import recalibrate
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, Parameter, symbol
 
+pytestmark = pytest.mark.portable
+
 COUNT = 80
 FLOW = np.array([[-1.0, 0.8], [0.5, -0.5]])  # of x and of what is remembered
 

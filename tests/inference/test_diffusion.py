@@ -28,6 +28,8 @@ from siq.workflow.outcomes import Status
 from siq.workflow.pipeline import PipelineSettings
 from siq.workflow.settings import Sampling, StateSpace
 
+pytestmark = pytest.mark.portable
+
 D = np.array([[1.0, 0.3], [0.3, 0.5]])
 NORMALISED = D / np.sqrt(np.linalg.det(D))
 LINEAR = IdentificationOptions(degree=1)

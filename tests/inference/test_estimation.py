@@ -17,6 +17,8 @@ from siq.numerics.files import Document, validate
 from siq.systems.cards import SystemCard, build_system
 from siq.systems.dynamics import Dynamics
 
+pytestmark = pytest.mark.portable
+
 OSCILLATOR = {
     "name": "oscillator",
     "time_unit": "s",

@@ -14,6 +14,8 @@ from siq.inference.measurements import Measurements, measurements
 from siq.inference.recalibration import noise_uncertainty
 from siq.systems.dynamics import Dynamics, Parameter, Signals
 
+pytestmark = pytest.mark.portable
+
 STEP, FORCES = 0.02, 0.3
 WELLS = np.array([0.0, 1.0, 0.0, -1.0])  # x - x³, by powers
 

@@ -47,6 +47,7 @@ def found_by(recordings: Recordings, names: list[str], *, degree: int) -> Hidden
     return identify_hidden_motion(library, recordings, false_terms=0.02, generator=np.random.default_rng(0))
 
 
+@pytest.mark.portable
 def test_positions_alone_show_the_force_and_both_noises() -> None:
     done, _, _ = identified()
     assert done.outcome.status == Status.OK and done.record is not None

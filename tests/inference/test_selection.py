@@ -7,6 +7,8 @@ from scipy.special import ndtr
 from siq.inference.library import CandidateLibrary, candidate_library
 from siq.inference.selection import Equation, best_support, critical_values, improved_support, lacks_terms
 
+pytestmark = pytest.mark.portable
+
 LIBRARY = candidate_library(["x", "y"], degree=5)
 NAMES = list(LIBRARY.names)
 

@@ -24,6 +24,8 @@ from siq.numerics.files import Document, validate
 from siq.systems.cards import SystemCard, build_system
 from siq.systems.dynamics import Dynamics, Parameter
 
+pytestmark = pytest.mark.portable
+
 PENDULUM = {
     "name": "pendulum",
     "time_unit": "s",

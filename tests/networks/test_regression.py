@@ -13,6 +13,8 @@ from siq.quasipotential.formulas import term_coefficients
 from siq.systems.diffusion import Diffusion
 from siq.workflow.scoring import exact_values
 
+pytestmark = pytest.mark.portable
+
 FULL = np.array([[1.0, 0.4], [0.4, 2.0]])
 Values = tuple[np.ndarray, np.ndarray, np.ndarray]
 

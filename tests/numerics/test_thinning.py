@@ -10,6 +10,8 @@ from scipy.spatial.distance import pdist
 from siq.numerics.least_squares import representative_subset
 from siq.numerics.randomness import generator
 
+pytestmark = pytest.mark.portable
+
 
 def naive_subset(points: np.ndarray, distance: float, order: np.ndarray) -> np.ndarray:
     kept: list[int] = []

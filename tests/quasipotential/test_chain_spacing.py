@@ -10,6 +10,8 @@ from siq.quasipotential.path_chains import PathProblem, spaced
 from siq.systems.cycles import closed_orbit
 from siq.systems.dynamics import Dynamics
 
+pytestmark = pytest.mark.portable
+
 x, y = sympy.symbols("x y", real=True)
 ROUNDING = 1e-16  # by which points that are one may differ
 

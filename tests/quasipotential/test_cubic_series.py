@@ -10,6 +10,8 @@ from known_systems import polynomial_system
 from siq.quasipotential.power_series import cubic_series, quasipotential_series
 from siq.systems.dynamics import Dynamics
 
+pytestmark = pytest.mark.portable
+
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_it_is_the_power_series_of_degree_three(dimension: int) -> None:

@@ -20,6 +20,8 @@ from known_systems import (
 from siq.data.recordings import SnapshotPairs
 from siq.quasipotential.certificate_tests import Candidate, CertificateOptions, check_descent
 
+pytestmark = pytest.mark.portable
+
 OPTIONS = CertificateOptions()
 NOISE = 0.02  # ε: the noise per unit of time is ε D
 

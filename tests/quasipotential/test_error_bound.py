@@ -18,6 +18,8 @@ from known_systems import (
 from siq.quasipotential.certificate_tests import SAFETY, residual_integral
 from siq.systems.dynamics import Dynamics
 
+pytestmark = pytest.mark.portable
+
 Gradient = Callable[[np.ndarray], np.ndarray]
 
 

@@ -15,6 +15,8 @@ from siq.quasipotential.occupancy import cell_process, cores_of
 from siq.systems.diffusion import Diffusion, StateNoise
 from siq.systems.dynamics import Dynamics
 
+pytestmark = pytest.mark.portable
+
 x, y = sympy.symbols("x y", real=True)
 TILTED = Dynamics(("x",), (x - x**3 + sympy.Rational(1, 10),), Diffusion.identity(1))
 WELLS = np.sort(np.roots([-1, 0, 1, 0.1]).real)[[0, 2]]

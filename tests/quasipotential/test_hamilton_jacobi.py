@@ -29,6 +29,8 @@ from siq.quasipotential.hamilton_jacobi import (
 from siq.quasipotential.refinement import field_terms
 from siq.systems.dynamics import Dynamics
 
+pytestmark = pytest.mark.portable
+
 SYSTEMS = {
     "archetype": archetype(3),
     "Maier-Stein": maier_stein(1),

@@ -20,6 +20,8 @@ from siq.inference.field_estimate import IdentifiedField
 from siq.quasipotential.refinement import OrthogonalFit, fit_orthogonal, refine_globally
 from siq.systems.diffusion import Diffusion
 
+pytestmark = pytest.mark.portable
+
 SYSTEMS = {
     "archetype": archetype(3),
     "Maier-Stein": maier_stein(1),

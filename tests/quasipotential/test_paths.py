@@ -19,6 +19,8 @@ from siq.errors import NumericalFailure
 from siq.quasipotential.paths import MinimumActionPath, minimum_action_path, transition_path
 from siq.systems.equilibria import find_equilibria
 
+pytestmark = pytest.mark.portable
+
 MAIER_STEIN = {1: 0.5, 3: 0.5, 5: 0.4830697, 10: 0.3400413}  # β > 4: by shooting, independent of this code
 
 

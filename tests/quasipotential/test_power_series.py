@@ -18,6 +18,8 @@ from known_systems import (
 from siq.quasipotential.power_series import PowerSeries, quasipotential_series
 from siq.systems.dynamics import Dynamics
 
+pytestmark = pytest.mark.portable
+
 x, y = (sympy.Symbol(name, real=True) for name in "xy")
 
 

@@ -11,6 +11,8 @@ from siq.quasipotential.formulas import downhill_formulas
 from siq.quasipotential.wells import WellOptions, local_well
 from siq.systems.equilibria import hessian_at
 
+pytestmark = pytest.mark.portable
+
 
 @pytest.mark.parametrize("dimension", [2, 3, pytest.param(4, marks=pytest.mark.slow)])
 def test_the_given_potential_is_found(dimension: int) -> None:

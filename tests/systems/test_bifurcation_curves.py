@@ -9,6 +9,8 @@ import sympy
 from siq.systems.bifurcation_curves import CurveSeed, follow_curves
 from siq.systems.dynamics import Dynamics
 
+pytestmark = pytest.mark.portable
+
 a, b, x, y, z = sympy.symbols("a b x y z", real=True)
 LIMITS = {"a": (-1.0, 1.0), "b": (-0.5, 1.5)}
 

@@ -7,6 +7,8 @@ import sympy
 from siq.systems.continuation import ParameterFamily, follow_branches, place_on
 from siq.systems.dynamics import Dynamics
 
+pytestmark = pytest.mark.portable
+
 x, y, z, k, mu = sympy.symbols("x y z k mu", real=True)
 
 

@@ -10,6 +10,8 @@ from siq.errors import NumericalFailure
 from siq.systems.cycles import Cycle, closed_orbit, hessians_along, unstable_direction
 from siq.systems.dynamics import Dynamics
 
+pytestmark = pytest.mark.portable
+
 x, y, z = (sympy.Symbol(name, real=True) for name in "xyz")
 INNER, OUTER, TURN = 0.6, 1.0, 2.0
 

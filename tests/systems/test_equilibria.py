@@ -20,6 +20,8 @@ from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import classify, find_equilibria, hessian_at
 from siq.systems.phase_portrait import phase_portrait
 
+pytestmark = pytest.mark.portable
+
 x, y = (sympy.Symbol(name, real=True) for name in "xy")
 WIDE = np.array([[-2.0, 2.0], [-2.0, 2.0]])
 

@@ -23,6 +23,8 @@ from siq.systems.simulation import (
     simulate_stationary,
 )
 
+pytestmark = pytest.mark.portable
+
 SMALL = SimulationOptions(trajectories=6, pairs=4, pair_step=0.02, interval=0.1, substeps=5)
 
 

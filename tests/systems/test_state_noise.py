@@ -13,6 +13,8 @@ from siq.systems.diffusion import Diffusion, NoiseField, StateNoise, state_noise
 from siq.systems.dynamics import Dynamics
 from siq.systems.simulation import simulate_stationary
 
+pytestmark = pytest.mark.portable
+
 Write = Callable[..., Path]
 X, Y = sympy.symbols("x y", real=True)
 ROWS = ((1 + X**2 / 2, X * Y / 4), (X * Y / 4, 2 + sympy.sin(Y) / 2))
