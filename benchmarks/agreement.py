@@ -36,8 +36,7 @@ from known_systems import (
 
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import IdentifiedField
-from siq.networks.options import TrainingOptions
-from siq.networks.trained import TrainedNetworks
+from siq.networks.decomposition import TrainedNetworks, TrainingOptions
 from siq.quasipotential.certificate import HARMLESS
 from siq.quasipotential.certificate_tests import (
     Candidate,

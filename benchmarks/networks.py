@@ -25,7 +25,7 @@ sys.path.append(str(Path(__file__).parents[1] / "tests"))
 from untuned_systems import SYSTEMS, simulated
 
 from siq.data.recordings import Recordings, snapshot_pairs
-from siq.networks.options import TrainingOptions
+from siq.networks.decomposition import TrainingOptions
 from siq.systems.cards import load_exact, load_system
 from siq.systems.formulas import compile_formulas
 from siq.systems.simulation import complete, simulate_snapshots

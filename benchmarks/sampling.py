@@ -14,9 +14,10 @@ import time
 
 import numpy as np
 
+from siq.numerics.integration import runge_kutta_step
 from siq.numerics.least_squares import representative_subset
 from siq.systems.cards import load_system
-from siq.systems.simulation import SimulationOptions, runge_kutta_step, simulate_snapshots
+from siq.systems.simulation import SimulationOptions, simulate_snapshots
 
 
 def plain_field(x: np.ndarray) -> np.ndarray:

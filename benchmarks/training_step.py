@@ -19,8 +19,8 @@ import torch
 
 from siq.data.recordings import snapshot_pairs
 from siq.networks import networks as networks_module
+from siq.networks.decomposition import TrainingOptions
 from siq.networks.networks import Layer
-from siq.networks.options import TrainingOptions
 from siq.networks.training import prepare_data, start, train
 from siq.systems.cards import load_system
 from siq.systems.simulation import SimulationOptions, simulate_snapshots

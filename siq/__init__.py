@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from siq.diagnosis.study import MismatchStudy
     from siq.errors import InputError, MissingExtra, NumericalFailure
     from siq.inference.library import candidate_library
-    from siq.networks.options import TrainingOptions
+    from siq.networks.decomposition import TrainingOptions
     from siq.networks.regression import RegressionOptions, sparse_decomposition
     from siq.networks.training import train
     from siq.quasipotential.formulas import SymbolicDecomposition, read_model
@@ -34,8 +34,7 @@ if TYPE_CHECKING:
     from siq.systems.cards import load_system
     from siq.systems.diffusion import Diffusion
     from siq.systems.dynamics import Dynamics
-    from siq.systems.export import Formula
-    from siq.systems.formulas import parse_formula
+    from siq.systems.formulas import Formula, parse_formula
     from siq.systems.simulation import SimulationOptions, simulate_snapshots
     from siq.validation.reference_systems import reference_systems, reference_table
     from siq.workflow.equations_step import EquationSettings
@@ -98,7 +97,7 @@ _MODULES = {
     "Diffusion": "siq.systems.diffusion",
     "Dynamics": "siq.systems.dynamics",
     "EquationSettings": "siq.workflow.equations_step",
-    "Formula": "siq.systems.export",
+    "Formula": "siq.systems.formulas",
     "InputError": "siq.errors",
     "Landscape": "siq.quasipotential.landscape",
     "MismatchStudy": "siq.diagnosis.study",
@@ -112,7 +111,7 @@ _MODULES = {
     "Study": "siq.workflow.study",
     "Sweep": "siq.workflow.sweep_step",
     "SymbolicDecomposition": "siq.quasipotential.formulas",
-    "TrainingOptions": "siq.networks.options",
+    "TrainingOptions": "siq.networks.decomposition",
     "candidate_library": "siq.inference.library",
     "diagnose": "siq.diagnosis.diagnosis",
     "inspect": "siq.data.inspection",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from siq.networks.options import TrainingOptions
+from siq.networks.decomposition import TrainingOptions
 
 PAPER = TrainingOptions(
     widths=(50, 50, 50),

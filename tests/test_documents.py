@@ -18,7 +18,7 @@ from pydantic import BaseModel
 import siq
 from siq.diagnosis.dictionary import Form, Mechanism, MechanismParameter, standard_dictionary
 from siq.diagnosis.study import MismatchStudy
-from siq.networks.options import TrainingOptions
+from siq.networks.decomposition import TrainingOptions
 from siq.systems.cards import SystemCard
 from siq.workflow.study import RecordingsOptions, Study
 

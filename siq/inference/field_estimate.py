@@ -25,10 +25,10 @@ import sympy
 from siq.errors import NumericalFailure
 from siq.inference.library import CandidateLibrary
 from siq.inference.selection import RivalTerms
+from siq.numerics.integration import runge_kutta_step
 from siq.systems.diffusion import Diffusion, state_noise
 from siq.systems.dynamics import Dynamics, Parameter, symbol
 from siq.systems.formulas import compile_formulas, parse_formula
-from siq.systems.simulation import runge_kutta_step
 
 Field = Callable[[np.ndarray], np.ndarray]
 """f, mapping components ``(d, n)`` to components ``(d, n)``."""

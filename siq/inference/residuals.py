@@ -24,8 +24,8 @@ from siq.inference.noisy_sensor import (
     rounding_errors,
     rounding_text,
 )
+from siq.numerics.integration import runge_kutta_step
 from siq.systems.dynamics import Dynamics
-from siq.systems.simulation import runge_kutta_step
 
 NoiseKind = Literal["none", "process", "measurement", "rounding", "coloured"]
 

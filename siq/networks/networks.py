@@ -10,13 +10,13 @@ the chain of products that it is, so that training needs first-order automatic d
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from siq.errors import needs_extra
-from siq.networks.trained import TrainedNetworks
+from siq.networks.decomposition import MatchingRule, Order, TrainedNetworks
 
 with needs_extra("networks"):
     import torch
@@ -297,3 +297,48 @@ def orthogonality_loss(
     lengths = downhill_square.clamp_min(tiny).sqrt() * circulatory_square.clamp_min(tiny).sqrt()
     cosine = product / lengths
     return (torch.where(cosine < 0, asymmetry * cosine, cosine) * cosine).mean(dim=-1)
+
+
+def mean_velocity(
+    vector_field: Callable[[Tensor], Tensor],
+    x0: Tensor,
+    xh: Tensor,
+    h: Tensor,
+    *,
+    kind: MatchingRule,
+    order: Order,
+) -> Tensor:
+    """Mean velocity over the pair that the vector field predicts, to be compared with (Xh - X0)/h.
+
+    Parameters
+    ----------
+    vector_field
+        f at points of shape ``(..., d)``.
+    x0, xh
+        The two snapshots, shape ``(..., d)``.
+    h
+        Time between them, shape ``(..., 1)``.
+    kind, order
+        The rule, see the table above.
+
+    Returns
+    -------
+    torch.Tensor
+        Shape ``(..., d)``.
+    """
+    match kind, order:
+        case "explicit", 2:
+            return vector_field(x0 + h / 2 * vector_field(x0))
+        case "explicit", 4:
+            k1 = vector_field(x0)
+            k2 = vector_field(x0 + h / 2 * k1)
+            k3 = vector_field(x0 + h / 2 * k2)
+            k4 = vector_field(x0 + h * k3)
+            return (k1 + 2 * (k2 + k3) + k4) / 6
+        case "symmetric", 2:
+            return vector_field((x0 + xh) / 2)
+        case "symmetric", 4:
+            start, end = vector_field(x0), vector_field(xh)
+            middle = vector_field((x0 + xh) / 2 + h / 8 * (start - end))
+            return (start + 4 * middle + end) / 6
+    raise ValueError(f"there is no {kind} matching rule of order {order}; use order 2 or 4")

@@ -18,19 +18,19 @@ import pandas as pd
 
 from siq.data.recordings import SnapshotPairs
 from siq.errors import InputError, NumericalFailure, needs_extra
+from siq.networks.decomposition import TrainingOptions, pack, read_archive, unpack, write_archive
 from siq.networks.networks import (
     Networks,
     at_rest,
     dynamics_loss,
     evaluate,
     initial_layers,
+    mean_velocity,
     move,
     orthogonality_loss,
     select_run,
     side_by_side,
 )
-from siq.networks.options import TrainingOptions, mean_velocity
-from siq.networks.trained import pack, read_archive, unpack, write_archive
 from siq.numerics.least_squares import representative_subset
 from siq.systems.diffusion import Diffusion
 

@@ -80,3 +80,74 @@ def machine_code(function: Function) -> Function:
         return cast(Function, numba.njit(cache=True)(function))
     except RuntimeError:  # neither beside the module nor in the user's own folder
         return cast(Function, numba.njit(function))
+
+
+def runge_kutta_step(drift: Rates, x: np.ndarray, step: float | np.ndarray) -> np.ndarray:
+    """One step of the classical fourth-order Runge–Kutta rule.
+
+    Parameters
+    ----------
+    drift
+        f, mapping components ``(d, n)`` to components ``(d, n)``.
+    x
+        States, shape ``(d, n)``.
+    step
+        Time step, one for all or one for each, shape ``(n,)``.
+
+    Returns
+    -------
+    numpy.ndarray
+        States one step later, shape ``(d, n)``; the local error is O(step⁵).
+    """
+    k1 = drift(x)
+    k2 = drift(x + (step / 2) * k1)
+    k3 = drift(x + (step / 2) * k2)
+    k4 = drift(x + step * k3)
+    k2 += k3
+    k2 *= 2
+    k2 += k1
+    k2 += k4
+    k2 *= step / 6
+    k2 += x
+    return k2
+
+
+def euler_maruyama_step(drift: Rates, x: np.ndarray, step: float, increments: np.ndarray) -> np.ndarray:
+    """One step of the Euler–Maruyama rule, ``x + f(x) Δt + sqrt(ε) D^(1/2) ΔW``.
+
+    Parameters
+    ----------
+    drift
+        f, mapping components ``(d, n)`` to components ``(d, n)``.
+    x
+        States, shape ``(d, n)``.
+    step
+        Time step Δt.
+    increments
+        ``sqrt(ε) D^(1/2) ΔW``, shape ``(d, n)``: the noise over the step, see `noise_source`.
+
+    Returns
+    -------
+    numpy.ndarray
+        States one step later, shape ``(d, n)``. The rule is of strong order 1 where the noise is additive,
+        and of ½ where D depends on the state; its weak order is 1.
+    """
+    result = step * drift(x)
+    result += x
+    result += increments
+    return result
+
+
+def heun_step(drift: Rates, x: np.ndarray, step: float, noise: np.ndarray) -> np.ndarray:
+    """One step of Heun's rule; `noise` is ``sqrt(ε) D^(1/2) ΔW``, shape ``(d, walkers)``.
+
+    The noise is the same in both of its stages, so that it is one of Itô.
+    """
+    first = drift(x)
+    predicted = x + step * first
+    predicted += noise
+    first += drift(predicted)
+    first *= step / 2
+    first += x
+    first += noise
+    return first

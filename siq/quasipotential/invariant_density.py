@@ -48,11 +48,11 @@ import scipy.special
 import sympy
 
 from siq.errors import NumericalFailure
+from siq.numerics.integration import heun_step, runge_kutta_step
 from siq.quasipotential.landscape import GlobalQuasipotential
 from siq.systems.dynamics import Dynamics
 from siq.systems.formulas import compile_formulas
-from siq.systems.simulation import noise_source, runge_kutta_step
-from siq.validation.escapes import heun_step
+from siq.systems.simulation import noise_source
 
 GROUPS = 100  # of walkers, among which the sampling error is estimated
 BINS = 40  # along each of the states

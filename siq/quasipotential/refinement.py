@@ -41,8 +41,7 @@ from siq.errors import NumericalFailure
 from siq.inference.field_estimate import IdentifiedField
 from siq.inference.library import CandidateLibrary, joint_library, total_degree
 from siq.inference.selection import RivalTerms
-from siq.networks.options import CheckOptions
-from siq.networks.trained import TrainedNetworks
+from siq.networks.decomposition import CheckOptions, TrainedNetworks
 from siq.quasipotential.formulas import SymbolicDecomposition, minimum
 from siq.quasipotential.hamilton_jacobi import (
     HamiltonJacobi,

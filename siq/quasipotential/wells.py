@@ -51,8 +51,16 @@ from siq.systems.cycles import Cycle
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import Equilibrium, hessian_at, measure_at
-from siq.systems.export import Formula, as_latex, as_sympy, as_text, c_source, julia_source, numpy_source
-from siq.systems.formulas import DIGITS
+from siq.systems.formulas import (
+    DIGITS,
+    Formula,
+    as_latex,
+    as_sympy,
+    as_text,
+    c_source,
+    julia_source,
+    numpy_source,
+)
 from siq.systems.phase_portrait import PhasePortrait
 
 TOLERANCE = 0.05  # residual at a point up to which a formula is believed: V is then off by some per cent

@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 
 from siq.data.recordings import Recordings, snapshot_pairs
 from siq.inference.residuals import predict
+from siq.networks.decomposition import TrainedNetworks
 from siq.networks.regression import highest_used, points_below
-from siq.networks.trained import TrainedNetworks
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.quasipotential.landscape import GlobalQuasipotential

@@ -21,11 +21,18 @@ References
 R. Graham, T. Tél, Phys. Rev. A 31 (1985) 1109: V in the limit of weak noise, limit cycles among its
 attractors. S. Bittanti, P. Colaneri, Periodic Systems, Springer 2009, chapter 4: the periodic equation of
 Lyapunov.
+
+Stable cycles are where trajectories end that come to rest nowhere. In two states unstable cycles are where
+they come from: the same, backwards in time. In more states a cycle that parts two basins attracts along
+their boundary, and is found by tracking that (`siq.systems.basins`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 import scipy.linalg
@@ -34,7 +41,9 @@ from scipy.integrate import solve_ivp
 from scipy.sparse.linalg import spsolve
 
 from siq.errors import NumericalFailure
+from siq.systems.basins import Descents, apart_of, bisected, ends_of, follow, settled_on
 from siq.systems.dynamics import Dynamics
+from siq.systems.equilibria import Equilibrium, classify, spread_evenly
 
 PARTS = 256  # of the period: splines through as many points are exact to about 1e-8
 NEWTON_STEPS = 20
@@ -289,3 +298,405 @@ def _parts(
         raise NumericalFailure("f cannot be followed around the orbit")
     end = way.y[:, -1].reshape(n, -1) * unit
     return end[:, :d], end[:, d : d + d * d].reshape(n, d, d), end[:, d + d * d :].reshape(n, d, d)
+
+
+TRIES = 12  # trajectories of a domain that are asked for their cycle: there are rarely more cycles than a few
+BACKWARDS = 256  # states of the domain that are followed backwards
+SAME = 1e-3  # of the domain: closer cycles are one
+MOST_PAIRS = 6  # of attractors, between which a boundary is tracked in three states and more
+ROUNDS = 40  # of tracking a boundary
+QUIET_ROUNDS = 4  # before a cycle is looked for on it
+RETURNED = 0.05  # of the domain: a state on the boundary that has come back, as a guess for Newton's method
+
+
+def cycles_reached(
+    dynamics: Dynamics, descents: Descents, *, first: int, box: np.ndarray, rate: float
+) -> tuple[tuple[Cycle, ...], Descents]:
+    """Stable cycles on which descents end, and the descents with the numbers of these.
+
+    Parameters
+    ----------
+    dynamics
+        f.
+    descents
+        Of which some have come to rest nowhere.
+    first
+        The number of the first cycle: that of the attractors.
+    box
+        Shape ``(d, 2)``: the domain.
+    rate
+        At which f crosses it.
+    """
+    ends, last, asked = descents.ends.copy(), descents.paths[:, -1], np.zeros(len(descents.ends), dtype=bool)
+    cycles: list[Cycle] = []
+    for _ in range(TRIES):
+        left = np.flatnonzero((ends < 0) & ~descents.escaped)
+        if asked[left].all():
+            break
+        one = left[~asked[left]][0]
+        asked[one] = True
+        found = recurrence_of(dynamics, last[one][None], box=box, rate=rate)
+        if found.place is None:
+            continue
+        try:
+            index = _place_among(cycles, _orbit(dynamics, found.place, found.period, box), box)
+        except NumericalFailure:
+            continue
+        near = settled_on(last[left], cycles, box=box)
+        ends[left[near >= 0]] = first + near[near >= 0]
+        ends[one] = first + index
+    return tuple(cycles), replace(descents, ends=ends)
+
+
+def _orbit(dynamics: Dynamics, place: np.ndarray, period: float, box: np.ndarray) -> Cycle:
+    width = np.ptp(box, axis=1)
+    times = np.linspace(0, period, PARTS, endpoint=False)
+    way = solve_ivp(
+        lambda _, y: dynamics.drift((y * width)[None])[0] / width, (0.0, period), place / width,
+        method="DOP853", rtol=1e-9, atol=1e-11, t_eval=times,
+    )  # fmt: skip
+    if not way.success:
+        raise NumericalFailure("f cannot be followed around the cycle")
+    return closed_orbit(dynamics, way.y.T * width, period, scale=width)
+
+
+def _place_among(cycles: list[Cycle], new: Cycle, box: np.ndarray) -> int:
+    """The place of a cycle among those that are known; it is added where it is not known yet."""
+    width = np.ptp(box, axis=1)
+    for index, one in enumerate(cycles):
+        if one.distances(new.points[:1], scale=width)[0] < SAME:
+            return index
+    cycles.append(new)
+    return len(cycles) - 1
+
+
+def cycles_left(
+    dynamics: Dynamics, equilibria: Sequence[Equilibrium], *, box: np.ndarray, generator: np.random.Generator
+) -> tuple[Cycle, ...]:
+    """Cycles of two states that are left on both sides: stable ones of the same equations backwards in time.
+
+    Parameters
+    ----------
+    dynamics
+        f.
+    equilibria
+        All of the domain.
+    box
+        Shape ``(2, 2)``: the domain.
+    generator
+        Scrambles the states that are followed backwards.
+    """
+    backwards = Dynamics.of(dynamics.symbols, [-one for one in dynamics.formulas])
+    sources = [classify(backwards, one.position) for one in equilibria if one.kind == "repeller"]
+    starts = spread_evenly(box, BACKWARDS, generator=generator)
+    width = np.ptp(box, axis=1)
+    rate = float(np.median(np.linalg.norm(dynamics.drift(starts) / width, axis=1)))
+    try:
+        with np.errstate(all="ignore"):
+            ways = follow(backwards, starts, sources, box=box)
+            found, _ = cycles_reached(backwards, ways, first=len(sources), box=box, rate=rate)
+    except NumericalFailure:
+        return ()
+    inside = [one for one in found if ((one.points > box[:, 0]) & (one.points < box[:, 1])).all()]
+    return tuple(closed_orbit(dynamics, one.points[::-1], one.period, scale=width) for one in inside)
+
+
+def cycles_between(
+    dynamics: Dynamics,
+    attractors: Sequence[Equilibrium],
+    cycles: Sequence[Cycle],
+    *,
+    box: np.ndarray,
+    generator: np.random.Generator,
+) -> tuple[Cycle, ...]:
+    """Cycles with one unstable direction on the boundaries of basins, where a cycle is on one side of them.
+
+    Parameters
+    ----------
+    dynamics
+        f.
+    attractors, cycles
+        What is stable.
+    box
+        Shape ``(d, 2)``: the domain.
+    generator
+        Bends the first ways between them.
+    """
+
+    def ends(x: np.ndarray) -> np.ndarray:
+        return ends_of(dynamics, x, attractors, cycles, box=box)
+
+    places = [*(one.position for one in attractors), *(one.position for one in cycles)]
+    pairs = [pair for pair in itertools.combinations(range(len(places)), 2) if max(pair) >= len(attractors)]
+    found: list[Cycle] = []
+    for one, two in pairs[:MOST_PAIRS]:
+        cycle = _edge_cycle(dynamics, one, (places[one], places[two]), ends, box, generator)
+        if cycle is not None:
+            _place_among(found, cycle, box)
+    return tuple(found)
+
+
+def _edge_cycle(
+    dynamics: Dynamics,
+    one: int,
+    places: tuple[np.ndarray, np.ndarray],
+    ends: Callable[[np.ndarray], np.ndarray],
+    box: np.ndarray,
+    generator: np.random.Generator,
+) -> Cycle | None:
+    """What a boundary is tracked to, if it is a cycle."""
+    width = np.ptp(box, axis=1)
+    pair = bisected(*places, one, ends, width=width, generator=generator)
+    times, states = [0.0], [pair.mean(axis=0)]
+    for number in range(ROUNDS):
+        tracked = apart_of(dynamics, pair, width)
+        if tracked is None:
+            return None
+        pair, passed, along = tracked
+        times += (times[-1] + passed).tolist()
+        states += list(along)
+        pair = bisected(pair[0], pair[1], one, ends, width=width)
+        if number >= QUIET_ROUNDS:
+            cycle = _closed(dynamics, np.array(times), np.array(states), box)
+            if cycle is not None and cycle.unstable == 1:
+                return cycle
+    return None
+
+
+def _closed(dynamics: Dynamics, times: np.ndarray, states: np.ndarray, box: np.ndarray) -> Cycle | None:
+    """A periodic orbit next to the last return of a trajectory; None where there is none."""
+    width = np.ptp(box, axis=1)
+    away = np.linalg.norm((states - states[-1]) / width, axis=1)
+    gone = np.flatnonzero(away > 2 * RETURNED)
+    if not len(gone):
+        return None
+    before = np.flatnonzero(away[: gone[-1]] < RETURNED)
+    if not len(before):
+        return None
+    last = before[-1]  # of the latest visit, the closest state
+    visit = last - np.flatnonzero(away[last::-1] > RETURNED)[:1].sum() + 1
+    closest = visit + int(np.argmin(away[visit : last + 1]))
+    begin, period = times[closest], float(times[-1] - times[closest])
+    at = begin + np.linspace(0, period, PARTS, endpoint=False)
+    guess = np.stack([np.interp(at, times, column) for column in states.T], axis=1)
+    try:
+        return closed_orbit(dynamics, guess, period, scale=width)
+    except NumericalFailure:
+        return None
+
+
+RETURNS = 40  # through the section, within which chaos has to have lost what was known at the start
+LOOKED = (4, 12, RETURNS)  # returns after which a cycle is sought: most are told long before chaos can be
+CLOSE_RETURN_RATIO = 2.0  # to the closest return: one as close may be earlier, and the period shorter
+RETURN_TOLERANCE = 1e-6  # of the box: returns as close are at one place; chaos tears them a box apart
+STARTS = 3  # trajectories that are followed until one returns
+WAITED = 50.0  # crossings of the box, in which there has to be a return
+MOST_EVALUATIONS = 1_000_000  # of f, in all: some ten times what the equations of Lorenz and Rössler need
+FAR = 1.5  # of the box from its middle: what comes so far has escaped, as in `follow`
+LONGEST = 12  # returns of one period: longer cycles than the doubled ones of doubled ones are not looked for
+RECURRENCE_NEWTON_STEPS = 12
+LOST = 2.0  # times the first gap: from there Newton's method no longer leads to what is close by
+RETURN_CLOSURE_TOLERANCE = 1e-8  # of the box: by which an orbit may fail to close, with integrals to 1e-10
+RESTING = 1e-4  # of the rate: a trajectory so slow at its end is coming to rest
+
+Kind = Literal["cycle", "chaos", "aperiodic", "none"]
+
+
+@dataclass(frozen=True)
+class Recurrence:
+    """What becomes of a trajectory that comes to rest nowhere.
+
+    Attributes
+    ----------
+    kind
+        ``cycle``: it ends on a limit cycle. ``chaos``: it returns, never to the same place, and small
+        differences grow. ``aperiodic``: it returns, and neither can be said. ``none``: it does not return.
+    period
+        Of the cycle, in units of time; NaN of anything else.
+    exponent
+        Mean rate at which small differences grow, per unit of time: the largest Lyapunov exponent. NaN where
+        it was not asked for.
+    place
+        A state on the cycle, shape ``(d,)``; None of anything else.
+    """
+
+    kind: Kind
+    period: float = float("nan")
+    exponent: float = float("nan")
+    place: np.ndarray | None = field(default=None, compare=False)
+
+    def sentence(self) -> str:
+        """In words that follow a colon."""
+        if self.kind == "cycle":
+            return f"they end on a limit cycle of period {self.period:.4g}"
+        if self.kind == "chaos":
+            return (
+                "they settle neither on an equilibrium nor on a cycle: aperiodic motion, as of chaos (small"
+                f" differences grow at a rate of {self.exponent:.3g} per unit of time)"
+            )
+        if self.kind == "aperiodic":
+            return "they settle neither on an equilibrium nor on a cycle: aperiodic motion"
+        return "within the time for which they were followed they neither rest nor return"
+
+
+class _TooLongError(Exception):
+    """f was evaluated so often that the trajectory is given up."""
+
+
+def recurrence_of(dynamics: Dynamics, starts: np.ndarray, *, box: np.ndarray, rate: float) -> Recurrence:
+    """What becomes of the first of some trajectories that returns.
+
+    Parameters
+    ----------
+    dynamics
+        f.
+    starts
+        Shape ``(n, d)``, n ≥ 1: where trajectories are that have come to rest for a long time nowhere.
+    box
+        Shape ``(d, 2)``: the recorded region.
+    rate
+        At which f crosses it, per unit of time. What is far slower is coming to rest.
+    """
+    chosen = np.linspace(0, len(starts) - 1, min(STARTS, len(starts))).astype(int)
+    found = Recurrence("none")
+    for start in starts[chosen]:
+        found = _Motion(dynamics, start, box, rate).recurrence()
+        if found.kind != "none":
+            break
+    return found
+
+
+class _Motion:
+    """One trajectory, in units of the box, so that states of any size count alike."""
+
+    def __init__(self, dynamics: Dynamics, start: np.ndarray, box: np.ndarray, rate: float) -> None:
+        self.dynamics, self.dimension = dynamics, len(start)
+        self.width = box[:, 1] - box[:, 0]
+        self.middle = box.mean(axis=1) / self.width
+        self.start = start / self.width
+        self.across = self.drift(self.start)
+        self.speed, self.rate, self.evaluations = float(np.linalg.norm(self.across)), rate, 0
+
+    def drift(self, y: np.ndarray) -> np.ndarray:
+        return np.asarray(self.dynamics.drift((y * self.width)[None])[0] / self.width)
+
+    def count(self) -> None:
+        """Give up what takes too long: f may be too stiff to be followed so."""
+        self.evaluations += 1
+        if self.evaluations > MOST_EVALUATIONS:
+            raise _TooLongError
+
+    def jacobian(self, y: np.ndarray) -> np.ndarray:
+        jacobian = self.dynamics.jacobian((y * self.width)[None])[0]
+        return np.asarray(jacobian * self.width / self.width[:, None])
+
+    def recurrence(self) -> Recurrence:
+        """From return to return, until there are enough of them."""
+        if not self.speed > RESTING * self.rate:
+            return Recurrence("none")
+        try:
+            return self._followed()
+        except _TooLongError:
+            return Recurrence("none")
+
+    def _followed(self) -> Recurrence:
+        draw = np.random.default_rng(0)  # any direction grows as the fastest does
+        state, tangent = self.start, draw.standard_normal(self.dimension)
+        tangent /= np.linalg.norm(tangent)
+        growth, times, places = [], [], []
+        for _ in range(RETURNS):
+            step = self._next(state, tangent)
+            if step is None:
+                break
+            state, grown, time = step
+            size = float(np.linalg.norm(grown))
+            tangent = grown / size
+            growth.append(np.log(size))
+            times.append(time)
+            places.append(state)
+            if len(places) in LOOKED and (found := self._cycle(places, np.cumsum(times))) is not None:
+                return Recurrence("cycle", found[1], place=found[0] * self.width)
+        if not places:
+            return Recurrence("none")
+        exponent = float(np.sum(growth) / np.sum(times))
+        # Regular motion tears two states apart in proportion to the time, forty returns by some forty times.
+        chaotic = np.sum(growth) > -np.log(RETURN_TOLERANCE)
+        return Recurrence("chaos" if chaotic else "aperiodic", exponent=exponent)
+
+    def _next(self, state: np.ndarray, tangent: np.ndarray) -> tuple[np.ndarray, np.ndarray, float] | None:
+        """State, tangent and time at the next return through the section; None where there is none."""
+        d = self.dimension
+
+        def rates(_: float, z: np.ndarray) -> np.ndarray:
+            self.count()
+            return np.concatenate([self.drift(z[:d]), self.jacobian(z[:d]) @ z[d:]])
+
+        def returns(_: float, z: np.ndarray) -> float:
+            return float(self.across @ (z[:d] - self.start))
+
+        def escapes(_: float, z: np.ndarray) -> float:
+            return float(FAR - np.abs(z[:d] - self.middle).max())
+
+        returns.terminal, returns.direction = True, 1.0  # type: ignore[attr-defined]
+        escapes.terminal = True  # type: ignore[attr-defined]
+        # Away from the section first, on which it begins: what is zero there would be taken for a return.
+        away = RETURN_CLOSURE_TOLERANCE / self.speed
+        begin = np.concatenate([state + away * self.drift(state), tangent])
+        way = solve_ivp(
+            rates, (0.0, WAITED / self.rate), begin, method="DOP853", rtol=1e-8, atol=1e-10,
+            events=[returns, escapes],
+        )  # fmt: skip
+        if not len(way.t_events[0]):
+            return None
+        end = way.y_events[0][0]
+        return end[:d], end[d:], float(way.t_events[0][0]) + away
+
+    def _cycle(self, places: Sequence[np.ndarray], times: np.ndarray) -> tuple[np.ndarray, float] | None:
+        """A state and the period of a stable periodic orbit close by, None where there is none."""
+        # Backwards from the last place, where a trajectory is closest to the cycle on which it ends.
+        away = np.array([np.linalg.norm(place - places[-1]) for place in places[-2 : -2 - LONGEST : -1]])
+        first = int(np.flatnonzero(away <= max(CLOSE_RETURN_RATIO * away.min(), RETURN_TOLERANCE))[0])
+        return self._closed(places[-1], float(times[-1] - times[-2 - first]))
+
+    def _closed(self, base: np.ndarray, period: float) -> tuple[np.ndarray, float] | None:
+        d, x, longest, widest = self.dimension, base, 2 * period, np.inf
+        across = self.drift(base)
+        for _ in range(RECURRENCE_NEWTON_STEPS):
+            flowed = self._flowed(x, period)
+            if flowed is None:
+                return None
+            end, monodromy = flowed
+            gap = end - x
+            away = float(np.abs(gap).max())
+            if away < RETURN_CLOSURE_TOLERANCE:
+                return (x, period) if self._stable(monodromy) else None
+            if away > widest:
+                return None
+            widest = min(widest, LOST * away)
+            matrix = np.zeros((d + 1, d + 1))
+            matrix[:d, :d], matrix[:d, d], matrix[d, :d] = monodromy - np.eye(d), self.drift(end), across
+            step = np.linalg.lstsq(matrix, -np.append(gap, across @ (x - base)), rcond=None)[0]
+            step *= min(1.0, 0.2 / max(float(np.abs(step[:d]).max()), 1e-300))  # a fifth of the box at most
+            x, period = x + step[:d], period + float(step[d])
+            if not 0 < period < longest:
+                return None
+        return None
+
+    def _flowed(self, x: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray] | None:
+        d = self.dimension
+
+        def rates(_: float, z: np.ndarray) -> np.ndarray:
+            self.count()
+            return np.concatenate([self.drift(z[:d]), (self.jacobian(z[:d]) @ z[d:].reshape(d, d)).ravel()])
+
+        begin = np.concatenate([x, np.eye(d).ravel()])
+        way = solve_ivp(rates, (0.0, period), begin, method="DOP853", rtol=1e-10, atol=1e-12)
+        if not way.success or not np.isfinite(way.y[:, -1]).all():
+            return None
+        return way.y[:d, -1], way.y[d:, -1].reshape(d, d)
+
+    def _stable(self, monodromy: np.ndarray) -> bool:
+        """Whether all multipliers but the one of the motion along the orbit lie within the unit circle."""
+        multipliers = np.linalg.eigvals(monodromy)
+        others = np.delete(multipliers, np.argmin(np.abs(multipliers - 1)))
+        return bool((np.abs(others) < 1 - NEUTRAL).all())

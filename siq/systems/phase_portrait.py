@@ -21,19 +21,8 @@ import numpy as np
 
 from siq.errors import NumericalFailure
 from siq.numerics.least_squares import representative_subset
-from siq.systems.basins import (
-    Basin,
-    Descents,
-    Focus,
-    Recurrence,
-    basin_of,
-    edge_saddle,
-    follow,
-    neighbours,
-    recurrence_of,
-)
-from siq.systems.cycle_search import cycles_between, cycles_left, cycles_reached
-from siq.systems.cycles import Cycle
+from siq.systems.basins import Basin, Descents, Focus, basin_of, edge_saddle, follow, neighbours
+from siq.systems.cycles import Cycle, Recurrence, cycles_between, cycles_left, cycles_reached, recurrence_of
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import (
     Equilibrium,
@@ -338,7 +327,7 @@ SEARCHED = (
 )
 
 
-def portrait_of_many(dynamics: Dynamics, *, seed: int = 0) -> PhasePortrait:
+def high_dimensional_portrait(dynamics: Dynamics, *, seed: int = 0) -> PhasePortrait:
     """Attractors, and the saddles between them.
 
     Parameters

@@ -21,6 +21,7 @@ from pydantic.dataclasses import dataclass
 
 from siq.data.recordings import Recordings
 from siq.errors import NumericalFailure
+from siq.numerics.integration import euler_maruyama_step, runge_kutta_step
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import find_equilibria
@@ -76,62 +77,6 @@ def sampling_stride(options: SimulationOptions) -> int:
             f" pair_step/substeps ({step}) that exceeds pair_step; change one of them"
         )
     return stride
-
-
-def runge_kutta_step(drift: Drift, x: np.ndarray, step: float | np.ndarray) -> np.ndarray:
-    """One step of the classical fourth-order Runge–Kutta rule.
-
-    Parameters
-    ----------
-    drift
-        f, mapping components ``(d, n)`` to components ``(d, n)``.
-    x
-        States, shape ``(d, n)``.
-    step
-        Time step, one for all or one for each, shape ``(n,)``.
-
-    Returns
-    -------
-    numpy.ndarray
-        States one step later, shape ``(d, n)``; the local error is O(step⁵).
-    """
-    k1 = drift(x)
-    k2 = drift(x + (step / 2) * k1)
-    k3 = drift(x + (step / 2) * k2)
-    k4 = drift(x + step * k3)
-    k2 += k3
-    k2 *= 2
-    k2 += k1
-    k2 += k4
-    k2 *= step / 6
-    k2 += x
-    return k2
-
-
-def euler_maruyama_step(drift: Drift, x: np.ndarray, step: float, increments: np.ndarray) -> np.ndarray:
-    """One step of the Euler–Maruyama rule, ``x + f(x) Δt + sqrt(ε) D^(1/2) ΔW``.
-
-    Parameters
-    ----------
-    drift
-        f, mapping components ``(d, n)`` to components ``(d, n)``.
-    x
-        States, shape ``(d, n)``.
-    step
-        Time step Δt.
-    increments
-        ``sqrt(ε) D^(1/2) ΔW``, shape ``(d, n)``: the noise over the step, see `noise_source`.
-
-    Returns
-    -------
-    numpy.ndarray
-        States one step later, shape ``(d, n)``. The rule is of strong order 1 where the noise is additive,
-        and of ½ where D depends on the state; its weak order is 1.
-    """
-    result = step * drift(x)
-    result += x
-    result += increments
-    return result
 
 
 def noise_source(

@@ -16,9 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from siq.errors import NumericalFailure
+from siq.numerics.integration import heun_step, runge_kutta_step
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import hessian_at
-from siq.systems.simulation import noise_source, runge_kutta_step
+from siq.systems.simulation import noise_source
 
 Field = Callable[[np.ndarray], np.ndarray]
 
@@ -173,21 +174,6 @@ def simulate_escapes(
     if lost:
         raise NumericalFailure(f"{lost} of {walkers} walkers run to infinity; take a smaller step")
     return EscapeTimes(np.concatenate(times), np.concatenate(reached), x.shape[1], steps * step)
-
-
-def heun_step(function: Field, x: np.ndarray, step: float, noise: np.ndarray) -> np.ndarray:
-    """One step of Heun's rule; `noise` is ``sqrt(ε) D^(1/2) ΔW``, shape ``(d, walkers)``.
-
-    The noise is the same in both of its stages, so that it is one of Itô.
-    """
-    first = function(x)
-    predicted = x + step * first
-    predicted += noise
-    first += function(predicted)
-    first *= step / 2
-    first += x
-    first += noise
-    return first
 
 
 def _settling_steps(dynamics: Dynamics, target: Neighbourhood, step: float) -> int:

@@ -20,7 +20,7 @@ from pydantic.dataclasses import dataclass
 
 from siq.errors import NumericalFailure
 from siq.inference.identification import read_field
-from siq.networks.trained import TrainedNetworks
+from siq.networks.decomposition import TrainedNetworks
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.quasipotential.landscape import Landscape, LandscapeOptions, NoLandscape

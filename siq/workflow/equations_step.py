@@ -34,7 +34,12 @@ from siq.systems.basins import enlarged
 from siq.systems.cards import load_system
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import hessian_at, spread_evenly
-from siq.systems.phase_portrait import MOST_SEARCHED, PhasePortrait, domain_portrait, portrait_of_many
+from siq.systems.phase_portrait import (
+    MOST_SEARCHED,
+    PhasePortrait,
+    domain_portrait,
+    high_dimensional_portrait,
+)
 from siq.workflow.landscape_step import degree_rows, landscape_rows
 from siq.workflow.outcomes import Method, Outcome, Status, Step
 from siq.workflow.settings import STRICT
@@ -107,7 +112,7 @@ def landscape_of_equations(
     draw = generator(settings.seed, Purpose.LANDSCAPE)
     try:
         many = system.dimension > MOST_SEARCHED
-        portrait = (portrait_of_many if many else domain_portrait)(system, seed=settings.seed)
+        portrait = (high_dimensional_portrait if many else domain_portrait)(system, seed=settings.seed)
     except NumericalFailure as error:
         raise NoLandscape(str(error), None, system) from None
     fault = portrait.fault()

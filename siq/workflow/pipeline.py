@@ -16,7 +16,7 @@ from siq.data.recordings import Recordings
 from siq.data.selection import in_stretches
 from siq.data.two_states import without_slow_drift
 from siq.inference.identification import IdentificationOptions
-from siq.networks.options import TrainingOptions
+from siq.networks.decomposition import TrainingOptions
 from siq.networks.regression import RegressionOptions
 from siq.quasipotential.certificate_tests import CertificateOptions, PredictionLimits
 from siq.quasipotential.landscape import LandscapeOptions

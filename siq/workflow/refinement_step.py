@@ -24,7 +24,7 @@ from siq.inference.field_estimate import IdentifiedField
 from siq.inference.identification import FieldRecord
 from siq.inference.instrumental_variables import coarse_pairs
 from siq.inference.noisy_sensor import filtered_recordings, of_all_states
-from siq.networks.trained import TrainedNetworks, shuffled
+from siq.networks.decomposition import TrainedNetworks, shuffled
 from siq.numerics.randomness import Purpose, generator
 from siq.numerics.text import place_text
 from siq.quasipotential.certificate import (

@@ -12,8 +12,8 @@ from pydantic.dataclasses import dataclass
 from siq.data.recordings import Recordings, snapshot_pairs
 from siq.errors import NumericalFailure
 from siq.inference.library import candidate_library
+from siq.networks.decomposition import TrainedNetworks
 from siq.networks.regression import RegressionOptions, RegressionResult, points_below, sparse_decomposition
-from siq.networks.trained import TrainedNetworks
 from siq.quasipotential.formulas import (
     SymbolicDecomposition,
     decomposition_from_coefficients,

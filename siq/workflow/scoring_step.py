@@ -17,8 +17,8 @@ from pydantic.dataclasses import dataclass
 
 from siq.inference.library import candidate_library
 from siq.inference.residuals import prediction_errors
+from siq.networks.decomposition import TrainedNetworks, shuffled
 from siq.networks.regression import RegressionOptions
-from siq.networks.trained import TrainedNetworks, shuffled
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.systems.dynamics import Dynamics

@@ -20,7 +20,7 @@ from siq.errors import InputError, suggestion
 from siq.inference.identification import IdentificationOptions
 from siq.inference.library import candidate_library
 from siq.inference.observation import velocity_names
-from siq.networks.options import TrainingOptions
+from siq.networks.decomposition import TrainingOptions
 from siq.networks.regression import RegressionOptions
 from siq.numerics.files import read_document, validate
 from siq.quasipotential.certificate_tests import CertificateOptions

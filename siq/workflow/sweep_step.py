@@ -9,7 +9,7 @@ Hopf point, and where branches meet.
 
 Along each row and each column of the map branches of equilibria are followed through those that its points
 know. What folds or begins to oscillate there is a point of a curve, which is followed through the plane
-(`siq.systems.bifurcation_curves`).
+(`siq.systems.continuation`).
 
 Barriers and prefactors are those of the point; times and shares follow from them for a noise
 (`siq.quasipotential.rates`, `siq.quasipotential.invariant_density`).
@@ -40,9 +40,17 @@ from siq.quasipotential.invariant_density import shares_by_rates
 from siq.quasipotential.landscape import LandscapeOptions, NoLandscape
 from siq.quasipotential.rates import Exit, NoiseStrength, dwell_time
 from siq.quasipotential.transitions import Transition
-from siq.systems.bifurcation_curves import BifurcationCurve, CurveSeed, follow_curves
 from siq.systems.cards import ParameterEntry, SystemCard, build_system, load_system
-from siq.systems.continuation import Branch, Branches, ParameterFamily, follow_branches, place_on
+from siq.systems.continuation import (
+    BifurcationCurve,
+    Branch,
+    Branches,
+    CurveSeed,
+    ParameterFamily,
+    follow_branches,
+    follow_curves,
+    place_on,
+)
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import all_equilibria
 from siq.systems.phase_portrait import MOST_SEARCHED, UNSETTLED

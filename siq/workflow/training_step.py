@@ -23,9 +23,8 @@ from pydantic.dataclasses import dataclass as pydantic_dataclass
 from siq.data.recordings import Recordings, snapshot_pairs
 from siq.errors import NumericalFailure
 from siq.inference.identification import FieldRecord, read_field
+from siq.networks.decomposition import TrainedNetworks, TrainingOptions, load_networks, save_networks
 from siq.networks.networks import Networks, at_rest
-from siq.networks.options import TrainingOptions
-from siq.networks.trained import TrainedNetworks, load_networks, save_networks
 from siq.networks.training import (
     TrainingData,
     TrainingState,

@@ -215,7 +215,7 @@ def test_what_is_known_exactly_has_no_axis() -> None:
 
 
 def test_networks_have_no_use_for_hidden_velocities() -> None:
-    from siq.networks.options import TrainingOptions
+    from siq.networks.decomposition import TrainingOptions
 
     with pytest.raises(ValueError, match="velocities are hidden"):
         replace(SETTINGS, training=TrainingOptions())

@@ -5,7 +5,7 @@ import pytest
 import scipy.integrate
 import torch
 
-from siq.networks.options import mean_velocity
+from siq.networks.networks import mean_velocity
 
 RULES = [("explicit", 2), ("explicit", 4), ("symmetric", 2), ("symmetric", 4)]
 

@@ -13,9 +13,8 @@ from known_settings import PAPER
 from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
 from siq.data.selection import resample_recordings
 from siq.errors import InputError, NumericalFailure
+from siq.networks.decomposition import TrainingOptions, load_networks, pack, save_networks
 from siq.networks.networks import Components, at_rest, dynamics_loss, orthogonality_loss
-from siq.networks.options import TrainingOptions
-from siq.networks.trained import load_networks, pack, save_networks
 from siq.networks.training import (
     HISTORY,
     Batches,

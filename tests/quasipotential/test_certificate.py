@@ -34,8 +34,8 @@ from siq.data.recordings import Recordings, SnapshotPairs
 from siq.inference.field_estimate import IdentifiedField
 from siq.inference.library import candidate_library, monomial_exponents
 from siq.inference.residuals import prediction_errors
+from siq.networks.decomposition import shuffled
 from siq.networks.networks import Networks, at_rest, initial_layers
-from siq.networks.trained import shuffled
 from siq.numerics.least_squares import representative_subset
 from siq.quasipotential.certificate import Certificate, HeldOut, certify_formulas, certify_wells
 from siq.quasipotential.certificate_characteristics import Reference, check_characteristics, references_about

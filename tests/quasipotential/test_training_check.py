@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from known_systems import KnownSystem, archetype, exact_field, limit_cycle, linear_system, potential_values
 
-from siq.networks.options import CheckOptions
+from siq.networks.decomposition import CheckOptions
 from siq.quasipotential.refinement import TrainingCheck, training_check
 
 

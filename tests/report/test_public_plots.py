@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import siq
+from siq.numerics.integration import runge_kutta_step
 from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.landscape_assembly import find_landscape
@@ -25,7 +26,6 @@ from siq.report.landscape_summary import DrawnLandscape, DrawnPoint, DrawnWay, d
 from siq.report.plots import prediction
 from siq.report.plots.quasipotential import plane_of, quasipotential_figure
 from siq.report.plots.wells import joined
-from siq.systems.simulation import runge_kutta_step
 
 NONE = np.zeros((0, 1))
 

@@ -15,7 +15,7 @@ from untuned_systems import SYSTEMS, error_beside_mesh, simulated
 
 from siq.data.recordings import snapshot_pairs
 from siq.inference.identification import IdentificationOptions
-from siq.networks.options import CheckOptions, TrainingOptions
+from siq.networks.decomposition import CheckOptions, TrainingOptions
 from siq.networks.regression import RegressionOptions
 from siq.workflow.outcomes import Method
 from siq.workflow.pipeline import Analysis, PipelineSettings, analyse

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import sympy
 
-from siq.systems.bifurcation_curves import CurveSeed, follow_curves
+from siq.systems.continuation import CurveSeed, follow_curves
 from siq.systems.dynamics import Dynamics
 
 pytestmark = pytest.mark.portable

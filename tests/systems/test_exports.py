@@ -13,8 +13,18 @@ import pytest
 import sympy
 
 from siq.inference.library import monomial_exponents
-from siq.systems.export import Formula, as_latex, as_sympy, as_text, c_source, julia_source, numpy_source
-from siq.systems.formulas import FUNCTIONS, compile_formulas, parse_formula
+from siq.systems.formulas import (
+    FUNCTIONS,
+    Formula,
+    as_latex,
+    as_sympy,
+    as_text,
+    c_source,
+    compile_formulas,
+    julia_source,
+    numpy_source,
+    parse_formula,
+)
 
 POINTS = 10_000
 ACCURACY = 1e-12  # of the sum of absolute terms

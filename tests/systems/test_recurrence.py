@@ -7,7 +7,7 @@ import pytest
 import sympy
 from known_systems import limit_cycle
 
-from siq.systems.basins import Recurrence, recurrence_of
+from siq.systems.cycles import Recurrence, recurrence_of
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import rate_of
 from siq.systems.phase_portrait import phase_portrait

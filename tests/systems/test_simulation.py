@@ -10,14 +10,13 @@ from pydantic import ValidationError
 
 from siq.data.recordings import snapshot_pairs
 from siq.errors import NumericalFailure
+from siq.numerics.integration import euler_maruyama_step, runge_kutta_step
 from siq.numerics.randomness import generator
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.systems.simulation import (
     SimulationOptions,
-    euler_maruyama_step,
     noise_source,
-    runge_kutta_step,
     sampling_stride,
     simulate_snapshots,
     simulate_stationary,

@@ -11,7 +11,7 @@ from known_systems import as_system, double_well, potential_gradient, potential_
 
 from siq.data.recordings import Recordings
 from siq.errors import NumericalFailure
-from siq.networks.options import CheckOptions, TrainingOptions
+from siq.networks.decomposition import CheckOptions, TrainingOptions
 from siq.networks.regression import RegressionOptions
 from siq.quasipotential.formulas import exact_decomposition, model_to_data
 from siq.quasipotential.refinement import RefinementOptions

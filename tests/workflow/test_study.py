@@ -8,7 +8,7 @@ import pytest
 from known_settings import PAPER
 
 from siq.errors import InputError
-from siq.networks.options import TrainingOptions
+from siq.networks.decomposition import TrainingOptions
 from siq.networks.regression import RegressionOptions
 from siq.quasipotential.landscape import LandscapeOptions
 from siq.systems.dynamics import Dynamics

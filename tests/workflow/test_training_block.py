@@ -11,8 +11,7 @@ import torch
 from known_settings import PAPER
 
 from siq.data.recordings import SnapshotPairs
-from siq.networks.options import CheckOptions
-from siq.networks.trained import TrainedNetworks, pack
+from siq.networks.decomposition import CheckOptions, TrainedNetworks, pack
 from siq.networks.training import prepare_data
 from siq.systems.diffusion import Diffusion
 from siq.workflow.outcomes import Status

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic.dataclasses import dataclass
 
-from siq.networks.options import TrainingOptions
+from siq.networks.decomposition import TrainingOptions
 from siq.networks.regression import RegressionOptions
 from siq.systems.simulation import SimulationOptions
 from siq.workflow.settings import STRICT

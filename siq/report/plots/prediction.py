@@ -20,6 +20,7 @@ from siq.data.correlation import lagged_covariances, long_run_covariance, markov
 from siq.data.recordings import Recordings, snapshot_pairs
 from siq.inference.field_estimate import NOISE_FREE
 from siq.inference.instrumental_variables import lagged_pairs
+from siq.numerics.integration import runge_kutta_step
 from siq.numerics.text import unit_text
 from siq.quasipotential.landscape import Landscape
 from siq.report.plots.diagnosis import draw_errors
@@ -44,7 +45,6 @@ from siq.report.plots.style import (
     unit_label,
 )
 from siq.systems.dynamics import Dynamics
-from siq.systems.simulation import runge_kutta_step
 
 TRAJECTORIES_SHOWN = 6
 BINS = 40

@@ -14,70 +14,32 @@ symmetric    4      3            Hermite–Simpson: noise-free pairs, unbiased t
 
 The symmetric rules put Xh into f: with noise in Xh that correlates the regressor with its error and
 biases f by as much as the noise is strong.
+
+What comes after training needs V_θ, g and f at points and no gradient by a weight, so that it does without
+torch, which takes longer to import than such an evaluation does to run.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated, Literal
+import json
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import ConfigDict, Field
-from pydantic.dataclasses import dataclass
+from pydantic.dataclasses import dataclass as pydantic_dataclass
 
-if TYPE_CHECKING:  # options name the rules, and who only reads options need not wait for torch
-    from torch import Tensor
+from siq.errors import InputError
+from siq.numerics.files import whole_file
 
 MatchingRule = Literal["explicit", "symmetric"]
 Order = Literal[2, 4]
 
 
-def mean_velocity(
-    vector_field: Callable[[Tensor], Tensor],
-    x0: Tensor,
-    xh: Tensor,
-    h: Tensor,
-    *,
-    kind: MatchingRule,
-    order: Order,
-) -> Tensor:
-    """Mean velocity over the pair that the vector field predicts, to be compared with (Xh - X0)/h.
-
-    Parameters
-    ----------
-    vector_field
-        f at points of shape ``(..., d)``.
-    x0, xh
-        The two snapshots, shape ``(..., d)``.
-    h
-        Time between them, shape ``(..., 1)``.
-    kind, order
-        The rule, see the table above.
-
-    Returns
-    -------
-    torch.Tensor
-        Shape ``(..., d)``.
-    """
-    match kind, order:
-        case "explicit", 2:
-            return vector_field(x0 + h / 2 * vector_field(x0))
-        case "explicit", 4:
-            k1 = vector_field(x0)
-            k2 = vector_field(x0 + h / 2 * k1)
-            k3 = vector_field(x0 + h / 2 * k2)
-            k4 = vector_field(x0 + h * k3)
-            return (k1 + 2 * (k2 + k3) + k4) / 6
-        case "symmetric", 2:
-            return vector_field((x0 + xh) / 2)
-        case "symmetric", 4:
-            start, end = vector_field(x0), vector_field(xh)
-            middle = vector_field((x0 + xh) / 2 + h / 8 * (start - end))
-            return (start + 4 * middle + end) / 6
-    raise ValueError(f"there is no {kind} matching rule of order {order}; use order 2 or 4")
-
-
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+@pydantic_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class CheckOptions:
     """When a training may end before its last step: as soon as refinement will succeed from where it is.
 
@@ -108,7 +70,7 @@ class CheckOptions:
     attempts: Annotated[int, Field(ge=1)] = 2
 
 
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+@pydantic_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class TrainingOptions:
     """How the networks are trained; every one of these changes the result.
 
@@ -136,7 +98,7 @@ class TrainingOptions:
     asymmetry
         δ of w(z, δ).
     matching, matching_order
-        The pair-matching rule, see `siq.networks.options`.
+        The pair-matching rule, see `siq.networks.decomposition`.
     relative_dynamics
         Divide the first term of the loss by the mean square of the observed velocities, so that λ means
         the same for every system and in any units. The paper does not.
@@ -209,3 +171,176 @@ class TrainingOptions:
             slowest_share=0.5 * self.slowest_share,
             slow_speed=(self.slow_speed or 0.1) if self.matching == "symmetric" else self.slow_speed,
         )
+
+
+Layer = tuple[np.ndarray, np.ndarray]
+"""Weights, shape ``(inputs, outputs)``, and biases, shape ``(1, outputs)``."""
+
+
+@dataclass(frozen=True)
+class PointValues:
+    """The decomposition at points: V ``(n,)``, g and f ``(n, d)``."""
+
+    potential: np.ndarray
+    circulatory: np.ndarray
+    vector_field: np.ndarray
+
+
+@dataclass(frozen=True)
+class TrainedNetworks:
+    """An orthogonal decomposition ``f = -D∇V + g`` given by two tanh networks.
+
+    Not to be confused with `siq.networks.networks.Networks`, the tensors of several runs that
+    training changes; this is one run of them, at rest.
+
+    Attributes
+    ----------
+    potential
+        Layers of V^NN, from d inputs to one output.
+    circulatory
+        Layers of g^NN, from d inputs to d outputs.
+    mean, scale
+        μ and σ of ``y = (x - μ)/σ``, shape ``(1, d)``, in the units of the states.
+    potential_scale, circulatory_scale
+        η_v and η_g, shape ``(1, 1)``.
+    diffusion
+        D, shape ``(d, d)``.
+    """
+
+    potential: tuple[Layer, ...]
+    circulatory: tuple[Layer, ...]
+    mean: np.ndarray
+    scale: np.ndarray
+    potential_scale: np.ndarray
+    circulatory_scale: np.ndarray
+    diffusion: np.ndarray
+
+    def evaluate(self, x: np.ndarray, *, chunk: int = 50_000) -> PointValues:
+        """Evaluate V, g and f.
+
+        Parameters
+        ----------
+        x
+            Points, shape ``(n, d)``, in the units of the states.
+        chunk
+            Points evaluated together, which bounds the memory.
+        """
+        pieces = [self._evaluate(x[begin : begin + chunk]) for begin in range(0, len(x), chunk)]
+        potential, circulatory, vector_field = zip(*pieces or [self._evaluate(x)], strict=True)
+        return PointValues(
+            np.concatenate(potential), np.concatenate(circulatory), np.concatenate(vector_field)
+        )
+
+    def _evaluate(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        y = (x.astype(self.mean.dtype) - self.mean) / self.scale
+        value, gradient = _value_and_gradient(self.potential, y)
+        potential = self.potential_scale * (value + (y * y).sum(axis=1, keepdims=True))
+        gradient = self.potential_scale / self.scale * (gradient + 2 * y)
+        circulatory = self.circulatory_scale * _hidden(self.circulatory, y)[-1]
+        values = (potential[:, 0], circulatory, circulatory - gradient @ self.diffusion)
+        return tuple(np.asarray(array, dtype=float) for array in values)  # type: ignore[return-value]
+
+
+def shuffled(networks: TrainedNetworks, *, generator: np.random.Generator) -> TrainedNetworks:
+    """The same weights in random order: a network that knows nothing, for comparison."""
+
+    def layers(source: tuple[Layer, ...]) -> tuple[Layer, ...]:
+        return tuple(
+            (_shuffle(weights, generator), _shuffle(biases, generator)) for weights, biases in source
+        )
+
+    return replace(networks, potential=layers(networks.potential), circulatory=layers(networks.circulatory))
+
+
+def _shuffle(array: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    return array.ravel()[generator.permutation(array.size)].reshape(array.shape)
+
+
+def _hidden(layers: tuple[Layer, ...], y: np.ndarray) -> list[np.ndarray]:
+    """Activations of the hidden layers, and the output behind them."""
+    found = []
+    for weights, biases in layers[:-1]:
+        y = np.tanh(y @ weights + biases)
+        found.append(y)
+    weights, biases = layers[-1]
+    return [*found, y @ weights + biases]
+
+
+def _value_and_gradient(layers: tuple[Layer, ...], y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Value of a scalar tanh network and its gradient, backwards through the layers."""
+    *hidden, value = _hidden(layers, y)
+    delta = layers[-1][0].T
+    for (weights, _), activation in zip(reversed(layers[:-1]), reversed(hidden), strict=True):
+        delta = (delta * (1 - activation * activation)) @ weights.T
+    return value, delta
+
+
+def save_networks(path: str | Path, runs: Sequence[TrainedNetworks]) -> None:
+    """Write the networks of one or more runs, whole or not at all."""
+    write_archive(path, pack(runs))
+
+
+def load_networks(path: str | Path, *, run: int = 0) -> TrainedNetworks:
+    """Read the networks of one of the runs that `save_networks` wrote.
+
+    Raises
+    ------
+    InputError
+        When the file is missing or is no such archive.
+    """
+    arrays = read_archive(path)
+    try:
+        return unpack(arrays, run)
+    except (KeyError, IndexError, ValueError, TypeError):
+        raise InputError(path, "", "it is not an archive of networks", "make it again") from None
+
+
+def pack(runs: Sequence[TrainedNetworks]) -> dict[str, np.ndarray]:
+    """Arrays by name, with a leading axis of runs in all but D, which runs share."""
+    first = runs[0]
+    arrays = {
+        "sizes": np.array(json.dumps([len(first.potential), len(first.circulatory)])),
+        "diffusion": first.diffusion,
+    }
+    for name in ("mean", "scale", "potential_scale", "circulatory_scale"):
+        arrays[name] = np.stack([getattr(one, name) for one in runs])
+    for name in ("potential", "circulatory"):
+        for index in range(len(getattr(first, name))):
+            weights, biases = zip(*(getattr(one, name)[index] for one in runs), strict=True)
+            arrays[f"{name}_weights{index}"] = np.stack(weights)
+            arrays[f"{name}_biases{index}"] = np.stack(biases)
+    return arrays
+
+
+def unpack(arrays: dict[str, np.ndarray], run: int) -> TrainedNetworks:
+    """One of the runs that `pack` put side by side."""
+    potential, circulatory = json.loads(str(arrays["sizes"]))
+
+    def layers(name: str, count: int) -> tuple[Layer, ...]:
+        return tuple(
+            (arrays[f"{name}_weights{index}"][run], arrays[f"{name}_biases{index}"][run])
+            for index in range(count)
+        )
+
+    own = {field.name for field in fields(TrainedNetworks)} - {"potential", "circulatory", "diffusion"}
+    return TrainedNetworks(
+        potential=layers("potential", potential),
+        circulatory=layers("circulatory", circulatory),
+        diffusion=arrays["diffusion"],
+        **{name: arrays[name][run] for name in own},
+    )
+
+
+def write_archive(path: str | Path, arrays: dict[str, np.ndarray]) -> None:
+    """Write a NumPy archive of plain arrays, never pickles, whole or not at all."""
+    with whole_file(path) as partial, partial.open("wb") as file:  # given a name, savez would add .npz
+        np.savez(file, allow_pickle=False, **arrays)
+
+
+def read_archive(path: str | Path) -> dict[str, np.ndarray]:
+    """Read such an archive, or refuse the file with an `InputError`."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except (OSError, ValueError, EOFError, NotImplementedError, zipfile.BadZipFile):
+        raise InputError(path, "", "it is not an archive of networks", "make it again") from None
