@@ -17,7 +17,6 @@ than the errors of one that was estimated leave open.
 
 from __future__ import annotations
 
-import logging
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -38,18 +37,17 @@ from siq.quasipotential.rates import NoiseStrength, dwell_time
 from siq.quasipotential.wells import Well
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
-from siq.systems.equilibria import hessian_at
 from siq.systems.phase_portrait import PhasePortrait
-from siq.validation.mesh import MeshQuasipotential, mesh_quasipotential
 
-LOGGER = logging.getLogger(__name__)
 GRID = 161  # points along each of two states
 SCATTERED = 4000  # points of a fan where there are more states
-MESH = 512
 CURVES = 400
 GAP = 0.04  # between the ends of neighbouring curves, in units in which the level is at about 1
 NEAR = 0.06  # of a point of a curve, in the same units: V is told from its nearest
 WIDER = 0.25  # of the box, by which curves may leave it
+
+Potential = Callable[[np.ndarray], np.ndarray]
+"""U at points ``(n, d)``, NaN where it is not known; up to a constant."""
 
 
 @dataclass(frozen=True)
@@ -107,6 +105,7 @@ def reference_landscape(
     box: np.ndarray,
     reach: float,
     generator: np.random.Generator,
+    mesh: Callable[[np.ndarray, float], Potential | None] | None = None,
 ) -> ReferenceLandscape:
     """Compute the references.
 
@@ -122,6 +121,9 @@ def reference_landscape(
         Level up to which curves are followed, as a share of each well's lowest barrier.
     generator
         Draws first directions and points in more than two dimensions.
+    mesh
+        Of two states, V (not U) about an attractor up to a level by a method that shares no code with the
+        others (`siq.validation.mesh.mesh_potential`).
 
     Raises
     ------
@@ -159,31 +161,17 @@ def reference_landscape(
         ]
     )
     on_mesh, mesh_barriers = np.full(values.shape, np.nan), np.full(len(attractors), np.nan)
-    for index, one in enumerate(attractors if dynamics.dimension == 2 else ()):
-        mesh = _mesh(dynamics, one, box, level=levels[index] / 2)
-        if mesh is None:
+    for index, one in enumerate(attractors if dynamics.dimension == 2 and mesh is not None else ()):
+        potential = mesh(one, levels[index] / 2) if mesh is not None else None
+        if potential is None:
             continue
-        on_mesh[index] = 2 * mesh.evaluate(points)
+        on_mesh[index] = 2 * potential(points)
         tops = np.array([saddle.position for saddle in portrait.saddles[index]]).reshape(-1, 2)
         if len(tops):
-            mesh_barriers[index] = np.nanmin(2 * mesh.evaluate(tops), initial=np.inf)
+            mesh_barriers[index] = np.nanmin(2 * potential(tops), initial=np.inf)
     return ReferenceLandscape(
         attractors, points, values, on_mesh, barriers, mesh_barriers, _heights(actions, len(attractors))
     )
-
-
-def _mesh(
-    dynamics: Dynamics, attractor: np.ndarray, box: np.ndarray, *, level: float
-) -> MeshQuasipotential | None:
-    """V of two states on a mesh; none where f is not finite, or D not positive definite, in the whole box."""
-    try:
-        return mesh_quasipotential(
-            dynamics.drift, attractor, hessian=hessian_at(dynamics, attractor), box=box,
-            shape=(MESH, MESH), diffusion=dynamics.diffusion, level=level, stop_at_boundary=False,
-        )  # fmt: skip
-    except NumericalFailure as reason:
-        LOGGER.info("no mesh about %s: %s", attractor, reason)
-        return None
 
 
 def no_reference(dimension: int, reason: str) -> ReferenceLandscape:
@@ -239,9 +227,6 @@ def read_reference(path: str | Path) -> ReferenceLandscape:
 
 WELL_SHARE = 0.9  # of its barrier: below it a well is compared
 OVERALL = 1.1  # of the highest saddle of U
-
-Potential = Callable[[np.ndarray], np.ndarray]
-"""U at points ``(n, d)``, NaN where it is not known; up to a constant."""
 
 
 @dataclass(frozen=True)

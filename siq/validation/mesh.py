@@ -1,40 +1,38 @@
 """V of a system with two states on a mesh: the ordered line integral method with the midpoint rule.
 
-A mesh is worked through from an ellipse about the attractor, within which V is ``½ (x - A)·M (x - A)``. What
-is refused here would lead to a wrong V and not to a fault.
-
-The mesh is worked through from its front on, the lowest value first, as `siq.validation.mesh` says. All of it
-is machine code and stands in one file: numba keeps a function until *its own* file changes, and would not
-notice that a function of another file did.
-
 The quasipotential U = 2V of a state is the least geometric action of a curve that leads there from the
 attractor,
 
     U(y) = inf ∫ (|f| |φ'| - f·φ') ds,
 
 lengths and the product being those of ``D⁻¹``, which may depend on the state. The mesh is worked through as
-by Dijkstra's algorithm, from the attractor upwards. What is known so far ends in a front. A node next to it
-takes the least action over straight segments from the front within a reach of some mesh widths, from a node
-or from between two neighbours,
+by Dijkstra's algorithm, from an ellipse about the attractor A upwards, within which V is ``½ (x - A)·M (x -
+A)``. What is known so far ends in a front. A node next to it takes the least action over straight segments
+from the front within a reach of some mesh widths, from a node or from between two neighbours,
 
     U(y) = min over λ of (1 - λ) U(x₀) + λ U(x₁) + |f_m| |y - x_λ| - f_m·(y - x_λ),
 
 f_m being f in the middle of the segment, where D is taken, too. Of all such nodes the one with the lowest
-value is known for good, and joins the front (D. Dahiya, M. Cameron, *Ordered line integral methods for
-computing the quasi-potential*, J. Sci. Comput. 75, 2018). Where f turns fast, segments lead far along the
-front, and the reach has to be large. A reach larger than that does harm: the longest segments have the
-largest errors, and the minimum picks those that are too low.
+value is known for good, and joins the front. Where f turns fast, segments lead far along the front, and the
+reach has to be large. A larger one does harm: the longest segments have the largest errors, and the minimum
+picks those that are too low.
 
 Two differences from the published method, which is there as an option: along the front U is interpolated with
 its second difference and not linearly, which raises the order from one to two; and a node tries all pairs of
 neighbours within its reach, diagonal ones included, not only those at its best single node.
 
-Nothing is shared with the characteristics, the series and the formulas of this library, neither equations nor
-code; so that agreement with them means something. No derivative of f is needed, and V may have kinks.
+No equation and no code is shared with characteristics, series and formulas, so that agreement with them means
+something. No derivative of f is needed, and V may have kinks. The compiled functions stand in one file: numba
+keeps a function until *its own* file changes.
+
+References
+----------
+D. Dahiya, M. Cameron, J. Sci. Comput. 75 (2018) 1351: ordered line integral methods.
 """
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -46,6 +44,10 @@ from scipy.spatial import cKDTree
 from siq.errors import NumericalFailure
 from siq.numerics.integration import machine_code
 from siq.systems.diffusion import Diffusion
+from siq.systems.dynamics import Dynamics
+from siq.systems.equilibria import hessian_at
+
+LOGGER = logging.getLogger(__name__)
 
 Stop = Literal["boundary", "level", "everywhere"]
 
@@ -120,14 +122,14 @@ class MeshQuasipotential:
         return np.where(share == 0, 0.0, share * around).sum(axis=(1, 2))
 
 
-FEWEST = 16  # nodes along a state: fewer leave no room around the start
-START = 2.5  # mesh widths: shortest half-axis of the ellipse within which V is its quadratic form
-SLACK = 0.05  # by which f at the attractor, and M, may be off
-SMALL = 1e-3  # of the starting ellipse: where f counts as linear
+MIN_NODES = 16  # nodes along a state: fewer leave no room around the start
+START_HALF_AXIS = 2.5  # mesh widths: shortest half-axis of the ellipse within which V is its quadratic form
+EQUILIBRIUM_TOLERANCE = 0.05  # by which f at the attractor, and M, may be off
+LINEAR_RANGE = 1e-3  # of the starting ellipse: where f counts as linear
 DIRECTIONS = 360  # numerical: of the starting ellipse, a degree apart
 
 
-def check_arguments(
+def _check_arguments(
     attractor: np.ndarray,
     hessian: np.ndarray,
     box: np.ndarray,
@@ -146,8 +148,8 @@ def check_arguments(
             raise ValueError(f"the {name} must be finite numbers of shape {wanted}: the mesh has two states")
     if diffusion.dimension != 2:  # asked before D is evaluated, which takes a state of its own dimension
         raise ValueError(f"the diffusion is one of {diffusion.dimension} states: the mesh has two")
-    if len(shape) != 2 or min(shape) < FEWEST:
-        raise ValueError(f"a mesh of {shape} nodes is too coarse; give at least {FEWEST} along each state")
+    if len(shape) != 2 or min(shape) < MIN_NODES:
+        raise ValueError(f"a mesh of {shape} nodes is too coarse; give at least {MIN_NODES} along each state")
     scale = np.sqrt(np.abs(np.diag(hessian)))
     ratio = hessian / np.maximum(np.outer(scale, scale), np.finfo(float).tiny)
     if not np.allclose(ratio, ratio.T) or np.diag(hessian).min() <= 0 or np.linalg.eigvalsh(ratio)[0] <= 0:
@@ -165,29 +167,7 @@ def check_arguments(
         raise ValueError(f"the level {level} must be positive: V is zero at the attractor")
 
 
-def check_room(
-    attractor: np.ndarray,
-    form: np.ndarray,
-    rim: float,
-    box: np.ndarray,
-    widths: np.ndarray,
-    level: float | None,
-) -> None:
-    """Refuse a mesh whose starting ellipse does not fit into the box and below the level."""
-    half = np.sqrt(2 * rim * np.diag(np.linalg.inv(form)))
-    room = np.minimum(attractor - box[:, 0], box[:, 1] - attractor) / widths
-    if np.any(half + 1 >= room):
-        raise ValueError(
-            f"the start around the attractor takes {np.ceil(half).tolist()} mesh widths, to the box's ends "
-            f"there are {np.floor(room).tolist()}; take more nodes or a larger box"
-        )
-    if level is not None and rim >= level:
-        raise ValueError(
-            f"V is {rim:.3g} at the rim of the start, above the level {level:.3g}; take more nodes"
-        )
-
-
-def check_start(
+def _turning_near(
     drift: Callable[[np.ndarray], np.ndarray],
     attractor: np.ndarray,
     hessian: np.ndarray,
@@ -199,19 +179,19 @@ def check_start(
     angles = np.linspace(0, 2 * np.pi, DIRECTIONS, endpoint=False)
     circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     # In mesh widths: states may differ in size by many orders.
-    small = SMALL * np.sqrt(2 * rim) * circle
+    small = LINEAR_RANGE * np.sqrt(2 * rim) * circle
     offset = np.linalg.solve(np.linalg.cholesky(hessian * np.outer(widths, widths)).T, small.T).T * widths
-    force = (drift_values(drift, attractor + offset) - drift_values(drift, attractor - offset)) / 2
+    force = (_drift_values(drift, attractor + offset) - _drift_values(drift, attractor - offset)) / 2
     momentum = offset @ hessian
     push = diffusion.push(attractor + offset, momentum)
     # Of H = p·(f + Dp), which vanishes.
     energy = np.sum(momentum * (force + push), axis=1)
-    root = square(metric_roots(diffusion, attractor[None]))[0]
+    root = _square(_metric_roots(diffusion, attractor[None]))[0]
     size = np.linalg.norm(momentum @ np.linalg.inv(root), axis=1) * np.linalg.norm(force @ root.T, axis=1)
-    resting = np.linalg.norm(root @ drift_values(drift, attractor[None])[0]) * SMALL
-    if resting > SLACK * np.linalg.norm(force @ root.T, axis=1).max():
+    resting = np.linalg.norm(root @ _drift_values(drift, attractor[None])[0]) * LINEAR_RANGE
+    if resting > EQUILIBRIUM_TOLERANCE * np.linalg.norm(force @ root.T, axis=1).max():
         raise ValueError(f"the attractor {attractor.tolist()} is no equilibrium: f does not vanish there")
-    if np.abs(energy).max() > SLACK * size.max():
+    if np.abs(energy).max() > EQUILIBRIUM_TOLERANCE * size.max():
         raise ValueError(
             f"{hessian.tolist()} is not the Hessian of V at the attractor;"
             " see siq.systems.equilibria.hessian_at, and mind that U = 2V has twice that"
@@ -221,7 +201,7 @@ def check_start(
     return float((lengths / np.sum(velocity * slope, axis=1)).max())
 
 
-def metric_roots(diffusion: Diffusion, x: np.ndarray) -> np.ndarray:
+def _metric_roots(diffusion: Diffusion, x: np.ndarray) -> np.ndarray:
     """R with ``RᵀR = D⁻¹`` at points ``(n, 2)``, exact in powers of two: R₁₁, R₂₁, R₂₂, shape ``(n, 3)``.
 
     Raises
@@ -234,15 +214,15 @@ def metric_roots(diffusion: Diffusion, x: np.ndarray) -> np.ndarray:
     return np.stack([1 / a, -b / (a * c), 1 / c], axis=1)
 
 
-def square(roots: np.ndarray) -> np.ndarray:
+def _square(roots: np.ndarray) -> np.ndarray:
     """Lower triangular matrices of their three entries: ``(..., 3)`` to ``(..., 2, 2)``."""
     matrices = np.zeros((*roots.shape[:-1], 2, 2))
     matrices[..., 0, 0], matrices[..., 1, 0], matrices[..., 1, 1] = np.moveaxis(roots, -1, 0)
     return matrices
 
 
-def drift_values(drift: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> np.ndarray:
-    """F of points ``(n, 2)``, of the same shape and finite."""
+def _drift_values(drift: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> np.ndarray:
+    """f of points ``(n, 2)``, of the same shape and finite."""
     values = np.asarray(drift(x), dtype=float)
     if values.shape != x.shape:
         raise ValueError(f"f of points of shape {x.shape} has the shape {values.shape}; it must be the same")
@@ -251,15 +231,15 @@ def drift_values(drift: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> np
     return values
 
 
-PRECISION = 1e-6  # of λ: U is flat at its minimum, and off by the square of this
-MOST_SECANTS = 60  # numerical, a guard: bisection alone reaches PRECISION in 20
+SHARE_TOLERANCE = 1e-6  # of λ: U is flat at its minimum, and off by the _square of this
+MAX_SECANTS = 60  # numerical, a guard: bisection alone reaches SHARE_TOLERANCE in 20
 
 # A node has no value yet; a guess; its value, on the front; its value, behind the front.
 UNKNOWN, CONSIDERED, FRONT, ACCEPTED = range(4)
 STOPS: tuple[Stop, ...] = ("boundary", "level", "everywhere")
 
 
-class Mesh(NamedTuple):
+class _Mesh(NamedTuple):
     """What the compiled functions work on; displacements are in mesh widths.
 
     Attributes
@@ -294,7 +274,7 @@ class Mesh(NamedTuple):
     refined: bool
 
 
-class Heap(NamedTuple):
+class _Heap(NamedTuple):
     """Considered nodes, the lowest first: ``nodes`` by place, ``places`` by node, and how many, ``(1,)``."""
 
     nodes: np.ndarray
@@ -303,7 +283,7 @@ class Heap(NamedTuple):
 
 
 @machine_code
-def march(mesh: Mesh, heap: Heap, top: float, stop_at_boundary: bool) -> tuple[int, float]:
+def _march(mesh: _Mesh, heap: _Heap, top: float, stop_at_boundary: bool) -> tuple[int, float]:
     """Work through the mesh; the index in `STOPS`, and the highest U that is known."""
     nx, ny = mesh.values.shape
     for i in range(nx):
@@ -337,7 +317,7 @@ def march(mesh: Mesh, heap: Heap, top: float, stop_at_boundary: bool) -> tuple[i
 
 
 @machine_code
-def _consider_around(mesh: Mesh, heap: Heap, i: int, j: int) -> None:
+def _consider_around(mesh: _Mesh, heap: _Heap, i: int, j: int) -> None:
     """Give the unknown neighbours of a new node of the front their first values."""
     nx, ny = mesh.values.shape
     for a in range(max(i - 1, 0), min(i + 2, nx)):
@@ -351,7 +331,7 @@ def _consider_around(mesh: Mesh, heap: Heap, i: int, j: int) -> None:
 
 
 @machine_code
-def _consider(mesh: Mesh, i: int, j: int) -> None:
+def _consider(mesh: _Mesh, i: int, j: int) -> None:
     """The first value of a node, from all of the front within reach."""
     nx, ny = mesh.values.shape
     mesh.status[i, j] = CONSIDERED
@@ -367,7 +347,7 @@ def _consider(mesh: Mesh, i: int, j: int) -> None:
 
 
 @machine_code
-def _improve(mesh: Mesh, heap: Heap, a: int, b: int, i: int, j: int) -> None:
+def _improve(mesh: _Mesh, heap: _Heap, a: int, b: int, i: int, j: int) -> None:
     """Lower the value of the node (i, j), if segments from near the new node (a, b) of the front do."""
     ny = mesh.values.shape[1]
     value = mesh.values[a, b] + _action(mesh, a, b, i, j)
@@ -386,7 +366,7 @@ def _improve(mesh: Mesh, heap: Heap, a: int, b: int, i: int, j: int) -> None:
 
 
 @machine_code
-def _from_pairs(mesh: Mesh, a: int, b: int, i: int, j: int) -> float:
+def _from_pairs(mesh: _Mesh, a: int, b: int, i: int, j: int) -> float:
     """The lowest value of (i, j) by segments from between (a, b) and a neighbour on the front."""
     nx, ny = mesh.values.shape
     lowest = math.inf
@@ -399,12 +379,12 @@ def _from_pairs(mesh: Mesh, a: int, b: int, i: int, j: int) -> float:
 
 
 @machine_code
-def _within(mesh: Mesh, a: int, b: int, i: int, j: int) -> bool:
+def _within(mesh: _Mesh, a: int, b: int, i: int, j: int) -> bool:
     return (a - i) * (a - i) + (b - j) * (b - j) <= mesh.reach * mesh.reach
 
 
 @machine_code
-def _leave_front(mesh: Mesh, i: int, j: int) -> None:
+def _leave_front(mesh: _Mesh, i: int, j: int) -> None:
     """A node of the front falls behind it when all its neighbours are known."""
     nx, ny = mesh.values.shape
     if mesh.status[i, j] != FRONT:
@@ -417,7 +397,7 @@ def _leave_front(mesh: Mesh, i: int, j: int) -> None:
 
 
 @machine_code
-def _action(mesh: Mesh, a: int, b: int, i: int, j: int) -> float:
+def _action(mesh: _Mesh, a: int, b: int, i: int, j: int) -> float:
     """Action of the segment from (a, b) to (i, j); its middle is a node of the mesh half as wide."""
     r, s, t = mesh.roots[mesh.varies * (a + i), mesh.varies * (b + j)]
     u, v = r * (i - a), s * (i - a) + t * (j - b)
@@ -426,7 +406,7 @@ def _action(mesh: Mesh, a: int, b: int, i: int, j: int) -> float:
 
 
 @machine_code
-def _from_between(mesh: Mesh, a: int, b: int, c: int, d: int, i: int, j: int) -> float:
+def _from_between(mesh: _Mesh, a: int, b: int, c: int, d: int, i: int, j: int) -> float:
     """The least value of (i, j) by segments from between (a, b) and (c, d), infinite if there is none.
 
     At either end of the pair the segment from a single node has the same value, so that only a minimum
@@ -451,11 +431,11 @@ def _from_between(mesh: Mesh, a: int, b: int, c: int, d: int, i: int, j: int) ->
     if high_slope <= 0:
         return math.inf
     share, last = 0.5, 0
-    for _ in range(MOST_SECANTS):
+    for _ in range(MAX_SECANTS):
         before = share
         share = (low * high_slope - high * low_slope) / (high_slope - low_slope)
         slope = _slope(share, u, v, du, dv, ddu, ddv, p, q, dp, dq, rise, bend)
-        if abs(share - before) < PRECISION:
+        if abs(share - before) < SHARE_TOLERANCE:
             break
         # Of an end that stays twice in a row the slope is halved (Illinois), or the other would creep.
         if slope > 0:
@@ -498,7 +478,7 @@ def _slope(
 
 
 @machine_code
-def _second_difference(mesh: Mesh, a: int, b: int, c: int, d: int) -> float:
+def _second_difference(mesh: _Mesh, a: int, b: int, c: int, d: int) -> float:
     """Of U along the line of two neighbours: the smaller of those at both, none where they differ in sign."""
     nx, ny = mesh.values.shape
     known, smaller = 0, 0.0
@@ -516,7 +496,7 @@ def _second_difference(mesh: Mesh, a: int, b: int, c: int, d: int) -> float:
 
 
 @machine_code
-def _rise(heap: Heap, values: np.ndarray, position: int) -> None:
+def _rise(heap: _Heap, values: np.ndarray, position: int) -> None:
     """Move the node at a place up until its parent is lower."""
     ny = values.shape[1]
     node = heap.nodes[position]
@@ -533,7 +513,7 @@ def _rise(heap: Heap, values: np.ndarray, position: int) -> None:
 
 
 @machine_code
-def _take_lowest(heap: Heap, values: np.ndarray) -> None:
+def _take_lowest(heap: _Heap, values: np.ndarray) -> None:
     """Remove the first node; the last takes its place and moves down."""
     ny = values.shape[1]
     heap.size[0] -= 1
@@ -558,8 +538,8 @@ def _take_lowest(heap: Heap, values: np.ndarray) -> None:
 
 
 STRAIGHT_REACH = 3.0  # mesh widths that suffice where f does not turn
-FARTHEST = 60  # mesh widths, beyond which the reach is not set unasked
-AT_ONCE = 1 << 18  # points at which f is evaluated in one call
+LONGEST_DEFAULT_REACH = 60  # mesh widths, beyond which the reach is not set unasked
+CHUNK = 1 << 18  # points at which f is evaluated in one call
 
 
 def mesh_quasipotential(
@@ -596,7 +576,7 @@ def mesh_quasipotential(
         Longest segment, in mesh widths. By default ``3 + r/2``, r being the ratio ``|f + 2D∇V| |∇V| /
         ((f + 2D∇V)·∇V)`` in mesh widths at its largest near A, 1 if f does not turn there: the least that
         sufficed in systems with known V. Where f turns faster elsewhere, give more. V falls as the reach
-        grows: it is too high where the reach is too short, and too low, by its square, where it is too long.
+        grows: it is too high where the reach is too short, and too low, by its _square, where it is too long.
     level
         V (not U) above which nothing is asked for.
     stop_at_boundary
@@ -631,16 +611,28 @@ def mesh_quasipotential(
     all compiles, which takes seconds; the code is kept for later sessions.
     """
     attractor, hessian, box = (np.asarray(one, dtype=float) for one in (attractor, hessian, box))
-    check_arguments(attractor, hessian, box, shape, diffusion, reach, level)
+    _check_arguments(attractor, hessian, box, shape, diffusion, reach, level)
     axes = tuple(np.linspace(low, high, count) for (low, high), count in zip(box, shape, strict=True))
     widths = (box[:, 1] - box[:, 0]) / (np.array(shape) - 1)
     form = hessian * np.outer(widths, widths)  # M, of displacements in mesh widths
-    rim = START**2 * np.linalg.eigvalsh(form)[-1] / 2
-    check_room(attractor, form, rim, box, widths, level)
-    turning = check_start(drift, attractor, hessian, rim, widths, diffusion)
+    rim = START_HALF_AXIS**2 * np.linalg.eigvalsh(form)[-1] / 2
+    half = np.sqrt(2 * rim * np.diag(np.linalg.inv(form)))
+    room = np.minimum(attractor - box[:, 0], box[:, 1] - attractor) / widths
+    if np.any(half + 1 >= room):
+        raise ValueError(
+            f"the start around the attractor takes {np.ceil(half).tolist()} mesh widths, to the box's ends "
+            f"there are {np.floor(room).tolist()}; take more nodes or a larger box"
+        )
+    if level is not None and rim >= level:
+        raise ValueError(
+            f"V is {rim:.3g} at the rim of the start, above the level {level:.3g}; take more nodes"
+        )
+    turning = _turning_near(drift, attractor, hessian, rim, widths, diffusion)
     if reach is None:
         published = max(round(10 + 4 * (math.log2(max(shape)) - 7)), 2)
-        reach = published if as_published else min(math.ceil(STRAIGHT_REACH + turning / 2), FARTHEST)
+        reach = (
+            published if as_published else min(math.ceil(STRAIGHT_REACH + turning / 2), LONGEST_DEFAULT_REACH)
+        )
 
     x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1) - attractor
     start = np.einsum("abi,ij,abj->ab", x, hessian, x) / 2
@@ -693,10 +685,27 @@ def mesh_quasipotential_of_cycle(
     away, which = cKDTree(points / widths).query(x / widths)
     offset = x - points[which]
     start = np.einsum("ni,nij,nj->n", offset, hessians[which], offset) / 2
-    begin = np.where(away <= START, start, np.inf).reshape(shape)
+    begin = np.where(away <= START_HALF_AXIS, start, np.inf).reshape(shape)
     return _marched(
         drift, points[0], begin, axes, box, diffusion, reach, None, stop_at_boundary, refined=True
     )
+
+
+def mesh_potential(
+    dynamics: Dynamics, attractor: np.ndarray, *, box: np.ndarray, level: float, nodes: int = 512
+) -> Callable[[np.ndarray], np.ndarray] | None:
+    """V about an attractor as a function of points, up to a level.
+
+    None where f is not finite, or D not positive definite, in the whole box.
+    """
+    try:
+        return mesh_quasipotential(
+            dynamics.drift, attractor, hessian=hessian_at(dynamics, attractor), box=box,
+            shape=(nodes, nodes), diffusion=dynamics.diffusion, level=level, stop_at_boundary=False,
+        ).evaluate  # fmt: skip
+    except NumericalFailure as reason:
+        LOGGER.info("no mesh about %s: %s", attractor, reason)
+        return None
 
 
 def _marched(
@@ -717,20 +726,20 @@ def _marched(
     widths = (box[:, 1] - box[:, 0]) / (np.array(shape) - 1)
     finer = tuple(np.linspace(low, high, 2 * n - 1) for (low, high), n in zip(box, shape, strict=True))
     if diffusion.constant:
-        roots = metric_roots(diffusion, attractor[None])[None]
+        roots = _metric_roots(diffusion, attractor[None])[None]
     else:
-        roots = _by_rows(lambda x: metric_roots(diffusion, x), finer)
+        roots = _by_rows(lambda x: _metric_roots(diffusion, x), finer)
     roots = roots * widths[[0, 0, 1]]
     small = math.frexp(np.abs(roots).max())[1]
     roots = np.ldexp(roots, -small)
-    flow = _by_rows(lambda x: drift_values(drift, x), finer)
-    flow = (square(roots) @ (flow / widths)[..., None])[..., 0]
+    flow = _by_rows(lambda x: _drift_values(drift, x), finer)
+    flow = (_square(roots) @ (flow / widths)[..., None])[..., 0]
     fast = math.frexp(np.abs(flow).max())[1]
     flow = np.ldexp(flow, -fast)
     unit = math.ldexp(0.5, 2 * small + fast)  # V of one unit of U within the mesh
     known = np.isfinite(begin)
     values = begin / unit
-    mesh = Mesh(
+    mesh = _Mesh(
         values=values,
         status=np.where(known, FRONT, UNKNOWN).astype(np.int8),
         lowest=np.full(shape, np.inf),
@@ -741,8 +750,8 @@ def _marched(
         reach=reach,
         refined=refined,
     )
-    heap = Heap(np.empty(values.size, dtype=int), np.empty(values.size, dtype=int), np.zeros(1, dtype=int))
-    stop, highest = march(mesh, heap, math.inf if level is None else level / unit, stop_at_boundary)
+    heap = _Heap(np.empty(values.size, dtype=int), np.empty(values.size, dtype=int), np.zeros(1, dtype=int))
+    stop, highest = _march(mesh, heap, math.inf if level is None else level / unit, stop_at_boundary)
     known = np.where(mesh.status >= FRONT, unit * values, np.nan)
     return MeshQuasipotential((axes[0], axes[1]), known, attractor, unit * highest, STOPS[stop], reach)
 
@@ -750,7 +759,7 @@ def _marched(
 def _by_rows(function: Callable[[np.ndarray], np.ndarray], axes: Sequence[np.ndarray]) -> np.ndarray:
     """A function of points ``(n, 2)`` on a rectangular mesh, some rows of it at a time."""
     first, second = axes
-    rows = max(AT_ONCE // len(second), 1)
+    rows = max(CHUNK // len(second), 1)
     parts = []
     for row in range(0, len(first), rows):
         points = np.stack(np.meshgrid(first[row : row + rows], second, indexing="ij"), axis=-1)

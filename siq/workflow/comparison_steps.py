@@ -43,6 +43,7 @@ from siq.quasipotential.landscape_files import StoredLandscape, landscape_data, 
 from siq.systems.dynamics import Dynamics
 from siq.systems.phase_portrait import evenly_spread, phase_portrait
 from siq.validation.escapes import Neighbourhood, neighbourhood, simulate_escapes
+from siq.validation.mesh import mesh_potential
 from siq.workflow.equations_step import EquationSettings, landscape_of_equations
 from siq.workflow.published import PublishedFigure, published_potentials
 from siq.workflow.settings import STRICT, StateSpace
@@ -89,7 +90,10 @@ def run(settings: ReferenceSettings, system: Dynamics) -> ReferenceLandscape:
         portrait = phase_portrait(system, points)
         if not portrait.attractors and (fault := portrait.fault()) is not None:
             return no_reference(system.dimension, fault)
-        return reference_landscape(system, portrait, box=system.box, reach=REACH, generator=draw)
+        return reference_landscape(
+            system, portrait, box=system.box, reach=REACH, generator=draw,
+            mesh=lambda attractor, level: mesh_potential(system, attractor, box=system.box, level=level),
+        )  # fmt: skip
     except (NumericalFailure, np.linalg.LinAlgError) as error:
         return no_reference(system.dimension, str(error))
 

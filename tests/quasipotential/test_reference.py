@@ -22,6 +22,7 @@ from siq.quasipotential.landscape_comparison import (
 )
 from siq.systems.cards import load_system
 from siq.systems.phase_portrait import phase_portrait
+from siq.validation.mesh import mesh_potential
 
 ROOT = Path(__file__).parents[2]
 PUBLISHED_MESH = Path(os.environ.get("SIQ_RESOURCES", "")) / "meshV1p0018.mat"
@@ -31,6 +32,7 @@ def reference_of(known) -> ReferenceLandscape:
     return reference_landscape(
         known.dynamics, portrait_of(known), box=known.domain, reach=1.0,
         generator=np.random.default_rng(0),
+        mesh=lambda place, level: mesh_potential(known.dynamics, place, box=known.domain, level=level),
     )  # fmt: skip
 
 
@@ -98,7 +100,10 @@ def resonator() -> ReferenceLandscape:
     draw = np.random.default_rng(0)
     low, high = system.box.T
     setting = phase_portrait(system, draw.uniform(low, high, (400, 2)))
-    return reference_landscape(system, setting, box=system.box, reach=1.2, generator=draw)
+    return reference_landscape(
+        system, setting, box=system.box, reach=1.2, generator=draw,
+        mesh=lambda place, level: mesh_potential(system, place, box=system.box, level=level),
+    )  # fmt: skip
 
 
 @pytest.mark.slow
