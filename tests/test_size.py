@@ -1,6 +1,7 @@
 """The size of the library may fall and not rise: the numbers in `tests/size.json` are its ratchets.
 
-Where a number has fallen, write the new one into the file. Where it has to rise, a record of decision says why.
+Where a number has fallen, write the new one into the file. Where it has to rise, a record of decision says
+why.
 """
 
 from __future__ import annotations
