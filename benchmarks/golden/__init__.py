@@ -1,4 +1,1 @@
-"""Outputs of a known state of the code as small tables, in ``tests/golden``, that a change has to reproduce.
-
-`table` says how they are written and compared, `landscapes` what of a landscape; other modules are groups.
-"""
+"""Small tables in ``tests/golden`` of what a known state of the code gives, and a change has to reproduce."""

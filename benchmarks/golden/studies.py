@@ -25,20 +25,22 @@ BY: dict[str, tuple[str, ...]] = {  # what names an item, by table
 WORDS = ["title", "sentence", "note", "reason"]
 OVER_RUNS = ["mean", "standard_deviation", "median", "inclusion_frequency"]
 TOLERANCES = {
-    **tolerated("coefficients prediction rrmse.rrmse rrmse.stated_error over_runs", 1e-6, 1e-8),
-    **tolerated("invariant.bessel invariant.quadrature invariant.unknown_at_most", 1e-6, 1e-9),
-    **tolerated(
-        "invariant.simulated_distance invariant.sampling_floor invariant.simulated_unknown", 0.02, 1e-6
-    ),
-    **tolerated("rrmse.network_error network_error", 0.1),  # of which refined formulas are free
-    **tolerated(
-        "learned_coefficients learned_prediction learned_over_runs learned_network_error", 1e-4, 1e-6
-    ),
-    **tolerated("learned_rrmse.rrmse learned_rrmse.network_error learned_rrmse.stated_error", 1e-4),
+    "studies": {
+        **tolerated("coefficients prediction rrmse.rrmse rrmse.stated_error over_runs", 1e-6, 1e-8),
+        **tolerated("invariant.bessel invariant.quadrature invariant.unknown_at_most", 1e-6, 1e-9),
+        **tolerated(
+            "invariant.simulated_distance invariant.sampling_floor invariant.simulated_unknown", 0.02, 1e-6
+        ),
+        **tolerated("rrmse.network_error network_error", 0.1),  # of which refined formulas are free
+        **tolerated(
+            "learned_coefficients learned_prediction learned_over_runs learned_network_error", 1e-4, 1e-6
+        ),
+        **tolerated("learned_rrmse.rrmse learned_rrmse.network_error learned_rrmse.stated_error", 1e-4),
+    }
 }
 
 
-def items(results: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+def studies(results: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     """The answer of every study, formulas, errors and verdicts of every run, and whole tables."""
     for study in sorted(path.stem for path in STUDIES.glob("*.yaml")):
         if not _has_results(study, results):
