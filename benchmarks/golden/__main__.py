@@ -48,10 +48,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run(group: str, chosen: argparse.Namespace) -> bool:
     """One group; whether all of it is as written down."""
-    module, path = (
-        importlib.import_module(f"benchmarks.golden.{GROUPS[group]}"),
-        chosen.folder / f"{group}.json",
-    )
+    module = importlib.import_module(f"benchmarks.golden.{GROUPS[group]}")
+    path = chosen.folder / f"{group}.json"
     known, began, same = read(path), time.process_time(), 0
     found: dict[str, Any] = {}
     worst: dict[str, float] = {}
