@@ -14,6 +14,7 @@ from workflow.proof.concealment import cases as concealment
 from workflow.proof.foreign import cases as foreign
 
 SEED = 20261124
+WORK = 6e8  # allowed, a dozen seconds of a core: that of some cases is cut short, always at the same place
 OWN_SHARES = {"null": 0.20, "shift": 0.15, "mechanism": 0.45, "process noise": 0.08, "withheld": 0.12}
 SETS = (
     ("concealment", concealment, 32, OWN_SHARES),
@@ -42,6 +43,8 @@ def diagnosis(results: Path) -> Iterator[tuple[str, dict[str, Any]]]:
 
 def diagnosed(folder: Path) -> dict[str, Any]:
     """The verdict of one case with its numbers."""
+    with (folder / "study.yaml").open("a", encoding="utf-8") as study:
+        study.write(f"budget: {{evaluations: {WORK}}}\n")
     case = siq.read_case(folder / "system.yaml", folder / "recordings.parquet", folder / "study.yaml")
     try:
         said = siq.solve_case(case, clock=lambda: 0.0).statement.as_data()
