@@ -63,7 +63,7 @@ def diagnosed(folder: Path) -> dict[str, Any]:
     }
     for kind in ("mechanisms", "described"):
         parts = said[kind]
-        told[kind] = [[one.get("kind"), one["name"], sorted(one["equations"])] for one in parts]
+        told[kind] = [[*_called(one), sorted(one["equations"])] for one in parts]
         for name in ("estimate", "standard_error"):
             told[f"{name}s {kind}"] = [[each[name] for each in one["parameters"].values()] for one in parts]
         for name in ("delta_chi2", "log_odds"):
@@ -76,3 +76,9 @@ def diagnosed(folder: Path) -> dict[str, Any]:
         told["place_shares"] = place["equations"]
         told |= {name: place[name] for name in ("coordinate", "outputs", "region", "recordings")}
     return told
+
+
+def _called(part: dict[str, Any]) -> list[Any]:
+    """The name of a mechanism; of what has none, its kind and of which coordinates it is a function."""
+    nameless = part.get("kind", "mechanism") != "mechanism"
+    return [part["kind"], part["coordinates"]] if nameless else ["mechanism", part["name"]]
