@@ -8,7 +8,7 @@ CORES ?= 2
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 
 .PHONY: statistics examples test test-portable full untuned noise wheel test-pages newcomer laboratories coverage supports discrepancies \
-        official docs docs-full lint format environment clean
+        golden official docs docs-full lint format environment clean
 
 statistics: environment
 	$(BIN)/snakemake --cores $(CORES) statistics
@@ -71,6 +71,12 @@ supports: environment
 # it goes on where it was stopped.
 discrepancies: environment
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python -m benchmarks.discrepancies
+
+# What the code gives, against the tables in tests/golden: half an hour of one core. `make golden GROUP=equations` is one
+# group, `GOLDEN=--write` writes the tables, `GOLDEN='--results DIR'` names another folder of results.
+GROUP ?=
+golden: environment
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python -m benchmarks.golden $(GROUP) $(GOLDEN)
 
 # The official tests of public benchmarks: results/official/page.md, a table with published figures, and a
 # picture of each. Nothing is downloaded; `make official SIQ_RESOURCES=DIR` names the folder of their files.

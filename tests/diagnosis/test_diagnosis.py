@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
-from tests.mismatch.foreign_cases import falling_ball
+from tests.diagnosis.foreign_cases import falling_ball
 
 from siq.diagnosis import held_out_fit, investigation, search
 from siq.diagnosis.diagnosis import Diagnosis, anything_else, solve_case, withdrawn

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import sympy
-from tests.mismatch.decays import DECAY, X
+from tests.diagnosis.decays import DECAY, X
 
 from siq.data.recordings import Recordings
 from siq.diagnosis import unnamed_models

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.mismatch.foreign_cases import (
+from tests.diagnosis.foreign_cases import (
     ForeignCase,
     chain_of_masses,
     double_pendulum,

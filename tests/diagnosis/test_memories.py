@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 import sympy
-from tests.mismatch.decays import DECAY, X
+from tests.diagnosis.decays import DECAY, X
 
 from siq.data.recordings import Recordings
 from siq.diagnosis import unnamed_models

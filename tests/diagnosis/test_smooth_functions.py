@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import scipy.stats
 import sympy
-from tests.mismatch.foreign_cases import ForeignCase, course, table_of
+from tests.diagnosis.foreign_cases import ForeignCase, course, table_of
 
 from siq.diagnosis import unnamed_models
 from siq.diagnosis.diagnosis import solve_case
