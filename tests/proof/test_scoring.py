@@ -349,12 +349,12 @@ def test_the_blind_diagnosis_imports_nothing_of_keys_and_concealment() -> None:
 
 
 def test_the_proof_imports_nothing_of_the_search_and_the_verdict_that_it_tests() -> None:
-    tested = {"search", "trials", "screening", "probes", "clusters", "structure", "remainder", "steadiness",
-              "investigation", "location", "held_out", "verdict", "diagnosis"}  # fmt: skip
-    assert all((ROOT / f"siq/mismatch/{name}.py").is_file() for name in tested)
+    tested = {"search", "screening", "significance", "residual_structure", "investigation", "location",
+              "held_out_fit", "verdict", "diagnosis"}  # fmt: skip
+    assert all((ROOT / f"siq/diagnosis/{name}.py").is_file() for name in tested)
     for file in sorted((ROOT / "workflow/proof").glob("*.py")):
         found = imported_files(ROOT, file)
-        used = {each.stem for each in found if each.parent == ROOT / "siq/mismatch"}
+        used = {each.stem for each in found if each.parent == ROOT / "siq/diagnosis"}
         assert not used & tested, file.name
 
 
