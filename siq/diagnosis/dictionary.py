@@ -1,9 +1,4 @@
-"""The dictionary of mechanisms, and which states, inputs and parameters may take part in each.
-
-Mechanisms are written for roles - a position, a velocity, the two quadratures of a rotating frame, a
-population, a level, a store - and roles are read off equations and units, never off names. A system of mere
-numbers is described by generic monomials only.
-"""
+"""dictionary"""
 
 from __future__ import annotations
 
@@ -305,8 +300,8 @@ def _parse(unit: str, words: dict[str, sympy.Symbol]) -> sympy.Expr:
         return stand_in(unit)
 
 
-SAME = 1e-9  # relative difference of values of formulas that are the same
-TRIALS = 12
+FORMULA_TOLERANCE = 1e-9  # relative difference of values of formulas that are the same
+TRIAL_POINTS = 12
 ANYWHERE = (0.5, 1.5)  # where formulas of a state without a domain are compared, as those of inputs are
 
 
@@ -409,7 +404,7 @@ def meetings(equation: sympy.Expr, one: str, other: str) -> sympy.Expr:
 
 
 def trial_points(
-    model: Dynamics, count: int = TRIALS, *, either_sign: bool = False
+    model: Dynamics, count: int = TRIAL_POINTS, *, either_sign: bool = False
 ) -> tuple[np.ndarray, Signals]:
     """States and signals at which formulas are compared; any will do that are the same each time.
 
@@ -470,7 +465,7 @@ def _turns(model: Dynamics, first: int, second: int) -> bool:
     if model.units[first] != model.units[second]:
         return False
     x, signals = trial_points(model)
-    angle = np.linspace(0.3, 5.9, TRIALS)
+    angle = np.linspace(0.3, 5.9, TRIAL_POINTS)
     turned = x.copy()
     turned[first] = np.cos(angle) * x[first] - np.sin(angle) * x[second]
     turned[second] = np.sin(angle) * x[first] + np.cos(angle) * x[second]
@@ -483,10 +478,10 @@ def _turns(model: Dynamics, first: int, second: int) -> bool:
     expected[first] = np.cos(angle) * free[first] - np.sin(angle) * free[second]
     expected[second] = np.sin(angle) * free[first] + np.cos(angle) * free[second]
     size = np.abs(free).max()
-    if not (np.isfinite(free).all() and np.abs(after - expected).max() <= SAME * size):
+    if not (np.isfinite(free).all() and np.abs(after - expected).max() <= FORMULA_TOLERANCE * size):
         return False
     turning = x[first] * free[second] - x[second] * free[first]
-    return bool(np.abs(turning).max() > SAME * np.abs(x[[first, second]]).max() * size)
+    return bool(np.abs(turning).max() > FORMULA_TOLERANCE * np.abs(x[[first, second]]).max() * size)
 
 
 def _stays_zero(model: Dynamics, place: int) -> bool:
@@ -495,7 +490,9 @@ def _stays_zero(model: Dynamics, place: int) -> bool:
     x[place] = 0.0
     rate = model.functions.rates(x, signals, model.values)[place]
     return bool(
-        np.isfinite(rate).all() and np.abs(rate).max() <= SAME * np.abs(moving).max() and moving.any()
+        np.isfinite(rate).all()
+        and np.abs(rate).max() <= FORMULA_TOLERANCE * np.abs(moving).max()
+        and moving.any()
     )
 
 

@@ -1,198 +1,81 @@
-"""Evidence: is a mechanism likelier than a smooth function, and could chance do as much?
-
-Both are compared as whole explanations of what is missing, by their marginal likelihoods: along the
-trajectories of the fit with the mechanism everything is linear, and amplitudes, shapes and functions have
-normal priors. How large an effect is nobody knows beforehand, so that its size on the recordings is drawn
-evenly on a logarithmic scale, for both alike. A smooth function could have been anything, and pays for it:
-the more so the more the recordings tell. (MacKay, Information Theory, Inference, and Learning Algorithms,
-chapter 28.)
-
-Errors of a simulation that lacks more than what is in question hang together over time. Of n errors with an
-integral correlation time τ, n/τ are independent; logarithms of likelihoods are divided by τ, as those of so
-many errors are. Of white errors τ is 1.
-
-Smooth functions are compared in all places by their evidence (`siq.diagnosis.evidence`), along the
-trajectories of a fit and at several levels of random forces, as mechanisms are screened.
-
-A mechanism that leaves something may be right and not alone, or wrong and alike. Effects without a name are
-drawn as smooth functions in all places; along the trajectories of the recalibrated simulation everything is
-linear, so that least squares tells how much of each the best mechanisms would explain.
-"""
+"""evidence"""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
-import scipy.special
+import scipy.stats
 
-from siq.diagnosis.dictionary import Roles
-from siq.diagnosis.function_sites import (
-    Place,
-    Power,
-    linearised_with_places,
-    places_in,
-    powers,
-    products_in,
-    with_formula,
-)
 from siq.diagnosis.mechanisms import MechanismCandidate
-from siq.diagnosis.screening import PROBE_SUBSTEPS, Probe, ProbeColumns, levels_of, probe_response, projected
-from siq.diagnosis.significance import correlation_time_of
 from siq.errors import NumericalFailure
-from siq.inference.kalman_filter import Grid, Noise, Whitened, profile_likelihood, solve, whiten
+from siq.inference.kalman_filter import solve, whiten
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
-from siq.systems.dynamics import Dynamics
 
-LENGTHS = (0.125, 0.25)
+SMOOTH_LENGTHS = (0.125, 0.25)
 """Of the range of the coordinate, over which a smooth function without a name changes.
 
 What is smoother is a constant, a straight line or a parabola, for which there are names.
 """
-JITTER = 1e-9  # numerical: on the diagonal of a prior's covariance
+PRIOR_JITTER = 1e-9  # numerical: on the diagonal of a prior's covariance
 
 
-def log_odds_of_a_name(
-    fit: Fit,
-    data: Measurements,
-    candidates: Sequence[MechanismCandidate],
-    roles: Roles,
-    model: Dynamics,
-    *,
-    considered: Sequence[MechanismCandidate],
-    unnamed: float,
+def orthonormal(columns: np.ndarray) -> np.ndarray:
+    """Orthonormal basis of what columns span, shape ``(n, r)``."""
+    if not columns.shape[1]:
+        return columns
+    scale = np.sqrt((columns**2).sum(axis=0))
+    basis, values, _ = np.linalg.svd(columns / np.where(scale > 0, scale, 1.0), full_matrices=False)
+    return basis[:, values > 1e-9 * values[0]] if values[0] > 0 else basis[:, :0]
+
+
+def sizes_of_effects(total: float) -> np.ndarray:
+    """Expected squares of an effect's size on the recordings, in units of noise, evenly on a logarithm."""
+    return np.exp2(np.arange(0.0, max(np.log2(max(total, 2.0)), 1.0) + 2))
+
+
+def smooth_prior(knots: np.ndarray, length: float) -> np.ndarray:
+    """Covariance of a smooth function at knots, as a share of whose range the length is given."""
+    distance = np.subtract.outer(knots, knots) / np.ptp(knots)
+    return np.exp(-0.5 * (distance / length) ** 2) + PRIOR_JITTER * np.eye(len(knots))
+
+
+def log_evidence(
+    gram: np.ndarray, overlap: np.ndarray, prior: np.ndarray, *, total: float, freedom: float
 ) -> float:
-    """Logarithm of the odds that what is missing is the mechanism, rather than a function without a name.
+    """Log-likelihood of columns with normal coefficients, over that without them.
 
     Parameters
     ----------
-    fit, data
-        The fit with the mechanism in place, and the recordings.
-    candidates
-        The mechanism; where there are several, all of them together against one function.
-    roles, model
-        The simulation as its author believes it, and the roles of its states.
-    considered
-        The mechanisms that could have been named: each name is as likely beforehand, and so is each of its
-        forms and places.
-    unnamed
-        Probability beforehand that what is missing has no name.
+    gram, overlap
+        Of the columns with each other and with the target, in units of noise; shapes ``(k, k)`` and ``(k,)``.
+    prior
+        Covariance of the coefficients, shape ``(k, k)``.
+    total, freedom
+        Sum of squares of the target, and its degrees of freedom. The scale of the noise is at its best, so
+        that a target much larger than noise does not make small differences count.
 
     Returns
     -------
     float
-        Positive where the name is likelier.
+        -½ log det(1 + K G) - ½ν log(1 - q/total), with q = bᵀ K (1 + G K)⁻¹ b.
     """
-    ours, theirs = -np.inf, []
-    single = places_in(model, roles, data, fit.x)
-    there = {name for each in candidates for name in each.equations}
-    products = products_in([each for each in single if there & set(each.targets)], model, data, fit.x)
-    for response, some in linearised_with_places(fit, data, (*single, *products)):
-        problem = Missing(whiten(response, data, fit.noise), fit, candidates)
-        ours = problem.log_evidence_of_mechanisms()
-        theirs += [
-            problem.log_evidence_of_function(columns, place) for columns, place in problem.functions(some)
-        ]
-    if not theirs:
-        return np.inf
-    forms = Counter(each.name for each in considered)
-    chosen = sum(np.log(len(forms) * forms[each.name]) for each in candidates if forms[each.name])
-    named = ours + np.log1p(-unnamed) - chosen
-    nameless = scipy.special.logsumexp(theirs) + np.log(unnamed) - np.log(len(theirs))
-    return float(named - nameless)
+    unit = np.eye(len(gram))
+    inner = unit + gram @ prior
+    sign, determinant = np.linalg.slogdet(inner)
+    explained = float(overlap @ (prior @ np.linalg.solve(inner, overlap)))
+    left = max(total - explained, 1e-12 * total)
+    return float(-0.5 * determinant - 0.5 * freedom * np.log(left / total)) if sign > 0 else -np.inf
 
 
-class Missing:
-    """What is missing, as a linear problem: innovations without the mechanism, and what could explain them.
-
-    Parameters
-    ----------
-    white
-        Innovations of the fit with the mechanism, with columns of its parameters and of places.
-    fit
-        The fit.
-    candidates
-        The mechanisms whose effect counts as missing.
-    """
-
-    def __init__(self, white: Whitened, fit: Fit, candidates: Sequence[MechanismCandidate]) -> None:
-        names = [fit.model.parameters[place].name for place in fit.model.free]
-        own = white.columns[:, : len(names)]
-        change, _ = solve(own, white.innovations)
-        values = fit.model.values[list(fit.model.free)] + change
-        linear = [n for each in candidates for n in (each.amplitudes or each.shapes) if n in names]
-        others = [n for each in candidates for n in each.shapes if n in names and n not in linear]
-        self._tested = [names.index(name) for name in (*linear, *others)]
-        self._linear = len(linear)
-        rest = [place for place in range(len(names)) if place not in self._tested]
-        self._basis = orthonormal(own[:, rest])
-        effect = own[:, self._tested[: self._linear]] @ values[self._tested[: self._linear]]
-        left = white.innovations - own @ change
-        self.correlated = correlation_time_of(left, white.recording, outputs=len(fit.model.outputs))
-        self._target = self._projected((left + effect)[:, None])[:, 0]
-        self._total = float(self._target @ self._target)
-        self._freedom = (white.degrees_of_freedom - len(rest)) / self.correlated
-        self._values = values[self._tested]
-        self._white, self._parameters = white, len(names)
-
-    def _projected(self, columns: np.ndarray) -> np.ndarray:
-        """Columns without what the other parameters can do, weighed as so many independent errors are."""
-        return (columns - self._basis @ (self._basis.T @ columns)) / np.sqrt(self.correlated)
-
-    def functions(self, places: Sequence[Place]) -> Iterator[tuple[np.ndarray, Place]]:
-        """The columns of each place, its parameters' effect taken off, shape ``(n, k)``."""
-        begin = self._parameters
-        for place in places:
-            columns = self._white.columns[:, begin : begin + len(place.knots)]
-            begin += len(place.knots)
-            if np.isfinite(columns).all():
-                yield self._projected(columns), place
-
-    def log_evidence_of_mechanisms(self) -> float:
-        """Log-likelihood of the mechanisms, averaged over their amplitudes and shapes, to that of nothing.
-
-        An amplitude has the size that the effect has; a shape may be off by as much as it is.
-        """
-        columns = self._projected(self._white.columns[:, self._tested])
-        gram = columns.T @ columns
-        own = np.diag(gram)[: self._linear]
-        unit, wide = np.zeros(len(self._tested)), np.zeros(len(self._tested))
-        unit[: self._linear] = 1.0 / np.where(own > 0, own, np.inf) / self._linear
-        wide[self._linear :] = self._values[self._linear :] ** 2
-        priors = [np.diag(size * unit + wide) for size in sizes_of_effects(self._total)]
-        return averaged_evidence(gram, columns.T @ self._target, priors, self._total, self._freedom)
-
-    def log_evidence_of_function(self, columns: np.ndarray, place: Place) -> float:
-        """The same of a smooth function; see `evidence_of_function`."""
-        return evidence_of_function(columns, self._target, place.knots, freedom=self._freedom)
-
-
-def evidence_of_function(
-    columns: np.ndarray, target: np.ndarray, knots: np.ndarray, *, freedom: float
+def averaged_evidence(
+    gram: np.ndarray, overlap: np.ndarray, priors: Sequence[np.ndarray], total: float, freedom: float
 ) -> float:
-    """Log-likelihood of a smooth function, averaged over its values, size and smoothness, to that of nothing.
-
-    Parameters
-    ----------
-    columns
-        What its value at each knot does to the innovations, in units of noise, shape ``(n, k)``.
-    target
-        The innovations, shape ``(n,)``.
-    knots
-        Shape ``(k,)``.
-    freedom
-        Degrees of freedom of the target.
-    """
-    total = float(target @ target)
-    values = []
-    for length in LENGTHS:
-        along = columns @ np.linalg.cholesky(smooth_prior(knots, length))
-        values.append(evidences_by_size(along.T @ along, along.T @ target, total, freedom=freedom)[0])
-    return float(scipy.special.logsumexp(values) - np.log(np.size(values)))
+    """Logarithm of the mean evidence over priors; see `log_evidence`."""
+    values = [log_evidence(gram, overlap, prior, total=total, freedom=freedom) for prior in priors]
+    return float(scipy.special.logsumexp(values) - np.log(len(values)))
 
 
 def evidences_by_size(
@@ -227,60 +110,28 @@ def evidences_by_size(
     return gained, scale[:, 0], left
 
 
-def averaged_evidence(
-    gram: np.ndarray, overlap: np.ndarray, priors: Sequence[np.ndarray], total: float, freedom: float
+def evidence_of_function(
+    columns: np.ndarray, target: np.ndarray, knots: np.ndarray, *, freedom: float
 ) -> float:
-    """Logarithm of the mean evidence over priors; see `log_evidence`."""
-    values = [log_evidence(gram, overlap, prior, total=total, freedom=freedom) for prior in priors]
-    return float(scipy.special.logsumexp(values) - np.log(len(values)))
-
-
-def sizes_of_effects(total: float) -> np.ndarray:
-    """Expected squares of an effect's size on the recordings, in units of noise, evenly on a logarithm."""
-    return np.exp2(np.arange(0.0, max(np.log2(max(total, 2.0)), 1.0) + 2))
-
-
-def smooth_prior(knots: np.ndarray, length: float) -> np.ndarray:
-    """Covariance of a smooth function at knots, as a share of whose range the length is given."""
-    distance = np.subtract.outer(knots, knots) / np.ptp(knots)
-    return np.exp(-0.5 * (distance / length) ** 2) + JITTER * np.eye(len(knots))
-
-
-def log_evidence(
-    gram: np.ndarray, overlap: np.ndarray, prior: np.ndarray, *, total: float, freedom: float
-) -> float:
-    """Log-likelihood of columns with normal coefficients, over that without them.
+    """Log-likelihood of a smooth function, averaged over its values, size and smoothness, to that of nothing.
 
     Parameters
     ----------
-    gram, overlap
-        Of the columns with each other and with the target, in units of noise; shapes ``(k, k)`` and ``(k,)``.
-    prior
-        Covariance of the coefficients, shape ``(k, k)``.
-    total, freedom
-        Sum of squares of the target, and its degrees of freedom. The scale of the noise is at its best, so
-        that a target much larger than noise does not make small differences count.
-
-    Returns
-    -------
-    float
-        -½ log det(1 + K G) - ½ν log(1 - q/total), with q = bᵀ K (1 + G K)⁻¹ b.
+    columns
+        What its value at each knot does to the innovations, in units of noise, shape ``(n, k)``.
+    target
+        The innovations, shape ``(n,)``.
+    knots
+        Shape ``(k,)``.
+    freedom
+        Degrees of freedom of the target.
     """
-    unit = np.eye(len(gram))
-    inner = unit + gram @ prior
-    sign, determinant = np.linalg.slogdet(inner)
-    explained = float(overlap @ (prior @ np.linalg.solve(inner, overlap)))
-    left = max(total - explained, 1e-12 * total)
-    return float(-0.5 * determinant - 0.5 * freedom * np.log(left / total)) if sign > 0 else -np.inf
-
-
-def orthonormal(columns: np.ndarray) -> np.ndarray:
-    """Orthonormal basis of what columns span, shape ``(n, r)``."""
-    if not columns.shape[1]:
-        return columns
-    scale = np.sqrt((columns**2).sum(axis=0))
-    basis, values, _ = np.linalg.svd(columns / np.where(scale > 0, scale, 1.0), full_matrices=False)
-    return basis[:, values > 1e-9 * values[0]] if values[0] > 0 else basis[:, :0]
+    total = float(target @ target)
+    values = []
+    for length in SMOOTH_LENGTHS:
+        along = columns @ np.linalg.cholesky(smooth_prior(knots, length))
+        values.append(evidences_by_size(along.T @ along, along.T @ target, total, freedom=freedom)[0])
+    return float(scipy.special.logsumexp(values) - np.log(np.size(values)))
 
 
 def log_evidence_of(fit: Fit, data: Measurements, *, correlated: float = 1.0) -> float:
@@ -335,202 +186,260 @@ def correlation_time_left(fits: Sequence[Fit], data: Measurements) -> float:
     return correlation_time_of(left, white.recording, outputs=len(closest.model.outputs))
 
 
-FITTED = 3  # places in which functions are fitted, the most likely ones: a choice
+BLOCK_CORRELATION_TIMES = 4.0  # correlation times in a block
+AUTOCORRELATION_95 = 1.96  # standard deviations of an autocorrelation of white errors, which are 1/√n
+
+
+def probability_by_chance(
+    fit: Fit, before: Fit, data: Measurements, candidate: MechanismCandidate, *, blocks: int
+) -> float:
+    """Probability of a mechanism by chance, where errors of a recording hang together.
+
+    Among many recordings each counts as one (`clustered_probability`). Of a few, blocks are too few to know a
+    covariance from them; how long errors hang together is known all the same (`correlated_probability`).
+
+    Parameters
+    ----------
+    fit, before
+        With the mechanism and without it.
+    data, candidate
+        The recordings, and the mechanism.
+    blocks
+        Where there are fewer recordings than half of it, they are few.
+    """
+    if len(data.labels) >= blocks // 2 or fit.has_process_noise or before.has_process_noise:
+        return clustered_probability(fit, data, candidate, blocks=blocks)
+    gained = 2 * (fit.log_likelihood - before.log_likelihood)
+    return correlated_probability(fit, data, candidate, gained=gained)
+
+
+def correlated_probability(
+    fit: Fit, data: Measurements, candidate: MechanismCandidate, *, gained: float
+) -> float:
+    """Probability by chance of a gain in likelihood, for errors that are correlated over time.
+
+    Of n errors with an integral correlation time τ, n/τ are independent, and so much less does twice the
+    logarithm of a ratio of likelihoods weigh. Places at which a shape was looked for are chances, too.
+
+    Parameters
+    ----------
+    fit
+        With the mechanism; it tells τ.
+    data, candidate
+        The recordings, and the mechanism.
+    gained
+        Twice the increase of the log-likelihood.
+    """
+    white = whiten(fit.linearisation, data, fit.noise)
+    change, _ = solve(white.columns, white.innovations)
+    left = white.innovations - white.columns @ change
+    weights = np.bincount(white.recording)
+    times = [correlation_time(left[white.recording == place]) for place in range(len(weights))]
+    together = float(np.average(times, weights=weights))
+    places = [each.frequencies or len(each.at) for each in candidate.searches]
+    alone = float(scipy.stats.chi2.sf(max(gained, 0.0) / together, max(len(candidate.new), 1)))
+    return min(1.0, float(np.prod(places)) * alone)
+
+
+def clustered_probability(
+    fit: Fit, data: Measurements, candidate: MechanismCandidate, *, blocks: int
+) -> float:
+    """Probability of a mechanism by chance, whatever errors within a recording are like.
+
+    Where there are fewer recordings than half of `blocks` they are cut into at least that many, of several
+    correlation times each.
+    """
+    white = whiten(fit.linearisation, data, fit.noise)
+    names = [fit.model.parameters[place].name for place in fit.model.free]
+    tested = [names.index(name) for name in (candidate.amplitudes or candidate.shapes)]
+    values = fit.model.values[[fit.model.free[place] for place in tested]]
+    change, _ = solve(white.columns, white.innovations)
+    left = white.innovations - white.columns @ change
+    owner = white.recording
+    if len(data.labels) < blocks // 2:
+        owner = blocks_of(owner, left, least=blocks)
+    return cluster_test(white.columns, left, tested, values + change[tested], blocks=owner)
+
+
+def blocks_of(recording: np.ndarray, left: np.ndarray, *, least: int) -> np.ndarray:
+    """The block of each residual, numbered from 0, where recordings are cut into at least so many."""
+    recordings = np.unique(recording)
+    block = np.empty(len(recording), dtype=int)
+    begun = 0
+    for place in recordings:
+        rows = np.flatnonzero(recording == place)
+        parts = max(
+            -(-least // len(recordings)),
+            int(len(rows) / (BLOCK_CORRELATION_TIMES * correlation_time(left[rows]))),
+        )
+        block[rows] = begun + (np.arange(len(rows)) * parts) // len(rows)
+        begun += parts
+    return block
+
+
+def correlation_time(series: np.ndarray) -> float:
+    """Integral correlation time in samples: one and twice the autocorrelations up to the first negative."""
+    power = float(series @ series)
+    total = 1.0
+    for lag in range(1, len(series) // 4):
+        correlation = float(series[lag:] @ series[:-lag]) / power if power > 0 else 0.0
+        if correlation <= 0:
+            break
+        total += 2 * correlation
+    return total
+
+
+def correlation_time_of(left: np.ndarray, recording: np.ndarray, *, outputs: int) -> float:
+    """Integral correlation time of all residuals in samples, at least 1; of white ones it is 1.
+
+    Autocorrelations are means over recordings and outputs. The sum ends at the first that white errors would
+    have by chance, so that noise does not lengthen it. Of n residuals, n over it count as independent.
+
+    Parameters
+    ----------
+    left, recording
+        Residuals, the outputs of a sample one behind the other, and the recording of each; shape ``(n·m,)``.
+    outputs
+        Their number m.
+    """
+    series = left.reshape(-1, outputs)
+    owner = recording.reshape(-1, outputs)[:, 0]
+    power = float((series**2).mean())
+    total = 1.0
+    for lag in range(1, len(series) // 4):
+        same = owner[lag:] == owner[:-lag]
+        pairs = int(same.sum()) * outputs
+        if not pairs or power <= 0:
+            break
+        correlation = float((series[lag:] * series[:-lag])[same].sum()) / pairs / power
+        if correlation <= AUTOCORRELATION_95 / np.sqrt(pairs):
+            break
+        total += 2 * correlation
+    return total
+
+
+def cluster_test(
+    columns: np.ndarray,
+    left: np.ndarray,
+    parameters: Sequence[int],
+    values: np.ndarray,
+    *,
+    blocks: np.ndarray,
+) -> float:
+    """Probability that columns explain as much by chance, whatever the errors within a block are like.
+
+    A Wald test with the covariance of the scores of whole blocks in the place of that of white errors. The
+    residuals are those with the columns included, so that a real effect does not inflate its own error.
+
+    Parameters
+    ----------
+    columns, left
+        Of all parameters, those to be tested included, shape ``(n, p)``, and the residuals with them,
+        shape ``(n,)``.
+    parameters
+        Places of the columns to be tested.
+    values
+        The best values of these parameters, which would be zero by chance.
+    blocks
+        The block of each innovation, numbered from 0, shape ``(n,)``.
+    """
+    tested = np.array(parameters, dtype=int)
+    others = np.setdiff1d(np.arange(columns.shape[1]), tested)
+    nuisance, _ = np.linalg.qr(columns[:, others]) if len(others) else (np.zeros((len(left), 0)), None)
+    columns = columns[:, tested] - nuisance @ (nuisance.T @ columns[:, tested])
+    scale = np.sqrt((columns**2).sum(axis=0))
+    scale = np.where(scale > 0, scale, 1.0)
+    columns = columns / scale
+    scores = np.stack([np.bincount(blocks, column * left) for column in columns.T], axis=1)
+    count, width = len(scores), len(tested)
+    if count <= width + 1:
+        return 1.0
+    gram = columns.T @ columns
+    spread = scores.T @ scores * count / (count - 1)
+    estimate = values * scale
+    # Wald: a' (G⁻¹ S G⁻¹)⁻¹ a = (G a)' S⁻¹ (G a).
+    weighted = gram @ estimate
+    statistic = float(weighted @ np.linalg.lstsq(spread, weighted, rcond=1e-10)[0])
+    factor = (count - width) / (width * (count - 1))
+    return float(scipy.stats.f.sf(statistic * factor, width, count - width))
+
+
+NUMERICAL_ERRORS = (ArithmeticError, ValueError, np.linalg.LinAlgError)
+"""What ends a candidate, never the search: an overflow, a division by zero, a singular matrix."""
+BUDGET_SPENT = "the budget was spent before it was tried"
 
 
 @dataclass(frozen=True)
-class LikelyPlace:
-    """A place, the logarithm of its evidence, and the level of random forces at which it is best.
+class TriedMechanism:
+    """A candidate, fitted.
 
-    The evidence is that of a smooth function there over that of none, each at its best level.
-    """
-
-    place: Place
-    log_evidence: float
-    level: float
-
-
-def likely_places(fit: Fit, data: Measurements, roles: Roles) -> list[LikelyPlace]:
-    """All places, the one in which a smooth function is likeliest first.
-
-    Functions of one coordinate are tried everywhere, and as coefficients of other coordinates in the
-    equations in which they do best.
-    """
-    single = places_in(fit.model, roles, data, fit.x)
-    ranked = _compared(fit, data, single)
-    if not ranked:
-        return []
-    equations = {each.place.targets for each in ranked[:FITTED] if each.place.equations}
-    products = products_in([each for each in single if each.targets in equations], fit.model, data, fit.x)
-    return sorted((*ranked, *_compared(fit, data, products)), key=lambda each: -each.log_evidence)
-
-
-def _compared(fit: Fit, data: Measurements, places: Sequence[Place]) -> list[LikelyPlace]:
-    parameters = len(fit.model.free)
-    found: dict[int, LikelyPlace] = {}
-    alone = -np.inf
-    for response, some in linearised_with_places(fit, data, places):
-        for level in levels_of(fit):
-            try:
-                white = whiten(response, data, fit.noise.scaled(level))
-                left, columns = projected(white, parameters)
-            except NumericalFailure:  # without random forces an unstable simulation does not follow
-                continue
-            freedom = white.degrees_of_freedom - parameters
-            base = profile_likelihood(float(left @ left), freedom, white.log_determinant)
-            alone = max(alone, base)
-            begin = 0
-            for place in some:
-                own = columns[:, begin : begin + len(place.knots)]
-                begin += len(place.knots)
-                value = base + evidence_of_function(own, left, place.knots, freedom=freedom)
-                known = found.get(id(place))
-                if own.any() and (known is None or value > known.log_evidence):
-                    found[id(place)] = LikelyPlace(place, value, level)
-    ranked = sorted(found.values(), key=lambda each: -each.log_evidence)
-    return [replace(each, log_evidence=each.log_evidence - alone) for each in ranked]
-
-
-def few_powers(likely: LikelyPlace, fit: Fit, data: Measurements, *, degree: int) -> tuple[Power, ...]:
-    """The powers that a formula needs: each added as long as it earns its place (Schwarz).
-
-    Errors count as correlated as all of the powers leave them (`siq.diagnosis.evidence`).
-    """
-    terms = powers(likely.place, degree=degree)
-    probe = Probe(with_formula(fit.model, likely.place, terms), ())
-    grid = Grid(data, min(fit.substeps, PROBE_SUBSTEPS))
-    columns = ProbeColumns(fit.model, grid, [probe], fit.x, fit.model.values)
-    white = whiten(probe_response(fit.model, grid, fit, columns), data, fit.noise.scaled(likely.level))
-    left, own = projected(white, len(fit.model.free))
-    count = independent(left, own, white, fit)
-    chosen: list[int] = []
-    total = float(left @ left)
-    while len(chosen) < len(terms):
-        sums = {}
-        for place in range(len(terms)):
-            if place not in chosen and own[:, place].any():
-                some = own[:, [*chosen, place]]
-                some = some / np.sqrt((some**2).sum(axis=0))
-                sums[place] = float(((left - some @ np.linalg.lstsq(some, left, rcond=1e-9)[0]) ** 2).sum())
-        if not sums:
-            break
-        best = min(sums, key=lambda place: sums[place])
-        if count * np.log(total / max(sums[best], 1e-300)) < np.log(count):
-            break
-        chosen.append(best)
-        total = sums[best]
-    return tuple(terms[place] for place in sorted(chosen))
-
-
-def independent(left: np.ndarray, columns: np.ndarray, white: Whitened, fit: Fit) -> float:
-    """How many errors count as independent, if columns are fitted to what is left."""
-    basis = orthonormal(columns)
-    rest = left - basis @ (basis.T @ left)
-    correlated = correlation_time_of(rest, white.recording, outputs=len(fit.model.outputs))
-    return max(float(white.known.sum()) / correlated, 2.0)
-
-
-DRAWS = 300  # effects without a name, which tell a probability of 5 % to 1 %
-
-
-def probability_of_a_match(
-    recalibrated: Fit,
-    data: Measurements,
-    probes: Sequence[Probe],
-    roles: Roles,
-    *,
-    share: float,
-    mechanisms: int,
-    measurement: np.ndarray,
-    generator: np.random.Generator,
-) -> float:
-    """Probability that so many mechanisms explain as large a share of an effect that has no name.
-
-    Parameters
+    Attributes
     ----------
-    recalibrated, data
-        The simulation with nothing added, and the recordings.
-    probes
-        What could have been named.
-    roles
-        Of the simulation's states.
-    share
-        Of the excess that the mechanisms explain.
-    mechanisms
-        How many they are.
-    measurement
-        Variance of the sensors' noise, shape ``(m,)``.
-    generator
-        Draws the effects.
-
-    Raises
-    ------
-    NumericalFailure
-        When the simulation, as linearised, runs away.
+    candidate
+        The mechanism.
+    fit
+        Of the simulation with it.
+    delta_chi2
+        Twice the increase of the log-likelihood over the simulation without it.
+    delta_bic
+        Change of the Bayesian information criterion; negative where the mechanism is worth its parameters.
+    p_white, p_cluster
+        Probabilities of as much by chance.
     """
-    noise = Noise(measurement, np.zeros(recalibrated.model.dimension))
-    effects = drawn_effects(recalibrated, data, roles, noise, generator=generator)
-    model = recalibrated.model
-    grid = Grid(data, min(recalibrated.substeps, PROBE_SUBSTEPS))
-    columns = ProbeColumns(model, grid, probes, recalibrated.x, model.values)
-    white = whiten(probe_response(model, grid, recalibrated, columns), data, noise)
-    own = orthonormal(white.columns[:, : len(model.free)])
-    effects = effects - own @ (own.T @ effects)
-    effects = effects[:, (effects**2).sum(axis=0) > 0]
-    if not effects.shape[1]:
-        raise NumericalFailure("no effect can be seen in the recordings")
-    groups, begin = [], len(model.free)
-    for probe in probes:
-        group = white.columns[:, begin : begin + probe.width]
-        begin += probe.width
-        if np.isfinite(group).all():
-            groups.append(orthonormal(group - own @ (own.T @ group)))
-    best = best_shares(effects, groups, mechanisms)
-    return float((np.sum(best >= share) + 1) / (len(best) + 1))
+
+    candidate: MechanismCandidate
+    fit: Fit
+    delta_chi2: float
+    delta_bic: float
+    p_white: float
+    p_cluster: float
 
 
-def drawn_effects(
-    fit: Fit, data: Measurements, roles: Roles, noise: Noise, *, generator: np.random.Generator
-) -> np.ndarray:
-    """What smooth functions in places drawn at random do to the innovations, shape ``(n, DRAWS)``."""
-    places = places_in(fit.model, roles, data, fit.x)
-    if not places:
-        return np.zeros((data.outputs.size, 0))
-    counts = generator.multinomial(DRAWS, np.full(len(places), 1 / len(places)))
-    drawn, place = [], 0
-    for response, some in linearised_with_places(fit, data, places):
-        white = whiten(response, data, noise)
-        begin = len(fit.model.free)
-        for each in some:
-            columns = white.columns[:, begin : begin + len(each.knots)]
-            begin += len(each.knots)
-            if np.isfinite(columns).all():
-                for _ in range(counts[place]):
-                    root = np.linalg.cholesky(smooth_prior(each.knots, generator.choice(LENGTHS)))
-                    drawn.append(columns @ (root @ generator.normal(size=len(each.knots))))
-            place += 1
-    return np.stack(drawn, axis=1) if drawn else np.zeros((data.outputs.size, 0))
+@dataclass(frozen=True)
+class UntriedMechanism:
+    """A candidate that promised something, and whose fit gave nothing that could be judged.
 
-
-def best_shares(effects: np.ndarray, groups: Sequence[np.ndarray], most: int) -> np.ndarray:
-    """Share of each effect that the best so many groups explain, each chosen beside those before it.
-
-    Parameters
+    Attributes
     ----------
-    effects
-        Shape ``(n, e)``.
-    groups
-        Orthonormal columns of each group, shape ``(n, k)``.
-    most
-        How many groups.
+    candidate
+        The mechanism.
+    reason
+        Why, in words.
     """
-    size = (effects**2).sum(axis=0)
-    left = effects.copy()
-    chosen: list[list[np.ndarray]] = [[] for _ in size]
-    for _ in range(most):
-        explained = np.stack([((group.T @ left) ** 2).sum(axis=0) for group in groups])
-        for place, best in enumerate(explained.argmax(axis=0)):
-            chosen[place].append(groups[best])
-            basis = orthonormal(np.concatenate(chosen[place], axis=1))
-            left[:, place] = effects[:, place] - basis @ (basis.T @ effects[:, place])
-    return 1 - (left**2).sum(axis=0) / size
+
+    candidate: MechanismCandidate
+    reason: str
+
+
+def in_words(error: Exception) -> str:
+    """Why a candidate gave nothing, as a reader is told."""
+    return str(error) if isinstance(error, NumericalFailure) else f"{type(error).__name__}: {error}"
+
+
+def judged(
+    trial: Fit, before: Fit, data: Measurements, candidate: MechanismCandidate, *, blocks: int
+) -> TriedMechanism:
+    """A candidate's fit with its evidence over the fit without it."""
+    extra = len(trial.model.free) - len(before.model.free)
+    gained = 2 * (trial.log_likelihood - before.log_likelihood)
+    count = trial.degrees_of_freedom + len(trial.model.free)
+    return TriedMechanism(
+        candidate=candidate,
+        fit=trial,
+        delta_chi2=gained,
+        delta_bic=-gained + extra * np.log(count),
+        p_white=float(scipy.stats.chi2.sf(max(gained, 0.0), extra)),
+        p_cluster=probability_by_chance(trial, before, data, candidate, blocks=blocks),
+    )
+
+
+def admissible(trial: Fit, candidate: MechanismCandidate) -> bool:
+    """Whether parameters that a mechanism allows one sign only have it, or are zero within their errors."""
+    names = [trial.model.parameters[place].name for place in trial.model.free]
+    for name in candidate.positive:
+        if name in names:
+            place = names.index(name)
+            value = trial.model.values[trial.model.free[place]]
+            if value < -2 * trial.standard_errors[place]:
+                return False
+    return True

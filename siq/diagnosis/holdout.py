@@ -1,18 +1,10 @@
-"""Errors of free runs on held-out recordings, and cross-validation.
-
-Two simulations of the same recordings are off by the same noise. Whether one is better is therefore asked of
-pairs: of the ratio of their errors, whose own error is known from leaving out one block of samples at a time
-(the jackknife). Errors of a simulation last; blocks are long, and few.
-
-Every part of the recordings to learn from is left out in turn: whole recordings, or stretches of a single
-one. All parameters are fitted to the others, so that what is left out had no part in them.
-"""
+"""holdout"""
 
 from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -20,12 +12,15 @@ import numpy as np
 import scipy.stats
 
 from siq.diagnosis.mechanisms import MechanismCandidate
+from siq.diagnosis.unnamed_models import Model
 from siq.errors import NumericalFailure
 from siq.inference.kalman_filter import Noise
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
 from siq.inference.recalibration import fit_with_process_noise_as_needed
 from siq.inference.trajectories import FreeRun, UsualStates, free_run, squared_errors
+
+LOGGER = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -64,9 +59,9 @@ def mean_error(squares: np.ndarray | None) -> float:
 
 Change = Literal["better", "same", "worse", "unknown"]
 Run = Literal["before", "recalibrated", "augmented", "named", "without"]
-WIDE = 1.96  # standard errors within which 95 % lie
+CONFIDENCE_95 = 1.96  # standard errors within which 95 % lie
 BLOCKS = 12  # as many as tell an error of a ratio; fewer leave more samples that belong together in one
-BY_CHANCE = 0.05  # probability of a gain, or a loss, where there is none
+CHANGE_BY_CHANCE = 0.05  # probability of a gain, or a loss, where there is none
 
 
 @dataclass(frozen=True)
@@ -160,7 +155,7 @@ class HeldOutErrors:
         error = self.error(run)
         if error is None or self.noise_floor is None:
             return False
-        tolerance = WIDE / float(np.sqrt(2 * self.values)) if self.values else 0.0
+        tolerance = CONFIDENCE_95 / float(np.sqrt(2 * self.values)) if self.values else 0.0
         return error * (1 - tolerance) <= self.noise_floor
 
 
@@ -185,7 +180,7 @@ def change_between(first: tuple[float, ...] | None, second: tuple[float, ...] | 
     middle, left_out = np.log(other.sum() / one.sum()), np.log(other_rest / rest)
     count = len(one)
     deviation = np.sqrt((count - 1) / count * ((left_out - left_out.mean()) ** 2).sum())
-    limit = scipy.stats.t.isf(BY_CHANCE, count - 1) * deviation
+    limit = scipy.stats.t.isf(CHANGE_BY_CHANCE, count - 1) * deviation
     return "same" if abs(middle) <= limit else "better" if middle < 0 else "worse"
 
 
@@ -194,9 +189,8 @@ def in_blocks(squares: np.ndarray) -> tuple[float, ...]:
     return tuple(float(each.mean()) for each in np.array_split(squares, max(min(BLOCKS, len(squares)), 1)))
 
 
-LOGGER = logging.getLogger(__name__)
-PARTS = 4  # of which one is left out at a time: a quarter, as is held out by default
-FEWEST = 16  # samples of a stretch that an initial state and an error can be told from
+FOLDS = 4  # of which one is left out at a time: a quarter, as is held out by default
+MIN_STRETCH_SAMPLES = 16  # samples of a stretch that an initial state and an error can be told from
 
 
 @dataclass(frozen=True)
@@ -218,9 +212,9 @@ def parts_left_out(learned: Measurements) -> Iterator[LeftOut]:
     if count > 1:
         pieces = list(zip(learned.first[:-1], learned.first[1:], strict=True))
         owner = np.arange(count)
-        groups = [np.arange(part, count, min(PARTS, count)) for part in range(min(PARTS, count))]
+        groups = [np.arange(part, count, min(FOLDS, count)) for part in range(min(FOLDS, count))]
     else:
-        parts = max(min(PARTS, len(learned.t) // FEWEST), 2)
+        parts = max(min(FOLDS, len(learned.t) // MIN_STRETCH_SAMPLES), 2)
         edges = np.linspace(0, len(learned.t), parts + 1).round().astype(int)
         pieces, owner = list(itertools.pairwise(edges)), np.zeros(parts, dtype=int)
         groups = [np.array([part]) for part in range(parts)]
@@ -321,3 +315,129 @@ def _stretches(
         outputs=data.outputs[rows],
         courses=tuple(data.courses[place] for place in owner) if data.courses else data.courses,
     ), rows
+
+
+def adopted_by_held_out(
+    choices: Sequence[tuple[Model, Fit]],
+    without: Sequence[Fit],
+    data: Measurements,
+    *,
+    runs: RunsAlike,
+    certain: float,
+) -> int | None:
+    """The place of the model that is adopted, judged by recordings held out; None where none helps.
+
+    What is not certain where it was found has to be better by more than appears by chance, what is certain
+    better than the simulation fitted alike; one of fewer coordinates that foresees no worse takes its place.
+
+    Parameters
+    ----------
+    choices
+        Models, the likeliest first, each with the estimates that are run.
+    without
+        The simulation without any of them: as it may be, and last as it was fitted to the same recordings.
+    data
+        The recordings held out that may choose.
+    runs
+        How all are run.
+    certain
+        Logarithm of the odds from which on a model is certain where it was found.
+    """
+    alone = [runs.errors(each, data) for each in without]
+    known = [each for each in alone if each is not None]
+    least = min(known, key=np.mean, default=None)
+    errors = [runs.errors(fit, data) for _, fit in choices]
+    # A card whose values are right foresees well, and tells nothing of a function whose fit had to find
+    # them, too. Beside random forces a free run is off by these, and a little may be chance.
+    fitted_alone, lowest = mean_error(alone[-1]), mean_error(least)
+    limits = [
+        0.0 if model.log_evidence < certain else lowest if model.fit.has_process_noise else fitted_alone
+        for model, _ in choices
+    ]
+    likeliest = first_better(least, errors, limits)
+    if likeliest is None:
+        return None
+    sizes = [mean_error(each) for each in errors]
+    return simplest_of(sizes, [model.coordinates for model, _ in choices], likeliest)
+
+
+def adopted_by_left_out(
+    choices: Sequence[tuple[Model, Fit]],
+    without: Fit,
+    learned: Measurements,
+    *,
+    noise: Noise,
+    named: Sequence[MechanismCandidate] = (),
+) -> int | None:
+    """The place of the model that foresees parts left out best, and better than without; None for none.
+
+    Parameters
+    ----------
+    choices
+        See `adopted_by_held_out`.
+    without
+        The simulation without any of them, fitted.
+    learned
+        The recordings that all of them were fitted to.
+    noise
+        See `siq.inference.trajectories.free_run`.
+    named
+        The mechanisms in all of them.
+    """
+    alone = errors_left_out(without, learned, noise=noise, candidates=named)
+    errors = [
+        errors_left_out(
+            fit,
+            learned,
+            noise=noise,
+            candidates=[*named, *(part.trial.candidate for part in model.parts)],
+        )
+        for model, fit in choices
+    ]
+    sizes = [mean_error(each) for each in errors]
+    LOGGER.info("parts left out: mean squared errors %s with models of what has no name", sizes)
+    best = int(np.argmin(sizes))
+    return best if first_better(alone, [errors[best]], [0.0]) == 0 else None
+
+
+def simplest_of(errors: Sequence[float], coordinates: Sequence[int], likeliest: int) -> int:
+    """The place of the model of fewest coordinates that foresees no worse than the likeliest one.
+
+    Errors of a sensor's clock, for one, grow with the motion, and look like functions of more than there is.
+
+    Parameters
+    ----------
+    errors
+        Of each model, on recordings held out.
+    coordinates
+        How many each depends on.
+    likeliest
+        The place of the one to begin with.
+    """
+    known = [place for place, error in enumerate(errors) if error <= errors[likeliest]]
+    return min(known, key=lambda place: (coordinates[place], place != likeliest, place))
+
+
+def first_better(
+    without: np.ndarray | None, models: Iterable[np.ndarray | None], limits: Iterable[float]
+) -> int | None:
+    """The place of the first of several models that foresees better than without it; None where none does.
+
+    Parameters
+    ----------
+    without
+        Squared errors without any of the models, shape ``(values,)``; None where it ran away.
+    models
+        Those of each model, the likeliest first.
+    limits
+        Mean squared errors below which a model need only be no worse than without it, by more than appears
+        by chance; zero for one that has to be better by more than that.
+    """
+    before = None if without is None else in_blocks(without)
+    for place, (squares, limit) in enumerate(zip(models, limits, strict=True)):
+        if squares is None:
+            continue
+        change = change_between(before, in_blocks(squares))
+        if change == "better" or (change == "same" and squares.mean() < limit):
+            return place
+    return None

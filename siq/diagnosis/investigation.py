@@ -1,21 +1,22 @@
-"""The investigation of a case, from its recalibration to what it lacks."""
+"""investigation"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy.stats
 
 from siq.diagnosis.dictionary import Mechanism, Roles, dictionary_of, roles_of
-from siq.diagnosis.hidden_state_terms import models_of_the_nameless
+from siq.diagnosis.evidence import UntriedMechanism
+from siq.diagnosis.holdout import HeldOutErrors, RunsAlike, adopted_by_held_out, adopted_by_left_out
 from siq.diagnosis.mechanisms import MechanismCandidate, candidates_of, generic_candidates
-from siq.diagnosis.naming import Naming, names_of
-from siq.diagnosis.options import MismatchVerdict, SearchOptions, quiet_verdict, shift_probability
+from siq.diagnosis.naming import NamingDecision, decide_naming
 from siq.diagnosis.residual_structure import (
-    LEFT,
+    RANDOM_RESIDUALS,
     STRUCTURED,
     Remainder,
     Structure,
@@ -24,14 +25,23 @@ from siq.diagnosis.residual_structure import (
     what_is_left,
 )
 from siq.diagnosis.search import Search, search
-from siq.diagnosis.significance import UntriedMechanism
-from siq.diagnosis.study import MismatchStudy, load_mismatch_study, measurements_of, split, with_known_noise
-from siq.diagnosis.unnamed_models import Material, Model
+from siq.diagnosis.study import (
+    MismatchStudy,
+    MismatchVerdict,
+    SearchOptions,
+    load_mismatch_study,
+    measurements_of,
+    split,
+    with_known_noise,
+)
+from siq.diagnosis.unnamed_models import Material, Model, models_of_the_nameless
 from siq.errors import NumericalFailure
 from siq.inference.budget import UNLIMITED, Account, Budget
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements, with_expectations
 from siq.inference.recalibration import covariance_with_unknown_forces, recalibrate
+from siq.inference.trajectories import FreeRun, squared_errors
+from siq.remarks import Remark
 from siq.systems.cards import load_system
 from siq.systems.dynamics import Dynamics
 
@@ -39,6 +49,155 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from siq.data.recordings import Recordings
+
+
+def quiet_verdict(p_shift: float, options: SearchOptions) -> MismatchVerdict:
+    """The verdict where nothing is missing, by the probability that the card's parameters are right."""
+    shifted = p_shift < options.false_alarms
+    return MismatchVerdict.PARAMETER_SHIFT if shifted else MismatchVerdict.NO_MISMATCH
+
+
+def shift_probability(model: Dynamics, recalibrated: Fit) -> float:
+    """p-value of the test that the card's parameters are the true ones, given the recalibrated ones."""
+    free = np.array(model.free, dtype=int)
+    if not len(free):
+        return 1.0
+    difference = recalibrated.model.values[free] - model.values[free]
+    scale = np.sqrt(np.diag(recalibrated.covariance))
+    scale = np.where(scale > 0, scale, np.inf)
+    correlation = recalibrated.covariance / np.outer(scale, scale)
+    values, vectors = np.linalg.eigh(correlation)
+    kept = values > 1e-9 * values[-1]
+    along = vectors[:, kept].T @ (difference / scale) / np.sqrt(values[kept])
+    return float(scipy.stats.chi2.sf(float(along @ along), int(kept.sum())))
+
+
+@dataclass(frozen=True)
+class HeldOutRuns:
+    """Free runs of held-out recordings by the three simulations, and how far each is off.
+
+    Attributes
+    ----------
+    before, recalibrated, augmented
+        The simulation as it is, with its parameters refitted, and with what was found.
+    model
+        The augmented simulation that was run.
+    errors
+        Of the three.
+    independent
+        Whether the recordings are others than those that were learned from, rather than a later part.
+    described
+        The model of what has no name that was run; None where nothing was described.
+    described_fit
+        Its estimates that were run.
+    adopted
+        Whether that model is part of the new card, since it makes predictions better.
+    """
+
+    before: FreeRun
+    recalibrated: FreeRun
+    augmented: FreeRun
+    model: Dynamics
+    errors: HeldOutErrors
+    independent: bool = True
+    described: Model | None = None
+    described_fit: Fit | None = None
+    adopted: bool = False
+
+
+def held_out_runs(
+    investigation: Investigation,
+    learned: Measurements,
+    data: Measurements,
+    *,
+    certain: float,
+    tests: Collection[str] = (),
+) -> HeldOutRuns:
+    """Show the fit on recordings that had no part in anything.
+
+    Of several models of what has no name one may be adopted (`siq.diagnosis.holdout`): it makes the
+    prediction better than that of the mechanisms with a name, where there are any, or else of the simulation.
+    Where all recordings are tests of somebody else, parts of those to learn from are left out in turn, and
+    decide.
+
+    Parameters
+    ----------
+    investigation
+        What was found.
+    learned
+        The recordings that it was found in; they decide which estimates run freely best.
+    data
+        The recordings held out.
+    certain
+        Logarithm of the odds from which on a model is certain where it was found.
+    tests
+        Labels of those that may choose nothing.
+    """
+    search = investigation.search
+    noise, substeps = search.recalibrated.noise, max(search.fit.substeps, search.recalibrated.substeps)
+    runs = RunsAlike(noise, substeps)
+
+    def best_of(*fits: Fit | None) -> Fit:
+        return runs.nearest([each for each in fits if each is not None], learned)
+
+    card = replace(search.recalibrated, model=investigation.model)
+    # What fits best with random forces admitted need not be what runs best without.
+    recalibrated = search.recalibrated
+    if recalibrated.has_process_noise and np.isfinite(investigation.least_squares.sum_of_squares):
+        recalibrated = best_of(investigation.least_squares, recalibrated, card)
+    plain = best_of(investigation.augmented_least_squares, search.fit)
+    choices = [(model, best_of(model.fit, model.exact)) for model in investigation.models]
+    named = investigation.verdict is MismatchVerdict.MISSING_PHYSICS
+    judges = [place for place, label in enumerate(data.labels) if label not in tests]
+    adopted = None
+    if choices and judges:
+        without = (plain,) if named else (card, recalibrated)
+        adopted = adopted_by_held_out(choices, without, data.select(judges), runs=runs, certain=certain)
+    elif choices:
+        names = [each.best.candidate for each in search.found] if named else []
+        alone = plain if named else search.recalibrated
+        adopted = adopted_by_left_out(choices, alone, learned, noise=noise, named=names)
+    described, fit = (None, plain) if named or not choices else choices[0]
+    if adopted is not None:
+        described, fit = choices[adopted]
+    before, refitted, run = (runs.run(each, data) for each in (card, recalibrated, fit))
+    squares = {
+        "before": squared_errors(data.outputs, before),
+        "recalibrated": squared_errors(data.outputs, refitted),
+        "augmented": squared_errors(data.outputs, run),
+        "named": runs.errors(plain, data) if named and adopted is not None else None,
+    }
+    floor = noise_floor_of((search.fit, fit), data, before.scored)
+    return HeldOutRuns(
+        before=before,
+        recalibrated=refitted,
+        augmented=run,
+        model=fit.model,
+        errors=HeldOutErrors.of(squares, noise_floor=floor),
+        independent=not set(learned.labels) & set(data.labels),
+        described=described,
+        described_fit=fit if described is not None else None,
+        adopted=adopted is not None,
+    )
+
+
+def noise_floor_of(fits: Sequence[Fit], data: Measurements, scored: np.ndarray) -> float:
+    """The error that noise alone would leave, as a share of the recordings' spread.
+
+    What a fit leaves may be more than noise; the one that leaves least is nearest to it.
+
+    Parameters
+    ----------
+    fits
+        Of several simulations, each with its estimate of the measurement noise.
+    data
+        The recordings held out.
+    scored
+        Rows that count, shape ``(n,)``.
+    """
+    spread = np.nanvar(data.outputs[scored], axis=0)
+    least = np.minimum.reduce([each.noise.measurement for each in fits])
+    return float(np.sqrt(np.mean(least / np.where(spread > 0, spread, 1.0))))
 
 
 @dataclass(frozen=True)
@@ -110,10 +269,6 @@ def read_case(card: str | Path, recordings: str | Path, study: str | Path | None
     return comparison_of(system, recordings, load_mismatch_study(study), file=str(study))
 
 
-ROUNDED = "What is left looks like noise once the steps are allowed for in which {} was recorded."
-GROWING = "Random forces would explain it only if they grew with the motion; a hidden state is more likely."
-
-
 @dataclass(frozen=True)
 class Investigation:
     """What was found out about a simulation and recordings of the system, with all fits that it rests on.
@@ -143,7 +298,7 @@ class Investigation:
     share
         Of the excess that the mechanisms explain.
     remarks
-        Sentences about reservations.
+        Reservations.
     candidates
         All mechanisms that were considered.
     naming
@@ -167,9 +322,9 @@ class Investigation:
     process_noise: bool
     p_shift: float
     share: float
-    remarks: tuple[str, ...]
+    remarks: tuple[Remark, ...]
     candidates: tuple[MechanismCandidate, ...]
-    naming: Naming | None = None
+    naming: NamingDecision | None = None
     models: tuple[Model, ...] = ()
     account: Account = UNLIMITED
     withdrawn: bool = False
@@ -241,31 +396,31 @@ def investigate(
     found, by_each = remainders(model, data, found, roles)
     left = by_each[-1]
     exact: Fit | None = None
-    naming: Naming | None = None
+    naming: NamingDecision | None = None
     models: tuple[Model, ...] = ()
-    verdict, remarks = MismatchVerdict.NO_MISMATCH, tuple[str, ...]()
+    verdict, remarks = MismatchVerdict.NO_MISMATCH, tuple[Remark, ...]()
     material = Material(data, roles, study.degree, options.blocks, len(candidates), budget)
     tried = bool(found.found)
     if tried:
-        names = names_of(
+        naming = decide_naming(
             found, by_each, model, material, candidates,
             options=options, generator=np.random.default_rng(seed),
         )  # fmt: skip
-        naming, models, exact, remarks = names.naming, names.models, names.exact, names.remarks
-        found, left = naming.search, naming.left
-        verdict = MismatchVerdict.MISSING_PHYSICS if names.given else MismatchVerdict.UNEXPLAINED
+        models, exact, remarks = naming.models, naming.exact, naming.remarks
+        found, left = naming.search, naming.remainder
+        verdict = MismatchVerdict.MISSING_PHYSICS if naming.named else MismatchVerdict.UNEXPLAINED
     rounded = None
     doubtful = not tried and (found.fit.has_process_noise or left.structured)
     if doubtful or verdict is MismatchVerdict.UNEXPLAINED:
         budget.says("asking whether the sensors' steps explain it")
         with budget.exempt():
             # What a mechanism has found already has to be gone more clearly.
-            least = LEFT if tried else STRUCTURED
+            least = RANDOM_RESIDUALS if tried else STRUCTURED
             rounded = explained_by_rounding(model, data, least_squares, roles, least=least, budget=budget)
     if rounded is not None:
         found = replace(found, recalibrated=rounded.fit, found=(), fit=rounded.fit)
         left, least_squares, naming, models, exact = rounded.left, rounded.fit, None, (), None
-        remarks = (ROUNDED.format(", ".join(rounded.outputs)),)
+        remarks = (Remark("diagnosis.quantised", {"outputs": ", ".join(rounded.outputs)}),)
     p_shift = shift_probability(model, found.recalibrated)
     if rounded is not None or not (tried or doubtful):
         verdict = quiet_verdict(p_shift, options)
@@ -305,7 +460,7 @@ def driven(
     material: Material,
     dictionary: Sequence[Mechanism],
     options: SearchOptions,
-) -> tuple[MismatchVerdict, tuple[Model, ...], tuple[str, ...]]:
+) -> tuple[MismatchVerdict, tuple[Model, ...], tuple[Remark, ...]]:
     """The verdict where random forces are needed and no mechanism was found, with models and remarks.
 
     Random forces explain any recordings. They are named where nothing else is likelier, neither a function
@@ -322,7 +477,7 @@ def driven(
         Random forces are named only where an entry of it knows them.
     """
     steady = unsteadiness(found.fit, material.data) < 2 * options.least_log_odds
-    remarks = () if steady else (GROWING,)
+    remarks = () if steady else (Remark("diagnosis.noise_follows_motion"),)
     knows_noise = any(form.noise for mechanism in dictionary for form in mechanism.forms)
     if not (knows_noise and steady) or left.doubtful:
         return MismatchVerdict.UNEXPLAINED, (), remarks

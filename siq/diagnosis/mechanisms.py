@@ -1,23 +1,4 @@
-"""Mechanisms built into a simulation, and which of them are no more than a recalibration.
-
-What a mechanism does not depend on linearly is looked for about sizes, times and frequencies of the recorded
-motion; what the values themselves show of a sensor, its steps and the ends of its range, is read off them.
-
-A mechanism is written for roles (`siq.diagnosis.dictionary`). Beside the roles its formulas may use what the
-simulation itself says of them: `v_rate`, the equation of the state v; `p_with_q`, the part of the equation of
-p in which q stands as well; `y_rate` and `y_curvature`, the first and second time derivative of the output y,
-inputs being held.
-
-Where a simulation has a free damping rate, linear damping is another value of it: no recording can tell the
-two apart, and a mechanism of that kind would only stand in the way of the parameter. This follows from the
-formulas alone. To first order a mechanism adds the derivatives of f and h by its amplitudes; it is something
-new where these are linearly independent, as functions of states, inputs and time, of the derivatives by the
-free parameters.
-
-A mechanism is written for roles (`siq.diagnosis.dictionary`); here it becomes models, one for each way of
-filling the roles (`siq.diagnosis.mechanisms`). Generic monomials become candidates of the same kind, for
-systems whose states have no roles.
-"""
+"""mechanisms"""
 
 from __future__ import annotations
 
@@ -47,7 +28,9 @@ from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import TIME, Dynamics, Parameter, Signals, arguments_of, evaluable, symbol
 from siq.systems.formulas import FormulaError, compile_values, parse_formula
 
-ON_LATTICE = 1e-3  # of a step: numbers that were written with a few digits lie on their lattice within this
+LATTICE_TOLERANCE = (
+    1e-3  # of a step: numbers that were written with a few digits lie on their lattice within this
+)
 
 
 def places_of(search: Shape, data: Measurements, model: Dynamics, x: np.ndarray) -> np.ndarray:
@@ -103,7 +86,7 @@ def lattice_step(values: np.ndarray) -> float | None:
     if not numbers.any():
         return None
     step = float(levels @ numbers / (numbers @ numbers))
-    return step if np.abs(levels - numbers * step).max() < ON_LATTICE * step else None
+    return step if np.abs(levels - numbers * step).max() < LATTICE_TOLERANCE * step else None
 
 
 def plateau(values: np.ndarray, recording: np.ndarray, *, noise: float) -> float | None:
@@ -374,7 +357,9 @@ def label_of(name: str, variant: str, model: Dynamics, augmented: Dynamics) -> s
     return f"{whole} in {', '.join(measured)}, by {new}"
 
 
-INDEPENDENT = 1e-6  # of a column's length, left beside others: between rounding and what any shape leaves
+INDEPENDENCE_TOLERANCE = (
+    1e-6  # of a column's length, left beside others: between rounding and what any shape leaves
+)
 
 
 def beyond_parameters(
@@ -421,12 +406,12 @@ def _new_columns(own: np.ndarray, columns: np.ndarray) -> list[bool]:
         return [True] * columns.shape[1]
     own, columns = _of_unit_length(own[whole]), _of_unit_length(columns[whole])
     left, sizes, _ = np.linalg.svd(own, full_matrices=False)
-    basis = left[:, sizes > INDEPENDENT * sizes.max(initial=0.0)]
+    basis = left[:, sizes > INDEPENDENCE_TOLERANCE * sizes.max(initial=0.0)]
     new = []
     for column in columns.T:
         rest = column - basis @ (basis.T @ column)
         size = float(np.linalg.norm(rest))
-        new.append(size > INDEPENDENT)
+        new.append(size > INDEPENDENCE_TOLERANCE)
         if new[-1]:
             basis = np.column_stack([basis, rest / size])
     return new
@@ -542,8 +527,6 @@ def without_amplitudes(
         changes=tuple((name, formula) for name, formula in changes if formula != 0),
     )
 
-
-__all__ = ["GENERIC", "PROCESS_NOISE", "MechanismCandidate", "candidates_of", "generic_candidates"]
 
 GENERIC = "generic monomial"
 PROCESS_NOISE = "process noise"

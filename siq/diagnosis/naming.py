@@ -1,20 +1,18 @@
 """Naming: which mechanisms may be named, and what models the rest.
 
-A mechanism may be right although more is missing that no entry of the dictionary does. Two explanations are
-then fitted in earnest, each with a function for the rest: the mechanism and a function on top of it, against
-a function in its place and another on top of that. Neither is all of it, and the errors that both leave hang
-together over time; they count as so many as are independent (`siq.diagnosis.evidence`). How many these are is
-known roughly, so that the odds may decide nothing. Parts of the recordings that are left out then tell which
-of the two foresees. Where random forces still have to stand in for something, the rest has no model, and
-nobody can say.
+**Odds.** A mechanism and a smooth function in its place are compared as whole explanations of what is
+missing, by their marginal likelihoods (`siq.diagnosis.evidence`): along the trajectories of the fit with the
+mechanism everything is linear, and amplitudes, shapes and functions have normal priors whose size is drawn
+evenly on a logarithmic scale. A name takes the odds that keep wrong names as rare as is asked for.
 
-A name has to be likelier than a function without one, by the odds that keep wrong names as rare as is asked
-for (`siq.diagnosis.evidence`). Where it leaves something, it also has to explain more than mechanisms
-explain of effects that have no name (`siq.diagnosis.evidence`).
+**Matches by chance.** A mechanism that leaves something may be right and not alone, or wrong and alike.
+Effects without a name are drawn as smooth functions at all sites; least squares says how much of each the
+best mechanisms would explain. A name has to explain more than that.
 
-A name stands if it is convincing and likelier than a function without one (`siq.diagnosis.naming`). Where
-mechanisms leave something and are not convincing as a whole, the first may still be likelier than a function
-in its place, beside a function for the rest (`siq.diagnosis.naming`).
+**Beside a remainder.** Where it does not, the first mechanism may still be likelier than a function in its
+place, whatever else is missing being a function for both. The errors that both leave are autocorrelated and
+count as so many as are independent. Where the odds decide nothing, cross-validation does. Where process noise
+still has to stand in for something, the rest has no model, and nobody can say.
 """
 
 from __future__ import annotations
@@ -29,32 +27,243 @@ import scipy.special
 
 from siq.diagnosis.dictionary import Roles
 from siq.diagnosis.evidence import (
+    NUMERICAL_ERRORS,
+    SMOOTH_LENGTHS,
+    TriedMechanism,
+    admissible,
+    averaged_evidence,
     correlation_time_left,
+    correlation_time_of,
+    evidence_of_function,
     log_evidence_of,
-    log_odds_of_a_name,
-    probability_of_a_match,
+    orthonormal,
+    sizes_of_effects,
+    smooth_prior,
 )
-from siq.diagnosis.hidden_state_terms import models_beside_names, models_of_the_nameless
 from siq.diagnosis.holdout import change_between, errors_left_out, in_blocks
 from siq.diagnosis.mechanisms import MechanismCandidate
-from siq.diagnosis.options import SearchOptions
 from siq.diagnosis.residual_structure import Remainder
-from siq.diagnosis.screening import probes_of
+from siq.diagnosis.screening import PROBE_SUBSTEPS, Probe, ProbeColumns, probe_response, probes_of
 from siq.diagnosis.search import Search
-from siq.diagnosis.significance import UNFORESEEN, TriedMechanism, admissible
-from siq.diagnosis.unnamed_models import Material, Model, runs_freely, with_a_function
+from siq.diagnosis.study import SearchOptions
+from siq.diagnosis.terms import linearised_with_places, places_in, products_in
+from siq.diagnosis.unnamed_models import (
+    Material,
+    Model,
+    models_beside_names,
+    models_of_the_nameless,
+    runs_freely,
+    with_a_function,
+)
+from siq.errors import NumericalFailure
+from siq.inference.kalman_filter import Grid, Noise, Whitened, solve, whiten
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
 from siq.inference.recalibration import fit_with_and_without_process_noise
-from siq.numerics.text import p_equation, percent
+from siq.remarks import Remark
 from siq.systems.dynamics import Dynamics
 
 LOGGER = logging.getLogger(__name__)
-RIVALS = 2  # functions in the place of the mechanism that get another on top of them: a choice
+FUNCTIONS_EXTENDED = 2  # functions in the place of the mechanism that get another on top of them: a choice
+EFFECTS_DRAWN = 300  # effects without a name, which tell a probability of 5 % to 1 %
+
+
+class MissingEffect:
+    """What is missing, as a linear problem: innovations without the mechanism, and what could explain them.
+
+    Parameters
+    ----------
+    white
+        Innovations of the fit with the mechanism, with columns of its parameters.
+    fit
+        The fit.
+    candidates
+        The mechanisms whose effect counts as missing.
+    """
+
+    def __init__(self, white: Whitened, fit: Fit, candidates: Sequence[MechanismCandidate]) -> None:
+        names = [fit.model.parameters[place].name for place in fit.model.free]
+        own = white.columns[:, : len(names)]
+        change, _ = solve(own, white.innovations)
+        values = fit.model.values[list(fit.model.free)] + change
+        linear = [n for each in candidates for n in (each.amplitudes or each.shapes) if n in names]
+        others = [n for each in candidates for n in each.shapes if n in names and n not in linear]
+        tested = [names.index(name) for name in (*linear, *others)]
+        rest = [place for place in range(len(names)) if place not in tested]
+        self._linear, self._values, self._basis = len(linear), values[tested], orthonormal(own[:, rest])
+        effect = own[:, tested[: len(linear)]] @ values[tested[: len(linear)]]
+        left = white.innovations - own @ change
+        self.correlated = correlation_time_of(left, white.recording, outputs=len(fit.model.outputs))
+        self._target = self.projected((left + effect)[:, None])[:, 0]
+        self._freedom = (white.degrees_of_freedom - len(rest)) / self.correlated
+        self._columns = self.projected(own[:, tested])
+
+    def projected(self, columns: np.ndarray) -> np.ndarray:
+        """Columns without what the other parameters can do, weighed as so many independent errors are."""
+        return (columns - self._basis @ (self._basis.T @ columns)) / np.sqrt(self.correlated)
+
+    def log_evidence_of_mechanisms(self) -> float:
+        """Log-likelihood of the mechanisms, averaged over their amplitudes and shapes, to that of nothing.
+
+        An amplitude has the size that the effect has; a shape may be off by as much as it is.
+        """
+        total = float(self._target @ self._target)
+        gram = self._columns.T @ self._columns
+        own = np.diag(gram)[: self._linear]
+        unit, wide = np.zeros(len(gram)), np.zeros(len(gram))
+        unit[: self._linear] = 1.0 / np.where(own > 0, own, np.inf) / self._linear
+        wide[self._linear :] = self._values[self._linear :] ** 2
+        priors = [np.diag(size * unit + wide) for size in sizes_of_effects(total)]
+        return averaged_evidence(gram, self._columns.T @ self._target, priors, total, self._freedom)
+
+    def log_evidence_of_function(self, columns: np.ndarray, knots: np.ndarray) -> float:
+        """The log-likelihood of a smooth function, averaged likewise; see `evidence_of_function`."""
+        return evidence_of_function(self.projected(columns), self._target, knots, freedom=self._freedom)
+
+
+def log_odds_of_a_name(
+    fit: Fit,
+    data: Measurements,
+    candidates: Sequence[MechanismCandidate],
+    roles: Roles,
+    model: Dynamics,
+    *,
+    considered: Sequence[MechanismCandidate],
+    unnamed: float,
+) -> float:
+    """Logarithm of the odds that what is missing is the mechanism, rather than a function without a name.
+
+    Parameters
+    ----------
+    fit, data
+        The fit with the mechanism in place, and the recordings.
+    candidates
+        The mechanism; where there are several, all of them together against one function.
+    roles, model
+        The simulation as its author believes it, and the roles of its states.
+    considered
+        The mechanisms that could have been named: each name is as likely beforehand, and so is each of its
+        forms and places.
+    unnamed
+        Probability beforehand that what is missing has no name.
+    """
+    ours, theirs = -np.inf, []
+    single = places_in(model, roles, data, fit.x)
+    there = {name for each in candidates for name in each.equations}
+    products = products_in([each for each in single if there & set(each.targets)], model, data, fit.x)
+    for response, some in linearised_with_places(fit, data, (*single, *products)):
+        white = whiten(response, data, fit.noise)
+        problem = MissingEffect(white, fit, candidates)
+        ours = problem.log_evidence_of_mechanisms()
+        begin = len(fit.model.free)
+        for place in some:
+            columns = white.columns[:, begin : begin + len(place.knots)]
+            begin += len(place.knots)
+            if np.isfinite(columns).all():
+                theirs.append(problem.log_evidence_of_function(columns, place.knots))
+    if not theirs:
+        return np.inf
+    forms = Counter(each.name for each in considered)
+    chosen = sum(np.log(len(forms) * forms[each.name]) for each in candidates if forms[each.name])
+    named = ours + np.log1p(-unnamed) - chosen
+    nameless = scipy.special.logsumexp(theirs) + np.log(unnamed) - np.log(len(theirs))
+    return float(named - nameless)
+
+
+def false_match_rate(
+    recalibrated: Fit,
+    data: Measurements,
+    probes: Sequence[Probe],
+    roles: Roles,
+    *,
+    share: float,
+    mechanisms: int,
+    measurement: np.ndarray,
+    generator: np.random.Generator,
+) -> float:
+    """Probability that so many mechanisms explain as large a share of an effect that has no name.
+
+    Parameters
+    ----------
+    recalibrated, data
+        The simulation with nothing added, and the recordings.
+    probes
+        What could have been named.
+    roles
+        Of the simulation's states.
+    share
+        Of the excess that the mechanisms explain.
+    mechanisms
+        How many they are.
+    measurement
+        Variance of the measurement noise, shape ``(m,)``.
+    generator
+        Draws the effects.
+
+    Raises
+    ------
+    NumericalFailure
+        When the simulation, as linearised, runs away.
+    """
+    model, noise = recalibrated.model, Noise(measurement, np.zeros(recalibrated.model.dimension))
+    effects = _drawn_effects(recalibrated, data, roles, noise, generator=generator)
+    grid = Grid(data, min(recalibrated.substeps, PROBE_SUBSTEPS))
+    columns = ProbeColumns(model, grid, probes, recalibrated.x, model.values)
+    white = whiten(probe_response(model, grid, recalibrated, columns), data, noise)
+    own = orthonormal(white.columns[:, : len(model.free)])
+    effects = effects - own @ (own.T @ effects)
+    effects = effects[:, (effects**2).sum(axis=0) > 0]
+    if not effects.shape[1]:
+        raise NumericalFailure("no effect can be seen in the recordings")
+    groups, begin = [], len(model.free)
+    for probe in probes:
+        group = white.columns[:, begin : begin + probe.width]
+        begin += probe.width
+        if np.isfinite(group).all():
+            groups.append(orthonormal(group - own @ (own.T @ group)))
+    best = _best_shares(effects, groups, mechanisms)
+    return float((np.sum(best >= share) + 1) / (len(best) + 1))
+
+
+def _drawn_effects(
+    fit: Fit, data: Measurements, roles: Roles, noise: Noise, *, generator: np.random.Generator
+) -> np.ndarray:
+    """Effects of smooth functions at sites drawn at random on the innovations, shape ``(n, draws)``."""
+    places = places_in(fit.model, roles, data, fit.x)
+    if not places:
+        return np.zeros((data.outputs.size, 0))
+    counts = generator.multinomial(EFFECTS_DRAWN, np.full(len(places), 1 / len(places)))
+    drawn, place = [], 0
+    for response, some in linearised_with_places(fit, data, places):
+        white = whiten(response, data, noise)
+        begin = len(fit.model.free)
+        for each in some:
+            columns = white.columns[:, begin : begin + len(each.knots)]
+            begin += len(each.knots)
+            if np.isfinite(columns).all():
+                for _ in range(counts[place]):
+                    root = np.linalg.cholesky(smooth_prior(each.knots, generator.choice(SMOOTH_LENGTHS)))
+                    drawn.append(columns @ (root @ generator.normal(size=len(each.knots))))
+            place += 1
+    return np.stack(drawn, axis=1) if drawn else np.zeros((data.outputs.size, 0))
+
+
+def _best_shares(effects: np.ndarray, groups: Sequence[np.ndarray], most: int) -> np.ndarray:
+    """Share of effects ``(n, e)`` that so many groups of columns explain, chosen one beside the other."""
+    size = (effects**2).sum(axis=0)
+    left = effects.copy()
+    chosen: list[list[np.ndarray]] = [[] for _ in size]
+    for _ in range(most):
+        explained = np.stack([((group.T @ left) ** 2).sum(axis=0) for group in groups])
+        for place, best in enumerate(explained.argmax(axis=0)):
+            chosen[place].append(groups[best])
+            basis = orthonormal(np.concatenate(chosen[place], axis=1))
+            left[:, place] = effects[:, place] - basis @ (basis.T @ effects[:, place])
+    return 1 - (left**2).sum(axis=0) / size
 
 
 @dataclass(frozen=True)
-class BesideARemainder:
+class ResidualModelComparison:
     """How likely a mechanism is beside a function without a name, and what was fitted to know it.
 
     Attributes
@@ -65,18 +274,18 @@ class BesideARemainder:
         Functions on top of the mechanism.
     instead
         Functions in its place, alone and with another on top.
-    foresees
-        Whether an explanation with the mechanism foresees parts left out better than every one without it, by
+    predicts_better
+        Whether an explanation with the mechanism predicts parts left out better than every one without it, by
         more than appears by chance; asked only where the odds decide nothing.
     """
 
     log_odds: float
     on_top: tuple[Model, ...]
     instead: tuple[Model, ...]
-    foresees: bool = False
+    predicts_better: bool = False
 
 
-def beside_a_remainder(
+def residual_model_comparison(
     trial: TriedMechanism,
     recalibrated: Fit,
     material: Material,
@@ -84,7 +293,7 @@ def beside_a_remainder(
     considered: Sequence[MechanismCandidate],
     unnamed: float,
     least: float,
-) -> BesideARemainder | None:
+) -> ResidualModelComparison | None:
     """Hold a mechanism against functions in its place, whatever else is missing being a function for both.
 
     Parameters
@@ -104,8 +313,8 @@ def beside_a_remainder(
 
     Returns
     -------
-    BesideARemainder or None
-        None where random forces stand in for what it leaves, or it has states of its own.
+    ResidualModelComparison or None
+        None where process noise stands in for what it leaves, or it has states of its own.
     """
     if trial.fit.has_process_noise or trial.fit.model.dimension > recalibrated.model.dimension:
         return None
@@ -118,7 +327,7 @@ def beside_a_remainder(
         and runs_freely(each.fit, trial.fit, data)
     ]
     instead = with_a_function((), recalibrated, material)
-    for one in instead[:RIVALS]:
+    for one in instead[:FUNCTIONS_EXTENDED]:
         instead = instead + with_a_function(one.parts, one.fit, material)
     ours = [Model((), trial.fit), *on_top]
     theirs = [Model((), recalibrated), *instead]
@@ -135,75 +344,69 @@ def beside_a_remainder(
 
     forms = Counter(each.name for each in considered)
     chosen = np.log(max(len(forms) * forms[trial.candidate.name], 1))
-    named = best(ours) + np.log1p(-unnamed) - chosen
-    log_odds = float(named - best(theirs))
+    log_odds = float(best(ours) + np.log1p(-unnamed) - chosen - best(theirs))
     LOGGER.info(
         "%s beside a function: log-odds %.1f, errors correlated over %.1f samples",
         trial.candidate.label, log_odds, correlated,
     )  # fmt: skip
-    foresees = False
+    predicts_better = False
     if abs(log_odds) < least:
-        errors = [
-            min(known, key=np.mean, default=None)
-            for known in (
-                _left_out(models, recalibrated, data, candidates=candidates)
-                for models, candidates in ((theirs, ()), (ours, (trial.candidate,)))
+        blocks = []
+        for models, candidates in ((theirs, ()), (ours, (trial.candidate,))):
+            errors = (
+                errors_left_out(each.fit, data, noise=recalibrated.noise, candidates=candidates)
+                for each in models
             )
-        ]
-        blocks = [None if each is None else in_blocks(each) for each in errors]
-        foresees = None not in blocks and change_between(*blocks) == "better"
-        LOGGER.info("parts left out are foreseen better with it: %s", foresees)
-    return BesideARemainder(log_odds, tuple(on_top), tuple(instead), foresees)
-
-
-def _left_out(
-    models: Sequence[Model],
-    recalibrated: Fit,
-    data: Measurements,
-    *,
-    candidates: Sequence[MechanismCandidate],
-) -> list[np.ndarray]:
-    """Squared errors on parts left out, of each model that does not run away there."""
-    errors = (
-        errors_left_out(each.fit, data, noise=recalibrated.noise, candidates=candidates) for each in models
-    )
-    return [each for each in errors if each is not None]
+            least_error = min((each for each in errors if each is not None), key=np.mean, default=None)
+            blocks.append(None if least_error is None else in_blocks(least_error))
+        predicts_better = None not in blocks and change_between(*blocks) == "better"
+        LOGGER.info("parts left out are predicted better with it: %s", predicts_better)
+    return ResidualModelComparison(log_odds, tuple(on_top), tuple(instead), predicts_better)
 
 
 @dataclass(frozen=True)
-class Naming:
-    """Whether mechanisms that were found may be named.
+class NamingDecision:
+    """Whether mechanisms that were found may be named, and what models the rest.
 
     Attributes
     ----------
     search
-        With those that are not mere patches of others.
-    left
+        With the mechanisms that are named, or that describe what has no name.
+    remainder
         What they leave.
     log_odds
         For each, that it is the mechanism rather than a function without a name, as a logarithm.
     together
-        The same of all of them against one such function.
+        The odds of all of them against one such function, as a logarithm.
     p_alike
         Probability that as many mechanisms explain as much of an effect that has no name; None where nothing
         is left, so that nobody asked.
     convincing
         Whether they explain enough.
-    likely
-        Whether the odds are for them.
+    named
+        Whether they are named: the odds are for them as well.
+    remarks
+        Reservations.
+    models
+        Of what has no name: of what names leave, or of all of it.
+    exact
+        The fit with names whose trajectories follow the equations, where process noise is part of the other.
     """
 
     search: Search
-    left: Remainder
+    remainder: Remainder
     log_odds: tuple[float, ...]
     together: float
     p_alike: float | None
     convincing: bool
-    likely: bool
+    named: bool
+    remarks: tuple[Remark, ...] = ()
+    models: tuple[Model, ...] = ()
+    exact: Fit | None = None
 
 
-def naming_of(
-    search: Search,
+def judge_mechanisms(
+    whole: Search,
     left: Sequence[Remainder],
     data: Measurements,
     model: Dynamics,
@@ -212,13 +415,13 @@ def naming_of(
     *,
     options: SearchOptions,
     generator: np.random.Generator,
-) -> Naming:
-    """Judge the mechanisms of a search.
+) -> NamingDecision:
+    """Judge the mechanisms of a search, as far as they explain by themselves what is missing.
 
     Parameters
     ----------
-    search
-        That found at least one.
+    whole
+        The search, that found at least one.
     left
         What is left with the first, the first two, and so on.
     data, model, roles, candidates
@@ -228,144 +431,61 @@ def naming_of(
     generator
         Draws effects without a name.
     """
-    jury = _Jury(search, data, model, roles, candidates, options, generator)
-    if len(search.found) > 1 and jury.convincing(1, left[0])[0]:
-        search, kept = jury.without_patches(left)
-        left = left[: len(kept)]
-    convincing, p_alike = jury.convincing(len(search.found), left[-1])
-    odds = tuple(jury.log_odds(len(search.found), [place]) for place in range(len(search.found)))
-    together = odds[0] if len(odds) == 1 else jury.log_odds(len(odds), list(range(len(odds))))
-    likely = min(*odds, together) >= options.least_log_odds
-    return Naming(search, left[-1], odds, together, p_alike, convincing, likely)
 
+    def log_odds(number: int, chosen: Sequence[int]) -> float:
+        return _log_odds(whole, number, chosen, data, model, roles, candidates, options)
 
-def log_odds_of_the_first(
-    search: Search,
-    data: Measurements,
-    model: Dynamics,
-    roles: Roles,
-    candidates: Sequence[MechanismCandidate],
-    *,
-    options: SearchOptions,
-) -> float:
-    """Logarithm of the odds that the first mechanism is one rather than a function, in the fit with it alone.
-
-    Parameters
-    ----------
-    search, data, model, roles, candidates, options
-        See `naming_of`.
-    """
-    return _Jury(search, data, model, roles, candidates, options, np.random.default_rng(0)).log_odds(1, [0])
-
-
-@dataclass(frozen=True)
-class _Jury:
-    """What is asked of mechanisms several times; the attributes are the parameters of `naming_of`."""
-
-    search: Search
-    data: Measurements
-    model: Dynamics
-    roles: Roles
-    candidates: Sequence[MechanismCandidate]
-    options: SearchOptions
-    generator: np.random.Generator
-
-    def log_odds(self, number: int, chosen: Sequence[int]) -> float:
-        """Of some mechanisms, in the fit with the first so many."""
-        found = [each.best for each in self.search.found]
-        try:
-            odds = log_odds_of_a_name(
-                found[number - 1].fit,
-                self.data,
-                [found[place].candidate for place in chosen],
-                self.roles,
-                self.model,
-                considered=self.candidates,
-                unnamed=self.options.unnamed,
-            )
-        except UNFORESEEN as error:
-            LOGGER.info("the odds of a name are not known: %s", error)
-            return -np.inf
-        if len(chosen) == 1:  # what cannot be told apart is named as a class
-            one = self.search.found[chosen[0]]
-            same = [one.best.delta_bic, *(each.delta_bic for each in one.indistinguishable)]
-            odds += float(scipy.special.logsumexp(-0.5 * (np.array(same) - one.best.delta_bic)))
-        LOGGER.info("%s: log-odds of the name %.1f", [found[k].candidate.label for k in chosen], odds)
-        return odds
-
-    def convincing(self, number: int, left: Remainder) -> tuple[bool, float | None]:
+    def convincing(number: int, left: Remainder) -> tuple[bool, float | None]:
         """Whether the first so many mechanisms leave nothing, or explain more than by chance."""
-        if not (left.doubtful or self.search.found[number - 1].best.fit.has_process_noise):
+        if not (left.doubtful or whole.found[number - 1].best.fit.has_process_noise):
             return True, None
-        recalibrated = self.search.recalibrated
-        probes = [
-            probe
-            for each in self.candidates
-            for probe in probes_of(each, self.data, self.model, recalibrated.x)
-        ]
+        recalibrated = whole.recalibrated
         try:
-            p_alike = probability_of_a_match(
+            p_alike = false_match_rate(
                 recalibrated,
-                self.data,
-                probes,
-                self.roles,
+                data,
+                [probe for each in candidates for probe in probes_of(each, data, model, recalibrated.x)],
+                roles,
                 share=left.share,
                 mechanisms=number,
-                measurement=self.search.fit.noise.measurement,
-                generator=self.generator,
+                measurement=whole.fit.noise.measurement,
+                generator=generator,
             )
-        except UNFORESEEN as error:
+        except NUMERICAL_ERRORS as error:
             LOGGER.info("matches by chance are not known: %s", error)
             return False, None
         LOGGER.info("%d mechanisms explain %.4f; by chance: p %.3f", number, left.share, p_alike)
-        return p_alike <= self.options.most_alike, p_alike
+        return p_alike <= options.most_alike, p_alike
 
-    def without_patches(self, left: Sequence[Remainder]) -> tuple[Search, list[Remainder]]:
-        """The first mechanism, and those after it as long as each is likely and leaves less of the excess."""
-        search, kept = self.search, 1
+    search = whole
+    if len(whole.found) > 1 and convincing(1, left[0])[0]:
+        # Those after the first stay as long as each is likely and leaves less; others are patches of them.
+        kept = 1
         while (
             kept < len(left)
             and left[kept].share > left[kept - 1].share
-            and self.log_odds(kept + 1, [kept]) >= self.options.least_log_odds
+            and log_odds(kept + 1, [kept]) >= options.least_log_odds
         ):
             kept += 1
-        found = search.found[:kept]
-        return replace(search, found=found, fit=found[-1].best.fit), list(left[:kept])
+        search = replace(whole, found=whole.found[:kept], fit=whole.found[kept - 1].best.fit)
+        left = left[:kept]
+    convinces, p_alike = convincing(len(search.found), left[-1])
+    odds = tuple(log_odds(len(search.found), [place]) for place in range(len(search.found)))
+    together = odds[0] if len(odds) == 1 else log_odds(len(odds), list(range(len(odds))))
+    least = min(*odds, together)
+    remarks = []
+    if convinces and p_alike is not None and (left[-1].doubtful or left[-1].share < 1):
+        remarks.append(_remainder_remark(left[-1]))
+    if convinces and not least >= options.least_log_odds:
+        names = " and ".join(each.best.candidate.name for each in search.found)
+        needed = float(np.exp(options.least_log_odds))
+        values = {"names": names, "odds": float(np.exp(least)), "needed": needed}
+        remarks.append(Remark("diagnosis.not_certain", values))
+    named = convinces and least >= options.least_log_odds
+    return NamingDecision(search, left[-1], odds, together, p_alike, convinces, named, tuple(remarks))
 
 
-NAMELESS = "It has no name."
-EXACT = (
-    "The estimates allow for random forces that stand for what remains. The new card has the estimates of"
-    " least squares instead, where it runs better with them."
-)
-
-
-@dataclass(frozen=True)
-class Names:
-    """What is named of a search that found something.
-
-    Attributes
-    ----------
-    given
-        Whether a name is given.
-    naming
-        What was asked, with the mechanisms that are named, or that describe what has no name.
-    models
-        Of what has no name: of what names leave, or of all of it.
-    exact
-        The fit with names whose trajectories follow the equations, where random forces are part of the other.
-    remarks
-        Sentences about reservations.
-    """
-
-    given: bool
-    naming: Naming
-    models: tuple[Model, ...]
-    exact: Fit | None
-    remarks: tuple[str, ...]
-
-
-def names_of(
+def decide_naming(
     whole: Search,
     left: Sequence[Remainder],
     model: Dynamics,
@@ -374,8 +494,8 @@ def names_of(
     *,
     options: SearchOptions,
     generator: np.random.Generator,
-) -> Names:
-    """Judge a search that found something.
+) -> NamingDecision:
+    """Decide about the names of a search that found something, and fit models of the rest.
 
     Parameters
     ----------
@@ -391,82 +511,74 @@ def names_of(
         Draws effects without a name.
     """
     data, roles = material.data, material.roles
-    naming = naming_of(whole, left, data, model, roles, candidates, options=options, generator=generator)
-    given, remarks = named_or_not(naming, options)
-    beside: BesideARemainder | None = None
+    decision = judge_mechanisms(
+        whole, left, data, model, roles, candidates, options=options, generator=generator
+    )
+    beside: ResidualModelComparison | None = None
     # Only few functions are fitted; along the trajectories of a fit all are compared. Where these speak
     # against the name as clearly as something would have to speak for it, the few prove nothing.
-    if not naming.convincing and (
-        log_odds_of_the_first(whole, data, model, roles, candidates, options=options)
-        > -options.least_log_odds
+    if not decision.convincing and (
+        _log_odds(whole, 1, [0], data, model, roles, candidates, options) > -options.least_log_odds
     ):
-        beside = beside_a_remainder(
+        beside = residual_model_comparison(
             whole.found[0].best, whole.recalibrated, material,
             considered=candidates, unnamed=options.unnamed, least=options.least_log_odds,
         )  # fmt: skip
-    if beside is not None and (beside.log_odds >= options.least_log_odds or beside.foresees):
-        naming = named_beside_a_remainder(naming, whole, left[0], beside)
-        given, remarks = True, (f"{remains(naming.left)} {NAMELESS}",)
-    named = naming.search
-    if not given:
+    if beside is not None and (beside.log_odds >= options.least_log_odds or beside.predicts_better):
+        first = replace(whole, found=whole.found[:1], fit=whole.found[0].best.fit)
+        decision = replace(
+            decision, search=first, remainder=left[0], log_odds=(beside.log_odds,), together=beside.log_odds,
+            convincing=True, named=True, remarks=(_remainder_remark(left[0], unnamed=True),),
+        )  # fmt: skip
+    search = decision.search
+    if not decision.named:
         instead = None if beside is None else beside.instead
-        models = models_of_the_nameless(named, material, functions=instead)
-        return Names(False, naming, models, None, remarks)
-    models, exact = (), None
-    if len(whole.found) > len(named.found) or naming.left.doubtful or named.fit.has_process_noise:
+        return replace(decision, models=models_of_the_nameless(search, material, functions=instead))
+    if len(whole.found) > len(search.found) or decision.remainder.doubtful or search.fit.has_process_noise:
         on_top = None if beside is None else beside.on_top
-        models = models_beside_names(named, whole, material, functions=on_top)
-    if named.fit.has_process_noise:
-        still = replace(named.fit, noise=named.fit.noise.without_process())
+        models = models_beside_names(search, whole, material, functions=on_top)
+        decision = replace(decision, models=models)
+    if search.fit.has_process_noise:
+        still = replace(search.fit, noise=search.fit.noise.without_process())
         with material.budget.exempt():
-            followed = fit_with_and_without_process_noise(
-                named.fit.model, data, still, budget=material.budget
-            )[1]
-        if followed.converged:
-            exact, remarks = followed, (*remarks, EXACT)
-    return Names(True, naming, models, exact, remarks)
+            exact = fit_with_and_without_process_noise(search.fit.model, data, still, budget=material.budget)[
+                1
+            ]
+        if exact.converged:
+            remarks = (*decision.remarks, Remark("diagnosis.least_squares"))
+            decision = replace(decision, exact=exact, remarks=remarks)
+    return decision
 
 
-def named_or_not(naming: Naming, options: SearchOptions) -> tuple[bool, tuple[str, ...]]:
-    """Whether mechanisms that were found are named, and with which reservations."""
-    if not naming.convincing:
-        return False, ()
-    remarks = tuple(filter(None, [remains(naming.left)])) if naming.p_alike is not None else ()
-    if naming.likely:
-        return True, remarks
-    names = " and ".join(each.best.candidate.name for each in naming.search.found)
-    least = min(*naming.log_odds, naming.together)
-    return False, (
-        *remarks,
-        f"It looks like {names}, but a function without a name is {_as_likely(least)}; a name takes odds of"
-        f" {np.exp(options.least_log_odds):.0f} to 1.",
-    )
+def _log_odds(
+    search: Search,
+    number: int,
+    chosen: Sequence[int],
+    data: Measurements,
+    model: Dynamics,
+    roles: Roles,
+    candidates: Sequence[MechanismCandidate],
+    options: SearchOptions,
+) -> float:
+    """Logarithm of the odds of some mechanisms of a search, in the fit with the first so many."""
+    found = [each.best for each in search.found]
+    named = [found[place].candidate for place in chosen]
+    try:
+        odds = log_odds_of_a_name(
+            found[number - 1].fit, data, named, roles, model, considered=candidates, unnamed=options.unnamed
+        )
+    except NUMERICAL_ERRORS as error:
+        LOGGER.info("the odds of a name are not known: %s", error)
+        return -np.inf
+    if len(chosen) == 1:  # what cannot be told apart is named as a class
+        one = search.found[chosen[0]]
+        same = [one.best.delta_bic, *(each.delta_bic for each in one.indistinguishable)]
+        odds += float(scipy.special.logsumexp(-0.5 * (np.array(same) - one.best.delta_bic)))
+    LOGGER.info("%s: log-odds of the name %.1f", [each.label for each in named], odds)
+    return odds
 
 
-def named_beside_a_remainder(
-    naming: Naming, whole: Search, left: Remainder, beside: BesideARemainder
-) -> Naming:
-    """The first mechanism of a search, named although what it leaves has no name."""
-    first = replace(whole, found=whole.found[:1], fit=whole.found[0].best.fit)
-    return replace(
-        naming, search=first, left=left, log_odds=(beside.log_odds,), together=beside.log_odds,
-        convincing=True, likely=True,
-    )  # fmt: skip
-
-
-def _as_likely(log_odds: float) -> str:
-    """How likely a function without a name is, beside a mechanism."""
-    if log_odds < 0:
-        return "likelier"
-    return f"nearly as likely (odds of {np.exp(log_odds):.0f} to 1)"
-
-
-def remains(left: Remainder) -> str:
+def _remainder_remark(left: Remainder, *, unnamed: bool = False) -> Remark:
     """How much of the excess over noise is left by what was found, and whether it looks like noise."""
-    size = percent(1 - left.share)
-    if not left.doubtful:
-        return "" if size == "none" else f"What was found leaves {size} of the difference."
-    chance = f"({p_equation(left.after.p_value)})"
-    if size == "none":
-        return f"What is left is as small as noise, but does not look like it {chance}."
-    return f"What was found leaves {size} of the difference, and this rest does not look like noise {chance}."
+    values = {"left": 1 - left.share, "doubtful": left.doubtful, "p": left.after.p_value, "unnamed": unnamed}
+    return Remark("diagnosis.remainder", values)

@@ -1,22 +1,4 @@
-"""Structure in residuals, quantisation, and whether process noise is stationary.
-
-What may be missing is described without naming it: in every equation a piecewise linear function of every
-coordinate - a state, an input, the amplitude of a rotating frame, time - is let in, and the data say how
-large it would be. The same description tells where a mismatch sits, and whether one is left.
-
-Where a sensor's steps are wide beside its noise, what rounding does hangs together for as long as a reading
-stays on a step, and looks like random forces, or like physics that is missing. The steps are known: the
-recorded values lie on them. Of a reading that was rounded it is known that the value lay within its step, and
-a simulation says where: at the mean of a normal distribution that is cut off at the edges of the step. About
-the right simulation the residuals to these values are independent of each other (the generalised residuals of
-Gourieroux, Monfort, Renault and Trognon, Journal of Econometrics 34, 5, 1987), and the fit to them is that
-of highest likelihood of the readings (Dempster, Laird and Rubin's EM algorithm). So they can be asked whether
-anything is left.
-
-Process noise drives a system alike whether it moves or rests. What a simulation lacks of a hidden part - a
-second oscillator, a memory - can pass for random forces, too, where recordings are noisy; but such forces
-fade with the motion that excites them. The likelihood tells the two apart.
-"""
+"""residual_structure"""
 
 from __future__ import annotations
 
@@ -37,8 +19,8 @@ from siq.inference.noise import first_noise, likelihood_sums
 from siq.inference.recalibration import FAINT, process_noise_needed
 from siq.systems.dynamics import Dynamics
 
-KNOTS = 9  # of the functions that are tried: a choice
-SUBSTEPS = 2  # between samples, for the response to these functions
+HAT_KNOTS = 9  # of the functions that are tried: a choice
+RESPONSE_SUBSTEPS = 2  # between samples, for the response to these functions
 LAGS = 12  # of autocorrelations
 
 
@@ -156,7 +138,7 @@ def directions_of(model: Dynamics, roles: Roles, data: Measurements, x: np.ndarr
         draft = Direction(equations, coordinate, across, np.empty(0))
         course = coordinate_values(model, draft, x.T, signals.inputs, signals.t)
         if np.ptp(course) > 0:
-            knots = np.unique(np.quantile(course, np.linspace(0, 1, KNOTS)))
+            knots = np.unique(np.quantile(course, np.linspace(0, 1, HAT_KNOTS)))
             if len(knots) > 3:
                 found.append(Direction(equations, coordinate, across, knots))
 
@@ -206,7 +188,7 @@ def structure_of(
         process noise they show all that the simulation does not explain.
     """
     directions = directions_of(model, roles, data, fit.x)
-    grid = Grid(data, min(fit.substeps, SUBSTEPS))
+    grid = Grid(data, min(fit.substeps, RESPONSE_SUBSTEPS))
     noise = fit.noise if noise is None else noise
     parameters = len(fit.model.free)
 
@@ -274,7 +256,7 @@ def _autocorrelation(left: np.ndarray, recording: np.ndarray, known: np.ndarray,
 
 STRUCTURED = 1e-4  # probability below which residuals are not called random
 DOUBTFUL = 2e-3  # the same for what a mechanism leaves: the burden of proof is on a name
-LEFT = 0.01  # probability that residuals are random, above which no further mechanism is sought
+RANDOM_RESIDUALS = 0.01  # probability that residuals are random, above which no further mechanism is sought
 
 
 @dataclass(frozen=True)
@@ -348,13 +330,13 @@ def something_left(current: Fit, data: Measurements) -> bool:
     if current.has_process_noise:
         return True
     try:
-        return structure_of(model, data, current, roles_of(model)).p_value < LEFT
+        return structure_of(model, data, current, roles_of(model)).p_value < RANDOM_RESIDUALS
     except NumericalFailure:  # a simulation that runs away lacks something, whatever it is
         return True
 
 
-ROUNDS = 30  # of fits at most
-STILL = 0.01  # relative change of the noise, at which they have settled
+QUANTISATION_ROUNDS = 30  # of fits at most
+NOISE_SETTLED = 0.01  # relative change of the noise, at which they have settled
 
 
 @dataclass(frozen=True)
@@ -408,7 +390,7 @@ def explained_by_rounding(
         return None
     deviation, fit = np.sqrt(strict.noise.measurement), strict
     values = data
-    for _ in range(ROUNDS):
+    for _ in range(QUANTISATION_ROUNDS):
         before = deviation
         values, deviation = unrounded(data, simulated(fit, values), steps, before)
         fit = fit_by_multiple_shooting(
@@ -417,7 +399,7 @@ def explained_by_rounding(
         )  # fmt: skip
         if not fit.converged:
             return None
-        if (np.abs(deviation - before) < STILL * before).all():
+        if (np.abs(deviation - before) < NOISE_SETTLED * before).all():
             break
     faint = Noise(fit.noise.measurement, FAINT * first_noise(model, values, fit.x).process)
     forced = fit_by_multiple_shooting(
@@ -479,8 +461,8 @@ def unrounded(
     return replace(data, outputs=outputs), wide
 
 
-SHARES = (0.5, 0.9, 0.99)  # of the forces that follow the motion
-RATIOS = (1 / 8, 1 / 4, 1 / 2, 1 / 1.4, 1.0, 1.4, 2.0, 4.0, 8.0)  # of process noise, to that of the fit
+FOLLOWING_SHARES = (0.5, 0.9, 0.99)  # of the forces that follow the motion
+NOISE_RATIOS = (1 / 8, 1 / 4, 1 / 2, 1 / 1.4, 1.0, 1.4, 2.0, 4.0, 8.0)  # of process noise, to that of the fit
 
 
 def unsteadiness(fit: Fit, data: Measurements) -> float:
@@ -504,16 +486,16 @@ def unsteadiness(fit: Fit, data: Measurements) -> float:
     moved = (fit.x - fit.x.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
     motion = (moved**2).mean(axis=1)
     following = motion / motion.mean()
-    steady = max(_log_likelihood(fit, data, ratio, np.ones(len(motion))) for ratio in RATIOS)
+    steady = max(_likelihood_of_noise(fit, data, ratio, np.ones(len(motion))) for ratio in NOISE_RATIOS)
     fading = max(
-        _log_likelihood(fit, data, ratio, 1 - share + share * following)
-        for share in SHARES
-        for ratio in RATIOS
+        _likelihood_of_noise(fit, data, ratio, 1 - share + share * following)
+        for share in FOLLOWING_SHARES
+        for ratio in NOISE_RATIOS
     )
     return 2 * (fading - steady)
 
 
-def _log_likelihood(fit: Fit, data: Measurements, ratio: float, weight: np.ndarray) -> float:
+def _likelihood_of_noise(fit: Fit, data: Measurements, ratio: float, weight: np.ndarray) -> float:
     """With both kinds of noise on the best common scale; the weight is of the forces at every sample."""
     noise = Noise(fit.noise.measurement, ratio * fit.noise.process)
     return profile_likelihood(*likelihood_sums(fit.linearisation, data, noise, weight=weight))

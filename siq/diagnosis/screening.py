@@ -1,12 +1,4 @@
-"""Screening: how much a little of each mechanism would improve the fit.
-
-A mechanism that is absent from a simulation enters, to first order, by the derivative of f by its amplitudes.
-The responses of all candidates are worked out together, along the trajectories of a fit.
-
-Along the trajectories of one fit everything is linear, so that the likelihood with a probe, its amplitude and
-all parameters at their best, is a matter of least squares. It is worked out for several levels of process
-noise: where physics is missing the fit had to admit such noise, and the right probe makes it needless.
-"""
+"""screening"""
 
 from __future__ import annotations
 
@@ -17,8 +9,8 @@ from functools import cached_property
 import numpy as np
 import sympy
 
+from siq.diagnosis.evidence import BUDGET_SPENT, NUMERICAL_ERRORS, UntriedMechanism, in_words
 from siq.diagnosis.mechanisms import MechanismCandidate, along, places_of
-from siq.diagnosis.significance import BUDGET_SPENT, UNFORESEEN, UntriedMechanism, in_words
 from siq.errors import NumericalFailure
 from siq.inference.budget import Budget, BudgetSpent, evaluation
 from siq.inference.kalman_filter import (
@@ -311,11 +303,11 @@ def _fill(result: np.ndarray, place: int, entries: list[tuple[int, int]], found:
         result[row, place + column] = value
 
 
-LEVELS = (1.0, 0.1, 1e-2, 1e-3, 1e-4, 0.0)
+NOISE_LEVELS = (1.0, 0.1, 1e-2, 1e-3, 1e-4, 0.0)
 """Process noise, relative to that of the fit."""
 LARGEST_PORTION = 20_000_000  # numbers that are worked out at once; with copies about a gigabyte
 LEAST_PORTION = 10  # columns
-CLEARLY = 2.0  # standard errors below zero, from which on an amplitude is taken for negative
+NEGATIVE_ERRORS = 2.0  # standard errors below zero, from which on an amplitude is taken for negative
 COLLINEAR = 0.02  # share of a column left beside the parameters, below which its amplitude knows no bounds
 
 
@@ -344,7 +336,7 @@ class Screened:
 
 def levels_of(fit: Fit) -> tuple[float, ...]:
     """The levels of random forces at which something is judged on top of a fit; one where it has none."""
-    return LEVELS if fit.has_process_noise else (1.0,)
+    return NOISE_LEVELS if fit.has_process_noise else (1.0,)
 
 
 def in_portions(widths: Sequence[int], model: Dynamics, data: Measurements) -> Iterator[slice]:
@@ -485,7 +477,7 @@ def _admissible(
         amplitudes[kept], errors[kept] = solved, spread
         below = np.where(positive & kept, -amplitudes / np.maximum(errors, np.finfo(float).tiny), 0.0)
         worst = int(np.argmax(below))
-        if below[worst] <= CLEARLY:
+        if below[worst] <= NEGATIVE_ERRORS:
             break
         kept[worst] = False
         amplitudes[worst] = errors[worst] = 0.0
@@ -544,7 +536,7 @@ def screen_all(
             sharp = max(substeps, EDGE_SUBSTEPS)
             spread = replace(candidate, model=spread_edges(candidate.model, data, current.x, substeps=sharp))
             probes += probes_of(spread, data, model, current.x)
-        except UNFORESEEN as error:
+        except NUMERICAL_ERRORS as error:
             untried[candidate.label] = UntriedMechanism(candidate, in_words(error))
     grid = Grid(data, min(substeps, PROBE_SUBSTEPS))
     screened: list[tuple[Probe, Screened]] = []
@@ -557,7 +549,7 @@ def screen_all(
             screened += _screened(model, data, current, grid, some)
         except BudgetSpent:
             break
-        except UNFORESEEN as error:
+        except NUMERICAL_ERRORS as error:
             for probe in some:
                 reason = in_words(error)
                 untried[probe.candidate.label] = UntriedMechanism(probe.candidate, reason)

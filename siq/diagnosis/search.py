@@ -1,27 +1,17 @@
-"""The search for missing mechanisms: screen, fit the best, accept what stands every test.
-
-White errors, errors clustered by recording, and the Bayesian information criterion all have to say so; what
-cannot be told from the best is kept as its class of indistinguishables. One that leads to better parameters
-of the simulation itself is held against these, and one on trial has to stand beside what came after it.
-
-Mechanisms are added one at a time, each on top of those before it.
-"""
+"""search"""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
-from siq.diagnosis.mechanisms import MechanismCandidate, once_more, rebased
-from siq.diagnosis.options import SearchOptions
-from siq.diagnosis.residual_structure import something_left
-from siq.diagnosis.screening import Probe, Screened, screen_all, with_further_states
-from siq.diagnosis.significance import (
+from siq.diagnosis.evidence import (
     BUDGET_SPENT,
-    UNFORESEEN,
+    NUMERICAL_ERRORS,
     TriedMechanism,
     UntriedMechanism,
     admissible,
@@ -30,6 +20,10 @@ from siq.diagnosis.significance import (
     judged,
     probability_by_chance,
 )
+from siq.diagnosis.mechanisms import MechanismCandidate, once_more, rebased
+from siq.diagnosis.residual_structure import something_left
+from siq.diagnosis.screening import Probe, Screened, screen_all, with_further_states
+from siq.diagnosis.study import SearchOptions
 from siq.errors import NumericalFailure
 from siq.inference.budget import Budget, BudgetSpent
 from siq.inference.maximum_likelihood import Fit
@@ -37,6 +31,11 @@ from siq.inference.measurements import Measurements
 from siq.inference.recalibration import fit_with_process_noise_as_needed, least_to_believe
 from siq.inference.trajectories import sharpened
 from siq.systems.dynamics import Dynamics
+
+LOGGER = logging.getLogger(__name__)
+
+
+Standing = Literal["same", "needless", "less"]
 
 
 @dataclass(frozen=True)
@@ -59,6 +58,11 @@ class Found:
     indistinguishable: tuple[TriedMechanism, ...]
     needless: tuple[TriedMechanism, ...] = ()
     lesser: tuple[TriedMechanism, ...] = ()
+
+    @property
+    def standings(self) -> dict[Standing, tuple[TriedMechanism, ...]]:
+        """What else was fitted, by how it stands beside the mechanism."""
+        return {"same": self.indistinguishable, "needless": self.needless, "less": self.lesser}
 
 
 @dataclass(frozen=True)
@@ -91,9 +95,6 @@ class Search:
     untried: tuple[UntriedMechanism, ...] = ()
     screened_beside: tuple[str, ...] = ()
     fruitless: frozenset[str] = frozenset()
-
-
-LOGGER = logging.getLogger(__name__)
 
 
 def accepted(
@@ -181,7 +182,7 @@ def better_without(
     begin = replace(fit, noise=replace(fit.noise, process=fit.noise.process[:d]))
     try:
         again = fit_with_process_noise_as_needed(begun, data, begin, x=fit.x[:, :d], budget=budget)
-    except (*UNFORESEEN, BudgetSpent):
+    except (*NUMERICAL_ERRORS, BudgetSpent):
         return None
     gained = 2 * (again.log_likelihood - current.log_likelihood)
     return again if again.converged and gained > max(least, trial.delta_chi2 - least) else None
@@ -239,8 +240,10 @@ def _probability_in_place(
     return probability_by_chance(fit, without, data, candidate, blocks=options.blocks)
 
 
-PROMISING = 0.2  # of the best gain so far; a candidate that promises less is not fitted
-RIVALS = 0.6  # of the best gain, from which on a candidate's jumps are sharpened: that gains up to a quarter
+PROMISING_GAIN = 0.2  # of the best gain so far; a candidate that promises less is not fitted
+SHARPENED_GAIN = (
+    0.6  # of the best gain, from which on a candidate's jumps are sharpened: that gains up to a quarter
+)
 
 
 def fit_most_promising(
@@ -269,7 +272,7 @@ def fit_most_promising(
     least_gain
         Twice the increase of the log-likelihood that a candidate must promise.
     blocks
-        For clustered errors; see `siq.diagnosis.significance.probability_by_chance`.
+        For clustered errors; see `siq.diagnosis.evidence.probability_by_chance`.
     budget
         Charged for the work; what it does not reach is not fitted.
 
@@ -292,7 +295,7 @@ def fit_most_promising(
         except BudgetSpent:
             failed.setdefault(candidate.label, UntriedMechanism(candidate, BUDGET_SPENT))
             return
-        except UNFORESEEN as error:
+        except NUMERICAL_ERRORS as error:
             LOGGER.info("%s cannot be fitted: %s", candidate.label, error)
             failed[candidate.label] = UntriedMechanism(candidate, in_words(error))
             return
@@ -307,7 +310,7 @@ def fit_most_promising(
         # Against what screening foresaw of those that did gain it: some promise much and gain nothing, and
         # of others the first order shows little.
         gained = max((min(each.delta_chi2, best[name][1].gain) for name, each in trials.items()), default=0.0)
-        if result.gain < max(least_gain, PROMISING * gained):
+        if result.gain < max(least_gain, PROMISING_GAIN * gained):
             break
         if place >= most and result.gain < gained - least_gain:
             break  # no rival of the best, which the class of indistinguishables must have
@@ -346,12 +349,12 @@ def _with_jumps_followed(
     result = []
     for trial in trials:
         better, label = trial, trial.candidate.label
-        if trial.fit.model.edges and trial.delta_chi2 >= RIVALS * most_gained:
+        if trial.fit.model.edges and trial.delta_chi2 >= SHARPENED_GAIN * most_gained:
             try:
                 budget.says(f"following the jumps of {label}")
                 sharp = sharpened(trial.fit, data, budget=budget)
                 better = judged(sharp, current, data, trial.candidate, blocks=blocks)
-            except (*UNFORESEEN, BudgetSpent) as error:
+            except (*NUMERICAL_ERRORS, BudgetSpent) as error:
                 LOGGER.info("%s stays as sharp as it is: %s", label, error)
         result.append(better)
     return result
@@ -448,7 +451,7 @@ def with_start(probe: Probe, result: Screened, base: Dynamics) -> Dynamics:
     return candidate.model.with_values(np.array([known[each.name] for each in candidate.model.parameters]))
 
 
-FOR_FUNCTIONS = 0.4  # of the budget, for functions without a name: a choice
+BUDGET_FOR_FUNCTIONS = 0.4  # of the budget, for functions without a name: a choice
 
 
 def search(
@@ -462,7 +465,7 @@ def search(
 ) -> Search:
     """Look for mechanisms, one after the other, until nothing is found or its part of the budget is spent."""
     begin, budget = Search(recalibrated, (), recalibrated, ()), budget or Budget()
-    with budget.keeping(FOR_FUNCTIONS):
+    with budget.keeping(BUDGET_FOR_FUNCTIONS):
         return _extended(begin, model, data, candidates, options=options, budget=budget, on_trial=True)
 
 

@@ -1,44 +1,281 @@
-"""Smooth functions of one or two coordinates as normal processes.
-
-A smooth function could be anything. All that is expected of it is that its values are alike where its
-coordinates are, and know nothing of each other far apart: a normal process with the covariance
-``s² exp(-½ Σ ((z_i - z'_i)/ℓ_i)²)`` (Rasmussen and Williams, Gaussian Processes for Machine Learning, MIT
-Press 2006). It is written as a sum of Gaussian bumps as wide as the lengths ℓ, which stand closely where the
-recordings have been; what is expected of their heights is what makes the sum such a process there
-(Quiñonero-Candela and Rasmussen, J. Mach. Learn. Res. 6, 1939 (2005)). A length or so beyond, the function
-goes to zero.
-
-Lengths and size are taken from the recordings (`siq.diagnosis.unnamed_models`).
-
-What depends on two coordinates is often a product: a force that friction or a valve scales, a rate that food
-and temperature both limit. A product has far fewer heights than a surface, and where each
-coordinate has been, if not both at a time, it is known all the same.
-
-Of ``f(x) g(y)`` a normal process of unit size is expected of f, and one of the size of the whole of g. Given
-one of them everything is linear in the other, so that they are worked out in turn.
-"""
+"""smooth_functions"""
 
 from __future__ import annotations
 
 import itertools
+import logging
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
+from typing import Final, Protocol
 
 import numpy as np
 import scipy.linalg
 import sympy
 
-from siq.diagnosis.function_sites import Ground, built, fresh_names, unit_in
+from siq.diagnosis.evidence import (
+    NUMERICAL_ERRORS,
+    TriedMechanism,
+    correlation_time_of,
+    evidences_by_size,
+    orthonormal,
+)
 from siq.diagnosis.mechanisms import MechanismCandidate
+from siq.diagnosis.residual_structure import RESPONSE_SUBSTEPS
+from siq.diagnosis.screening import levels_of, probe_response, projected
+from siq.diagnosis.terms import (
+    LARGEST_LINEARISATION,
+    Ground,
+    Kind,
+    Place,
+    PlaceColumns,
+    built,
+    fresh_names,
+    unit_in,
+)
 from siq.errors import NumericalFailure
+from siq.inference.kalman_filter import Grid, Whitened, profile_likelihood, whiten
+from siq.inference.maximum_likelihood import Fit
+from siq.inference.measurements import Measurements
 from siq.systems.dynamics import Dynamics, JointExpectation, symbol
 
-CURVE, SURFACE = "curve", "surface"
+LOGGER = logging.getLogger(__name__)
+MECHANISM: Final = "mechanism"
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of a description.
+
+    Attributes
+    ----------
+    trial
+        What was added, fitted and judged.
+    kind
+        ``formula``, ``curve``, ``surface``, or ``mechanism``.
+    cost
+        Logarithm of the number of places, or mechanisms, that it was chosen among.
+    place
+        Where a function stands; None for a mechanism or a memory.
+    smooth
+        What a curve or a surface is made of: the amplitudes are the heights of its bumps.
+    """
+
+    trial: TriedMechanism
+    kind: Kind
+    cost: float
+    place: Place | None = None
+    smooth: Smooth | None = None
+
+
+LENGTH_SCALES = (
+    1 / 16,
+    1 / 8,
+    1 / 4,
+    1 / 2,
+    1.0,
+    2.0,
+)  # of the range; over twice of it a function is a parabola
+MOST_BUMPS = 100  # a guard on the time of a fit
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a fit leaves says of a function's values, at a level of random forces.
+
+    Attributes
+    ----------
+    level
+        Relative to the random forces of the fit.
+    fine
+        The function, with bumps as narrow as any.
+    correlated
+        Correlation time τ of the innovations in samples, with such a function: n of them count as n/τ.
+    gram, overlap
+        Of what a unit of each bump does to the innovations, with each other and with the innovations; shapes
+        ``(b, b)`` and ``(b,)``. Over τ, as are those that follow.
+    total, freedom
+        Sum of squares of the innovations, and degrees of freedom.
+    likelihood
+        Logarithm, without the function.
+    """
+
+    level: float
+    fine: SmoothFunction
+    correlated: float
+    gram: np.ndarray
+    overlap: np.ndarray
+    total: float
+    freedom: float
+    likelihood: float
+
+    def over(self, correlated: float) -> Told:
+        """The same where so many samples hang together."""
+        return Told(
+            self.level, self.fine, correlated, self.gram / correlated, self.overlap / correlated,
+            self.total / correlated, self.freedom / correlated, self.likelihood / correlated,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Smoothness:
+    """How smooth a function is, as recordings tell it.
+
+    Attributes
+    ----------
+    shares
+        Its lengths, as shares of the ranges of its coordinates.
+    deviation
+        Its size.
+    told
+        What the recordings tell, at the level of random forces at which it is likeliest.
+    noise
+        Variance of the innovations then, in units of what the fit takes for it.
+    log_evidence
+        Logarithm of the odds for such a function, over none, each at its best level; averaged over all
+        lengths and sizes.
+    considered
+        How many lengths and sizes these are.
+    """
+
+    shares: tuple[float, ...]
+    deviation: float
+    told: Told
+    noise: float
+    log_evidence: float
+    considered: int
+
+
+def smoothness_of(
+    fit: Fit, data: Measurements, ground: Ground, *, known: Part | None = None, alike: bool = False
+) -> Smoothness | None:
+    """The likeliest smoothness of a function on top of a fit; None where it cannot be worked out.
+
+    Parameters
+    ----------
+    fit, data
+        The fit along whose trajectories everything is linear, and what it was made for.
+    ground
+        Where the function stands.
+    known
+        A part of the fit that is a first description of this function, in whose stead it comes.
+    alike
+        Whether both lengths are the same share of the range.
+    """
+    least, fine = _finest(ground, data, fit.model)
+    some = [share for share in LENGTH_SCALES if share >= least]
+    choices = [(each,) * len(ground.words) for each in some]
+    if not alike:
+        choices = list(itertools.product(some, repeat=len(ground.words)))
+    # What processes of these lengths have for values at the finest bumps, as heights of these.
+    shapes = [fine.heights_of(triangle_of(fine.centres, np.array(each) * ground.ranges)) for each in choices]
+    alone = -np.inf
+    values: list[np.ndarray] = []
+    highest, best = -np.inf, None
+    for told in _told(fit, data, fine, known):
+        alone = max(alone, told.likelihood)
+        for shares, shape in zip(choices, shapes, strict=True):
+            gained, scale, rest = evidences_by_size(
+                shape.T @ told.gram @ shape, shape.T @ told.overlap, told.total, freedom=told.freedom
+            )
+            values.append(told.likelihood + gained)
+            place = int(np.argmax(gained))
+            if values[-1][place] > highest:
+                # The scale of the noise was at its best, too, and the size is one in units of it.
+                highest, noise = values[-1][place], float(rest[place] / told.freedom)
+                deviation = float(np.sqrt(scale[place] * noise))
+                best = Smoothness(shares, deviation, told, noise, 0.0, len(gained) * len(choices))
+    if best is None or not best.deviation > 0:
+        return None
+    whole = np.concatenate(values)
+    mean = float(np.logaddexp.reduce(whole) - np.log(len(whole)))
+    return replace(best, log_evidence=mean - alone)
+
+
+def likeliest_product(asked: Smoothness, ground: Ground, *, times: float = 1.0) -> ProductFunction:
+    """The likeliest product of two functions, where a function of two coordinates is asked for.
+
+    Parameters
+    ----------
+    asked
+        What the recordings say of a function of both.
+    ground
+        Where it stands.
+    times
+        Factor on the lengths to choose among.
+    """
+    told = asked.told
+    by_value = told.fine.heights_of(told.fine.heights_of(told.gram).T)
+    return product_of(
+        ground,
+        tuple(times * share for share in LENGTH_SCALES),
+        points=told.fine.centres,
+        gram=(by_value + by_value.T) / (2 * asked.noise),
+        overlap=told.fine.heights_of(told.overlap) / asked.noise,
+        deviation=asked.deviation,
+        weight=told.correlated,
+    )
+
+
+def _told(fit: Fit, data: Measurements, fine: SmoothFunction, known: Part | None) -> list[Told]:
+    """What is told at each level of random forces at which it can be worked out.
+
+    Errors are as correlated as the likeliest level leaves them with such a function, at all levels.
+    """
+    grid = Grid(data, fit.substeps if known else min(fit.substeps, RESPONSE_SUBSTEPS))
+    response = probe_response(fit.model, grid, fit, PlaceColumns(fit.model, grid, [fine]))
+    found: list[Told] = []
+    highest, correlated = -np.inf, 1.0
+    for level in levels_of(fit):
+        try:
+            white = whiten(response, data, fit.noise.scaled(level))
+            white, parameters = _without(white, fit, known)
+            left, columns = projected(white, parameters)
+        except NUMERICAL_ERRORS as error:
+            LOGGER.info("no function of %s can be screened: %s", " and ".join(fine.ground.words), error)
+            continue
+        total, freedom = float(left @ left), white.degrees_of_freedom - parameters
+        likelihood = profile_likelihood(total, freedom, white.log_determinant)
+        found.append(
+            Told(level, fine, 1.0, columns.T @ columns, columns.T @ left, total, freedom, likelihood)
+        )
+        basis = orthonormal(columns)
+        rest = left - basis @ (basis.T @ left)
+        likelihood = profile_likelihood(float(rest @ rest), freedom, white.log_determinant)
+        if likelihood > highest:
+            highest = likelihood
+            correlated = correlation_time_of(rest, white.recording, outputs=len(fit.model.outputs))
+    return [each.over(correlated) for each in found]
+
+
+def _finest(ground: Ground, data: Measurements, model: Dynamics) -> tuple[float, SmoothFunction]:
+    """The shortest length, as a share of the range, of which the recordings need not too many bumps."""
+    room = LARGEST_LINEARISATION // (len(data.t) * (model.dimension + len(model.outputs)))
+    most = max(min(MOST_BUMPS, room), 1)
+    for share in LENGTH_SCALES:
+        function = smooth_function(ground, (share,) * len(ground.words), most=most + 1)
+        if function.width <= most:
+            return share, function
+    return LENGTH_SCALES[-1], smooth_function(ground, (LENGTH_SCALES[-1],) * len(ground.words), most=most)
+
+
+def _without(white: Whitened, fit: Fit, known: Part | None) -> tuple[Whitened, int]:
+    """Innovations as if a part were not there, its columns left out, and the number of parameters left."""
+    names = [fit.model.parameters[place].name for place in fit.model.free]
+    amplitudes = () if known is None else known.trial.candidate.amplitudes
+    mine = [names.index(name) for name in amplitudes]
+    linear = mine if known is None or known.smooth is None else mine[: known.smooth.linear]
+    values = fit.model.values[[fit.model.free[place] for place in linear]]
+    others = np.delete(white.columns, mine, axis=1)
+    innovations = white.innovations + white.columns[:, linear] @ values
+    return replace(white, innovations=innovations, columns=others), len(names) - len(mine)
+
+
+CURVE: Final = "curve"
+SURFACE: Final = "surface"
 # Lengths between neighbours: a sum of bumps then has the variance of the process to 2e-5, that of two
 # coordinates to 4 % (of points that are spread evenly).
-APART = 0.5
-ROUNDING = 1e-6  # numerical: of the process's variance, added to it at every bump
+BUMP_SPACING = 0.5
+COVARIANCE_JITTER = 1e-6  # numerical: of the process's variance, added to it at every bump
 
 
 class Smooth(Protocol):
@@ -49,7 +286,7 @@ class Smooth(Protocol):
         """Where it stands."""
 
     @property
-    def kind(self) -> str:
+    def kind(self) -> Kind:
         """What it looks like."""
 
     @property
@@ -106,7 +343,7 @@ class SmoothFunction:
     weight: float = 1.0
 
     @property
-    def kind(self) -> str:
+    def kind(self) -> Kind:
         """What it looks like."""
         return CURVE if len(self.lengths) == 1 else SURFACE
 
@@ -209,9 +446,9 @@ def smooth_function(
     lengths = np.array(shares) * ground.ranges
     if len(shares) == 1:
         lower, upper = ground.courses.min(), ground.courses.max()
-        centres = np.linspace(lower, upper, int(np.ceil(1 / (APART * shares[0]))) + 1)[:most, None]
+        centres = np.linspace(lower, upper, int(np.ceil(1 / (BUMP_SPACING * shares[0]))) + 1)[:most, None]
     else:
-        apart = APART * np.sqrt(len(shares))
+        apart = BUMP_SPACING * np.sqrt(len(shares))
         scaled = ground.courses / lengths[:, None]
         centres = ground.courses[:, spread_out(scaled, apart=apart, most=most)].T
     return SmoothFunction(ground, centres, lengths, deviation, weight)
@@ -247,7 +484,7 @@ def with_smooth_function(model: Dynamics, function: Smooth) -> MechanismCandidat
 def triangle_of(points: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     """Lower triangle of the covariance of a process of unit size at points ``(b, c)``, shape ``(b, b)``."""
     likeness = np.exp(-0.5 * _squares(points / lengths, points / lengths))
-    return np.linalg.cholesky(likeness + ROUNDING * np.eye(len(points)))
+    return np.linalg.cholesky(likeness + COVARIANCE_JITTER * np.eye(len(points)))
 
 
 def _number(value: float) -> sympy.Expr:
@@ -259,8 +496,8 @@ def _squares(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return ((one[:, None, :] - other[None, :, :]) ** 2).sum(axis=2)
 
 
-TURNS = 30  # at most, of working out one factor after the other
-SETTLED = 1e-4  # of what is left, by which a turn has to be better
+PRODUCT_ITERATIONS = 30  # at most, of working out one factor after the other
+PRODUCT_TOLERANCE = 1e-4  # of what is left, by which a turn has to be better
 
 
 @dataclass(frozen=True)
@@ -283,7 +520,7 @@ class ProductFunction:
     begin: np.ndarray
 
     @property
-    def kind(self) -> str:
+    def kind(self) -> Kind:
         """What it looks like."""
         return SURFACE
 
@@ -383,11 +620,11 @@ def _in_turns(
     """
     g = np.linalg.lstsq(second.T, np.full(second.shape[1], np.sqrt((second**2).sum(axis=0).mean())))[0]
     f, before = np.zeros(len(first)), np.inf
-    for _ in range(TURNS):
+    for _ in range(PRODUCT_ITERATIONS):
         f, _ = _given(first * (g @ second), gram, overlap)
         g, left = _given(second * (f @ first), gram, overlap)
         left += float(f @ f)
-        if before - left < SETTLED * abs(left):
+        if before - left < PRODUCT_TOLERANCE * abs(left):
             break
         before = left
     both = np.concatenate([first * (g @ second), second * (f @ first)])

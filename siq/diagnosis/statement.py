@@ -1,202 +1,208 @@
-"""The statement of a diagnosis: the content of ``verdict.json``.
+"""The statement of a diagnosis: what `verdict.json` holds, as data.
 
-The page, the report as text and the terminal all show these, so that none can contradict another.
+The verdict, mechanisms with their parameters, errors and evidence, the place of the mismatch, the errors on
+held-out recordings and bounds of what was not found. `siq.report.diagnosis_text` has the sentences: the page,
+the report as text and the terminal all show these, so that none can contradict another.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Annotated, Any
 
-import numpy as np
-import sympy
+from pydantic import BeforeValidator, TypeAdapter
+from pydantic_core import to_jsonable_python
 
-from siq.diagnosis.function_sites import FORMULA
-from siq.diagnosis.held_out_fit import HeldOutRuns
+from siq.diagnosis.evidence import BUDGET_SPENT
 from siq.diagnosis.holdout import HeldOutErrors
-from siq.diagnosis.location import Location
-from siq.diagnosis.mechanisms import PROCESS_NOISE
-from siq.diagnosis.options import MismatchVerdict
-from siq.diagnosis.significance import BUDGET_SPENT
-from siq.diagnosis.smooth_functions import CURVE, SURFACE, Smooth
-from siq.diagnosis.unnamed_models import MECHANISM, Part
-from siq.diagnosis.wording import (
-    LISTED,
-    DescribedCurve,
-    DescribedSurface,
-    Estimate,
-    Evidence,
-    StatedFunction,
-    StatedMechanism,
-    alternatives,
-    as_it_is,
-    described_part,
-    error_stays,
-    gained,
-    named,
-    not_foreseen,
-    or_else,
-    placed,
-)
+from siq.diagnosis.mechanisms import GENERIC, PROCESS_NOISE
+from siq.diagnosis.search import Standing
+from siq.diagnosis.study import MismatchVerdict
+from siq.diagnosis.terms import Kind
 from siq.inference.budget import UNLIMITED, Account
-from siq.inference.maximum_likelihood import Fit
-from siq.numerics.text import (
-    SMALLEST_SHARE,
-    capital,
-    listed,
-    number_text,
-    p_equation,
-    p_text,
-    percent,
-    value_text,
-)
-from siq.systems.dynamics import Dynamics, symbol
-from siq.systems.formulas import compile_values
-
-COORDINATE = sympy.Symbol("coordinate", positive=True)  # positive, so that the root of its square is itself
-GRID = 25  # places along either coordinate of a surface, for its figure
-_KINDS: Mapping[str, Literal["formula", "curve", "surface", "mechanism"]] = {
-    FORMULA: "formula",
-    CURVE: "curve",
-    SURFACE: "surface",
-    MECHANISM: "mechanism",
-}
-
-
-def stated_functions(shown: HeldOutRuns, *, beside: tuple[str, ...] = ()) -> tuple[StatedFunction, ...]:
-    """The parts of the model that is in the new card; none where nothing that was added helped.
-
-    Parameters
-    ----------
-    shown
-        The free runs, with the model.
-    beside
-        Labels of mechanisms with a name, which were in place before.
-    """
-    if shown.described is None or shown.described_fit is None or not shown.adopted:
-        return ()
-    labels = [each.trial.candidate.label for each in shown.described.parts]
-    return tuple(
-        _stated(part, shown.described_fit, (*beside, *labels[:place]))
-        for place, part in enumerate(shown.described.parts)
-    )
-
-
-def _stated(part: Part, fit: Fit, beside: tuple[str, ...]) -> StatedFunction:
-    trial, candidate = part.trial, part.trial.candidate
-    errors = dict(
-        zip(
-            (fit.model.parameters[place].name for place in fit.model.free),
-            map(float, fit.standard_errors),
-            strict=True,
-        )
-    )
-    known = {entry.name: entry for entry in fit.model.parameters}
-    changed = [name for name, _ in candidate.changes]
-    return StatedFunction(
-        name=candidate.name,
-        label=candidate.label,
-        kind=_KINDS[part.kind],
-        terms={name: str(formula) for name, formula in candidate.changes},
-        parameters={
-            name: Estimate(known[name].value, errors.get(name), known[name].unit) for name in candidate.new
-        },
-        evidence=Evidence(trial.delta_chi2, trial.delta_bic, trial.p_white, trial.p_cluster),
-        equations=candidate.equations,
-        outputs=tuple(name for name in changed if name in fit.model.output_names)
-        if not candidate.equations
-        else (),
-        coordinates=part.place.words if part.place is not None else tuple(candidate.coordinate.split(", ")),
-        curve=curve_of(part, fit),
-        surface=surface_of(part, fit),
-        beside=beside,
-    )
-
-
-def curve_of(part: Part, fit: Fit) -> DescribedCurve | None:
-    """A function of one coordinate at the knots of its place, with its standard errors.
-
-    None for a formula in two coordinates, for a surface, and for a mechanism.
-    """
-    place, smooth = part.place, part.smooth
-    if place is None or (part.kind != CURVE and len(place.words) > 1):
-        return None
-    if smooth is not None:
-        lower, upper = smooth.limits[:, 0]
-        knots = np.linspace(lower, upper, GRID)
-        values, errors = _along(smooth, part, fit, knots[None])
-    else:
-        knots = place.knots
-        weights = _terms(part, fit.model, knots)
-        values, errors = weights @ _amplitudes(part, fit), _errors(weights, part, fit)
-    return DescribedCurve(
-        place.words[0], tuple(map(float, knots)), tuple(map(float, values)), tuple(map(float, errors))
-    )
-
-
-def surface_of(part: Part, fit: Fit) -> DescribedSurface | None:
-    """A surface on a grid that covers the recordings, with its standard errors; None for anything else."""
-    smooth = part.smooth
-    if smooth is None or part.kind != SURFACE:
-        return None
-    at = [np.linspace(lower, upper, GRID) for lower, upper in smooth.limits.T]
-    courses = np.stack([each.ravel() for each in np.meshgrid(*at, indexing="ij")])
-    values, errors = _along(smooth, part, fit, courses)
-    first, second = (tuple(map(float, each)) for each in at)
-
-    def rows(flat: np.ndarray) -> tuple[tuple[float, ...], ...]:
-        return tuple(tuple(map(float, row)) for row in flat.reshape(GRID, GRID))
-
-    words = smooth.ground.words
-    return DescribedSurface((words[0], words[1]), (first, second), rows(values), rows(errors))
-
-
-def _along(smooth: Smooth, part: Part, fit: Fit, courses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A smooth function along courses ``(c, k)`` of its coordinates, and its standard errors, ``(k,)``."""
-    values, derivatives = smooth.along(_amplitudes(part, fit), courses)
-    return values, _errors(derivatives, part, fit)
-
-
-def _amplitudes(part: Part, fit: Fit) -> np.ndarray:
-    known = {each.name: each.value for each in fit.model.parameters}
-    return np.array([known[name] for name in part.trial.candidate.amplitudes])
-
-
-def _errors(weights: np.ndarray, part: Part, fit: Fit) -> np.ndarray:
-    """Standard errors of weighted sums ``(k, c)`` of the amplitudes of a part, shape ``(k,)``."""
-    free = [fit.model.parameters[each].name for each in fit.model.free]
-    rows = [free.index(name) for name in part.trial.candidate.amplitudes]
-    variances = np.einsum("kc,cd,kd->k", weights, fit.covariance[np.ix_(rows, rows)], weights)
-    return np.sqrt(np.maximum(variances, 0.0))
-
-
-def _terms(part: Part, model: Dynamics, knots: np.ndarray) -> np.ndarray:
-    """What a unit of each coefficient of a formula is at the knots, shape ``(k, c)``."""
-    assert part.place is not None
-    candidate = part.trial.candidate
-    name, formula = candidate.changes[0]
-    factor = dict((*part.place.equations, *part.place.outputs))[name]
-    columns = []
-    for amplitude in candidate.amplitudes:
-        term = in_coordinate(formula.diff(symbol(amplitude)) / factor, part.place.coordinate)
-        value = compile_values([term], [COORDINATE], common=False)(knots)[0]
-        columns.append(np.broadcast_to(np.asarray(value, dtype=float), knots.shape))
-    return np.stack(columns, axis=1)
-
-
-def in_coordinate(term: sympy.Expr, coordinate: sympy.Expr) -> sympy.Expr:
-    """A formula in `COORDINATE`, in the place of the formula that the coordinate is.
-
-    The square of ``sqrt(P**2 + Q**2)`` has no root in it, so that what stands under the root is replaced.
-    """
-    if isinstance(coordinate, sympy.Pow) and coordinate.exp == sympy.Rational(1, 2):
-        return term.subs(coordinate.base, COORDINATE**2)
-    return term.subs(coordinate, COORDINATE)
-
+from siq.remarks import Remark
 
 METRIC = "normalised rms, held-out recordings"
-UNKNOWN_ERRORS = HeldOutErrors()
+# JSON has no number for what is not finite: it is null there.
+Number = Annotated[float, BeforeValidator(lambda value: float("nan") if value is None else value)]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A parameter's value with its standard error, None where it has none, and its unit."""
+
+    estimate: float
+    standard_error: float | None
+    unit: str
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Why a mechanism is believed; None where a test does not apply.
+
+    Attributes
+    ----------
+    delta_chi2, delta_bic
+        What it gains, see `siq.diagnosis.evidence.TriedMechanism`.
+    p_white, p_cluster
+        Probabilities of as much by chance: if all errors are independent, and whatever errors within a
+        recording have to do with each other.
+    log_odds
+        Logarithm of the odds that it is this mechanism, rather than a function without a name.
+    """
+
+    delta_chi2: float | None
+    delta_bic: float | None
+    p_white: float | None
+    p_cluster: float | None
+    log_odds: float | None = None
+
+
+@dataclass(frozen=True)
+class Rival:
+    """A mechanism that was fitted in the place of one that was found.
+
+    Attributes
+    ----------
+    name, label
+        As of `StatedMechanism`.
+    delta_chi2
+        What it gains, compared with the same simulation.
+    further_parameters
+        How many more it has than the one that was found.
+    standing
+        ``same``: it explains the recordings as well. ``needless``: it explains as much, with further
+        parameters that gain no more than they would by chance. ``less``: it explains less.
+    """
+
+    name: str
+    label: str
+    delta_chi2: float
+    further_parameters: int
+    standing: Standing
+
+
+@dataclass(frozen=True)
+class StatedMechanism:
+    """A mechanism that is named, or that describes what has no name.
+
+    Attributes
+    ----------
+    name, label
+        Of the dictionary, and told apart from its other forms and places.
+    terms
+        Formula that is added, by equation; see `siq.diagnosis.mechanisms.MechanismCandidate.changes`.
+    parameters
+        Those that it brings.
+    evidence
+        Why it is believed.
+    share_of_excess
+        What all mechanisms together explain of the excess over noise.
+    indistinguishable_from
+        Names of mechanisms that explain the recordings as well; None where it is not named itself.
+    equations
+        States in whose equations it changes something; none for a fault of the sensor.
+    beside
+        Labels of the mechanisms that were in place when it was judged.
+    rivals
+        What else was fitted in its place, the one that gains most first.
+    """
+
+    name: str
+    label: str
+    terms: Mapping[str, str]
+    parameters: Mapping[str, Estimate]
+    evidence: Evidence
+    share_of_excess: float
+    indistinguishable_from: tuple[str, ...] | None = None
+    equations: tuple[str, ...] = ()
+    beside: tuple[str, ...] = ()
+    rivals: tuple[Rival, ...] = ()
+
+    def rival_names(self, standing: Standing) -> list[str]:
+        """Names of rivals, each once; their labels where the name alone is that of the mechanism itself."""
+        names = (
+            each.label if each.name in (self.name, GENERIC) else each.name
+            for each in self.rivals
+            if each.standing == standing
+        )
+        return list(dict.fromkeys(names))
+
+
+@dataclass(frozen=True)
+class DescribedCurve:
+    """A function of one coordinate with its band.
+
+    Attributes
+    ----------
+    coordinate
+        Of which it is a function.
+    at, value, standard_error
+        In the units of the card; each as long.
+    """
+
+    coordinate: str
+    at: tuple[float, ...]
+    value: tuple[float, ...]
+    standard_error: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class DescribedSurface:
+    """A function of two coordinates on a grid, with its standard errors.
+
+    Attributes
+    ----------
+    coordinates
+        Of which it is a function.
+    at
+        The grid, along the first and along the second of them, in the units of the card.
+    value, standard_error
+        A row for each place along the first coordinate.
+    """
+
+    coordinates: tuple[str, str]
+    at: tuple[tuple[float, ...], tuple[float, ...]]
+    value: tuple[tuple[float, ...], ...]
+    standard_error: tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True)
+class StatedFunction:
+    """A part of the model of what has no name.
+
+    Attributes
+    ----------
+    name, label, terms, parameters, evidence, equations, beside
+        As of `StatedMechanism`.
+    kind
+        ``formula``: a sum of a few powers. ``curve``, ``surface``: a smooth function of one coordinate, or of
+        two, as a sum of Gaussian bumps. ``mechanism``: one of the dictionary that is not certain enough for
+        its name.
+    outputs
+        What is measured otherwise, for a fault of the sensor.
+    coordinates
+        What it depends on.
+    curve
+        Where it is a function of one coordinate, or a curve; a curve in two coordinates is the coefficient of
+        the second.
+    surface
+        Where it is a surface.
+    """
+
+    name: str
+    label: str
+    kind: Kind
+    terms: Mapping[str, str]
+    parameters: Mapping[str, Estimate]
+    evidence: Evidence
+    equations: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
+    coordinates: tuple[str, ...] = ()
+    curve: DescribedCurve | None = None
+    surface: DescribedSurface | None = None
+    beside: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -234,11 +240,12 @@ class Description:
 
 @dataclass(frozen=True)
 class Recalibrated:
-    """A parameter of the simulation before and after the fit, with the standard error."""
+    """A parameter of the simulation before and after the fit, with its standard error and unit."""
 
     before: float
     after: float
-    standard_error: float
+    standard_error: Number
+    unit: str = "1"
 
 
 @dataclass(frozen=True)
@@ -278,6 +285,40 @@ class Explanation:
 
 
 @dataclass(frozen=True)
+class Location:
+    """Where a mismatch sits.
+
+    Attributes
+    ----------
+    equations
+        Share of each equation in the excess, largest first; empty for a fault of a sensor.
+    coordinate
+        Along which it acts.
+    region
+        The part of the coordinate's range where it can be seen, by coordinate.
+    time
+        First and last time of it, where it acts along time only.
+    recordings
+        Labels of those that show it.
+    recordings_total
+        How many it was sought in.
+    outputs
+        What is measured otherwise, for a fault of a sensor.
+    unit
+        Of the coordinate.
+    """
+
+    equations: dict[str, float]
+    coordinate: str
+    region: dict[str, tuple[float, float]]
+    time: tuple[float, float] | None
+    recordings: tuple[str, ...]
+    recordings_total: int = 0
+    outputs: tuple[str, ...] = ()
+    unit: str = "1"
+
+
+@dataclass(frozen=True)
 class Statement:
     """All that a diagnosis states.
 
@@ -285,8 +326,6 @@ class Statement:
     ----------
     verdict
         One of four.
-    sentence
-        The same as a colleague would say it, with the numbers.
     mechanisms
         What is named.
     description
@@ -305,8 +344,6 @@ class Statement:
         Reservations.
     not_fitted
         What could not be judged.
-    words
-        Further sentences by what they are about; see `words_of`.
     explanations
         Whole explanations that were compared, the likeliest first.
     account
@@ -314,17 +351,15 @@ class Statement:
     """
 
     verdict: MismatchVerdict
-    sentence: str
     mechanisms: tuple[StatedMechanism, ...] = ()
     description: Description | None = None
     described: tuple[StatedFunction, ...] = ()
     location: Location | None = None
-    recalibration: Mapping[str, Recalibrated] | None = None
-    errors: HeldOutErrors = UNKNOWN_ERRORS
-    excluded: Mapping[str, UpperBound] | None = None
-    remarks: tuple[str, ...] = ()
+    recalibration: Mapping[str, Recalibrated] = field(default_factory=dict)
+    errors: HeldOutErrors = field(default_factory=HeldOutErrors)
+    excluded: Mapping[str, UpperBound] = field(default_factory=dict)
+    remarks: tuple[Remark, ...] = ()
     not_fitted: tuple[NotFitted, ...] = ()
-    words: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     explanations: tuple[Explanation, ...] = ()
     account: Account = UNLIMITED
 
@@ -343,238 +378,36 @@ class Statement:
         """Whether random forces are all that is missing."""
         return [each.name for each in self.mechanisms] == [PROCESS_NOISE]
 
+    @property
+    def sentence(self) -> str:
+        """The verdict as a colleague would say it, with the numbers."""
+        from siq.report.diagnosis_text import sentence_of  # which stands above this module
+
+        return sentence_of(self)
+
     def as_data(self) -> dict[str, Any]:
-        """The content of ``verdict.json``; a number that is not finite is null."""
-        errors = asdict(self.errors)
-        del errors["squares"]
-        data = {
-            "verdict": str(self.verdict),
-            "sentence": self.sentence,
-            "mechanisms": [_mechanism_data(each) for each in self.mechanisms],
-            "description": None
-            if self.description is None
-            else asdict(self.description) | {"by": [_mechanism_data(each) for each in self.description.by]},
-            "described": [asdict(each) for each in self.described],
-            "location": None if self.location is None else self.location.as_data(),
-            "recalibration": {name: asdict(each) for name, each in (self.recalibration or {}).items()},
-            "fit": {"metric": METRIC, **errors},
-            "excluded": {label: asdict(each) for label, each in (self.excluded or {}).items()},
-            "remarks": list(self.remarks),
-            "not_fitted": [asdict(each) for each in self.not_fitted],
-            "explanations": [asdict(each) for each in self.explanations],
-            "partial": self.partial,
-            "not_tried": list(self.not_tried),
-            "budget": asdict(self.account),
-            "words": {about: list(lines) for about, lines in self.words.items()},
+        """The content of ``verdict.json``, sentences included; a number that is not finite is null."""
+        from siq.report.diagnosis_text import sentences_of  # which stands above this module
+
+        data: dict[str, Any] = to_jsonable_python(
+            self, inf_nan_mode="null", fallback=lambda value: value.item()
+        )
+        for each in (data["description"] or {}).get("by", ()):
+            del each["indistinguishable_from"]
+        data["fit"] = {"metric": METRIC} | data.pop("errors")
+        data |= {"partial": self.partial, "not_tried": list(self.not_tried), "budget": data.pop("account")}
+        data["remark_codes"] = data.pop("remarks")
+        sentences = sentences_of(self)
+        if self.location is not None:
+            data["location"]["sentence"] = sentences.pop("location")
+        return data | sentences
+
+    @classmethod
+    def from_data(cls, data: Mapping[str, Any]) -> Statement:
+        """The statement that `as_data` wrote."""
+        known = dict(data) | {
+            "errors": data["fit"],
+            "account": data["budget"] | {"allowed": data["budget"]["allowed"] or float("inf")},
+            "remarks": data["remark_codes"],
         }
-        plain: dict[str, Any] = _plain(data)
-        return plain
-
-
-def _mechanism_data(mechanism: StatedMechanism) -> dict[str, Any]:
-    data = asdict(mechanism)
-    if mechanism.indistinguishable_from is None:
-        del data["indistinguishable_from"]
-    return data
-
-
-def _plain(value: Any) -> Any:
-    """The same as JSON has it."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(each) for each in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
-NOTICED = 1.96  # standard errors beyond which a parameter counts as changed
-LOOKS_RANDOM = 2e-3  # the p-value below which a name is refused; siq.diagnosis.residual_structure.DOUBTFUL
-
-
-def sentence_of(statement: Statement, units: Mapping[str, str]) -> str:
-    """What the page opens with: the verdict, how large, and what it does to the held-out error.
-
-    Parameters
-    ----------
-    statement
-        All but its own sentence.
-    units
-        Of the simulation's own parameters, by name.
-    """
-    errors = statement.errors
-    if statement.verdict is MismatchVerdict.NO_MISMATCH:
-        return f"The simulation explains the recordings as it is. {as_it_is(errors)}".strip()
-    if statement.verdict is MismatchVerdict.PARAMETER_SHIFT:
-        said = shifted(statement.recalibration or {}, units)
-        gain = gained(errors, "before", "recalibrated", it="With the new values", them="them")
-        return (
-            f"The simulation's equations explain the recordings, but with other parameters: {said}. {gain}"
-        ).strip()
-    if statement.verdict is MismatchVerdict.UNEXPLAINED:
-        return f"{_unexplained(statement)} {_described(statement)}".strip()
-    if statement.random_forces:
-        return f"{_random_forces(statement.mechanisms[0])} {not_foreseen(errors)}".strip()
-    what = " and ".join(named(each) for each in statement.mechanisms)
-    they = len(statement.mechanisms) > 1
-    # What is credited to physics is only what neither the simulation as given nor other parameters can do.
-    gain = gained(
-        errors, "without", "named" if statement.described else "augmented",
-        it=f"With {'them' if they else 'it'}", them="them" if they else "it",
-    )  # fmt: skip
-    return f"The simulation lacks {what}. {gain} {_rest(statement)}".strip()
-
-
-def words_of(statement: Statement) -> dict[str, tuple[str, ...]]:
-    """The other sentences, by what they are about.
-
-    Returns
-    -------
-    dict
-        ``alternatives``: what cannot be told apart, and whether anything else would do. ``explained``: how
-        much of the difference is explained. ``left``: what that leaves.
-    """
-    description = statement.description
-    mechanisms = statement.mechanisms if description is None else description.by
-    return {
-        "alternatives": tuple(line for each in mechanisms for line in alternatives(each)),
-        "explained": explained(mechanisms),
-        "left": () if description is None else left_over(description),
-    }
-
-
-def explained(mechanisms: Sequence[StatedMechanism]) -> tuple[str, ...]:
-    """How much of the excess over noise mechanisms explain, all of them together."""
-    if not mechanisms or mechanisms[0].name == PROCESS_NOISE:
-        return ()
-    share = percent(mechanisms[0].share_of_excess)
-    who = capital(listed([each.label for each in mechanisms], "and"))
-    verb = "explains" if len(mechanisms) == 1 else "together explain"
-    return (f"{who} {verb} {share} of the difference that other parameters cannot explain.",)
-
-
-def left_over(description: Description) -> tuple[str, ...]:
-    """Why a mismatch has no name: what is left, and whether it looks like noise."""
-    p = description.p_residuals_random
-    lines = []
-    if description.by and description.misleading:
-        lines.append(
-            "It is not named: with it, recordings held out are foreseen worse than without, so that it stands"
-            " in for something else."
-        )
-    elif description.by and description.too_faint:
-        lines.append(
-            "It is not named, since a smooth function that the dictionary does not have is nearly as likely."
-        )
-    elif description.by and description.p_alike is not None:
-        lines.append(
-            "It is not named: of effects that have no name, mechanisms explain as much with a probability of"
-            f" {p_text(description.p_alike)}."
-        )
-    elif description.by:
-        lines.append("It is not named: what explains only a part may be standing in for something else.")
-    if p >= LOOKS_RANDOM:
-        lines.append(f"What is left looks like noise ({p_equation(p)}).")
-    else:
-        lines.append(
-            f"What is left is not noise: noise alone would look as structured with a probability of"
-            f" {p_text(p)} (the p-value)."
-        )
-    if description.random_forces_admitted:
-        lines.append("Random forces had to stand in for it in the fit.")
-    return tuple(lines)
-
-
-def shifted(recalibration: Mapping[str, Recalibrated], units: Mapping[str, str]) -> str:
-    """Which parameters differ from those on the card, the most certain first, with both values."""
-    changes = {
-        name: abs(each.after - each.before) / each.standard_error if each.standard_error > 0 else float("inf")
-        for name, each in recalibration.items()
-        if each.after != each.before
-    }
-    ranked = sorted(changes, key=lambda name: -changes[name])
-    if not ranked:
-        return "which of them cannot be said"
-    certain = [name for name in ranked if changes[name] > NOTICED]
-
-    def change(name: str) -> str:
-        each, unit = recalibration[name], units.get(name, "1")
-        after = value_text(each.after, each.standard_error, unit=unit)
-        return f"{name} is {after}, where the card has {_value(each.before)}"
-
-    if not certain:
-        return f"none of them stands out by itself, and most of all {change(ranked[0])}"
-    shown = "; ".join(change(name) for name in certain[: LISTED + 1])
-    more = len(certain) - LISTED - 1
-    return shown if more <= 0 else f"{shown}; and {more} more differ{'s' * (more == 1)}"
-
-
-def _rest(statement: Statement) -> str:
-    """What describes the rest that mechanisms with a name leave, and what that does to the held-out error."""
-    if not statement.described:
-        return ""
-    parts = listed([described_part(each) for each in statement.described], "and")
-    verb = "describe" if len(statement.described) > 1 else "describes"
-    # The names are what it is compared with, and not the simulation without them.
-    gain = gained(statement.errors, "named", "augmented", it="With that, too", them="that")
-    return f"What is left has no name; {parts} {verb} it. {gain}".strip()
-
-
-def _described(statement: Statement) -> str:
-    """What the model of something without a name does to the held-out error, or that nothing was gained."""
-    errors = statement.errors
-    if errors.noise_floor is None or statement.description is None:
-        return error_stays(errors)
-    if not statement.described:
-        return (
-            "Neither a mechanism nor a function of its coordinates improves the prediction of recordings"
-            f" held out, so that the simulation stays as it was. {error_stays(errors)}"
-        ).strip()
-    gain = gained(errors, "without", "augmented", it="With it", them="it")
-    named = {each.label for each in statement.description.by}
-    if all(each.label in named for each in statement.described):
-        return gain
-    what = " and ".join(described_part(each) for each in statement.described)
-    many = len(statement.described) > 1
-    return f"{capital(what)} {'describe' if many else 'describes'} it. {gain}".strip()
-
-
-def _random_forces(mechanism: StatedMechanism) -> str:
-    sizes = [
-        f"{value_text(entry.estimate, entry.standard_error, unit=entry.unit, digits=3)} on"
-        f" {name.removeprefix('intensity_')}"
-        for name, entry in mechanism.parameters.items()
-    ]
-    size = f", with an intensity of {listed(sizes, 'and')}" if sizes else ""
-    return f"The system is driven by random forces that the simulation does not have{size}."
-
-
-def _unexplained(statement: Statement) -> str:
-    description = statement.description
-    if statement.errors.noise_floor is None and description is None:
-        return statement.sentence
-    begin = "The recordings differ from the simulation by more than noise and wrong parameters"
-    if description is None or not description.by:
-        return f"{begin}, and no mechanism in the dictionary accounts for it."
-    what = " and ".join(placed(each) for each in description.by)
-    what += or_else(description.by[0]) if len(description.by) == 1 else ""
-    share = percent(description.share_described)
-    if description.misleading:
-        return f"{begin}. It looks like {what}, but recordings held out are foreseen worse with that."
-    if description.too_faint:
-        return f"{begin}. It looks like {what}, which is not certain enough to be named."
-    if description.share_described > 1 - SMALLEST_SHARE:
-        return (
-            f"{begin}. {capital(what)} would account for {share} of it, but not convincingly enough to be"
-            " named."
-        )
-    amount = "no part" if share == "none" else share
-    return (
-        f"{begin}, and nothing explains it fully. The best description is {what}: it covers {amount} of it."
-    )
-
-
-def _value(value: float) -> str:
-    text = f"{value:.6g}"
-    return number_text(value) if "e" in text else text.replace("-", "−")
+        return TypeAdapter(cls).validate_python({each.name: known[each.name] for each in fields(cls)})

@@ -1,18 +1,20 @@
-"""Studies of mismatch: which simulation, which recordings, which of them are held out."""
+"""study"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
+from pydantic.dataclasses import dataclass
 
 from siq.data.recordings import Recordings, read_recordings
 from siq.diagnosis.dictionary import Mechanism
-from siq.diagnosis.options import SearchOptions
 from siq.errors import InputError
 from siq.inference.budget import DEFAULT_SECONDS, DEFAULT_WORK
 from siq.inference.measurements import Measurements, columns_of, measurements
@@ -22,7 +24,74 @@ from siq.systems.dynamics import Dynamics
 if TYPE_CHECKING:
     import pandas as pd
 
-FEWEST = 8  # samples of a recording that something can be learned from
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class SearchOptions:
+    """What counts as found.
+
+    Attributes
+    ----------
+    false_alarms
+        Probability of a mechanism where none is missing, over all candidates together, for each test.
+    same
+        Candidates whose χ² is within this of the best are indistinguishable from it.
+    fitted
+        Most candidates that are fitted after each screening.
+    mechanisms
+        Most mechanisms that are looked for.
+    unnamed
+        Probability beforehand that what a simulation lacks is not in the dictionary.
+    wrong_names
+        Most probability of a name that is wrong, since something without a name looks alike. What is less
+        certain is detected, and described.
+    blocks
+        Least number of blocks into which recordings are cut for clustered errors, where there are fewer than
+        half as many recordings.
+    """
+
+    false_alarms: Annotated[float, Field(gt=0, lt=1)] = 0.002
+    same: Annotated[float, Field(gt=0)] = 10.0
+    fitted: Annotated[int, Field(ge=1)] = 6
+    mechanisms: Annotated[int, Field(ge=1, le=5)] = 3
+    unnamed: Annotated[float, Field(gt=0, lt=1)] = 0.1
+    wrong_names: Annotated[float, Field(gt=0, lt=0.5)] = 0.05
+    blocks: Annotated[int, Field(ge=4)] = 10
+
+    @property
+    def least_log_odds(self) -> float:
+        """Logarithm of the odds that a name takes."""
+        return math.log((1 - self.wrong_names) / self.wrong_names)
+
+    @property
+    def most_alike(self) -> float:
+        """Most probability that an effect without a name is explained as well, if a name is to stand.
+
+        By Bayes' rule: where something is left, either the name is right and something without a name is
+        missing beside it, (1 - unnamed) unnamed, or there is only the latter, and looks alike.
+        """
+        return math.exp(-self.least_log_odds) * (1 - self.unnamed)
+
+
+class MismatchVerdict(StrEnum):
+    """What a diagnosis ends with, as files have it."""
+
+    NO_MISMATCH = "no mismatch"
+    PARAMETER_SHIFT = "parameter shift"
+    MISSING_PHYSICS = "missing physics"
+    UNEXPLAINED = "unexplained"
+
+    @property
+    def mismatch(self) -> bool:
+        """Whether the equations differ from the system, whatever their parameters."""
+        return self in (MismatchVerdict.MISSING_PHYSICS, MismatchVerdict.UNEXPLAINED)
+
+    @property
+    def names(self) -> bool:
+        """Whether what is missing has a name."""
+        return self is MismatchVerdict.MISSING_PHYSICS
+
+
+MIN_SAMPLES = 8  # samples of a recording that something can be learned from
 
 
 class Allowance(BaseModel):
@@ -135,12 +204,12 @@ def measurements_of(recordings: Recordings | pd.DataFrame | str | Path, system: 
         fault, remedy = str(error).split("; ", 1)
         raise InputError(file, "", fault, remedy) from None
     lengths = np.diff(data.first)
-    if (lengths < FEWEST).any():
-        label = data.labels[int((lengths < FEWEST).argmax())]
+    if (lengths < MIN_SAMPLES).any():
+        label = data.labels[int((lengths < MIN_SAMPLES).argmax())]
         raise InputError(
             file,
             f"recording {label}",
-            f"it has fewer than {FEWEST} samples",
+            f"it has fewer than {MIN_SAMPLES} samples",
             "leave it out, or join recordings",
         )
     return data
@@ -239,8 +308,8 @@ def split(data: Measurements, study: MismatchStudy, *, file: str) -> tuple[Measu
 def _cut(data: Measurements, share: float) -> tuple[Measurements, Measurements]:
     """The first part of a single recording, and its last."""
     rows = len(data.t)
-    at = min(max(round((1 - share) * rows), FEWEST), rows - FEWEST)
-    if at < FEWEST:
+    at = min(max(round((1 - share) * rows), MIN_SAMPLES), rows - MIN_SAMPLES)
+    if at < MIN_SAMPLES:
         at = rows // 2
     first = data.until(np.array([at]))
     last = replace(data, first=np.array([0, rows - at]), t=data.t[at:], outputs=data.outputs[at:])

@@ -1,19 +1,4 @@
-"""Models of effects that have no name: smooth functions, powers and products, fitted and judged.
-
-What explains the recordings best as a whole describes them, be it a function or a mechanism that was found
-and is not certain enough for its name.
-
-Along the trajectories of a fit everything is linear. The likelihood of a smooth function, averaged over
-everything that it could be, tells its lengths and its size: one that is too rough could have been too much
-else, and one that is too smooth explains too little (MacKay, Neural Computation 4, 415 (1992)).
-
-What a fit leaves says how smooth a function is, along the trajectories of that fit. Those with the function
-are better, and say it better; so it is asked for again. Functions of two coordinates are fitted where they
-are likelier than the likeliest functions of one, along the trajectories of these.
-
-In the likeliest places (`siq.diagnosis.evidence`) a formula of a few powers and a smooth curve are fitted
-in earnest.
-"""
+"""unnamed_models"""
 
 from __future__ import annotations
 
@@ -25,52 +10,57 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import sympy
 
-from siq.diagnosis.dictionary import Roles
+from siq.diagnosis.dictionary import Form, FurtherState, Mechanism, MechanismParameter, Role, Roles, Shape
 from siq.diagnosis.evidence import (
-    FITTED,
-    LikelyPlace,
+    NUMERICAL_ERRORS,
+    TriedMechanism,
+    admissible,
     correlation_time_left,
-    evidences_by_size,
-    few_powers,
-    likely_places,
+    judged,
     log_evidence_of,
-    orthonormal,
 )
-from siq.diagnosis.function_sites import (
+from siq.diagnosis.mechanisms import MechanismCandidate, candidates_of
+from siq.diagnosis.residual_structure import something_left
+from siq.diagnosis.screening import Probe, Screened, screen_all, with_further_states
+from siq.diagnosis.search import Search, best_probes
+from siq.diagnosis.smooth_functions import (
+    MECHANISM,
+    Part,
+    Smooth,
+    Smoothness,
+    likeliest_product,
+    smooth_function,
+    smoothness_of,
+    with_smooth_function,
+)
+from siq.diagnosis.terms import (
     FORMULA,
-    NUMBERS,
+    FUNCTIONS_FITTED,
     Ground,
+    LikelyPlace,
     Place,
-    PlaceColumns,
     coordinates_of,
+    few_powers,
     ground_of,
     ground_of_two,
+    likely_places,
     simplest,
     with_formula,
 )
-from siq.diagnosis.mechanisms import MechanismCandidate
-from siq.diagnosis.residual_structure import SUBSTEPS, something_left
-from siq.diagnosis.screening import levels_of, probe_response, projected
-from siq.diagnosis.significance import UNFORESEEN, TriedMechanism, correlation_time_of, judged
-from siq.diagnosis.smooth_functions import (
-    ProductFunction,
-    Smooth,
-    SmoothFunction,
-    product_of,
-    smooth_function,
-    triangle_of,
-    with_smooth_function,
-)
 from siq.errors import NumericalFailure
 from siq.inference.budget import Budget, BudgetSpent
-from siq.inference.kalman_filter import Grid, Whitened, profile_likelihood, substeps_needed, whiten
+from siq.inference.kalman_filter import substeps_needed
 from siq.inference.maximum_likelihood import SUBSTEP_ERROR, Fit
 from siq.inference.measurements import Measurements
-from siq.inference.recalibration import better_of, fit_with_process_noise_as_needed
+from siq.inference.recalibration import (
+    better_of,
+    fit_with_and_without_process_noise,
+    fit_with_process_noise_as_needed,
+)
 from siq.inference.trajectories import UsualStates, fit_trajectories, free_run, normalised_rms
 from siq.systems.dynamics import Dynamics, symbol
 
-MECHANISM = "mechanism"
+LOGGER = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -86,7 +76,7 @@ class Material:
     degree
         Highest degree of formulas.
     blocks
-        For clustered errors; see `siq.diagnosis.significance.clustered_probability`.
+        For clustered errors; see `siq.diagnosis.evidence.clustered_probability`.
     considered
         How many mechanisms there are.
     budget
@@ -99,31 +89,6 @@ class Material:
     blocks: int
     considered: int
     budget: Budget = field(default_factory=Budget)
-
-
-@dataclass(frozen=True)
-class Part:
-    """A part of a description.
-
-    Attributes
-    ----------
-    trial
-        What was added, fitted and judged.
-    kind
-        ``formula``, ``curve``, ``surface``, or ``mechanism``.
-    cost
-        Logarithm of the number of places, or mechanisms, that it was chosen among.
-    place
-        Where a function stands; None for a mechanism or a memory.
-    smooth
-        What a curve or a surface is made of: the amplitudes are the heights of its bumps.
-    """
-
-    trial: TriedMechanism
-    kind: str
-    cost: float
-    place: Place | None = None
-    smooth: Smooth | None = None
 
 
 @dataclass(frozen=True)
@@ -194,7 +159,6 @@ def runs_freely(fit: Fit, alone: Fit, data: Measurements) -> bool:
     return one is not None and (other is None or one < other)
 
 
-LOGGER = logging.getLogger(__name__)
 LARGEST_PART = 0.25  # of the work left, that a single fit may take: a choice
 
 
@@ -235,14 +199,14 @@ def fitted_part(
     try:
         material.budget.says(f"a {kind}: {candidate.label}")
         with material.budget.part(LARGEST_PART):
-            trial = _fitted(candidate, level, begin or fit, fit, material)
-    except (*UNFORESEEN, BudgetSpent) as error:
+            trial = _fitted_term(candidate, level, begin or fit, fit, material)
+    except (*NUMERICAL_ERRORS, BudgetSpent) as error:
         LOGGER.info("%s as a %s cannot be fitted: %s", candidate.label, kind, error)
         return []
     return [Part(trial, kind, cost, place, smooth)]
 
 
-def _fitted(
+def _fitted_term(
     candidate: MechanismCandidate, level: float, begin: Fit, fit: Fit, material: Material
 ) -> TriedMechanism:
     """A function, fitted from a fit on, and judged against the fit without it.
@@ -282,204 +246,8 @@ def _fitted(
     return judged(trial, fit, data, candidate, blocks=material.blocks)
 
 
-SHARES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0)  # of the range; over twice of it a function is a parabola
-MOST_BUMPS = 100  # a guard on the time of a fit
-
-
-@dataclass(frozen=True)
-class Told:
-    """What a fit leaves says of a function's values, at a level of random forces.
-
-    Attributes
-    ----------
-    level
-        Relative to the random forces of the fit.
-    fine
-        The function, with bumps as narrow as any.
-    correlated
-        Correlation time τ of the innovations in samples, with such a function: n of them count as n/τ.
-    gram, overlap
-        Of what a unit of each bump does to the innovations, with each other and with the innovations; shapes
-        ``(b, b)`` and ``(b,)``. Over τ, as are those that follow.
-    total, freedom
-        Sum of squares of the innovations, and degrees of freedom.
-    likelihood
-        Logarithm, without the function.
-    """
-
-    level: float
-    fine: SmoothFunction
-    correlated: float
-    gram: np.ndarray
-    overlap: np.ndarray
-    total: float
-    freedom: float
-    likelihood: float
-
-    def over(self, correlated: float) -> Told:
-        """The same where so many samples hang together."""
-        return Told(
-            self.level, self.fine, correlated, self.gram / correlated, self.overlap / correlated,
-            self.total / correlated, self.freedom / correlated, self.likelihood / correlated,
-        )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Smoothness:
-    """How smooth a function is, as recordings tell it.
-
-    Attributes
-    ----------
-    shares
-        Its lengths, as shares of the ranges of its coordinates.
-    deviation
-        Its size.
-    told
-        What the recordings tell, at the level of random forces at which it is likeliest.
-    noise
-        Variance of the innovations then, in units of what the fit takes for it.
-    log_evidence
-        Logarithm of the odds for such a function, over none, each at its best level; averaged over all
-        lengths and sizes.
-    considered
-        How many lengths and sizes these are.
-    """
-
-    shares: tuple[float, ...]
-    deviation: float
-    told: Told
-    noise: float
-    log_evidence: float
-    considered: int
-
-
-def smoothness_of(
-    fit: Fit, data: Measurements, ground: Ground, *, known: Part | None = None, alike: bool = False
-) -> Smoothness | None:
-    """The likeliest smoothness of a function on top of a fit; None where it cannot be worked out.
-
-    Parameters
-    ----------
-    fit, data
-        The fit along whose trajectories everything is linear, and what it was made for.
-    ground
-        Where the function stands.
-    known
-        A part of the fit that is a first description of this function, in whose stead it comes.
-    alike
-        Whether both lengths are the same share of the range.
-    """
-    least, fine = _finest(ground, data, fit.model)
-    some = [share for share in SHARES if share >= least]
-    choices = [(each,) * len(ground.words) for each in some]
-    if not alike:
-        choices = list(itertools.product(some, repeat=len(ground.words)))
-    # What processes of these lengths have for values at the finest bumps, as heights of these.
-    shapes = [fine.heights_of(triangle_of(fine.centres, np.array(each) * ground.ranges)) for each in choices]
-    alone = -np.inf
-    values: list[np.ndarray] = []
-    highest, best = -np.inf, None
-    for told in _told(fit, data, fine, known):
-        alone = max(alone, told.likelihood)
-        for shares, shape in zip(choices, shapes, strict=True):
-            gained, scale, rest = evidences_by_size(
-                shape.T @ told.gram @ shape, shape.T @ told.overlap, told.total, freedom=told.freedom
-            )
-            values.append(told.likelihood + gained)
-            place = int(np.argmax(gained))
-            if values[-1][place] > highest:
-                # The scale of the noise was at its best, too, and the size is one in units of it.
-                highest, noise = values[-1][place], float(rest[place] / told.freedom)
-                deviation = float(np.sqrt(scale[place] * noise))
-                best = Smoothness(shares, deviation, told, noise, 0.0, len(gained) * len(choices))
-    if best is None or not best.deviation > 0:
-        return None
-    whole = np.concatenate(values)
-    mean = float(np.logaddexp.reduce(whole) - np.log(len(whole)))
-    return replace(best, log_evidence=mean - alone)
-
-
-def likeliest_product(asked: Smoothness, ground: Ground, *, times: float = 1.0) -> ProductFunction:
-    """The likeliest product of two functions, where a function of two coordinates is asked for.
-
-    Parameters
-    ----------
-    asked
-        What the recordings say of a function of both.
-    ground
-        Where it stands.
-    times
-        Factor on the lengths to choose among.
-    """
-    told = asked.told
-    by_value = told.fine.heights_of(told.fine.heights_of(told.gram).T)
-    return product_of(
-        ground,
-        tuple(times * share for share in SHARES),
-        points=told.fine.centres,
-        gram=(by_value + by_value.T) / (2 * asked.noise),
-        overlap=told.fine.heights_of(told.overlap) / asked.noise,
-        deviation=asked.deviation,
-        weight=told.correlated,
-    )
-
-
-def _told(fit: Fit, data: Measurements, fine: SmoothFunction, known: Part | None) -> list[Told]:
-    """What is told at each level of random forces at which it can be worked out.
-
-    Errors are as correlated as the likeliest level leaves them with such a function, at all levels.
-    """
-    grid = Grid(data, fit.substeps if known else min(fit.substeps, SUBSTEPS))
-    response = probe_response(fit.model, grid, fit, PlaceColumns(fit.model, grid, [fine]))
-    found: list[Told] = []
-    highest, correlated = -np.inf, 1.0
-    for level in levels_of(fit):
-        try:
-            white = whiten(response, data, fit.noise.scaled(level))
-            white, parameters = _without(white, fit, known)
-            left, columns = projected(white, parameters)
-        except UNFORESEEN as error:
-            LOGGER.info("no function of %s can be screened: %s", " and ".join(fine.ground.words), error)
-            continue
-        total, freedom = float(left @ left), white.degrees_of_freedom - parameters
-        likelihood = profile_likelihood(total, freedom, white.log_determinant)
-        found.append(
-            Told(level, fine, 1.0, columns.T @ columns, columns.T @ left, total, freedom, likelihood)
-        )
-        basis = orthonormal(columns)
-        rest = left - basis @ (basis.T @ left)
-        likelihood = profile_likelihood(float(rest @ rest), freedom, white.log_determinant)
-        if likelihood > highest:
-            highest = likelihood
-            correlated = correlation_time_of(rest, white.recording, outputs=len(fit.model.outputs))
-    return [each.over(correlated) for each in found]
-
-
-def _finest(ground: Ground, data: Measurements, model: Dynamics) -> tuple[float, SmoothFunction]:
-    """The shortest length, as a share of the range, of which the recordings need not too many bumps."""
-    room = NUMBERS // (len(data.t) * (model.dimension + len(model.outputs)))
-    most = max(min(MOST_BUMPS, room), 1)
-    for share in SHARES:
-        function = smooth_function(ground, (share,) * len(ground.words), most=most + 1)
-        if function.width <= most:
-            return share, function
-    return SHARES[-1], smooth_function(ground, (SHARES[-1],) * len(ground.words), most=most)
-
-
-def _without(white: Whitened, fit: Fit, known: Part | None) -> tuple[Whitened, int]:
-    """Innovations as if a part were not there, its columns left out, and the number of parameters left."""
-    names = [fit.model.parameters[place].name for place in fit.model.free]
-    amplitudes = () if known is None else known.trial.candidate.amplitudes
-    mine = [names.index(name) for name in amplitudes]
-    linear = mine if known is None or known.smooth is None else mine[: known.smooth.linear]
-    values = fit.model.values[[fit.model.free[place] for place in linear]]
-    others = np.delete(white.columns, mine, axis=1)
-    innovations = white.innovations + white.columns[:, linear] @ values
-    return replace(white, innovations=innovations, columns=others), len(names) - len(mine)
-
-
-ROUNDS = 4  # of fits, each along the trajectories of the one before: a choice
-WORTH = 1.0  # of a logarithm of odds, below which another round is not worth its time
+SMOOTH_ROUNDS = 4  # of fits, each along the trajectories of the one before: a choice
+LEAST_GAIN = 1.0  # of a logarithm of odds, below which another round is not worth its time
 
 
 def with_a_smooth_function(
@@ -514,7 +282,7 @@ def with_a_smooth_function(
         return []
     likeliest: Model | None = None
     current, known = (fit, None) if like is None else (like.fit, like.parts[-1])
-    for _ in range(ROUNDS):
+    for _ in range(SMOOTH_ROUNDS):
         here = ground.along(current.model, data, current.x)
         asked = _asked(current, data, here, known=known)
         if asked is None:
@@ -527,7 +295,7 @@ def with_a_smooth_function(
                 break
             try:
                 function = _function(asked, here, product=product, times=times)
-            except UNFORESEEN as error:
+            except NUMERICAL_ERRORS as error:
                 LOGGER.info("no function of %s can be worked out: %s", " and ".join(here.words), error)
                 break
             candidate = with_smooth_function(fit.model, function)
@@ -545,7 +313,7 @@ def with_a_smooth_function(
             new = {
                 each.fit is found.fit: each.log_evidence for each in weighed([likeliest, found], fit, data)
             }
-            if new[True] < new[False] + WORTH:
+            if new[True] < new[False] + LEAST_GAIN:
                 break
         likeliest, current, known = found, found.fit, parts[0]
     return [] if likeliest is None else [likeliest]
@@ -557,7 +325,7 @@ def _asked(
     """See `smoothness_of`; what is beyond all numbers ends a function, not a case."""
     try:
         return smoothness_of(fit, data, ground, known=known, alike=alike)
-    except UNFORESEEN as error:
+    except NUMERICAL_ERRORS as error:
         LOGGER.info("no function of %s can be worked out: %s", " and ".join(ground.words), error)
         return None
 
@@ -608,7 +376,7 @@ def with_surfaces(fit: Fit, models: Sequence[Model], material: Material) -> list
     ranked = sorted((each for each in asked if each[0] > cost), key=lambda each: -each[0])
     price = max((part.cost for model in models for part in model.parts), default=0.0) + cost
     found: list[Model] = []
-    for _, ground, like in ranked[:FITTED]:
+    for _, ground, like in ranked[:FUNCTIONS_FITTED]:
         for product in (True, False):
             some = with_a_smooth_function((), fit, ground, price, material, like=like, product=product)
             found += some
@@ -623,15 +391,15 @@ def _begins(fit: Fit, models: Sequence[Model], material: Material) -> list[tuple
     Where there are none, one of two may tell so little of either coordinate alone.
     """
     single = [each for each in models if len(each.parts) == 1]
-    known = [(each.parts[0].place, each) for each in single[:FITTED]]
+    known = [(each.parts[0].place, each) for each in single[:FUNCTIONS_FITTED]]
     found: list[tuple[Place, Model | None]] = [(place, each) for place, each in known if place is not None]
     if not single:
         try:
             likely = likely_places(fit, material.data, material.roles)
-        except UNFORESEEN as error:
+        except NUMERICAL_ERRORS as error:
             LOGGER.info("no function can be screened: %s", error)
             return []
-        found = [(each.place, None) for each in likely[:FITTED]]
+        found = [(each.place, None) for each in likely[:FUNCTIONS_FITTED]]
     # Not in a rotating frame, nor in a sensor.
     return [(place, model) for place, model in found if len(place.equations) == 1]
 
@@ -661,7 +429,7 @@ def with_a_function(before: tuple[Part, ...], fit: Fit, material: Material) -> l
     budget.says("comparing functions without a name")
     try:
         ranked = likely_places(fit, data, material.roles)
-    except UNFORESEEN as error:
+    except NUMERICAL_ERRORS as error:
         LOGGER.info("no function can be screened: %s", error)
         return []
     cost = float(np.log(max(len(ranked), 1)))  # a function is chosen among so many places
@@ -670,7 +438,9 @@ def with_a_function(before: tuple[Part, ...], fit: Fit, material: Material) -> l
         return []
     models = _formulas(before, fit, ranked, cost, material)
     alone = (each for each in ranked if len(each.place.words) == 1)
-    for likely in {id(each): each for each in (*ranked[:FITTED], *itertools.islice(alone, 1))}.values():
+    for likely in {
+        id(each): each for each in (*ranked[:FUNCTIONS_FITTED], *itertools.islice(alone, 1))
+    }.values():
         ground = ground_of(likely.place, fit.model, data, fit.x)
         models += with_a_smooth_function(before, fit, ground, cost, material)
     given = sum(part.cost for part in before)
@@ -691,7 +461,7 @@ def _formulas(
     single = {(each.place.targets, each.place.words): each.place.knots for each in ranked}
     done: set[frozenset[tuple[str, sympy.Expr]]] = set()
     models: list[Model] = []
-    for likely in ranked[:FITTED]:
+    for likely in ranked[:FUNCTIONS_FITTED]:
         terms = few_powers(likely, fit, material.data, degree=material.degree)
         if not terms:
             continue
@@ -709,3 +479,274 @@ def _formulas(
             models += [Model((*before, each), each.trial.fit) for each in parts]
         done.add(monomials)
     return models
+
+
+# Times τ that are tried, in units of the time in which the coordinate changes; the best of them is then
+# fitted. A much shorter memory cannot be told from none, nor a much longer one from a constant of each
+# recording.
+MEMORY_TIMES = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
+MEMORY_DAMPINGS = (0.1, 1.0)  # k of what rings, tried and then fitted: over many turns, and over hardly one
+MEMORIES_FITTED = 6  # memories that are fitted, the most promising ones: a choice
+
+
+def memory_suspected(models: Sequence[Model], data: Measurements) -> bool:
+    """Whether models leave room for a memory: all but a function of one coordinate that leaves nothing.
+
+    The time is no such coordinate, since nothing but the time itself knows it: what seems to depend on it may
+    have been brought about before.
+
+    Parameters
+    ----------
+    models
+        Of what has no name, the likeliest first.
+    data
+        The recordings.
+    """
+    if not models:
+        return True
+    best = models[0]
+    place = best.parts[0].place
+    told = len(best.parts) == 1 and place is not None and len(place.words) == 1 and place.words[0] != "t"
+    return not told or something_left(best.fit, data)
+
+
+def with_memories(fit: Fit, models: Sequence[Model], material: Material) -> list[Model]:
+    """Models with a hidden state that follows a coordinate late, or that it makes ring.
+
+    Parameters
+    ----------
+    fit
+        Of the simulation without them.
+    models
+        Others: the equations in which these have something come first, should work be scarce.
+    material
+        What models are made from.
+    """
+    likely = {name for each in models for part in each.parts for name in part.trial.candidate.equations}
+    candidates = sorted(
+        memories_of(fit.model, material.roles), key=lambda each: not likely & set(each.equations)
+    )
+    if not candidates:
+        return []
+    cost = float(np.log(len(candidates)))
+    # Nobody knows what was remembered when a recording began: what was there already, or nothing.
+    begun = [
+        each
+        for one in candidates
+        for each in (one, replace(one, begins=(sympy.Integer(0),) * len(one.begins)))
+    ]
+    with material.budget.part(LARGEST_PART):
+        screened, _ = screen_all(fit.model, material.data, fit, begun, budget=material.budget)
+    found: list[Model] = []
+    ranked = sorted(best_probes(screened).values(), key=lambda each: -each[1].gain)
+    for probe, result in ranked[:MEMORIES_FITTED]:
+        if result.gain < 2 * cost:
+            break
+        found += [
+            Model((part,), part.trial.fit) for part in _fitted_memory(probe, result, fit, cost, material)
+        ]
+    return found
+
+
+def _fitted_memory(probe: Probe, result: Screened, fit: Fit, cost: float, material: Material) -> list[Part]:
+    """A memory fitted from no effect on, with the τ that promises most."""
+    candidate, model = probe.candidate, probe.candidate.model
+    known = dict(probe.shapes)
+    values = [known.get(each.name, each.value) for each in model.parameters]
+    candidate = replace(candidate, model=model.with_values(np.array(values)))
+    try:
+        x = with_further_states(
+            probe, fit.model, material.data, fit.x, substeps=fit.substeps, values=fit.model.values
+        )
+    except NUMERICAL_ERRORS as error:
+        LOGGER.info("%s cannot be fitted: %s", candidate.label, error)
+        return []
+    begin = replace(fit, x=x)
+    parts = fitted_part(candidate, result.level, None, fit, cost, material, begin=begin)
+    for each in parts:
+        LOGGER.info("%s: chi2 better by %.1f", candidate.label, each.trial.delta_chi2)
+    return [each for each in parts if admissible(each.trial.fit, candidate)]
+
+
+def memories_of(model: Dynamics, roles: Roles) -> list[MechanismCandidate]:
+    """A memory of every coordinate in every equation that says more than a definition."""
+    what = Mechanism(name="memory", sentence="What is missing follows a coordinate late.", forms=MEMORY_FORMS)
+    return [_named(each) for each in candidates_of(model, roles, (what,))]
+
+
+def _named(candidate: MechanismCandidate) -> MechanismCandidate:
+    name = f"a memory of {candidate.coordinate}"
+    variant = f", {candidate.variant}" if candidate.variant else ""
+    return replace(candidate, name=name, label=f"{name} in {', '.join(candidate.equations)}{variant}")
+
+
+def _late(of: str) -> Shape:
+    return Shape(time_of=of, at=MEMORY_TIMES)
+
+
+def _memory_form(
+    roles: dict[str, Role],
+    of: str,
+    terms: dict[str, str],
+    unit: str,
+    variant: str = "",
+    *,
+    own_unit: str | None = None,
+    coordinate: str | None = None,
+) -> Form:
+    """A form in which z follows a coordinate, or a formula with a unit and a word, and acts with c."""
+    return Form(
+        roles=roles,
+        states={"z": FurtherState(equation=f"({of} - z)/tau", begin=of, unit=own_unit or of, scale=of)},
+        terms=terms,
+        parameters={
+            "c": MechanismParameter(unit=unit),
+            "tau": MechanismParameter(sign="positive", unit="T", shape=_late(of)),
+        },
+        coordinate=coordinate or of,
+        variant=variant,
+    )
+
+
+def _forms_of(roles: dict[str, Role], of: str) -> tuple[Form, ...]:
+    """What is remembered as a force, and as a rate at which the state grows; and what rings."""
+    ringing = Form(
+        roles=roles,
+        states={
+            "z": FurtherState(equation="y", begin=of, unit=of, scale=of),
+            "y": FurtherState(equation=f"({of} - z)/tau**2 - k*y/tau", unit=f"{of}/T", scale=of),
+        },
+        terms={"q": "c*z"},
+        parameters={
+            "c": MechanismParameter(unit=f"q/T/{of}"),
+            "tau": MechanismParameter(sign="positive", unit="T", shape=_late(of)),
+            "k": MechanismParameter(sign="positive", shape=Shape(scale_of="1", at=MEMORY_DAMPINGS)),
+        },
+        coordinate=of,
+        variant="that rings",
+    )
+    return (
+        _memory_form(roles, of, {"q": "c*z"}, f"q/T/{of}"),
+        _memory_form(roles, of, {"q": "c*z*q"}, f"1/T/{of}", "as a rate"),
+        ringing,
+    )
+
+
+def _intensity(terms: dict[str, str], variant: str) -> Form:
+    """In a rotating frame what is remembered is the intensity, which shifts the frequency, or damps."""
+    return _memory_form(
+        {"p": "amplitude", "q": "amplitude"}, "p**2 + q**2", terms, "1/T/p**2", variant,
+        own_unit="p**2", coordinate="amplitude",
+    )  # fmt: skip
+
+
+MEMORY_FORMS = (
+    *_forms_of({"q": "state"}, "q"),
+    *_forms_of({"x": "state", "q": "state"}, "x"),
+    *_forms_of({"x": "position", "q": "state"}, "x"),
+    *_forms_of({"x": "input", "q": "state"}, "x"),
+    _intensity({"p": "c*z*q", "q": "-c*z*p"}, "across the state"),
+    _intensity({"p": "c*z*p", "q": "c*z*q"}, "along the state"),
+)
+DESCRIBED_MOST = 2  # functions that are put on top of each other: more are no description
+
+
+def models_of_the_nameless(
+    search: Search, material: Material, *, functions: Sequence[Model] | None = None
+) -> tuple[Model, ...]:
+    """Models of what is missing, the likeliest first; none where none is likelier than the simulation alone.
+
+    Parameters
+    ----------
+    search
+        What was found; mechanisms among it are one of the models.
+    material
+        What models are made from.
+    functions
+        Those without mechanisms, where they are fitted already.
+    """
+    base, data = search.recalibrated, material.data
+    models = list(with_a_function((), base, material) if functions is None else functions)
+    if search.found and np.isfinite(search.fit.log_likelihood):
+        models.append(Model(parts_of(search, material.considered), search.fit))
+    models = weighed(models, base, data)
+    if functions is None:
+        models = weighed([*models, *with_surfaces(base, models, material)], base, data)
+        if memory_suspected(models, data):
+            models = weighed([*models, *with_memories(base, models, material)], base, data)
+    best = models[0] if models else None
+    if (
+        best is not None
+        and best.fit.model.dimension == base.model.dimension
+        and len(best.parts) < DESCRIBED_MOST
+        and (functions is None or best.parts[0].kind == MECHANISM)
+        and something_left(best.fit, data)
+    ):
+        models += with_a_function(best.parts, best.fit, material)
+    return likeliest(models, base, data)
+
+
+def models_beside_names(
+    named: Search, whole: Search, material: Material, *, functions: Sequence[Model] | None = None
+) -> tuple[Model, ...]:
+    """Models of what mechanisms with a name leave, the likeliest first; none where none is likelier.
+
+    They are what was found beside the names, not certain enough for one itself, and functions on top of all
+    that was found.
+
+    Parameters
+    ----------
+    named, whole
+        The search with what is named, and with all that was found.
+    material
+        What models are made from.
+    functions
+        Those on top of the names alone, where they are fitted already.
+    """
+    base, data = named.fit, material.data
+
+    def on_top(parts: tuple[Part, ...], fit: Fit) -> list[Model]:
+        if fit.model.dimension > named.recalibrated.model.dimension or not something_left(fit, data):
+            return []
+        return with_a_function(parts, fit, material)
+
+    models = list(functions or ())
+    parts = parts_of(whole, material.considered)[len(named.found) :]
+    fits = [each.best.fit for each in whole.found[len(named.found) :]]
+    models += [Model(parts[: place + 1], fit) for place, fit in enumerate(fits)]
+    if parts:
+        models += on_top(parts, whole.fit)
+    elif functions is None:
+        models += on_top((), base)
+    names = [each.best.candidate for each in named.found]
+    allowed = [
+        each
+        for each in models
+        if np.isfinite(each.fit.log_likelihood) and all(admissible(each.fit, name) for name in names)
+    ]
+    return likeliest(allowed, base, data)
+
+
+def parts_of(search: Search, considered: int) -> tuple[Part, ...]:
+    """The mechanisms of a search as parts of a model, each chosen among so many."""
+    cost = float(np.log(max(considered, 1)))
+    return tuple(Part(each.best, MECHANISM, cost) for each in search.found)
+
+
+def likeliest(models: Sequence[Model], alone: Fit, data: Measurements) -> tuple[Model, ...]:
+    """The few models that are likelier than the simulation without them, the likeliest first."""
+    likelier = (
+        each
+        for each in weighed(models, alone, data)
+        if each.log_evidence > 0 and runs_freely(each.fit, alone, data)
+    )
+    return tuple(_followed(each, data) for each in itertools.islice(likelier, FUNCTIONS_FITTED))
+
+
+def _followed(model: Model, data: Measurements) -> Model:
+    """A model with its estimates of least squares, where random forces are part of its fit."""
+    if not model.fit.has_process_noise:
+        return model
+    still = replace(model.fit, noise=model.fit.noise.without_process())
+    followed = fit_with_and_without_process_noise(model.fit.model, data, still)[1]
+    return replace(model, exact=followed) if followed.converged else model

@@ -1,54 +1,64 @@
-"""What is the verdict, with mechanisms and their evidence, place, fit and bounds?"""
+"""The verdict: from an investigation and the runs held out to the statement of a diagnosis.
+
+What is named, with parameters, errors, evidence and rivals; the model of what has no name; in which equation
+the mismatch sits, along which coordinate and where, in which recordings; bounds of what was not found.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
+import sympy
 
-from siq.diagnosis.dictionary import unit_of
-from siq.diagnosis.evidence import correlation_time_left, log_evidence_of
-from siq.diagnosis.held_out_fit import HeldOutRuns
-from siq.diagnosis.investigation import Investigation
-from siq.diagnosis.location import locate
+from siq.diagnosis.dictionary import Roles, unit_of, units_of
+from siq.diagnosis.evidence import BUDGET_SPENT, correlation_time_left, log_evidence_of
+from siq.diagnosis.investigation import HeldOutRuns, Investigation
 from siq.diagnosis.mechanisms import PROCESS_NOISE
-from siq.diagnosis.options import MismatchVerdict
-from siq.diagnosis.search import Found
-from siq.diagnosis.significance import BUDGET_SPENT, TriedMechanism
+from siq.diagnosis.residual_structure import Structure
+from siq.diagnosis.smooth_functions import CURVE, SURFACE, Part
 from siq.diagnosis.statement import (
+    DescribedCurve,
+    DescribedSurface,
     Description,
+    Estimate,
+    Evidence,
     Explanation,
+    Location,
     NotFitted,
     Recalibrated,
+    Rival,
+    StatedFunction,
+    StatedMechanism,
     Statement,
     UpperBound,
-    sentence_of,
-    stated_functions,
-    words_of,
 )
-from siq.diagnosis.wording import Estimate, Evidence, Rival, Standing, StatedMechanism
+from siq.diagnosis.study import MismatchVerdict
+from siq.diagnosis.unnamed_models import Model
+from siq.inference.kalman_filter import Noise, solve, whiten
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
+from siq.remarks import Remark
+from siq.systems.dynamics import symbol
+from siq.systems.formulas import compile_values
 
-NOT_INDEPENDENT = (
-    "There is one recording only. What is held out is its later part, which is no independent recording."
-)
-BOUND = 1.96  # standard errors on either side of an estimate within which 95 % lie
+COORDINATE = sympy.Symbol("coordinate", positive=True)  # positive, so that the root of its square is itself
+GRID_POINTS = 25  # places along either coordinate of a curve or surface, for its figure
+BOUND_ERRORS = 1.96  # standard errors on either side of an estimate within which 95 % lie
+VISIBLE_SHARE = 0.1  # of the largest value of a curve
+VISIBLE_ERRORS = 2.0  # standard errors beyond which a curve differs from zero
+NEARLY_ALL = 0.9  # of what the best coordinate, or a perfect description, would explain
+MOTION_SHARE = 0.75  # of what the time or an input explains, from which on it is rather a state
+AFFECTED_SHARE = 0.5  # of its fair share of the excess, from which on a recording counts as affected
 
 
 def statement_of_failure(reason: str) -> Statement:
-    """What is stated of a simulation that cannot be fitted to the recordings at all.
+    """The statement about a simulation that cannot be fitted to the recordings at all.
 
     Parameters
     ----------
     reason
         What happened, in lower case and without a full stop.
     """
-    return Statement(
-        MismatchVerdict.UNEXPLAINED,
-        "The simulation cannot be compared with the recordings: no fit of it to them has a result.",
-        remarks=(f"{reason[:1].upper()}{reason[1:]}.",),
-    )
+    return Statement(MismatchVerdict.UNEXPLAINED, remarks=(Remark("diagnosis.no_fit", {"reason": reason}),))
 
 
 def statement_of(investigation: Investigation, data: Measurements, shown: HeldOutRuns) -> Statement:
@@ -63,129 +73,58 @@ def statement_of(investigation: Investigation, data: Measurements, shown: HeldOu
     shown
         The fit on those held out.
     """
-    stated = Statement(
-        verdict=investigation.verdict,
-        sentence="",
-        mechanisms=mechanisms_of(investigation, shown.described_fit if shown.adopted else None),
-        description=description_of(investigation),
-        described=stated_functions(shown, beside=names_in(investigation)),
-        location=locate(investigation, data, shown.described if shown.adopted else None),
-        recalibration=recalibration_of(investigation, shown),
-        errors=shown.errors,
-        excluded={} if investigation.verdict.mismatch else excluded(investigation),
-        explanations=explanations_of(investigation, data),
-        remarks=(
-            *investigation.remarks,
-            *left_undone(investigation),
-            *(() if shown.independent else (NOT_INDEPENDENT,)),
+    search, verdict = investigation.search, investigation.verdict
+    described = shown.described if shown.adopted else None
+    described_fit = shown.described_fit if shown.adopted else None
+    found = _found_mechanisms(investigation, described_fit if verdict.names else None)
+    names = tuple(each.best.candidate.label for each in search.found) if verdict.names else ()
+    parts = () if described is None else described.parts
+    labels = [each.trial.candidate.label for each in parts]
+    final = investigation.final if described_fit is None else described_fit
+    errors = standard_errors(final)
+    remarks = list(investigation.remarks)
+    if investigation.account.partial:
+        untried = sum(each.reason == BUDGET_SPENT for each in search.untried)
+        stopped_by = investigation.account.stopped_by
+        remarks.append(Remark("diagnosis.partial", {"untried": untried, "stopped_by": stopped_by}))
+    if not shown.independent:
+        remarks.append(Remark("diagnosis.one_recording"))
+    return Statement(
+        verdict=verdict,
+        mechanisms=found if verdict.names else (),
+        description=Description(
+            share_described=investigation.share if found else 0.0,
+            by=found,
+            p_residuals_random=investigation.after.p_value,
+            random_forces_admitted=search.fit.has_process_noise,
+            too_faint=investigation.too_faint,
+            p_alike=None if investigation.naming is None else investigation.naming.p_alike,
+            misleading=investigation.withdrawn,
+        )
+        if verdict is MismatchVerdict.UNEXPLAINED
+        else None,
+        described=tuple(
+            _stated_function(part, described_fit, (*names, *labels[:place]))
+            for place, part in enumerate(parts)
+            if described_fit is not None
         ),
+        location=locate(investigation, data, described) if verdict.mismatch else None,
+        recalibration={
+            entry.name: Recalibrated(
+                entry.value, float(final.model.values[place]), errors[entry.name], entry.unit
+            )
+            for place, entry in enumerate(investigation.model.parameters)
+            if entry.name in errors
+        },
+        errors=shown.errors,
+        excluded={} if verdict.mismatch else _excluded(investigation),
+        explanations=_explanations(investigation, names, data),
+        remarks=tuple(remarks),
         not_fitted=tuple(
-            NotFitted(each.candidate.name, each.candidate.label, each.reason)
-            for each in investigation.search.untried
+            NotFitted(each.candidate.name, each.candidate.label, each.reason) for each in search.untried
         ),
         account=investigation.account,
     )
-    units = {entry.name: entry.unit for entry in investigation.model.parameters}
-    return replace(stated, sentence=sentence_of(stated, units), words=words_of(stated))
-
-
-def left_undone(investigation: Investigation) -> tuple[str, ...]:
-    """The sentence that says that an answer is partial, where it is."""
-    if not investigation.account.partial:
-        return ()
-    left = sum(each.reason == BUDGET_SPENT for each in investigation.search.untried)
-    what = f"{left} candidates were not tried" if left > 1 else "one candidate was not tried"
-    if not left:
-        what = "further mechanisms were not looked for"
-    which = "work" if investigation.account.stopped_by == "work" else "time"
-    return (
-        f"This answer is partial: the {which} allowed for the case was spent, and {what}."
-        " A larger budget in the study tries the rest.",
-    )
-
-
-def mechanisms_of(investigation: Investigation, card: Fit | None = None) -> tuple[StatedMechanism, ...]:
-    """What is named, each with its evidence.
-
-    Parameters
-    ----------
-    investigation
-        What was found.
-    card
-        The fit whose estimates the new card has, where something without a name describes what names leave.
-    """
-    if investigation.verdict is not MismatchVerdict.MISSING_PHYSICS:
-        return ()
-    if investigation.process_noise:
-        return (_process_noise(investigation),)
-    return tuple(
-        replace(
-            stated,
-            indistinguishable_from=tuple(
-                sorted({each.name for each in stated.rivals if each.standing == "same"} - {stated.name})
-            ),
-        )
-        for stated in _all_stated(investigation, card)
-    )
-
-
-def explanations_of(investigation: Investigation, data: Measurements) -> tuple[Explanation, ...]:
-    """Whole explanations with their evidence: parameters, with forces, with mechanisms, with functions."""
-    search = investigation.search
-    fits = [("other parameters", investigation.least_squares), ("other parameters", search.recalibrated)]
-    if search.found:
-        fits.append((" and ".join(each.best.candidate.label for each in search.found), search.fit))
-    names = names_in(investigation)
-    fits += [
-        (" and ".join((*names, *(part.trial.candidate.label for part in model.parts))), model.fit)
-        for model in investigation.models
-    ]
-    found: dict[str, float] = {}
-    correlated = correlation_time_left([fit for _, fit in fits], data)
-    for what, fit in fits:
-        if np.isfinite(fit.log_likelihood):
-            forces = " and random forces" if fit.has_process_noise else ""
-            found[f"{what}{forces}"] = log_evidence_of(fit, data, correlated=correlated)
-    best = max(found.values(), default=0.0)
-    ranked = sorted(found.items(), key=lambda each: -each[1])
-    return tuple(Explanation(what, value - best) for what, value in ranked)
-
-
-def names_in(investigation: Investigation) -> tuple[str, ...]:
-    """Labels of the mechanisms that have a name, on top of which models of the rest are."""
-    if investigation.verdict is not MismatchVerdict.MISSING_PHYSICS:
-        return ()
-    return tuple(each.best.candidate.label for each in investigation.search.found)
-
-
-def description_of(investigation: Investigation) -> Description | None:
-    """What is known of a mismatch that has no name."""
-    if investigation.verdict is not MismatchVerdict.UNEXPLAINED:
-        return None
-    search = investigation.search
-    trials = _all_stated(investigation)
-    return Description(
-        share_described=investigation.share if trials else 0.0,
-        by=trials,
-        p_residuals_random=investigation.after.p_value,
-        random_forces_admitted=search.fit.has_process_noise,
-        too_faint=investigation.too_faint,
-        p_alike=None if investigation.naming is None else investigation.naming.p_alike,
-        misleading=investigation.withdrawn,
-    )
-
-
-def recalibration_of(investigation: Investigation, shown: HeldOutRuns) -> dict[str, Recalibrated]:
-    """The simulation's own parameters: on the card, and in the simulation that the verdict ends with."""
-    fit = investigation.final
-    if shown.described_fit is not None and shown.adopted:
-        fit = shown.described_fit
-    errors = standard_errors(fit)
-    return {
-        entry.name: Recalibrated(entry.value, float(fit.model.values[place]), errors[entry.name])
-        for place, entry in enumerate(investigation.model.parameters)
-        if entry.name in errors
-    }
 
 
 def standard_errors(fit: Fit) -> dict[str, float]:
@@ -194,89 +133,282 @@ def standard_errors(fit: Fit) -> dict[str, float]:
     return dict(zip(names, map(float, fit.standard_errors), strict=True))
 
 
-def excluded(investigation: Investigation) -> dict[str, UpperBound]:
+def _explanations(
+    investigation: Investigation, names: tuple[str, ...], data: Measurements
+) -> tuple[Explanation, ...]:
+    """Whole explanations with their evidence: parameters, with forces, with mechanisms, with functions."""
+    search = investigation.search
+    fits = [("other parameters", investigation.least_squares), ("other parameters", search.recalibrated)]
+    if search.found:
+        fits.append((" and ".join(each.best.candidate.label for each in search.found), search.fit))
+    fits += [
+        (" and ".join((*names, *(part.trial.candidate.label for part in model.parts))), model.fit)
+        for model in investigation.models
+    ]
+    evidence: dict[str, float] = {}
+    correlated = correlation_time_left([fit for _, fit in fits], data)
+    for what, fit in fits:
+        if np.isfinite(fit.log_likelihood):
+            forces = " and random forces" if fit.has_process_noise else ""
+            evidence[f"{what}{forces}"] = log_evidence_of(fit, data, correlated=correlated)
+    best = max(evidence.values(), default=0.0)
+    ranked = sorted(evidence.items(), key=lambda each: -each[1])
+    return tuple(Explanation(what, value - best) for what, value in ranked)
+
+
+def _excluded(investigation: Investigation) -> dict[str, UpperBound]:
     """Upper bounds (95 %) of the amplitudes of mechanisms that were not found."""
     bounds: dict[str, UpperBound] = {}
     for probe, result in investigation.search.screened:
         candidate = probe.candidate
+        units = {each.name: each.unit for each in candidate.model.parameters}
         for name, estimate, error in zip(
             candidate.amplitudes, result.amplitudes, result.standard_errors, strict=False
         ):
-            bound = abs(float(estimate)) + BOUND * float(error)
-            unit = next(p.unit for p in candidate.model.parameters if p.name == name)
+            bound = abs(float(estimate)) + BOUND_ERRORS * float(error)
             known = bounds.get(candidate.label)
             if np.isfinite(bound) and error > 0 and (known is None or bound > known.upper_bound_95):
-                bounds[candidate.label] = UpperBound(bound, unit, name, candidate.label)
+                bounds[candidate.label] = UpperBound(bound, units[name], name, candidate.label)
     return dict(sorted(bounds.items()))
 
 
-def _all_stated(investigation: Investigation, card: Fit | None = None) -> tuple[StatedMechanism, ...]:
-    """Every mechanism that was found, whether it is named or only describes."""
+def _found_mechanisms(investigation: Investigation, card: Fit | None) -> tuple[StatedMechanism, ...]:
+    """Every mechanism that was found, whether it is named or only describes; the estimates are the card's."""
     search = investigation.search
+    if investigation.process_noise:
+        fit = search.fit
+        entries = zip(fit.model.states, fit.model.units, fit.noise.process, strict=True)
+        driven = [entry for entry in entries if entry[2] > 0]
+        return (
+            StatedMechanism(
+                name=PROCESS_NOISE,
+                label=PROCESS_NOISE,
+                terms={},
+                parameters={
+                    f"intensity_{name}": Estimate(
+                        float(value), None, unit_of("_x**2/_t", {"_x": unit, "_t": fit.model.time_unit})
+                    )
+                    for name, unit, value in driven
+                },
+                evidence=Evidence(None, None, None, None),
+                share_of_excess=1.0,
+                indistinguishable_from=(),
+                equations=tuple(name for name, _, _ in driven),
+            ),
+        )
     labels = [each.best.candidate.label for each in search.found]
     log_odds = investigation.naming.log_odds if investigation.naming is not None else ()
-    return tuple(
-        _stated(each, card or search.fit, investigation.share, tuple(labels[:place]), odds)
-        for place, (each, odds) in enumerate(zip(search.found, log_odds, strict=True))
-    )
-
-
-def _stated(
-    found: Found, final: Fit, share: float, beside: tuple[str, ...], log_odds: float
-) -> StatedMechanism:
-    trial, candidate = found.best, found.best.candidate
-    standings: tuple[tuple[Standing, tuple[TriedMechanism, ...]], ...] = (
-        ("same", found.indistinguishable),
-        ("needless", found.needless),
-        ("less", found.lesser),
-    )
-    rivals = [
-        Rival(
-            other.candidate.name,
-            other.candidate.label,
-            other.delta_chi2,
-            len(other.candidate.new) - len(candidate.new),
-            standing,
+    final = search.fit if card is None else card
+    errors, known = standard_errors(final), {entry.name: entry for entry in final.model.parameters}
+    stated = []
+    for place, (found, odds) in enumerate(zip(search.found, log_odds, strict=True)):
+        trial, candidate = found.best, found.best.candidate
+        rivals = [
+            Rival(
+                other.candidate.name,
+                other.candidate.label,
+                other.delta_chi2,
+                len(other.candidate.new) - len(candidate.new),
+                standing,
+            )
+            for standing, others in found.standings.items()
+            for other in others
+        ]
+        alike = {each.name for each in rivals if each.standing == "same"} - {candidate.name}
+        stated.append(
+            StatedMechanism(
+                name=candidate.name,
+                label=candidate.label,
+                terms={name: str(formula) for name, formula in candidate.changes},
+                parameters={
+                    name: Estimate(known[name].value, errors.get(name), known[name].unit)
+                    for name in candidate.new
+                    if name in known
+                },
+                evidence=Evidence(trial.delta_chi2, trial.delta_bic, trial.p_white, trial.p_cluster, odds),
+                share_of_excess=investigation.share,
+                indistinguishable_from=tuple(sorted(alike)) if investigation.verdict.names else None,
+                equations=candidate.equations,
+                beside=tuple(labels[:place]),
+                rivals=tuple(sorted(rivals, key=lambda each: -each.delta_chi2)),
+            )
         )
-        for standing, others in standings
-        for other in others
-    ]
-    errors = standard_errors(final)
-    known = {entry.name: entry for entry in final.model.parameters}
-    return StatedMechanism(
+    return tuple(stated)
+
+
+def _stated_function(part: Part, fit: Fit, beside: tuple[str, ...]) -> StatedFunction:
+    """A part of the model of what has no name, with its curve or surface and their standard errors."""
+    trial, candidate, place, smooth = part.trial, part.trial.candidate, part.place, part.smooth
+    errors, known = standard_errors(fit), {entry.name: entry for entry in fit.model.parameters}
+    free = list(errors)
+    changed = [name for name, _ in candidate.changes]
+
+    def along(weights: np.ndarray) -> np.ndarray:
+        """Standard errors of weighted sums ``(k, c)`` of the amplitudes, shape ``(k,)``."""
+        rows = [free.index(name) for name in candidate.amplitudes]
+        variances = np.einsum("kc,cd,kd->k", weights, fit.covariance[np.ix_(rows, rows)], weights)
+        return np.sqrt(np.maximum(variances, 0.0))
+
+    curve = surface = None
+    if place is not None and part.kind != SURFACE and (part.kind == CURVE or len(place.words) == 1):
+        amplitudes = np.array([known[name].value for name in candidate.amplitudes])
+        if smooth is not None:
+            lower, upper = smooth.limits[:, 0]
+            knots = np.linspace(lower, upper, GRID_POINTS)
+            values, weights = smooth.along(amplitudes, knots[None])
+        else:  # of a formula: what a unit of each coefficient is at the knots
+            knots = place.knots
+            name, formula = candidate.changes[0]
+            factor = dict((*place.equations, *place.outputs))[name]
+            columns = []
+            for amplitude in candidate.amplitudes:
+                term = in_coordinate(formula.diff(symbol(amplitude)) / factor, place.coordinate)
+                value = compile_values([term], [COORDINATE], common=False)(knots)[0]
+                columns.append(np.broadcast_to(np.asarray(value, dtype=float), knots.shape))
+            weights = np.stack(columns, axis=1)
+            values = weights @ amplitudes
+        curve = DescribedCurve(
+            place.words[0], tuple(knots.tolist()), tuple(values.tolist()), tuple(along(weights).tolist())
+        )
+    elif smooth is not None and part.kind == SURFACE:
+        amplitudes = np.array([known[name].value for name in candidate.amplitudes])
+        at = [np.linspace(lower, upper, GRID_POINTS) for lower, upper in smooth.limits.T]
+        courses = np.stack([each.ravel() for each in np.meshgrid(*at, indexing="ij")])
+        values, weights = smooth.along(amplitudes, courses)
+        rows = [
+            tuple(map(tuple, each.reshape(GRID_POINTS, GRID_POINTS).tolist()))
+            for each in (values, along(weights))
+        ]
+        words = smooth.ground.words
+        surface = DescribedSurface(
+            (words[0], words[1]), (tuple(at[0].tolist()), tuple(at[1].tolist())), rows[0], rows[1]
+        )
+    return StatedFunction(
         name=candidate.name,
         label=candidate.label,
+        kind=part.kind,
         terms={name: str(formula) for name, formula in candidate.changes},
         parameters={
-            name: Estimate(known[name].value, errors.get(name), known[name].unit)
-            for name in candidate.new
-            if name in known
+            name: Estimate(known[name].value, errors.get(name), known[name].unit) for name in candidate.new
         },
-        evidence=Evidence(trial.delta_chi2, trial.delta_bic, trial.p_white, trial.p_cluster, log_odds),
-        share_of_excess=share,
+        evidence=Evidence(trial.delta_chi2, trial.delta_bic, trial.p_white, trial.p_cluster),
         equations=candidate.equations,
+        outputs=()
+        if candidate.equations
+        else tuple(name for name in changed if name in fit.model.output_names),
+        coordinates=tuple(candidate.coordinate.split(", ")) if place is None else place.words,
+        curve=curve,
+        surface=surface,
         beside=beside,
-        rivals=tuple(sorted(rivals, key=lambda each: -each.delta_chi2)),
     )
 
 
-def _process_noise(investigation: Investigation) -> StatedMechanism:
-    fit = investigation.search.fit
-    return StatedMechanism(
-        name=PROCESS_NOISE,
-        label=PROCESS_NOISE,
-        terms={},
-        parameters={
-            f"intensity_{name}": Estimate(
-                float(value), None, unit_of("_x**2/_t", {"_x": unit, "_t": fit.model.time_unit})
-            )
-            for name, unit, value in zip(fit.model.states, fit.model.units, fit.noise.process, strict=True)
-            if value > 0
-        },
-        evidence=Evidence(None, None, None, None),
-        share_of_excess=1.0,
-        indistinguishable_from=(),
-        equations=tuple(
-            name for name, value in zip(fit.model.states, fit.noise.process, strict=False) if value > 0
+def in_coordinate(term: sympy.Expr, coordinate: sympy.Expr) -> sympy.Expr:
+    """A formula in `COORDINATE`, in the place of the formula that the coordinate is.
+
+    The square of ``sqrt(P**2 + Q**2)`` has no root in it, so that what stands under the root is replaced.
+    """
+    if isinstance(coordinate, sympy.Pow) and coordinate.exp == sympy.Rational(1, 2):
+        return term.subs(coordinate.base, COORDINATE**2)
+    return term.subs(coordinate, COORDINATE)
+
+
+def locate(investigation: Investigation, data: Measurements, described: Model | None = None) -> Location:
+    """In which equation a mismatch sits, along which coordinate and where, and in which recordings.
+
+    What has no name is where the model of it stands. Where nothing describes it, it is sought in all
+    equations by what they leave unexplained.
+
+    Parameters
+    ----------
+    investigation
+        What was found.
+    data
+        The recordings that it was found in.
+    described
+        The model of it that is part of the new card; by default the likeliest one, if there is any.
+    """
+    curves, search = investigation.before.curves, investigation.search
+    candidate, outputs = None, tuple[str, ...]()
+    if investigation.verdict.names and search.found:
+        candidate = search.found[0].best.candidate
+    elif not investigation.verdict.names and (model := described or next(iter(investigation.models), None)):
+        candidate = model.parts[0].trial.candidate
+    if candidate is not None:
+        equations, coordinate = candidate.equations, candidate.coordinate
+        if not equations:  # it changes nothing but what sensors read
+            measured = set(candidate.model.output_names)
+            outputs = tuple(name for name, _ in candidate.changes if name in measured)
+    elif curves:
+        equations, coordinate = most_telling(investigation.before, investigation.roles)
+    else:
+        equations, coordinate = (), "unknown"
+    curve = next(
+        (
+            each
+            for each in curves
+            if each.direction.coordinate == coordinate and set(each.direction.equations) & set(equations)
         ),
+        None,
     )
+    if investigation.process_noise:
+        driven = zip(investigation.model.states, search.fit.noise.process, strict=False)
+        equations, coordinate, curve = tuple(name for name, q in driven if q > 0), "random", None
+    region = {}
+    if curve is not None:  # where the missing part is seen beyond its error
+        size, knots = np.abs(curve.values), curve.direction.knots
+        seen = (size > VISIBLE_ERRORS * curve.standard_errors) & (size > VISIBLE_SHARE * size.max())
+        knots = knots[seen] if seen.any() else knots
+        region = {curve.direction.coordinate: (float(knots.min()), float(knots.max()))}
+    # What any one equation could explain, as a share of the excess over noise.
+    gains: dict[str, float] = {}
+    for each in curves:
+        for name in each.direction.equations:
+            gains[name] = max(gains.get(name, 0.0), each.gain)
+    total = max(investigation.before.total - investigation.before.freedom, 1e-300)
+    # Recordings whose residuals, process noise not admitted, exceed noise by a fair share of the excess.
+    recalibrated = search.recalibrated
+    still = Noise(search.fit.noise.measurement, np.zeros(recalibrated.model.dimension))
+    white = whiten(recalibrated.linearisation, data, still)
+    change, _ = solve(white.columns, white.innovations)
+    left = white.innovations - white.columns @ change
+    counts = np.bincount(white.recording, white.known, minlength=len(data.labels))
+    excess = np.maximum(np.bincount(white.recording, left**2, minlength=len(data.labels)) - counts, 0.0)
+    affected = data.labels
+    if excess.sum() > 0:
+        shares = excess / excess.sum(), AFFECTED_SHARE * (counts / counts.sum())
+        affected = tuple(label for label, own, fair in zip(data.labels, *shares, strict=True) if own > fair)
+    return Location(
+        equations={name: float(min(max(gains.get(name, 0.0) / total, 0.0), 1.0)) for name in equations},
+        coordinate=coordinate,
+        region=region,
+        time=(float(data.t.min()), float(data.t.max())) if coordinate == "t" else None,
+        recordings=affected,
+        recordings_total=len(data.labels),
+        outputs=outputs,
+        unit=units_of(investigation.model).get(coordinate, "1"),
+    )
+
+
+def most_telling(structure: Structure, roles: Roles) -> tuple[tuple[str, ...], str]:
+    """The equation in which something is missing, and the coordinate along which it shows best.
+
+    Where its own motion tells nearly as much as that of others, it is its own; and where any motion tells
+    most of what the time or an input tells, it is the motion, since these move a system, too. Where no
+    coordinate tells nearly all, a force depends on the course of the motion, position and velocity both.
+    """
+    best = structure.curves[0]
+    equations, coordinate = best.direction.equations, best.direction.coordinate
+    own = next((pair for pair in roles.motions if pair[1] in equations), equations)
+    if coordinate in (*own, "amplitude"):
+        return equations, coordinate
+    motion = {*roles.states, *(name for pair in roles.motions for name in pair), "amplitude"}
+    rivals, share = (own, NEARLY_ALL) if coordinate in motion else (motion, MOTION_SHARE)
+    for curve in structure.curves:
+        there = set(equations) <= set(curve.direction.equations)
+        if there and curve.direction.coordinate in rivals and curve.gain >= share * best.gain:
+            return curve.direction.equations, curve.direction.coordinate
+    excess = structure.total - structure.freedom
+    if len(own) > len(equations) and best.gain < NEARLY_ALL * excess:
+        return equations, ", ".join(own)
+    return equations, coordinate

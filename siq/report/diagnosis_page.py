@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from html import escape
 
-from siq.diagnosis.statement import METRIC, Statement
-from siq.diagnosis.wording import Estimate, StatedFunction, StatedMechanism
+from siq.diagnosis.statement import METRIC, Estimate, StatedFunction, StatedMechanism, Statement
 from siq.numerics.text import p_text, value_text
 from siq.report.diagnosis_sections import Findings, answer, badge, numbers, picture, sections
+from siq.report.diagnosis_text import location_sentence, words_of
 from siq.report.page import ReportContent, render_report
+from siq.report.remarks import sentence
 from siq.systems.dynamics import Dynamics
 
 
@@ -61,11 +62,11 @@ def _sections(statement: Statement, system: Dynamics) -> list[Section]:
     """Every section that has something to say."""
     closest = () if statement.description is None else statement.description.by
     found = [
-        (f"Verdict: {statement.verdict}", [statement.sentence, *statement.remarks]),
+        (f"Verdict: {statement.verdict}", [statement.sentence, *map(sentence, statement.remarks)]),
         ("Mechanisms", [line for each in statement.mechanisms for line in _mechanism(each)]),
         ("What comes closest", [line for each in closest for line in _mechanism(each)]),
         ("A model of it", [line for each in statement.described for line in _mechanism(each)]),
-        ("How sure it is", [line for lines in statement.words.values() for line in lines]),
+        ("How sure it is", [line for lines in words_of(statement).values() for line in lines]),
         ("Location", _location(statement)),
         ("Parameters", _parameters(statement, system)),
         (f"Error ({METRIC})", _errors(statement)),
@@ -106,7 +107,7 @@ def _location(statement: Statement) -> list[str]:
     if place is None:
         return []
     some = 0 < len(place.recordings) < place.recordings_total
-    return [place.sentence, *([f"recordings: {', '.join(place.recordings)}"] if some else [])]
+    return [location_sentence(place), *([f"recordings: {', '.join(place.recordings)}"] if some else [])]
 
 
 def _parameters(statement: Statement, system: Dynamics) -> list[str]:

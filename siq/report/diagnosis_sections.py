@@ -47,7 +47,7 @@ class Findings:
         SVG files by the names of `CAPTIONS`, as far as there was something to
         draw.
     wells, escape, notes
-        See `siq.diagnosis.consequences.Consequences`.
+        See `workflow.consequences.Consequences`.
     scores
         Columns ``simulation score output rms unit published``, of public benchmarks only.
     held_out
@@ -107,7 +107,7 @@ def mechanisms_said(findings: Findings) -> list[Mapping[str, Any]]:
 
 
 def described(findings: Findings) -> list[Mapping[str, Any]]:
-    """The model of what has no name; see `siq.diagnosis.wording.StatedFunction`."""
+    """The model of what has no name; see `siq.diagnosis.statement.StatedFunction`."""
     return list(findings.verdict.get("described") or [])
 
 

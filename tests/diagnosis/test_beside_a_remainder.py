@@ -11,11 +11,9 @@ import pytest
 
 from siq.data.recordings import Recordings
 from siq.diagnosis import naming
-from siq.diagnosis.evidence import Missing
-from siq.diagnosis.held_out_fit import first_better
-from siq.diagnosis.holdout import errors_left_out, parts_left_out
-from siq.diagnosis.naming import beside_a_remainder
-from siq.diagnosis.significance import correlation_time_of
+from siq.diagnosis.evidence import correlation_time_of
+from siq.diagnosis.holdout import errors_left_out, first_better, parts_left_out
+from siq.diagnosis.naming import MissingEffect, residual_model_comparison
 from siq.diagnosis.unnamed_models import Material, Model, runs_freely
 from siq.inference.kalman_filter import Whitened
 from siq.inference.measurements import Measurements, measurements
@@ -73,7 +71,7 @@ def test_evidence_counts_errors_that_hang_together_as_one() -> None:
             model=SimpleNamespace(free=(0, 1), parameters=parameters, values=values, outputs=("x",))
         )
         cubic = SimpleNamespace(amplitudes=("c",), shapes=())
-        return Missing(white, fit, [cubic]).log_evidence_of_mechanisms()
+        return MissingEffect(white, fit, [cubic]).log_evidence_of_mechanisms()
 
     alone, repeated = evidence(1), evidence(10)
     assert alone > 2
@@ -130,7 +128,9 @@ def test_a_name_stands_beside_a_rest_where_no_function_does_as_well_in_its_place
     monkeypatch.setattr(naming, "log_evidence_of", lambda fit, *_, **__: fit.evidence)
     material = SimpleNamespace(data=None)
     considered = [SimpleNamespace(name=name) for name in ("overflow", "overflow", "leak")]
-    found = beside_a_remainder(trial_of(own), base, material, considered=considered, unnamed=0.1, least=2.9)
+    found = residual_model_comparison(
+        trial_of(own), base, material, considered=considered, unnamed=0.1, least=2.9
+    )
     # Each function costs what it was chosen among, and the probability that something has no name.
     cost = 1.0 + np.log(10)
     best = max(on_top - cost if on_top else 0.0, 12.0)
@@ -139,14 +139,16 @@ def test_a_name_stands_beside_a_rest_where_no_function_does_as_well_in_its_place
     assert bool(found.log_odds >= np.log(19)) is given
     undecided = abs(found.log_odds) < 2.9
     # Functions on top of the mechanism foresee as badly as those in its place here.
-    assert found.foresees is (undecided and foreseen == 0.5)
+    assert found.predicts_better is (undecided and foreseen == 0.5)
 
 
 def test_what_random_forces_stand_in_for_has_no_model_beside_which_a_name_could_stand() -> None:
     material = Material(SimpleNamespace(), SimpleNamespace(), 3, 10, 5)
     for fit in (fit_of(50.0, forces=True), fit_of(50.0, dimension=2)):
         assert (
-            beside_a_remainder(trial_of(fit), fit_of(0.0), material, considered=(), unnamed=0.1, least=2.9)
+            residual_model_comparison(
+                trial_of(fit), fit_of(0.0), material, considered=(), unnamed=0.1, least=2.9
+            )
             is None
         )
 

@@ -12,24 +12,25 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
-from tests.diagnosis.foreign_cases import falling_ball
 
-from siq.diagnosis import held_out_fit, investigation, search
+from siq.diagnosis import holdout, investigation, search
 from siq.diagnosis.diagnosis import Diagnosis, anything_else, solve_case, withdrawn
 from siq.diagnosis.dictionary import standard_dictionary
-from siq.diagnosis.held_out_fit import held_out_runs
-from siq.diagnosis.investigation import read_case
-from siq.diagnosis.naming import Naming
-from siq.diagnosis.options import MismatchVerdict
+from siq.diagnosis.evidence import TriedMechanism
+from siq.diagnosis.investigation import held_out_runs, read_case
+from siq.diagnosis.naming import NamingDecision
 from siq.diagnosis.residual_structure import Remainder
 from siq.diagnosis.screening import Probe
 from siq.diagnosis.search import Search
-from siq.diagnosis.significance import TriedMechanism
-from siq.diagnosis.unnamed_models import MECHANISM, Material, Model, Part
+from siq.diagnosis.smooth_functions import MECHANISM, Part
+from siq.diagnosis.study import MismatchVerdict
+from siq.diagnosis.unnamed_models import Material, Model
 from siq.errors import InputError, NumericalFailure
 from siq.inference.budget import Budget
+from siq.remarks import has_code
 from siq.systems.cards import load_system
 from siq.systems.dynamics import Dynamics, Signals
+from tests.diagnosis.foreign_cases import falling_ball
 
 CARD = {
     "name": "oscillator",
@@ -222,7 +223,7 @@ def test_random_forces_are_no_noise_where_a_function_beside_them_is_likelier(
         return (Model((part,), search.recalibrated, 5.0),)
 
     monkeypatch.setattr(investigation, "models_of_the_nameless", models)
-    monkeypatch.setattr(held_out_fit, "first_better", lambda *_: None)
+    monkeypatch.setattr(holdout, "first_better", lambda *_: None)
     diagnosis = solved(tmp_path, recordings_of(nothing, drive=0.05, count=4), study={"held_out": ["r2"]})
     assert said(diagnosis)["verdict"] == "unexplained" and names(diagnosis) == []
     # It is located where the likeliest function stands.
@@ -292,11 +293,11 @@ def test_what_the_dictionary_lacks_stays_unexplained(tmp_path: Path) -> None:
 def test_what_a_name_leaves_is_described_and_no_sample_of_a_test_chooses_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def the_first_alone(whole: Search, left: list[Remainder], *_: Any, **__: Any) -> Naming:
+    def the_first_alone(whole: Search, left: list[Remainder], *_: Any, **__: Any) -> NamingDecision:
         first = replace(whole, found=whole.found[:1], fit=whole.found[0].best.fit)
-        return Naming(first, left[0], (9.0,), 9.0, None, convincing=True, likely=True)
+        return NamingDecision(first, left[0], (9.0,), 9.0, None, convincing=True, named=True)
 
-    monkeypatch.setattr("siq.diagnosis.naming.naming_of", the_first_alone)
+    monkeypatch.setattr("siq.diagnosis.naming.judge_mechanisms", the_first_alone)
     table = recordings_of(lambda x, v, t: -2.0 * x**3 - 0.1 * v * np.abs(v), count=6)
     study = {"held_out": ["r2", "r4"], "tests": ["r2", "r4"], "search": {"mechanisms": 2}}
     diagnosis = solved(tmp_path, table, study=study)
@@ -470,7 +471,7 @@ def test_where_nothing_speaks_of_a_mismatch_but_a_refuted_name_there_is_none(tmp
     refuted = replace(found, verdict=MismatchVerdict.MISSING_PHYSICS)
     again = withdrawn(refuted, diagnosis.case, Budget())
     assert str(again.verdict) == "no mismatch" and not again.withdrawn and not again.search.found
-    assert "nothing else speaks of a mismatch" in again.remarks[-1]
+    assert has_code(again.remarks, "diagnosis.refuted")
     # Random forces that are needed speak of one by themselves.
     fit = found.search.recalibrated
     forced = replace(fit, noise=replace(fit.noise, process=np.array([0.0, 1e-3])))

@@ -20,8 +20,8 @@ from siq.diagnosis.mechanisms import (
     places_of,
     plateau,
 )
-from siq.diagnosis.options import SearchOptions
 from siq.diagnosis.screening import screen_all
+from siq.diagnosis.study import SearchOptions
 from siq.inference.recalibration import recalibrate
 from siq.systems.dynamics import Dynamics, without_teeth
 

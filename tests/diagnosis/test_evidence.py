@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import sympy
 
-from siq.diagnosis.evidence import best_shares, evidence_of_function, log_evidence, orthonormal, smooth_prior
-from siq.diagnosis.function_sites import Place, Power, fresh_names, powers, simplest, with_formula
-from siq.diagnosis.options import SearchOptions
+from siq.diagnosis.evidence import evidence_of_function, log_evidence, orthonormal, smooth_prior
+from siq.diagnosis.naming import _best_shares
+from siq.diagnosis.study import SearchOptions
+from siq.diagnosis.terms import Place, Power, fresh_names, powers, simplest, with_formula
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, symbol
 from siq.systems.formulas import compile_values
@@ -66,7 +67,7 @@ def test_the_best_mechanisms_of_each_effect_are_chosen_one_beside_the_other() ->
     groups = [orthonormal(draw.normal(size=(30, width))) for width in (1, 2, 1, 1)]
     effects = draw.normal(size=(30, 5))
     effects[:, 0] = groups[1] @ [1.0, -2.0] + 0.5 * groups[3][:, 0]
-    one, two = best_shares(effects, groups, 1), best_shares(effects, groups, 2)
+    one, two = _best_shares(effects, groups, 1), _best_shares(effects, groups, 2)
     alone = max(float(((g.T @ effects[:, 1]) ** 2).sum()) for g in groups) / float(
         effects[:, 1] @ effects[:, 1]
     )

@@ -8,15 +8,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import sympy
-from tests.diagnosis.decays import DECAY, X
 
 from siq.data.recordings import Recordings
 from siq.diagnosis import unnamed_models
-from siq.diagnosis.function_sites import Place, Power, with_formula
+from siq.diagnosis.terms import Place, Power, with_formula
 from siq.diagnosis.unnamed_models import Material, fitted_part
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements, measurements
 from siq.inference.recalibration import recalibrate
+from tests.diagnosis.decays import DECAY, X
 
 
 def bent_decays() -> Measurements:

@@ -9,6 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+from siq.diagnosis.diagnosis import Diagnosis, solve_case, tables_of
+from siq.diagnosis.study import Allowance
+from siq.errors import NumericalFailure
+from siq.inference.budget import Budget, BudgetSpent
+from siq.systems.cards import load_system
 from tests.diagnosis.foreign_cases import (
     ForeignCase,
     chain_of_masses,
@@ -18,13 +24,6 @@ from tests.diagnosis.foreign_cases import (
     motor_axis,
     polynomial_on_the_brink,
 )
-
-from siq.diagnosis.diagnosis import Diagnosis, solve_case
-from siq.diagnosis.study import Allowance
-from siq.diagnosis.tables import tables_of
-from siq.errors import NumericalFailure
-from siq.inference.budget import Budget, BudgetSpent
-from siq.systems.cards import load_system
 
 SMALL: dict[str, Callable[[], ForeignCase]] = {
     "falling ball, drag": lambda: falling_ball(0.03),
@@ -101,7 +100,8 @@ def test_what_the_budget_does_not_reach_is_named(tmp_path: Path) -> None:
 def test_a_clock_that_runs_out_is_said(tmp_path: Path) -> None:
     found = answered(falling_ball(0.3), tmp_path, seconds=1e-3)
     assert found.statement.as_data()["budget"]["stopped_by"] == "clock"
-    assert "the time allowed" in found.statement.remarks[-1]
+    assert found.statement.remarks[-1].code == "diagnosis.partial"
+    assert "the time allowed" in found.statement.as_data()["remarks"][-1]
 
 
 def test_progress_is_told(tmp_path: Path) -> None:

@@ -10,25 +10,26 @@ import numpy as np
 import pytest
 import scipy.linalg
 import sympy
-from tests.diagnosis.decays import DECAY, X
 
 from siq.data.recordings import Recordings
 from siq.diagnosis import unnamed_models
 from siq.diagnosis.dictionary import roles_of
-from siq.diagnosis.function_sites import Place
-from siq.diagnosis.hidden_state_terms import (
+from siq.diagnosis.search import Search
+from siq.diagnosis.terms import Place
+from siq.diagnosis.unnamed_models import (
+    Material,
     memories_of,
     memory_suspected,
     models_of_the_nameless,
+    weighed,
     with_memories,
 )
-from siq.diagnosis.search import Search
-from siq.diagnosis.unnamed_models import Material, weighed
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements, measurements
 from siq.inference.recalibration import recalibrate
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, Parameter, symbol
+from tests.diagnosis.decays import DECAY, X
 
 pytestmark = pytest.mark.portable
 
@@ -122,7 +123,7 @@ def test_the_intensity_of_a_rotating_frame_has_its_own_unit() -> None:
 def test_the_time_is_suspected_of_standing_in_for_what_was(
     words: tuple[str, ...], *, suspected: bool, fading: Measurements, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("siq.diagnosis.hidden_state_terms.something_left", lambda *_: False)
+    monkeypatch.setattr("siq.diagnosis.unnamed_models.something_left", lambda *_: False)
     place = Place((("x", sympy.Integer(1)),), (), X, words, np.empty(0))
     model = SimpleNamespace(parts=(SimpleNamespace(place=place),), fit=None)
     assert memory_suspected([model], fading) is suspected

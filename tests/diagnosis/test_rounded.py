@@ -9,9 +9,8 @@ import scipy.stats
 
 from siq.diagnosis.diagnosis import diagnose
 from siq.diagnosis.dictionary import roles_of
-from siq.diagnosis.options import MismatchVerdict
 from siq.diagnosis.residual_structure import Unrounded, explained_by_rounding, steps_of, unrounded
-from siq.diagnosis.study import measurements_of
+from siq.diagnosis.study import MismatchVerdict, measurements_of
 from siq.inference.measurements import Measurements, with_expectations
 from siq.inference.recalibration import recalibrate
 from siq.systems.diffusion import Diffusion

@@ -13,18 +13,19 @@ import sympy
 from siq.data.recordings import Recordings
 from siq.diagnosis import naming
 from siq.diagnosis.dictionary import Roles, Shape
-from siq.diagnosis.location import most_telling
+from siq.diagnosis.evidence import TriedMechanism, blocks_of, correlated_probability, correlation_time
 from siq.diagnosis.mechanisms import once_more
-from siq.diagnosis.naming import Naming, named_or_not, naming_of
-from siq.diagnosis.options import SearchOptions
+from siq.diagnosis.naming import NamingDecision, judge_mechanisms
 from siq.diagnosis.residual_structure import Curve, Direction, Remainder, Structure
 from siq.diagnosis.screening import screen
 from siq.diagnosis.search import Found, Search, accepted, better_without
-from siq.diagnosis.significance import TriedMechanism, blocks_of, correlated_probability, correlation_time
+from siq.diagnosis.study import SearchOptions
+from siq.diagnosis.verdict import most_telling
 from siq.inference.budget import Budget
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements, measurements
 from siq.inference.recalibration import recalibrate
+from siq.report.remarks import sentence
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, Parameter
 
@@ -205,7 +206,7 @@ def judged(
     *,
     together: float = 20.0,
     p_alike: float = 0.5,
-) -> Naming:
+) -> NamingDecision:
     """A search of so many mechanisms, judged by odds and matches that are given."""
 
     def of_a_name(
@@ -214,9 +215,9 @@ def judged(
         return odds[candidates[0].number - 1] if len(candidates) == 1 else together
 
     monkeypatch.setattr(naming, "log_odds_of_a_name", of_a_name)
-    monkeypatch.setattr(naming, "probability_of_a_match", lambda *_, **__: p_alike)
+    monkeypatch.setattr(naming, "false_match_rate", lambda *_, **__: p_alike)
     data = SimpleNamespace()
-    return naming_of(
+    return judge_mechanisms(
         found_with(len(odds)), left, data, SimpleNamespace(), MOTION, (),
         options=SearchOptions(wrong_names=0.05, unnamed=0.2), generator=np.random.default_rng(0),
     )  # fmt: skip
@@ -237,7 +238,7 @@ def test_further_mechanisms_stay_as_long_as_each_is_likely_and_leaves_less(
     found = judged(monkeypatch, odds, [remainder(share) for share in shares])
     assert len(found.search.found) == kept
     assert found.search.fit.number == kept
-    assert found.left.share == shares[kept - 1]
+    assert found.remainder.share == shares[kept - 1]
 
 
 @pytest.mark.parametrize(
@@ -264,9 +265,8 @@ def test_a_name_has_to_be_likelier_than_none(
 ) -> None:
     left = [remainder(0.99 + 0.001 * place, p_left) for place in range(len(odds))]
     found = judged(monkeypatch, odds, left, together=together, p_alike=p_alike)
-    given, remarks = named_or_not(found, SearchOptions(wrong_names=0.05, unnamed=0.2))
-    assert given == (verdict == "missing physics")
-    assert said is None or said in remarks[-1]
+    assert found.named == (verdict == "missing physics")
+    assert said is None or said in sentence(found.remarks[-1])
 
 
 def test_a_name_has_to_leave_less_than_what_speaks_of_a_mismatch_by_itself() -> None:

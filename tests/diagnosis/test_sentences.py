@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import replace
 from typing import Any
@@ -10,13 +11,23 @@ import numpy as np
 import pytest
 
 from siq.diagnosis.holdout import HeldOutErrors
-from siq.diagnosis.location import where_it_sits
 from siq.diagnosis.mechanisms import PROCESS_NOISE
-from siq.diagnosis.options import MismatchVerdict
-from siq.diagnosis.statement import Description, Recalibrated, Statement, sentence_of, words_of
+from siq.diagnosis.statement import (
+    Description,
+    Estimate,
+    Evidence,
+    Location,
+    Recalibrated,
+    Rival,
+    StatedFunction,
+    StatedMechanism,
+    Statement,
+)
+from siq.diagnosis.study import MismatchVerdict
 from siq.diagnosis.verdict import statement_of_failure
-from siq.diagnosis.wording import Estimate, Evidence, Rival, StatedFunction, StatedMechanism
 from siq.numerics.text import p_text, percent
+from siq.remarks import Remark
+from siq.report.diagnosis_text import location_sentence, sentence_of, words_of
 
 NAMES = ("dry friction", "Stribeck friction", "hysteresis", "quadratic drag", "cubic damping", "input delay")
 SAME = 10.0
@@ -81,7 +92,9 @@ def statement_from(number: int, verdict: MismatchVerdict, **changes: Any) -> Sta
         bool(draw.integers(2)), too_faint=bool(by) and bool(draw.integers(2)),
     )  # fmt: skip
     recalibration = {
-        name: Recalibrated(1.0, 1.0 + float(draw.normal()), float(10 ** draw.uniform(-3, 1)))
+        name: Recalibrated(
+            1.0, 1.0 + float(draw.normal()), float(10 ** draw.uniform(-3, 1)), "N/m" if name == "k" else "1"
+        )
         for name in ("k", "d", "m", "tau", "a")[: draw.integers(1, 6)]
     }
     given = {
@@ -90,14 +103,12 @@ def statement_from(number: int, verdict: MismatchVerdict, **changes: Any) -> Sta
         "recalibration": recalibration,
         "errors": errors_of(draw),
     }
-    return Statement(verdict, "", **{**given, **changes})
+    return Statement(verdict, **{**given, **changes})
 
 
 def said(statement: Statement) -> str:
     words = words_of(statement)
-    return " ".join(
-        [sentence_of(statement, {"k": "N/m"}), *(line for lines in words.values() for line in lines)]
-    )
+    return " ".join([sentence_of(statement), *(line for lines in words.values() for line in lines)])
 
 
 def percentages(text: str) -> list[float]:
@@ -134,7 +145,7 @@ def test_no_other_is_said_only_where_none_is_as_good(verdict):
 def test_a_class_of_equals_is_part_of_the_first_sentence():
     for number in CASES:
         statement = statement_from(number, MismatchVerdict.MISSING_PHYSICS)
-        text = sentence_of(statement, {})
+        text = sentence_of(statement)
         open_ended = [m for m in statement.mechanisms if any(r.standing == "same" for r in m.rivals)]
         assert text.count("the recordings as well") == len(open_ended)
 
@@ -143,7 +154,7 @@ def test_a_class_of_equals_is_part_of_the_first_sentence():
 def test_a_gain_is_said_only_where_the_held_out_error_falls(verdict):
     for number in CASES:
         statement = statement_from(number, verdict)
-        text, errors = sentence_of(statement, {}), statement.errors
+        text, errors = sentence_of(statement), statement.errors
         assert "nan" not in text and "None" not in text and "unknown" not in text
         pair = {
             MismatchVerdict.MISSING_PHYSICS: ("without", "augmented"),
@@ -168,7 +179,7 @@ def test_a_gain_is_said_only_where_the_held_out_error_falls(verdict):
 
 def test_missing_physics_without_a_gain_cannot_be_read_as_one():
     same = errors_with({"before": 0.103, "recalibrated": 0.103, "augmented": 0.103}, 0.020)
-    text = sentence_of(statement_from(3, MismatchVerdict.MISSING_PHYSICS, errors=same), {})
+    text = sentence_of(statement_from(3, MismatchVerdict.MISSING_PHYSICS, errors=same))
     assert "does not improve the prediction of recordings held out" in text
     assert text.count("10.3 %") == 2
 
@@ -176,7 +187,7 @@ def test_missing_physics_without_a_gain_cannot_be_read_as_one():
 def test_a_parameter_shift_names_its_parameters_with_both_values():
     for number in CASES:
         statement = statement_from(number, MismatchVerdict.PARAMETER_SHIFT)
-        text = sentence_of(statement, {"k": "N/m"})
+        text = sentence_of(statement)
         assert statement.recalibration is not None
         z = {n: abs(e.after - e.before) / e.standard_error for n, e in statement.recalibration.items()}
         certain = sorted((n for n in z if z[n] > 1.96), key=lambda n: -z[n])
@@ -211,10 +222,9 @@ def test_a_model_without_a_name_is_said_with_its_gain_or_that_nothing_was_gained
     description = Description(0.0, (), 0.0, False)
     text = sentence_of(
         Statement(
-            MismatchVerdict.UNEXPLAINED, "", description=description, errors=errors,
+            MismatchVerdict.UNEXPLAINED, description=description, errors=errors,
             described=(part,) if described else (),
-        ),
-        {},
+        )
     )  # fmt: skip
     if described:
         assert "A function of x in the equation of v describes it. With it, the error" in text
@@ -230,7 +240,7 @@ def test_what_describes_a_rest_is_told_from_what_has_a_name():
     statement = statement_from(3, MismatchVerdict.MISSING_PHYSICS)
     runs = {"before": 0.5, "recalibrated": 0.3, "augmented": 0.05, "named": 0.2}
     errors = errors_with(runs, 0.04)
-    text = sentence_of(replace(statement, errors=errors, described=(part,)), {})
+    text = sentence_of(replace(statement, errors=errors, described=(part,)))
     named, rest = text.split("What is left has no name; a function of x in the equation of v describes it. ")
     assert percentages(named.split("falls from")[1])[:3] == [50.0, 30.0, 20.0]
     assert percentages(rest.split("falls from")[1])[:2] == [20.0, 5.0] and "refitted" not in rest
@@ -250,14 +260,18 @@ def test_random_forces_are_a_verdict_of_their_own():
 
 def test_a_failure_keeps_its_sentence():
     statement = statement_of_failure("it runs away")
-    assert statement.sentence == sentence_of(statement, {})
+    assert statement.sentence == sentence_of(statement)
+    assert statement.sentence.startswith("The simulation cannot be compared with the recordings")
 
 
 @pytest.mark.parametrize("recordings", range(1, 6))
 def test_recordings_are_counted_only_where_there_are_several(recordings):
     for affected in range(1, recordings + 1):
-        text = where_it_sits(
-            ("v",), "x", {"x": (-2.0, 1.5)}, affected=affected, recordings=recordings, units={"x": "mm"}
+        labels = tuple(f"r{number}" for number in range(affected))
+        text = location_sentence(
+            Location(
+                {"v": 0.9}, "x", {"x": (-2.0, 1.5)}, None, labels, recordings_total=recordings, unit="mm"
+            )
         )
         assert "between −2.00 and 1.50 mm" in text
         assert ("all" in text) == (affected == recordings > 1)
@@ -282,3 +296,14 @@ def test_a_share_is_not_rounded_to_all_or_nothing(share, text):
 )
 def test_p_values_are_written_as_people_do(p, text):
     assert p_text(p) == text
+
+
+@pytest.mark.parametrize("verdict", list(MismatchVerdict))
+def test_a_statement_is_read_as_it_was_written(verdict):
+    for number in range(20):
+        place = Location({"v": 0.9}, "t", {}, (0.0, 2.0), ("r1",), recordings_total=3)
+        remarks = (Remark("diagnosis.partial", {"untried": 2, "stopped_by": "work"}),)
+        statement = statement_from(number, verdict, location=place, remarks=remarks)
+        data = json.loads(json.dumps(statement.as_data(), allow_nan=False))
+        assert Statement.from_data(data) == statement
+        assert Statement.from_data(data).as_data() == data

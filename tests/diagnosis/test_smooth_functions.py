@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 import scipy.stats
 import sympy
-from tests.diagnosis.foreign_cases import ForeignCase, course, table_of
 
 from siq.diagnosis import unnamed_models
 from siq.diagnosis.diagnosis import solve_case
 from siq.diagnosis.evidence import evidences_by_size, log_evidence_of
-from siq.diagnosis.function_sites import Ground, Place
-from siq.diagnosis.held_out_fit import simplest_of
+from siq.diagnosis.holdout import simplest_of
 from siq.diagnosis.smooth_functions import (
+    LENGTH_SCALES,
     ProductFunction,
     Smooth,
     product_of,
@@ -25,13 +24,14 @@ from siq.diagnosis.smooth_functions import (
     triangle_of,
     with_smooth_function,
 )
-from siq.diagnosis.unnamed_models import SHARES
+from siq.diagnosis.terms import Ground, Place
 from siq.inference.budget import Budget, BudgetSpent
 from siq.inference.kalman_filter import Noise
 from siq.inference.maximum_likelihood import fit_by_multiple_shooting
 from siq.inference.measurements import Measurements
 from siq.report.plots.diagnosis import plot_described
 from siq.systems.dynamics import TIME, Diffusion, Dynamics, Signals
+from tests.diagnosis.foreign_cases import ForeignCase, course, table_of
 
 X, V = sympy.symbols("x v", real=True)
 ONE = sympy.Integer(1)
@@ -102,7 +102,7 @@ def test_length_and_size_of_a_function_are_told() -> None:
         )
         left = fine.along(heights, where.courses)[0] / noise + draw.normal(size=400)
         told = []
-        for each in SHARES:
+        for each in LENGTH_SCALES:
             function = smooth_function(where, (each,))
             along = np.linalg.solve(function.triangle, function.values(where.courses)).T / noise
             total = float(left @ left)
@@ -127,7 +127,7 @@ def test_a_product_is_told_where_both_coordinates_were_never_large_at_a_time() -
     told = true(*where.courses) + 0.02 * draw.normal(size=seen.sum())
     weights = np.eye(len(told)) / 0.02**2
     found = product_of(
-        where, SHARES, points=where.courses.T, gram=weights, overlap=weights @ told, deviation=1.0
+        where, LENGTH_SCALES, points=where.courses.T, gram=weights, overlap=weights @ told, deviation=1.0
     )
     corner = draw.uniform(1.2, 2.8, size=(2, 200))
     values, _ = found.along(found.begin, corner)

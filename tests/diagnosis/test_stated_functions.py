@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import sympy
 
-from siq.diagnosis.statement import COORDINATE, in_coordinate
+from siq.diagnosis.verdict import COORDINATE, in_coordinate
 
 P, Q = sympy.symbols("P Q", real=True)
 AMPLITUDE = sympy.sqrt(P**2 + Q**2)

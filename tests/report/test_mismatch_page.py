@@ -11,7 +11,6 @@ import pandas as pd
 import pytest
 import sympy
 
-from siq.diagnosis.consequences import compare_landscapes, identified, obstacle
 from siq.diagnosis.dictionary import dictionary_of
 from siq.diagnosis.verdict import statement_of_failure
 from siq.report.diagnosis_page import mismatch_page
@@ -31,6 +30,7 @@ from siq.report.plots.style import rate_unit
 from siq.systems.cards import load_system
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
+from workflow.consequences import compare_landscapes, identified, obstacle
 
 CARD = """\
 name: spring

@@ -7,8 +7,7 @@ from homes_of_mechanisms import HOMES, RESIDENTS, Resident, recorded
 
 from siq.diagnosis.dictionary import standard_dictionary
 from siq.diagnosis.investigation import investigate
-from siq.diagnosis.options import MismatchVerdict
-from siq.diagnosis.study import MismatchStudy
+from siq.diagnosis.study import MismatchStudy, MismatchVerdict
 
 pytestmark = pytest.mark.slow
 

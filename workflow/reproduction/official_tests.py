@@ -23,7 +23,7 @@ def official_rows(benchmark: str, table: pd.DataFrame) -> pd.DataFrame:
     benchmark
         Its name.
     table
-        Of `siq.diagnosis.official_tests.official_tables`.
+        Of `workflow.reproduction.official_scores.official_tables`.
 
     Returns
     -------

@@ -8,9 +8,8 @@ import json
 import logging
 from typing import Any
 
-from siq.diagnosis.diagnosis import solve_case
+from siq.diagnosis.diagnosis import solve_case, tables_of, tables_of_failure
 from siq.diagnosis.investigation import read_case
-from siq.diagnosis.tables import tables_of, tables_of_failure
 from siq.diagnosis.verdict import statement_of_failure
 from siq.errors import NumericalFailure
 from siq.numerics.files import whole_file

@@ -11,18 +11,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from siq.diagnosis.consequences import (
-    ESCAPE_COLUMNS,
-    WELLS_COLUMNS,
-    Consequences,
-    compare_landscapes,
-    obstacle,
-)
 from siq.errors import NumericalFailure
 from siq.numerics.files import whole_file
 from siq.systems.cards import load_system
 from siq.workflow.tables import read_table, write_table
 from step import job, read_json
+from workflow.consequences import ESCAPE_COLUMNS, WELLS_COLUMNS, Consequences, compare_landscapes, obstacle
 
 COMPARED = {
     "missing physics": ("recalibrated", "augmented"),

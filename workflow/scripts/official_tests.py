@@ -8,10 +8,10 @@ from typing import Any
 
 from siq.data.public_recordings import BENCHMARKS
 from siq.diagnosis.investigation import read_case
-from siq.diagnosis.official_tests import official_tables
 from siq.systems.cards import load_system
 from siq.workflow.tables import read_table, write_table
 from step import job
+from workflow.reproduction.official_scores import official_tables
 
 
 def main(snakemake: Any) -> None:

@@ -250,7 +250,7 @@ def plot_described(
     Parameters
     ----------
     described
-        As ``verdict.json`` has them; see `siq.diagnosis.wording.StatedFunction`.
+        As ``verdict.json`` has them; see `siq.diagnosis.statement.StatedFunction`.
     units
         Units of states and inputs.
     time_unit
@@ -664,7 +664,7 @@ def plot_candidates(table: pd.DataFrame) -> Figure | None:
     ----------
     table
         Columns ``label gain stage``, one row per probe; of each label the best counts. For the stages see
-        `siq.diagnosis.tables.tables_of`.
+        `siq.diagnosis.diagnosis.tables_of`.
 
     Returns
     -------

@@ -204,7 +204,7 @@ def plot_official_tests(runs: pd.DataFrame, *, unit: str, time_unit: str) -> Fig
     ----------
     runs
         Columns ``test output t measured scored recalibrated augmented``; see
-        `siq.diagnosis.official_tests.official_tables`.
+        `workflow.reproduction.official_scores.official_tables`.
     unit, time_unit
         Of the outputs, and of ``t``.
     """

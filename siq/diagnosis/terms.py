@@ -1,33 +1,125 @@
-"""Sites of unknown functions: in which equation they may stand, and of which coordinates.
-
-A function of one coordinate - a state, an input, time, the amplitude of a rotating frame - may be missing
-in an equation or in what is measured, alone or as the coefficient of another coordinate. In every place it
-is offered as a natural cubic spline, of which the data are asked for the values at the knots.
-"""
+"""terms"""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Final, Literal, Protocol
 
 import numpy as np
 import scipy.interpolate
 import sympy
 
 from siq.diagnosis.dictionary import Roles, unit_of, units_of
+from siq.diagnosis.evidence import correlation_time_of, evidence_of_function, orthonormal
 from siq.diagnosis.mechanisms import MechanismCandidate
-from siq.diagnosis.residual_structure import SUBSTEPS
-from siq.diagnosis.screening import probe_response
-from siq.inference.kalman_filter import Grid, Linearisation
+from siq.diagnosis.residual_structure import RESPONSE_SUBSTEPS
+from siq.diagnosis.screening import PROBE_SUBSTEPS, Probe, ProbeColumns, levels_of, probe_response, projected
+from siq.errors import NumericalFailure
+from siq.inference.kalman_filter import Grid, Linearisation, Whitened, profile_likelihood, whiten
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
 from siq.systems.dynamics import Dynamics, Parameter, Signals, symbol
 from siq.systems.formulas import compile_values, exact_number
 
-KNOTS = 17  # enough for the shortest length of `siq.diagnosis.evidence.LENGTHS`, two for each
-NUMBERS = 40_000_000  # of a linearisation held at a time, which is a third of a gigabyte
+FUNCTIONS_FITTED = 3  # places in which functions are fitted, the most likely ones: a choice
+
+
+@dataclass(frozen=True)
+class LikelyPlace:
+    """A place, the logarithm of its evidence, and the level of random forces at which it is best.
+
+    The evidence is that of a smooth function there over that of none, each at its best level.
+    """
+
+    place: Place
+    log_evidence: float
+    level: float
+
+
+def likely_places(fit: Fit, data: Measurements, roles: Roles) -> list[LikelyPlace]:
+    """All places, the one in which a smooth function is likeliest first.
+
+    Functions of one coordinate are tried everywhere, and as coefficients of other coordinates in the
+    equations in which they do best.
+    """
+    single = places_in(fit.model, roles, data, fit.x)
+    ranked = _compared(fit, data, single)
+    if not ranked:
+        return []
+    equations = {each.place.targets for each in ranked[:FUNCTIONS_FITTED] if each.place.equations}
+    products = products_in([each for each in single if each.targets in equations], fit.model, data, fit.x)
+    return sorted((*ranked, *_compared(fit, data, products)), key=lambda each: -each.log_evidence)
+
+
+def _compared(fit: Fit, data: Measurements, places: Sequence[Place]) -> list[LikelyPlace]:
+    parameters = len(fit.model.free)
+    found: dict[int, LikelyPlace] = {}
+    alone = -np.inf
+    for response, some in linearised_with_places(fit, data, places):
+        for level in levels_of(fit):
+            try:
+                white = whiten(response, data, fit.noise.scaled(level))
+                left, columns = projected(white, parameters)
+            except NumericalFailure:  # without random forces an unstable simulation does not follow
+                continue
+            freedom = white.degrees_of_freedom - parameters
+            base = profile_likelihood(float(left @ left), freedom, white.log_determinant)
+            alone = max(alone, base)
+            begin = 0
+            for place in some:
+                own = columns[:, begin : begin + len(place.knots)]
+                begin += len(place.knots)
+                value = base + evidence_of_function(own, left, place.knots, freedom=freedom)
+                known = found.get(id(place))
+                if own.any() and (known is None or value > known.log_evidence):
+                    found[id(place)] = LikelyPlace(place, value, level)
+    ranked = sorted(found.values(), key=lambda each: -each.log_evidence)
+    return [replace(each, log_evidence=each.log_evidence - alone) for each in ranked]
+
+
+def few_powers(likely: LikelyPlace, fit: Fit, data: Measurements, *, degree: int) -> tuple[Power, ...]:
+    """The powers that a formula needs: each added as long as it earns its place (Schwarz).
+
+    Errors count as correlated as all of the powers leave them (`siq.diagnosis.evidence`).
+    """
+    terms = powers(likely.place, degree=degree)
+    probe = Probe(with_formula(fit.model, likely.place, terms), ())
+    grid = Grid(data, min(fit.substeps, PROBE_SUBSTEPS))
+    columns = ProbeColumns(fit.model, grid, [probe], fit.x, fit.model.values)
+    white = whiten(probe_response(fit.model, grid, fit, columns), data, fit.noise.scaled(likely.level))
+    left, own = projected(white, len(fit.model.free))
+    count = independent(left, own, white, fit)
+    chosen: list[int] = []
+    total = float(left @ left)
+    while len(chosen) < len(terms):
+        sums = {}
+        for place in range(len(terms)):
+            if place not in chosen and own[:, place].any():
+                some = own[:, [*chosen, place]]
+                some = some / np.sqrt((some**2).sum(axis=0))
+                sums[place] = float(((left - some @ np.linalg.lstsq(some, left, rcond=1e-9)[0]) ** 2).sum())
+        if not sums:
+            break
+        best = min(sums, key=lambda place: sums[place])
+        if count * np.log(total / max(sums[best], 1e-300)) < np.log(count):
+            break
+        chosen.append(best)
+        total = sums[best]
+    return tuple(terms[place] for place in sorted(chosen))
+
+
+def independent(left: np.ndarray, columns: np.ndarray, white: Whitened, fit: Fit) -> float:
+    """How many errors count as independent, if columns are fitted to what is left."""
+    basis = orthonormal(columns)
+    rest = left - basis @ (basis.T @ left)
+    correlated = correlation_time_of(rest, white.recording, outputs=len(fit.model.outputs))
+    return max(float(white.known.sum()) / correlated, 2.0)
+
+
+SPLINE_KNOTS = 17  # enough for the shortest length of `siq.diagnosis.evidence.SMOOTH_LENGTHS`, two for each
+LARGEST_LINEARISATION = 40_000_000  # of a linearisation held at a time, which is a third of a gigabyte
 
 
 @dataclass(frozen=True)
@@ -236,7 +328,9 @@ def _with_knots(
             (course,) = courses_of((each.coordinate,), model, data, x)
             finite = course[np.isfinite(course)]
             known[each.coordinate] = (
-                np.unique(np.quantile(finite, np.linspace(0, 1, KNOTS))) if len(finite) else np.empty(0)
+                np.unique(np.quantile(finite, np.linspace(0, 1, SPLINE_KNOTS)))
+                if len(finite)
+                else np.empty(0)
             )
         if len(known[each.coordinate]) > 3:
             yield replace(each, knots=known[each.coordinate])
@@ -275,15 +369,16 @@ def linearised_with_places(
     """
     model = fit.model
     own = len(model.free)
-    room = NUMBERS // (len(data.t) * (model.dimension + len(model.outputs))) - own
-    at_once = max(room // KNOTS, 1)
-    grid = Grid(data, min(fit.substeps, SUBSTEPS))
+    room = LARGEST_LINEARISATION // (len(data.t) * (model.dimension + len(model.outputs))) - own
+    at_once = max(room // SPLINE_KNOTS, 1)
+    grid = Grid(data, min(fit.substeps, RESPONSE_SUBSTEPS))
     for begin in range(0, len(places), at_once):
         some = places[begin : begin + at_once]
         yield probe_response(model, grid, fit, PlaceColumns(model, grid, some)), some
 
 
-FORMULA = "formula"
+Kind = Literal["formula", "curve", "surface", "mechanism"]
+FORMULA: Final = "formula"
 
 
 def described_name(place: Place) -> str:

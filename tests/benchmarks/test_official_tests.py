@@ -8,10 +8,10 @@ import pytest
 
 from siq.data.public_recordings import Benchmark, OfficialTest, PublishedError
 from siq.data.recordings import Recordings
-from siq.diagnosis.official_tests import official_tables, scored_run
 from siq.inference.measurements import Measurements, measurements
 from siq.systems.cards import load_system
 from siq.systems.dynamics import Dynamics
+from workflow.reproduction.official_scores import official_tables, scored_run
 from workflow.reproduction.official_tests import official_page, official_rows
 
 CARD = """\

@@ -1,4 +1,4 @@
-"""What left-out physics does to a landscape: wells, barriers and escape times, without it and with it."""
+"""consequences"""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ROUGH = (sympy.sign, sympy.Abs, sympy.Max, sympy.Min, sympy.Heaviside, sympy.Pie
 DEGREES = (4, 6, 8)
 LEVELS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0)  # barriers over ε at which escape times are given
 TINY = 1e-100  # what remains of a zero that Newton's method found
-SAME_WELL = 0.5  # of the spread of the states: how far a well may move and keep its name
+WELL_SHIFT_TOLERANCE = 0.5  # of the spread of the states: how far a well may move and keep its name
 WELLS_COLUMNS = ("simulation", "item", "kind", "position", "U", "barrier", "prefactor", "note")
 ESCAPE_COLUMNS = ("transition", "intensity", "simulation", "time")
 
@@ -171,7 +171,7 @@ def _labels(found: Landscape, known: list[np.ndarray], spread: np.ndarray) -> li
             float(np.linalg.norm((one.position - place) / spread)) if number not in taken else np.inf
             for number, place in enumerate(known)
         ]
-        if distance and min(distance) < SAME_WELL:
+        if distance and min(distance) < WELL_SHIFT_TOLERANCE:
             number = int(np.argmin(distance))
         else:
             number = len(known)

@@ -1,4 +1,4 @@
-"""Official tests of public benchmarks, and scores of simulations on them."""
+"""official_tests"""
 
 from __future__ import annotations
 

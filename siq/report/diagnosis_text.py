@@ -1,0 +1,127 @@
+"""The sentences of a diagnosis, from the templates in `siq/report/templates/diagnosis.j2`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from functools import cache
+from typing import Any
+
+import jinja2
+
+from siq.diagnosis.mechanisms import GENERIC, PROCESS_NOISE
+from siq.diagnosis.residual_structure import DOUBTFUL
+from siq.diagnosis.statement import Location, Recalibrated, Statement
+from siq.numerics.text import (
+    LARGEST_PLAIN_NUMBER,
+    SMALLEST_SHARE,
+    capital,
+    listed,
+    number_text,
+    p_equation,
+    p_text,
+    percent,
+    unit_text,
+    value_text,
+)
+from siq.report.remarks import sentence
+
+SENTENCE_END = "¶"
+
+
+@cache
+def _templates() -> Any:
+    """The macros of the templates, each of which writes sentences."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("siq.report", "templates"), undefined=jinja2.StrictUndefined,
+        autoescape=False, trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    environment.globals |= {"GENERIC": GENERIC, "PROCESS_NOISE": PROCESS_NOISE, "DOUBTFUL": DOUBTFUL}
+    environment.globals |= {"SMALLEST_SHARE": SMALLEST_SHARE}
+    environment.filters |= {
+        "capitalised": capital,
+        "listed": lambda names, word="and": listed(list(names), word),
+        "p": p_text,
+        "p_equation": p_equation,
+        "share": percent,
+        "error": error_text,
+        "value": lambda entry, digits=4: value_text(
+            entry.estimate, entry.standard_error, unit=entry.unit, digits=digits
+        ),
+        "after": lambda each: value_text(each.after, each.standard_error, unit=each.unit),
+        "before": lambda each: card_value(each.before),
+        "limit": lambda value: value_text(value, digits=3),
+        "unit": unit_text,
+        "changes": changes,
+    }
+    return environment.get_template("diagnosis.j2").module
+
+
+def _written(text: str) -> list[str]:
+    """The sentences of a template's text; how that is broken into lines is of no matter."""
+    lines = (re.sub(r"[ \n]+", " ", line).strip() for line in text.split(SENTENCE_END))
+    return [line for line in lines if line]
+
+
+def sentence_of(statement: Statement) -> str:
+    """The sentence that the page opens with: the verdict, how large, and what it does to the error."""
+    return " ".join(_written(_templates().verdict(statement)))
+
+
+def words_of(statement: Statement) -> dict[str, list[str]]:
+    """Further sentences, by what they are about.
+
+    ``alternatives``: what cannot be told apart, and whether anything else would do. ``explained``: how much
+    of the difference is explained. ``left``: what that leaves.
+    """
+    description, templates = statement.description, _templates()
+    mechanisms = statement.mechanisms if description is None else description.by
+    return {
+        "alternatives": [line for each in mechanisms for line in _written(templates.alternatives(each))],
+        "explained": _written(templates.explained(mechanisms)),
+        "left": [] if description is None else _written(templates.left(description)),
+    }
+
+
+def location_sentence(location: Location) -> str:
+    """In which equation a mismatch sits, along which coordinate and where, in how many recordings."""
+    return _written(_templates().location(location))[0]
+
+
+def sentences_of(statement: Statement) -> dict[str, Any]:
+    """All sentences of a statement: ``sentence``, ``words``, ``remarks`` and ``location``."""
+    location = {} if statement.location is None else {"location": location_sentence(statement.location)}
+    return {
+        "sentence": sentence_of(statement),
+        "words": words_of(statement),
+        "remarks": [sentence(each) for each in statement.remarks],
+        **location,
+    }
+
+
+def changes(recalibration: Mapping[str, Recalibrated]) -> list[tuple[str, Recalibrated, float]]:
+    """Parameters that differ from those on the card, with how many standard errors; the surest first."""
+    found = []
+    for name, each in recalibration.items():
+        change, error = abs(each.after - each.before), each.standard_error
+        if change:
+            found.append((name, each, change / error if error > 0 else float("inf")))
+    return sorted(found, key=lambda each: -each[2])
+
+
+def card_value(value: float) -> str:
+    """A value as a card has it."""
+    text = f"{value:.6g}"
+    return number_text(value) if "e" in text else text.replace("-", "−")
+
+
+def error_text(value: float | None) -> str:
+    """An error as a share of the recordings' spread."""
+    if value is None:
+        return "unknown"
+    share = 100 * value
+    if share >= 1e3 or 0 < share < 1e-3:
+        text = f"{share:.0f}" if 1e3 <= share < LARGEST_PLAIN_NUMBER else number_text(share, decimals=2)
+    else:
+        text = f"{share:#.3g}".rstrip(".")
+    return f"{text} %"
