@@ -215,7 +215,7 @@ class TrainedNetworks:
     circulatory_scale: np.ndarray
     diffusion: np.ndarray
 
-    def evaluate(self, x: np.ndarray, *, chunk: int = 50_000) -> PointValues:
+    def evaluate(self, x: np.ndarray, *, chunk: int = 4096) -> PointValues:
         """Evaluate V, g and f.
 
         Parameters
@@ -223,13 +223,22 @@ class TrainedNetworks:
         x
             Points, shape ``(n, d)``, in the units of the states.
         chunk
-            Points evaluated together, which bounds the memory.
+            Points evaluated together: few enough for their activations to stay in the processor's cache.
         """
         pieces = [self._evaluate(x[begin : begin + chunk]) for begin in range(0, len(x), chunk)]
         potential, circulatory, vector_field = zip(*pieces or [self._evaluate(x)], strict=True)
         return PointValues(
             np.concatenate(potential), np.concatenate(circulatory), np.concatenate(vector_field)
         )
+
+    def potential_at(self, x: np.ndarray, *, chunk: int = 4096) -> np.ndarray:
+        """V alone, shape ``(n,)``, at a third of the cost of `evaluate`."""
+        values = [np.zeros(0)]
+        for begin in range(0, len(x), chunk):
+            y = (x[begin : begin + chunk].astype(self.mean.dtype) - self.mean) / self.scale
+            square = (y * y).sum(axis=1, keepdims=True)
+            values.append((self.potential_scale * (_hidden(self.potential, y)[-1] + square))[:, 0])
+        return np.concatenate(values).astype(float)
 
     def _evaluate(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         y = (x.astype(self.mean.dtype) - self.mean) / self.scale

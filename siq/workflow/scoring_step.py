@@ -141,7 +141,7 @@ def _network_errors(
     randomised = shuffled(trained, generator=draw)
 
     def error_of(networks: TrainedNetworks, grid: np.ndarray) -> float:
-        return relative_error(2 * networks.evaluate(grid.T).potential, exact_values(exact, grid))
+        return relative_error(2 * networks.potential_at(grid.T), exact_values(exact, grid))
 
     error = error_of(trained, domain_grid(box))
     chance = error_of(randomised, domain_grid(box, points=COARSE))

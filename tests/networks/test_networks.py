@@ -117,12 +117,14 @@ def test_networks_at_rest_have_the_values_of_those_in_training() -> None:
         one = at_rest(nets, run)
         components = evaluate(select_run(nets, run), torch.from_numpy(x)[None])
         whole, pieces = one.evaluate(x), one.evaluate(x, chunk=7)
+        np.testing.assert_allclose(one.potential_at(x, chunk=7), whole.potential, rtol=1e-12)
         for name in ("potential", "circulatory", "vector_field"):
             np.testing.assert_allclose(getattr(pieces, name), getattr(whole, name), rtol=1e-12, atol=1e-14)
             np.testing.assert_allclose(
                 getattr(whole, name), getattr(components, name)[0], rtol=1e-12, atol=1e-14
             )
     assert one.evaluate(x[:0]).vector_field.shape == (0, 3)
+    assert one.potential_at(x[:0]).shape == (0,)
 
 
 def test_networks_at_rest_can_be_trained_on() -> None:
