@@ -93,7 +93,7 @@ def test_one_table_says_whose_figure_is_whose_and_how_it_was_scored(decay):
 
 
 def test_runs_are_drawn_with_few_points_and_lose_no_extreme():
-    from siq.report.plots.proof import FINE, envelope, plot_official_tests
+    from workflow.reproduction.plots import FINE, envelope, plot_official_tests
 
     values = np.zeros(50_000)
     values[31_234] = 3.0

@@ -18,7 +18,6 @@ from scipy.integrate import solve_ivp
 
 from siq.diagnosis.investigation import Comparison, read_case
 from siq.diagnosis.study import measurements_of
-from siq.report.plots.proof import plot_foreign_proof
 from siq.systems.cards import load_system
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, Parameter, Signals, symbol
@@ -42,6 +41,7 @@ from workflow.proof.foreign_scores.targets import foreign_failures, foreign_targ
 from workflow.proof.keys import CaseKey, read_key, read_truth
 from workflow.proof.keys import Truth as KeyTruth
 from workflow.proof.oracle import true_model
+from workflow.proof.plots import plot_foreign_proof
 from workflow.proof.scoring import Answer
 from workflow.proof.sets import FOREIGN, load_proofs
 

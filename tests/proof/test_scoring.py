@@ -13,13 +13,13 @@ import pytest
 import yaml
 
 from siq.errors import InputError
-from siq.report.plots.proof import plot_proof
 from siq.systems.dynamics import Dynamics, Signals
 from workflow.code_digest import imported_files
 from workflow.proof.batches import check_digests
 from workflow.proof.concealment.cases import CaseDesign, make_case
 from workflow.proof.keys import CaseKey, Truth, read_key, read_truth
 from workflow.proof.oracle import Oracle, pairing, true_model
+from workflow.proof.plots import plot_proof
 from workflow.proof.scoring import (
     Answer,
     covered,

@@ -12,13 +12,13 @@ import yaml
 from proof_page import HELP, answer
 from siq.numerics.files import whole_file
 from siq.report.page import ReportContent, ReportFigure, ReportSection, ReportTable, render_report
-from siq.report.plots.proof import plot_foreign_proof
 from siq.report.plots.style import save_figure
 from siq.workflow.tables import read_table, write_table
 from step import job
 from workflow.proof.foreign_scores.rulers import NEAR
 from workflow.proof.foreign_scores.scores import ENOUGH
 from workflow.proof.foreign_scores.targets import foreign_failures, foreign_targets
+from workflow.proof.plots import plot_foreign_proof
 from workflow.proof.targets import target_table
 
 QUESTION = (

@@ -11,12 +11,12 @@ import pandas as pd
 
 from siq.data.public_recordings import BENCHMARKS
 from siq.numerics.files import whole_file
-from siq.report.plots.proof import plot_official_tests
 from siq.report.plots.style import save_figure
 from siq.systems.cards import load_system
 from siq.workflow.tables import read_table, write_table
 from step import job, read_json
 from workflow.reproduction.official_tests import official_page, official_rows
+from workflow.reproduction.plots import plot_official_tests
 
 
 def main(snakemake: Any) -> None:

@@ -13,10 +13,10 @@ import yaml
 from siq.numerics.files import whole_file
 from siq.numerics.text import number_text
 from siq.report.page import ReportContent, ReportFigure, ReportSection, ReportTable, render_report
-from siq.report.plots.proof import plot_proof
 from siq.report.plots.style import save_figure
 from siq.workflow.tables import read_table, write_table
 from step import job
+from workflow.proof.plots import plot_proof
 from workflow.proof.targets import STRONG, Target, failures_of, target_table, targets_of
 
 QUESTION = (

@@ -96,13 +96,6 @@ def drawn_in_style(function: Callable[Parameters, Drawn]) -> Callable[Parameters
     return draw
 
 
-def sentence_figure(sentence: str) -> Figure:
-    """Make a figure that says in words why there is nothing to draw."""
-    figure = Figure(figsize=(COLUMN_WIDTH, 1.2))
-    say(figure.add_subplot(), sentence)
-    return figure
-
-
 def say(axes: Axes, sentence: str) -> None:
     """Write a sentence in place of a panel's curves."""
     axes.set_axis_off()
