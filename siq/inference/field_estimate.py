@@ -26,7 +26,7 @@ from siq.errors import NumericalFailure
 from siq.inference.library import CandidateLibrary
 from siq.inference.selection import RivalTerms
 from siq.numerics.integration import runge_kutta_step
-from siq.systems.diffusion import Diffusion, state_noise
+from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, Parameter, symbol
 from siq.systems.formulas import compile_formulas, parse_formula
 
@@ -149,7 +149,9 @@ class NoiseFormula:
         rows = [[sympy.S.Zero for _ in range(d)] for _ in range(d)]
         for (i, j), term, value in zip(self.places, self.terms, self.values, strict=True):
             rows[i][j] += sympy.Float(float(value / intensity), 17) * term
-        return state_noise(self.symbols, [[rows[min(i, j)][max(i, j)] for j in range(d)] for i in range(d)])
+        return Diffusion.of_formulas(
+            self.symbols, [[rows[min(i, j)][max(i, j)] for j in range(d)] for i in range(d)]
+        )
 
     @cached_property
     def _functions(self) -> Callable[[np.ndarray], np.ndarray]:

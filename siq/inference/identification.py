@@ -39,7 +39,7 @@ from siq.inference.selection import (
     weakest_term,
 )
 from siq.numerics.files import whole_file
-from siq.systems.diffusion import Diffusion, diffusion_of_rows, diffusion_rows_of
+from siq.systems.diffusion import Diffusion
 
 
 @pydantic_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -353,7 +353,7 @@ def write_field(path: str | Path, record: FieldRecord, options: IdentificationOp
         else {"mean_change": found.rivals.mean_change.tolist(), "spread": found.rivals.spread.tolist()},
         "noise_rate": found.noise_rate.tolist(),
         "residual_ratio": found.residual_ratio,
-        "diffusion": diffusion_rows_of(found.diffusion),
+        "diffusion": found.diffusion.rows,
         "noise_formula": None if found.noise is None else found.noise.as_data(),
         "constant_noise": None if found.constant_noise is None else found.constant_noise.as_data(),
         "flow": {"steps": found.flow.steps, "euler": found.flow.euler},
@@ -406,7 +406,7 @@ def read_field(path: str | Path) -> FieldRecord | None:
         found = IdentifiedField(
             library, coefficients, support, np.array(data["covariance"]), np.array(data["noise_rate"]),
             float(data["residual_ratio"]), FlowMap(**data["flow"]),
-            diffusion_of_rows(library.symbols, data["diffusion"]),
+            Diffusion.of_rows(library.symbols, data["diffusion"]),
             rivals=_rivals(data.get("rivals"), library), stability=_stability(data["terms"]),
             noise=_noise(data.get("noise_formula"), library),  # older files have neither
             constant_noise=_noise(data.get("constant_noise"), library),

@@ -48,7 +48,7 @@ class FormulaField:
         d = self.noise.dimension
         matrices = self.noise.at(x[:, :d])
         wide = _widened(spread[:, :d, :d], matrices, step)
-        bends = self.noise.second_derivatives(x[:, :d])
+        bends = self.noise.derivatives(x[:, :d], 2)
         matrices = matrices + np.einsum("nijkl,nkl->nij", bends, wide) / 2
         # On its way a fit may come where the formula is no covariance.
         levels, vectors = np.linalg.eigh(matrices)

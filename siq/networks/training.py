@@ -275,7 +275,7 @@ def initial_networks(
 
 def _descent(x: np.ndarray, gradient: np.ndarray, velocity: np.ndarray, diffusion: Diffusion) -> float:
     """The factor on V with which -D∇V comes closest to the velocities; 0 where these go up V on the whole."""
-    size = diffusion.steepness(x, gradient).sum()
+    size = diffusion.contract(x, gradient).sum()
     return max(float(-(gradient * velocity).sum() / size), 0.0)
 
 

@@ -312,7 +312,7 @@ def check_hamilton_jacobi(candidate: Candidate, found: AnyField, *, limit: float
     measure = found.diffusion
     if candidate.attractors:
         measure = measure_at(found.dynamics, candidate.attractors[0].position)
-    slope = np.sqrt(np.maximum(measure.steepness(candidate.points, gradient), 0))
+    slope = np.sqrt(np.maximum(measure.contract(candidate.points, gradient), 0))
     speed, fall = (np.sqrt(measure.squared_speed(candidate.points, one)) for one in (flow, down))
     # Where V falls it falls by f: a V that hardly varies while states move is no potential.
     if not np.isfinite(slope).all() or np.median(slope / np.where(speed > 0, speed, np.inf)) < 1e-6:
@@ -591,7 +591,7 @@ def _in_the_mean(
     error: float,
 ) -> Verdict:
     """Whether ∇V·ΔX/h has the mean -∇V·D∇V, in bins of V."""
-    claimed = found.diffusion.steepness(x0, slope)
+    claimed = found.diffusion.contract(x0, slope)
     excess = (slope * (xh - x0)).sum(axis=1) / h + claimed
     forces = np.broadcast_to(found.noise_rate, (len(h), *found.noise_rate.shape))
     if found.noise is not None:  # each increment has the noise of the state where it starts

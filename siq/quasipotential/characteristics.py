@@ -98,7 +98,7 @@ class HamiltonianFlow:
             turned = turned if self.constant else turned + 2 * self.noise.turn(y, q)
         pulled = -(turned.transpose(0, 2, 1) @ q[:, :, None])[:, :, 0]
         if not self.constant:  # of which the turn has twice as much
-            pulled += self.noise.pull(y, q)
+            pulled += self.noise.contract(y, q, 1)
         return force + 2 * push, pulled, 2 * np.sum(q * push, axis=1)
 
     def linear(self, y: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -108,7 +108,7 @@ class HamiltonianFlow:
         bend = self.units.T @ self.dynamics.bend(x, p) @ self.units / (2 * self.level)
         if self.constant:
             return turned, self.at(y), bend
-        return turned + 2 * self.noise.turn(y, q), self.at(y), bend + self.noise.bend(y, q)
+        return turned + 2 * self.noise.turn(y, q), self.at(y), bend + self.noise.contract(y, q, 2)
 
     def at(self, y: np.ndarray) -> np.ndarray:
         """D at positions, ``(n, d, d)``."""

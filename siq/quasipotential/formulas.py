@@ -24,7 +24,7 @@ from siq.inference.library import CandidateLibrary, linear_combination
 from siq.numerics.files import whole_file
 from siq.quasipotential.hamilton_jacobi import PowerBasis
 from siq.quasipotential.wells import TOLERANCE, DegreeTrial, Well
-from siq.systems.diffusion import Diffusion, diffusion_of_rows, diffusion_rows_of
+from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.systems.formulas import FormulaError, compile_formulas, parse_formula
 
@@ -278,7 +278,7 @@ def _decomposition_to_data(one: SymbolicDecomposition) -> dict[str, Any]:
             }
             for well in one.wells
         ]
-        data["D"] = diffusion_rows_of(one.wells[0].dynamics.diffusion)
+        data["D"] = one.wells[0].dynamics.diffusion.rows
     if one.standard_errors:
         data["standard_errors"] = {name: dict(errors) for name, errors in one.standard_errors.items()}
     return data
@@ -307,7 +307,7 @@ def _wells_from_data(method: Mapping[str, Any], symbols: tuple[sympy.Symbol, ...
         return ()
     d = len(symbols)
     equations = [expression_from_data(part, symbols) for part in method["f"]]
-    diffusion = diffusion_of_rows(symbols, method.get("D", np.eye(d).tolist()))
+    diffusion = Diffusion.of_rows(symbols, method.get("D", np.eye(d).tolist()))
     dynamics = Dynamics.of(symbols, equations, diffusion=diffusion)
     return tuple(
         Well(

@@ -257,7 +257,7 @@ class HamiltonJacobi:
     def size(self, coefficients: np.ndarray) -> float:
         """Rms of ∇V over the points, in the metric of the noise."""
         gradient = self.slopes(coefficients)
-        return float(np.sqrt(self.measure.steepness(self.points, gradient).mean()))
+        return float(np.sqrt(self.measure.contract(self.points, gradient).mean()))
 
     def size_jacobian(self, coefficients: np.ndarray) -> np.ndarray:
         """Derivative of the size, which must not be zero, by the coefficients, shape ``(m,)``."""
@@ -266,7 +266,7 @@ class HamiltonJacobi:
 
     def sizes(self) -> np.ndarray:
         """Rms of each function's gradient over the points, in the metric of the noise: shape ``(m,)``."""
-        steepness = self.measure.steepness(self.points, self.gradients.transpose(0, 2, 1))
+        steepness = self.measure.contract(self.points, self.gradients.transpose(0, 2, 1))
         return np.sqrt(np.asarray(steepness.mean(axis=0)))
 
     def restricted(self, rows: np.ndarray) -> HamiltonJacobi:
@@ -277,7 +277,7 @@ class HamiltonJacobi:
 def relative_residuals(equation: HamiltonJacobi, coefficients: np.ndarray) -> np.ndarray:
     """``∣∇V·(f + D∇V)∣ / (∣∇V∣ ∣f∣)`` at the points, shape ``(n,)``."""
     slope = equation.slopes(coefficients)
-    size = np.sqrt(equation.measure.steepness(equation.points, slope))
+    size = np.sqrt(equation.measure.contract(equation.points, slope))
     return np.asarray(np.abs(equation.residual(coefficients)) / np.where(size > 0, size, np.inf))
 
 
@@ -451,7 +451,7 @@ def _least_squares(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
 def relative_residual(equation: HamiltonJacobi, coefficients: np.ndarray) -> float:
     """Rms of the weighted residual over rms of ∇V; infinite for V = 0, or all but 0."""
     gradient = equation.slopes(coefficients)
-    squared = equation.measure.steepness(equation.points, gradient)
+    squared = equation.measure.contract(equation.points, gradient)
     if not np.sqrt((equation.weight**2 * squared).mean()) > VANISHING:
         return np.inf
     return float(np.sqrt((equation.residual(coefficients) ** 2).mean() / squared.mean()))

@@ -218,7 +218,7 @@ def _followed(
     def rates(z: np.ndarray) -> np.ndarray:
         x, p = z[:, :d], z[:, d : 2 * d]
         push = dynamics.diffusion.push(x, p)
-        falls = -np.einsum("nij,ni->nj", dynamics.jacobian(x), p) - dynamics.diffusion.pull(x, p)
+        falls = -np.einsum("nij,ni->nj", dynamics.jacobian(x), p) - dynamics.diffusion.contract(x, p, 1)
         return np.column_stack([dynamics.drift(x) + 2 * push, falls, 2 * np.sum(p * push, axis=1)])
 
     z = np.column_stack([states, momenta, np.zeros(n)])
@@ -612,9 +612,12 @@ class Across:
         if not problem.constant:
             noise = problem.noise
             turned = jacobian + noise.turn(middles, twice)
-            by_middle = by_middle + noise.pull(middles, twice) / 2
-            bent = bent - times / 2 * noise.bend(middles, twice)
-            slower -= times[:, 0] * noise.pull(middles, force) - noise.pull(middles, forward) / times[:, 0]
+            by_middle = by_middle + noise.contract(middles, twice, 1) / 2
+            bent = bent - times / 2 * noise.contract(middles, twice, 2)
+            slower -= (
+                times[:, 0] * noise.contract(middles, force, 1)
+                - noise.contract(middles, forward, 1) / times[:, 0]
+            )
         by_middle *= -times[:, 0]
         slope = np.zeros_like(y)
         slope[1:] += by_middle / 2 + twice
@@ -726,7 +729,7 @@ def path_nodes(problem: PathProblem, chain: DiscretisedPath) -> np.ndarray:
     middle = products(parts.metric, (parts.forward / times - parts.force) / 2)
     change = np.einsum("nij,ni->nj", problem.jacobian(parts.middles), middle)
     if not problem.constant:
-        change += problem.noise.pull(parts.middles, middle)
+        change += problem.noise.contract(parts.middles, middle, 1)
     turn = times / 2 * change
     p = np.empty_like(y)
     p[1:-1] = (middle[1:] + turn[1:] + middle[:-1] - turn[:-1]) / 2

@@ -457,7 +457,7 @@ class _Frame:
         """``Σ_k p_k ∇²f_k + p·∇²D p``, ``(n, d, d)``."""
         second = self.dynamics.bend(self.start + y @ self.units.T, p @ self.inverse / self.rate)
         bent = np.asarray(self.units.T @ second @ self.units)
-        return bent if self.constant else bent + self.noise.bend(y, p)
+        return bent if self.constant else bent + self.noise.contract(y, p, 2)
 
     def rise(self, y: np.ndarray, p: np.ndarray, curvatures: np.ndarray) -> np.ndarray:
         """c, by which the logarithm of the density's prefactor falls along the path: shape ``(n,)``."""
@@ -521,7 +521,7 @@ class _Frame:
         forces = -np.einsum("nji,nj->ni", jacobians, self.momenta)
         noise = self.diffusion(self.points)
         if not self.constant:
-            forces -= self.noise.pull(self.points, self.momenta)
+            forces -= self.noise.contract(self.points, self.momenta, 1)
             jacobians = jacobians + 2 * self.noise.turn(self.points, self.momenta)
         largest = LARGEST * np.abs(self.at_attractor).max()
 

@@ -251,7 +251,7 @@ def _eliminate(
     triangle = np.asarray(np.linalg.qr(np.column_stack([jacobian, goal, forcing]), mode="r"))
     m = len(coefficients)
     spread = equation.sizes()
-    size = np.sqrt(equation.diffusion.steepness(equation.points, gradient).mean()) or 1.0
+    size = np.sqrt(equation.diffusion.contract(equation.points, gradient).mean()) or 1.0
     rows = max(len(equation.points) - m, 1)
     active = np.arange(m)
     while len(active):
@@ -422,7 +422,7 @@ class _Family:
         self.circulation = np.zeros((len(points), d, len(places)))
         for column, (i, k) in enumerate(places):
             self.circulation[:, i, column] = values[:, k]
-        slopes = np.sqrt(noise.steepness(points, self.gradients.transpose(0, 2, 1)))
+        slopes = np.sqrt(noise.contract(points, self.gradients.transpose(0, 2, 1)))
         scale = np.concatenate([np.sqrt((slopes**2).mean(axis=0)) / usual, sizes[self.of_circulatory]])
         self.scale = np.where(scale > 0, scale, 1.0)
         self.weight = 1 / np.maximum(speed, 1e-3 * speed.max()) / usual / np.sqrt(len(points))

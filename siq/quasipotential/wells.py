@@ -210,7 +210,7 @@ class Well:
         slope, flow, noise = self.gradients(x), self.dynamics.drift(x), self.dynamics.diffusion
         numerator = np.abs((slope * (flow + noise.push(x, slope))).sum(axis=1))
         measure = self._measure
-        return numerator, np.sqrt(measure.steepness(x, slope) * measure.squared_speed(x, flow))
+        return numerator, np.sqrt(measure.contract(x, slope) * measure.squared_speed(x, flow))
 
     @cached_property
     def _measure(self) -> Diffusion:
@@ -767,10 +767,10 @@ def _towards_path(well: Well, x: np.ndarray, depth: Depth, free: np.ndarray) -> 
     if not len(where) or not len(x):
         return well.coefficients
     old, along = well.basis.gradients(x), well.basis.gradients(where)
-    size = np.sqrt(noise.steepness(where, slopes))
+    size = np.sqrt(noise.contract(where, slopes))
     weight = np.sqrt(len(x) / len(where)) / size
     rest = slopes - along @ well.coefficients
-    steep = np.sqrt(noise.steepness(x, old @ well.coefficients))
+    steep = np.sqrt(noise.contract(x, old @ well.coefficients))
     steep = np.maximum(steep, np.median(steep))
     roots = noise.root_at(where), noise.root_at(x)
     rows = [

@@ -19,7 +19,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validat
 
 from siq.errors import InputError
 from siq.numerics.files import Document, read_document, validate
-from siq.systems.diffusion import Diffusion, state_noise
+from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import TIME, Dynamics, Input, Parameter, symbol
 from siq.systems.formulas import CONSTANTS, FUNCTIONS, FormulaError, exact_number, parse_formula
 
@@ -240,7 +240,7 @@ def read_diffusion(
     if not _has_formulas(rows):
         return Diffusion(np.array(rows, dtype=float))
     read = parse if parse is not None else (lambda text: parse_formula(text, names))
-    return state_noise(symbols, [[read(entry) for entry in row] for row in rows])
+    return Diffusion.of_formulas(symbols, [[read(entry) for entry in row] for row in rows])
 
 
 def _has_formulas(rows: list[list[Formula]]) -> bool:

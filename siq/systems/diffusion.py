@@ -1,22 +1,18 @@
-"""The diffusion D(x): constant, formulas of the states, singular; what it does to momenta and velocities.
+"""The diffusion D(x) of ``dx = f(x) dt + √ε σ(x) dW``, with ``D = σσᵀ``, in the sense of Itô.
 
-``dx = f(x) dt + √ε σ(x) dW`` with ``D = σσᵀ``, in the sense of Itô. Every product with D, its root or its
-inverse is taken at points, so that a constant D, `Diffusion`, and one that is a formula of the states,
-`StateNoise`, are used alike. Who can do with a constant D only asks for its
-`matrix`, and another one refuses.
+D is constant, or formulas of the states, and either may be singular: noise then acts on some states only. All
+products with D, its root or its inverse are taken at points, so that every D is used alike. Who can do with a
+constant D only asks for its `matrix`, and another one refuses. Whether formulas are positive definite is
+looked at where they are used: no formula says it by itself.
 
 Along characteristics, paths and in the prefactor of escape times stand derivatives of D with a momentum p:
-``pull`` is ``pᵀ(∂_k D)p``, ``turn`` is ``(∂_k D)p``, ``bend`` is ``pᵀ(∂_k ∂_l D)p``, and ``divergence`` is
-``Σ_i ∂_i D_ij``. Of a constant D they vanish.
-
-``dx = f(x) dt + √ε σ(x) dW`` with ``D(x) = σσᵀ``, in the sense of Itô: the noise of a moment is that of the
-state before it. Whether D is positive definite is looked at where it is used: no formula says it by itself.
+``p·D p``, ``p·(∂_k D) p`` and ``p·(∂_k ∂_l D) p`` (`Diffusion.contract`), ``(∂_k D) p`` (`Diffusion.turn`)
+and ``Σ_i ∂_i D_ij`` (`Diffusion.divergence`). All but the first vanish where D is constant.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -26,95 +22,13 @@ from scipy.linalg import solve_triangular
 from siq.errors import NumericalFailure
 from siq.systems.formulas import compile_formulas, exact_number, parse_formula
 
-
-class NoiseField:
-    """What follows from D and its derivatives at points, whatever D is."""
-
-    def at(self, x: np.ndarray) -> np.ndarray:
-        """D at points: ``(n, d)`` to ``(n, d, d)``."""
-        raise NotImplementedError
-
-    def derivatives(self, x: np.ndarray) -> np.ndarray:
-        """∂D_ij/∂x_k at points: ``(n, d)`` to ``(n, d, d, d)``, k last."""
-        raise NotImplementedError
-
-    def second_derivatives(self, x: np.ndarray) -> np.ndarray:
-        """∂²D_ij/∂x_k∂x_l at points: ``(n, d)`` to ``(n, d, d, d, d)``, k and l last."""
-        raise NotImplementedError
-
-    def pull(self, x: np.ndarray, momenta: np.ndarray) -> np.ndarray:
-        """``pᵀ(∂_k D)p`` at points and momenta ``(n, d)``: shape ``(n, d)``."""
-        return np.asarray(np.einsum("ni,nijk,nj->nk", momenta, self.derivatives(x), momenta))
-
-    def turn(self, x: np.ndarray, momenta: np.ndarray) -> np.ndarray:
-        """``((∂_k D)p)_i`` at points and momenta ``(n, d)``: shape ``(n, d, d)``, i before k."""
-        return np.asarray(np.einsum("nijk,nj->nik", self.derivatives(x), momenta))
-
-    def bend(self, x: np.ndarray, momenta: np.ndarray) -> np.ndarray:
-        """``pᵀ(∂_k ∂_l D)p`` at points and momenta ``(n, d)``: shape ``(n, d, d)``."""
-        return np.asarray(np.einsum("ni,nijkl,nj->nkl", momenta, self.second_derivatives(x), momenta))
-
-    def divergence(self, x: np.ndarray) -> np.ndarray:
-        """``Σ_i ∂_i D_ij`` at points: ``(n, d)`` to ``(n, d)``."""
-        return np.asarray(np.einsum("nijj->ni", self.derivatives(x)))
+ROUNDING = 1e-12  # of numbers of size one, and some products of them
 
 
-@dataclass(frozen=True)
-class NoiseInUnits(NoiseField):
-    """D of the states ``x = center + units y`` as a D of y, times a factor for the unit of time.
+class Diffusion:
+    """D(x): ``Diffusion(matrix)`` is constant, `Diffusion.of_formulas` depends on the state.
 
-    Attributes
-    ----------
-    noise
-        D of x.
-    center, units
-        Shape ``(d,)`` and ``(d, d)``.
-    factor
-        By which ``units⁻¹ D units⁻ᵀ`` is multiplied.
-    """
-
-    noise: Diffusion
-    center: np.ndarray
-    units: np.ndarray
-    factor: float
-
-    @cached_property
-    def _inverse(self) -> np.ndarray:
-        return np.linalg.inv(self.units)
-
-    def _points(self, y: np.ndarray) -> np.ndarray:
-        return np.asarray(self.center + y @ self.units.T)
-
-    def at(self, y: np.ndarray) -> np.ndarray:
-        """D at points: ``(n, d)`` to ``(n, d, d)``."""
-        return np.asarray(self.factor * self._inverse @ self.noise.at(self._points(y)) @ self._inverse.T)
-
-    def whitening_at(self, y: np.ndarray) -> np.ndarray:
-        """σ⁻¹ at points: ``(n, d)`` to ``(n, d, d)``; raises as that of the noise."""
-        own = self.noise.whitening_at(self._points(y)) @ self.units
-        return np.asarray(own / np.sqrt(self.factor))
-
-    def derivatives(self, y: np.ndarray) -> np.ndarray:
-        """∂D_ij/∂y_k at points: ``(n, d)`` to ``(n, d, d, d)``, k last."""
-        inner = self.noise.derivatives(self._points(y))
-        left, units = self._inverse, self.units
-        return np.asarray(
-            self.factor * np.einsum("ai,bj,nijk,kl->nabl", left, left, inner, units, optimize=True)
-        )
-
-    def second_derivatives(self, y: np.ndarray) -> np.ndarray:
-        """∂²D_ij/∂y_k∂y_l at points: ``(n, d)`` to ``(n, d, d, d, d)``, k and l last."""
-        inner = self.noise.second_derivatives(self._points(y))
-        left, units = self._inverse, self.units
-        turned = np.einsum("ai,bj,nijkl,kc,ld->nabcd", left, left, inner, units, units, optimize=True)
-        return np.asarray(self.factor * turned)
-
-
-@dataclass(frozen=True, eq=False)
-class Diffusion(NoiseField):
-    """A constant D.
-
-    Attributes
+    Parameters
     ----------
     matrix
         D, shape ``(d, d)``, in the states' units squared per unit of time; symmetric and positive
@@ -132,53 +46,78 @@ class Diffusion(NoiseField):
     array([[1., 4.]])
     >>> noise.squared_speed(np.zeros((1, 2)), np.array([[1.0, 2.0]]))
     array([2.])
+    >>> x, y = sympy.symbols("x y", real=True)
+    >>> noise = Diffusion.of_formulas((x, y), ((1 + x**2, 0), (0, 1)))
+    >>> noise.contract(np.array([[2.0, 0.0]]), np.array([[1.0, 1.0]]), order=1)
+    array([[4., 0.]])
     """
 
-    matrix: np.ndarray
+    dimension: int
+    constant: bool
+    """Whether D is the same everywhere, so that `matrix`, `root` and their kin may be asked for."""
+    regular: bool
+    """Whether noise reaches every state directly, so that D has an inverse where it is positive."""
+    formulas: tuple[tuple[sympy.Expr, ...], ...]
+    """D row by row as formulas."""
+    symbols: tuple[sympy.Symbol, ...] = ()
+    """The states in the formulas, in their order; none of a constant D."""
 
-    def __post_init__(self) -> None:
-        matrix = np.asarray(self.matrix, dtype=float)
-        if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
-            raise ValueError("the diffusion is not a square matrix; give one row and one column a state")
-        scale = np.sqrt(np.where(np.diag(matrix) > 0, np.diag(matrix), 1.0))
-        scaled = matrix / np.outer(scale, scale)
-        rounding = 1e-12  # of numbers of size one, and some products of them
-        if not np.isfinite(scaled).all() or np.abs(scaled - scaled.T).max() > rounding:
-            raise ValueError("the diffusion is not symmetric; correct the matrix")
-        if np.linalg.eigvalsh(scaled)[0] < -rounding:
-            raise ValueError("the diffusion is not positive semi-definite; correct the matrix")
-        object.__setattr__(self, "matrix", (matrix + matrix.T) / 2)
+    def __new__(cls, *_: object) -> Diffusion:
+        """A constant D where no other is asked for by its class."""
+        return super().__new__(_Constant if cls is Diffusion else cls)
+
+    def __init__(self, matrix: np.ndarray) -> None:
+        raise NotImplementedError
 
     @classmethod
     def identity(cls, dimension: int) -> Diffusion:
         """D = 1, for states of one unit."""
-        return cls(np.eye(dimension))
+        return Diffusion(np.eye(dimension))
+
+    @classmethod
+    def of_formulas(
+        cls, symbols: Sequence[sympy.Symbol], rows: Sequence[Sequence[sympy.Expr | float]]
+    ) -> Diffusion:
+        """D of formulas, d rows of d, in the symbols of the states; constant where no state stands in them.
+
+        Raises
+        ------
+        ValueError
+            When the formulas are not a symmetric matrix, or other names than the states stand in them.
+        """
+        found = _Formulas(symbols, rows)
+        if any(entry.free_symbols for row in found.formulas for entry in row):
+            return found
+        return Diffusion(np.array([[float(entry) for entry in row] for row in found.formulas]))
+
+    @classmethod
+    def of_rows(cls, symbols: Sequence[sympy.Symbol], rows: Sequence[Sequence[str | float]]) -> Diffusion:
+        """D from plain data, see `rows`; raises as `of_formulas`, or `FormulaError`."""
+        names = {each.name: each for each in symbols}
+        if all(not isinstance(entry, str) for row in rows for entry in row):
+            return Diffusion(np.array(rows, dtype=float))
+        return cls.of_formulas(symbols, [[parse_formula(entry, names) for entry in row] for row in rows])
 
     @property
-    def dimension(self) -> int:
-        """Number of states, d."""
-        return len(self.matrix)
+    def rows(self) -> list[list[str | float]]:
+        """D as plain data, row by row: numbers where it is constant, formulas elsewhere."""
+        if self.constant:
+            return [[float(entry) for entry in row] for row in self.matrix]
+        return [[str(entry) for entry in row] for row in self.formulas]
+
+    # A constant D alone.
 
     @property
-    def constant(self) -> bool:
-        """Whether D is the same everywhere, so that `matrix`, `root` and their kin may be asked for."""
-        return True
-
-    @property
-    def formulas(self) -> tuple[tuple[sympy.Expr, ...], ...]:
-        """D row by row as formulas."""
-        return tuple(tuple(exact_number(float(entry)) for entry in row) for row in self.matrix)
+    def matrix(self) -> np.ndarray:
+        """D where it is the same everywhere, shape ``(d, d)``; raises NumericalFailure where it is not."""
+        raise NumericalFailure(
+            "this is worked out only for a noise that is the same everywhere; here D depends on the state"
+        )
 
     @property
     def scale(self) -> np.ndarray:
         """√D_ii, shape ``(d,)``: the unit of each state in which its noise is one; 1 where there is none."""
         return np.sqrt(np.where(np.diag(self.matrix) > 0, np.diag(self.matrix), 1.0))
-
-    @cached_property
-    def regular(self) -> bool:
-        """Whether noise reaches every state directly, so that D has an inverse."""
-        scaled = self.matrix / np.outer(self.scale, self.scale)
-        return bool(np.linalg.eigvalsh(scaled)[0] > 1e-12)  # rounding of units of size one
 
     @cached_property
     def root(self) -> np.ndarray:
@@ -190,241 +129,214 @@ class Diffusion(NoiseField):
 
     @cached_property
     def precision(self) -> np.ndarray:
-        """D⁻¹, shape ``(d, d)``.
-
-        Raises
-        ------
-        NumericalFailure
-            Where noise does not reach every state.
-        """
+        """D⁻¹, shape ``(d, d)``; raises NumericalFailure where noise does not reach every state."""
         self._check_inverse()
         return np.linalg.inv(self.matrix)
 
     @cached_property
     def whitening(self) -> np.ndarray:
-        """σ⁻¹, shape ``(d, d)``: in the states ``σ⁻¹ x`` the noise is the same in every direction.
-
-        Raises
-        ------
-        NumericalFailure
-            Where noise does not reach every state.
-        """
+        """σ⁻¹, shape ``(d, d)``: the noise of ``σ⁻¹ x`` is the same in every direction; raises as D⁻¹."""
         self._check_inverse()
         return np.asarray(solve_triangular(self.root, np.eye(self.dimension), lower=True))
-
-    def _check_inverse(self) -> None:
-        if not self.regular:
-            raise NumericalFailure("the noise does not reach every state: D has no inverse")
-
-    def extended(self, count: int) -> Diffusion:
-        """The same noise in a system of `count` further states, which it does not reach."""
-        return Diffusion(np.pad(self.matrix, (0, count)))
-
-    def at(self, x: np.ndarray) -> np.ndarray:
-        """D at points: ``(n, d)`` to ``(n, d, d)``."""
-        return np.broadcast_to(self.matrix, (len(x), *self.matrix.shape))
-
-    def push(self, x: np.ndarray, momenta: np.ndarray) -> np.ndarray:
-        """``D(x) p`` at points ``(n, d)`` and momenta: the velocity that a momentum, or ∇V, adds.
-
-        There may be several momenta at a point, shape ``(n, ..., d)``.
-        """
-        del x  # D is constant
-        return momenta @ self.matrix
-
-    def steepness(self, x: np.ndarray, momenta: np.ndarray) -> np.ndarray:
-        """``p·D(x) p`` at points ``(n, d)`` and momenta ``(n, ..., d)``: shape ``(n, ...)``."""
-        return np.asarray((momenta * self.push(x, momenta)).sum(axis=-1))
-
-    def squared_speed(self, x: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """``v·D(x)⁻¹ v`` at points and velocities ``(n, d)``: shape ``(n,)``, no state's unit matters in it.
-
-        Raises
-        ------
-        NumericalFailure
-            Where D has no inverse.
-        """
-        del x  # D is constant
-        return np.asarray(np.einsum("ni,ij,nj->n", velocity, self.precision, velocity))
-
-    def root_at(self, x: np.ndarray) -> np.ndarray:
-        """σ at points: ``(n, d)`` to ``(n, d, d)``."""
-        return np.broadcast_to(self.root, (len(x), *self.matrix.shape))
-
-    def whitening_at(self, x: np.ndarray) -> np.ndarray:
-        """σ⁻¹ at points: ``(n, d)`` to ``(n, d, d)``; raises as `whitening`."""
-        return np.broadcast_to(self.whitening, (len(x), *self.matrix.shape))
-
-    def positive_at(self, x: np.ndarray) -> np.ndarray:
-        """Mask of the points ``(n, d)`` at which D is a covariance: shape ``(n,)``; here everywhere."""
-        return np.full(len(x), True)
-
-    def precision_at(self, x: np.ndarray) -> np.ndarray:
-        """D⁻¹ at points: ``(n, d)`` to ``(n, d, d)``; raises as `precision`."""
-        return np.broadcast_to(self.precision, (len(x), *self.matrix.shape))
-
-    def frozen(self, point: np.ndarray) -> Diffusion:
-        """The constant D that is the one at a point, shape ``(d,)``."""
-        del point  # D is constant
-        return self
-
-    def derivatives(self, x: np.ndarray) -> np.ndarray:
-        """∂D_ij/∂x_k at points: ``(n, d)`` to ``(n, d, d, d)``, k last."""
-        return np.zeros((len(x), *(self.dimension,) * 3))
-
-    def second_derivatives(self, x: np.ndarray) -> np.ndarray:
-        """∂²D_ij/∂x_k∂x_l at points: ``(n, d)`` to ``(n, d, d, d, d)``, k and l last."""
-        return np.zeros((len(x), *(self.dimension,) * 4))
-
-    def in_units(self, center: np.ndarray, units: np.ndarray, factor: float) -> NoiseInUnits:
-        """The same noise as one of y, ``x = center + units y``; see `NoiseInUnits`."""
-        return NoiseInUnits(self, center, units, factor)
-
-    def kicks(self, x: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-        """``σ(x) ξ`` of components: states and numbers ``(d, ...)`` to ``(d, ...)``, for simulations."""
-        del x  # D is constant
-        return np.asarray(self.root @ numbers)
 
     def intensity(self, rate: np.ndarray) -> float:
         """ε of a noise whose covariance per unit of time, shape ``(d, d)``, is about ε D."""
         return float(np.trace(self.precision @ rate)) / self.dimension
 
+    def _check_inverse(self) -> None:
+        if not self.regular:
+            raise NumericalFailure("the noise does not reach every state: D has no inverse")
 
-class StateNoise(Diffusion):
-    """A D that depends on the state.
+    # Any D, at points.
 
-    Parameters
-    ----------
-    symbols
-        The d states, in their order, as they stand in the formulas.
-    rows
-        D_ij as formulas, d rows of d.
-
-    Raises
-    ------
-    ValueError
-        When the formulas are not a symmetric matrix, or other names than the states stand in them.
-
-    Examples
-    --------
-    >>> x, y = sympy.symbols("x y", real=True)
-    >>> noise = StateNoise((x, y), ((1 + x**2, 0), (0, 1)))
-    >>> noise.push(np.array([[2.0, 0.0]]), np.array([[1.0, 1.0]]))
-    array([[5., 1.]])
-    >>> noise.pull(np.array([[2.0, 0.0]]), np.array([[1.0, 1.0]]))
-    array([[4., 0.]])
-    """
-
-    def __init__(self, symbols: Sequence[sympy.Symbol], rows: Sequence[Sequence[sympy.Expr | float]]) -> None:
-        d = len(symbols)
-        formulas = tuple(tuple(sympy.sympify(entry) for entry in row) for row in rows)
-        if len(formulas) != d or any(len(row) != d for row in formulas):
-            raise ValueError("the diffusion is not a square matrix; give one row and one column a state")
-        if any(formulas[i][j] - formulas[j][i] != 0 for i in range(d) for j in range(i)) and any(
-            sympy.simplify(formulas[i][j] - formulas[j][i]) != 0 for i in range(d) for j in range(i)
-        ):
-            raise ValueError("the diffusion is not symmetric; correct the matrix")
-        unknown = set().union(*(entry.free_symbols for row in formulas for entry in row)) - set(symbols)
-        if unknown:
-            names = ", ".join(sorted(map(str, unknown)))
-            raise ValueError(f"the diffusion depends on {names}; let it depend on the states alone")
-        object.__setattr__(self, "symbols", tuple(symbols))
-        object.__setattr__(self, "_formulas", formulas)
-
-    symbols: tuple[sympy.Symbol, ...]
-    _formulas: tuple[tuple[sympy.Expr, ...], ...]
-
-    def __repr__(self) -> str:
-        return f"StateNoise({self.symbols}, {self._formulas})"
-
-    @property
-    def matrix(self) -> np.ndarray:
-        """There is none.
-
-        Raises
-        ------
-        NumericalFailure
-            Always.
-        """
-        raise NumericalFailure(
-            "this is worked out only for a noise that is the same everywhere; here D depends on the state"
-        )
-
-    @property
-    def dimension(self) -> int:
-        """Number of states, d."""
-        return len(self.symbols)
-
-    @property
-    def constant(self) -> bool:
-        """No."""
-        return False
-
-    @property
-    def formulas(self) -> tuple[tuple[sympy.Expr, ...], ...]:
-        """D row by row as formulas."""
-        return self._formulas
-
-    @cached_property
-    def regular(self) -> bool:
-        """Whether no state is left out by its formulas; where D is singular otherwise is told at points."""
-        return all(any(entry != 0 for entry in row) for row in self._formulas)
-
-    @cached_property
-    def diagonal(self) -> bool:
-        """Whether the noise of each state is its own."""
-        return all(
-            entry == 0 for i, row in enumerate(self._formulas) for j, entry in enumerate(row) if i != j
-        )
-
-    def extended(self, count: int) -> Diffusion:
-        """The same noise in a system of `count` further states, which it does not reach."""
-        further = sympy.symbols(f"_further:{count}", real=True)
-        rows = [(*row, *(sympy.S.Zero,) * count) for row in self._formulas]
-        nothing = [(sympy.S.Zero,) * (self.dimension + count)] * count
-        return StateNoise((*self.symbols, *further), [*rows, *nothing])
-
-    def frozen(self, point: np.ndarray) -> Diffusion:
-        """The constant D that is the one at a point, shape ``(d,)``.
-
-        Raises
-        ------
-        NumericalFailure
-            Where D is no covariance.
-        """
-        matrix = self.at(np.asarray(point, dtype=float)[None])[0]
-        try:
-            return Diffusion(matrix)
-        except ValueError:
-            raise NumericalFailure(_indefinite(point)) from None
+    def derivatives(self, x: np.ndarray, order: int = 1) -> np.ndarray:
+        """``∂^order D_ij / ∂x_k …`` at points: ``(n, d)`` to ``(n, d, d, d, …)``, k and further ones last."""
+        raise NotImplementedError
 
     def at(self, x: np.ndarray) -> np.ndarray:
         """D at points: ``(n, d)`` to ``(n, d, d)``."""
-        return self._tensor(self._values, x, 2)
+        return self.derivatives(x, 0)
 
-    def derivatives(self, x: np.ndarray) -> np.ndarray:
-        """∂D_ij/∂x_k at points: ``(n, d)`` to ``(n, d, d, d)``, k last."""
-        return self._tensor(self._first, x, 3)
+    def contract(self, x: np.ndarray, momenta: np.ndarray, order: int = 0) -> np.ndarray:
+        """``p·D(x) p``, or its first or second derivatives by x.
 
-    def second_derivatives(self, x: np.ndarray) -> np.ndarray:
-        """∂²D_ij/∂x_k∂x_l at points: ``(n, d)`` to ``(n, d, d, d, d)``, k and l last."""
-        return self._tensor(self._second, x, 4)
+        Parameters
+        ----------
+        x
+            Points, shape ``(n, d)``.
+        momenta
+            p, shape ``(n, d)``; for order 0 there may be several at a point, ``(n, ..., d)``.
+        order
+            Of the derivative: the result has the shape ``(n, ...)``, ``(n, d)`` or ``(n, d, d)``.
+        """
+        if order == 0:
+            return np.asarray((momenta * self.push(x, momenta)).sum(axis=-1))
+        result = "nk" if order == 1 else "nkl"
+        factors = f"ni,nij{result[1:]},nj->{result}"
+        return np.asarray(np.einsum(factors, momenta, self.derivatives(x, order), momenta))
+
+    def turn(self, x: np.ndarray, momenta: np.ndarray) -> np.ndarray:
+        """``((∂_k D)p)_i`` at points and momenta ``(n, d)``: shape ``(n, d, d)``, i before k."""
+        return np.asarray(np.einsum("nijk,nj->nik", self.derivatives(x), momenta))
+
+    def divergence(self, x: np.ndarray) -> np.ndarray:
+        """``Σ_i ∂_i D_ij`` at points: ``(n, d)`` to ``(n, d)``."""
+        return np.asarray(np.einsum("nijj->ni", self.derivatives(x)))
 
     def push(self, x: np.ndarray, momenta: np.ndarray) -> np.ndarray:
-        """``D(x) p`` at points ``(n, d)`` and momenta ``(n, ..., d)``."""
+        """``D(x) p``, the velocity that a momentum, or ∇V, adds, at points and momenta ``(n, ..., d)``."""
         if not len(x):
             return np.zeros(momenta.shape)
         n, d = x.shape
         return np.asarray((momenta.reshape(n, -1, d) @ self.at(x)).reshape(momenta.shape))
 
     def root_at(self, x: np.ndarray) -> np.ndarray:
-        """σ at points, lower triangular: ``(n, d)`` to ``(n, d, d)``.
+        """σ at points, lower triangular where D is regular: ``(n, d)`` to ``(n, d, d)``.
 
         Raises
         ------
         NumericalFailure
-            Where D is not positive definite, or where it leaves a state out.
+            Where D is not positive definite, or formulas leave a state out.
         """
+        raise NotImplementedError
+
+    def whitening_at(self, x: np.ndarray) -> np.ndarray:
+        """σ⁻¹ at points: ``(n, d)`` to ``(n, d, d)``; raises NumericalFailure where there is none."""
+        return np.linalg.inv(self.root_at(x))
+
+    def precision_at(self, x: np.ndarray) -> np.ndarray:
+        """D⁻¹ at points: ``(n, d)`` to ``(n, d, d)``; raises as `whitening_at`."""
+        whitening = self.whitening_at(x)
+        return whitening.transpose(0, 2, 1) @ whitening
+
+    def squared_speed(self, x: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """``v·D(x)⁻¹ v`` at points and velocities ``(n, d)``: shape ``(n,)``, no state's unit matters in it.
+
+        Raises NumericalFailure where D has no inverse.
+        """
+        whitened = (self.whitening_at(x) @ velocity[:, :, None])[:, :, 0]
+        return np.asarray((whitened**2).sum(axis=1))
+
+    def positive_at(self, x: np.ndarray) -> np.ndarray:
+        """Mask of the points ``(n, d)`` at which D is a covariance: shape ``(n,)``.
+
+        Formulas may be none far from the states that they were learned from. Where they leave no state out, D
+        has to be positive definite.
+        """
+        return np.full(len(x), True)
+
+    def frozen(self, point: np.ndarray) -> Diffusion:
+        """The constant D that is the one at a point ``(d,)``; raises NumericalFailure where it is none."""
+        raise NotImplementedError
+
+    def kicks(self, x: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+        """``σ(x) ξ`` of components, for simulations: states and numbers ``(d, ...)`` to ``(d, ...)``.
+
+        Raises NumericalFailure where D is no covariance.
+        """
+        raise NotImplementedError
+
+    def extended(self, count: int) -> Diffusion:
+        """The same noise in a system of `count` further states, which it does not reach."""
+        raise NotImplementedError
+
+    def in_units(self, center: np.ndarray, units: np.ndarray, factor: float) -> Diffusion:
+        """``factor · units⁻¹ D units⁻ᵀ`` as a D of the states y, ``x = center + units y``."""
+        return _InUnits(self, center, units, factor)
+
+
+class _Constant(Diffusion):
+    constant = True
+
+    def __init__(self, matrix: np.ndarray) -> None:
+        matrix = np.asarray(matrix, dtype=float)
+        if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
+            raise ValueError("the diffusion is not a square matrix; give one row and one column a state")
+        scale = np.sqrt(np.where(np.diag(matrix) > 0, np.diag(matrix), 1.0))
+        scaled = matrix / np.outer(scale, scale)
+        if not np.isfinite(scaled).all() or np.abs(scaled - scaled.T).max() > ROUNDING:
+            raise ValueError("the diffusion is not symmetric; correct the matrix")
+        if np.linalg.eigvalsh(scaled)[0] < -ROUNDING:
+            raise ValueError("the diffusion is not positive semi-definite; correct the matrix")
+        self._matrix = (matrix + matrix.T) / 2
+        self.dimension = len(matrix)
+
+    def __repr__(self) -> str:
+        return f"Diffusion({self._matrix!r})"
+
+    @property
+    def matrix(self) -> np.ndarray:
+        return self._matrix
+
+    @cached_property
+    def regular(self) -> bool:  # type: ignore[override]
+        return bool(np.linalg.eigvalsh(self.matrix / np.outer(self.scale, self.scale))[0] > ROUNDING)
+
+    @property
+    def formulas(self) -> tuple[tuple[sympy.Expr, ...], ...]:  # type: ignore[override]
+        return tuple(tuple(exact_number(float(entry)) for entry in row) for row in self.matrix)
+
+    def derivatives(self, x: np.ndarray, order: int = 1) -> np.ndarray:
+        if order == 0:
+            return np.broadcast_to(self.matrix, (len(x), *self.matrix.shape))
+        return np.zeros((len(x), *(self.dimension,) * (2 + order)))
+
+    def push(self, x: np.ndarray, momenta: np.ndarray) -> np.ndarray:
+        return momenta @ self.matrix
+
+    def root_at(self, x: np.ndarray) -> np.ndarray:
+        return np.broadcast_to(self.root, (len(x), *self.matrix.shape))
+
+    def whitening_at(self, x: np.ndarray) -> np.ndarray:
+        return np.broadcast_to(self.whitening, (len(x), *self.matrix.shape))
+
+    def frozen(self, point: np.ndarray) -> Diffusion:
+        return self
+
+    def kicks(self, x: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+        return np.asarray(self.root @ numbers)
+
+    def extended(self, count: int) -> Diffusion:
+        return Diffusion(np.pad(self.matrix, (0, count)))
+
+
+class _Formulas(Diffusion):
+    constant = False
+
+    def __init__(self, symbols: Sequence[sympy.Symbol], rows: Sequence[Sequence[sympy.Expr | float]]) -> None:
+        d = len(symbols)
+        formulas = tuple(tuple(sympy.sympify(entry) for entry in row) for row in rows)
+        if len(formulas) != d or any(len(row) != d for row in formulas):
+            raise ValueError("the diffusion is not a square matrix; give one row and one column a state")
+        apart = [formulas[i][j] - formulas[j][i] for i in range(d) for j in range(i)]
+        if any(each != 0 and sympy.simplify(each) != 0 for each in apart):
+            raise ValueError("the diffusion is not symmetric; correct the matrix")
+        unknown = set().union(*(entry.free_symbols for row in formulas for entry in row)) - set(symbols)
+        if unknown:
+            names = ", ".join(sorted(map(str, unknown)))
+            raise ValueError(f"the diffusion depends on {names}; let it depend on the states alone")
+        self.symbols, self.formulas, self.dimension = tuple(symbols), formulas, d
+        self.regular = all(any(entry != 0 for entry in row) for row in formulas)
+        self._compiled: dict[int, Callable[[np.ndarray], np.ndarray]] = {}
+        self._diagonal = all(formulas[i][j] == 0 for i in range(d) for j in range(d) if i != j)
+
+    def __repr__(self) -> str:
+        return f"_Formulas({self.symbols}, {self.formulas})"
+
+    def derivatives(self, x: np.ndarray, order: int = 1) -> np.ndarray:
+        values = self._values(np.ascontiguousarray(x.T), order)
+        return values.T.reshape(len(x), *(self.dimension,) * (2 + order))
+
+    def _values(self, components: np.ndarray, order: int) -> np.ndarray:
+        """Derivatives one after another: components ``(d, n)`` to ``(d^(2 + order), n)``."""
+        if order not in self._compiled:
+            entries = [entry for row in self.formulas for entry in row]
+            for _ in range(order):
+                entries = [each.diff(symbol) for each in entries for symbol in self.symbols]
+            self._compiled[order] = compile_formulas(entries, self.symbols)
+        return self._compiled[order](components)
+
+    def root_at(self, x: np.ndarray) -> np.ndarray:
         self._check_inverse()
         matrices = self.at(x)
         try:
@@ -432,122 +344,77 @@ class StateNoise(Diffusion):
         except np.linalg.LinAlgError:
             root = np.full(matrices.shape, np.nan)
         if not np.isfinite(root).all():
-            lowest = np.array([_lowest(matrix) for matrix in matrices])
-            raise NumericalFailure(_indefinite(x[np.argmin(lowest)]))
+            lowest = np.full(len(x), -np.inf)  # eigenvalues, in units in which the diagonal is one
+            for k in np.flatnonzero(np.isfinite(matrices).all(axis=(1, 2))):
+                scale = np.sqrt(np.where(np.diag(matrices[k]) > 0, np.diag(matrices[k]), 1.0))
+                lowest[k] = np.linalg.eigvalsh(matrices[k] / np.outer(scale, scale))[0]
+            raise _indefinite(x[np.argmin(lowest)])
         return root
 
-    def whitening_at(self, x: np.ndarray) -> np.ndarray:
-        """σ⁻¹ at points: ``(n, d)`` to ``(n, d, d)``; raises as `root_at`."""
-        return np.linalg.inv(self.root_at(x))
-
     def positive_at(self, x: np.ndarray) -> np.ndarray:
-        """Mask of the points ``(n, d)`` at which D is a covariance: shape ``(n,)``.
-
-        Far from the states that they were learned from formulas may be none. Where they leave no state out,
-        D has to be positive definite.
-        """
         matrices = self.at(x)
         finite = np.isfinite(matrices).all(axis=(1, 2))
         values = np.linalg.eigvalsh(np.where(finite[:, None, None], matrices, 0.0))
-        least = 0.0 if self.regular else -1e-12 * np.abs(values).max(axis=1)  # rounding
+        least = 0.0 if self.regular else -ROUNDING * np.abs(values).max(axis=1)
         return np.asarray(finite & (values[:, 0] > least))
 
-    def precision_at(self, x: np.ndarray) -> np.ndarray:
-        """D⁻¹ at points: ``(n, d)`` to ``(n, d, d)``; raises as `root_at`."""
-        whitening = self.whitening_at(x)
-        return whitening.transpose(0, 2, 1) @ whitening
-
-    def squared_speed(self, x: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """``v·D(x)⁻¹ v`` at points and velocities ``(n, d)``: shape ``(n,)``; raises as `root_at`."""
-        whitened = (self.whitening_at(x) @ velocity[:, :, None])[:, :, 0]
-        return np.asarray((whitened**2).sum(axis=1))
+    def frozen(self, point: np.ndarray) -> Diffusion:
+        matrix = self.at(np.asarray(point, dtype=float)[None])[0]
+        try:
+            return Diffusion(matrix)
+        except ValueError:
+            raise _indefinite(point) from None
 
     def kicks(self, x: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-        """``σ(x) ξ`` of components: states and numbers ``(d, ...)`` to ``(d, ...)``, for simulations.
-
-        Raises
-        ------
-        NumericalFailure
-            Where D is no covariance.
-        """
         d = self.dimension
-        values = self._values(x)
+        values = self._values(x, 0)
         finite = np.isfinite(x).all(axis=0)  # a state that has run away is told by who simulates
-        if self.diagonal:
+        if self._diagonal:
             variances = values[:: d + 1]
             if not (variances[:, finite] >= 0).all():
-                worst = int(np.argmin(np.where(finite, variances.min(axis=0), np.inf)))
-                raise NumericalFailure(_indefinite(x[:, worst]))
+                raise _indefinite(x[:, int(np.argmin(np.where(finite, variances.min(axis=0), np.inf)))])
             return np.asarray(np.sqrt(variances) * numbers)
         matrices = np.where(finite, values, np.eye(d).reshape(d * d, 1)).T.reshape(-1, d, d)
         levels, vectors = np.linalg.eigh(matrices)
-        rounding = -1e-12 * np.abs(levels).max(axis=1)  # of numbers of one size, and some products of them
-        if (levels[:, 0] < rounding).any():
-            raise NumericalFailure(_indefinite(x[:, int(np.argmin(levels[:, 0]))]))
+        if (levels[:, 0] < -ROUNDING * np.abs(levels).max(axis=1)).any():
+            raise _indefinite(x[:, int(np.argmin(levels[:, 0]))])
         along = np.einsum("nji,jn->ni", vectors, numbers) * np.sqrt(np.maximum(levels, 0.0))
-        kicks: np.ndarray = np.einsum("nij,nj->in", vectors, along)
-        return np.where(finite, kicks, np.nan)
+        return np.where(finite, np.einsum("nij,nj->in", vectors, along), np.nan)
 
-    def _tensor(self, function: Callable[[np.ndarray], np.ndarray], x: np.ndarray, order: int) -> np.ndarray:
-        values = function(np.ascontiguousarray(x.T))
-        return values.T.reshape(len(x), *(self.dimension,) * order)
-
-    @cached_property
-    def _values(self) -> Callable[[np.ndarray], np.ndarray]:
-        return compile_formulas(self._flat, self.symbols)
-
-    @cached_property
-    def _first(self) -> Callable[[np.ndarray], np.ndarray]:
-        return compile_formulas(_derivatives(self._flat, self.symbols), self.symbols)
-
-    @cached_property
-    def _second(self) -> Callable[[np.ndarray], np.ndarray]:
-        first = _derivatives(self._flat, self.symbols)
-        return compile_formulas(_derivatives(first, self.symbols), self.symbols)
-
-    @property
-    def _flat(self) -> list[sympy.Expr]:
-        return [entry for row in self._formulas for entry in row]
+    def extended(self, count: int) -> Diffusion:
+        further = sympy.symbols(f"_further:{count}", real=True)
+        rows = [(*row, *(sympy.S.Zero,) * count) for row in self.formulas]
+        nothing = [(sympy.S.Zero,) * (self.dimension + count)] * count
+        return _Formulas((*self.symbols, *further), [*rows, *nothing])
 
 
-def state_noise(symbols: Sequence[sympy.Symbol], rows: Sequence[Sequence[sympy.Expr | float]]) -> Diffusion:
-    """D of formulas: constant where no state stands in them. Raises as `StateNoise` and `Diffusion`."""
-    found = StateNoise(symbols, rows)
-    if any(entry.free_symbols for row in found.formulas for entry in row):
-        return found
-    return Diffusion(np.array([[float(entry) for entry in row] for row in found.formulas]))
+class _InUnits(Diffusion):
+    """D of the states ``x = center + units y`` as a D of y, times a factor for the unit of time."""
+
+    def __init__(self, noise: Diffusion, center: np.ndarray, units: np.ndarray, factor: float) -> None:
+        self.noise, self.center, self.units, self.factor = noise, center, units, factor
+        self.dimension, self.constant, self.regular = noise.dimension, noise.constant, noise.regular
+        self._inverse = np.linalg.inv(units)
+
+    def derivatives(self, y: np.ndarray, order: int = 1) -> np.ndarray:
+        inner = self.noise.derivatives(self.center + y @ self.units.T, order)
+        if order == 0:
+            return np.asarray(self.factor * self._inverse @ inner @ self._inverse.T)
+        left, units = self._inverse, self.units
+        if order == 1:
+            turned = np.einsum("ai,bj,nijk,kl->nabl", left, left, inner, units, optimize=True)
+        else:
+            turned = np.einsum("ai,bj,nijkl,kc,ld->nabcd", left, left, inner, units, units, optimize=True)
+        return np.asarray(self.factor * turned)
+
+    def whitening_at(self, y: np.ndarray) -> np.ndarray:
+        own = self.noise.whitening_at(self.center + y @ self.units.T) @ self.units
+        return np.asarray(own / np.sqrt(self.factor))
 
 
-def diffusion_rows_of(diffusion: Diffusion) -> list[list[str | float]]:
-    """D as plain data, row by row: numbers where it is constant, formulas elsewhere."""
-    if diffusion.constant:
-        return [[float(entry) for entry in row] for row in diffusion.matrix]
-    return [[str(entry) for entry in row] for row in diffusion.formulas]
-
-
-def diffusion_of_rows(symbols: Sequence[sympy.Symbol], rows: Sequence[Sequence[str | float]]) -> Diffusion:
-    """D from what `diffusion_rows_of` made; raises as `StateNoise` and `Diffusion`, or `FormulaError`."""
-    names = {each.name: each for each in symbols}
-    if all(not isinstance(entry, str) for row in rows for entry in row):
-        return Diffusion(np.array(rows, dtype=float))
-    return state_noise(symbols, [[parse_formula(entry, names) for entry in row] for row in rows])
-
-
-def _derivatives(expressions: Sequence[sympy.Expr], symbols: Sequence[sympy.Symbol]) -> list[sympy.Expr]:
-    return [expression.diff(symbol) for expression in expressions for symbol in symbols]
-
-
-def _lowest(matrix: np.ndarray) -> float:
-    """The smallest eigenvalue, in units in which the diagonal is one where it is positive."""
-    if not np.isfinite(matrix).all():
-        return -np.inf
-    scale = np.sqrt(np.where(np.diag(matrix) > 0, np.diag(matrix), 1.0))
-    return float(np.linalg.eigvalsh(matrix / np.outer(scale, scale))[0])
-
-
-def _indefinite(point: np.ndarray) -> str:
+def _indefinite(point: np.ndarray) -> NumericalFailure:
     place = ", ".join(f"{value:.4g}" for value in point)
-    return (
+    return NumericalFailure(
         f"D is not positive definite at ({place}): give formulas that are positive wherever states are, or"
         " leave the states beyond out"
     )

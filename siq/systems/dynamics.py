@@ -23,7 +23,7 @@ import numpy as np
 import sympy
 import yaml
 
-from siq.systems.diffusion import Diffusion, StateNoise, diffusion_rows_of, state_noise
+from siq.systems.diffusion import Diffusion
 from siq.systems.formulas import Tape, compile_formulas, compile_values, delay, exact_number, tape_of
 
 TIME = sympy.Symbol("t", real=True)
@@ -250,7 +250,7 @@ def _domain(limits: np.ndarray) -> dict[str, list[float]]:
 
 def _diffusion(diffusion: Diffusion) -> str | list[str | float] | list[list[str | float]]:
     """``identity``, the diagonal, or the whole matrix."""
-    rows = diffusion_rows_of(diffusion)
+    rows = diffusion.rows
     places = range(len(rows))
     if any(rows[i][j] not in (0.0, "0") for i in places for j in places if i != j):
         return rows
@@ -388,7 +388,7 @@ class Dynamics:
                             ("rows of D", self.diffusion.dimension)):  # fmt: skip
             if count != d:
                 raise ValueError(f"there are {count} {what} for {d} states; give one for each")
-        if isinstance(self.diffusion, StateNoise) and self.diffusion.symbols != self.symbols:
+        if self.diffusion.symbols not in ((), self.symbols):
             raise ValueError("D is one of other states; give it with these in their order")
         if self.domain is not None and np.shape(self.domain) != (d, 2):
             raise ValueError(f"the domain has the shape {np.shape(self.domain)}; give two limits a state")
@@ -423,7 +423,7 @@ class Dynamics:
         elif isinstance(diffusion, np.ndarray):
             diffusion = Diffusion(np.asarray(diffusion, dtype=float))
         elif not isinstance(diffusion, Diffusion):
-            diffusion = state_noise(symbols, diffusion)
+            diffusion = Diffusion.of_formulas(symbols, diffusion)
         names, formulas = tuple(each.name for each in symbols), tuple(map(sympy.sympify, equations))
         box = None if domain is None else np.asarray(domain, dtype=float)
         named = tuple(Parameter(each.name, float(value)) for each, value in (parameters or {}).items())

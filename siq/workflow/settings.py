@@ -16,7 +16,7 @@ from siq.numerics.files import read_document, validate
 from siq.quasipotential.certificate_tests import PredictionLimits
 from siq.quasipotential.refinement import RefinementOptions
 from siq.systems.cards import DiffusionEntry, SystemCard, diffusion_rows, read_diffusion
-from siq.systems.diffusion import Diffusion, diffusion_rows_of
+from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, symbol
 from siq.systems.simulation import SimulationOptions, complete
 from siq.workflow.outcomes import METHODS, Method
@@ -133,7 +133,7 @@ class StudyParts:
         if self.system is not None:
             units = dict(zip(self.system.states, self.system.units, strict=True))
             units["t"] = self.system.time_unit
-            return StateSpace(self.system.states, units, diffusion_rows_of(self.system.diffusion))
+            return StateSpace(self.system.states, units, self.system.diffusion.rows)
         recordings = self.study.recordings
         assert recordings is not None  # the schema asks for one of the two
         return StateSpace(recordings.states, recordings.units, recordings.diffusion)
@@ -204,4 +204,4 @@ def card_content(system: Dynamics | None) -> list[Any] | None:
         return None
     formulas = [str(equation) for equation in system.formulas]
     domain = None if system.domain is None else system.domain.tolist()
-    return [list(system.states), domain, formulas, diffusion_rows_of(system.diffusion)]
+    return [list(system.states), domain, formulas, system.diffusion.rows]

@@ -15,7 +15,7 @@ from siq.inference.measurements import Measurements
 from siq.inference.observation import View
 from siq.inference.state_dependent_diffusion import FilteredNoise, FormulaField, noise_by_state
 from siq.quasipotential.landscape import Landscape
-from siq.systems.diffusion import Diffusion, state_noise
+from siq.systems.diffusion import Diffusion
 from siq.workflow import identification_step
 from siq.workflow.pipeline import PipelineSettings
 
@@ -89,7 +89,7 @@ def test_a_constant_noise_is_given_up_as_rarely_as_asked() -> None:
 
 def test_the_field_is_the_mean_over_what_is_known_of_the_state() -> None:
     x, y = sympy.symbols("x y", real=True)
-    field = FormulaField(state_noise((x, y), [[1 + x**2, x * y], [x * y, 2 + y**2]]))
+    field = FormulaField(Diffusion.of_formulas((x, y), [[1 + x**2, x * y], [x * y, 2 + y**2]]))
     point, spread = np.array([[0.3, -0.2]]), np.array([[[0.05, 0.01], [0.01, 0.08]]])
     found = field.over(point, spread, np.zeros(1))[0]
     assert found == pytest.approx(np.array([[1.09 + 0.05, -0.06 + 0.01], [-0.06 + 0.01, 2.04 + 0.08]]))
@@ -101,7 +101,7 @@ def test_the_field_is_the_mean_over_what_is_known_of_the_state() -> None:
 
 def test_a_formula_that_is_no_covariance_somewhere_drives_nothing_there() -> None:
     x = sympy.Symbol("x", real=True)
-    field = FormulaField(state_noise((x,), [[1 + x]]))
+    field = FormulaField(Diffusion.of_formulas((x,), [[1 + x]]))
     assert field.over(np.array([[-1.5], [1.0]]), np.zeros((2, 1, 1)), np.zeros(2)).ravel() == pytest.approx(
         [0, 2]
     )

@@ -12,7 +12,7 @@ from siq.data.stationarity import runs_of
 from siq.data.two_states import continued_visits, dwell_counts
 from siq.errors import NumericalFailure
 from siq.quasipotential.occupancy import cell_process, cores_of
-from siq.systems.diffusion import Diffusion, StateNoise
+from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 
 pytestmark = pytest.mark.portable
@@ -28,17 +28,11 @@ def cores(points: np.ndarray) -> np.ndarray:
     return cores_of(points, WELLS[:, None], np.ones((2, 1, 1)), np.full(2, HALF**2))
 
 
-class Graded(Diffusion):
-    """D = (1 + x²/2)², as an object that depends on the state."""
-
-    def at(self, points: np.ndarray) -> np.ndarray:
-        return ((1 + points[:, 0] ** 2 / 2) ** 2)[:, None, None]
-
-
 @pytest.mark.parametrize("intensity", [0.05, 0.15, 0.4])
 @pytest.mark.parametrize("graded", [False, True])
 def test_one_state_by_quadrature(intensity: float, graded: bool) -> None:
-    system = TILTED.with_diffusion(Graded(np.eye(1))) if graded else TILTED
+    graded_noise = Diffusion.of_formulas((x,), (((1 + x**2 / 2) ** 2,),))
+    system = TILTED.with_diffusion(graded_noise) if graded else TILTED
     process = cell_process(system, intensity, BOX)
     grid = np.linspace(*BOX[0], 200_001)
     spread = (1 + grid**2 / 2) ** 2 if graded else np.ones_like(grid)
@@ -58,14 +52,14 @@ def test_one_state_by_quadrature(intensity: float, graded: bool) -> None:
 
 def test_cells_where_a_formula_of_the_noise_is_none_are_left_out() -> None:
     """D = 1 - x² on a wider box: Jacobi's process, with the density (1 - x²)^(1/ε - 1)."""
-    system = Dynamics(("x",), (-x,), StateNoise((x,), ((1 - x**2,),)))
+    system = Dynamics(("x",), (-x,), Diffusion.of_formulas((x,), ((1 - x**2,),)))
     intensity = 0.4
     process = cell_process(system, intensity, BOX)
     place = process.points[:, 0]
     assert np.abs(place).max() < 1 and np.abs(place).max() > 0.99
     expected = (1 - place**2) ** (1 / intensity - 1)
     assert process.density == pytest.approx(expected / expected.sum(), rel=1e-3, abs=1e-6)
-    beyond = system.with_diffusion(StateNoise((x,), ((x**2 - 9,),)))
+    beyond = system.with_diffusion(Diffusion.of_formulas((x,), ((x**2 - 9,),)))
     with pytest.raises(NumericalFailure, match="does not reach every state"):
         cell_process(beyond, intensity, BOX)
 

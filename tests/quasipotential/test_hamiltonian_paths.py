@@ -146,7 +146,7 @@ def test_shooting_from_point_to_point_of_a_solution_meets_the_next() -> None:
     def rates(_: float, state: np.ndarray) -> np.ndarray:
         x, p = state[None, :2], state[None, 2:]
         velocity = system.drift(x) + 2 * noise.push(x, p)
-        force = -np.einsum("nij,ni->nj", system.jacobian(x), p) - noise.pull(x, p)
+        force = -np.einsum("nij,ni->nj", system.jacobian(x), p) - noise.contract(x, p, 1)
         return np.concatenate([velocity[0], force[0]])
 
     states = np.concatenate([path.points, path.momenta], axis=1)

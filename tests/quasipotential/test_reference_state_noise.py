@@ -11,7 +11,7 @@ from known_systems import potential_gradient, potential_values
 from siq.errors import NumericalFailure
 from siq.quasipotential.characteristics import characteristics, even_directions
 from siq.quasipotential.power_series import quasipotential_series
-from siq.systems.diffusion import state_noise
+from siq.systems.diffusion import Diffusion
 from siq.systems.equilibria import hessian_at
 from siq.validation.mesh import mesh_quasipotential
 
@@ -74,7 +74,7 @@ def test_the_mesh_finds_the_given_potential_with_errors_of_second_order(which: i
 
 def test_the_mesh_refuses_a_box_in_which_d_is_no_covariance() -> None:
     x, y = sympy.symbols("x y", real=True)
-    noise = state_noise((x, y), ((x, 0), (0, 1)))
+    noise = Diffusion.of_formulas((x, y), ((x, 0), (0, 1)))
     with pytest.raises(NumericalFailure, match="not positive definite"):
         mesh_quasipotential(
             lambda points: np.stack([points[:, 0] * (1 - points[:, 0]), -points[:, 1]], axis=1),

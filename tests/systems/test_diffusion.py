@@ -26,17 +26,17 @@ def test_root_inverse_and_whitening_belong_to_one_d_in_any_units(scale: np.ndarr
 def test_products_at_points() -> None:
     noise = Diffusion(FULL)
     np.testing.assert_allclose(noise.push(X, P), P @ FULL, rtol=1e-14)
-    np.testing.assert_allclose(noise.steepness(X, P), [p @ FULL @ p for p in P], rtol=1e-13)
-    np.testing.assert_allclose(noise.squared_speed(X, noise.push(X, P)), noise.steepness(X, P), rtol=1e-12)
+    np.testing.assert_allclose(noise.contract(X, P), [p @ FULL @ p for p in P], rtol=1e-13)
+    np.testing.assert_allclose(noise.squared_speed(X, noise.push(X, P)), noise.contract(X, P), rtol=1e-12)
     np.testing.assert_array_equal(noise.at(X)[3], FULL)
 
 
 def test_several_momenta_at_a_point_are_taken_one_by_one() -> None:
     noise, many = Diffusion(FULL), np.random.default_rng(1).normal(size=(5, 4, 3))
-    together = noise.steepness(X, many)
+    together = noise.contract(X, many)
     assert noise.push(X, many).shape == (5, 4, 3)
     for k in range(4):
-        np.testing.assert_allclose(together[:, k], noise.steepness(X, many[:, k]), rtol=1e-13)
+        np.testing.assert_allclose(together[:, k], noise.contract(X, many[:, k]), rtol=1e-13)
 
 
 def test_a_noise_that_does_not_reach_every_state_has_a_root_and_no_inverse() -> None:

@@ -9,7 +9,7 @@ import sympy
 
 from siq.errors import InputError, NumericalFailure
 from siq.systems.cards import load_system
-from siq.systems.diffusion import Diffusion, NoiseField, StateNoise, state_noise
+from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.systems.simulation import simulate_stationary
 
@@ -18,29 +18,29 @@ pytestmark = pytest.mark.portable
 Write = Callable[..., Path]
 X, Y = sympy.symbols("x y", real=True)
 ROWS = ((1 + X**2 / 2, X * Y / 4), (X * Y / 4, 2 + sympy.sin(Y) / 2))
-NOISE = StateNoise((X, Y), ROWS)
+NOISE = Diffusion.of_formulas((X, Y), ROWS)
 DRAW = np.random.default_rng(0)
 POINTS, MOMENTA = DRAW.normal(size=(2, 5, 2))
 CENTER, UNITS = np.array([0.3, -0.2]), np.array([[0.5, 0.2], [-0.1, 3.0]])
 
 
 @pytest.mark.parametrize("noise", [NOISE, NOISE.in_units(CENTER, UNITS, 0.7)])
-def test_derivatives_are_those_of_d(noise: NoiseField) -> None:
+def test_derivatives_are_those_of_d(noise: Diffusion) -> None:
     for k in range(2):
         step = 1e-5 * np.eye(2)[k]
         first = (noise.at(POINTS + step) - noise.at(POINTS - step)) / 2e-5
         second = (noise.derivatives(POINTS + step) - noise.derivatives(POINTS - step)) / 2e-5
         np.testing.assert_allclose(noise.derivatives(POINTS)[..., k], first, atol=1e-7)
-        np.testing.assert_allclose(noise.second_derivatives(POINTS)[..., k], second, atol=1e-7)
+        np.testing.assert_allclose(noise.derivatives(POINTS, 2)[..., k], second, atol=1e-7)
 
 
 def test_what_characteristics_need_follows_from_the_derivatives() -> None:
-    first, second = NOISE.derivatives(POINTS), NOISE.second_derivatives(POINTS)
+    first, second = NOISE.derivatives(POINTS), NOISE.derivatives(POINTS, 2)
     for n, p in enumerate(MOMENTA):
         for k in range(2):
-            assert NOISE.pull(POINTS, MOMENTA)[n, k] == pytest.approx(p @ first[n, :, :, k] @ p)
+            assert NOISE.contract(POINTS, MOMENTA, 1)[n, k] == pytest.approx(p @ first[n, :, :, k] @ p)
             np.testing.assert_allclose(NOISE.turn(POINTS, MOMENTA)[n, :, k], first[n, :, :, k] @ p)
-            assert NOISE.bend(POINTS, MOMENTA)[n, k, 1] == pytest.approx(p @ second[n, :, :, k, 1] @ p)
+            assert NOISE.contract(POINTS, MOMENTA, 2)[n, k, 1] == pytest.approx(p @ second[n, :, :, k, 1] @ p)
     np.testing.assert_allclose(NOISE.divergence(POINTS)[:, 0], first[:, 0, 0, 0] + first[:, 0, 1, 1])
 
 
@@ -52,9 +52,9 @@ def test_products_roots_and_inverses_belong_to_the_d_of_the_point() -> None:
         np.testing.assert_allclose(NOISE.root_at(POINTS)[n], one.root, rtol=1e-13)
         np.testing.assert_allclose(NOISE.frozen(POINTS[n]).matrix, matrix, rtol=1e-15)
     many = DRAW.normal(size=(5, 3, 2))
-    np.testing.assert_allclose(NOISE.steepness(POINTS, many)[:, 1], NOISE.steepness(POINTS, many[:, 1]))
+    np.testing.assert_allclose(NOISE.contract(POINTS, many)[:, 1], NOISE.contract(POINTS, many[:, 1]))
     squares = NOISE.squared_speed(POINTS, NOISE.push(POINTS, MOMENTA))
-    np.testing.assert_allclose(squares, NOISE.steepness(POINTS, MOMENTA), rtol=1e-12)
+    np.testing.assert_allclose(squares, NOISE.contract(POINTS, MOMENTA), rtol=1e-12)
 
 
 def test_who_needs_a_constant_d_is_refused() -> None:
@@ -64,7 +64,7 @@ def test_who_needs_a_constant_d_is_refused() -> None:
 
 
 def test_a_d_that_is_negative_somewhere_is_refused_there() -> None:
-    noise = StateNoise((X,), ((1 + X,),))
+    noise = Diffusion.of_formulas((X,), ((1 + X,),))
     noise.root_at(np.array([[0.0], [1.0]]))
     assert noise.positive_at(np.array([[0.0], [-1.0], [-2.0], [np.nan]])).tolist() == [
         True,
@@ -80,7 +80,7 @@ def test_a_d_that_is_negative_somewhere_is_refused_there() -> None:
         with pytest.raises(NumericalFailure, match=r"not positive definite at \(-3\)"):
             ask()
     with pytest.raises(NumericalFailure, match="not positive definite at"):
-        StateNoise((X, Y), ((1, X), (X, 1))).kicks(np.array([[2.0], [0.0]]), np.ones((2, 1)))
+        Diffusion.of_formulas((X, Y), ((1, X), (X, 1))).kicks(np.array([[2.0], [0.0]]), np.ones((2, 1)))
 
 
 @pytest.mark.parametrize(
@@ -93,11 +93,11 @@ def test_a_d_that_is_negative_somewhere_is_refused_there() -> None:
 )
 def test_formulas_that_are_no_diffusion_are_refused(rows: object, fault: str) -> None:
     with pytest.raises(ValueError, match=fault):
-        StateNoise((X, Y), rows)  # type: ignore[arg-type]
+        Diffusion.of_formulas((X, Y), rows)  # type: ignore[arg-type]
 
 
 def test_formulas_without_states_are_a_constant_d() -> None:
-    found = state_noise((X, Y), ((sympy.Rational(1, 2), 0), (0, 2)))
+    found = Diffusion.of_formulas((X, Y), ((sympy.Rational(1, 2), 0), (0, 2)))
     assert found.constant
     np.testing.assert_array_equal(found.matrix, np.diag([0.5, 2.0]))
     assert not NOISE.constant
@@ -127,7 +127,7 @@ diffusion: DIFFUSION
 )
 def test_a_card_gives_d_as_formulas_and_is_written_so(write: Write, diffusion: str, expected: object) -> None:
     system = load_system(write(CARD.replace("DIFFUSION", diffusion)))
-    truth = StateNoise((X, Y), expected)  # type: ignore[arg-type]
+    truth = Diffusion.of_formulas((X, Y), expected)  # type: ignore[arg-type]
     again = load_system(write(system.to_card(), "again.yaml"))
     for one in (system, again):
         np.testing.assert_allclose(one.diffusion.at(POINTS), truth.at(POINTS), rtol=1e-14)
