@@ -18,8 +18,7 @@ if TYPE_CHECKING:
     from siq.data.inspection import inspect
     from siq.data.recordings import Recordings, read_recordings, snapshot_pairs, write_recordings
     from siq.diagnosis.diagnosis import Diagnosis, diagnose, solve_case
-    from siq.diagnosis.investigation import read_case
-    from siq.diagnosis.study import MismatchStudy
+    from siq.diagnosis.study import MismatchStudy, read_case
     from siq.errors import InputError, MissingExtra, NumericalFailure
     from siq.inference.library import candidate_library
     from siq.networks.decomposition import TrainingOptions

@@ -193,8 +193,7 @@ class Cases:
 def _checked(name: str, card: str, recordings: str, study: str | None, command: str) -> CheckedCase:
     """Check the files of a case; recordings that a rule makes are checked by their job."""
     from siq.diagnosis.dictionary import dictionary_of
-    from siq.diagnosis.investigation import read_case
-    from siq.diagnosis.study import MismatchStudy
+    from siq.diagnosis.study import MismatchStudy, read_case
     from siq.systems.cards import build_system
 
     document = read_document(card)

@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 
 from pydantic import BaseModel, ConfigDict
 
-from siq.diagnosis.investigation import Comparison, read_case
+from siq.diagnosis.study import Comparison, read_case
 from siq.numerics.files import read_document, validate, whole_file
 from workflow.proof.batches import Generator, check_digests, read_digests, write_batch
 from workflow.proof.concealment import cases as concealment

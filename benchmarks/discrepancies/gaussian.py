@@ -26,7 +26,7 @@ from benchmarks.discrepancies.regression import (
 )
 from benchmarks.discrepancies.sindy import WORSE, plain_equations, values_of
 from benchmarks.discrepancies.states import SeenStates, seen_states
-from siq.diagnosis.investigation import Comparison
+from siq.diagnosis.study import Comparison
 from siq.inference.recalibration import recalibrate
 from siq.systems.dynamics import Dynamics
 

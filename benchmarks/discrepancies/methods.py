@@ -14,7 +14,7 @@ import numpy as np
 from benchmarks.discrepancies import gaussian, ours, sindy, universal
 from benchmarks.discrepancies.answers import Answer, read_answer, write_answer
 from benchmarks.discrepancies.cases import CaseFiles
-from siq.diagnosis.investigation import Comparison
+from siq.diagnosis.study import Comparison
 
 Report = Callable[[Answer], None]
 Method = Callable[[Comparison, float, Report], Answer]

@@ -7,8 +7,7 @@ from dataclasses import replace
 
 from benchmarks.discrepancies.answers import Answer
 from siq.diagnosis.diagnosis import solve_case
-from siq.diagnosis.investigation import Comparison
-from siq.diagnosis.study import Allowance
+from siq.diagnosis.study import Allowance, Comparison
 from siq.diagnosis.verdict import statement_of_failure
 from siq.errors import NumericalFailure
 from workflow.proof.foreign_scores.rulers import said_place

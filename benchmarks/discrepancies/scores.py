@@ -14,7 +14,7 @@ from benchmarks.discrepancies.added import Added
 from benchmarks.discrepancies.answers import Answer, Term, answer_file, read_answer
 from benchmarks.discrepancies.cases import CaseFiles
 from benchmarks.discrepancies.truth import TrueCase, true_case
-from siq.diagnosis.investigation import Comparison
+from siq.diagnosis.study import Comparison
 from siq.errors import NumericalFailure
 from siq.inference.recalibration import recalibrate
 from siq.systems.dynamics import Dynamics

@@ -11,7 +11,7 @@ from benchmarks.discrepancies.answers import Answer, Term
 from benchmarks.discrepancies.refit import refitted, runs_better
 from benchmarks.discrepancies.regression import Equation, Found, chosen_terms, joint, powers
 from benchmarks.discrepancies.states import SeenStates, seen_states
-from siq.diagnosis.investigation import Comparison
+from siq.diagnosis.study import Comparison
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
 from siq.inference.recalibration import recalibrate

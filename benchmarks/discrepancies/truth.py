@@ -11,7 +11,7 @@ import sympy
 from benchmarks.discrepancies.added import Added
 from benchmarks.discrepancies.regression import DEGREE
 from benchmarks.discrepancies.simulation import Simulation
-from siq.diagnosis.investigation import Comparison
+from siq.diagnosis.study import Comparison
 from siq.systems.dynamics import Dynamics, symbol
 from workflow.proof.foreign_scores.oracle import free_errors, true_simulation
 from workflow.proof.keys import CaseKey, Truth

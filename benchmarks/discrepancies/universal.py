@@ -24,7 +24,7 @@ from benchmarks.discrepancies.regression import SURE, Equation, chosen_terms, po
 from benchmarks.discrepancies.segments import Segments, segments_of
 from benchmarks.discrepancies.sindy import WORSE, along, dynamic, strongest_term, values_of
 from benchmarks.discrepancies.states import SeenStates, parts, seen_states, smooth
-from siq.diagnosis.investigation import Comparison
+from siq.diagnosis.study import Comparison
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
 from siq.inference.recalibration import recalibrate

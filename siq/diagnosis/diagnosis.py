@@ -13,21 +13,13 @@ import numpy as np
 import pandas as pd
 
 from siq.diagnosis.evidence import NUMERICAL_ERRORS
-from siq.diagnosis.investigation import (
-    Comparison,
-    HeldOutRuns,
-    Investigation,
-    comparison_of,
-    held_out_runs,
-    investigate,
-    quiet_verdict,
-)
+from siq.diagnosis.investigation import HeldOutRuns, Investigation, held_out_runs, investigate, quiet_verdict
 from siq.diagnosis.mechanisms import completed
 from siq.diagnosis.residual_structure import what_is_left
 from siq.diagnosis.search import Search
 from siq.diagnosis.smooth_functions import MECHANISM
 from siq.diagnosis.statement import Location, StatedMechanism, Statement
-from siq.diagnosis.study import MismatchStudy, MismatchVerdict
+from siq.diagnosis.study import Comparison, MismatchStudy, MismatchVerdict, comparison_of
 from siq.diagnosis.unnamed_models import Material, Model, models_of_the_nameless
 from siq.diagnosis.verdict import statement_of
 from siq.errors import InputError, NumericalFailure

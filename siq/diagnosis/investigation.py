@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.stats
 
-from siq.diagnosis.dictionary import Mechanism, Roles, dictionary_of, roles_of
+from siq.diagnosis.dictionary import Mechanism, Roles, roles_of
 from siq.diagnosis.evidence import UntriedMechanism
 from siq.diagnosis.holdout import HeldOutErrors, RunsAlike, adopted_by_held_out, adopted_by_left_out
 from siq.diagnosis.mechanisms import MechanismCandidate, candidates_of, generic_candidates
@@ -25,15 +23,7 @@ from siq.diagnosis.residual_structure import (
     what_is_left,
 )
 from siq.diagnosis.search import Search, search
-from siq.diagnosis.study import (
-    MismatchStudy,
-    MismatchVerdict,
-    SearchOptions,
-    load_mismatch_study,
-    measurements_of,
-    split,
-    with_known_noise,
-)
+from siq.diagnosis.study import MismatchStudy, MismatchVerdict, SearchOptions
 from siq.diagnosis.unnamed_models import Material, Model, models_of_the_nameless
 from siq.errors import NumericalFailure
 from siq.inference.budget import UNLIMITED, Account, Budget
@@ -42,13 +32,7 @@ from siq.inference.measurements import Measurements, with_expectations
 from siq.inference.recalibration import covariance_with_unknown_forces, recalibrate
 from siq.inference.trajectories import FreeRun, squared_errors
 from siq.remarks import Remark
-from siq.systems.cards import load_system
 from siq.systems.dynamics import Dynamics
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from siq.data.recordings import Recordings
 
 
 def quiet_verdict(p_shift: float, options: SearchOptions) -> MismatchVerdict:
@@ -198,75 +182,6 @@ def noise_floor_of(fits: Sequence[Fit], data: Measurements, scored: np.ndarray) 
     spread = np.nanvar(data.outputs[scored], axis=0)
     least = np.minimum.reduce([each.noise.measurement for each in fits])
     return float(np.sqrt(np.mean(least / np.where(spread > 0, spread, 1.0))))
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """What is compared with what.
-
-    Attributes
-    ----------
-    system
-        The simulation.
-    learn, kept
-        Recordings to learn from, and those held out.
-    settings
-        How to go about it.
-    dictionary
-        The mechanisms that may be named.
-    """
-
-    system: Dynamics
-    learn: Measurements
-    kept: Measurements
-    settings: MismatchStudy
-    dictionary: tuple[Mechanism, ...]
-
-
-def comparison_of(
-    system: Dynamics,
-    recordings: Recordings | pd.DataFrame | str | Path,
-    settings: MismatchStudy | None = None,
-    *,
-    file: str = "the settings",
-) -> Comparison:
-    """Check a simulation, recordings and settings against each other.
-
-    Parameters
-    ----------
-    system
-        The simulation. A state needs no domain; the recordings tell where it lies.
-    recordings
-        With a column for each output and each input.
-    settings
-        What is held out, what is known of the noise, and what counts as found.
-    file
-        What messages about the settings call them.
-
-    Raises
-    ------
-    InputError
-        For the first thing that cannot be used, with its file, place and remedy.
-    """
-    settings = MismatchStudy() if settings is None else settings
-    data = with_known_noise(measurements_of(recordings, system), system, settings, file=file)
-    learn, kept = split(data, settings, file=file)
-    dictionary = dictionary_of(without=settings.without, further=settings.mechanisms, file=file)
-    return Comparison(system, learn, kept, settings, dictionary)
-
-
-def read_case(card: str | Path, recordings: str | Path, study: str | Path | None) -> Comparison:
-    """Read and check the files of a case.
-
-    Raises
-    ------
-    InputError
-        For the first thing that cannot be used, with its file, place and remedy.
-    """
-    system = load_system(card)
-    if study is None:
-        return comparison_of(system, recordings)
-    return comparison_of(system, recordings, load_mismatch_study(study), file=str(study))
 
 
 @dataclass(frozen=True)

@@ -33,8 +33,6 @@ from siq.inference.trajectories import sharpened
 from siq.systems.dynamics import Dynamics
 
 LOGGER = logging.getLogger(__name__)
-
-
 Standing = Literal["same", "needless", "less"]
 
 

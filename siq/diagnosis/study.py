@@ -1,32 +1,37 @@
-"""study"""
+"""Studies of mismatch: which simulation is compared with which recordings, and how.
+
+`MismatchStudy` is the schema of a study, `SearchOptions` says what counts as found, and `Comparison` is a case
+that was read and checked: the simulation, the recordings to learn from and those held out, and the mechanisms
+that may be named.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
-from pydantic.dataclasses import dataclass
 
 from siq.data.recordings import Recordings, read_recordings
-from siq.diagnosis.dictionary import Mechanism
-from siq.errors import InputError
+from siq.diagnosis.dictionary import Mechanism, dictionary_of
+from siq.errors import Fault, InputError
 from siq.inference.budget import DEFAULT_SECONDS, DEFAULT_WORK
 from siq.inference.measurements import Measurements, columns_of, measurements
 from siq.numerics.files import read_document, validate
+from siq.systems.cards import load_system
 from siq.systems.dynamics import Dynamics
 
 if TYPE_CHECKING:
     import pandas as pd
 
+MIN_SAMPLES = 8  # of a recording that something can be learned from
 
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class SearchOptions:
+
+class SearchOptions(BaseModel):
     """What counts as found.
 
     Attributes
@@ -48,6 +53,8 @@ class SearchOptions:
         Least number of blocks into which recordings are cut for clustered errors, where there are fewer than
         half as many recordings.
     """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
     false_alarms: Annotated[float, Field(gt=0, lt=1)] = 0.002
     same: Annotated[float, Field(gt=0)] = 10.0
@@ -89,9 +96,6 @@ class MismatchVerdict(StrEnum):
     def names(self) -> bool:
         """Whether what is missing has a name."""
         return self is MismatchVerdict.MISSING_PHYSICS
-
-
-MIN_SAMPLES = 8  # samples of a recording that something can be learned from
 
 
 class Allowance(BaseModel):
@@ -191,126 +195,147 @@ def measurements_of(recordings: Recordings | pd.DataFrame | str | Path, system: 
         For anything that cannot be used, a recording that is too short included.
     """
     file = str(recordings) if isinstance(recordings, str | Path) else "the recordings"
-    columns, units = columns_of(system), _units_of_columns(system)
+    columns, states = columns_of(system), dict(zip(system.states, system.units, strict=True))
+    # The unit of each column, as far as it follows from those of the states and inputs.
+    units = {name: states[str(formula)] for name, formula in system.outputs if str(formula) in states}
+    units |= {entry.name: entry.unit for entry in system.inputs} | {"t": system.time_unit}
     if isinstance(recordings, Recordings):
-        chosen = _chosen(recordings, columns, units, file=file)
+        for name in columns:
+            if name not in recordings.names:
+                remedy = (
+                    f"the simulation measures or is driven by it; there are {', '.join(recordings.names)}"
+                )
+                raise InputError(file, "", f"the column '{name}' is missing", remedy)
+        places = [recordings.names.index(name) for name in columns]
+        chosen = replace(
+            recordings,
+            names=tuple(columns),
+            units=tuple(recordings.units[place] for place in places),
+            values=np.ascontiguousarray(recordings.values[:, places]),
+        )
+        for name, unit in {"t": chosen.time_unit, **dict(zip(columns, chosen.units, strict=True))}.items():
+            if unit is not None and name in units and unit != units[name]:
+                fault = f"its unit is {unit}, and in the simulation it is {units[name]}"
+                raise InputError(file, f"column {name}", fault, "convert one of the two")
     elif isinstance(recordings, str | Path):
         chosen = read_recordings(recordings, columns=columns, units=units, gaps=False)
     else:
         chosen = Recordings.from_frame(recordings, columns=columns, units=units)
     try:
         data = measurements(chosen, system)
-    except ValueError as error:
-        fault, remedy = str(error).split("; ", 1)
-        raise InputError(file, "", fault, remedy) from None
+    except Fault as error:
+        raise error.at(file) from None
     lengths = np.diff(data.first)
     if (lengths < MIN_SAMPLES).any():
-        label = data.labels[int((lengths < MIN_SAMPLES).argmax())]
-        raise InputError(
-            file,
-            f"recording {label}",
-            f"it has fewer than {MIN_SAMPLES} samples",
-            "leave it out, or join recordings",
-        )
+        place = f"recording {data.labels[int((lengths < MIN_SAMPLES).argmax())]}"
+        remedy = "leave it out, or join recordings"
+        raise InputError(file, place, f"it has fewer than {MIN_SAMPLES} samples", remedy)
     return data
 
 
-def _units_of_columns(system: Dynamics) -> dict[str, str]:
-    """The unit of each column, as far as it follows from those of the states and inputs."""
-    states = dict(zip(system.states, system.units, strict=True))
-    known = {name: states[str(formula)] for name, formula in system.outputs if str(formula) in states}
-    known |= {entry.name: entry.unit for entry in system.inputs}
-    return known | {"t": system.time_unit}
+@dataclass(frozen=True)
+class Comparison:
+    """What is compared with what.
+
+    Attributes
+    ----------
+    system
+        The simulation.
+    learn, kept
+        Recordings to learn from, and those held out.
+    settings
+        How to go about it.
+    dictionary
+        The mechanisms that may be named.
+    """
+
+    system: Dynamics
+    learn: Measurements
+    kept: Measurements
+    settings: MismatchStudy
+    dictionary: tuple[Mechanism, ...]
 
 
-def _chosen(
-    recordings: Recordings, columns: Sequence[str], units: Mapping[str, str], *, file: str
-) -> Recordings:
-    """The columns that are wanted, in their order."""
-    for name in columns:
-        if name not in recordings.names:
-            remedy = f"the simulation measures or is driven by it; there are {', '.join(recordings.names)}"
-            raise InputError(file, "", f"the column '{name}' is missing", remedy)
-    places = [recordings.names.index(name) for name in columns]
-    said = {"t": recordings.time_unit} | {
-        name: recordings.units[p] for name, p in zip(columns, places, strict=True)
-    }
-    for name, unit in said.items():
-        if unit is not None and name in units and unit != units[name]:
-            fault = f"its unit is {unit}, and in the simulation it is {units[name]}"
-            raise InputError(file, f"column {name}", fault, "convert one of the two")
-    return replace(
-        recordings,
-        names=tuple(columns),
-        units=tuple(recordings.units[place] for place in places),
-        values=np.ascontiguousarray(recordings.values[:, places]),
-    )
+def comparison_of(
+    system: Dynamics,
+    recordings: Recordings | pd.DataFrame | str | Path,
+    settings: MismatchStudy | None = None,
+    *,
+    file: str = "the settings",
+) -> Comparison:
+    """Check a simulation, recordings and settings against each other.
 
-
-def with_known_noise(data: Measurements, model: Dynamics, study: MismatchStudy, *, file: str) -> Measurements:
-    """The measurements with the noise of the sensors that the study knows.
+    Parameters
+    ----------
+    system
+        The simulation. A state needs no domain; the recordings tell where it lies.
+    recordings
+        With a column for each output and each input.
+    settings
+        What is held out, what is known of the noise, and what counts as found.
+    file
+        What messages about the settings call them.
 
     Raises
     ------
     InputError
-        For a noise of something that is not measured.
+        For the first thing that cannot be used, with its file, place and remedy.
     """
-    for name in study.noise:
-        if name not in model.output_names:
-            raise InputError(
-                file, "noise", f"'{name}' is no output", f"use one of {', '.join(model.output_names)}"
-            )
-    if not study.noise:
-        return data
-    known = [study.noise.get(name, np.nan) ** 2 for name in model.output_names]
-    return replace(data, sensor_noise=np.array(known))
+    settings = MismatchStudy() if settings is None else settings
+    data = measurements_of(recordings, system)
+    for name in settings.noise:
+        if name not in system.output_names:
+            remedy = f"use one of {', '.join(system.output_names)}"
+            raise InputError(file, "noise", f"'{name}' is no output", remedy)
+    if settings.noise:
+        known = [settings.noise.get(name, np.nan) ** 2 for name in system.output_names]
+        data = replace(data, sensor_noise=np.array(known))
+    learn, kept = _split(data, settings, file=file)
+    dictionary = dictionary_of(without=settings.without, further=settings.mechanisms, file=file)
+    return Comparison(system, learn, kept, settings, dictionary)
 
 
-def split(data: Measurements, study: MismatchStudy, *, file: str) -> tuple[Measurements, Measurements]:
-    """Recordings to learn from, and those held out.
-
-    Raises
-    ------
-    InputError
-        When a label is unknown, or nothing is left on one side.
-    """
+def _split(data: Measurements, study: MismatchStudy, *, file: str) -> tuple[Measurements, Measurements]:
+    """Recordings to learn from, and those held out; of a single recording its first part and its last."""
     count = len(data.labels)
-    out_by_name = () if isinstance(study.held_out, float) else study.held_out
     for label in study.tests:
-        if label not in out_by_name:
-            raise InputError(
-                file, "tests", f"the recording '{label}' is not held out", "list it in held_out, too"
-            )
+        if isinstance(study.held_out, float) or label not in study.held_out:
+            fault, remedy = f"the recording '{label}' is not held out", "list it in held_out, too"
+            raise InputError(file, "tests", fault, remedy)
     if isinstance(study.held_out, float):
         if count == 1:
-            return _cut(data, study.held_out)
+            rows = len(data.t)
+            at = min(max(round((1 - study.held_out) * rows), MIN_SAMPLES), rows - MIN_SAMPLES)
+            at = rows // 2 if at < MIN_SAMPLES else at
+            last = replace(data, first=np.array([0, rows - at]), t=data.t[at:], outputs=data.outputs[at:])
+            return data.until(np.array([at])), last
         # Spread over all of them, so that a drift of the experiment is in both parts.
         out = min(max(round(study.held_out * count), 1), count - 1)
         chosen = set(np.linspace(0, count - 1, 2 * out + 1).round().astype(int)[1::2].tolist())
     else:
         for label in study.held_out:
             if label not in data.labels:
-                raise InputError(
-                    file,
-                    "held_out",
-                    f"no recording is called '{label}'",
-                    f"use labels such as {data.labels[0]}",
-                )
+                fault, remedy = f"no recording is called '{label}'", f"use labels such as {data.labels[0]}"
+                raise InputError(file, "held_out", fault, remedy)
         chosen = {data.labels.index(label) for label in study.held_out}
         if not chosen or len(chosen) == count:
-            raise InputError(file, "held_out", "one side of the split is empty", "hold out some, not all")
+            fault = "one side of the split is empty"
+            raise InputError(file, "held_out", fault, "hold out some, not all")
     return (
         data.select([place for place in range(count) if place not in chosen]),
         data.select(sorted(chosen)),
     )
 
 
-def _cut(data: Measurements, share: float) -> tuple[Measurements, Measurements]:
-    """The first part of a single recording, and its last."""
-    rows = len(data.t)
-    at = min(max(round((1 - share) * rows), MIN_SAMPLES), rows - MIN_SAMPLES)
-    if at < MIN_SAMPLES:
-        at = rows // 2
-    first = data.until(np.array([at]))
-    last = replace(data, first=np.array([0, rows - at]), t=data.t[at:], outputs=data.outputs[at:])
-    return first, last
+def read_case(card: str | Path, recordings: str | Path, study: str | Path | None) -> Comparison:
+    """Read and check the files of a case.
+
+    Raises
+    ------
+    InputError
+        For the first thing that cannot be used, with its file, place and remedy.
+    """
+    system = load_system(card)
+    if study is None:
+        return comparison_of(system, recordings)
+    return comparison_of(system, recordings, load_mismatch_study(study), file=str(study))

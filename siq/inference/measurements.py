@@ -17,6 +17,7 @@ import scipy.signal
 import sympy
 
 from siq.data.recordings import Recordings
+from siq.errors import Fault
 from siq.systems.dynamics import Dynamics, Input, Signals, symbol
 
 OVERSAMPLING = 16  # of band-limited inputs, between whose dense samples cubics are exact enough
@@ -187,7 +188,7 @@ def course_of_input(t: np.ndarray, u: np.ndarray, interpolation: str) -> scipy.i
         return scipy.interpolate.PPoly(np.stack([np.diff(u) / np.diff(t), u[:-1]]), t)
     step = np.diff(t)
     if np.ptp(step) > 1e-3 * step.mean():
-        raise ValueError("a band-limited input is sampled irregularly; resample it, or call it linear")
+        raise Fault("a band-limited input is sampled irregularly", "resample it, or call it linear")
     padding = min(PADDING, len(u) - 1)
     # Mirrored through its end points the signal goes on without a jump and without a kink.
     left = 2 * u[0] - u[padding:0:-1]
@@ -242,8 +243,8 @@ def columns_of(model: Dynamics) -> tuple[str, ...]:
 def _course(recordings: Recordings, rows: slice, column: int, entry: Input) -> scipy.interpolate.PPoly:
     try:
         return course_of_input(recordings.t[rows], recordings.values[rows, column], entry.interpolation)
-    except ValueError as error:
-        raise ValueError(f"input {entry.name}: {error}") from None
+    except Fault as error:
+        raise Fault(f"input {entry.name}: {error.fault}", error.remedy) from None
 
 
 def first_states(model: Dynamics, data: Measurements) -> np.ndarray:

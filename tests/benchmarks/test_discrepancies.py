@@ -21,8 +21,7 @@ from benchmarks.discrepancies.scores import COLUMNS, judged, place_right, write_
 from benchmarks.discrepancies.segments import segments_of
 from benchmarks.discrepancies.simulation import Simulation
 from benchmarks.discrepancies.truth import TrueCase, effect_terms
-from siq.diagnosis.investigation import Comparison, comparison_of
-from siq.diagnosis.study import MismatchStudy
+from siq.diagnosis.study import Comparison, MismatchStudy, comparison_of
 from siq.systems.dynamics import Parameter
 from workflow.proof.foreign_scores.integrator import Integrator
 from workflow.proof.keys import CaseKey, KeyEffect, KeySensors, Truth

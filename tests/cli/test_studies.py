@@ -10,7 +10,7 @@ import pytest
 from siq.cli.examples import double_well_recordings, spring_recordings, write_example
 from siq.cli.studies import init_study, name_for, write_generated
 from siq.data.recordings import read_recordings
-from siq.diagnosis.investigation import read_case
+from siq.diagnosis.study import read_case
 from siq.errors import InputError
 from siq.systems.cards import load_system
 from siq.workflow.study import load_study

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 import yaml
 
-from siq.diagnosis.investigation import Comparison, read_case
+from siq.diagnosis.study import Comparison, read_case
 from siq.systems.cards import load_system
 
 Rate = Callable[[float, np.ndarray], np.ndarray]

@@ -17,13 +17,13 @@ from siq.diagnosis import holdout, investigation, search
 from siq.diagnosis.diagnosis import Diagnosis, anything_else, solve_case, withdrawn
 from siq.diagnosis.dictionary import standard_dictionary
 from siq.diagnosis.evidence import TriedMechanism
-from siq.diagnosis.investigation import held_out_runs, read_case
+from siq.diagnosis.investigation import held_out_runs
 from siq.diagnosis.naming import NamingDecision
 from siq.diagnosis.residual_structure import Remainder
 from siq.diagnosis.screening import Probe
 from siq.diagnosis.search import Search
 from siq.diagnosis.smooth_functions import MECHANISM, Part
-from siq.diagnosis.study import MismatchVerdict
+from siq.diagnosis.study import MismatchVerdict, read_case
 from siq.diagnosis.unnamed_models import Material, Model
 from siq.errors import InputError, NumericalFailure
 from siq.inference.budget import Budget

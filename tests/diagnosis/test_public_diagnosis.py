@@ -16,7 +16,7 @@ import sympy
 import siq
 from siq.diagnosis import diagnosis as module
 from siq.diagnosis.diagnosis import tables_of, tables_of_failure
-from siq.diagnosis.investigation import comparison_of
+from siq.diagnosis.study import comparison_of
 from siq.diagnosis.verdict import statement_of_failure
 from siq.numerics.text import value_text
 from siq.report.diagnosis_page import diagnosis_html, diagnosis_text

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 import sympy
 
-from siq.diagnosis.investigation import comparison_of
+from siq.diagnosis.study import comparison_of
 from siq.inference.budget import Budget, BudgetSpent
 from siq.inference.kalman_filter import Noise
 from siq.inference.measurements import Expectations, Measurements, with_expectations

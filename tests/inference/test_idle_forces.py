@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 import sympy
 
-from siq.diagnosis.investigation import comparison_of
+from siq.diagnosis.study import comparison_of
 from siq.inference.kalman_filter import Noise
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements

@@ -16,8 +16,8 @@ import sympy
 import yaml
 from scipy.integrate import solve_ivp
 
-from siq.diagnosis.investigation import Comparison, read_case
-from siq.diagnosis.study import measurements_of
+from siq.diagnosis.study import Comparison, measurements_of, read_case
+from siq.report.plots.proof import plot_foreign_proof
 from siq.systems.cards import load_system
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, Parameter, Signals, symbol
@@ -109,8 +109,8 @@ def test_the_generator_shares_nothing_with_the_first_nor_with_the_library() -> N
 def test_scores_import_nothing_of_the_search_and_the_verdict_that_they_test() -> None:
     for file in sorted((ROOT / "workflow/proof/foreign_scores").glob("*.py")):
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ImportFrom) and str(node.module).startswith("siq.mismatch"):
-                assert node.module == "siq.diagnosis.investigation", file.name
+            if isinstance(node, ast.ImportFrom) and str(node.module).startswith("siq.diagnosis"):
+                assert node.module == "siq.diagnosis.study", file.name
 
 
 def test_a_third_of_the_cases_conceal_nothing_and_all_kinds_take_turns() -> None:

@@ -349,8 +349,8 @@ def test_the_blind_diagnosis_imports_nothing_of_keys_and_concealment() -> None:
 
 
 def test_the_proof_imports_nothing_of_the_search_and_the_verdict_that_it_tests() -> None:
-    tested = {"search", "screening", "significance", "residual_structure", "investigation", "location",
-              "held_out_fit", "verdict", "diagnosis"}  # fmt: skip
+    tested = {"search", "screening", "evidence", "residual_structure", "investigation", "naming", "holdout",
+              "unnamed_models", "verdict", "diagnosis"}  # fmt: skip
     assert all((ROOT / f"siq/diagnosis/{name}.py").is_file() for name in tested)
     for file in sorted((ROOT / "workflow/proof").glob("*.py")):
         found = imported_files(ROOT, file)

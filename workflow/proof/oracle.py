@@ -14,8 +14,8 @@ import sympy
 
 from siq.diagnosis.dictionary import Form, FurtherState, Mechanism, MechanismParameter
 from siq.diagnosis.dictionary import Role as RoleKind
-from siq.diagnosis.investigation import Comparison
 from siq.diagnosis.mechanisms import MechanismCandidate, build_candidate
+from siq.diagnosis.study import Comparison
 from siq.errors import NumericalFailure
 from siq.inference.recalibration import fit_with_process_noise_as_needed, recalibrate
 from siq.inference.trajectories import free_run, normalised_rms, sharpened

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 import sympy
 
-from siq.diagnosis.investigation import Comparison, read_case
+from siq.diagnosis.study import Comparison, read_case
 from siq.systems.cards import load_system
 from siq.systems.dynamics import Dynamics, Signals
 from siq.systems.formulas import parse_formula

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from siq.diagnosis.diagnosis import solve_case
-from siq.diagnosis.investigation import read_case
+from siq.diagnosis.study import read_case
 from siq.diagnosis.verdict import statement_of_failure
 from siq.errors import NumericalFailure
 from siq.numerics.files import whole_file

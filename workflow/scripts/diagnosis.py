@@ -9,7 +9,7 @@ import logging
 from typing import Any
 
 from siq.diagnosis.diagnosis import solve_case, tables_of, tables_of_failure
-from siq.diagnosis.investigation import read_case
+from siq.diagnosis.study import read_case
 from siq.diagnosis.verdict import statement_of_failure
 from siq.errors import NumericalFailure
 from siq.numerics.files import whole_file

@@ -7,7 +7,7 @@ run_warm()
 from typing import Any
 
 from siq.data.public_recordings import BENCHMARKS
-from siq.diagnosis.investigation import read_case
+from siq.diagnosis.study import read_case
 from siq.systems.cards import load_system
 from siq.workflow.tables import read_table, write_table
 from step import job

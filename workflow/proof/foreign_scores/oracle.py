@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 import scipy.optimize
 
-from siq.diagnosis.investigation import Comparison
+from siq.diagnosis.study import Comparison
 from siq.inference.measurements import Measurements
 from siq.systems.dynamics import Dynamics
 from workflow.proof.foreign_scores.integrator import Integrator

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from siq.diagnosis.investigation import Comparison
+from siq.diagnosis.study import Comparison
 from workflow.proof.foreign_scores.oracle import LeastSquares
 from workflow.proof.keys import CaseKey
 

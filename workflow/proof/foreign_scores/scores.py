@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from siq.diagnosis.investigation import Comparison, read_case
+from siq.diagnosis.study import Comparison, read_case
 from workflow.proof.foreign_scores.oracle import TrueSimulation, free_errors, true_simulation
 from workflow.proof.foreign_scores.places import Told, told_places
 from workflow.proof.foreign_scores.rulers import NEAR, name_error, said_place, true_place, unreal_names
