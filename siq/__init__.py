@@ -124,7 +124,7 @@ _MODULES = {
     "plot_residuals": "siq.report.plots.prediction",
     "plot_wells": "siq.report.plots.wells",
     "probability_of_tipping": "siq.workflow.tipping",
-    "read_case": "siq.diagnosis.investigation",
+    "read_case": "siq.diagnosis.study",
     "read_model": "siq.quasipotential.formulas",
     "read_recordings": "siq.data.recordings",
     "reference_systems": "siq.validation.reference_systems",

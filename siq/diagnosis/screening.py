@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 import sympy
 
-from siq.diagnosis.evidence import BUDGET_SPENT, NUMERICAL_ERRORS, UntriedMechanism, in_words
+from siq.diagnosis.evidence import BUDGET_SPENT, NUMERICAL_ERRORS, UntriedMechanism, in_words, orthonormal
 from siq.diagnosis.mechanisms import MechanismCandidate, along, places_of
 from siq.errors import NumericalFailure
 from siq.inference.budget import Budget, BudgetSpent, evaluation
@@ -391,12 +391,7 @@ def projected(white: Whitened, parameters: int) -> tuple[np.ndarray, np.ndarray]
     if not np.isfinite(own).all():
         raise NumericalFailure("the effect of a parameter on what is measured is beyond all numbers")
     further = np.where(np.isfinite(further).all(axis=0), further, 0.0)
-    if parameters:
-        scale = np.sqrt((own**2).sum(axis=0))
-        basis, values, _ = np.linalg.svd(own / np.where(scale > 0, scale, 1.0), full_matrices=False)
-        basis = basis[:, values > 1e-9 * values[0]] if values[0] > 0 else basis[:, :0]
-    else:
-        basis = own
+    basis = orthonormal(own)
     left = white.innovations - basis @ (basis.T @ white.innovations)
     size = np.sqrt((further**2).sum(axis=0))
     further = further - basis @ (basis.T @ further)

@@ -1,9 +1,15 @@
-"""search"""
+"""The search for missing mechanisms: screen, fit the best, accept what stands every test.
+
+White errors, errors clustered by recording, and the Bayesian information criterion all have to say so; what
+cannot be told from the best is kept as its class of indistinguishables. One that leads to better parameters
+of the simulation itself is held against these, and one on trial has to stand beside what came after it.
+Mechanisms are added one at a time, each on top of those before it.
+"""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -33,6 +39,9 @@ from siq.inference.trajectories import sharpened
 from siq.systems.dynamics import Dynamics
 
 LOGGER = logging.getLogger(__name__)
+PROMISING_GAIN = 0.2  # of the best gain so far; a candidate that promises less is not fitted
+SHARPENED_GAIN = 0.6  # of the best gain, from which on jumps are sharpened: that gains up to a quarter
+BUDGET_FOR_FUNCTIONS = 0.4  # of the budget, for functions without a name: a choice
 Standing = Literal["same", "needless", "less"]
 
 
@@ -126,24 +135,24 @@ def accepted(
         equals = [each for each in significant if each.delta_bic < best.delta_bic + options.same]
         best = min(equals, key=lambda each: each.p_cluster)
     least = best.delta_chi2 - options.same
+
+    def needless(other: TriedMechanism) -> bool:
+        """Whether it needs more parameters than the best, and does not earn them.
+
+        One that fits better by as much as its further parameters would bring by chance twice over (Akaike) is
+        not ruled out, although the simpler is preferred (Bayes).
+        """
+        more = len(other.candidate.new) - len(best.candidate.new)
+        return more > 0 and other.delta_chi2 - best.delta_chi2 < 2 * more
+
     others = [other for other in trials if other is not best]
     equals = [other for other in others if other.delta_chi2 > least]
     return Found(
         best,
-        indistinguishable=tuple(other for other in equals if not _needless(other, best)),
-        needless=tuple(other for other in equals if _needless(other, best)),
+        indistinguishable=tuple(other for other in equals if not needless(other)),
+        needless=tuple(other for other in equals if needless(other)),
         lesser=tuple(other for other in others if not other.delta_chi2 > least),
     )
-
-
-def _needless(other: TriedMechanism, best: TriedMechanism) -> bool:
-    """Whether an alternative needs more parameters than the best, and does not earn them.
-
-    One that fits better by as much as its further parameters would bring by chance twice over (Akaike) is not
-    ruled out, although the simpler is preferred (Bayes).
-    """
-    more = len(other.candidate.new) - len(best.candidate.new)
-    return more > 0 and other.delta_chi2 - best.delta_chi2 < 2 * more
 
 
 def better_without(
@@ -184,64 +193,6 @@ def better_without(
         return None
     gained = 2 * (again.log_likelihood - current.log_likelihood)
     return again if again.converged and gained > max(least, trial.delta_chi2 - least) else None
-
-
-def tried_together(
-    progress: Search, before: Search, data: Measurements, *, chance: float, options: SearchOptions
-) -> Search | None:
-    """A search in which a mechanism was taken on trial, if it stands the clustered test in the final fit.
-
-    Parameters
-    ----------
-    progress, before
-        The search with it, and as it was before.
-    data
-        The recordings.
-    chance
-        Probability of as much by chance, below which it stands.
-    options
-        Of the search.
-
-    Returns
-    -------
-    Search or None
-        With the probabilities of the final fit; None where nothing came on top of it, or it does not stand.
-    """
-    place = len(before.found)
-    if len(progress.found) < place + 2:
-        return None
-    on_trial = progress.found[place]
-    p_cluster = _probability_in_place(progress.fit, data, on_trial.best.candidate, options=options)
-    LOGGER.info("%s on trial: p %.1e clustered", on_trial.best.candidate.label, p_cluster)
-    if p_cluster >= chance:
-        return None
-    stands = replace(on_trial, best=replace(on_trial.best, p_cluster=p_cluster))
-    return replace(progress, found=(*progress.found[:place], stands, *progress.found[place + 1 :]))
-
-
-def _probability_in_place(
-    fit: Fit, data: Measurements, candidate: MechanismCandidate, *, options: SearchOptions
-) -> float:
-    """Probability of a mechanism by chance beside those that were found after it."""
-    names = [each.name for each in fit.model.parameters]
-    if not candidate.amplitudes or not set(candidate.new) <= set(names):
-        return clustered_probability(fit, data, candidate, blocks=options.blocks)
-    absent = tuple(
-        replace(each, value=0.0 if each.name in candidate.amplitudes else each.value, fixed=True)
-        if each.name in candidate.new
-        else each
-        for each in fit.model.parameters
-    )
-    without = fit_with_process_noise_as_needed(replace(fit.model, parameters=absent), data, fit)
-    if not without.converged:
-        return clustered_probability(fit, data, candidate, blocks=options.blocks)
-    return probability_by_chance(fit, without, data, candidate, blocks=options.blocks)
-
-
-PROMISING_GAIN = 0.2  # of the best gain so far; a candidate that promises less is not fitted
-SHARPENED_GAIN = (
-    0.6  # of the best gain, from which on a candidate's jumps are sharpened: that gains up to a quarter
-)
 
 
 def fit_most_promising(
@@ -287,9 +238,24 @@ def fit_most_promising(
     begun: list[tuple[Probe, Screened]] = []
 
     def attempt(probe: Probe, result: Screened, begin: Fit) -> None:
+        """Fit and judge a candidate; one that leads away, or has a sign that it cannot have, has failed."""
         candidate = probe.candidate
         try:
-            trial = _tried(probe, result, begin, current, base_model, data, blocks=blocks, budget=budget)
+            x = with_further_states(
+                probe, base_model, data, begin.x[:, : base_model.dimension],
+                substeps=current.substeps, values=current.model.values,
+            )  # fmt: skip
+            fit = fit_with_process_noise_as_needed(
+                with_start(probe, result, begin.model), data, begin, level=result.level, x=x, budget=budget
+            )
+            if not fit.converged:
+                raise NumericalFailure(fit.fault or "its fit does not settle")
+            # With no effect it would be what it is compared with, but for forces that are not believed.
+            if 2 * (current.log_likelihood - fit.log_likelihood) > least_to_believe(current.noise):
+                raise NumericalFailure("its fit leads away, to less than without it")
+            if not admissible(fit, candidate):
+                raise NumericalFailure("its best parameters have a sign that the mechanism cannot have")
+            trial = judged(fit, current, data, candidate, blocks=blocks)
         except BudgetSpent:
             failed.setdefault(candidate.label, UntriedMechanism(candidate, BUDGET_SPENT))
             return
@@ -318,13 +284,39 @@ def fit_most_promising(
             f" {probe.candidate.label}"
         )
         attempt(probe, result, current)
-    for probe, result in begun:
-        better = _better_start(probe.candidate, trials)
-        if better is not None:
-            budget.says(f"once more: {probe.candidate.label}")
-            attempt(_with_shapes_on_top(probe, better, base_model, data, budget), result, better.fit)
-    sharp = _with_jumps_followed(list(trials.values()), current, data, blocks=blocks, budget=budget)
-    return sharp, [each for label, each in failed.items() if label not in trials]
+    for probe, result in begun:  # once more, what led nowhere, or to less than a special case of it
+        candidate = probe.candidate
+        own = trials.get(candidate.label)
+        rivals = [
+            each
+            for each in trials.values()
+            if own is None or (_special_case(each.candidate, candidate) and each.delta_chi2 > own.delta_chi2)
+        ]
+        if rivals:
+            better = max(rivals, key=lambda each: each.delta_chi2)
+            budget.says(f"once more: {candidate.label}")
+            if candidate.shapes and _special_case(better.candidate, candidate):
+                # With the shapes that promise most on top of the special case; alone they may all be that.
+                on_top = replace(rebased(candidate, base_model, better.fit.model), positive=frozenset())
+                again, _ = screen_all(better.fit.model, data, better.fit, [on_top], budget=budget)
+                if again:
+                    values = [value for _, value in max(again, key=lambda each: each[1].gain)[0].shapes]
+                    probe = replace(probe, shapes=tuple(zip(candidate.shapes, values, strict=True)))
+            attempt(probe, result, better.fit)
+    most_gained = max((each.delta_chi2 for each in trials.values()), default=0.0)
+    for label, trial in trials.items():
+        if trial.fit.model.edges and trial.delta_chi2 >= SHARPENED_GAIN * most_gained:
+            try:
+                budget.says(f"following the jumps of {label}")
+                sharp = sharpened(trial.fit, data, budget=budget)
+                trials[label] = judged(sharp, current, data, trial.candidate, blocks=blocks)
+            except (*NUMERICAL_ERRORS, BudgetSpent) as error:
+                LOGGER.info("%s stays as sharp as it is: %s", label, error)
+    return list(trials.values()), [each for label, each in failed.items() if label not in trials]
+
+
+def _special_case(one: MechanismCandidate, of: MechanismCandidate) -> bool:
+    return one.name in of.generalises and one.equations == of.equations
 
 
 def best_probes(
@@ -337,102 +329,6 @@ def best_probes(
         if result.gain > 0 and (label not in best or result.gain > best[label][1].gain):
             best[label] = (probe, result)
     return best
-
-
-def _with_jumps_followed(
-    trials: Sequence[TriedMechanism], current: Fit, data: Measurements, *, blocks: int, budget: Budget
-) -> list[TriedMechanism]:
-    """The same trials, those sharper whose f jumps and which rival the best."""
-    most_gained = max((each.delta_chi2 for each in trials), default=0.0)
-    result = []
-    for trial in trials:
-        better, label = trial, trial.candidate.label
-        if trial.fit.model.edges and trial.delta_chi2 >= SHARPENED_GAIN * most_gained:
-            try:
-                budget.says(f"following the jumps of {label}")
-                sharp = sharpened(trial.fit, data, budget=budget)
-                better = judged(sharp, current, data, trial.candidate, blocks=blocks)
-            except (*NUMERICAL_ERRORS, BudgetSpent) as error:
-                LOGGER.info("%s stays as sharp as it is: %s", label, error)
-        result.append(better)
-    return result
-
-
-def _tried(
-    probe: Probe,
-    result: Screened,
-    begin: Fit,
-    current: Fit,
-    base_model: Dynamics,
-    data: Measurements,
-    *,
-    blocks: int,
-    budget: Budget,
-) -> TriedMechanism:
-    """A probe's candidate, fitted from a fit and judged.
-
-    Raises
-    ------
-    NumericalFailure
-        When the fit has no result, does not settle, or has a sign that the mechanism does not allow.
-    BudgetSpent
-        When nothing is left of what is allowed.
-    """
-    candidate = probe.candidate
-    x = with_further_states(
-        probe, base_model, data, begin.x[:, : base_model.dimension],
-        substeps=current.substeps, values=current.model.values,
-    )  # fmt: skip
-    start = with_start(probe, result, begin.model)
-    trial = fit_with_process_noise_as_needed(start, data, begin, level=result.level, x=x, budget=budget)
-    if not trial.converged:
-        raise NumericalFailure(trial.fault or "its fit does not settle")
-    # With no effect it would be what it is compared with, but for random forces that are not believed.
-    if 2 * (current.log_likelihood - trial.log_likelihood) > least_to_believe(current.noise):
-        raise NumericalFailure("its fit leads away, to less than without it")
-    if not admissible(trial, candidate):
-        raise NumericalFailure("its best parameters have a sign that the mechanism cannot have")
-    return judged(trial, current, data, candidate, blocks=blocks)
-
-
-def _better_start(
-    candidate: MechanismCandidate, trials: Mapping[str, TriedMechanism]
-) -> TriedMechanism | None:
-    """Where a candidate is begun once more: one that led nowhere, or to less than a special case of it."""
-    own = trials.get(candidate.label)
-    if own is None:
-        rivals = list(trials.values())
-    else:
-        rivals = [
-            each
-            for each in trials.values()
-            if _special_case(each.candidate, candidate) and each.delta_chi2 > own.delta_chi2
-        ]
-    return max(rivals, key=lambda each: each.delta_chi2) if rivals else None
-
-
-def _special_case(one: MechanismCandidate, of: MechanismCandidate) -> bool:
-    return one.name in of.generalises and one.equations == of.equations
-
-
-def _with_shapes_on_top(
-    probe: Probe, better: TriedMechanism, base_model: Dynamics, data: Measurements, budget: Budget
-) -> Probe:
-    """A candidate's probe with the shapes that promise most on top of a special case of it.
-
-    Beside the simulation alone they may all promise the same: the special case. Where the fit is that of
-    another mechanism, and where nothing can be screened, the shapes stay as they are.
-    """
-    candidate = probe.candidate
-    if not (candidate.shapes and _special_case(better.candidate, candidate)):
-        return probe
-    on_top = replace(rebased(candidate, base_model, better.fit.model), positive=frozenset())
-    screened, _ = screen_all(better.fit.model, data, better.fit, [on_top], budget=budget)
-    if not screened:
-        return probe
-    best, _ = max(screened, key=lambda each: each[1].gain)
-    values = [value for _, value in best.shapes]
-    return replace(probe, shapes=tuple(zip(candidate.shapes, values, strict=True)))
 
 
 def with_start(probe: Probe, result: Screened, base: Dynamics) -> Dynamics:
@@ -449,7 +345,35 @@ def with_start(probe: Probe, result: Screened, base: Dynamics) -> Dynamics:
     return candidate.model.with_values(np.array([known[each.name] for each in candidate.model.parameters]))
 
 
-BUDGET_FOR_FUNCTIONS = 0.4  # of the budget, for functions without a name: a choice
+def _stands_together(
+    progress: Search, before: Search, data: Measurements, *, chance: float, options: SearchOptions
+) -> Search | None:
+    """A search in which a mechanism was taken on trial, if it stands the clustered test in the final fit.
+
+    It has the probabilities of the final fit; None where nothing came on top of it, or it does not stand.
+    """
+    place = len(before.found)
+    if len(progress.found) < place + 2:
+        return None
+    on_trial, fit = progress.found[place], progress.fit
+    candidate, without = on_trial.best.candidate, None
+    if candidate.amplitudes and set(candidate.new) <= {each.name for each in fit.model.parameters}:
+        absent = tuple(
+            replace(each, value=0.0 if each.name in candidate.amplitudes else each.value, fixed=True)
+            if each.name in candidate.new
+            else each
+            for each in fit.model.parameters
+        )
+        without = fit_with_process_noise_as_needed(replace(fit.model, parameters=absent), data, fit)
+    if without is None or not without.converged:
+        p_cluster = clustered_probability(fit, data, candidate, blocks=options.blocks)
+    else:
+        p_cluster = probability_by_chance(fit, without, data, candidate, blocks=options.blocks)
+    LOGGER.info("%s on trial: p %.1e clustered", candidate.label, p_cluster)
+    if p_cluster >= chance:
+        return None
+    stands = replace(on_trial, best=replace(on_trial.best, p_cluster=p_cluster))
+    return replace(progress, found=(*progress.found[:place], stands, *progress.found[place + 1 :]))
 
 
 def search(
@@ -508,7 +432,10 @@ def _extended(
             most=options.fitted, least_gain=options.same, blocks=options.blocks,
             budget=budget,
         )  # fmt: skip
-        untried = _together(progress.untried, (*unscreened, *failed), trials)
+        # All that could never be judged, each once, with the last reason.
+        reasons = {each.candidate.label: each for each in (*progress.untried, *unscreened, *failed)}
+        judged_ones = {each.candidate.label for each in trials}
+        untried = tuple(each for label, each in reasons.items() if label not in judged_ones)
         fruitless = {each.candidate.label for each in trials if each.delta_chi2 < options.same}
         progress = replace(
             progress, screened=tuple(screened), untried=untried, screened_beside=tuple(labels),
@@ -537,28 +464,14 @@ def _extended(
         ):
             LOGGER.info("%s is on trial", best.best.candidate.label)
             further = _extended(
-                _with(progress, best), model, data, candidates,
+                replace(progress, found=(*found, best), fit=best.best.fit), model, data, candidates,
                 options=options, budget=budget, on_trial=False,
             )  # fmt: skip
-            together = tried_together(further, progress, data, chance=chance, options=options)
+            together = _stands_together(further, progress, data, chance=chance, options=options)
             if together is not None:
                 return together
             on_trial = False
         if stands is None:
             return progress
         LOGGER.info("found %s, chi2 better by %.1f", stands.best.candidate.label, stands.best.delta_chi2)
-        progress = _with(progress, stands)
-
-
-def _together(
-    before: Sequence[UntriedMechanism], now: Sequence[UntriedMechanism], trials: Sequence[TriedMechanism]
-) -> tuple[UntriedMechanism, ...]:
-    """All that could never be judged, each once, with the last reason."""
-    reasons = {each.candidate.label: each for each in (*before, *now)}
-    for trial in trials:
-        reasons.pop(trial.candidate.label, None)
-    return tuple(reasons.values())
-
-
-def _with(progress: Search, found: Found) -> Search:
-    return replace(progress, found=(*progress.found, found), fit=found.best.fit)
+        progress = replace(progress, found=(*found, stands), fit=stands.best.fit)

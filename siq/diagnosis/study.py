@@ -1,8 +1,8 @@
 """Studies of mismatch: which simulation is compared with which recordings, and how.
 
-`MismatchStudy` is the schema of a study, `SearchOptions` says what counts as found, and `Comparison` is a case
-that was read and checked: the simulation, the recordings to learn from and those held out, and the mechanisms
-that may be named.
+`MismatchStudy` is the schema of a study, `SearchOptions` says what counts as found, and `Comparison` is a
+case that was read and checked: the simulation, the recordings to learn from and those held out, and the
+mechanisms that may be named.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ import numpy as np
 import sympy
 
 from siq.diagnosis.dictionary import Roles, unit_of, units_of
-from siq.diagnosis.evidence import BUDGET_SPENT, correlation_time_left, log_evidence_of
+from siq.diagnosis.evidence import BUDGET_SPENT, correlation_time_left, log_evidence_of, residuals
 from siq.diagnosis.investigation import HeldOutRuns, Investigation
 from siq.diagnosis.mechanisms import PROCESS_NOISE
 from siq.diagnosis.residual_structure import Structure
@@ -33,7 +33,7 @@ from siq.diagnosis.statement import (
 )
 from siq.diagnosis.study import MismatchVerdict
 from siq.diagnosis.unnamed_models import Model
-from siq.inference.kalman_filter import Noise, solve, whiten
+from siq.inference.kalman_filter import Noise
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
 from siq.remarks import Remark
@@ -369,9 +369,7 @@ def locate(investigation: Investigation, data: Measurements, described: Model | 
     # Recordings whose residuals, process noise not admitted, exceed noise by a fair share of the excess.
     recalibrated = search.recalibrated
     still = Noise(search.fit.noise.measurement, np.zeros(recalibrated.model.dimension))
-    white = whiten(recalibrated.linearisation, data, still)
-    change, _ = solve(white.columns, white.innovations)
-    left = white.innovations - white.columns @ change
+    white, _, left = residuals(recalibrated, data, still)
     counts = np.bincount(white.recording, white.known, minlength=len(data.labels))
     excess = np.maximum(np.bincount(white.recording, left**2, minlength=len(data.labels)) - counts, 0.0)
     affected = data.labels
