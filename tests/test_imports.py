@@ -40,7 +40,7 @@ UPWARDS: frozenset[tuple[str, str]] = frozenset(
         ("siq.data.inspection", "siq.report.plots.recordings"),
         ("siq.diagnosis.diagnosis", "siq.report.diagnosis_page"),
         ("siq.diagnosis.statement", "siq.report.diagnosis_text"),
-        ("siq.quasipotential.landscape", "siq.report.landscape_answer"),
+        ("siq.quasipotential.landscape", "siq.report.landscape"),
         ("siq.quasipotential.landscape", "siq.report.plots.quasipotential"),
         ("siq.quasipotential.landscape", "siq.workflow.comparison_steps"),
         ("siq.quasipotential.landscape", "siq.workflow.equations_step"),

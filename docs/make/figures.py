@@ -19,9 +19,9 @@ from pathlib import Path
 import pandas as pd
 
 from siq.numerics.text import range_text, value_text
-from siq.report.landscape_answer import counted_text, foreseen_text, with_visits
-from siq.report.landscape_summary import SaidLandscape
-from siq.report.study_page import read_seen
+from siq.report.figures import read_seen
+from siq.report.formatting import counted_text, predicted_text
+from siq.report.summary import summarise
 
 ROOT = Path(__file__).parents[2]
 FIGURES = ROOT / "docs" / "figures.json"
@@ -82,14 +82,14 @@ def greenland_ice(tables: Path) -> Found:
     noise = json.loads((tables.parent / "runs" / "000" / "vector_field.json").read_text(encoding="utf-8"))[
         "noise"
     ]
-    said = SaidLandscape(with_visits(overview, record) or {})
+    said = summarise(overview, record=record)
     found: Found = {}
     for name, well in zip(("warm", "cold"), sorted(said.wells, key=lambda one: one.position[0]), strict=True):
         assert well.visits is not None
         found[f"{name}_place"] = value_text(well.position[0], well.position_errors[0])
         found[f"{name}_counted"] = counted_text(well.visits)
-        found[f"{name}_foreseen"] = foreseen_text(well.visits)
-        found[f"{name}_barrier"] = value_text(*said.relative_depth(well))
+        found[f"{name}_foreseen"] = predicted_text(well.visits)
+        found[f"{name}_barrier"] = value_text(*well.relative_depth(said.noise))
     missing = certificates.set_index("test")["value"]["existence"]
     assert said.noise is not None
     seen = read_seen(tables.parent / "drawn" / "study")

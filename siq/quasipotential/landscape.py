@@ -535,7 +535,7 @@ class Landscape:
 
     def report(self) -> str:
         """What was found, as text."""
-        from siq.report.landscape_answer import landscape_text
+        from siq.report.landscape import landscape_text
 
         return landscape_text(self)
 
@@ -547,7 +547,7 @@ class Landscape:
         )
 
     def _repr_html_(self) -> str:
-        from siq.report.landscape_answer import landscape_html
+        from siq.report.landscape import landscape_html
 
         return landscape_html(self)
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
+from typing import Any
 
 from siq.diagnosis.statement import METRIC, Estimate, StatedFunction, StatedMechanism, Statement
 from siq.numerics.text import p_text, value_text
-from siq.report.diagnosis_sections import Findings, answer, badge, numbers, picture, sections
+from siq.report.diagnosis_sections import Findings, answer, badge, final_simulation, numbers, picture, sections
 from siq.report.diagnosis_text import location_sentence, words_of
 from siq.report.page import ReportContent, render_report
 from siq.report.remarks import sentence
@@ -137,3 +138,33 @@ def _excluded(statement: Statement) -> list[str]:
         f"{label}: {bound.parameter} = {value_text(bound.upper_bound_95, unit=bound.unit, digits=2)}"
         for label, bound in (statement.excluded or {}).items()
     ]
+
+
+def mismatch_answer(verdict: Mapping[str, Any], *, title: str) -> dict[str, Any]:
+    """The content of ``answer.json``: the sentence that the page opens with, and the number beside it.
+
+    Parameters
+    ----------
+    verdict
+        The content of ``verdict.json``.
+    title
+        What the page is headed.
+
+    Returns
+    -------
+    dict
+        ``title``, ``sentence``, ``verdict``, ``compared`` (false where no fit of the simulation has a
+        result), ``held_out_before`` (the simulation as given), ``held_out_after`` (the one that the verdict
+        ends with) and ``held_out_noise``. The errors are root mean squares on recordings held out, as a share
+        of the spread of what was measured; null where a simulation ran away.
+    """
+    fit = verdict["fit"]
+    return {
+        "title": title,
+        "sentence": verdict["sentence"],
+        "verdict": verdict["verdict"],
+        "compared": fit["noise_floor"] is not None,
+        "held_out_before": fit["before"],
+        "held_out_after": fit[final_simulation(verdict)],
+        "held_out_noise": fit["noise_floor"],
+    }

@@ -1,60 +1,185 @@
-"""Numbers and formulas as people read them, and pages as HTML that need nothing else.
+"""Numbers, formulas and sentences as people read them.
 
-A measured coefficient keeps its decimals (``1.000 x⁴``, not ``x⁴``), because how many of them are zero is
-the result; integers and fractions, which only exact formulas contain, are written as they are.
+Sentences stand in templates (`siq/report/templates`), which `paragraphs` fills from summaries; words for
+codes stand in YAML files beside them (`texts`). Formulas are typeset by sympy's MathML printer, with the
+terms of a sum by falling degree. A measured coefficient keeps its decimals (``1.000 x⁴``, not ``x⁴``), since
+how many of them are zero is the result; integers and fractions, which only exact formulas contain, are
+written as they are.
 """
 
 from __future__ import annotations
 
-import base64
-import datetime
 import html
 import math
 import re
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Sequence
+from functools import cache
+from importlib.resources import files
 from typing import Any
 from xml.dom.minidom import Document
 
 import numpy as np
-import pandas as pd
 import sympy
-from jinja2 import ChoiceLoader, Environment, FileSystemLoader, PackageLoader, StrictUndefined
+import yaml
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from sympy.printing.mathml import MathMLPresentationPrinter
 from sympy.printing.precedence import PRECEDENCE
 from sympy.printing.str import StrPrinter
 
-from siq.numerics.text import MINUS, SUPERSCRIPTS, mantissa_and_exponent, number_text, value_text
+from siq.numerics.text import (
+    MINUS,
+    SUPERSCRIPTS,
+    capital,
+    listed,
+    mantissa_and_exponent,
+    number_text,
+    p_text,
+    percent,
+    range_text,
+    unit_text,
+    value_text,
+)
+from siq.quasipotential.rates import DWELL_TIMES_FEWEST, MeanTime
+from siq.report.summary import LandscapeSummary, VisitSummary, WellSummary
 from siq.systems.formulas import CONSTANTS, FUNCTIONS, parse_formula
 
+COUNTS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine")
+MOST_STATES_IN_A_SENTENCE = 4  # of which a sentence writes out a position
+LARGE_ERROR = 0.5  # relative error from which a range says more than ±
 CHARACTERS_PER_LINE = 56  # a longer formula is broken between its terms: browsers do not break MathML
-
 _INVISIBLE_TIMES = "\u2062"
 
 
-def polynomial_expression(terms: Mapping[str, float]) -> sympy.Expr:
-    """Build the sum of coefficient × term, terms as in the table of coefficients (``x**2*y``).
+def counted_text(visits: VisitSummary, unit: str = "") -> str:
+    """The mean of visits on the record, with its interval of 95 %; of none that ended a lower bound."""
+    if not visits.count:
+        return f"more than {value_text(visits.lowest, unit=unit, digits=2)}"
+    text = f"{value_text(visits.counted, digits=3)} ({range_text(visits.lowest, visits.highest)})"
+    return f"{text}\u00a0{unit_text(unit)}" if unit_text(unit) else text
 
-    Parameters
-    ----------
-    terms
-        Coefficient of each term; zeros are left out.
 
-    Returns
-    -------
-    sympy.Expr
-        The polynomial with floating-point coefficients.
-    """
-    names = {name for term in terms for name in re.findall(r"[^\W\d]\w*", term)} - {*FUNCTIONS, *CONSTANTS}
-    symbols = {name: sympy.Symbol(name, real=True) for name in names}
-    return sympy.Add(
-        *(
-            sympy.Float(float(value)) * parse_formula(term, symbols)
-            for term, value in terms.items()
-            if value != 0
-        )
+def predicted_text(visits: VisitSummary, unit: str = "") -> str:
+    """The mean of visits as f and D predict it, with its error; a range where that is large."""
+    share = visits.error / visits.predicted
+    if share > LARGE_ERROR:
+        factor = math.exp(share)
+        return range_text(visits.predicted / factor, visits.predicted * factor, unit=unit)
+    return value_text(visits.predicted, visits.error, unit=unit)
+
+
+def time_text(mean: MeanTime | None, unit: str = "") -> str:
+    """A mean time with its error; a range where the error is as large as the time; empty where not known."""
+    if mean is None:
+        return ""
+    if mean.error > LARGE_ERROR:
+        text = range_text(*mean.limits, unit=unit)
+    else:
+        text = value_text(mean.value, mean.value * mean.error, unit=unit)
+    return text if mean.complete else f"at most {text}"
+
+
+def position_text(well: WellSummary, summary: LandscapeSummary) -> str:
+    """Where a well is: ``x = −0.996 ± 0.005 nm``, ``(x, y) = (−0.50, 0.00) µm``."""
+    names, units = summary.names, summary.units
+    if len(names) > MOST_STATES_IN_A_SENTENCE:
+        return "the place that the table gives"
+    if len(names) == 1:
+        value = value_text(well.position[0], well.position_errors[0], unit=units[0])
+        return f"{names[0]}\u00a0=\u00a0{value}"
+    size = float(np.abs([one.position for one in summary.wells]).max())
+    values = []
+    for value, error in zip(well.position, well.position_errors, strict=True):
+        if not math.isfinite(error) or error < 1e-4 * size:
+            error = 1e-3 * size if size else 1.0
+            if abs(value) < 0.5e-3 * error:  # what rounding left of zero
+                values.append("0")
+                continue
+        decimals = max(0, -math.floor(math.log10(error))) if error > 0 else 3
+        if decimals > 6 or size >= 1e5:
+            values.append(value_text(value))
+        else:
+            text = f"{abs(value):.{decimals}f}"
+            values.append((MINUS if value < 0 and float(text) else "") + text)
+    if len(set(units)) == 1:
+        unit = unit_text(units[0])
+        named = ",\u00a0".join(names)  # a phone breaks the values, not the names
+        return f"({named})\u00a0=\u00a0({', '.join(values)})" + (f"\u00a0{unit}" if unit else "")
+    return ", ".join(
+        f"{name}\u00a0=\u00a0{value}\u00a0{unit_text(unit)}".rstrip()
+        for name, value, unit in zip(names, values, units, strict=True)
     )
+
+
+def relative_text(share: float) -> str:
+    """A relative error: ``3.7 %``, ``4.2 × 10⁻⁶``.
+
+    Examples
+    --------
+    >>> relative_text(0.0371)
+    '3.7 %'
+    """
+    if share < 1e-4:
+        return number_text(share, decimals=1)
+    percent = 100 * share
+    return f"{percent:.2g} %" if percent < 99.5 else f"{percent:.0f} %"
+
+
+def percent_text(share: float) -> str:
+    """A difference in per cent, empty where it is not known."""
+    return f"{value_text(100 * share, digits=2)} %" if np.isfinite(share) else ""
+
+
+def _named(unit: str) -> str:
+    return unit if unit_text(unit) else "time units"
+
+
+@cache
+def environment() -> Environment:
+    """Templates of plain text, with numbers as filters: ``{{ value | value(error, unit="s") }}``."""
+    made = Environment(
+        loader=PackageLoader("siq.report"), undefined=StrictUndefined, autoescape=False, trim_blocks=True,
+        lstrip_blocks=True,
+    )  # fmt: skip
+    made.filters |= {
+        "value": value_text,
+        "number": number_text,
+        "share": percent,
+        "relative": relative_text,
+        "percent": percent_text,
+        "p": p_text,
+        "range": lambda ends, **options: range_text(*ends, **options),
+        "unit": unit_text,
+        "listed": listed,
+        "capital": capital,
+        "lower_first": lambda text: text[:1].lower() + text[1:],
+        "count_word": lambda count: COUNTS[count] if count < len(COUNTS) else str(count),
+        "term": term_text,
+        "time": lambda mean, unit: time_text(mean, _named(unit)),
+        "counted": counted_text,
+        "predicted": predicted_text,
+        "place": position_text,
+    }
+    made.tests["finite"] = lambda value: bool(np.isfinite(value))
+    made.globals["law_from"] = DWELL_TIMES_FEWEST
+    return made
+
+
+def in_paragraphs(text: str) -> list[str]:
+    """Paragraphs of a text, which blank lines part; within them a new line is a space."""
+    found = (re.sub(r"[ \n]+", " ", part).strip(" ") for part in re.split(r"\n\s*?\n", text))
+    return [part for part in found if part]
+
+
+def paragraphs(template: str, **values: Any) -> list[str]:
+    """The paragraphs of a template of text."""
+    return in_paragraphs(environment().get_template(template).render(values))
+
+
+@cache
+def texts(name: str) -> Any:
+    """Words for codes, from a YAML file of templates."""
+    return yaml.safe_load((files("siq.report") / "templates" / f"{name}.yaml").read_text(encoding="utf-8"))
 
 
 def formula_text(expression: sympy.Expr, *, decimals: int = 3) -> str:
@@ -108,67 +233,32 @@ def formula_mathml(expression: sympy.Expr, *, decimals: int = 3) -> Markup:
 
 
 def vector_mathml(expressions: Sequence[sympy.Expr], *, decimals: int = 3) -> Markup:
-    """Typeset the components of a vector as a column in brackets.
-
-    Parameters
-    ----------
-    expressions
-        The components, from the first to the last.
-    decimals
-        Decimals of their floating-point coefficients.
-
-    Returns
-    -------
-    markupsafe.Markup
-        One ``<math>`` element, as from `formula_mathml`.
-    """
+    """Typeset the components of a vector as a column in brackets, as `formula_mathml` does."""
     printer = _MathMLPrinter(decimals)
-    table = printer.table([printer.lines(_with_integer_exponents(entry)) for entry in expressions])
-    return _math(
-        printer,
-        printer.bracketed(table),
-        "; ".join(formula_text(entry, decimals=decimals) for entry in expressions),
-    )
+    table = printer.table([[printer.lines(_with_integer_exponents(entry))] for entry in expressions])
+    spoken = "; ".join(formula_text(entry, decimals=decimals) for entry in expressions)
+    return _math(printer, printer.bracketed(table), spoken)
 
 
-def matrix_mathml(matrix: Sequence[Sequence[float]]) -> Markup:
-    """Typeset a matrix of numbers in brackets; a number that stands alone without them."""
-    printer = _MathMLPrinter(3)
-    texts = [
-        [
-            str(int(value)).replace("-", MINUS) if float(value).is_integer() else value_text(value)
-            for value in row
-        ]
-        for row in matrix
-    ]
-    spoken = "; ".join(", ".join(row) for row in texts)
-    if texts == [[texts[0][0]]]:
-        return _math(printer, printer.leaf("mn", texts[0][0]), spoken)
-    rows = [
-        printer.element("mtr", *(printer.element("mtd", printer.leaf("mn", text)) for text in row))
-        for row in texts
-    ]
-    return _math(printer, printer.bracketed(printer.element("mtable", *rows)), spoken)
-
-
-def formula_matrix_mathml(rows: Sequence[Sequence[sympy.Expr]], *, decimals: int = 3) -> Markup:
-    """Typeset a matrix of formulas in brackets; a formula that stands alone without them."""
-    if len(rows) == 1:
-        return formula_mathml(rows[0][0], decimals=decimals)
+def matrix_mathml(rows: Sequence[Sequence[sympy.Expr | float]], *, decimals: int = 3) -> Markup:
+    """Typeset a matrix of numbers or formulas in brackets; an entry that stands alone without them."""
     printer = _MathMLPrinter(decimals)
-    table = [
-        printer.element(
-            "mtr",
-            *(printer.element("mtd", printer.lines(_with_integer_exponents(entry))) for entry in row),
-        )
-        for row in rows
-    ]
-    spoken = "; ".join(", ".join(formula_text(entry, decimals=decimals) for entry in row) for row in rows)
-    return _math(printer, printer.bracketed(printer.element("mtable", *table)), spoken)
 
+    def text(entry: sympy.Expr | float) -> str:
+        if isinstance(entry, sympy.Expr):
+            return formula_text(entry, decimals=decimals)
+        return str(int(entry)).replace("-", MINUS) if float(entry).is_integer() else value_text(entry)
 
-def _entry_text(value: float) -> str:
-    return str(int(value)).replace("-", MINUS) if value.is_integer() else value_text(value)
+    def node(entry: sympy.Expr | float) -> Any:
+        if isinstance(entry, sympy.Expr):
+            return printer.lines(_with_integer_exponents(entry))
+        return printer.leaf("mn", text(entry))
+
+    spoken = "; ".join(", ".join(map(text, row)) for row in rows)
+    nodes = [list(map(node, row)) for row in rows]
+    if len(nodes) == 1:
+        return _math(printer, nodes[0][0], spoken)
+    return _math(printer, printer.bracketed(printer.table(nodes, flush=False)), spoken)
 
 
 def _math(printer: _MathMLPrinter, content: Any, spoken: str) -> Markup:
@@ -272,12 +362,12 @@ class _MathMLPrinter(MathMLPresentationPrinter):
                 bracket.setAttribute(attribute, "true")
         return self.element("mrow", brackets[0], content, brackets[1])
 
-    def table(self, rows: Sequence[Any]) -> Any:
-        """Stack elements, flush left."""
-        cells = [self.element("mtd", row) for row in rows]
-        for cell in cells:
+    def table(self, rows: Sequence[Sequence[Any]], *, flush: bool = True) -> Any:
+        """A table of elements, by default flush left."""
+        cells = [[self.element("mtd", entry) for entry in row] for row in rows]
+        for cell in (cell for row in cells for cell in row if flush):
             cell.setAttribute("style", "text-align: left")
-        return self.element("mtable", *(self.element("mtr", cell) for cell in cells))
+        return self.element("mtable", *(self.element("mtr", *row) for row in cells))
 
     def lines(self, expression: sympy.Expr) -> Any:
         """Typeset a sum on as many lines as it needs."""
@@ -291,7 +381,7 @@ class _MathMLPrinter(MathMLPresentationPrinter):
             lines[-1] += self._signed(term, first=index == 0)
             filled += widths[index]
         rows = [self.element("mrow", *line) for line in lines]
-        return rows[0] if len(rows) == 1 else self.table(rows)
+        return rows[0] if len(rows) == 1 else self.table([[row] for row in rows])
 
     def _signed(self, term: sympy.Expr, *, first: bool) -> list[Any]:
         negative, coefficient, rest = _sign_and_parts(term)
@@ -341,138 +431,3 @@ class _MathMLPrinter(MathMLPresentationPrinter):
             power = self.element("msup", self.leaf("mn", "10"), self.element("mrow", *digits))
             nodes += [self.leaf("mo", "×"), power]
         return nodes[0] if len(nodes) == 1 else self.element("mrow", *nodes)
-
-
-LARGEST_VECTOR = 400_000  # bytes: a larger SVG is offered as the PNG that is shown
-DOTS_PER_INCH = 200  # of the PNG files; pages have 96
-CHARACTER = 7.6  # pixels, about: the width of a figure in a table
-CELL = 18.0  # pixels around it
-SHORT_TEXT, LINE = 24, 34  # characters: longer texts wrap, to lines no shorter than the latter
-PHONE, PAGE = 360, 950  # pixels that a table may fill
-
-
-def render_template(name: str, content: object, *, folder: Path | None = None) -> str:
-    """Render a page as HTML; all text is escaped, but for what is `markupsafe.Markup`.
-
-    A `folder` may have templates of its own beside those of this package.
-    """
-    package = PackageLoader("siq.report")
-    environment = Environment(
-        loader=package if folder is None else ChoiceLoader([FileSystemLoader(folder), package]),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters |= {
-        "cell": cell_text,
-        "is_number": _is_number_column,
-        "kept_columns": kept_columns,
-        "data_address": _data_address,
-        "figure_download": _figure_download,
-        "table_download": _table_download,
-        "file_name": file_name,
-        "page_width": _page_width,
-        "wide_for": _wide_for,
-        "short": short_caption,
-        "unbroken": lambda text: text.replace(" × 10", "\u00a0×\u00a010"),
-        "records": lambda frame: list(frame.itertuples(index=False, name=None)),
-    }
-    return environment.get_template(name).render(content=content)
-
-
-def kept_columns(frame: pd.DataFrame) -> pd.DataFrame:
-    """The table without columns that say nothing: of missing values, or of empty texts."""
-    said = [not (frame[name].isna() | (frame[name].astype(str) == "")).all() for name in frame.columns]
-    return frame if all(said) or frame.empty else frame.loc[:, said]
-
-
-def _address(kind: str, content: bytes) -> str:
-    return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
-
-
-_KINDS = {"svg": "image/svg+xml", "png": "image/png"}
-
-
-def _data_address(figure: Any) -> str:
-    # An SVG inside <img> keeps its identifiers to itself and cannot run or load anything.
-    return _address(_KINDS[figure.kind], figure.image)
-
-
-def _figure_download(figure: Any) -> tuple[str, str]:
-    """What a figure is downloaded as: its kind and its address."""
-    if figure.vector is not None and len(figure.vector) <= LARGEST_VECTOR:
-        return "svg", _address(_KINDS["svg"], figure.vector)
-    return figure.kind, _data_address(figure)
-
-
-def _table_download(table: Any) -> str:
-    frame = table.frame if table.data is None else table.data
-    text = frame.to_csv(index=False, lineterminator="\n")
-    return _address("text/csv;charset=utf-8", text.encode("utf-8"))
-
-
-def short_caption(caption: str) -> str:
-    """The first sentence, or its first part, for the contents: no more than a line."""
-    first = re.split(r"(?<=[a-zà-ÿ)\]])[.:;](?:\s|$)", caption, maxsplit=1)[0].rstrip(".")
-    return first if len(first) <= 90 else first[:88].rsplit(" ", 1)[0] + " …"
-
-
-def file_name(caption: str, number: int, *, what: str) -> str:
-    """A name for a download: ``table-3-barriers-of-u``."""
-    words = re.findall(r"[a-z0-9]+", caption.lower())[:5]
-    return "-".join([what, str(number), *words])
-
-
-def _page_width(figure: Any) -> int:
-    # The first chunk of every PNG holds its width in dots.
-    if figure.kind == "png":
-        return round(int.from_bytes(figure.image[16:20], "big") * 96 / DOTS_PER_INCH)
-    head = figure.image[:2000].decode("utf-8", errors="replace")
-    found = re.search(r"<svg[^>]*\bwidth=\"([\d.]+)(pt|px|in)?\"", head)
-    if found is None:
-        return 600
-    return round(float(found[1]) * {"pt": 96 / 72, "in": 96.0}.get(found[2] or "px", 1.0))
-
-
-def _wide_for(frame: pd.DataFrame, rows: int) -> str:
-    """For which screens a table is about too wide: ``page phone``, ``phone``, or none."""
-    width = 0.0
-    for name in frame.columns:
-        cells = [_least_width(cell_text(value)) for value in frame[name].head(rows)]
-        width += CELL + CHARACTER * max([longest_word(str(name)), *cells])
-    return "page phone" if width > PAGE else "phone" if width > PHONE else ""
-
-
-def _least_width(text: str) -> int:
-    """Characters on the narrowest line that a cell can be set in: long texts wrap."""
-    return len(text) if len(text) <= SHORT_TEXT else min(LINE, max(longest_word(text), SHORT_TEXT // 2))
-
-
-def longest_word(text: str) -> int:
-    """Characters of the longest word: headings wrap, figures do not."""
-    return max((len(word) for word in text.split()), default=0)
-
-
-def _is_number_column(column: pd.Series) -> bool:
-    return pd.api.types.is_numeric_dtype(column) and not pd.api.types.is_bool_dtype(column)
-
-
-def cell_text(value: object) -> str:
-    """What stands in a cell."""
-    if value is None or value is pd.NA or value is pd.NaT:
-        return "—"
-    if isinstance(value, bool | np.bool_):
-        return "yes" if value else "no"
-    if isinstance(value, int | np.integer):
-        return str(value).replace("-", "−")
-    if isinstance(value, float | np.floating):
-        return str(int(value)).replace("-", "−") if _is_whole(float(value)) else number_text(float(value))
-    if isinstance(value, datetime.datetime):
-        return value.isoformat(sep=" ", timespec="seconds")
-    return str(value)
-
-
-def _is_whole(value: float) -> bool:
-    # Counts become floating-point numbers as soon as one of their column is missing.
-    return value.is_integer() and abs(value) < 1e5

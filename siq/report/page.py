@@ -1,30 +1,33 @@
-"""Pages: sections with formulas, tables and figures, and U as a figure that a reader turns.
+"""Pages: what a page is made from, how a template fills it, and how it becomes HTML.
 
-The page asks nothing of any other machine: style, figures, formulas and downloads stand in it. It has no
-scripts, but for the view of U that can be turned, where there is one. `siq.report.formatting` makes HTML
-of it.
+A page asks nothing of any other machine: style, figures, formulas and downloads stand in it. It has no
+scripts, but for the view of U that can be turned, where there is one: its data are U on a coarse grid in
+steps of one part in 250, wells, saddles and paths, which are read and never run.
 
-The data are U on a coarse grid in steps of one part in 250, wells, saddles and paths: they are read, never
-run. The script asks nothing of any other machine, and draws with what every browser has.
+`compose` fills a page from a template of text, in which ``page.section``, ``page.table`` and so on stand
+where they stand on the page. A section, a table or a figure without content is left out.
 """
 
 from __future__ import annotations
 
 import base64
+import datetime
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from importlib.resources import files
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import ChoiceLoader, Environment, FileSystemLoader, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from siq.numerics.text import unit_text
-from siq.report.formatting import render_template
-from siq.report.landscape_summary import BLOCK_OF_POINTS, DrawnLandscape, chosen_states
+from siq.numerics.text import number_text, unit_text
+from siq.report.formatting import environment, in_paragraphs
+from siq.report.summary import BLOCK_OF_POINTS, LandscapeSummary, chosen_states
 
 
 @dataclass(frozen=True)
@@ -192,6 +195,108 @@ class ReportContent:
     language: str = "en"
 
 
+class PageWriter:
+    """A page that a template fills; see `compose`.
+
+    Parameters
+    ----------
+    title
+        Of the page.
+    """
+
+    def __init__(self, title: str) -> None:
+        self.content = ReportContent(title)
+        self._section: ReportSection | None = None
+
+    def answer(self, caller: Callable[[], str]) -> str:
+        """The answer: a sentence that stands alone, and what has to be known of it."""
+        self.content = replace(self.content, answer=in_paragraphs(caller()))
+        return ""
+
+    def badge(self, label: str, *, good: bool, caller: Callable[[], str]) -> str:
+        """Whether the answer may be believed, and what that means."""
+        self.content = replace(self.content, badge=Badge(label, good, in_paragraphs(caller())))
+        return ""
+
+    def section(
+        self, heading: str, *, folded: bool = False, listing: str = "", caller: Callable[[], str]
+    ) -> str:
+        """A section; one without content is left out."""
+        self._section = ReportSection(heading, folded=folded, listing=listing)
+        text = in_paragraphs(caller())
+        found, self._section = replace(self._section, text=text), None
+        if text or found.formulas or found.tables or found.figures or found.notes or listing:
+            self.content = replace(self.content, sections=[*self.content.sections, found])
+        return ""
+
+    def _add(self, **parts: Sequence[Any]) -> str:
+        assert self._section is not None  # the template opened it
+        old = {name: getattr(self._section, name) for name in parts}
+        self._section = replace(self._section, **{name: [*old[name], *parts[name]] for name in parts})
+        return ""
+
+    def formulas(self, rows: Sequence[FormulaRow]) -> str:
+        """Formulas of a section."""
+        return self._add(formulas=rows)
+
+    def notes(self, caller: Callable[[], str]) -> str:
+        """Paragraphs in small print at the end of a section."""
+        return self._add(notes=in_paragraphs(caller()))
+
+    def table(
+        self,
+        caption: str,
+        frame: pd.DataFrame | None,
+        *,
+        data: pd.DataFrame | None = None,
+        file: str = "",
+        rows: int = 30,
+        named: bool = False,
+        help: Mapping[str, str] | None = None,
+    ) -> str:
+        """A table of a section, or that of the answer; left out if it has no rows.
+
+        `help` says what columns mean, by their names without units.
+        """
+        if frame is None or frame.empty:
+            return ""
+        told = {str(name): (help or {}).get(str(name).partition(" (")[0], "") for name in frame.columns}
+        meaning = {name: text for name, text in told.items() if text}
+        made = ReportTable(caption, frame, meaning, file, rows, data, named)
+        if self._section is None:
+            self.content = replace(self.content, table=made)
+            return ""
+        return self._add(tables=[made])
+
+    def figures(self, figures: Sequence[ReportFigure]) -> str:
+        """Figures of a section."""
+        return self._add(figures=figures)
+
+    def lead(self, figure: ReportFigure | None, *, first: bool = False) -> str:
+        """The figure of the answer; `first` puts it above the sentence."""
+        self.content = replace(self.content, figure=figure, figure_first=first)
+        return ""
+
+
+def compose(template: str, *, title: str, interactive: Markup | None = None, **values: Any) -> ReportContent:
+    """Fill a page from a template of text, which has the writer as ``page``.
+
+    Parameters
+    ----------
+    template
+        Its file among the templates of this package.
+    title
+        Of the page.
+    interactive
+        A view of U that can be turned.
+    values
+        What the template reads.
+    """
+    writer = PageWriter(title)
+    environment().get_template(template).render(page=writer, **values)
+    return replace(writer.content, interactive=interactive)
+
+
 def render_report(content: ReportContent) -> str:
     """Render a report as one HTML page.
 
@@ -208,6 +313,141 @@ def render_report(content: ReportContent) -> str:
     return render_template("report.html.j2", content)
 
 
+LARGEST_VECTOR = 400_000  # bytes: a larger SVG is offered as the PNG that is shown
+DOTS_PER_INCH = 200  # of the PNG files; pages have 96
+CHARACTER = 7.6  # pixels, about: the width of a figure in a table
+CELL = 18.0  # pixels around it
+SHORT_TEXT, LINE = 24, 34  # characters: longer texts wrap, to lines no shorter than the latter
+PHONE, PAGE = 360, 950  # pixels that a table may fill
+
+
+def render_template(name: str, content: object, *, folder: Path | None = None) -> str:
+    """Render a page as HTML; all text is escaped, but for what is `markupsafe.Markup`.
+
+    A `folder` may have templates of its own beside those of this package.
+    """
+    package = PackageLoader("siq.report")
+    environment = Environment(
+        loader=package if folder is None else ChoiceLoader([FileSystemLoader(folder), package]),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {
+        "cell": cell_text,
+        "is_number": _is_number_column,
+        "kept_columns": kept_columns,
+        "data_address": _data_address,
+        "figure_download": _figure_download,
+        "table_download": _table_download,
+        "file_name": file_name,
+        "page_width": _page_width,
+        "wide_for": _wide_for,
+        "short": short_caption,
+        "unbroken": lambda text: text.replace(" × 10", "\u00a0×\u00a010"),
+        "records": lambda frame: list(frame.itertuples(index=False, name=None)),
+    }
+    return environment.get_template(name).render(content=content)
+
+
+def kept_columns(frame: pd.DataFrame) -> pd.DataFrame:
+    """The table without columns that say nothing: of missing values, or of empty texts."""
+    said = [not (frame[name].isna() | (frame[name].astype(str) == "")).all() for name in frame.columns]
+    return frame if all(said) or frame.empty else frame.loc[:, said]
+
+
+def _address(kind: str, content: bytes) -> str:
+    return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
+
+
+_KINDS = {"svg": "image/svg+xml", "png": "image/png"}
+
+
+def _data_address(figure: Any) -> str:
+    # An SVG inside <img> keeps its identifiers to itself and cannot run or load anything.
+    return _address(_KINDS[figure.kind], figure.image)
+
+
+def _figure_download(figure: Any) -> tuple[str, str]:
+    """What a figure is downloaded as: its kind and its address."""
+    if figure.vector is not None and len(figure.vector) <= LARGEST_VECTOR:
+        return "svg", _address(_KINDS["svg"], figure.vector)
+    return figure.kind, _data_address(figure)
+
+
+def _table_download(table: Any) -> str:
+    frame = table.frame if table.data is None else table.data
+    text = frame.to_csv(index=False, lineterminator="\n")
+    return _address("text/csv;charset=utf-8", text.encode("utf-8"))
+
+
+def short_caption(caption: str) -> str:
+    """The first sentence, or its first part, for the contents: no more than a line."""
+    first = re.split(r"(?<=[a-zà-ÿ)\]])[.:;](?:\s|$)", caption, maxsplit=1)[0].rstrip(".")
+    return first if len(first) <= 90 else first[:88].rsplit(" ", 1)[0] + " …"
+
+
+def file_name(caption: str, number: int, *, what: str) -> str:
+    """A name for a download: ``table-3-barriers-of-u``."""
+    words = re.findall(r"[a-z0-9]+", caption.lower())[:5]
+    return "-".join([what, str(number), *words])
+
+
+def _page_width(figure: Any) -> int:
+    # The first chunk of every PNG holds its width in dots.
+    if figure.kind == "png":
+        return round(int.from_bytes(figure.image[16:20], "big") * 96 / DOTS_PER_INCH)
+    head = figure.image[:2000].decode("utf-8", errors="replace")
+    found = re.search(r"<svg[^>]*\bwidth=\"([\d.]+)(pt|px|in)?\"", head)
+    if found is None:
+        return 600
+    return round(float(found[1]) * {"pt": 96 / 72, "in": 96.0}.get(found[2] or "px", 1.0))
+
+
+def _wide_for(frame: pd.DataFrame, rows: int) -> str:
+    """For which screens a table is about too wide: ``page phone``, ``phone``, or none."""
+    width = 0.0
+    for name in frame.columns:
+        cells = [_least_width(cell_text(value)) for value in frame[name].head(rows)]
+        width += CELL + CHARACTER * max([longest_word(str(name)), *cells])
+    return "page phone" if width > PAGE else "phone" if width > PHONE else ""
+
+
+def _least_width(text: str) -> int:
+    """Characters on the narrowest line that a cell can be set in: long texts wrap."""
+    return len(text) if len(text) <= SHORT_TEXT else min(LINE, max(longest_word(text), SHORT_TEXT // 2))
+
+
+def longest_word(text: str) -> int:
+    """Characters of the longest word: headings wrap, figures do not."""
+    return max((len(word) for word in text.split()), default=0)
+
+
+def _is_number_column(column: pd.Series) -> bool:
+    return pd.api.types.is_numeric_dtype(column) and not pd.api.types.is_bool_dtype(column)
+
+
+def cell_text(value: object) -> str:
+    """What stands in a cell."""
+    if value is None or value is pd.NA or value is pd.NaT:
+        return "—"
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else "no"
+    if isinstance(value, int | np.integer):
+        return str(value).replace("-", "−")
+    if isinstance(value, float | np.floating):
+        return str(int(value)).replace("-", "−") if _is_whole(float(value)) else number_text(float(value))
+    if isinstance(value, datetime.datetime):
+        return value.isoformat(sep=" ", timespec="seconds")
+    return str(value)
+
+
+def _is_whole(value: float) -> bool:
+    # Counts become floating-point numbers as soon as one of their column is missing.
+    return value.is_integer() and abs(value) < 1e5
+
+
 NODES = 64_000  # of the grid: 85 kB in the page
 MOST_NODES = 128  # along one state
 MOST_STATES = 4  # a grid of more would be too coarse to show a well
@@ -218,13 +458,13 @@ BANDS = 12  # of colours in a section
 SURFACE = 0.9  # of the height of the lowest saddle: where the surface is at first, a bubble about each well
 
 
-def interactive_view(landscape: DrawnLandscape) -> Markup | None:
+def interactive_view(landscape: LandscapeSummary) -> Markup | None:
     """A view of U that can be turned and cut; None of one state, and where U is known nowhere.
 
     Parameters
     ----------
     landscape
-        What is drawn. Of more than four states those are shown along which the wells lie apart, with the
+        The landscape. Of more than four states those are shown along which the wells lie apart, with the
         others held at the lowest saddle.
 
     Returns
@@ -279,14 +519,14 @@ def _safe(data: dict[str, Any]) -> str:
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
-def _shown(landscape: DrawnLandscape) -> list[int]:
+def _shown(landscape: LandscapeSummary) -> list[int]:
     """Places of the states that are shown, the two of the picture among them."""
     count = len(landscape.names)
     first = list(chosen_states(landscape, None))
     return sorted([*first, *(place for place in range(count) if place not in first)][:MOST_STATES])
 
 
-def _on_a_grid(landscape: DrawnLandscape, shown: Sequence[int]) -> np.ndarray:
+def _on_a_grid(landscape: LandscapeSummary, shown: Sequence[int]) -> np.ndarray:
     """U on a grid of the states that are shown."""
     count = min(int(NODES ** (1 / len(shown)) + 1e-9), MOST_NODES)
     axes = [landscape.along(place, count) for place in shown]
@@ -301,7 +541,7 @@ def _on_a_grid(landscape: DrawnLandscape, shown: Sequence[int]) -> np.ndarray:
 
 
 def _data(
-    landscape: DrawnLandscape, shown: Sequence[int], values: np.ndarray, limits: tuple[float, float]
+    landscape: LandscapeSummary, shown: Sequence[int], values: np.ndarray, limits: tuple[float, float]
 ) -> dict[str, Any]:
     """What the script draws, as plain data."""
     low, high = limits
@@ -348,13 +588,13 @@ def _short(value: float) -> float:
     return float(f"{value:.6g}")
 
 
-def _lowest_pass(landscape: DrawnLandscape) -> float | None:
+def _lowest_pass(landscape: LandscapeSummary) -> float | None:
     tops = [landscape.wells[way.start].height + way.barrier for way in landscape.ways]
     known = [top for top in tops if np.isfinite(top)]
     return min(known) if known else None
 
 
-def _text(landscape: DrawnLandscape, shown: Sequence[int]) -> str:
+def _text(landscape: LandscapeSummary, shown: Sequence[int]) -> str:
     rest = [place for place in range(len(landscape.names)) if place not in shown]
     text = (
         "Circles are stable states, diamonds saddles. The solid line is the most probable way out of a well,"

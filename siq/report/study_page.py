@@ -1,376 +1,150 @@
-"""The page of a study: the answer, formulas, evidence, the landscape, the workings."""
+"""The page of a study: the answer, formulas, evidence, the landscape, runs, a sweep, the workings.
+
+One template, `templates/study.j2`, tells studies of recordings, of simulated cards and of given equations;
+here stand the tables and numbers that it is filled with.
+"""
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
 import pandas as pd
+import sympy
 import yaml
+from markupsafe import Markup
+from pydantic.dataclasses import dataclass as pydantic_dataclass
 
-from siq.data.inspection import inspection_of
-from siq.data.recordings import Recordings
-from siq.data.selection import joined
 from siq.data.two_states import RecordStates
 from siq.inference.field_estimate import DiffusionSource
+from siq.inference.identification import FieldRecord
+from siq.numerics.files import whole_file
+from siq.numerics.text import unit_text, value_text
+from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.quasipotential.landscape import told_without_landscape
-from siq.report.formula_sections import formula_section, formulas_by
-from siq.report.landscape_answer import (
-    certificate_badge,
-    headline,
-    record_sentences,
+from siq.quasipotential.wells import Well
+from siq.report.figures import LEADING, figure_of, figures_of, shown_figures
+from siq.report.formatting import (
+    formula_mathml,
+    matrix_mathml,
+    paragraphs,
+    term_text,
+    texts,
+    vector_mathml,
+)
+from siq.report.landscape import (
+    answer_lines,
+    comparison_table,
+    counted_over_runs,
+    cycles_table,
+    equilibria_table,
+    exits_table,
+    headed,
+    in_words,
     record_table,
-    remarks,
     tests_table,
+    times_table,
     wells_table,
-    with_seen_states,
 )
-from siq.report.landscape_summary import SaidLandscape
-from siq.report.landscape_tables import (
-    beside_sentences,
-    beside_table,
-    errors_table,
-    escape_table,
-    invariant_tables,
-    landscape_sentences,
-    landscape_tables,
-)
-from siq.report.page import Badge, ReportContent, ReportFigure, ReportSection, ReportTable
-from siq.report.study_figures import LEADING, OF_ONE_STATE, Part, figure_of, shown_figures
-from siq.report.study_results import ShownStudy, StudyResults, control_sentences, method_tables, run_sentences
+from siq.report.page import FormulaRow, ReportContent, ReportFigure, compose
+from siq.report.summary import LandscapeSummary, well_name
+from siq.systems.diffusion import Diffusion
+from siq.systems.dynamics import Dynamics
+from siq.workflow.collection_steps import ModelFiles, Shown
 from siq.workflow.outcomes import Method, Outcome, Status, Step, why_no_landscape
-from siq.workflow.study import Study
-from siq.workflow.tables import as_table
+from siq.workflow.settings import STRICT
+from siq.workflow.study import Study, SweepOptions
+
+NEGLIGIBLE_TERM = 1e-3  # of the depth: a term that adds less everywhere is left to the whole formula
+ROUNDED_CONSTANT = 1e-9  # of the depth: a constant of U far below it is what rounding left of zero
+ROUNDED_COEFFICIENT = 1e-12  # of the largest coefficient of U, likewise
+SHORT_FORMULA = 8  # terms that are read at a glance: so short a formula is shown as it is
+PRINTED_OF_EQUATIONS = (
+    "name", "title", "system", "from", "seed", "refinement", "certificate", "landscape", "invariant", "sweep",
+)  # fmt: skip
+SUMMARY_COLUMNS = (
+    "method", "quantity", "exact", "mean", "standard_deviation", "median", "inclusion_frequency", "published",
+    "published_standard_deviation", "runs",
+)  # fmt: skip
 
 
-def study_badge(page: ShownStudy) -> Badge:
-    """Whether the answer may be believed."""
-    rrmse, certificates = page.results.tables["rrmse"], page.results.tables["certificates"]
-    mine = rrmse[rrmse["method"] == page.method]
-    refused = certificates[(certificates["method"] == page.method) & ~certificates["passed"]]
-    refused = refused[refused["run"] == page.results.shown.run]
-    return certificate_badge(
-        page.certificate(),
-        certified=int(mine["certified"].sum()),
-        runs=page.study.runs,
-        refusals=dict(zip(refused["test"], refused["reason"], strict=True)),
-    )
+@pydantic_dataclass(frozen=True, config=STRICT)
+class PageSettings:
+    """What the page of a study depends on: the whole study, which it prints."""
+
+    study: Study
 
 
-def evidence_section(page: ShownStudy) -> ReportSection | None:
-    """Why the answer may be believed, or may not."""
-    tables, shown, folder = page.results.tables, page.results.shown, page.results.folder
-    found = []
-    if shown.run is not None:
-        mine = tests_table(tables["certificates"], shown.run, shown.method)
-        if len(mine):
-            caption = "The tests of the certificate"
-            caption += f", of run {shown.run}." if page.study.runs > 1 else "."
-            found.append(ReportTable(caption, mine, {}, f"{folder}/certificates.csv", rows_named=True))
-    if "landscape_errors" in tables and len(tables["landscape_errors"]):
-        found.append(errors_table(tables["landscape_errors"], folder))
-    if "beside_equations" in tables and len(tables["beside_equations"]):
-        found.append(beside_table(tables["beside_equations"], folder))
-    if "escape" in tables and len(tables["escape"]):
-        time = "1" if page.results.overview is None else SaidLandscape(page.results.overview).time_unit
-        found.append(escape_table(tables["escape"], time, folder))
-    troubled = _troubled(page)
-    if len(troubled):
-        caption = "What went wrong, or was not certified."
-        found.append(ReportTable(caption, troubled, {}, f"{folder}/outcomes.csv", rows_shown=60))
-    text = [] if page.study.runs > 1 else runs_said(page)
-    text += control_sentences(tables["certificates"])
-    text += beside_sentences(tables.get("beside_equations"))
-    text += [
-        line for line in landscape_sentences(tables["landscape"], tables["outcomes"]) if shown.run is not None
-    ]
-    figures = page.figures(Part.EVIDENCE)
-    if not (text or found or figures):
-        return None
-    return ReportSection(
-        "How far it can be trusted", text, tables=found, figures=figures, notes=_remarks(page)
-    )
+@dataclass(frozen=True)
+class StudyResults:
+    """What a study left behind.
 
+    Attributes
+    ----------
+    tables
+        By name, see `siq.workflow.tables.COLUMNS`; `landscape_errors` and `escape` with a card only,
+        `beside_equations`, `invariant` and those of a sweep where the study asks for it.
+    folder
+        Where the whole tables are.
+    images, vectors
+        The figures that there are by name, as PNG and as SVG.
+    landscape
+        The landscape that the page opens with; None where there is none.
+    models, shown
+        The formulas of all runs, and the run and the method whose formulas are printed.
+    exact
+        The exact formulas, where they are known.
+    record
+        f and D of the run that is shown, None where there is none.
+    interactive
+        A view of U that can be turned, None where there is none.
+    inspection
+        What is in the recordings, line by line; None where they were simulated.
+    seen
+        The two states that they show by themselves; None where nothing is known of that.
+    system, certificate
+        f and D that were given as equations, and the certificate of their formulas; None of recordings.
+    """
 
-def _remarks(page: ShownStudy) -> list[str]:
-    """What steps that went well have to say, each once; where D is from stands beside D."""
-    outcomes = page.results.tables["outcomes"]
-    known = {source.note for source in DiffusionSource}
-    texts = outcomes[outcomes["status"] == Status.OK]["reason"].dropna()
-    return [f"{text[0].upper()}{text[1:]}." for text in dict.fromkeys(texts) if text and text not in known]
+    tables: Mapping[str, pd.DataFrame]
+    folder: Path
+    images: Mapping[str, bytes]
+    vectors: Mapping[str, bytes]
+    landscape: LandscapeSummary | None = None
+    models: ModelFiles = field(default_factory=lambda: ModelFiles(()))
+    shown: Shown = field(default_factory=lambda: Shown(0, Method.REFINED))
+    exact: SymbolicDecomposition | None = None
+    record: FieldRecord | None = None
+    interactive: Markup | None = None
+    inspection: Sequence[str] | None = None
+    seen: RecordStates | None = None
+    system: Dynamics | None = None
+    certificate: Mapping[str, Any] | None = None
 
+    def table(self, name: str) -> pd.DataFrame | None:
+        """A table that has rows, None otherwise."""
+        found = self.tables.get(name)
+        return None if found is None or found.empty else found
 
-def runs_said(page: ShownStudy) -> list[str]:
-    """What all runs say together, in sentences."""
-    tables = page.results.tables
-    return run_sentences(
-        tables["rrmse"], tables["outcomes"], tables["summary"], runs=page.study.runs, method=page.method
-    )
+    @property
+    def time_unit(self) -> str:
+        """Of the landscape, ``1`` where it is not known."""
+        return "1" if self.landscape is None else self.landscape.time_unit
 
-
-def _troubled(page: ShownStudy) -> pd.DataFrame:
-    """Steps that failed, and refined formulas that are not certified; the run where there are several."""
-    outcomes, rrmse = page.results.tables["outcomes"], page.results.tables["rrmse"]
-    troubled = outcomes[outcomes["status"].isin([Status.FAILED, Status.WARNING])]
-    # Which tests refused a formula is said once.
-    troubled = troubled[~troubled["reason"].fillna("").str.startswith("not certified")]
-    rows = pd.concat([troubled, _refusals(rrmse, page.results.tables["certificates"])])
-    rows = rows[["run", "step", "status", "reason"]].sort_values(["run", "step"])
-    return rows.drop(columns="run") if page.study.runs == 1 else rows
-
-
-def _refusals(rrmse: pd.DataFrame, certificates: pd.DataFrame) -> pd.DataFrame:
-    """Every refined formula that is not certified, with the tests that refused it."""
-    refused = certificates[(certificates["method"] == Method.REFINED) & ~certificates["passed"]]
-    reasons = refused.groupby("run")["reason"].agg(lambda texts: "; ".join(dict.fromkeys(texts)))
-    rows = rrmse[(rrmse["method"] == Method.REFINED) & ~rrmse["certified"]]
-    return pd.DataFrame(
-        {
-            "run": rows["run"],
-            "step": "certify",
-            "status": "not certified",
-            "reason": rows["run"].map(reasons).fillna("there is no refined formula"),
-        }
-    )
-
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-HEADING = "What is in the recordings"
-CAPTIONS: Mapping[str, str] = {
-    "record": "The states in the course of time; of long recordings from the lowest to the highest value.",
-    "visited": "How often states were visited: what was never visited, no formula knows.",
-    "memory": "Correlation of what increments leave once their mean is taken off, over the steps between"
-    " them; within the band they know nothing of each other. The mean is that which earlier states tell.",
-}
-
-
-FILE, SEEN = "inspection.json", "seen.json"
-
-
-def inspection_drawn(recordings: Recordings, *, folder: Path) -> dict[str, Figure]:
-    """The figures of an inspection by name; what it says is written into the folder."""
-    from siq.report.plots.recordings import inspection_figures  # matplotlib
-
-    found = inspection_of(joined(recordings))
-    (folder / FILE).write_text(json.dumps(found.lines(), ensure_ascii=False) + "\n", encoding="utf-8")
-    (folder / SEEN).write_text(
-        json.dumps(None if found.seen is None else found.seen.as_data(), ensure_ascii=False, allow_nan=False)
-        + "\n",
-        encoding="utf-8",
-    )
-    return inspection_figures(found)
-
-
-def read_seen(folder: str | Path) -> RecordStates | None:
-    """What `inspection_drawn` wrote of two states; None where recordings were simulated."""
-    file = Path(folder) / SEEN
-    data = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else None
-    return None if data is None else RecordStates.from_data(data)
-
-
-def read_inspection(folder: str | Path) -> list[str] | None:
-    """What `inspection_drawn` wrote, line by line; None where recordings were simulated."""
-    file = Path(folder) / FILE
-    return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else None
-
-
-def inspection_section(
-    lines: Sequence[str], images: Mapping[str, bytes], vectors: Mapping[str, bytes]
-) -> ReportSection:
-    """The section, from the lines of an inspection and its figures, PNG and SVG by name."""
-    sentences = [line if line.endswith((".", ":")) else f"{line}." for line in lines]
-    figures = [
-        ReportFigure(caption, caption, images[name], "png", vectors.get(name))
-        for name, caption in CAPTIONS.items()
-        if name in images
-    ]
-    # The name of a state stays as it is: X is not x.
-    named = [line.partition(" ")[0].endswith(":") for line in sentences]
-    capital = [
-        line if is_state else f"{line[0].upper()}{line[1:]}"
-        for line, is_state in zip(sentences, named, strict=True)
-    ]
-    return ReportSection(HEADING, capital, figures=figures)
-
-
-def study_answer(page: ShownStudy) -> list[str]:
-    """The sentence, and what has to be known of it."""
-    overview, seen = page.results.overview, page.results.seen
-    if overview is None or not overview["wells"]:
-        return told_without_landscape(_why(page), seen)
-    certificate = page.certificate()
-    certified = certificate is not None and bool(certificate["certified"])
-    return with_seen_states([headline(overview), *remarks(overview)], overview, seen, certified=certified)
-
-
-def _why(page: ShownStudy) -> str:
-    rows = page.results.tables["outcomes"].fillna({"reason": ""}).to_dict("records")
-    return why_no_landscape(
-        Outcome(int(row["run"]), Step(row["step"]), Status(row["status"]), str(row["reason"])) for row in rows
-    )
-
-
-def recordings_section(page: ShownStudy) -> ReportSection | None:
-    """What is in the recordings, before anything is learned from them."""
-    if page.results.inspection is None:
-        return None
-    return inspection_section(page.results.inspection, page.results.images, page.results.vectors)
-
-
-def record_section(page: ShownStudy) -> ReportSection | None:
-    """The record's own hops and histogram, beside what was identified."""
-    shown, certificate = page.results.shown, page.certificate()
-    table = page.results.tables.get("record", as_table("record", []))
-    mine = table[table["run"] == shown.run]
-    missing = "" if certificate is None else str(certificate.get("no_record_test") or "")
-    text, figures = record_sentences(mine, missing), page.figures(Part.RECORD)
-    if not text and not figures:
-        return None
-    overview = page.results.overview
-    time = "1" if overview is None else SaidLandscape(overview).time_unit
-    found = record_table(mine, time, page.results.folder)
-    return ReportSection(
-        "Against the record itself", text, tables=[] if found is None else [found], figures=figures
-    )
-
-
-def landscape_section(page: ShownStudy) -> ReportSection | None:
-    """Every way out, every equilibrium, the density."""
-    tables, folder = page.results.tables, page.results.folder
-    options = page.study.landscape
-    found = landscape_tables(
-        page.results.overview,
-        tables["landscape"],
-        noises=() if options is None else options.noise_intensities,
-        folder=folder,
-    )
-    found += invariant_tables(tables["invariant"], tables["well_shares"], folder)
-    figures = page.figures(Part.LANDSCAPE)
-    if not found and not figures:
-        return None
-    text = []
-    overview = page.results.overview
-    if overview is not None and page.study.runs > 1:
-        text = [f"The landscape is that of run {overview['run']}."]
-    return ReportSection("The landscape in full", text, tables=found, figures=figures)
-
-
-def runs_section(page: ShownStudy) -> ReportSection | None:
-    """What varies from run to run; of one run nothing does."""
-    if page.study.runs == 1:
-        return None
-    tables, folder = page.results.tables, page.results.folder
-    found = method_tables(
-        tables, folder, (str(page.method), str(Method.CONTROL)), beside_paper=page.beside_paper
-    )
-    return ReportSection(
-        f"What {page.study.runs} runs say together", runs_said(page),
-        tables=found, figures=page.figures(Part.RUNS),
-    )  # fmt: skip
-
-
-def published_section(page: ShownStudy) -> ReportSection | None:
-    """What the published method made of the networks, and what was published."""
-    other = page.study.training is not None and page.method != Method.REGRESSION
-    rows = formulas_by(page, Method.REGRESSION) if other else []
-    figures = page.figures(Part.PUBLISHED)
-    if not rows and not figures:
-        return None
-    text = []
-    training, regression = page.study.training, page.study.regression
-    if training is not None:
-        text.append(
-            f"The published method trains two networks, here for at most {training.steps} steps on"
-            f" batches of"
-            f" {training.batch_size}, and regresses formulas of degree {regression.degree} at most on"
-            f" them. Terms"
-            f" below {regression.threshold} are dropped (of the {regression.threshold_on})."
-        )
-    if rows:
-        text.append(_regression_verdict(page))
-    tables = []
-    if page.study.runs > 1 and other:
-        tables = method_tables(
-            page.results.tables, page.results.folder, (str(Method.REGRESSION),),
-            beside_paper=page.beside_paper,
-        )  # fmt: skip
-    return ReportSection("The published method", text, rows, tables, figures, folded=not page.beside_paper)
-
-
-def _regression_verdict(page: ShownStudy) -> str:
-    shown = page.results.shown
-    assert shown.run is not None  # it has formulas
-    one = page.results.models.certificates(shown.run)[str(Method.REGRESSION)]
-    if one["certified"]:
-        return "Its formulas are certified."
-    return f"Its formulas are not certified: {one['reason']}."
-
-
-def workings_section(page: ShownStudy) -> ReportSection:
-    """The recordings, and what became of each step."""
-    outcomes = page.results.tables["outcomes"]
-    steps = outcomes.drop(columns="run") if page.study.runs == 1 else outcomes
-    caption = "What became of each step" + (" of each run." if page.study.runs > 1 else ".")
-    return ReportSection(
-        "The recordings and the workings", [_source(page), _method_said(page)],
-        tables=[ReportTable(caption, steps, {}, f"{page.results.folder}/outcomes.csv", 12)],
-        figures=page.figures(Part.WORKINGS), folded=True,
-    )  # fmt: skip
-
-
-def _source(page: ShownStudy) -> str:
-    recordings = page.study.recordings
-    if recordings is not None:
-        return f"The recordings are those in {recordings.file}."
-    return f"The recordings are simulated trajectories of the system {page.study.system}."
-
-
-def _method_said(page: ShownStudy) -> str:
-    routes = page.study.refinement.with_routes(networks=page.study.training is not None).routes or ()
-    if page.results.record is None:
-        return "No f was identified, so that there is no formula."
-    return (
-        f"f was identified {_identified_by(page)}. The formulas solve the Hamilton–Jacobi"
-        " equation of this"
-        f" f, by the {' and the '.join(routes)} route, and have to pass the tests of the certificate."
-    )
-
-
-def _identified_by(page: ShownStudy) -> str:
-    record = page.results.record
-    if record is not None and record.memory is not None:
-        return f"from pairs of samples, as seen from {record.memory[0]} steps earlier"
-    if record is not None and record.sensor_variance is not None:
-        return "by the likelihood of whole recordings, with the noise of the sensor beside it"
-    return "from neighbouring samples alone"
-
-
-def provenance_section(page: ShownStudy, versions: Mapping[str, str]) -> ReportSection:
-    """The study as it was asked, with what, and how long."""
-    timings = page.results.tables["timings"]
-    total = timings.groupby("step")["seconds"].sum()
-    spent = ", ".join(f"{step} {seconds:.0f} s" for step, seconds in total.items())
-    named = ", ".join(f"{name} {version}" for name, version in versions.items())
-    machine = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"
-    text = [f"{named}; {machine}, {os.cpu_count()} cores.", f"Processor time by step: {spent}."]
-    printed = yaml.safe_dump(_printed(page.study), sort_keys=False, allow_unicode=True)
-    return ReportSection("The study and the versions", text, listing=printed, folded=True)
-
-
-def _printed(study: Study) -> dict[str, Any]:
-    """The study as plain data; of recordings nothing is simulated."""
-    data = study.model_dump(mode="json", by_alias=True)
-    return data if study.recordings is None else data | {"simulation": None}
-
-
-AGAIN = "Change one parameter of the study and run it again: only what depends on it is made again."
+    @property
+    def certificates(self) -> Mapping[str, Any]:
+        """Of the run that is shown, by method."""
+        if self.system is not None:
+            formulas = self.landscape is not None and any(w is not None for w in self.landscape.formulas)
+            return {str(Method.REFINED): self.certificate} if formulas else {}
+        return {} if self.shown.run is None else self.models.certificates(self.shown.run)
 
 
 def study_page(
@@ -389,41 +163,543 @@ def study_page(
     versions
         Of the programs that took part, by name.
     """
-    beside_paper = study.published is not None
-    drawn = shown_figures(
-        set(results.images), runs=study.runs, networks=study.training is not None, published=beside_paper
-    )
-    images = {name: image for name, image in results.images.items() if name in drawn}
-    lead = next((name for name in LEADING if name in drawn), None)
-    page = ShownStudy(study, results, images, lead, beside_paper)
-    overview = results.overview
-    table = None
-    if overview is not None and overview["wells"]:
-        shown, data = wells_table(overview)
-        table = ReportTable("Stable states, barriers and times.", shown, data=data, rows_named=True)
-    figure = None
-    if lead is not None:
-        figure = figure_of(lead, results.images, results.vectors, beside_paper=beside_paper)
-        if overview is not None and len(overview["states"]) == 1:
-            figure = replace(figure, caption=OF_ONE_STATE, alternative=OF_ONE_STATE)
-    sections = [
-        recordings_section(page),
-        formula_section(page),
-        record_section(page),
-        evidence_section(page),
-        landscape_section(page),
-        runs_section(page),
-        published_section(page),
-        workings_section(page),
-        ReportSection("How to run it again", listing=command, text=[AGAIN]),
-        provenance_section(page, versions),
-    ]
-    return ReportContent(
-        title=study.title or study.name,
-        answer=study_answer(page),
-        badge=study_badge(page),
-        figure=figure,
-        table=table,
+    shown, summary, given = results.shown, results.landscape, results.system
+    method, several, beside_paper = shown.method, study.runs > 1, study.published is not None
+    certificate = results.certificates.get(str(method))
+    certified = certificate is not None and bool(certificate["certified"])
+    wells = None if summary is None or not summary.wells else summary
+    noises = () if study.landscape is None else study.landscape.noise_intensities
+    headings, table = texts("help")["headings"], results.table
+    record, compared, landscape = table("record"), table("beside_equations"), table("landscape")
+    record = None if record is None else record[record["run"] == shown.run]
+    record = None if record is None or record.empty else record
+    other = study.training is not None and method != Method.REGRESSION
+    certificates, rrmse, timings = results.tables["certificates"], table("rrmse"), table("timings")
+    refused = certificates[(certificates["method"] == method) & ~certificates["passed"].astype(bool)]
+    refused = refused[refused["run"] == shown.run]
+    images, lead = _shown_images(study, results)
+    inspection = {
+        name: ReportFigure(text, text, results.images[name], "png", results.vectors.get(name))
+        for name, text in texts("captions")["inspection"].items()
+        if name in results.images
+    }
+    density = given is not None and table("invariant") is None and "invariant" in results.tables
+    escape, errors = table("escape"), table("landscape_errors")
+    invariant, shares = table("invariant"), None if density else table("well_shares")
+    named = ", ".join(f"{name} {version}" for name, version in versions.items())
+    machine = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"
+
+    def figures(part: str) -> list[ReportFigure]:
+        if part == "inspection":
+            return list(inspection.values())
+        return figures_of(part, images, results.vectors, beside_paper=beside_paper)
+
+    return compose(
+        "study.j2",
+        title=study.title or (given.title if given is not None else "") or study.name,
         interactive=results.interactive,
-        sections=[section for section in sections if section is not None],
+        study=study,
+        results=results,
+        s=summary,
+        given=given is not None,
+        shown=shown,
+        method=str(method),
+        beside_paper=beside_paper,
+        command=command,
+        help=texts("help"),
+        words=texts("certificate"),
+        answer=_answer(results, certified=certified),
+        certificate=certificate,
+        lead=lead,
+        figures=figures,
+        certified=0 if rrmse is None else int(rrmse[rrmse["method"] == method]["certified"].sum()),
+        refusals=list(dict(zip(refused["test"], refused["reason"], strict=True)).values()),
+        wells=(None, None) if wells is None else wells_table(wells),
+        formulas=_formulas(results),
+        coefficients=_coefficients(results),
+        record=record,
+        no_record_test=str((certificate or {}).get("no_record_test") or ""),
+        record_table=None if record is None else record_table(record, results.time_unit),
+        run_lines=paragraphs("runs.j2", r=run_figures(results.tables, runs=study.runs, method=str(method))),
+        control=control_counts(certificates),
+        without_landscape=without_landscape(results.tables),
+        compared=compared,
+        comparison=None if compared is None else comparison_table(compared),
+        compared_notes=[] if compared is None else comparison_notes(compared),
+        tests=None if shown.run is None else tests_table(certificates, shown.run, method),
+        landscape_errors=None if errors is None else errors_over_runs(errors),
+        escape=None if escape is None else escape.rename(columns=lambda name: name.replace("_", " ")),
+        time_unit=results.time_unit,
+        troubled=_troubled(study, results),
+        remarks=_remarks(results),
+        exits=exits_table(wells) if wells is not None and wells.ways else (None, None),
+        equilibria=None if wells is None else equilibria_table(wells),
+        cycles=None if wells is None else cycles_table(wells),
+        times=times_table(wells, noises) if wells is not None and wells.has_times else None,
+        barriers_over_runs=_barriers_over_runs(landscape),
+        invariant_missing=density,
+        invariant=None if invariant is None else in_words(invariant.rename(columns=headings)),
+        well_shares=None
+        if shares is None or invariant is None
+        else in_words(shares.rename(columns=headings)),
+        sweep=study.sweep,
+        tables=results.tables,
+        folder=results.folder,
+        bifurcations=None if given is None else _bifurcations(given, study.sweep, table("bifurcations")),
+        swept_wells=_swept_wells(table("sweep")),
+        of_runs=method_tables(results.tables, (str(method), str(Method.CONTROL))) if several else None,
+        published_formulas=_formulas_by(results, Method.REGRESSION) if other else [],
+        published_certificate=results.certificates.get(str(Method.REGRESSION)),
+        published_runs=method_tables(results.tables, (str(Method.REGRESSION),))
+        if several and other
+        else None,
+        routes=study.refinement.with_routes(networks=study.training is not None).routes or (),
+        steps=results.tables["outcomes"].drop(columns=[] if several else "run"),
+        machine=f"{named}; {machine}, {os.cpu_count()} cores",
+        printed=_printed(study, given=given is not None),
+        spent=None if timings is None else timings.groupby("step")["seconds"].sum(),
     )
+
+
+def _shown_images(study: Study, results: StudyResults) -> tuple[Mapping[str, bytes], ReportFigure | None]:
+    """The figures that the sections show, and the one that the page opens with."""
+    given = results.system is not None
+    drawn = set(results.images)
+    if not given:
+        networks, published = study.training is not None, study.published is not None
+        drawn = shown_figures(drawn, runs=study.runs, networks=networks, published=published)
+    images = {name: image for name, image in results.images.items() if name in drawn}
+    lead = next((name for name in LEADING if name in images), None)
+    if lead is None:
+        return images, None
+    figure = figure_of(lead, images, results.vectors, beside_paper=study.published is not None)
+    one = results.landscape is not None and len(results.landscape.names) == 1
+    kind = ("one_equation" if one else "equations") if given else "one_state" if one else ""
+    if kind:
+        caption = texts("captions")["lead"][kind]
+        figure = replace(figure, caption=caption, alternative=caption)
+    del images[lead]
+    return images, figure
+
+
+def _answer(results: StudyResults, *, certified: bool) -> list[str]:
+    """The sentence, and what has to be known of it."""
+    summary, outcomes = results.landscape, results.tables["outcomes"].fillna({"reason": ""})
+    if results.system is not None and summary is None:
+        reason = next((str(reason) for reason in outcomes["reason"] if reason), "there is no stable state")
+        return told_without_landscape(reason, None)
+    if results.system is None and (summary is None or not summary.wells):
+        reason = why_no_landscape(
+            Outcome(int(row["run"]), Step(row["step"]), Status(row["status"]), str(row["reason"]))
+            for row in outcomes.to_dict("records")
+        )
+        return told_without_landscape(reason, results.seen)
+    assert summary is not None
+    return answer_lines(summary, seen=results.seen, certified=certified)
+
+
+def answer_data(page: ReportContent, study: Study, results: StudyResults) -> dict[str, Any]:
+    """The content of ``answer.json``, for a terminal or another program.
+
+    Returns
+    -------
+    dict
+        ``title`` and ``sentence`` as on the page; ``certified``, whether the formulas of all runs, of some or
+        of none passed their certificates; ``formulas``, how many runs ended with a refined formula (of
+        equations: with a landscape), of how many ``runs``; in how many a step ``failed``.
+    """
+    outcomes = results.tables["outcomes"]
+    if results.system is not None:
+        certified = int(results.certificate is not None and bool(results.certificate["certified"]))
+        formulas = int(results.landscape is not None and bool(results.landscape.wells))
+        failed = int((outcomes["status"] == Status.FAILED).sum())
+    else:
+        rrmse = results.tables["rrmse"]
+        certified = int(rrmse[rrmse["method"] == Method.REFINED]["certified"].sum())
+        formulas = len(results.models.with_any_formula(Method.REFINED))
+        failed = int(outcomes[outcomes["status"] == Status.FAILED]["run"].nunique())
+    how = "none" if certified == 0 else "all" if certified >= study.runs else "some"
+    return {
+        "title": page.title, "sentence": page.answer[0], "certified": how, "formulas": formulas,
+        "runs": study.runs, "failed": failed,
+    }  # fmt: skip
+
+
+def write_answer(path: str | Path, answer: Mapping[str, Any]) -> None:
+    """Write `answer.json` whole or not at all."""
+    with whole_file(path) as partial:
+        partial.write_text(json.dumps(answer, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def _formulas(results: StudyResults) -> list[FormulaRow]:
+    """Formulas and D of the run that is shown; f and D alone where no formula was found."""
+    words = texts("formulas")
+    if (system := results.system) is not None:
+        formulas = () if results.landscape is None else results.landscape.formulas
+        wells = tuple(well for well in formulas if well is not None)
+        found = SymbolicDecomposition(system.symbols, None, (), system.formulas, wells)
+        rows = formula_rows(found, None, places=_places(results.landscape))
+        rows[-1] = replace(rows[-1], note=words["given"])
+        return [*rows, FormulaRow("D", diffusion_mathml(system.diffusion), words["D"]["given"])]
+    rows, record = _formulas_by(results, results.shown.method), results.record
+    if record is None:
+        return rows
+    if not rows:
+        rows.append(FormulaRow("f", vector_mathml(record.found.dynamics.formulas), words["f"]))
+    noise, note = record.found.diffusion, words["D"][record.diffusion_source]
+    note = note if noise.constant else f"{note} {words['by_state']}"
+    return [*rows, FormulaRow("D", diffusion_mathml(noise), note)]
+
+
+def diffusion_mathml(noise: Diffusion) -> Markup:
+    """D, typeset."""
+    return matrix_mathml(noise.matrix.tolist() if noise.constant else noise.formulas)
+
+
+def _places(summary: LandscapeSummary | None) -> list[np.ndarray]:
+    return [] if summary is None else [well.position for well in summary.wells]
+
+
+def _formulas_by(results: StudyResults, method: Method) -> list[FormulaRow]:
+    """The formulas of the run that is shown, as a method found them; none where it found none."""
+    run, summary = results.shown.run, results.landscape
+    found = {} if run is None else results.models.formulas(run)
+    if method not in found:
+        return []
+    barriers = [] if summary is None else [way.barrier for way in summary.ways if np.isfinite(way.barrier)]
+    return formula_rows(
+        found[method], results.exact, places=_places(summary), depth=max(barriers, default=0.0)
+    )
+
+
+def formula_rows(
+    found: SymbolicDecomposition,
+    exact: SymbolicDecomposition | None,
+    *,
+    places: Sequence[np.ndarray] = (),
+    depth: float = 0.0,
+) -> list[FormulaRow]:
+    """U, g and f of one method; U about each well where no single formula holds.
+
+    Parameters
+    ----------
+    found
+        The formulas.
+    exact
+        The exact ones, where they are known.
+    places
+        The attractors in the order of their letters; by default that of the wells.
+    depth
+        Of the deepest well: a constant far below it is what rounding left of zero.
+    """
+
+    def typeset(one: SymbolicDecomposition, depth: float = 0.0) -> dict[str, Markup]:
+        formulas = {}
+        if one.potential is not None:
+            whole = one.quasipotential
+            constant, rest = whole.as_coeff_Add()
+            rounded = rest != 0 and abs(float(constant)) < ROUNDED_CONSTANT * depth
+            formulas = {
+                "U": formula_mathml(rest if rounded else whole), "g": vector_mathml(one.circulatory),
+            }  # fmt: skip
+        return formulas | {"f": vector_mathml(one.vector_field)}
+
+    truths, notes = {} if exact is None else typeset(exact), texts("formulas")
+    rows = [
+        FormulaRow(name, formula, notes[name], truths.get(name))
+        for name, formula in typeset(found, depth).items()
+    ]
+    return [*(_well_row(well, places) for well in found.wells if found.potential is None), *rows]
+
+
+def _well_row(well: Well, places: Sequence[np.ndarray]) -> FormulaRow:
+    """U about one attractor in offsets from it: the terms that count, and the whole formula."""
+    basis, coefficients = well.basis, well.coefficients
+    label = "(" + ", ".join(value_text(value) for value in well.attractor) + ")"
+    if len(places):
+        away = [np.abs((np.asarray(place) - well.attractor) / basis.scale).max() for place in places]
+        label = well_name(int(np.argmin(away)))
+    size = np.abs(coefficients)
+    if len(well.points):
+        size = size * np.abs(basis.values(well.points)).max(axis=0)
+    kept = size > NEGLIGIBLE_TERM * well.level
+    if kept.sum() == 0 or len(kept) <= SHORT_FORMULA:
+        kept = coefficients != 0
+    left_out = int(((coefficients != 0) & ~kept).sum())
+    center = np.where(np.abs(basis.center) < 1e-12 * np.maximum(basis.scale, 1e-300), 0.0, basis.center)
+    (note,) = paragraphs(
+        "well_formula.j2", level=well.level, label=label, left_out=left_out,
+        offsets=[(symbol.name, value) for symbol, value in zip(basis.symbols, center, strict=True)],
+    )  # fmt: skip
+    offsets = [sympy.Symbol(f"Δ{symbol}", real=True) for symbol in basis.symbols]
+
+    def typeset(chosen: np.ndarray) -> Markup:
+        terms = []
+        for exponents, coefficient in zip(basis.exponents[chosen], coefficients[chosen], strict=True):
+            value = 2 * float(coefficient) / float(np.prod(basis.scale**exponents))
+            powers = [offset ** int(n) for offset, n in zip(offsets, exponents, strict=True) if n]
+            terms += [sympy.Mul(sympy.Float(value), *powers)] if value else []
+        return formula_mathml(sympy.Add(*terms))
+
+    whole = typeset(np.ones(len(kept), dtype=bool)) if left_out else None
+    return FormulaRow(f"U about {label}", typeset(kept), note, whole=whole)
+
+
+def _coefficients(results: StudyResults) -> tuple[pd.DataFrame, pd.DataFrame] | None:
+    """Coefficients of U and f with their errors, and as numbers those of g; None where there are none.
+
+    Those of g follow from the others, and stand in the download alone.
+    """
+    coefficients, shown = results.table("coefficients"), results.shown
+    if coefficients is None:
+        return None
+    mine = coefficients[(coefficients["run"] == shown.run) & (coefficients["method"] == str(shown.method))]
+    of_potential = mine["component"] == "U"
+    largest = mine[of_potential]["estimate"].abs().max()
+    rounded = of_potential & (mine["term"] == "1") & (mine["estimate"].abs() < ROUNDED_COEFFICIENT * largest)
+    mine = mine[~rounded & (mine["estimate"] != 0)]
+    chosen = mine[mine["component"].str.match("U$|f_")]
+    if chosen.empty:
+        return None
+    summary = results.landscape
+    units = {} if summary is None else dict(zip(summary.names, summary.units, strict=True))
+    time = "" if summary is None else unit_text(summary.time_unit)
+
+    def component(name: str) -> str:
+        kind, _, state = name.partition("_")
+        if kind != "f":
+            return f"{kind}, {state}" if state else kind
+        unit = unit_text(units.get(state, ""))
+        return headed(f"d{state}/dt", f"{unit or '1'}/{time}" if time else unit)
+
+    table = pd.DataFrame(
+        {
+            "in": [component(str(name)) for name in chosen["component"]],
+            "term": [term_text(str(name)) for name in chosen["term"]],
+            "coefficient": list(map(value_text, chosen["estimate"], chosen["standard_error"])),
+            "exact": chosen["exact"].to_numpy(),
+        }
+    )
+    whole = mine[mine["component"].str.match("U$|g_|f_")]
+    return table, whole.drop(columns=["run", "method"])
+
+
+def _remarks(results: StudyResults) -> list[str]:
+    """What has to be known of steps that went well, each once; where D is from stands beside D."""
+    if results.system is not None:
+        return [] if results.landscape is None else list(results.landscape.remarks)
+    outcomes = results.tables["outcomes"]
+    known = {source.note for source in DiffusionSource}
+    reasons = outcomes[outcomes["status"] == Status.OK]["reason"].dropna()
+    return [text for text in dict.fromkeys(reasons) if text and text not in known]
+
+
+def _troubled(study: Study, results: StudyResults) -> pd.DataFrame | None:
+    """Steps that failed, and refined formulas that are not certified; the run where there are several."""
+    if results.system is not None:
+        return None
+    outcomes, rrmse = results.tables["outcomes"], results.tables["rrmse"]
+    certificates = results.tables["certificates"]
+    troubled = outcomes[outcomes["status"].isin([Status.FAILED, Status.WARNING])]
+    # Which tests refused a formula is said once.
+    troubled = troubled[~troubled["reason"].fillna("").str.startswith("not certified")]
+    refused = certificates[(certificates["method"] == Method.REFINED) & ~certificates["passed"]]
+    reasons = refused.groupby("run")["reason"].agg(lambda texts: "; ".join(dict.fromkeys(texts)))
+    runs = rrmse[(rrmse["method"] == Method.REFINED) & ~rrmse["certified"]]["run"]
+    without = pd.DataFrame(
+        {
+            "run": runs, "step": "certify", "status": "not certified",
+            "reason": runs.map(reasons).fillna(texts("tables")["no_formula"]),
+        }
+    )  # fmt: skip
+    rows = pd.concat([troubled, without])[["run", "step", "status", "reason"]].sort_values(["run", "step"])
+    return rows.drop(columns="run") if study.runs == 1 else rows
+
+
+def without_landscape(tables: Mapping[str, pd.DataFrame]) -> tuple[str, int, int] | None:
+    """Why runs have no landscape whose f was followed, in how many, of how many; None where all have one."""
+    landscape, outcomes = tables["landscape"], tables["outcomes"]
+    asked = outcomes[
+        (outcomes["step"] == Step.LANDSCAPE) & outcomes["status"].isin([Status.WARNING, Status.FAILED])
+    ]
+    without = asked[~asked["run"].isin(landscape[landscape["kind"] == "attractor"]["run"])]
+    if without.empty:
+        return None
+    return str(without["reason"].iloc[0]), len(without), int(outcomes["run"].nunique())
+
+
+def comparison_notes(table: pd.DataFrame) -> list[tuple[str, list[str]]]:
+    """What could not be compared with the equations: each note, and the numbers that it is of."""
+    noted = table[table["note"].fillna("") != ""]
+    return [
+        (str(note), [item for item in dict.fromkeys(some["item"].fillna("")) if item])
+        for note, some in noted.groupby("note", sort=False)
+    ]
+
+
+@dataclass(frozen=True)
+class RunFigures:
+    """What all runs of a study say together of a method, for `templates/runs.j2`.
+
+    Attributes
+    ----------
+    runs, failed, certified, correct
+        How many were asked for, failed, are certified, and have exactly the right terms.
+    stated, errors, networks
+        Errors that certificates state, of the coefficients of U, and of U of the networks.
+    terms, rare
+        Terms of U in most runs with mean and standard deviation, and terms in some runs only.
+    published
+        The published error of the coefficients, NaN where there is none.
+    prediction
+        Error of predictions, mean and median over the runs; None where nothing was predicted.
+    """
+
+    runs: int
+    failed: int
+    certified: int
+    correct: int
+    stated: pd.Series
+    errors: pd.Series
+    networks: pd.Series
+    terms: Sequence[tuple[str, float, float]]
+    rare: Sequence[str]
+    published: float
+    prediction: tuple[float, float] | None
+
+
+def run_figures(tables: Mapping[str, pd.DataFrame], *, runs: int, method: str) -> RunFigures:
+    """Figures over the runs that a study asked for, of one method, from its tables."""
+    nothing = pd.Series(dtype=float)
+    outcomes, rrmse, summary = tables["outcomes"], tables.get("rrmse"), tables.get("summary")
+    if rrmse is None or summary is None:
+        return RunFigures(runs, 0, 0, 0, nothing, nothing, nothing, (), (), np.nan, None)
+    mine = rrmse[rrmse["method"] == method]
+    summary = summary[summary["method"] == method].set_index("quantity")
+    terms = summary[summary.index.str.startswith("U:")]
+    often = terms[(terms["inclusion_frequency"] >= 0.5) & (terms.index != "U:1")]
+    rare = terms[(terms["inclusion_frequency"] > 0) & (terms["inclusion_frequency"] < 0.5)]
+    predicted = summary[summary.index == "prediction_error"]
+    published = summary[summary.index == "rrmse"]["published"]
+    return RunFigures(
+        runs=runs,
+        failed=int(outcomes[outcomes["status"] == Status.FAILED]["run"].nunique()),
+        certified=int(mine["certified"].sum()),
+        correct=int(mine["support_correct"].fillna(False).sum()),
+        stated=mine[mine["certified"].astype(bool)]["stated_error"].dropna(),
+        errors=mine["rrmse"].dropna(),
+        networks=mine["network_error"].dropna(),
+        terms=[
+            (str(name).removeprefix("U:"), float(row["mean"]), float(row["standard_deviation"]))
+            for name, row in often.iterrows()
+        ],
+        rare=[str(name).removeprefix("U:") for name in rare.index],
+        published=float(published.iloc[0]) if len(published) else np.nan,
+        prediction=tuple(predicted.iloc[0][["mean", "median"]]) if len(predicted) else None,
+    )
+
+
+def control_counts(certificates: pd.DataFrame) -> dict[str, int] | None:
+    """What became of the control, a network with its weights in random order; None where there is none.
+
+    Parameters
+    ----------
+    certificates
+        The table of that name. `same_as_refined` is no test of the control but a comparison.
+
+    Returns
+    -------
+    dict or None
+        How many ``runs`` there are, in how many it was ``refused``, refined to the ``same`` U, or certified
+        with another: a ``false`` one.
+    """
+    mine = certificates[certificates["method"] == Method.CONTROL]
+    if not len(mine):
+        return None
+    compared = mine["test"] == "same_as_refined"
+    certified = mine[~compared].groupby("run")["passed"].all()
+    same = mine[compared].set_index("run")["passed"].reindex(certified.index, fill_value=False).astype(bool)
+    return {
+        "runs": len(certified), "refused": int((~certified).sum()), "same": int((certified & same).sum()),
+        "false": int((certified & ~same).sum()),
+    }  # fmt: skip
+
+
+def method_tables(
+    tables: Mapping[str, pd.DataFrame], methods: tuple[str, ...]
+) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame, pd.DataFrame]:
+    """Of some methods: figures over the runs, shown and as numbers, tests passed, and errors by run."""
+    summary, certificates, rrmse = (
+        tables[name][tables[name]["method"].isin(methods)] for name in ("summary", "certificates", "rrmse")
+    )
+    passed = counted_over_runs(
+        certificates, ["method", "test"], passed=("passed", "sum"), runs=("passed", "size"),
+        median=("value", "median"), worst=("value", "max"),
+    )  # fmt: skip
+    passed["test"] = [str(name).replace("_", " ") for name in passed["test"]]
+    shown = summary[~summary["quantity"].str.match("V:|f_")]
+    if shown["method"].nunique() == 1:
+        shown = shown.drop(columns="method")
+
+    def quantity(name: str) -> str:
+        component, colon, term = name.partition(":")
+        return f"{component.replace('_', ', ')}: {term_text(term)}" if colon else name.replace("_", " ")
+
+    columns = [name for name in SUMMARY_COLUMNS if name in shown and shown[name].notna().any()]
+    shown = shown[columns].assign(quantity=[quantity(str(name)) for name in shown["quantity"]])
+    words = {name: name.replace("_", " ") for name in (*shown.columns, *rrmse.columns)}
+    return shown.rename(columns=words), summary, passed, rrmse.rename(columns=words)
+
+
+def errors_over_runs(errors: pd.DataFrame) -> pd.DataFrame:
+    """Relative L2 errors of U over the runs, by source and region."""
+    return counted_over_runs(
+        errors, ["source", "region"], runs=("error", "size"), mean_error=("error", "mean"),
+        worst_error=("error", "max"), least_covered=("covered", "min"),
+        worst_everywhere=("error_everywhere", "max"),
+    )  # fmt: skip
+
+
+def _barriers_over_runs(landscape: pd.DataFrame | None) -> pd.DataFrame | None:
+    if landscape is None or landscape["run"].nunique() == 1:
+        return None
+    return counted_over_runs(
+        landscape[landscape["kind"] == "transition"], "item", runs=("barrier", "size"),
+        mean=("barrier", "mean"), lowest=("barrier", "min"), highest=("barrier", "max"),
+        by_the_path_alone=("minimum_action", "mean"), prefactor=("prefactor", "mean"),
+    )  # fmt: skip
+
+
+def _bifurcations(
+    system: Dynamics, options: SweepOptions | None, found: pd.DataFrame | None
+) -> pd.DataFrame | None:
+    """Where equilibria meet and vanish, begin to oscillate, or cross."""
+    if options is None or found is None:
+        return None
+    unit = next(each.unit for each in system.parameters if each.name == options.parameter)
+    rows = []
+    for one in found.itertuples():
+        states = zip(system.states, ast.literal_eval(str(one.position)), strict=True)
+        rows.append(
+            {
+                "what": one.kind,
+                headed(options.parameter, unit): f"{one.value:.10g}",
+                "state": ", ".join(f"{name} = {x:.5g}" for name, x in states),
+                "frequency": f"{one.frequency:.6g}" if one.kind == "Hopf" else "",
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def _swept_wells(table: pd.DataFrame | None) -> list[str]:
+    return [] if table is None else [well_name(int(well)) for well in sorted(set(table["well"])) if well >= 0]
+
+
+def _printed(study: Study, *, given: bool) -> str:
+    """The study as it was asked; of recordings nothing is simulated, of equations fewer keys have a use."""
+    data = study.model_dump(mode="json", by_alias=True)
+    if given:
+        data = {key: data[key] for key in PRINTED_OF_EQUATIONS}
+    elif study.recordings is not None:
+        data = data | {"simulation": None}
+    return str(yaml.safe_dump(data, sort_keys=False, allow_unicode=True))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -20,7 +18,7 @@ from siq.quasipotential.landscape_comparison import (
     differences,
 )
 from siq.quasipotential.landscape_files import landscape_data
-from siq.report.landscape_tables import beside_sentences, beside_table
+from siq.report.landscape import comparison_table
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.workflow import comparison_steps
@@ -133,17 +131,14 @@ def test_the_step_names_the_run_and_says_why_there_is_nothing_to_compare():
     assert row.run == -1 and row.note.startswith("the equations have no landscape: ")
 
 
-def test_the_page_says_the_largest_difference_and_that_it_is_scoring():
+def test_the_page_says_the_largest_difference():
     settings = BesideEquationsSettings(seed=0, landscape=LandscapeOptions(noise_intensities=(NOISE,)))
     found = wells()
     near = landscape_data(wells(1.01), dynamics=found.dynamics)
     far = landscape_data(wells(1.1), dynamics=found.dynamics)
     several = comparison_steps.run_beside_equations(settings, found.dynamics, [near, far])
-    assert beside_sentences(None) == []
-    assert "off by 21 % at most" in beside_sentences(several)[0]
-    shown = beside_table(several, Path("results/mine/tables"))
-    assert "no input of the method" in shown.caption and len(shown.frame) == 6
-    assert shown.frame["largest difference"].iloc[0] == "21 %"
-    alone = beside_table(several[several["run"] == 0], Path("tables")).frame
+    shown = comparison_table(several)
+    assert len(shown) == 6 and shown["largest difference"].iloc[0] == "21 %"
+    alone = comparison_table(several[several["run"] == 0])
     assert alone["difference"].iloc[0] == "+2.0 %"
     assert pd.isna(several["in_errors"]).all()  # equations state no errors

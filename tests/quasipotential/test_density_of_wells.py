@@ -26,7 +26,7 @@ from siq.quasipotential.invariant_density import (
     starting_states,
     walk,
 )
-from siq.report.study_figures import project_landscape
+from siq.report.figures import project_landscape
 from siq.systems.dynamics import Dynamics
 
 KNOWN, POTENTIAL = matched("double well")

@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from told_landscapes import landscape
 
 import siq
 from siq.data.inspection import inspection_of
@@ -13,7 +14,8 @@ from siq.data.recordings import Recordings
 from siq.data.two_states import RecordStates
 from siq.inference.identification import IdentificationOptions
 from siq.quasipotential.landscape import Landscape, NoLandscape
-from siq.report.landscape_answer import with_seen_states
+from siq.report.landscape import answer_lines
+from siq.report.summary import summarise
 from siq.workflow.outcomes import Outcome, Status, Step, why_no_landscape
 from siq.workflow.pipeline import PipelineSettings
 
@@ -78,10 +80,11 @@ def test_states_of_a_record_come_back_from_plain_data() -> None:
 
 def test_nothing_is_added_to_what_is_certified() -> None:
     seen = inspection_of(telegraph()).seen
-    two = {"wells": [{}, {}]}
-    assert with_seen_states(["Two."], two, seen, certified=True) == ["Two."]
-    assert with_seen_states(["Two."], two, None, certified=False) == ["Two."]
-    assert with_seen_states(["Two."], two, seen, certified=False)[1].startswith("Without any formula: the")
+    two = summarise(landscape([[-0.5], [0.5]], [0.25, 0.35]))
+    (answer, *further) = answer_lines(two, seen=seen, certified=True)
+    assert answer_lines(two) == [answer, *further]
+    last = answer_lines(two, seen=seen)[-1]
+    assert last.startswith("Without any formula: the recordings hop between two states of x")
 
 
 def test_the_reason_is_that_of_the_step_that_failed() -> None:

@@ -1,8 +1,13 @@
+"""The answer of a study as plain data, for a terminal."""
+
 import json
+from pathlib import Path
 
 import pytest
 
-from siq.report.answers import answer_of, write_answer
+from siq.report.page import ReportContent
+from siq.report.study_page import StudyResults, answer_data, write_answer
+from siq.workflow.study import Study
 from siq.workflow.tables import as_table
 
 
@@ -14,22 +19,22 @@ def answer(certified: list[bool], *, failed: list[int] | None = None):
         {"run": run, "step": "refine", "status": "failed" if run in (failed or []) else "ok", "reason": ""}
         for run in range(len(certified))
     ]
-    return answer_of(
-        "A study", "Two wells.", rrmse=as_table("rrmse", rows), outcomes=as_table("outcomes", outcomes),
-        formulas=len(certified) - len(failed or []), runs=len(certified),
-    )  # fmt: skip
+    tables = {"rrmse": as_table("rrmse", rows), "outcomes": as_table("outcomes", outcomes)}
+    results = StudyResults(tables, Path("tables"), images={}, vectors={})
+    study = Study.model_validate({"name": "mine", "runs": len(certified), "recordings": {"file": "mine.csv"}})
+    return answer_data(ReportContent("A study", ["Two wells."]), study, results)
 
 
 @pytest.mark.parametrize(
     "certified, said", [([True, True], "all"), ([True, False], "some"), ([False], "none"), ([True], "all")]
 )
 def test_how_many_runs_are_certified_is_one_word(certified, said):
-    assert answer(certified).certified == said
+    assert answer(certified)["certified"] == said
 
 
 def test_the_file_says_what_a_terminal_needs(tmp_path):
     write_answer(tmp_path / "answer.json", answer([True, False], failed=[1]))
     assert json.loads((tmp_path / "answer.json").read_text(encoding="utf-8")) == {
-        "title": "A study", "sentence": "Two wells.", "certified": "some", "formulas": 1, "runs": 2,
+        "title": "A study", "sentence": "Two wells.", "certified": "some", "formulas": 0, "runs": 2,
         "failed": 1,
     }  # fmt: skip

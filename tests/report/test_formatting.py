@@ -3,7 +3,7 @@ from xml.etree import ElementTree
 import pytest
 import sympy
 
-from siq.report.formatting import formula_mathml, formula_text, polynomial_expression, vector_mathml
+from siq.report.formatting import formula_mathml, formula_text, matrix_mathml, vector_mathml
 
 x, y, z = sympy.symbols("x y z", real=True)
 IDENTIFIED = 0.9991 * y**2 + 1.0009 - 2.0012 * x**2 + 0.9991 * z**2 + 1.0001 * x**4
@@ -89,6 +89,6 @@ def test_hostile_names_are_escaped() -> None:
     assert "<b>" not in markup
 
 
-def test_polynomial_of_a_table_of_coefficients() -> None:
-    expression = polynomial_expression({"1": 1.0, "x**2*y": -2.0, "x": 0.0, "omega_0": 1.0})
-    assert formula_text(expression) == "−2.000 x² y + 1.000 omega_0 + 1.000"
+def test_a_matrix_has_brackets_unless_it_is_one_entry() -> None:
+    assert shown(matrix_mathml([[1.0, -0.5], [-0.5, 2.0]])) == "[1−0.5000−0.50002]"
+    assert shown(matrix_mathml([[2.0]])) == "2" and shown(matrix_mathml([[x + 1]])) == "x+1"

@@ -1,6 +1,7 @@
 """The sentence that page and text open with, for every kind of landscape."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,10 +12,16 @@ from siq.quasipotential.landscape_assembly import find_landscape
 from siq.quasipotential.landscape_files import landscape_data
 from siq.quasipotential.rates import NoiseStrength
 from siq.quasipotential.wells import WellOptions
-from siq.report.landscape_answer import headline, remarks, wells_table
-from siq.report.landscape_summary import SaidLandscape, well_name
-from siq.report.landscape_tables import landscape_tables
-from siq.workflow.tables import as_table
+from siq.report.landscape import answer_lines, equilibria_table, exits_table, times_table, wells_table
+from siq.report.summary import summarise, well_name
+
+
+def headline(data: dict[str, Any]) -> str:
+    return answer_lines(summarise(data))[0]
+
+
+def remarks(data: dict[str, Any]) -> list[str]:
+    return answer_lines(summarise(data))[1:]
 
 
 def test_two_wells_without_noise_have_depths_and_a_way_to_times() -> None:
@@ -27,7 +34,7 @@ def test_two_wells_without_noise_have_depths_and_a_way_to_times() -> None:
     )
     (remark,) = remarks(data)
     assert "noise_intensities" in remark and "follow" in remark
-    assert not any("lasts" in text for text in wells_table(data)[0]["stable state"])
+    assert not any("lasts" in text for text in wells_table(summarise(data))[0]["stable state"])
 
 
 def test_like_wells_are_told_once() -> None:
@@ -38,9 +45,9 @@ def test_like_wells_are_told_once() -> None:
 
 def test_under_noise_every_well_lasts_as_the_law_says() -> None:
     data = landscape([[-0.5], [0.5]], [0.8, 0.9], noise=NOISE)
-    mean = SaidLandscape(data).wells[0].time
+    mean = summarise(data).wells[0].time(summarise(data).noise)
     assert mean is not None and mean.value == pytest.approx(4 * math.exp(8))
-    table, numbers = wells_table(data)
+    table, numbers = wells_table(summarise(data))
     assert list(numbers["mean_time"]) == pytest.approx([4 * math.exp(8), 4 * math.exp(9)])
     assert "lasts (s)" in list(table["stable state"]) and "ΔU/ε" in list(table["stable state"])
     assert "± " in headline(data) and " s" in headline(data)
@@ -76,14 +83,19 @@ def test_one_stable_state_and_none() -> None:
     assert remarks(alone) == []
     none = landscape([], []) | {"notes": ["they end on a limit cycle"]}
     assert headline(none) == "No stable state was found in the recorded region: they end on a limit cycle."
-    assert headline(None, missing="f was not found").endswith(": f was not found.")
 
 
 def test_more_wells_than_a_sentence_can_list_are_told_by_their_ends() -> None:
     data = landscape([[float(k)] for k in range(5)], [0.1, 0.5, 0.2, 0.3, 0.4])
     said = headline(data)
     assert "five stable states" in said and "the deepest, B at" in said and "the shallowest, A, " in said
-    assert list(wells_table(data)[0]["stable state"]) == ["A", "B", "C", "D", "E"]  # a row for each
+    assert list(wells_table(summarise(data))[0]["stable state"]) == [
+        "A",
+        "B",
+        "C",
+        "D",
+        "E",
+    ]  # a row for each
 
 
 def test_states_of_one_unit_share_it_and_of_several_keep_theirs() -> None:
@@ -91,29 +103,28 @@ def test_states_of_one_unit_share_it_and_of_several_keep_theirs() -> None:
     assert "A at (x,\u00a0y)\u00a0=\u00a0(−0.500, 0.000)\u00a0µm" in headline(data)
     data["units"] = ["um", "um/s"]
     assert "A at x\u00a0=\u00a0−0.500\u00a0µm, y\u00a0=\u00a00.000\u00a0µm/s" in headline(data)
-    assert SaidLandscape(data).energy_unit == ""  # D then carries the units
-    assert SaidLandscape(landscape([[0.0]], [], units="1")).energy_unit == "s^-1"
-    assert SaidLandscape(landscape([[0.0]], [], units="1", time="1")).energy_unit == ""
+    assert summarise(data).energy_unit == ""  # D then carries the units
+    assert summarise(landscape([[0.0]], [], units="1")).energy_unit == "s^-1"
+    assert summarise(landscape([[0.0]], [], units="1", time="1")).energy_unit == ""
 
 
 def test_what_rounding_left_of_zero_is_zero() -> None:
     data = landscape([[-1.0, 4.94066e-324], [1.0, 1e-13]], [0.25, 0.25])
     for well in data["wells"]:
         well["standard_errors"] = [1e-12, 1e-12]
-    table, _ = wells_table(data)
+    table, _ = wells_table(summarise(data))
     assert list(table.set_index("stable state").loc["y (µm)"]) == ["0", "0"]
     assert "e-3" not in headline(data)
 
 
-def test_ways_equilibria_and_times_for_given_noises_are_tables(tmp_path) -> None:
-    data = landscape([[-0.5], [0.5]], [0.25, 0.35])
-    tables = landscape_tables(data, as_table("landscape", []), noises=(0.05, 0.3), folder=tmp_path)
-    captions = [one.caption for one in tables]
-    assert [caption.split()[0] for caption in captions] == ["Every", "All", "How"]
-    times = tables[2].frame
+def test_ways_equilibria_and_times_for_given_noises_are_tables() -> None:
+    summary = summarise(landscape([[-0.5], [0.5]], [0.25, 0.35]))
+    times = times_table(summary, (0.05, 0.3))
     assert list(times.columns)[1:] == ["A lasts (s)", "B lasts (s)"]
     assert times.iloc[1, 1] == "too strong a noise" and times.iloc[0, 1] != ""
-    assert tables[0].data is not None and list(tables[0].data["barrier"]) == [0.25, 0.35]
+    shown, numbers = exits_table(summary)
+    assert list(shown["way"]) == ["A to B", "B to A"] and list(numbers["barrier"]) == [0.25, 0.35]
+    assert list(equilibria_table(summary)["what"]) == ["stable state", "stable state"]
 
 
 @pytest.mark.parametrize("noise", [None, NoiseStrength(0.05, 0.001, "estimated")])
@@ -127,7 +138,7 @@ def test_text_and_page_say_the_same_sentence(noise: NoiseStrength | None) -> Non
     text = found.report()
     assert text.splitlines()[0] == headline(data)
     assert ("lasts" in headline(data)) == (noise is not None)
-    assert np.isfinite(SaidLandscape(data).wells[0].position_errors).all()
+    assert np.isfinite(summarise(data).wells[0].position_errors).all()
 
 
 def test_letters_go_on_after_the_last() -> None:
@@ -148,7 +159,7 @@ def test_a_barrier_below_the_law_tells_of_visits() -> None:
     assert any("A is less than 3 times" in one and "Fokker–Planck operator" in one for one in told)
     assert any("barrier out of A is not resolved" in one for one in told)
     assert not any("orders of magnitude" in one for one in told)
-    table, numbers = wells_table(data)
+    table, numbers = wells_table(summarise(data))
     assert "mean visit, counted (s)" in list(table["stable state"]) and len(numbers) == 2
 
 

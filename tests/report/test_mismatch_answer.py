@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from siq.diagnosis.verdict import statement_of_failure
-from siq.report.answers import mismatch_answer
+from siq.report.diagnosis_page import mismatch_answer
 
 FIT = {"before": 0.5, "recalibrated": 0.1, "augmented": 0.02, "noise_floor": 0.01}
 

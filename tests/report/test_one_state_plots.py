@@ -10,7 +10,6 @@ import pytest
 from known_systems import double_well, exact_field, portrait_of
 from matplotlib.figure import Figure
 
-from siq.data.recordings import Recordings
 from siq.quasipotential.invariant_density import (
     ComparedDensity,
     known_density,
@@ -24,9 +23,8 @@ from siq.quasipotential.landscape_assembly import find_landscape
 from siq.quasipotential.landscape_comparison import reference_landscape
 from siq.quasipotential.landscape_files import StoredLandscape, read_landscape, write_landscape
 from siq.quasipotential.wells import WellOptions
+from siq.report.figures import LandscapeFiguresSettings, landscape_figures, project_landscape
 from siq.report.plots import plot_components, plot_invariant_distribution
-from siq.report.settings import LandscapeFiguresSettings
-from siq.report.study_figures import LandscapeComparisons, LandscapeRun, landscape_figures, project_landscape
 from siq.workflow.settings import StateSpace
 from siq.workflow.tables import as_table
 
@@ -50,17 +48,14 @@ def figures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Figure | None
     write_landscape(file, landscape(), dynamics=KNOWN.dynamics)
     stored = read_landscape(file, dynamics=KNOWN.dynamics)
     assert isinstance(stored, StoredLandscape)
-    x = np.linspace(-1.8, 1.8, 50)
-    recordings = Recordings.from_arrays(np.arange(50.0), x[None, :, None], names=["x"])
     reference = reference_landscape(
         KNOWN.dynamics, portrait_of(KNOWN), box=KNOWN.domain, reach=1.2, generator=np.random.default_rng(0)
     )
     space = StateSpace(names=("x",), units={"x": "mV", "t": "s"})
     return landscape_figures(
         LandscapeFiguresSettings(space=space, landscape=LandscapeOptions()),
-        LandscapeRun(stored, recordings, {}, None),
-        LandscapeComparisons(reference, as_table("escape", []), as_table("degrees", []), {}, None),
-    )
+        degrees=as_table("degrees", []), escape=as_table("escape", []), landscape=stored, reference=reference,
+    )  # fmt: skip
 
 
 def test_the_errors_are_a_curve_too(figures: dict[str, Figure | None]) -> None:

@@ -19,13 +19,14 @@ from siq.numerics.integration import runge_kutta_step
 from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.landscape_assembly import find_landscape
-from siq.quasipotential.landscape_files import landscape_data
+from siq.quasipotential.landscape_files import StoredLandscape, landscape_data
+from siq.quasipotential.rates import Exit
 from siq.quasipotential.transitions import barrier_uncertainty
 from siq.quasipotential.wells import WellOptions
-from siq.report.landscape_summary import DrawnLandscape, DrawnPoint, DrawnWay, drawn, drawn_data
 from siq.report.plots import prediction
 from siq.report.plots.quasipotential import plane_of, quasipotential_figure
 from siq.report.plots.wells import joined
+from siq.report.summary import ExitSummary, LandscapeSummary, summarise
 
 NONE = np.zeros((0, 1))
 
@@ -79,12 +80,12 @@ def test_the_states_of_the_plane_and_the_view_can_be_chosen() -> None:
     with pytest.raises(ValueError, match="name two of x, y, z"):
         siq.plot_quasipotential(landscape(3), states=("x", "w"), ax=Figure().add_subplot())
     with pytest.raises(ValueError, match="'projection' or 'section'"):
-        plane_of(drawn(landscape(3)), view="shadow")  # type: ignore[arg-type]
+        plane_of(summarise(landscape(3)), view="shadow")  # type: ignore[arg-type]
 
 
 def test_a_projection_keeps_wells_and_passes_at_their_heights() -> None:
     """The lowest U over z is U of the double well of x and y, since z only adds to it."""
-    shown = drawn(landscape(3))
+    shown = summarise(landscape(3))
     plane = plane_of(shown, states=("x", "y"))
     known = np.isfinite(plane.values)
     assert known.mean() > 0.1
@@ -106,7 +107,7 @@ def test_the_band_of_one_state_is_that_of_the_barrier() -> None:
     found, field = landscape(1), exact_field(double_well(1), 3)
     half = np.random.default_rng(0).normal(0, 0.01, (len(field.support), len(field.support)))
     field = replace(field, covariance=half @ half.T)
-    shown = replace(drawn(found), dynamics=field.dynamics)
+    shown = replace(summarise(found), dynamics=field.dynamics)
     deepest = int(np.argmin(found.heights))
     way = next(one for one in found.transitions if one.start == deepest)
     assert way.path is not None
@@ -116,13 +117,13 @@ def test_the_band_of_one_state_is_that_of_the_barrier() -> None:
     top = np.interp(float(way.saddle.position[0]), x, band)
     assert top == pytest.approx(barrier_uncertainty(way.path, field)[0], rel=1e-3)
     assert np.interp(float(found.attractors[deepest].position[0]), x, band) < 1e-3 * top
-    assert drawn(landscape(2)).standard_error(x) is None
+    assert summarise(landscape(2)).standard_error(x) is None
 
 
 def test_the_picture_is_the_same_from_a_file() -> None:
     data = landscape_data(landscape(2), dynamics=landscape(2).dynamics)
-    from_file = drawn_data(data, wells=landscape(2).wells, dynamics=landscape(2).dynamics)
-    shown = drawn(landscape(2))
+    from_file = summarise(StoredLandscape(None, landscape(2).wells, data), dynamics=landscape(2).dynamics)
+    shown = summarise(landscape(2))
     assert from_file.energy_unit == shown.energy_unit == "um^2/s"
     np.testing.assert_array_equal(from_file.box, shown.box)
     x = landscape(2).wells[0].points[:20]
@@ -135,33 +136,35 @@ def test_one_formula_is_drawn_where_states_were_recorded() -> None:
     data = landscape_data(landscape(2), dynamics=known.dynamics)
     points = np.random.default_rng(0).uniform(*known.domain.T, (500, 2))
     none = (None,) * len(data["wells"])
-    shown = drawn_data(data, wells=none, dynamics=known.dynamics, points=points, formula=formula)
+    shown = summarise(StoredLandscape(None, none, data), points, dynamics=known.dynamics, formula=formula)
     assert np.isfinite(shown.potential(points)).all()
     assert np.isnan(shown.potential(points + 10 * np.ptp(points, axis=0))).all()
     assert quasipotential_figure(shown) is not None
-    nothing = drawn_data(data, wells=none, dynamics=known.dynamics, points=points)
+    nothing = summarise(StoredLandscape(None, none, data), points, dynamics=known.dynamics)
     assert quasipotential_figure(nothing) is None
 
 
 @pytest.mark.parametrize("dimension", [1, 2, 3])
 def test_the_first_picture_can_be_read_on_a_phone(dimension: int) -> None:
     """Letters of nine pixels where the page leaves a figure 368, as on a phone of 400."""
-    figure = quasipotential_figure(drawn(landscape(dimension)))
+    figure = quasipotential_figure(summarise(landscape(dimension)))
     assert figure is not None
     sizes = [text.get_fontsize() for text in figure.findobj(matplotlib.text.Text) if text.get_text().strip()]
     assert min(sizes) * 368 / (72 * figure.get_figwidth()) >= 9
 
 
-def of_heights(heights: list[float], passes: dict[tuple[int, int], float]) -> DrawnLandscape:
+def of_heights(heights: list[float], passes: dict[tuple[int, int], float]) -> LandscapeSummary:
     ways = [
-        DrawnWay(*pair, np.zeros(1), top - heights[pair[0]], 0.01, NONE, NONE)
+        ExitSummary(*pair, np.zeros(1), top - heights[pair[0]], 0.01, NONE, NONE, Exit(np.nan, np.nan, None))
         for (left, right), top in passes.items()
         for pair in ((left, right), (right, left))
     ]
+    known = summarise(landscape(1))
     wells = tuple(
-        DrawnPoint("attractor", np.array([float(k)]), u, "ABCDEF"[k]) for k, u in enumerate(heights)
+        replace(known.wells[0], label="ABCDEF"[k], position=np.array([float(k)]), height=u)
+        for k, u in enumerate(heights)
     )
-    return replace(drawn(landscape(1)), wells=wells, ways=tuple(ways), others=())
+    return replace(known, wells=wells, ways=tuple(ways), others=())
 
 
 def test_wells_join_from_the_lowest_pass_to_the_highest_and_no_lines_cross() -> None:

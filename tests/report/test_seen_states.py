@@ -8,8 +8,7 @@ import numpy as np
 from told_landscapes import NOISE, landscape
 
 from siq.data.two_states import DwellCount, RecordStates
-from siq.report.landscape_answer import with_visits
-from siq.report.landscape_summary import SaidLandscape
+from siq.report.summary import summarise
 from siq.workflow.tables import as_table
 
 SEEN = RecordStates(
@@ -33,7 +32,7 @@ def test_visits_belong_to_the_well_at_their_place() -> None:
         for place, mean in (("(0.6)", 12.0), ("(−0.5)", 10.0))
     ]  # fmt: skip
     data = landscape([[-0.5], [0.6]], [0.25, 0.35], noise=NOISE) | {"run": 0}
-    wells = SaidLandscape(with_visits(data, as_table("record", rows)) or {}).wells
+    wells = summarise(data, record=as_table("record", rows)).wells
     assert [one.visits.counted for one in wells if one.visits] == [10.0, 12.0]
-    assert with_visits(None, as_table("record", [])) is None
-    assert with_visits(data | {"run": 1}, as_table("record", rows))["visits"] == []  # type: ignore[index]
+    others = summarise(data | {"run": 1}, record=as_table("record", rows)).wells
+    assert [one.visits for one in others] == [None, None]

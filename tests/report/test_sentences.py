@@ -4,7 +4,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from siq.report.study_results import control_sentences, run_sentences
+from siq.report.formatting import paragraphs
+from siq.report.study_page import control_counts, run_figures
 from siq.workflow.published import PublishedFigure
 from siq.workflow.scoring import summary_table
 from siq.workflow.tables import as_table
@@ -43,7 +44,8 @@ def answer(errors: list[float | None], *, published: bool = True, certified: boo
     summary = summary_table(
         as_table("coefficients", rows), rrmse, as_table("prediction", []), PUBLISHED if published else {}
     )
-    return " ".join(run_sentences(rrmse, outcomes, summary, runs=len(errors), method="regression"))
+    tables = {"rrmse": rrmse, "outcomes": outcomes, "summary": summary}
+    return " ".join(paragraphs("runs.j2", r=run_figures(tables, runs=len(errors), method="regression")))
 
 
 def test_it_says_how_many_runs_ended_with_formulas_and_how_many_failed() -> None:
@@ -91,8 +93,8 @@ def test_a_study_without_any_answer_known_claims_no_error() -> None:
     rrmse = as_table("rrmse", [{"run": 0, "method": "regression", "certified": False}])
     outcomes = as_table("outcomes", [{"run": 0, "step": "train", "status": "ok", "reason": ""}])
     summary = summary_table(as_table("coefficients", []), rrmse, as_table("prediction", []), {})
-    text = " ".join(run_sentences(rrmse, outcomes, summary, runs=1, method="regression"))
-    assert text == ""
+    tables = {"rrmse": rrmse, "outcomes": outcomes, "summary": summary}
+    assert paragraphs("runs.j2", r=run_figures(tables, runs=1, method="regression")) == []
 
 
 def test_one_run_is_not_counted() -> None:
@@ -116,10 +118,6 @@ def test_the_control_is_counted_by_what_became_of_it() -> None:
             for run, test, passed in rows
         ]
     )
-    (said,) = control_sentences(table)
-    assert "It was refused in 1 of 3 runs" in said
-    assert "in 1 refinement led from it to the same U" in said
-    assert "in 1 ANOTHER U than the refined one was certified" in said
-    (harmless,) = control_sentences(table[table["run"] < 2])
-    assert "ANOTHER" not in harmless
-    assert control_sentences(table.assign(method="refined")) == []
+    assert control_counts(table) == {"runs": 3, "refused": 1, "same": 1, "false": 1}
+    assert control_counts(table[table["run"] < 2]) == {"runs": 2, "refused": 1, "same": 1, "false": 0}
+    assert control_counts(table.assign(method="refined")) is None

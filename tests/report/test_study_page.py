@@ -6,16 +6,18 @@ import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
 import sympy
 from told_landscapes import NOISE, landscape
 
 from siq.quasipotential.formulas import SymbolicDecomposition, exact_decomposition, model_to_data, write_model
-from siq.report.page import ReportContent, render_report
-from siq.report.study_figures import CAPTIONS, LEADING, OF_NETWORKS, OF_ONE_STATE, OF_RUNS
-from siq.report.study_page import study_page
-from siq.report.study_results import StudyResults
+from siq.report.figures import LEADING, OF_NETWORKS, OF_RUNS
+from siq.report.formatting import texts
+from siq.report.page import ReportContent, ReportSection, render_report
+from siq.report.study_page import StudyResults, study_page
+from siq.report.summary import summarise
 from siq.systems.dynamics import Dynamics
 from siq.workflow.collection_steps import ModelFiles, shown_formula
 from siq.workflow.outcomes import Method
@@ -23,6 +25,8 @@ from siq.workflow.scoring import coefficient_table, summary_table
 from siq.workflow.study import Study
 from siq.workflow.tables import COLUMNS, as_table
 
+CAPTIONS = {name: caption["text"] for name, caption in texts("captions")["figures"].items()}
+OF_ONE_STATE = texts("captions")["lead"]["one_state"]
 PNG = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR" + (1400).to_bytes(4, "big") + (940).to_bytes(4, "big")
 X = sympy.Symbol("x", real=True)
 SYSTEM = Dynamics.of((X,), (2.0 * X - 8.0 * X**3,))
@@ -53,6 +57,8 @@ def page_of(
     overview: dict[str, Any] | None = None,
     images: tuple[str, ...] = (),
     reason: str = "",
+    record: list[dict[str, object]] | None = None,
+    inspection: list[str] | None = None,
     **study: Any,
 ) -> ReportContent:
     """The page of a study with these results; where there is a reason for it, without formulas."""
@@ -82,6 +88,8 @@ def page_of(
         "rrmse": as_table("rrmse", rrmse), "certificates": as_table("certificates", tests),
         "outcomes": as_table("outcomes", outcomes),
     }  # fmt: skip
+    if record:
+        tables["record"] = as_table("record", record)
     if coefficients:
         tables["coefficients"] = as_table("coefficients", pd.concat(coefficients))
     tables["summary"] = summary_table(tables["coefficients"], tables["rrmse"], tables["prediction"], {})
@@ -89,14 +97,19 @@ def page_of(
     models = ModelFiles(tuple(paths))
     asked = Study.model_validate({"name": "mine", "runs": runs, "recordings": {"file": "mine.csv"}} | study)
     results = StudyResults(
-        tables, Path("results/mine/tables"), models, shown_formula(tables["rrmse"], models), exact,
-        images=dict.fromkeys(images, PNG), vectors={}, overview=overview,
+        tables, Path("results/mine/tables"), images=dict.fromkeys(images, PNG), vectors={}, models=models,
+        shown=shown_formula(tables["rrmse"], models), exact=exact,
+        landscape=None if overview is None else summarise(overview), inspection=inspection,
     )  # fmt: skip
     return study_page(asked, results, command="siq run mine.yaml", versions={"siq": "1"})
 
 
 def headings(content: ReportContent) -> list[str]:
     return [section.heading for section in content.sections]
+
+
+def section_of(content: ReportContent, heading: str) -> ReportSection:
+    return next(section for section in content.sections if section.heading == heading)
 
 
 WELLS = {"run": 0} | landscape([[-0.5], [0.5]], [0.25, 0.25], noise=NOISE)
@@ -133,10 +146,10 @@ def test_every_figure_that_makes_sense_is_shown_once(tmp_path: Path, runs: int, 
     shown = [figure.alternative for section in content.sections for figure in section.figures]
     assert content.figure is not None
     shown.append(content.figure.alternative)
-    absent = {LEADING[1], "landscape_published", "record"}  # the record needs a table of its own
+    absent = {LEADING[1], "landscape_published", "record", "sweep"}  # records and sweeps have tables
     absent |= set(OF_RUNS) if runs == 1 else set()
     absent |= set() if regressed else set(OF_NETWORKS)
-    texts = {name: caption.text for name, caption in CAPTIONS.items()} | {"quasipotential": OF_ONE_STATE}
+    texts = CAPTIONS | {"quasipotential": OF_ONE_STATE}
     expected = [text for name, text in texts.items() if name not in absent]
     assert sorted(shown) == sorted([*expected, "Of tomorrow."])
 
@@ -202,3 +215,46 @@ def test_what_the_command_prints_is_what_the_page_opens_with(tmp_path: Path) -> 
     page = render_report(page_of(tmp_path, overview=WELLS))
     sentence = page_of(tmp_path, overview=WELLS).answer[0]
     assert page.index(sentence.split(";")[0]) < page.index("Formulas</h2>")
+
+
+def well(**change: Any) -> dict[str, object]:
+    row: dict[str, object] = {
+        "run": 0, "attractor": "(1)", "visits": 16, "time": 800.0, "counted": 50.0, "lowest": 31.0,
+        "highest": 87.0, "held_out_visits": 4, "held_out_time": 180.0, "held_out_counted": 45.0,
+        "predicted": 51.0, "predicted_error": 3.0, "method": "operator", "probability": 0.8,
+    }  # fmt: skip
+    return row | change
+
+
+def never(**change: Any) -> dict[str, object]:
+    return well(
+        visits=0, counted=np.nan, highest=np.nan, held_out_visits=0, held_out_counted=np.nan, **change
+    )
+
+
+def test_hops_are_counted_and_what_they_allow_is_said(tmp_path: Path) -> None:
+    rows = [well(), well(attractor="(-1)", visits=25)]
+    section = section_of(page_of(tmp_path, overview=WELLS, record=rows), "Against the record itself")
+    (said,) = section.text
+    assert said.startswith("41 hops") and "8 of them" in said and "is known to 25 % at best" in said
+    counted = section.tables[0].frame["mean visit, counted (s)"].tolist()
+    assert counted == ["50.0 (31 to 87)", "50.0 (31 to 87)"]
+    assert section.tables[0].frame["predicted (s)"].tolist()[0] == "51.0 ± 3.0"
+    assert list(section.tables[0].column_help) == [
+        "visits seen to end", "mean visit, counted (s)", "predicted (s)", "probability",
+    ]  # fmt: skip
+
+
+def test_where_nothing_hops_it_is_said(tmp_path: Path) -> None:
+    section = section_of(page_of(tmp_path, overview=WELLS, record=[never()]), "Against the record itself")
+    assert section.text == ["No hop from well to well was seen."]
+    assert section.tables[0].frame["mean visit, counted (s)"].tolist() == ["above 31"]
+    assert "Against the record itself" not in headings(page_of(tmp_path, overview=WELLS))
+
+
+def test_what_is_in_the_recordings_comes_first(tmp_path: Path) -> None:
+    lines = ["x: 2 recordings", "the noise is white."]
+    content = page_of(tmp_path, overview=WELLS, inspection=lines, images=("record", "visited", "memory"))
+    first = content.sections[0]
+    assert first.heading == "What is in the recordings" and len(first.figures) == 3
+    assert first.text == ["x: 2 recordings.", "The noise is white."]

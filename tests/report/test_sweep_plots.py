@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 import sympy
 
-from siq.report.equations_page import sweep_figure, sweep_section
+from siq.report.figures import sweep_figure
+from siq.report.page import ReportSection
 from siq.report.plots.sweep import plot_sweep
+from siq.report.study_page import StudyResults, study_page
 from siq.systems.dynamics import Dynamics
-from siq.workflow.study import SweepOptions
+from siq.workflow.study import Study, SweepOptions
 from siq.workflow.sweep_step import Sweep, sweep
+from siq.workflow.tables import as_table
 
 h, a, x = sympy.symbols("h a x", real=True)
 CUSP = Dynamics.of((x,), (h + a * x - x**3,), domain=[(-2, 2)], parameters={h: 0.0, a: 1.0})
@@ -29,6 +32,15 @@ def tables_of(found: Sweep) -> dict:
         "bifurcations": found.bifurcations,
         "bifurcation_curves": found.curves,
     }
+
+
+def section_of(options: dict, tables: dict) -> ReportSection:
+    study = Study.model_validate({"name": "s", "system": "cusp.yaml", "from": "equations", "sweep": options})
+    of_landscape = ("landscape", "degrees", "certificates", "outcomes")
+    tables = {name: as_table(name, []) for name in of_landscape} | tables
+    results = StudyResults(tables, Path("results/s/tables"), images={}, vectors={}, system=CUSP)
+    page = study_page(study, results, command="siq run s.yaml", versions={})
+    return next(section for section in page.sections if section.heading.startswith("Against"))
 
 
 def test_one_panel_for_equilibria_and_one_for_each_quantity_that_is_known(found):
@@ -60,9 +72,7 @@ def test_the_folds_of_a_map_are_drawn_and_said():
     for axes in found.plot().axes[:2]:
         (line,) = axes.lines
         assert 27 * line.get_xdata() ** 2 == pytest.approx(4 * line.get_ydata() ** 3, abs=1e-9)
-    section = sweep_section(
-        CUSP, asked, tables_of(found), folder=Path("results/s/tables"), images={}, vectors={}
-    )
+    section = section_of(options | {"second": second}, tables_of(found))
     assert "Folds lie on 1 curve of the plane, within h = -0.3849 to 0.3849 and a = " in section.text[1]
     assert "bifurcation_curves.csv" in section.notes[-1]
 
@@ -80,7 +90,7 @@ def test_the_section_says_where_wells_end_and_what_was_not_found(found):
     table = found.table.assign(note=found.table["note"])
     table.loc[table["value"] == -0.5, ["well", "note"]] = [-1, "it was too far"]
     tables = tables_of(found) | {"sweep": table}
-    section = sweep_section(CUSP, options, tables, folder=Path("results/s/tables"), images={}, vectors={})
+    section = section_of({"parameter": "h", "values": VALUES}, tables)
     assert section.heading == "Against h"
     assert "h has 3 values from -0.5 to 0.2: 3 landscapes" in section.text[0]
     assert "fold at h = -0.3849" in section.text[1]

@@ -44,7 +44,7 @@ def test_only_what_depends_on_a_change_runs_again(finished, tmp_path):
     study, card = project.path("study.yaml"), project.path("config/systems/archetype3d.yaml")
     regression = project.path("siq/networks/regression.py")
     dynamics = project.path("siq/systems/simulation.py")
-    page = project.path("siq/report/study_results.py")
+    page = project.path("siq/report/study_page.py")
 
     def what_no_model_depends_on():
         append(page)

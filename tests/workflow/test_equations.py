@@ -24,7 +24,7 @@ from siq.errors import InputError
 from siq.quasipotential.landscape import Landscape, LandscapeOptions, NoLandscape
 from siq.quasipotential.landscape_files import landscape_data
 from siq.quasipotential.paths import minimum_action_path
-from siq.report.landscape_summary import drawn
+from siq.report.summary import summarise
 from siq.systems.cards import load_system
 from siq.systems.cycles import hessians_along
 from siq.systems.dynamics import Dynamics
@@ -227,7 +227,7 @@ def test_a_limit_cycle_is_an_attractor_without_a_formula() -> None:
     assert rows.loc["cycle", "item"] == "A1" and rows.loc["cycle", "note"].startswith("period 3.1415927")
     (stored,) = landscape_data(landscape, dynamics=landscape.dynamics)["wells"]
     assert stored["cycle"]["period"] == cycle.period and len(stored["cycle"]["points"]) == len(cycle.points)
-    (line,) = drawn(landscape).cycles
+    (line,) = summarise(landscape).cycles
     np.testing.assert_allclose(np.linalg.norm(line, axis=1), 1, rtol=1e-6)
 
 

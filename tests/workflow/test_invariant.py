@@ -12,7 +12,6 @@ from two_lines import analysed
 from siq.inference.identification import IdentificationOptions, write_field
 from siq.quasipotential.landscape import LandscapeOptions
 from siq.quasipotential.landscape_files import write_landscape
-from siq.report.landscape_tables import invariant_tables
 from siq.systems.cards import load_system
 from siq.systems.dynamics import Dynamics
 from siq.workflow import comparison_steps, invariant_step
@@ -78,8 +77,6 @@ def test_the_density_of_two_like_wells_is_that_of_a_simulation(
     assert row["simulated_distance"] < 2 * row["sampling_floor"]
     np.testing.assert_allclose(got.shares["share"], 0.5, atol=1e-3)
     np.testing.assert_allclose(got.shares["by_rates"], 0.5, atol=1e-6)
-    headings = [one.caption for one in invariant_tables(got.table, got.shares, tmp_path)]
-    assert len(headings) == 2 and "shares" in headings[1]
 
 
 def test_the_density_of_a_formula_is_normalised_and_that_of_a_simulation(

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
-from siq.report.settings import FiguresSettings, PageSettings
+from siq.report.figures import FiguresSettings
+from siq.report.study_page import PageSettings
 from siq.systems.dynamics import Dynamics
 from siq.workflow.identification_step import IdentifySettings
 from siq.workflow.landscape_step import LandscapeSettings

@@ -13,9 +13,8 @@ from known_systems import as_system, limit_cycle
 
 from siq.quasipotential.landscape import LandscapeOptions
 from siq.quasipotential.landscape_comparison import read_reference, write_reference
-from siq.report.landscape_tables import landscape_sentences
-from siq.report.settings import LandscapeFiguresSettings
-from siq.report.study_figures import LandscapeComparisons, landscape_figures
+from siq.report.figures import LandscapeFiguresSettings, landscape_figures
+from siq.report.study_page import without_landscape
 from siq.systems.dynamics import Dynamics
 from siq.workflow import comparison_steps
 from siq.workflow.comparison_steps import LandscapeErrorsSettings
@@ -53,10 +52,10 @@ def test_without_wells_there_is_a_reason_and_no_rows(card: Dynamics, reason: str
     settings = LandscapeErrorsSettings(seed=1, space=StateSpace(), landscape=LandscapeOptions())
     table = comparison_steps.run_landscape_errors(settings, found, [], None)
     assert list(table.columns) == list(COLUMNS["landscape_errors"]) and table.empty
-    beside = LandscapeComparisons(found, as_table("escape", []), as_table("degrees", []), {}, None)
     drawn = landscape_figures(
-        LandscapeFiguresSettings(space=StateSpace(), landscape=LandscapeOptions()), None, beside
-    )
+        LandscapeFiguresSettings(space=StateSpace(), landscape=LandscapeOptions()),
+        degrees=as_table("degrees", []), escape=as_table("escape", []), reference=found,
+    )  # fmt: skip
     assert "landscape_errors" not in drawn
 
 
@@ -77,6 +76,7 @@ def test_the_answer_says_that_there_is_no_landscape_and_why() -> None:
         }
     )
     wells = as_table("landscape", [{"run": 1, "kind": "attractor"}])
-    assert landscape_sentences(wells, outcomes) == ["There is no landscape of 1 of 2 runs: a cycle."]
-    assert landscape_sentences(wells.iloc[:0], outcomes.iloc[:1]) == ["There is no landscape: a cycle."]
-    assert landscape_sentences(wells, outcomes.iloc[1:]) == []
+    assert without_landscape({"landscape": wells, "outcomes": outcomes}) == ("a cycle", 1, 2)
+    one = {"landscape": wells.iloc[:0], "outcomes": outcomes.iloc[:1]}
+    assert without_landscape(one) == ("a cycle", 1, 1)
+    assert without_landscape({"landscape": wells, "outcomes": outcomes.iloc[1:]}) is None

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 import sympy
 
-from siq.report.study_figures import CAPTIONS
+from siq.report.formatting import texts
 from siq.systems.dynamics import Dynamics
 from siq.workflow.published import PublishedFigure, load_published
 from siq.workflow.reproduction import (
@@ -62,7 +62,7 @@ def test_every_pattern_means_something() -> None:
 
 
 def test_every_figure_is_one_that_studies_have() -> None:
-    assert {figure for one in CONTENTS.places for figure in one.figures} <= set(CAPTIONS)
+    assert {figure for one in CONTENTS.places for figure in one.figures} <= set(texts("captions")["figures"])
     common = (RULES / "common.smk").read_text(encoding="utf-8")
     (reproduced,) = re.findall(r"REPRODUCED = \[(.*)\]", common)
     assert {one.study for one in CONTENTS.places} - {None} == set(re.findall(r'"([\w-]+)"', reproduced))

@@ -15,9 +15,10 @@ from siq.inference.identification import read_field
 from siq.networks.regression import points_below
 from siq.numerics.randomness import Purpose, generator
 from siq.numerics.text import number_text
-from siq.report.formatting import render_template
-from siq.report.landscape_tables import errors_table, invariant_tables, readable
-from siq.report.page import ReportFigure, ReportTable
+from siq.report.formatting import texts
+from siq.report.landscape import in_words
+from siq.report.page import ReportFigure, ReportTable, render_template
+from siq.report.study_page import errors_over_runs
 from siq.systems.dynamics import Dynamics
 from siq.workflow.collection_steps import ModelFiles, shown_formula
 from siq.workflow.outcomes import Method
@@ -203,22 +204,25 @@ class _Page:
         if name == "timings":
             return [_timing_table(self.studies)]
         assert study is not None  # the schema's other tables are of a study; see the test of the contents
-        folder = study.folder / "tables"
+        folder, words = study.folder / "tables", texts("help")
         if name == "own_equations":
             return [one for one in [_equations_table(study)] if one is not None]
         if name in ("invariant", "well_shares"):
-            found = invariant_tables(study.table("invariant"), study.table("well_shares"), folder)
-            return found[:1] if name == "invariant" else found[1:]
+            shown_here = in_words(study.table(name).rename(columns=words["headings"]))
+            kind = "invariant" if name == "invariant" else "shares"
+            table = ReportTable(words[f"{kind}_caption"], shown_here, words[kind], f"{folder}/{name}.csv")
+            return [table] if len(shown_here) else []
         if name == "landscape_errors":
-            return [errors_table(study.table("landscape_errors"), folder)]
+            errors = errors_over_runs(study.table(name))
+            return [ReportTable(words["errors_caption"], errors, words["errors"], f"{folder}/{name}.csv", 40)]
         if name == "escape":
             caption = "Mean escape times: the law from what was identified, and direct simulations."
-            return [ReportTable(caption, readable(study.table("escape")), {}, f"{folder}/escape.csv")]
+            return [ReportTable(caption, in_words(study.table("escape")), {}, f"{folder}/escape.csv")]
         landscape = study.table("landscape")
         wanted = (landscape["kind"] == "transition") == (name == "transitions")
         first = landscape[wanted & (landscape["run"] == landscape["run"].min())]
         caption = f"{name.capitalize()} of run {landscape['run'].min()}."
-        shown_here = readable(first.drop(columns=["run", "kind"] if name == "transitions" else "run"))
+        shown_here = in_words(first.drop(columns=["run", "kind"] if name == "transitions" else "run"))
         return [ReportTable(caption, shown_here, {}, f"{folder}/landscape.csv")]
 
     def section(self, place: Place, table: pd.DataFrame) -> ReproductionSection:

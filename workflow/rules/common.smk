@@ -8,13 +8,9 @@ from filelock import FileLock, Timeout
 from siq.cli.answers import Exit, answer_of_page
 from siq.numerics.files import files_of
 from siq.errors import InputError
-from siq.report.settings import (
-    FiguresSettings,
-    LandscapeFiguresSettings,
-    PageSettings,
-)
-from siq.report.study_figures import CAPTIONS as STUDY_CAPTIONS
-from siq.report.study_figures import Part, figure_place
+from siq.report.figures import FiguresSettings, LandscapeFiguresSettings
+from siq.report.formatting import texts
+from siq.report.study_page import PageSettings
 from siq.workflow.comparison_steps import BesideEquationsSettings
 from siq.workflow.recordings_step import DrawSettings
 from siq.workflow.equations_step import EquationSettings
@@ -55,7 +51,8 @@ except InputError as error:
 
 
 REPRODUCED = ["archetype3d", "archetype3d-noise", "archetype4d", "resonator"]
-CAPTIONS = {name: caption.text for name, caption in STUDY_CAPTIONS.items()}
+CAPTIONS = {name: caption["text"] for name, caption in texts("captions")["figures"].items()}
+PLACES = {name: caption["part"] for name, caption in texts("captions")["figures"].items()}
 
 
 wildcard_constraints:
@@ -340,19 +337,20 @@ ANSWER, EVIDENCE, LANDSCAPE, RUNS, PUBLISHED, WORKINGS = (
     "6 The workings",
 )
 PARTS = {
-    Part.LEAD: ANSWER,
-    Part.EVIDENCE: EVIDENCE,
-    Part.RECORD: EVIDENCE,
-    Part.LANDSCAPE: LANDSCAPE,
-    Part.RUNS: RUNS,
-    Part.PUBLISHED: PUBLISHED,
-    Part.WORKINGS: WORKINGS,
+    "lead": ANSWER,
+    "evidence": EVIDENCE,
+    "record": EVIDENCE,
+    "landscape": LANDSCAPE,
+    "sweep": LANDSCAPE,
+    "runs": RUNS,
+    "published": PUBLISHED,
+    "workings": WORKINGS,
 }
 
 
 def figure_part(wildcards):
     """The part of Snakemake's report in which a figure stands, as on the page."""
-    return PARTS[figure_place(wildcards.name)]
+    return PARTS[PLACES.get(wildcards.name, "workings")]
 
 
 def figure_labels(wildcards):

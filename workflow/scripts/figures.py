@@ -4,16 +4,22 @@ from workflow.warm import run_warm
 
 run_warm()
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 from siq.inference.identification import read_field
 from siq.quasipotential.landscape_files import read_landscape
+from siq.report.figures import (
+    DRAWN_TABLES,
+    FiguresSettings,
+    inspection_drawn,
+    leading_figures,
+    representative_run,
+    study_figures,
+)
 from siq.report.page import interactive_view
 from siq.report.plots import save_figure
-from siq.report.settings import FiguresSettings
-from siq.report.study_figures import PicturedRun, StudyTables, leading_figures, study_figures, what_is_shown
-from siq.report.study_page import inspection_drawn
+from siq.report.summary import summarise
 from siq.systems.cards import load_system
 from siq.workflow.collection_steps import ModelFiles, shown_formula
 from siq.workflow.comparison_steps import first_stored
@@ -29,13 +35,13 @@ if __name__ == "__main__":
     with job() as now:
         source, settings = now.input, now.settings(FiguresSettings)
         card, published = now.given("card"), now.given("published")
-        tables = StudyTables(*(read_table(source[field.name]) for field in fields(StudyTables)))
+        tables = {name: read_table(source[name]) for name in DRAWN_TABLES}
         models = ModelFiles(tuple(source.models))
-        chosen = shown_formula(tables.rrmse, models)
+        chosen = shown_formula(tables["rrmse"], models)
         complete = None
         if chosen.run is None or chosen.method == Method.REGRESSION:
             complete = first_stored(source.fields, source.landscapes)
-        shown = what_is_shown(chosen, models, complete)
+        shown = representative_run(chosen, models, complete)
         run = shown.number
         trained = (source.networks[run], source.blocks[run]) if source.networks else (None, None)
         shown = replace(
@@ -58,9 +64,9 @@ if __name__ == "__main__":
             dynamics, own = record.found.dynamics, models.formulas(first).get(Method.REFINED)
             stored = read_landscape(source.overview, dynamics=dynamics)
             states = read_states(source.recordings[first], source.every_field[first]) or recorded
-            picture = PicturedRun(overview, stored, own, dynamics, states)
-            figures |= leading_figures(picture)
-            view = interactive_view(picture.drawn()) if dynamics.dimension > 2 else None
+            summary = summarise(stored, states, dynamics=dynamics, formula=own)
+            figures |= leading_figures(summary, dynamics, states)
+            view = interactive_view(summary) if dynamics.dimension > 2 else None
         drawn = Path(now.params.folder)
         drawn.mkdir(parents=True, exist_ok=True)
         if settings.simulation is None and recorded is not None:

@@ -10,12 +10,10 @@ import pandas as pd
 
 from siq.quasipotential.formulas import read_model
 from siq.quasipotential.landscape_comparison import read_reference
+from siq.report.figures import LandscapeFiguresSettings, landscape_figures
 from siq.report.plots.style import save_figure
-from siq.report.settings import LandscapeFiguresSettings
-from siq.report.study_figures import LandscapeComparisons, LandscapeRun, landscape_figures
 from siq.workflow.comparison_steps import first_stored
 from siq.workflow.published import load_published, mesh_potential
-from siq.workflow.recordings_step import read_states
 from siq.workflow.tables import read_table
 from siq.workflow.training_step import read_trained
 from step import job
@@ -23,15 +21,11 @@ from step import job
 if __name__ == "__main__":
     with job() as now:
         source, settings = now.input, now.settings(LandscapeFiguresSettings)
-        found, shown = first_stored(source.fields, source.landscapes), None
+        found, networks, formulas = first_stored(source.fields, source.landscapes), None, None
         if found is not None:
-            run, stored = found
+            run = found[0]
             trained = (source.networks[run], source.training[run]) if source.networks else (None, None)
-            states = read_states(source.recordings[run], source.fields[run])
-            assert states is not None  # a landscape was found
-            shown = LandscapeRun(
-                stored,
-                states,
+            formulas, networks = (
                 read_model(source.models[run])[0],
                 read_trained(*trained, number=run).networks,
             )
@@ -41,15 +35,19 @@ if __name__ == "__main__":
             if (path := now.given("mesh")) is not None and figures.mesh is not None:
                 mesh = mesh_potential(path, figures.mesh)
         reference, escape = now.given("reference"), now.given("escape")
-        beside = LandscapeComparisons(
-            None if reference is None else read_reference(reference),
-            pd.DataFrame() if escape is None else read_table(escape),
-            read_table(source.degrees),
-            {} if figures is None else figures.figures,
-            mesh,
+        made = landscape_figures(
+            settings,
+            degrees=read_table(source.degrees),
+            escape=pd.DataFrame() if escape is None else read_table(escape),
+            landscape=None if found is None else found[1],
+            reference=None if reference is None else read_reference(reference),
+            networks=networks,
+            formulas=formulas,
+            published=None if figures is None else figures.figures,
+            mesh=mesh,
         )
         drawn = Path(now.params.folder)
         drawn.mkdir(parents=True, exist_ok=True)
-        for name, figure in landscape_figures(settings, shown, beside).items():
+        for name, figure in made.items():
             if figure is not None:
                 save_figure(figure, drawn / name)

@@ -13,8 +13,7 @@ import pandas as pd
 from siq.diagnosis.dictionary import dictionary_of
 from siq.diagnosis.study import MismatchStudy, load_mismatch_study
 from siq.numerics.files import whole_file
-from siq.report.answers import mismatch_answer
-from siq.report.diagnosis_page import mismatch_page
+from siq.report.diagnosis_page import mismatch_answer, mismatch_page
 from siq.report.diagnosis_sections import Findings
 from siq.systems.cards import load_system
 from siq.workflow.tables import read_table

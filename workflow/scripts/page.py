@@ -13,14 +13,11 @@ from markupsafe import Markup
 import siq
 from siq.inference.identification import read_field
 from siq.numerics.files import whole_file
-from siq.report.answers import answer_of, write_answer
-from siq.report.landscape_answer import with_visits
+from siq.report.figures import read_inspection, read_seen
 from siq.report.page import render_report
-from siq.report.settings import PageSettings
-from siq.report.study_page import read_inspection, read_seen, study_page
-from siq.report.study_results import StudyResults
+from siq.report.study_page import PageSettings, StudyResults, answer_data, study_page, write_answer
+from siq.report.summary import summarise
 from siq.workflow.collection_steps import ModelFiles, shown_formula
-from siq.workflow.outcomes import Method
 from siq.workflow.scoring import exact_answer
 from siq.workflow.tables import COLUMNS, read_table
 from step import job, read_json
@@ -42,19 +39,20 @@ if __name__ == "__main__":
         models = ModelFiles(tuple(source.models))
         shown, card = shown_formula(tables["rrmse"], models), now.given("card")
         shown = shown if shown.run is not None else models.first_wells()
-        overview = with_visits(read_json(source.overview), tables["record"])
+        overview = read_json(source.overview)
+        landscape = None if overview is None else summarise(overview, record=tables["record"])
         run = shown.run if shown.run is not None else (overview or {}).get("run", 0)
         view = Path(source.drawn) / "interactive.html"
         folders = [source.drawn, *source.drawn_landscape, source.drawn_density]
         results = StudyResults(
             tables,
             Path(source.summary).parent,
-            models,
-            shown,
-            None if card is None else exact_answer(card),
             images=files(folders, ".png"),
             vectors=files(folders, ".svg"),
-            overview=overview,
+            landscape=landscape,
+            models=models,
+            shown=shown,
+            exact=None if card is None else exact_answer(card),
             record=read_field(source.fields[run]),
             inspection=read_inspection(source.drawn),
             seen=read_seen(source.drawn),
@@ -63,14 +61,6 @@ if __name__ == "__main__":
         programs = PACKAGES if study.training is None else (*PACKAGES, *OF_NETWORKS)
         versions = {"siq": siq.__version__} | {name: version(name) for name in programs}
         page = study_page(study, results, command=now.params.command, versions=versions)
-        answer = answer_of(
-            page.title,
-            page.answer[0],
-            rrmse=tables["rrmse"],
-            outcomes=tables["outcomes"],
-            formulas=len(models.with_any_formula(Method.REFINED)),
-            runs=study.runs,
-        )
         gathered = Path(now.output.figures)
         gathered.mkdir(parents=True, exist_ok=True)
         for suffix in (".png", ".svg"):
@@ -78,4 +68,4 @@ if __name__ == "__main__":
                 (gathered / f"{name}{suffix}").write_bytes(content)
         with whole_file(now.output.html) as partial:
             partial.write_text(render_report(page), encoding="utf-8")
-        write_answer(now.output.answer, answer)
+        write_answer(now.output.answer, answer_data(page, study, results))

@@ -20,7 +20,6 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from siq.numerics.text import unit_text
-from siq.report.landscape_summary import well_name
 from siq.report.plots.style import (
     BLACK,
     BLUE,
@@ -37,6 +36,7 @@ from siq.report.plots.style import (
     name_label,
     unit_label,
 )
+from siq.report.summary import well_name
 
 CURVE_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, BLACK)
 MARKERS = ("o", "s", "^", "D", "v", "P")

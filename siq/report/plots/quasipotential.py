@@ -18,7 +18,7 @@ from matplotlib.ticker import MaxNLocator
 
 from siq.numerics.text import unit_text
 from siq.quasipotential.landscape import Landscape
-from siq.report.landscape_summary import BLOCK_OF_POINTS, DrawnLandscape, Potential, chosen_states, drawn
+from siq.quasipotential.landscape_comparison import Potential
 from siq.report.plots.errors import CURVE_COLOURS, LINE_STYLES, UNKNOWN, power_of_ten, scaled_label
 from siq.report.plots.style import (
     BLACK,
@@ -35,6 +35,7 @@ from siq.report.plots.style import (
     say,
     unit_label,
 )
+from siq.report.summary import BLOCK_OF_POINTS, LandscapeSummary, chosen_states, summarise
 
 if TYPE_CHECKING:  # to draw takes none of what it takes to compute
     from siq.quasipotential.invariant_density import ComparedDensity
@@ -205,7 +206,7 @@ class Plane:
 
 
 def plane_of(
-    landscape: DrawnLandscape, *, states: Sequence[str] | None = None, view: View = "projection"
+    landscape: LandscapeSummary, *, states: Sequence[str] | None = None, view: View = "projection"
 ) -> Plane:
     """U on the plane of two states.
 
@@ -246,7 +247,7 @@ def in_blocks(potential: Potential, x: np.ndarray) -> np.ndarray:
     return np.concatenate(parts) if parts else np.zeros(0)
 
 
-def _lowest_behind(landscape: DrawnLandscape, grid: np.ndarray, rest: list[int]) -> np.ndarray:
+def _lowest_behind(landscape: LandscapeSummary, grid: np.ndarray, rest: list[int]) -> np.ndarray:
     """The lowest U over the other states at each point of a plane.
 
     The best of some states seen anywhere is followed down, one direction after another, by parabolas.
@@ -300,7 +301,7 @@ def _take(
     best[known[better]], lowest[known[better]] = moved[better], values[better]
 
 
-def _points(landscape: DrawnLandscape) -> np.ndarray:
+def _points(landscape: LandscapeSummary) -> np.ndarray:
     points = landscape.points
     fitted = [well.points for well in landscape.formulas if well is not None]
     together = np.concatenate([np.zeros((0, len(landscape.names))), *fitted])
@@ -352,7 +353,7 @@ RECORDED: dict[str, Any] = {
 
 
 def plot_quasipotential(
-    landscape: Landscape | DrawnLandscape,
+    landscape: Landscape | LandscapeSummary,
     *,
     recordings: Recordings | None = None,
     states: Sequence[str] | None = None,
@@ -410,7 +411,7 @@ def plot_quasipotential(
 
 @drawn_in_style
 def quasipotential_figure(
-    landscape: DrawnLandscape, *, states: Sequence[str] | None = None, view: View = "projection"
+    landscape: LandscapeSummary, *, states: Sequence[str] | None = None, view: View = "projection"
 ) -> Figure | None:
     """The first picture of a page, None where U is known nowhere.
 
@@ -433,18 +434,20 @@ def quasipotential_figure(
     return figure
 
 
-def as_drawn(landscape: Landscape | DrawnLandscape, recordings: Recordings | None = None) -> DrawnLandscape:
+def as_drawn(
+    landscape: Landscape | LandscapeSummary, recordings: Recordings | None = None
+) -> LandscapeSummary:
     """What is drawn of a landscape, with recorded states where recordings are given."""
-    if isinstance(landscape, DrawnLandscape):
+    if isinstance(landscape, LandscapeSummary):
         return landscape
     if recordings is None:
-        return drawn(landscape)
+        return summarise(landscape)
     if recordings.names != landscape.dynamics.states:
         raise ValueError(
             f"the recordings have the states {', '.join(recordings.names)}, and the landscape has"
             f" {', '.join(landscape.dynamics.states)}"
         )
-    return drawn(landscape, points=recordings.values)
+    return summarise(landscape, recordings)
 
 
 def new_axes(**options: Any) -> Axes:
@@ -464,7 +467,7 @@ def add_legend(axes: Axes, handles: Sequence[Any]) -> None:
 
 
 def draw_quasipotential(
-    axes: Axes, landscape: DrawnLandscape, *, states: Sequence[str] | None = None, view: View = "projection"
+    axes: Axes, landscape: LandscapeSummary, *, states: Sequence[str] | None = None, view: View = "projection"
 ) -> list[Any]:
     """Draw U on axes; what is returned belongs into their legend."""
     if len(landscape.names) == 1:
@@ -480,7 +483,7 @@ def draw_quasipotential(
     return handles
 
 
-def _values_in(landscape: DrawnLandscape) -> np.ndarray:
+def _values_in(landscape: LandscapeSummary) -> np.ndarray:
     """U at places that are drawn, to see whether it is known at all."""
     places = [one.position[None] for one in landscape.wells]
     if landscape.points is not None:
@@ -488,7 +491,7 @@ def _values_in(landscape: DrawnLandscape) -> np.ndarray:
     return landscape.potential(np.concatenate(places)) if places else np.zeros(0)
 
 
-def highest_shown(landscape: DrawnLandscape, values: np.ndarray) -> float:
+def highest_shown(landscape: LandscapeSummary, values: np.ndarray) -> float:
     """U up to which colours differ, or the axis reaches: somewhat above the highest pass."""
     known = values[np.isfinite(values)]
     lowest = float(known.min()) if len(known) else 0.0
@@ -498,12 +501,12 @@ def highest_shown(landscape: DrawnLandscape, values: np.ndarray) -> float:
     return top + ROOM * (top - lowest)
 
 
-def energy_axis_label(axis: Any, landscape: DrawnLandscape, largest: float, what: str = "$U$") -> str:
+def energy_axis_label(axis: Any, landscape: LandscapeSummary, largest: float, what: str = "$U$") -> str:
     """The label of an axis of U: its unit, and a power of ten where numbers are unhandy."""
     return scaled_label(axis, what, landscape.energy_unit or "unit of ε", largest)
 
 
-def _draw_curve(axes: Axes, landscape: DrawnLandscape) -> list[Any]:
+def _draw_curve(axes: Axes, landscape: LandscapeSummary) -> list[Any]:
     x = landscape.along(0, CURVE_POINTS)
     values = landscape.potential(x[:, None])
     handles: list[Any] = []
@@ -556,7 +559,7 @@ def _draw_depth(axes: Axes, well: float, saddle: float, bottom: float, barrier: 
     )  # fmt: skip
 
 
-def _draw_map(axes: Axes, landscape: DrawnLandscape, plane: Plane) -> list[Any]:
+def _draw_map(axes: Axes, landscape: LandscapeSummary, plane: Plane) -> list[Any]:
     handles: list[Any] = []
     values = plane.values.T
     if np.isfinite(values).any():
@@ -585,7 +588,7 @@ def _draw_map(axes: Axes, landscape: DrawnLandscape, plane: Plane) -> list[Any]:
     return handles
 
 
-def draw_points(axes: Axes, landscape: DrawnLandscape, shown: tuple[int, int]) -> list[Any]:
+def draw_points(axes: Axes, landscape: LandscapeSummary, shown: tuple[int, int]) -> list[Any]:
     """Draw some of the recorded states, faintly."""
     points = landscape.points
     if points is None or not len(points):
@@ -596,7 +599,7 @@ def draw_points(axes: Axes, landscape: DrawnLandscape, shown: tuple[int, int]) -
     return [Line2D([], [], label="recorded states", **(RECORDED | {"markersize": 5, "alpha": 0.8}))]
 
 
-def draw_ways(axes: Axes, landscape: DrawnLandscape, shown: tuple[int, int]) -> list[Any]:
+def draw_ways(axes: Axes, landscape: LandscapeSummary, shown: tuple[int, int]) -> list[Any]:
     """Draw the paths: uphill those of least action, downhill those of f without noise."""
     handles = []
     for part, style, text in (
@@ -609,7 +612,7 @@ def draw_ways(axes: Axes, landscape: DrawnLandscape, shown: tuple[int, int]) -> 
     return handles
 
 
-def draw_equilibria(axes: Axes, landscape: DrawnLandscape, shown: tuple[int, int]) -> list[Any]:
+def draw_equilibria(axes: Axes, landscape: LandscapeSummary, shown: tuple[int, int]) -> list[Any]:
     """Draw wells with their letters, and passes."""
     low, high = landscape.box[list(shown)].T
     marks = [(one, SADDLE) for one in landscape.saddles] + [(one, WELL) for one in landscape.wells]
@@ -630,7 +633,7 @@ def draw_equilibria(axes: Axes, landscape: DrawnLandscape, shown: tuple[int, int
     return _names_of_marks(landscape)
 
 
-def _names_of_marks(landscape: DrawnLandscape) -> list[Any]:
+def _names_of_marks(landscape: LandscapeSummary) -> list[Any]:
     points = any(one.kind != "cycle" for one in landscape.wells)
     handles = [Line2D([], [], label="stable state", **WELL)] if points else []
     handles += [Line2D([], [], label="limit cycle", **CYCLE)] if landscape.cycles else []
@@ -638,7 +641,7 @@ def _names_of_marks(landscape: DrawnLandscape) -> list[Any]:
     return handles + ([Line2D([], [], label="saddle", **SADDLE)] if landscape.saddles else [])
 
 
-def name_axes(axes: Axes, landscape: DrawnLandscape, shown: Sequence[int]) -> None:
+def name_axes(axes: Axes, landscape: LandscapeSummary, shown: Sequence[int]) -> None:
     """Names and units of states at the axes, with a power of ten where numbers are unhandy."""
     for axis, place in zip((axes.xaxis, axes.yaxis), shown, strict=False):
         largest = float(np.abs(landscape.box[place]).max())

@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 
-from siq.report.landscape_summary import well_name
 from siq.report.plots.errors import CURVE_COLOURS, LINE_STYLES, MARKERS
 from siq.report.plots.style import (
     BLACK,
@@ -24,6 +23,7 @@ from siq.report.plots.style import (
     energy_label,
     unit_label,
 )
+from siq.report.summary import well_name
 
 BIFURCATIONS = {"fold": "o", "Hopf": "s", "branch point": "D"}
 PANEL = 2.2  # inches

@@ -14,7 +14,6 @@ from scipy.interpolate import PchipInterpolator
 from siq.numerics.text import unit_text
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.wells import Well
-from siq.report.landscape_summary import DrawnLandscape, DrawnWay, chosen_states
 from siq.report.plots.quasipotential import (
     CURVE_POINTS,
     MOST_POINTS,
@@ -41,6 +40,7 @@ from siq.report.plots.style import (
     magnitude_label,
     mean_and_spread,
 )
+from siq.report.summary import ExitSummary, LandscapeSummary, chosen_states
 
 if TYPE_CHECKING:
     from siq.data.recordings import Recordings
@@ -51,7 +51,7 @@ MARKERS = ("o", "s", "^", "D", "v", "P")
 
 
 def plot_wells(
-    landscape: Landscape | DrawnLandscape,
+    landscape: Landscape | LandscapeSummary,
     *,
     recordings: Recordings | None = None,
     states: Sequence[str] | None = None,
@@ -122,7 +122,9 @@ def plot_wells(
     return axes
 
 
-def plot_paths(landscape: Landscape | DrawnLandscape, *, legend: bool = True, ax: Axes | None = None) -> Axes:
+def plot_paths(
+    landscape: Landscape | LandscapeSummary, *, legend: bool = True, ax: Axes | None = None
+) -> Axes:
     """Draw U along the most probable way out of each well, over its pass, and down into the next.
 
     Parameters
@@ -197,7 +199,9 @@ def plot_paths(landscape: Landscape | DrawnLandscape, *, legend: bool = True, ax
     return axes
 
 
-def _profile(landscape: DrawnLandscape, way: DrawnWay, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _profile(
+    landscape: LandscapeSummary, way: ExitSummary, scale: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Distance along a way, zero at the pass, and U there: by the action uphill, by the formulas downhill."""
     up, down = way.uphill, way.downhill[1:]
     points = np.concatenate([up, down])
@@ -219,7 +223,7 @@ def _profile(landscape: DrawnLandscape, way: DrawnWay, scale: np.ndarray) -> tup
     return (-along[::-1], values[::-1]) if mirrored else (along, values)
 
 
-def _share_of_action(landscape: DrawnLandscape, path: np.ndarray) -> np.ndarray | None:
+def _share_of_action(landscape: LandscapeSummary, path: np.ndarray) -> np.ndarray | None:
     """Which share of the action is spent up to each point of a path; None where D has no inverse.
 
     It is ∫ (|f| |dφ| - f·dφ) in the metric of the noise, see `siq.quasipotential.paths`.
@@ -239,7 +243,7 @@ def _colour(place: int) -> str:
     return COLOURS[place % len(COLOURS)]
 
 
-def _draw_curves(axes: Axes, landscape: DrawnLandscape, known: Sequence[tuple[int, Well]]) -> None:
+def _draw_curves(axes: Axes, landscape: LandscapeSummary, known: Sequence[tuple[int, Well]]) -> None:
     x = landscape.along(0, CURVE_POINTS)
     heights = [one.height if landscape.matched else 0.0 for one in landscape.wells]
     every = [heights[place] + 2 * well.known_values(x[:, None]) for place, well in known]
@@ -265,7 +269,7 @@ def _draw_curves(axes: Axes, landscape: DrawnLandscape, known: Sequence[tuple[in
 
 
 def _draw_states(
-    axes: Axes, landscape: DrawnLandscape, known: Sequence[tuple[int, Well]], plane: tuple[int, int]
+    axes: Axes, landscape: LandscapeSummary, known: Sequence[tuple[int, Well]], plane: tuple[int, int]
 ) -> list[Any]:
     points = landscape.points
     points = np.zeros((0, len(landscape.names))) if points is None else points
@@ -295,7 +299,7 @@ def _draw_states(
 
 
 def _draw_rims(
-    axes: Axes, landscape: DrawnLandscape, known: Sequence[tuple[int, Well]], heights: Sequence[float]
+    axes: Axes, landscape: LandscapeSummary, known: Sequence[tuple[int, Well]], heights: Sequence[float]
 ) -> None:
     """Around each well the line of U at the height of its lowest pass."""
     x1, x2 = landscape.along(0, POINTS), landscape.along(1, POINTS)
@@ -334,7 +338,7 @@ class Join:
     height: float
 
 
-def plot_barriers(landscape: Landscape | DrawnLandscape, *, ax: Axes | None = None) -> Axes:
+def plot_barriers(landscape: Landscape | LandscapeSummary, *, ax: Axes | None = None) -> Axes:
     """Draw the wells as a tree: each hangs as deep as it is, and joins the next at the height of their pass.
 
     Parameters
@@ -420,7 +424,7 @@ def _with_error(value: float, error: float, *, broken: bool) -> str:
     return text.replace(r" \pm ", "$\n$\\pm$ $") if broken and "(" not in text else text
 
 
-def joined(landscape: DrawnLandscape, heights: list[float]) -> list[Join]:
+def joined(landscape: LandscapeSummary, heights: list[float]) -> list[Join]:
     """The passes by which wells join into one, from the lowest to the highest."""
     passes = sorted(
         (heights[way.start] + way.barrier, way.start, way.end)
@@ -466,6 +470,6 @@ def _draw_joins(axes: Axes, joins: list[Join], places: dict[int, float]) -> dict
     return tops
 
 
-def _lowest_way(landscape: DrawnLandscape, well: int) -> DrawnWay | None:
+def _lowest_way(landscape: LandscapeSummary, well: int) -> ExitSummary | None:
     ways = [way for way in landscape.ways if way.start == well and np.isfinite(way.barrier)]
     return min(ways, key=lambda way: way.barrier, default=None)

@@ -1,27 +1,35 @@
-"""The figures of a study and their captions."""
+"""The figures of a study: which there are, where they stand, and what they are drawn from.
+
+Their captions are in `templates/captions.yaml`.
+"""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from enum import StrEnum
-from typing import Any
+from dataclasses import dataclass as plain_dataclass
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import sympy
 from matplotlib.figure import Figure
+from pydantic.dataclasses import dataclass
 
+from siq.data.inspection import inspection_of
 from siq.data.recordings import Recordings, snapshot_pairs
+from siq.data.selection import joined
+from siq.data.two_states import RecordStates
 from siq.inference.residuals import predict
 from siq.networks.decomposition import TrainedNetworks
-from siq.networks.regression import highest_used, points_below
+from siq.networks.regression import RegressionOptions, highest_used, points_below
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.formulas import SymbolicDecomposition
-from siq.quasipotential.landscape import GlobalQuasipotential
+from siq.quasipotential.landscape import GlobalQuasipotential, LandscapeOptions
 from siq.quasipotential.landscape_comparison import Potential, ReferenceLandscape, overall_level
 from siq.quasipotential.landscape_files import StoredLandscape
-from siq.report.landscape_summary import DrawnLandscape, SaidLandscape, drawn_data
+from siq.report.formatting import texts
 from siq.report.page import ReportFigure
 from siq.report.plots import (
     ComponentFields,
@@ -37,13 +45,17 @@ from siq.report.plots import (
 from siq.report.plots.errors import plot_degrees, plot_error_maps, plot_escape
 from siq.report.plots.prediction import plot_record, residuals_figure
 from siq.report.plots.quasipotential import plot_error_curves, quasipotential_figure
-from siq.report.settings import FiguresSettings, LandscapeFiguresSettings
+from siq.report.plots.recordings import inspection_figures
+from siq.report.plots.sweep import plot_sweep
+from siq.report.summary import LandscapeSummary, energy_unit
 from siq.systems.dynamics import Dynamics
 from siq.systems.formulas import compile_formulas
-from siq.systems.simulation import simulate_snapshots
+from siq.systems.simulation import SimulationOptions, simulate_snapshots
 from siq.workflow.collection_steps import ModelFiles, Shown
 from siq.workflow.outcomes import METHODS, Method
 from siq.workflow.published import PublishedFigure, published_formula
+from siq.workflow.settings import STRICT, Sampling, StateSpace
+from siq.workflow.study import Study, SweepOptions
 
 
 def project(
@@ -139,147 +151,24 @@ def project_landscape(
     )
 
 
-class Part(StrEnum):
-    """Where a figure stands."""
+@dataclass(frozen=True, config=STRICT)
+class FiguresSettings:
+    """What the figures of a study depend on; `simulation` is None of recordings."""
 
-    LEAD = "lead"
-    EVIDENCE = "evidence"
-    RECORD = "record"
-    LANDSCAPE = "landscape"
-    RUNS = "runs"
-    PUBLISHED = "published"
-    WORKINGS = "workings"
-
-
-@dataclass(frozen=True)
-class Caption:
-    """Of one figure.
-
-    Attributes
-    ----------
-    part
-        Where it stands.
-    text
-        What it shows, panel by panel.
-    paper
-        The figure of the paper that it answers to; said only where a study is set beside the paper.
-    """
-
-    part: Part
-    text: str
-    paper: str = ""
+    seed: int
+    space: StateSpace
+    sampling: Sampling
+    simulation: SimulationOptions | None
+    regression: RegressionOptions
 
 
-CAPTIONS: Mapping[str, Caption] = {
-    "quasipotential": Caption(
-        Part.LEAD,
-        "The quasipotential U where it is known, with the stable states (letters), the saddles between them"
-        " (crosses), the most likely ways from one to the other, and recorded states (dots).",
-    ),
-    "landscape": Caption(
-        Part.LANDSCAPE,
-        "U over all wells where its formulas hold, with stable states, saddles, and the ways of least"
-        " action: solid"
-        " on the way up, dashed on the way down.",
-    ),
-    "residuals": Caption(
-        Part.EVIDENCE,
-        "What f leaves of the recorded increments, a panel for each state. Without a trend, nothing in f is"
-        " missing.",
-    ),
-    "prediction": Caption(
-        Part.EVIDENCE,
-        "Prediction of recordings that were held out: trajectories, recorded and computed from the same first"
-        " states by f; and the relative errors at their ends, with the median.",
-        "Fig. 4a",
-    ),
-    "record": Caption(
-        Part.RECORD,
-        "The record beside what f, D and ε say of it: (a) mean visits to each well, counted on all recordings"
-        " and predicted; below, how a state is spread during the visits to a well, on held-out recordings.",
-    ),
-    "escape": Caption(
-        Part.EVIDENCE,
-        "Mean escape times against the strength of the noise: lines by the law of Eyring and Kramers,"
-        " points by"
-        " direct simulation of the card, with standard errors.",
-    ),
-    "landscape_errors": Caption(
-        Part.EVIDENCE,
-        "U by every source, and below each its difference from U along characteristics of the exact vector"
-        " field.",
-        "fig2b, c to e, and Appendix E",
-    ),
-    "invariant": Caption(
-        Part.LANDSCAPE,
-        "The density of states exp(−U/ε) that follows from U, a panel for each ε; below each, a long"
-        " simulation"
-        " with lines of the same density.",
-        "fig1b and fig2c, b to d",
-    ),
-    "degrees": Caption(
-        Part.WORKINGS,
-        "How well formulas of rising degree solve the equation of U about each stable state, on points"
-        " that took no"
-        " part in the fit, against their number of terms. The ring marks the degree that was chosen.",
-    ),
-    "sweep": Caption(
-        Part.LANDSCAPE,
-        "Equilibria against the parameter, stable ones as lines of the colour of their well, and where they"
-        " begin and end; below, the lowest barrier of each stable state, and, for the noise that the study"
-        " gives, how long each lasts and its share of time in the long run. Against two parameters, maps of"
-        " the number of stable states and of the lowest barrier.",
-    ),
-    "error_distribution": Caption(
-        Part.RUNS, "Relative error of the coefficients of U, one dot for each run and method.", "Fig. 3"
-    ),
-    "coefficients_refined": Caption(
-        Part.RUNS,
-        "Coefficients of U over the runs, a panel for each term that belongs there; the last panel shows"
-        " the terms"
-        " that do not.",
-        "Fig. 2",
-    ),
-    "inclusion_refined": Caption(Part.RUNS, "How often each term was found, by component."),
-    "coefficients_regression": Caption(
-        Part.PUBLISHED,
-        "Coefficients of U over the runs by the published regression, from the networks as they are; a"
-        " panel for"
-        " each term that belongs there, and one for those that do not.",
-    ),
-    "inclusion_regression": Caption(
-        Part.PUBLISHED, "How often the published regression found each term, by component."
-    ),
-    "landscape_published": Caption(
-        Part.PUBLISHED,
-        "What was published of U, as a formula and, where it is at hand, on a mesh; below each, its"
-        " difference from U"
-        " along characteristics of the exact vector field.",
-    ),
-    "training": Caption(
-        Part.PUBLISHED,
-        "The networks' training, one line for each run: loss on training pairs and on held-out pairs, its"
-        " two parts,"
-        " and the learning rate.",
-    ),
-    "dataset": Caption(
-        Part.WORKINGS,
-        "The recordings: some trajectories; all recorded states; and, where networks were regressed, the"
-        " states below"
-        " the level of the regression.",
-        "fig2a; fig1_noisy a",
-    ),
-    "components": Caption(
-        Part.WORKINGS,
-        "The decomposition of f on the plane of the first two states: trajectories, the downhill part"
-        " −D∇V, the"
-        " circulatory part g, and U; where it is known, the exact U beside it.",
-        "Fig. 1",
-    ),
-}
+@dataclass(frozen=True, config=STRICT)
+class LandscapeFiguresSettings:
+    """What the figures of a landscape depend on."""
 
-OF_INSPECTION = ("record", "visited", "memory")
-"""Figures of the first section, see `siq.report.study_page`."""
+    space: StateSpace
+    landscape: LandscapeOptions
+
 
 OF_NETWORKS = ("coefficients_regression", "inclusion_regression", "training")
 """Figures that say nothing where no networks were asked for."""
@@ -288,23 +177,8 @@ OF_RUNS = ("coefficients_refined", "inclusion_refined", "coefficients_regression
            "error_distribution")  # fmt: skip
 """Figures of a scatter over runs, of which there is none in one."""
 
-OF_ONE_STATE = (
-    "The quasipotential U where it is known, with a band of two standard errors; the stable states (letters),"
-    " the saddles between them (crosses), the depth of each (arrows), and recorded states (ticks)."
-)
-"""What the first picture shows where there is one state: a curve, and no ways beside it."""
-
-OF_EQUATIONS = (
-    "The quasipotential U where it is known, with the stable states (letters), the saddles between them"
-    " (crosses), and the most likely ways from one to the other."
-)
-"""What it shows of given equations: nothing was recorded."""
-
-OF_ONE_EQUATION = (
-    "The quasipotential U where it is known; the stable states (letters), the saddles between them (crosses)"
-    " and the depth of each (arrows)."
-)
-"""The same of one state."""
+INSPECTION, SEEN = "inspection.json", "seen.json"
+"""Files beside the figures of an inspection: its lines, and the two states that it shows."""
 
 LEADING = ("quasipotential", "landscape")
 """Figures that a page can open with, the best first."""
@@ -324,7 +198,7 @@ def shown_figures(names: set[str], *, runs: int, networks: bool, published: bool
     published
         Whether the study names published figures.
     """
-    names = names - set(OF_INSPECTION)
+    names = names - set(texts("captions")["inspection"])
     if not published:
         names = names - {"landscape_published"}
     if not networks:
@@ -334,167 +208,116 @@ def shown_figures(names: set[str], *, runs: int, networks: bool, published: bool
     return names - {"landscape"} if "quasipotential" in names else names
 
 
-def figure_place(name: str) -> Part:
-    """In which part of the page a figure stands; one that nobody described, with the workings."""
-    return CAPTIONS[name].part if name in CAPTIONS else Part.WORKINGS
-
-
 def figures_of(
-    part: Part, images: Mapping[str, bytes], vectors: Mapping[str, bytes], *, beside_paper: bool
+    part: str, images: Mapping[str, bytes], vectors: Mapping[str, bytes], *, beside_paper: bool = False
 ) -> list[ReportFigure]:
-    """The figures of a part of the page, in the order of `CAPTIONS`; one that nobody described comes last.
+    """The figures of a part of the page, in the order of their captions.
 
     Parameters
     ----------
     part
-        Of the page; figures without a caption stand with the workings.
+        Of the page; figures without a caption stand last, with the workings.
     images, vectors
         PNG and SVG by name.
     beside_paper
         Whether to name the figures of the paper.
     """
-    names = [name for name, caption in CAPTIONS.items() if caption.part == part and name in images]
-    if part == Part.WORKINGS:
-        names += sorted(set(images) - set(CAPTIONS))
+    captions = texts("captions")["figures"]
+    names = [name for name, caption in captions.items() if caption["part"] == part and name in images]
+    if part == "workings":
+        names += sorted(set(images) - set(captions) - set(texts("captions")["inspection"]))
     return [figure_of(name, images, vectors, beside_paper=beside_paper) for name in names]
 
 
 def figure_of(
-    name: str, images: Mapping[str, bytes], vectors: Mapping[str, bytes], *, beside_paper: bool
+    name: str, images: Mapping[str, bytes], vectors: Mapping[str, bytes], *, beside_paper: bool = False
 ) -> ReportFigure:
     """One figure with its caption."""
-    caption = CAPTIONS.get(name, Caption(Part.WORKINGS, f"{name.replace('_', ' ').capitalize()}."))
-    text = caption.text
-    if beside_paper and caption.paper:
-        text += f" In the paper: {caption.paper}."
-    return ReportFigure(text, caption.text, images[name], "png", vectors.get(name))
-
-
-@dataclass(frozen=True)
-class LandscapeRun:
-    """The run whose landscape is shown: U over all wells, its trajectories, formulas by method, networks."""
-
-    landscape: StoredLandscape
-    recordings: Recordings
-    formulas: Mapping[str, SymbolicDecomposition]
-    networks: TrainedNetworks | None
-
-
-@dataclass(frozen=True)
-class LandscapeComparisons:
-    """What a landscape is held against, as far as it is known.
-
-    Attributes
-    ----------
-    reference
-        Of the card.
-    escape, degrees
-        The tables; `escape` is empty where nothing was simulated.
-    published
-        Published figures by quantity.
-    mesh
-        U on a mesh that was published.
-    """
-
-    reference: ReferenceLandscape | None
-    escape: pd.DataFrame
-    degrees: pd.DataFrame
-    published: Mapping[str, PublishedFigure]
-    mesh: Potential | None
+    caption = texts("captions")["figures"].get(name, {"text": f"{name.replace('_', ' ').capitalize()}."})
+    text = caption["text"]
+    if beside_paper and "paper" in caption:
+        text += f" In the paper: {caption['paper']}."
+    return ReportFigure(text, caption["text"], images[name], "png", vectors.get(name))
 
 
 def landscape_figures(
-    settings: LandscapeFiguresSettings, shown: LandscapeRun | None, beside: LandscapeComparisons
+    settings: LandscapeFiguresSettings,
+    *,
+    degrees: pd.DataFrame,
+    escape: pd.DataFrame,
+    landscape: StoredLandscape | None = None,
+    reference: ReferenceLandscape | None = None,
+    networks: TrainedNetworks | None = None,
+    formulas: Mapping[str, SymbolicDecomposition] | None = None,
+    published: Mapping[str, PublishedFigure] | None = None,
+    mesh: Potential | None = None,
 ) -> dict[str, Figure | None]:
     """All figures of a landscape by name, None for one that has nothing to show.
 
-    Nothing is `shown` where no run knows U over all wells.
+    Parameters
+    ----------
+    settings
+        Units, and below which U errors are drawn.
+    degrees, escape
+        The tables; `escape` is empty where nothing was simulated.
+    landscape
+        Of the run that is shown; None where no run knows U over all wells.
+    reference
+        Of the card, with which U is compared on a plane or along a line.
+    networks, formulas
+        Other sources of U: networks, and formulas by method.
+    published, mesh
+        Published figures by quantity, and a U that was published on a mesh.
     """
     time_unit = settings.space.unit("t", unknown="1")
     figures: dict[str, Figure | None] = {
-        "degrees": plot_degrees(beside.degrees),
-        "escape": plot_escape(beside.escape, time_unit=time_unit),
+        "degrees": plot_degrees(degrees),
+        "escape": plot_escape(escape, time_unit=time_unit),
     }
-    if shown is None or beside.reference is None or beside.reference.reason:
+    if landscape is None or reference is None or reference.reason or reference.points.shape[1] > 2:
         return figures
-    if len(shown.recordings.names) > 2:  # errors are drawn on a plane, or along a line
-        return figures
-    return figures | _maps(settings, shown, beside, beside.reference)
-
-
-def _maps(
-    settings: LandscapeFiguresSettings,
-    shown: LandscapeRun,
-    beside: LandscapeComparisons,
-    reference: ReferenceLandscape,
-) -> dict[str, Figure | None]:
-    """U by every source beside the reference: ours, and what was published."""
-    names = shown.recordings.names
+    names, x, potential = landscape.data["states"], reference.points, landscape.quasipotential
+    assert potential is not None  # U is known over all wells
     below = settings.landscape.compare_below or overall_level(reference)
     inside = np.nan_to_num(reference.values, nan=np.inf) < below
-    maps = {"landscape_errors": _error_maps(shown, reference, inside)}
-    if of_others := _published_maps(shown.landscape, reference, beside, inside, names):
-        maps["landscape_published"] = of_others
+    ours = {"characteristics": reference.values, "mesh": reference.mesh_values}
+    if networks is not None:
+        ours["networks"] = 2 * networks.evaluate(x).potential
+    regression = (formulas or {}).get(Method.REGRESSION)
+    if regression is not None and regression.potential is not None:
+        ours[str(Method.REGRESSION)] = 2 * regression.evaluate(np.ascontiguousarray(x.T))[0]
+    ours["local formulas"] = potential(x)
+    maps = {"landscape_errors": _shifted(ours, inside, of_any_constant=("networks", str(Method.REGRESSION)))}
+    symbols = [sympy.Symbol(name, real=True) for name in names]
+    formula = published_formula(published or {}, "U", symbols)
+    theirs = {"characteristics": reference.values}
+    if mesh is not None:
+        theirs["published mesh"] = mesh(x)
+    if formula is not None:
+        theirs["published formula"] = compile_formulas([formula], symbols)(np.ascontiguousarray(x.T))[0]
+    if len(theirs) > 1:
+        theirs["local formulas"] = ours["local formulas"]
+        constants = ("published mesh", "published formula")
+        maps["landscape_published"] = _shifted(theirs, inside, of_any_constant=constants)
     units = tuple(settings.space.unit(name, unknown="1") for name in names)
-    said = {"states": names, "units": units, "time_unit": settings.space.unit("t", unknown="1")}
-    energy = SaidLandscape(said).energy_unit
+    energy = energy_unit(units, time_unit)
     if len(names) == 1:
-        x = reference.points[:, 0]
-        return {
-            figure: plot_error_curves(x, one, name=names[0], unit=units[0], energy_unit=energy)
+        return figures | {
+            figure: plot_error_curves(x[:, 0], one, name=names[0], unit=units[0], energy_unit=energy)
             for figure, one in maps.items()
         }
-    side = round(len(reference.points) ** 0.5)
-    axes = (reference.points[::side, 0], reference.points[:side, 1])
-    return {
+    side = round(len(x) ** 0.5)
+    axes = (x[::side, 0], x[:side, 1])
+    return figures | {
         figure: plot_error_maps(
             axes,
             {name: values.reshape(side, side) for name, values in one.items()},
-            names=names,
+            names=tuple(names),
             units=units,
             energy_unit=energy,
         )
         for figure, one in maps.items()
     }
-
-
-def _error_maps(
-    shown: LandscapeRun, reference: ReferenceLandscape, inside: np.ndarray
-) -> dict[str, np.ndarray]:
-    """U by every source at the points of the reference, those inside."""
-    x, potential = reference.points, shown.landscape.quasipotential
-    assert potential is not None
-    maps = {"characteristics": reference.values, "mesh": reference.mesh_values}
-    if shown.networks is not None:
-        maps["networks"] = 2 * shown.networks.evaluate(x).potential
-    regression = shown.formulas.get(Method.REGRESSION)
-    if regression is not None and regression.potential is not None:
-        maps[str(Method.REGRESSION)] = 2 * regression.evaluate(np.ascontiguousarray(x.T))[0]
-    maps["local formulas"] = potential(x)
-    return _shifted(maps, inside, of_any_constant=("networks", str(Method.REGRESSION)))
-
-
-def _published_maps(
-    stored: StoredLandscape,
-    reference: ReferenceLandscape,
-    beside: LandscapeComparisons,
-    inside: np.ndarray,
-    names: tuple[str, ...],
-) -> dict[str, np.ndarray]:
-    """What was published of U at the points of the reference, those inside, and ours; empty without any."""
-    x, potential = reference.points, stored.quasipotential
-    assert potential is not None
-    symbols = [sympy.Symbol(name, real=True) for name in names]
-    formula = published_formula(beside.published, "U", symbols)
-    maps = {"characteristics": reference.values}
-    if beside.mesh is not None:
-        maps["published mesh"] = beside.mesh(x)
-    if formula is not None:
-        maps["published formula"] = compile_formulas([formula], symbols)(np.ascontiguousarray(x.T))[0]
-    if len(maps) == 1:
-        return {}
-    maps["local formulas"] = potential(x)
-    return _shifted(maps, inside, of_any_constant=("published mesh", "published formula"))
 
 
 def _shifted(
@@ -514,9 +337,9 @@ PREDICTED = 6
 GRID = 161  # on which the level of the regression is drawn
 
 
-@dataclass(frozen=True)
-class ShownRun:
-    """The run that is shown.
+@plain_dataclass(frozen=True)
+class RepresentativeRun:
+    """The run whose figures are shown.
 
     Attributes
     ----------
@@ -543,69 +366,24 @@ class ShownRun:
     exact: SymbolicDecomposition | None = None
 
 
-@dataclass(frozen=True)
-class PicturedRun:
-    """The run of the first picture: what of its landscape is drawn, its f, its recordings with their units.
-
-    Attributes
-    ----------
-    overview
-        Its landscape as plain data, None where f has no attractor.
-    stored
-        The same with the formulas about the attractors.
-    formula
-        Its refined formula, None where there is none.
-    dynamics
-        Its f and D.
-    recordings
-        Its trajectories.
-    """
-
-    overview: Mapping[str, Any] | None
-    stored: StoredLandscape | None
-    formula: SymbolicDecomposition | None
-    dynamics: Dynamics
-    recordings: Recordings
-
-    def drawn(self) -> DrawnLandscape:
-        """What is drawn of it."""
-        data = self.overview
-        if data is None:
-            units = [unit or "1" for unit in self.recordings.units]
-            data = {
-                "states": self.recordings.names, "units": units,
-                "time_unit": self.recordings.time_unit or "1",
-                "wells": [], "equilibria": [], "transitions": [],
-            }  # fmt: skip
-        return drawn_data(
-            data, wells=() if self.stored is None else self.stored.wells, dynamics=self.dynamics,
-            points=self.recordings.values, formula=self.formula,
-        )  # fmt: skip
-
-
-def leading_figures(run: PicturedRun) -> dict[str, Figure | None]:
+def leading_figures(
+    summary: LandscapeSummary, dynamics: Dynamics, recordings: Recordings
+) -> dict[str, Figure | None]:
     """What a page opens with, `quasipotential`, and the first of its evidence, `residuals`."""
-    shown = run.drawn()
-    time_unit = str((run.overview or {}).get("time_unit") or run.recordings.time_unit or "1")
+    time_unit = summary.time_unit if summary.time_unit != "1" else recordings.time_unit or "1"
     return {
-        "quasipotential": quasipotential_figure(shown),
-        "residuals": residuals_figure(run.dynamics, run.recordings, units=shown.units, time_unit=time_unit),
+        "quasipotential": quasipotential_figure(summary),
+        "residuals": residuals_figure(dynamics, recordings, units=summary.units, time_unit=time_unit),
     }
 
 
-@dataclass(frozen=True)
-class StudyTables:
-    """The tables that are drawn, see `siq.workflow.tables.COLUMNS`."""
-
-    coefficients: pd.DataFrame
-    rrmse: pd.DataFrame
-    training: pd.DataFrame
-    prediction: pd.DataFrame
-    record: pd.DataFrame
-    record_density: pd.DataFrame
+DRAWN_TABLES = ("coefficients", "rrmse", "training", "prediction", "record", "record_density")
+"""Tables of a study that are drawn, see `siq.workflow.tables.COLUMNS`."""
 
 
-def what_is_shown(shown: Shown, models: ModelFiles, complete: tuple[int, StoredLandscape] | None) -> ShownRun:
+def representative_run(
+    shown: Shown, models: ModelFiles, complete: tuple[int, StoredLandscape] | None
+) -> RepresentativeRun:
     """The refined formula, or else the landscape, or else the formula as published.
 
     Parameters
@@ -621,25 +399,25 @@ def what_is_shown(shown: Shown, models: ModelFiles, complete: tuple[int, StoredL
     if complete is not None:
         run, landscape = complete[0], complete[1].quasipotential
     if run is None:
-        return ShownRun(0, None, None, None)
+        return RepresentativeRun(0, None, None, None)
     formulas = models.formulas(run)
     own = formulas.get(Method.REFINED, formulas.get(shown.method))
     dynamics = None if own is None else Dynamics.of(own.symbols, own.vector_field)
-    return ShownRun(run, formulas.get(shown.method), landscape, dynamics)
+    return RepresentativeRun(run, formulas.get(shown.method), landscape, dynamics)
 
 
 def study_figures(
     settings: FiguresSettings,
-    tables: StudyTables,
-    shown: ShownRun,
+    tables: Mapping[str, pd.DataFrame],
+    shown: RepresentativeRun,
     system: Dynamics | None,
     published: Mapping[str, PublishedFigure],
 ) -> dict[str, Figure | None]:
     """All figures of a study by name, None for one that has nothing to show."""
-    rrmse = tables.rrmse[tables.rrmse["method"].isin(METHODS)]
+    rrmse = tables["rrmse"][tables["rrmse"]["method"].isin(METHODS)]
     figures: dict[str, Figure | None] = {}
     for method in METHODS:
-        coefficients = tables.coefficients
+        coefficients = tables["coefficients"]
         figures[f"coefficients_{method}"] = plot_coefficient_distributions(coefficients, method=method)
         figures[f"inclusion_{method}"] = plot_inclusion(coefficients, method=method)
     known = published.get("rrmse")
@@ -647,21 +425,23 @@ def study_figures(
     if known is not None and known.standard_deviation is not None:
         band = (known.mean, known.standard_deviation)
     figures["error_distribution"] = plot_error_distribution(rrmse, published=band)
-    figures["training"] = plot_training(tables.training)
+    figures["training"] = plot_training(tables["training"])
     figures["dataset"] = _dataset_figure(settings, shown, system)
     figures["components"] = _components_figure(shown, system)
     error = published.get("prediction_error")
     figures["record"] = _record_figure(tables, shown, system)
-    figures["prediction"] = _prediction_figure(settings, tables.prediction, shown, system, error)
+    figures["prediction"] = _prediction_figure(settings, tables["prediction"], shown, system, error)
     return figures
 
 
-def _record_figure(tables: StudyTables, shown: ShownRun, system: Dynamics | None) -> Figure | None:
+def _record_figure(
+    tables: Mapping[str, pd.DataFrame], shown: RepresentativeRun, system: Dynamics | None
+) -> Figure | None:
     """The test against the record, of the run that is shown."""
     recordings = shown.recordings
     if recordings is None:
         return None
-    one, two = (table[table["run"] == shown.number] for table in (tables.record, tables.record_density))
+    one, two = (table[table["run"] == shown.number] for table in (tables["record"], tables["record_density"]))
     units = dict(zip(recordings.names, _units(recordings, system), strict=True))
     return plot_record(one, two, units=units, time_unit=recordings.time_unit or "1")
 
@@ -676,7 +456,7 @@ def _units(recordings: Recordings, system: Dynamics | None) -> tuple[str, ...]:
     return system.units if system is not None else tuple(unit or "1" for unit in recordings.units)
 
 
-def _components_figure(shown: ShownRun, system: Dynamics | None) -> Figure | None:
+def _components_figure(shown: RepresentativeRun, system: Dynamics | None) -> Figure | None:
     """The decomposition on the plane of the first two states."""
     recordings = shown.recordings
     if recordings is None:
@@ -684,14 +464,12 @@ def _components_figure(shown: ShownRun, system: Dynamics | None) -> Figure | Non
     fields, domain = _component_fields(recordings, shown, system)
     units = _units(recordings, system)
     time_unit = recordings.time_unit or ("1" if system is None else system.time_unit)
-    said = SaidLandscape({"states": recordings.names, "units": units, "time_unit": time_unit})
-    return plot_components(
-        fields, states=recordings.names, units=units, domain=domain, energy_unit=said.energy_unit
-    )
+    energy = energy_unit(units, time_unit)
+    return plot_components(fields, states=recordings.names, units=units, domain=domain, energy_unit=energy)
 
 
 def _component_fields(
-    recordings: Recordings, shown: ShownRun, system: Dynamics | None
+    recordings: Recordings, shown: RepresentativeRun, system: Dynamics | None
 ) -> tuple[ComponentFields, np.ndarray]:
     """What the figure of the components shows, and its limits."""
     low, high = recordings.values.min(axis=0), recordings.values.max(axis=0)
@@ -725,7 +503,7 @@ def _limits_of(fields: ComponentFields, domain: np.ndarray) -> np.ndarray:
 def _prediction_figure(
     settings: FiguresSettings,
     errors: pd.DataFrame,
-    shown: ShownRun,
+    shown: RepresentativeRun,
     system: Dynamics | None,
     published: PublishedFigure | None,
 ) -> Figure | None:
@@ -747,7 +525,9 @@ def _prediction_figure(
     )
 
 
-def _dataset_figure(settings: FiguresSettings, shown: ShownRun, system: Dynamics | None) -> Figure | None:
+def _dataset_figure(
+    settings: FiguresSettings, shown: RepresentativeRun, system: Dynamics | None
+) -> Figure | None:
     """The recorded states of a run, and those that its regression sees."""
     recordings = shown.recordings
     if recordings is None:
@@ -787,3 +567,47 @@ def _dataset(
     return replace(
         marked, axes=(across, upwards), potential=values, threshold=highest_used(potential, level=level)
     )
+
+
+def sweep_figure(system: Dynamics, options: SweepOptions, tables: Mapping[str, pd.DataFrame]) -> Figure:
+    """The figure of a sweep, with the units of the card."""
+    units = dict(zip(system.states, system.units, strict=True)) | {"t": system.time_unit}
+    units |= {each.name: each.unit for each in system.parameters}
+    return plot_sweep(
+        tables["sweep"], tables["branches"], tables["bifurcations"], parameters=options.names,
+        states=system.states, units=units, curves=tables["bifurcation_curves"],
+    )  # fmt: skip
+
+
+def equations_figures(
+    system: Dynamics, summary: LandscapeSummary | None, tables: Mapping[str, pd.DataFrame], study: Study
+) -> dict[str, Figure | None]:
+    """The figures of a study of equations by name, None for one that has nothing to show."""
+    return {
+        "quasipotential": None if summary is None else quasipotential_figure(summary),
+        "degrees": plot_degrees(tables["degrees"]) if len(tables["degrees"]) else None,
+        "sweep": None if study.sweep is None else sweep_figure(system, study.sweep, tables),
+    }
+
+
+def inspection_drawn(recordings: Recordings, *, folder: Path) -> dict[str, Figure]:
+    """The figures of an inspection by name; what it says is written into the folder."""
+    found = inspection_of(joined(recordings))
+    seen = None if found.seen is None else found.seen.as_data()
+    for file, data in ((INSPECTION, found.lines()), (SEEN, seen)):
+        text = json.dumps(data, ensure_ascii=False, allow_nan=False)
+        (folder / file).write_text(text + "\n", encoding="utf-8")
+    return inspection_figures(found)
+
+
+def read_seen(folder: str | Path) -> RecordStates | None:
+    """What `inspection_drawn` wrote of two states; None where recordings were simulated."""
+    file = Path(folder) / SEEN
+    data = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else None
+    return None if data is None else RecordStates.from_data(data)
+
+
+def read_inspection(folder: str | Path) -> list[str] | None:
+    """What `inspection_drawn` wrote, line by line; None where recordings were simulated."""
+    file = Path(folder) / INSPECTION
+    return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else None

@@ -1,0 +1,343 @@
+"""A landscape for readers: the answer in a sentence, its certificate, its tables, as text and in a notebook.
+
+The answer is `templates/answer.j2`, filled from `siq.report.summary.LandscapeSummary`. Times are written with
+their errors, or as a range ``value · exp(±error)`` where the error is as large as the time. Each table comes
+as it is shown, units in its headings, and, where that is more, as the numbers to be downloaded.
+"""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from siq.data.two_states import RecordStates
+from siq.numerics.text import MINUS, range_text, unit_text, value_text
+from siq.quasipotential.landscape import Landscape
+from siq.quasipotential.rates import NoiseStrength, exit_time
+from siq.report.formatting import counted_text, paragraphs, percent_text, predicted_text, texts, time_text
+from siq.report.summary import LandscapeSummary, VisitSummary, settled, summarise, well_name
+from siq.workflow.outcomes import Method
+
+MOST_COLUMNS = 4  # wells that are columns of a table; more are rows
+
+
+def answer_lines(
+    summary: LandscapeSummary, *, seen: RecordStates | None = None, certified: bool = False
+) -> list[str]:
+    """The answer in one sentence, and what has to be known of it.
+
+    Parameters
+    ----------
+    summary
+        The landscape.
+    seen
+        The two states that the recordings show without any formula, None where nothing is known of them.
+    certified
+        Whether the landscape may be believed: then nothing is added.
+    """
+    return paragraphs(
+        "answer.j2", s=summary, seen="" if seen is None else seen.sentence(), certified=certified
+    )
+
+
+def certificate_line(certificate: Mapping[str, Any] | None) -> str:
+    """The certificate in one sentence, for text."""
+    (line,) = paragraphs("certificate.j2", certificate=certificate, texts=texts("certificate"))[-1:]
+    return line
+
+
+def tests_table(certificates: pd.DataFrame, run: int, method: Method) -> pd.DataFrame:
+    """The tests of the formulas of a run: what was asked, the figure, its limit, the verdict."""
+    mine = certificates[(certificates["run"] == run) & (certificates["method"] == method)]
+    asks = texts("certificate")["asks"]
+    return pd.DataFrame(
+        {
+            "test": [str(name).replace("_", " ") for name in mine["test"]],
+            "what it asks": [asks.get(str(name), "") for name in mine["test"]],
+            "found": mine["value"].to_numpy(),
+            "limit": mine["limit"].to_numpy(),
+            "passed": mine["passed"].to_numpy(),
+            "reason": mine["reason"].to_numpy(),
+        }
+    )
+
+
+def headed(name: str, unit: str) -> str:
+    """The heading of a column, with its unit where it has one."""
+    shown = unit_text(unit)
+    return f"{name} ({shown})" if shown else name
+
+
+def complex_text(value: complex) -> str:
+    """A complex number to four digits: ``−1.000 + 2.000 i``."""
+    if not value.imag:
+        return value_text(value.real)
+    return f"{value_text(value.real)} {MINUS if value.imag < 0 else '+'} {value_text(abs(value.imag))} i"
+
+
+def wells_table(summary: LandscapeSummary) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """The wells for a reader, a column for each, and the same as numbers, a row for each."""
+    wells, noise, time_unit = summary.wells, summary.noise, summary.time_unit
+    rows: dict[str, list[str]] = {}
+    numbers = []
+    for well in wells:
+        (ratio, ratio_error), mean, cycle = well.relative_depth(noise), well.time(noise), well.cycle
+        numbers.append(
+            {"well": well.label}
+            | dict(zip(summary.names, well.position.tolist(), strict=True))
+            | {f"{name}_error": error
+               for name, error in zip(summary.names, well.position_errors.tolist(), strict=True)}
+            | {
+                "depth": well.depth, "depth_error": well.depth_error, "depth_over_noise": ratio,
+                "depth_over_noise_error": ratio_error,
+                "mean_time": math.nan if mean is None else mean.value,
+                "mean_time_relative_error": math.nan if mean is None else mean.error,
+                "next": well.beyond or "",
+                "share_of_domain" if summary.given else "share_of_recorded_states": well.basin,
+            }
+        )  # fmt: skip
+        cells = {}
+        for place, (name, unit) in enumerate(zip(summary.names, summary.units, strict=True)):
+            cells[headed(name, unit)] = (
+                value_text(well.position[place], well.position_errors[place])
+                if cycle is None
+                else range_text(cycle.points[:, place].min(), cycle.points[:, place].max())
+            )
+        cells[headed("period", time_unit)] = "" if cycle is None else value_text(cycle.period, digits=4)
+        multipliers = [] if cycle is None else cycle.multipliers.tolist()
+        cells["Floquet multipliers"] = ", ".join(complex_text(one) for one in multipliers)
+        deep = math.isfinite(well.depth)
+        cells[headed("depth ΔU", summary.energy_unit)] = (
+            value_text(well.depth, well.depth_error) if deep else ""
+        )
+        cells["ΔU/ε"] = value_text(ratio, ratio_error) if math.isfinite(ratio) else ""
+        cells[headed("lasts", time_unit)] = time_text(mean)
+        seen = well.visits
+        cells[headed("mean visit, counted", time_unit)] = "" if seen is None else counted_text(seen)
+        cells[headed("mean visit, by f and D", time_unit)] = "" if seen is None else predicted_text(seen)
+        cells["next well"] = well.beyond or ""
+        if len(wells) > 1:
+            cells["share of the domain" if summary.given else "recorded states"] = f"{100 * well.basin:.0f} %"
+        for name, text in cells.items():
+            rows.setdefault(name, []).append(text)
+    kept = {name: row for name, row in rows.items() if any(row)}
+    names = [well.label for well in wells]
+    if len(names) > MOST_COLUMNS:  # as many columns would be too wide: a row for each
+        table = pd.DataFrame({"stable state": names} | kept)
+    else:
+        table = pd.DataFrame([[name, *row] for name, row in kept.items()], columns=["stable state", *names])
+    return table, pd.DataFrame(numbers).dropna(axis=1, how="all")
+
+
+def exits_table(summary: LandscapeSummary) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """One row for every way out of every well: for a reader, and as numbers."""
+    rows, numbers = [], []
+    for way in summary.ways:
+        known = math.isfinite(way.barrier)
+        mean = None if summary.noise is None or not known else exit_time(way.law, summary.noise)
+        start, end = well_name(way.start), "" if way.end is None else well_name(way.end)
+        place = _place(summary, way.saddle)
+        if math.isfinite(way.period):
+            period = value_text(way.period, unit=summary.time_unit, digits=4)
+            place += f", on an unstable cycle of period {period}"
+        row = {
+            "way": f"{start} to {end or f'out of the {summary.region}'}",
+            "over the saddle at": place,
+            headed("barrier ΔU", summary.energy_unit): value_text(way.barrier, way.standard_error)
+            if known
+            else "",
+        }
+        if not summary.given:
+            action = way.minimum_action
+            row["the same by the path alone"] = "" if action is None else value_text(action)
+        row[headed("mean time", summary.time_unit)] = time_text(mean)
+        rows.append(row | {"to be known": "; ".join(way.remarks)})
+        numbers.append(
+            {
+                "start": start, "end": end,
+                **{f"saddle_{name}": value for name, value in zip(summary.names, way.saddle, strict=True)},
+                "barrier": way.barrier, "barrier_error": way.standard_error,
+                "minimum_action": way.minimum_action, "prefactor": way.law.prefactor,
+                "mean_time": np.nan if mean is None else mean.value,
+                "data_error": np.nan if mean is None else mean.data_error,
+                "law_error": np.nan if mean is None else mean.law_error,
+            }
+        )  # fmt: skip
+    return pd.DataFrame(rows), pd.DataFrame(numbers)
+
+
+def _place(summary: LandscapeSummary, position: np.ndarray) -> str:
+    values, _ = settled(position, 0.0, summary.size)
+    return "(" + ", ".join(value_text(value) for value in values) + ")"
+
+
+def cycles_table(summary: LandscapeSummary) -> pd.DataFrame:
+    """The unstable cycles, a row for each."""
+    rows = []
+    for one in summary.unstable_cycles:
+        reach = [
+            range_text(*ends) for ends in zip(one.points.min(axis=0), one.points.max(axis=0), strict=True)
+        ]
+        rows.append(
+            dict(zip(summary.names, reach, strict=True))
+            | {headed("period", summary.time_unit): value_text(one.period, digits=4)}
+            | {"Floquet multipliers": ", ".join(map(complex_text, one.multipliers.tolist()))}
+        )
+    return pd.DataFrame(rows)
+
+
+def equilibria_table(summary: LandscapeSummary) -> pd.DataFrame:
+    """All states at which f vanishes, with the eigenvalues of f there."""
+    kinds = texts("tables")["equilibria"]
+    time = unit_text(summary.time_unit)
+    names = summary.names
+    position = f"({', '.join(names)})" if len(names) > 1 else names[0]
+    if len(set(summary.units)) == 1:
+        position = headed(position, summary.units[0])
+    rows = [
+        {
+            "name": one.label,
+            "what": kinds.get(one.kind, one.kind),
+            position: _place(summary, one.position),
+            f"rates (1/{time})" if time else "rates": ", ".join(map(complex_text, one.eigenvalues)),
+        }
+        for one in summary.equilibria
+    ]
+    frame = pd.DataFrame(rows)
+    return frame if any(frame["name"]) else frame.drop(columns="name")
+
+
+def times_table(summary: LandscapeSummary, noises: Sequence[float]) -> pd.DataFrame:
+    """How long each well lasts under some noise strengths."""
+    rows = []
+    for strength in noises:
+        row = {headed("noise strength ε", summary.energy_unit): value_text(strength)}
+        for well in summary.wells:
+            mean = well.time(NoiseStrength(strength))
+            strong = texts("tables")["too_strong"] if strength >= well.depth else ""
+            row[headed(f"{well.label} lasts", summary.time_unit)] = (
+                strong if mean is None else time_text(mean)
+            )
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def in_words(table: pd.DataFrame) -> pd.DataFrame:
+    """A table with headings in words, without columns that say nothing."""
+    return table.dropna(axis=1, how="all").rename(columns=lambda name: name.replace("_", " "))
+
+
+def counted_over_runs(table: pd.DataFrame, by: str | list[str], **columns: tuple[str, str]) -> pd.DataFrame:
+    """A table over all runs, a row for each group, with its columns as `pandas.DataFrame.agg` takes them."""
+    counted = table.groupby(by, sort=False).agg(**columns).reset_index()
+    return counted.rename(columns=lambda name: "way" if name == "item" else name.replace("_", " "))
+
+
+def record_table(record: pd.DataFrame, time_unit: str) -> pd.DataFrame:
+    """Mean visits to each well, counted on the record and predicted.
+
+    Parameters
+    ----------
+    record
+        The rows of one run of the table of that name.
+    time_unit
+        Of the recordings.
+    """
+    words, rows = texts("tables"), []
+    for one in record.to_dict("records"):
+        visits = VisitSummary(
+            int(one["visits"]), one["counted"], one["lowest"], one["highest"], one["predicted"],
+            one["predicted_error"], str(one["method"]),
+        )  # fmt: skip
+        held_out = one["held_out_counted"]
+        rows.append(
+            {
+                "well about": one["attractor"],
+                "visits seen to end": visits.count,
+                headed("mean visit, counted", time_unit): counted_text(visits)
+                if visits.count
+                else f"above {value_text(visits.lowest, digits=2)}",
+                "held out: visits": int(one["held_out_visits"]),
+                headed("held out: mean", time_unit): value_text(held_out, digits=3)
+                if math.isfinite(held_out)
+                else words["none_ended"],
+                headed("predicted", time_unit): predicted_text(visits),
+                "by": words["methods"].get(visits.method, visits.method),
+                "probability": f"{one['probability']:.2g}",
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def comparison_table(table: pd.DataFrame) -> pd.DataFrame:
+    """Numbers by the trajectories with those of the equations; of several runs the largest difference.
+
+    Parameters
+    ----------
+    table
+        `beside_equations`.
+    """
+
+    def text(value: float, digits: int = 5) -> str:
+        return value_text(value, digits=digits) if np.isfinite(value) else ""
+
+    rows = []
+    known = table[table["quantity"].fillna("") != ""]
+    for _, some in known.groupby(["item", "quantity", "noise"], sort=False, dropna=False):
+        first, off, sharp = some.iloc[0], some["relative_difference"], some["in_errors"]
+        at = f" at ε = {value_text(first['noise'])}" if np.isfinite(first["noise"]) else ""
+        row = {
+            "item": first["item"],
+            "what": f"{first['quantity']}{at}",
+            "by the equations": text(first["equations"]),
+            "by the trajectories": text(some["trajectories"].mean()),
+        }
+        if some["run"].nunique() > 1:
+            row["runs"] = int(some["trajectories"].notna().sum())
+            row["largest difference"] = percent_text(off.abs().max())
+            row["largest in standard errors"] = text(sharp.abs().max(), 2)
+        else:
+            row["difference"] = ("+" if off.iloc[0] > 0 else "") + percent_text(off.iloc[0])
+            row["in standard errors"] = text(sharp.iloc[0], 2)
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def landscape_text(landscape: Landscape) -> str:
+    """The report of a landscape as text: the answer, whether it may be believed, wells, ways out, notes."""
+    opening, tables = _report(landscape)
+    parts = list(opening)
+    for heading, table in tables:
+        parts += ["", heading, table.to_string(index=False, na_rep="-")]
+    return "\n".join([*parts, *(["", *landscape.notes] if landscape.notes else [])])
+
+
+def landscape_html(landscape: Landscape) -> str:
+    """The report of a landscape as HTML, without scripts or styles."""
+    opening, tables = _report(landscape)
+    parts = [f"<p>{html.escape(line)}</p>" for line in opening]
+    for heading, table in tables:
+        parts += [f"<p>{html.escape(heading)}</p>", table.to_html(index=False, na_rep="-", border=0)]
+    return "\n".join([*parts, *(f"<p>{html.escape(note)}</p>" for note in landscape.notes)])
+
+
+def _report(landscape: Landscape) -> tuple[list[str], list[tuple[str, pd.DataFrame]]]:
+    summary = summarise(landscape)
+    certificate = None if landscape.certificate is None else landscape.certificate.as_data()
+    certified = certificate is not None and bool(certificate["certified"])
+    answer, *further = answer_lines(summary, seen=landscape.seen, certified=certified)
+    written = certificate is not None or any(well is not None for well in landscape.wells)
+    verdict = certificate_line(certificate) if written else "U is not written as a formula."
+    words = texts("tables")
+    tables = [(words["wells"], wells_table(summary)[0])] if summary.wells else []
+    if landscape.transitions:
+        ways = landscape.barriers().rename(columns={"start": "from", "end": "to"})
+        for end in ("from", "to"):
+            ways[end] = [None if pd.isna(well) else well_name(int(well)) for well in ways[end]]
+        tables.append((words["exits"], ways))
+    return [answer, verdict, *further], tables
