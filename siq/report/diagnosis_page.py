@@ -8,7 +8,15 @@ from typing import Any
 
 from siq.diagnosis.statement import METRIC, Estimate, StatedFunction, StatedMechanism, Statement
 from siq.numerics.text import p_text, value_text
-from siq.report.diagnosis_sections import Findings, answer, badge, final_simulation, numbers, picture, sections
+from siq.report.diagnosis_sections import (
+    Findings,
+    answer,
+    badge,
+    final_simulation,
+    numbers,
+    picture,
+    sections,
+)
 from siq.report.diagnosis_text import location_sentence, words_of
 from siq.report.page import ReportContent, render_report
 from siq.report.remarks import sentence

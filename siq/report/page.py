@@ -231,8 +231,8 @@ class PageWriter:
 
     def _add(self, **parts: Sequence[Any]) -> str:
         assert self._section is not None  # the template opened it
-        old = {name: getattr(self._section, name) for name in parts}
-        self._section = replace(self._section, **{name: [*old[name], *parts[name]] for name in parts})
+        found: dict[str, Any] = {n: [*getattr(self._section, n), *more] for n, more in parts.items()}
+        self._section = replace(self._section, **found)
         return ""
 
     def formulas(self, rows: Sequence[FormulaRow]) -> str:

@@ -348,6 +348,11 @@ class LandscapeSummary:
         return tuple(one for one in self.others if one.kind == "saddle")
 
     @property
+    def marks(self) -> tuple[WellSummary | EquilibriumSummary, ...]:
+        """Wells and saddles."""
+        return (*self.wells, *self.saddles)
+
+    @property
     def top(self) -> float | None:
         """U at the highest saddle out of a well, None where none is known."""
         tops = [self.wells[way.start].height + way.barrier for way in self.ways]
@@ -366,7 +371,7 @@ class LandscapeSummary:
         known = [way for way in self.ways if np.isfinite(self.wells[way.start].height + way.barrier)]
         if known:
             return min(known, key=lambda way: self.wells[way.start].height + way.barrier).saddle
-        places = self.saddles or self.wells or self.others
+        places = self.saddles or self.marks or self.others
         heights = [np.inf if np.isnan(one.height) else one.height for one in places]
         return places[int(np.argmin(heights))].position
 
@@ -408,7 +413,7 @@ def chosen_states(landscape: LandscapeSummary, states: Sequence[str] | None) -> 
     if len(names) == 2:
         return 0, 1
     width = np.ptp(landscape.box, axis=1)
-    places = np.array([one.position for one in (*landscape.wells, *landscape.saddles)])
+    places = np.array([one.position for one in landscape.marks])
     apart = np.ptp(places, axis=0) / width if len(places) else np.zeros(len(names))
     # Where wells differ along one state only, the first of the others is as good as any.
     first, second = np.sort(np.argsort(-np.round(apart, 2), kind="stable")[:2])
@@ -467,7 +472,8 @@ def summarise(
     heights = np.array([_number(one.get("height")) for one in data["wells"]])
     if formula is not None and attractors:
         heights = 2 * formula.evaluate(np.ascontiguousarray(np.array(attractors).T))[0]
-        low, high = np.min(points, axis=0), np.max(points, axis=0)
+        assert points is not None  # or there is no formula
+        low, high = points.min(axis=0), points.max(axis=0)
         outside = [bool((place < low).any() or (place > high).any()) for place in attractors]
         heights = np.where(outside, np.nan, heights)
         heights = heights - heights.min() if np.isfinite(heights).all() else heights
@@ -555,8 +561,12 @@ def _well(
         visits=None
         if seen is None
         else VisitSummary(
-            int(seen["visits"]),
-            *(_number(seen[name]) for name in ("counted", "lowest", "highest", "predicted", "error")),
+            count=int(seen["visits"]),
+            counted=_number(seen["counted"]),
+            lowest=_number(seen["lowest"]),
+            highest=_number(seen["highest"]),
+            predicted=_number(seen["predicted"]),
+            error=_number(seen["error"]),
             method=str(seen["method"]),
         ),
         cycle=_cycle(one["cycle"]) if "cycle" in one else None,
@@ -565,17 +575,26 @@ def _well(
 
 def _ways(data: Mapping[str, Any], dimension: int) -> tuple[ExitSummary, ...]:
     laws = {index: iter(exits_of(data, index)) for index in range(len(data["wells"]))}
+
+    def path(points: Any) -> np.ndarray:
+        return np.reshape(np.array(points or [], dtype=float), (-1, dimension))
+
     return tuple(
         ExitSummary(
-            one["start"], one["end"], np.array(one["saddle"], dtype=float), _number(one["barrier"]),
-            _number(one.get("error", one["standard_error"])),
-            *(np.reshape(np.array(one.get(part) or [], float), (-1, dimension))
-              for part in ("uphill", "downhill")),
-            law=next(laws[one["start"]]), minimum_action=one["minimum_action"], remarks=tuple(one["notes"]),
+            start=one["start"],
+            end=one["end"],
+            saddle=np.array(one["saddle"], dtype=float),
+            barrier=_number(one["barrier"]),
+            standard_error=_number(one.get("error", one["standard_error"])),
+            uphill=path(one.get("uphill")),
+            downhill=path(one.get("downhill")),
+            law=next(laws[one["start"]]),
+            minimum_action=one["minimum_action"],
+            remarks=tuple(one["notes"]),
             period=_number(one.get("over_cycle")),
         )
         for one in data["transitions"]
-    )  # fmt: skip
+    )
 
 
 def settled(position: Any, errors: Any, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

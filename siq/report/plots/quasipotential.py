@@ -252,9 +252,7 @@ def _lowest_behind(landscape: LandscapeSummary, grid: np.ndarray, rest: list[int
 
     The best of some states seen anywhere is followed down, one direction after another, by parabolas.
     """
-    seen = [np.stack([one.position for one in (*landscape.wells, *landscape.saddles)])] if (
-        landscape.wells or landscape.saddles
-    ) else []  # fmt: skip
+    seen = [np.stack([one.position for one in landscape.marks])] if landscape.marks else []
     seen += [way.uphill for way in landscape.ways if len(way.uphill)]
     places = np.concatenate([*seen, _points(landscape)])[:, rest]
     width = np.ptp(landscape.box, axis=1)[rest]
