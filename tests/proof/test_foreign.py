@@ -15,9 +15,9 @@ import pytest
 import sympy
 import yaml
 from scipy.integrate import solve_ivp
+from siq.report.plots.proof import plot_foreign_proof
 
 from siq.diagnosis.study import Comparison, measurements_of, read_case
-from siq.report.plots.proof import plot_foreign_proof
 from siq.systems.cards import load_system
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, Parameter, Signals, symbol
