@@ -126,8 +126,8 @@ def judged(
     for one, two in zip(network, local, strict=True):
         x = two.points
         for candidate in (one, two):
-            solve &= check_hamilton_jacobi(candidate, found, limit=LIMITS.hamilton_jacobi).passed
-        errors = (stated_error(candidate, found)[0] for candidate in (one, two))
+            solve &= check_hamilton_jacobi(candidate, found, LIMITS).passed
+        errors = (stated_error(candidate, found) for candidate in (one, two))
         limit = HARMLESS + sum(min(error, LIMITS.error) for error in errors)
         agree &= difference(one, two.values, x) <= limit
         wrong |= difference(one, lambda y: potential_values(known, y), x) > WRONG

@@ -1,52 +1,69 @@
 """The certificate: which tests a formula of V has to pass, and what they come to.
 
-No formula is certified without a test that shares nothing with its fit but f: `INDEPENDENT` names those.
+One function certifies formulas, be it one for the recorded region or one for each attractor: each is a
+candidate for some points and for some attractors, the worst of them decides, and the tests stand in
+`siq.quasipotential.certificate_tests`. No formula is certified without a test that shares nothing with its
+fit but f and D: `INDEPENDENT` names those.
 
-`siq.quasipotential.certificate_tests` has the tests themselves; one formula for each attractor is certified
-by `siq.quasipotential.certificate`.
-
-`siq.quasipotential.certificate_tests` has the tests themselves; one formula for the whole region is certified
-by `siq.quasipotential.certificate`.
+That test is by characteristics of the Hamilton–Jacobi equation, which leave an attractor along its
+linearisation: no ansatz of V, no network, no recorded state enters (`siq.quasipotential.characteristics`).
+Along each V is integrated, and on the lowest sheet it is the quasipotential. Recorded states only say where
+to compare: within the box of the recordings, among states that lead to the attractor, and up to `SHARE` of
+the level at which the first characteristic leaves these.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from siq.data.recordings import SnapshotPairs
-from siq.inference.field_estimate import AnyField, GivenField, IdentifiedField
-from siq.quasipotential.certificate_characteristics import FEWEST, SHARE, Reference, check_characteristics
+from siq.errors import NumericalFailure
+from siq.inference.field_estimate import AnyField, GivenField
+from siq.numerics.least_squares import representative_subset
 from siq.quasipotential.certificate_tests import (
     ERROR_POINTS,
+    FEWEST,
+    SHARE,
     STATED,
-    BasinRegion,
     Candidate,
     CertificateOptions,
+    Reference,
     Verdict,
-    basin_region,
     check_agreement,
     check_branch,
+    check_characteristics,
     check_descent,
     check_error,
     check_existence,
     check_hamilton_jacobi,
     check_identity,
     stated_error,
+    sublevel_points,
 )
-from siq.quasipotential.characteristics import adapted_fan, first_caustic
+from siq.quasipotential.characteristics import (
+    End,
+    Fan,
+    adapted_fan,
+    first_caustic,
+    lowest_sheet,
+    relative_error,
+)
 from siq.quasipotential.formulas import SymbolicDecomposition
-from siq.quasipotential.refinement import Refined
-from siq.quasipotential.uncertainty import relative_error
-from siq.quasipotential.wells import Well
+from siq.quasipotential.wells import RecordedRegion, Well
 from siq.systems.dynamics import Dynamics
+from siq.systems.equilibria import hessian_at
 from siq.systems.formulas import compile_formulas
 from siq.systems.phase_portrait import PhasePortrait
 
 INDEPENDENT = ("characteristics",)  # tests of V that share nothing with a fit of V but f and D
+ALONE = "only one of the two routes that the study names led to a formula"
+HARMLESS = 1e-6  # a difference of the routes that no error needs to explain
+LEAST_CLAIMED = 0.5  # of the states in a well: a formula that holds at fewer is none of the well (a choice)
 
 
 @dataclass(frozen=True)
@@ -97,8 +114,232 @@ class Certificate:
 
 
 def uncertified(reason: str) -> dict[str, Any]:
-    """The certificate of formulas that could not be tested."""
+    """The certificate, as data, of formulas that could not be tested."""
     return {"certified": False, "scope": "region", "stated_error": None, "reason": reason, "tests": {}}
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Everything that formulas of V are tested with.
+
+    Attributes
+    ----------
+    found, portrait
+        f and D, identified without V or given, and the phase portrait that follows from them.
+    points
+        Evenly spread states that no fit saw, shape ``(n, d)``.
+    pairs
+        Consecutive samples of held-out recordings; None where f is given, and no motion was recorded.
+    references
+        V by characteristics about every attractor.
+    options
+        The limits.
+    prediction
+        The verdict on f; None where f is given.
+    seed
+        Draws of f, and the points on which the error is estimated.
+    """
+
+    found: AnyField
+    portrait: PhasePortrait
+    points: np.ndarray
+    pairs: SnapshotPairs | None = None
+    references: Sequence[Reference] = ()
+    options: CertificateOptions = field(default_factory=CertificateOptions)
+    prediction: Verdict | None = None
+    seed: int = 0
+
+
+def certify(
+    formulas: SymbolicDecomposition | Sequence[Well],
+    evidence: Evidence,
+    *,
+    others: Sequence[Well] = (),
+    compared: bool = False,
+    relative_error: float = 0.0,
+) -> Certificate:
+    """Certificate of one formula for the region, or of one for each attractor, the worst of them deciding.
+
+    The Hessian of the local route is M by construction, so that its branch test passes by itself; what tests
+    it are the characteristics. A formula about an attractor is tested on held-out states of its own well
+    where it claims to hold, and it has to claim more than half of them. Where f is given nothing was
+    recorded, and what tests predictions, motion, and whether uncertain wells exist has no object.
+
+    Parameters
+    ----------
+    formulas
+        V and g of the region, or V about the attractors.
+    evidence
+        What they are tested with.
+    others
+        V about the attractors by the other route, to be compared with.
+    compared
+        Whether both routes were asked for: then a formula that only one of them found is refused.
+    relative_error
+        Relative standard error of a V of the region from the uncertainty of f.
+    """
+    found, portrait, options, seed = evidence.found, evidence.portrait, evidence.options, evidence.seed
+    wells = () if isinstance(formulas, SymbolicDecomposition) else tuple(formulas)
+    if isinstance(formulas, SymbolicDecomposition):
+        scope, candidates = "region", [_candidate_of_region(formulas, evidence, relative_error)]
+    else:
+        scope, candidates = "wells", [candidate_in_well(well, evidence) for well in wells]
+    verdicts: dict[str, list[Verdict]] = {}
+    error = own_error = 0.0 if candidates else np.inf
+    from_field = 0.0
+    for number, candidate in enumerate(candidates):
+        if candidate.claimed < LEAST_CLAIMED:
+            advice = "" if isinstance(found, GivenField) else "record more there, or "
+            reason = (
+                f"V claims to hold at {candidate.claimed:.0%} of the held-out states in the well about"
+                f" {position_text(wells[number].attractor)}: {advice}raise refinement.degrees"
+            )
+            verdicts["hamilton_jacobi"] = [Verdict.refused(reason, options.hamilton_jacobi)]
+            error = own_error = np.inf
+            continue
+        its = stated_error(candidate, found, seed=seed)
+        # Characteristics follow the same f: what f's uncertainty adds explains no difference from them.
+        followed, its = check_characteristics(candidate, found, options, error=its, seed=seed)
+        made = {
+            "hamilton_jacobi": check_hamilton_jacobi(candidate, found, options),
+            "branch": check_branch(candidate, found, options, seed=seed),
+        }
+        if candidate.pairs is not None and not isinstance(found, GivenField):
+            made["descent"] = check_descent(candidate, found, options, error=its)
+        made["characteristics"] = followed
+        if candidate.circulatory is not None:
+            made["identity"] = check_identity(candidate, found, options)
+        for name, verdict in made.items():
+            verdicts.setdefault(name, []).append(verdict)
+        uncertain = STATED * candidate.relative_error
+        own_error = max(own_error, its - uncertain)
+        if wells:
+            uncertain = STATED * _error_from_field(wells[number], candidate.points, evidence)
+            its += uncertain
+        error, from_field = max(error, its), max(from_field, uncertain)
+    tests = {name: Verdict.worst(made) for name, made in verdicts.items()}
+    missing = len(portrait.attractors) - len(wells)
+    if scope == "wells" and (missing or not wells):
+        reason = f"{missing} of {len(portrait.attractors)} attractors have no formula"
+        tests["branch"] = Verdict.refused(reason, options.branch)
+    tests["error"] = check_error(own_error, from_field, options)
+    if not isinstance(found, GivenField):
+        if portrait.attractors:
+            tests["existence"] = check_existence(found, portrait, seed=seed)
+        if scope == "region":
+            pairs = [(candidates[0].values, others, others)] if others else []
+        else:
+            same = [(one, two) for one in others for two in wells if same_place(one, two)]
+            pairs = [(one.values, [two], [one]) for one, two in same]
+        if others and scope == "wells" and len(pairs) < len(portrait.attractors):
+            tests["agreement"] = Verdict.refused("the network route found no formula for some well")
+        elif others:
+            # Both routes share the error of f, and have the rest of their own.
+            tests["agreement"] = Verdict.worst(
+                [
+                    check_agreement(
+                        values, two,
+                        limit=explained_difference(
+                            options, error, max(_error_of_well(one, evidence) for one in erring)
+                        )
+                        + 6 * relative_error,
+                    )
+                    for values, two, erring in pairs
+                ]
+            )  # fmt: skip
+        elif compared:
+            tests["agreement"] = Verdict.refused(ALONE)
+        if evidence.prediction is not None:
+            tests["prediction"] = evidence.prediction
+    if (fault := portrait.fault()) is not None:
+        tests["branch"] = Verdict.refused(fault, tests["branch"].limit if "branch" in tests else 0.0)
+    refused = [verdict.reason for verdict in tests.values() if not verdict.passed]
+    tested_on = "; ".join(dict.fromkeys(candidate.tested_on for candidate in candidates))
+    return Certificate(tests, error, "; ".join(dict.fromkeys(refused)), scope, tested_on)
+
+
+def explained_difference(options: CertificateOptions, *errors: float) -> float:
+    """Difference of two routes that their errors explain; one that cannot be stated explains nothing."""
+    return HARMLESS + sum(min(error, options.error) for error in errors)
+
+
+def same_place(one: Well, two: Well) -> bool:
+    """Whether two wells are about one attractor: both are the same root of the same f."""
+    return np.array_equal(one.attractor, two.attractor)
+
+
+def _candidate_of_region(
+    formulas: SymbolicDecomposition, evidence: Evidence, relative_error: float
+) -> Candidate:
+    symbols, d = formulas.symbols, len(formulas.symbols)
+    second = [slope.diff(symbol) for slope in formulas.gradient for symbol in symbols]
+    hessian = compile_formulas(second, symbols)
+    together, gradient = formulas.evaluate, formulas.evaluate_gradient
+    return Candidate(
+        values=lambda x: together(np.ascontiguousarray(x.T))[0],
+        gradients=lambda x: gradient(np.ascontiguousarray(x.T)).T,
+        hessians=lambda x: hessian(np.ascontiguousarray(x.T)).T.reshape(-1, d, d),
+        circulatory=lambda x: together(np.ascontiguousarray(x.T))[1 : d + 1].T,
+        points=evidence.points,
+        attractors=evidence.portrait.attractors,
+        relative_error=relative_error,
+        pairs=evidence.pairs,
+        references=evidence.references,
+        tested_on=f"{len(evidence.points)} held-out states",
+    )
+
+
+def candidate_in_well(well: Well, evidence: Evidence) -> Candidate:
+    """V about an attractor, to be tested on what lies in its well below `SHARE` of its level.
+
+    It makes no claim where its own residual is large, as at a caustic: `claimed` has the share of the states
+    where it claims to hold. Where fewer than `FEWEST` held-out states lie in the well, points of
+    characteristics are added, which no fit saw either. Pairs count by their first sample: to ask where the
+    second one lies would be to choose the noise.
+    """
+    portrait, pairs = evidence.portrait, evidence.pairs
+    index = [np.array_equal(one.position, well.attractor) for one in portrait.attractors].index(True)
+    region = RecordedRegion.of_basin(portrait, index)
+    references = [one for one in evidence.references if np.array_equal(one.attractor, well.attractor)]
+
+    def inside(x: np.ndarray) -> np.ndarray:
+        mask = (well.values(x) < SHARE * well.level) & well.reaches(x)
+        mask[mask] = ~region.across(x[mask])
+        return np.asarray(mask)
+
+    points, further = evidence.points[inside(evidence.points)], ", all held out"
+    if len(points) < FEWEST and references:
+        further = (
+            f", {len(points)} of them held out and, as these are few, the others reached by characteristics"
+        )
+        points = np.concatenate([points, references[0].below(well.level)[0]])
+    believed = well.believed(points)
+    if pairs is not None:
+        rows = inside(pairs.x0)
+        rows[rows] = well.believed(pairs.x0[rows])
+        pairs = replace(
+            pairs, x0=pairs.x0[rows], xh=pairs.xh[rows], h=pairs.h[rows], recording=pairs.recording[rows]
+        )
+    return Candidate(
+        well.values, well.gradients, well.hessians, None, points[believed], [portrait.attractors[index]],
+        pairs=pairs, references=references, level=well.level,
+        claimed=float(believed.mean()) if len(points) else 0.0,
+        tested_on=f"{believed.sum()} of {len(points)} states of a well, where V claims to hold{further}",
+    )  # fmt: skip
+
+
+def _error_of_well(well: Well, evidence: Evidence) -> float:
+    """The error of V that is stated of a well, over the points of its fit."""
+    mine = [one for one in evidence.portrait.attractors if np.array_equal(one.position, well.attractor)]
+    candidate = Candidate(well.values, well.gradients, well.hessians, None, sublevel_points(well), mine)
+    return stated_error(candidate, evidence.found, seed=evidence.seed)
+
+
+def _error_from_field(well: Well, points: np.ndarray, evidence: Evidence) -> float:
+    """Relative standard error of V over points, from what is not known of f."""
+    generator = np.random.default_rng(evidence.seed)
+    x = points[generator.choice(len(points), min(ERROR_POINTS, len(points)), replace=False)]
+    return relative_error(evidence.found, well.gradients, well.attractor, x, well.values(x))
 
 
 def position_text(position: np.ndarray) -> str:
@@ -107,17 +348,8 @@ def position_text(position: np.ndarray) -> str:
 
 
 NOTICEABLE = 1e-3  # a stated error above this is worth an explanation
-FAN = 512  # characteristics in search of a caustic
-FAN_TOLERANCE = 1e-7  # of their steps: what is said of a caustic has four digits
-FAN_SPACING = 0.1  # of points along them, the level being at 1: a caustic between two of them is located
-
-
-def caustic_notes(
-    refined: Refined, portrait: PhasePortrait, error: float, *, seed: int = 0
-) -> tuple[str, ...]:
-    """Where characteristics cross below the saddle of a well of a refinement; see `caustics_below`."""
-    wells = refined.wells or refined.network_wells
-    return caustics_below(refined.found.dynamics, wells, portrait, error, seed=seed)
+# Curves in search of a caustic; what is said of one has four digits.
+CAUSTIC_FAN: dict[str, Any] = {"most": 512, "tolerance": 1e-7, "spacing": 0.1}
 
 
 def caustics_below(
@@ -131,408 +363,177 @@ def caustics_below(
     if not error > NOTICEABLE:
         return ()
     notes = []
+    width = portrait.box[:, 1] - portrait.box[:, 0]
+    box = np.stack([portrait.box[:, 0] - width / 4, portrait.box[:, 1] + width / 4], axis=1)
     for well in wells:
         fan = adapted_fan(
-            dynamics, well.attractor, level=0.98 * well.level,
-            box=_widened(portrait.box), generator=np.random.default_rng(seed), most=FAN,
-            tolerance=FAN_TOLERANCE, spacing=FAN_SPACING,
+            dynamics, well.attractor, level=0.98 * well.level, box=box,
+            generator=np.random.default_rng(seed), **CAUSTIC_FAN,
         )  # fmt: skip
-        caustic = first_caustic(fan)
-        if caustic is not None:
-            start, where = position_text(well.attractor), position_text(caustic.position)
+        if (caustic := first_caustic(fan)) is not None:
+            where, value = caustic
             notes.append(
-                f"characteristics from the attractor {start} cross at a caustic from {where} on, where"
-                f" U = {2 * caustic.value:.4g}: V has no smooth form there, and no formula follows it"
+                f"characteristics from the attractor {position_text(well.attractor)} cross at a caustic from"
+                f" {position_text(where)} on, where U = {2 * value:.4g}: V has no smooth form there, and no"
+                " formula follows it"
             )
     return tuple(notes)
 
 
-def _widened(box: np.ndarray) -> np.ndarray:
-    width = box[:, 1] - box[:, 0]
-    return np.stack([box[:, 0] - width / 4, box[:, 1] + width / 4], axis=1)
+REACHED = 0.8  # of what was asked for, up to which a curve has to come where most end before
+SCOUTS = {"count": 32, "most": 64, "rounds": 2, "tolerance": 1e-5}  # curves in search of the level
+CURVES = {"count": 64, "most": 128, "rounds": 3}  # and for the comparison: cost, not accuracy
+GAP = 0.15  # of the ends of neighbours, the level being at 1
+TOLERANCE = 1e-7  # of the integrator's steps, relative; by so much V may err in each
+START, START_DEGREE = 1e-3, 6  # of the level: the series errs by 10⁻³ to the power 5/2; closer, curves bundle
+MOST_STEPS = 1500  # of a curve, where 30 to 130 are usual; stiff systems take as many as their rates differ
+SHEETS = 2e-3  # of the level: the margin with which `lowest_sheet` tells sheets apart
+DOUBLINGS = 8  # of the level in search of the saddle
+CLOSE = 0.6  # of a saddle to a curve, the level being at 1: close enough for a first estimate of V there
+BEYOND = 1.2  # of the level of the fan: what lies higher was not reached
+AGAIN = 1.5  # of the level found: a fan up to more than that has to be followed again, up to less
+STARTS = 0.9  # share of the recorded starts below the first level where no saddle is known
 
 
-@dataclass(frozen=True)
-class HeldOut:
-    """States and pairs of held-out recordings.
-
-    Attributes
-    ----------
-    points
-        Evenly spread states, shape ``(n, d)``.
-    pairs
-        Consecutive samples; None where f is given, and no motion was recorded.
-    described
-        What the points are, in words.
-    claimed
-        Share of the states of the region at which the formula claims to hold.
-    """
-
-    points: np.ndarray
-    pairs: SnapshotPairs | None
-    described: str = ""
-    claimed: float = 1.0
-
-    def __post_init__(self) -> None:
-        if not self.described:
-            object.__setattr__(self, "described", f"{len(self.points)} held-out states")
+def references_about(
+    dynamics: Dynamics, portrait: PhasePortrait, *, depths: Sequence[float] | None = None, seed: int = 0
+) -> tuple[Reference, ...]:
+    """V by characteristics about every attractor of a phase portrait; see `follow_well` for the depths."""
+    known = [np.inf] * len(portrait.attractors) if depths is None else depths
+    return tuple(
+        follow_well(dynamics, portrait, index, depth=depth, seed=seed) for index, depth in enumerate(known)
+    )
 
 
-def part_of(held_out: HeldOut, well: Well, region: BasinRegion, reference: Reference | None) -> HeldOut:
-    """What lies in a well below `SHARE` of its level: at the saddle itself V is stationary.
+def follow_well(
+    dynamics: Dynamics, portrait: PhasePortrait, index: int, *, depth: float = np.inf, seed: int = 0
+) -> Reference:
+    """V by characteristics about one attractor, as far as they may be believed.
 
     Parameters
     ----------
-    held_out
-        Of all recordings.
-    well
-        The formula and its level.
-    region
-        Which states lead to its attractor.
-    reference
-        Points of characteristics, which no fit saw either: they are added where fewer than `FEWEST`
-        held-out states lie in the well.
+    dynamics
+        f, twice differentiable, and D.
+    portrait, index
+        Where to compare, and which attractor.
+    depth
+        V at the lowest saddle, where it is known: higher up nothing is compared. Where curves bundle, none
+        of a few in search of it may come close.
+    seed
+        Draws directions where there are more than two states, and thins the points.
 
     Returns
     -------
-    HeldOut
-        States where the formula claims to hold: it makes no claim where its own residual is large, as at a
-        caustic. `claimed` has their share. Pairs count by their first sample: to ask where the second one
-        lies would be to choose the noise.
+    Reference
+        With a fault where characteristics give none.
     """
+    attractor = portrait.attractors[index].position
+    name = position_text(attractor)
+    region = RecordedRegion.of_basin(portrait, index)
 
-    def inside(x: np.ndarray) -> np.ndarray:
-        mask = (well.values(x) < SHARE * well.level) & well.reaches(x)
-        mask[mask] = ~region.across(x[mask])
-        return np.asarray(mask)
+    def without(fault: str) -> Reference:
+        return Reference(attractor, np.zeros((0, len(attractor))), np.zeros(0), np.nan, np.inf, fault)
 
-    points, pairs = held_out.points[inside(held_out.points)], held_out.pairs
-    further = ""
-    if len(points) < FEWEST and reference is not None:
-        own = len(points)
-        points = np.concatenate([points, reference.below(well.level)[0]])
-        further = f", {own} of them held out and, as these are few, the others reached by characteristics"
-    believed = well.believed(points)
-    described = f"{believed.sum()} of {len(points)} states of a well, where V claims to hold"
-    described += further or ", all held out"
-    share = float(believed.mean()) if len(points) else 0.0
-    if pairs is None:
-        return HeldOut(points[believed], None, described, share)
-    rows = inside(pairs.x0)
-    rows[rows] = well.believed(pairs.x0[rows])
-    kept = replace(
-        pairs, x0=pairs.x0[rows], xh=pairs.xh[rows], h=pairs.h[rows], recording=pairs.recording[rows]
-    )
-    return HeldOut(points[believed], kept, described, share)
+    try:
+        level = min(_level(dynamics, portrait, index, region, seed), depth)
+        fan = _fan(dynamics, portrait, attractor, SHARE * level, seed, **CURVES)
+    except (NumericalFailure, ValueError, np.linalg.LinAlgError) as failure:
+        return without(f"characteristics cannot be followed from the attractor {name}: {failure}")
+    lowest = lowest_sheet(fan)
+    kept = np.flatnonzero(lowest & region.recorded(fan.points))
+    if not len(kept):
+        return without(f"no characteristic from the attractor {name} stays where states were recorded")
+    scaled = (fan.points[kept] - attractor) @ fan.metric.T
+    distance = _spacing(len(attractor))
+    kept = kept[representative_subset(scaled, distance=distance, generator=np.random.default_rng(seed))]
+    x, values, ends = fan.points[kept], fan.values[kept], fan.ends
+    error = TOLERANCE * int(np.bincount(fan.curve).max()) + (0.0 if lowest.all() else SHEETS)
+    stopped = np.isin(ends, (End.STALLED, End.TIME, End.CAUSTIC)).mean() > 0.5
+    if len(values) >= FEWEST and (values.max() >= REACHED * fan.level or not stopped):
+        return Reference(attractor, x, values, level, error)
+    if np.isin(ends, (End.STALLED, End.TIME)).mean() > 0.5:
+        why = "they are too stiff: leave out the fastest states, or record their slow motion alone"
+    elif (ends == End.CAUSTIC).any():
+        lowest_caustic = 2 * float(fan.caustic_values.min())
+        why = f"they cross at caustics from U = {lowest_caustic:.4g} on: record less far from the attractor"
+    elif (ends == End.LEVEL).mean() > 0.5:
+        why = "they draw together, its rates being too different: leave out the fastest states"
+    else:
+        why = "they leave the recorded states: record more of them about the attractor"
+    fault = f"characteristics from the attractor {name} give {len(values)} points to compare with, as {why}"
+    return Reference(attractor, x, values, level, error, fault)
 
 
-ALONE = "only one of the two routes that the study names led to a formula"
-HARMLESS = 1e-6  # a difference of the routes that no error needs to explain
+def _level(
+    dynamics: Dynamics, portrait: PhasePortrait, index: int, region: RecordedRegion, seed: int
+) -> float:
+    """V at which the first characteristic comes to another basin, or to rest at a saddle.
+
+    Where there is neither, 1.1 times as much as most recorded starts have of V in the quadratic
+    approximation, so that `SHARE` of it is about that.
+    """
+    attractor = portrait.attractors[index].position
+    hessian = hessian_at(dynamics, attractor)
+
+    def quadratic(x: np.ndarray) -> np.ndarray:
+        return np.asarray(0.5 * np.einsum("ni,ij,nj->n", x - attractor, hessian, x - attractor))
+
+    tops = np.array([one.position for one in portrait.saddles[index]]).reshape(-1, len(attractor))
+    starts = portrait.descents.paths[portrait.descents.ends == index][:, 0]
+    first = float(np.quantile(quadratic(starts), STARTS))
+    level = min(first, float(quadratic(tops).min(initial=np.inf)))
+    known: float | None = None
+    for _ in range(DOUBLINGS):
+        fan = _fan(dynamics, portrait, attractor, level, seed, **SCOUTS)
+        across = region.across(fan.points) & (fan.values > 0)
+        # One state on the wrong side may be a gap between recorded ones: the next has to lie there too.
+        across[:-1] &= across[1:] & (fan.curve[:-1] == fan.curve[1:])
+        across[-1] = False
+        ends = fan.values[fan.last]
+        left = np.concatenate([fan.values[across], ends[fan.ends == End.REST], _heights(fan, tops)])
+        if len(left) and left.min() <= BEYOND * level:
+            lowest = float(left.min())
+            if level <= AGAIN * lowest:
+                return lowest
+            known, level = lowest, BEYOND * lowest  # the same again, where curves lie closer together
+            continue
+        if known is not None:
+            return known
+        if not len(tops):
+            return level / SHARE
+        if not (fan.ends == End.LEVEL).any():
+            return float(ends.max())
+        level *= 2
+    raise NumericalFailure("they come to no saddle; record the way there")
 
 
-def common_tests(
-    candidate: Candidate,
-    found: AnyField,
-    held_out: HeldOut,
-    references: Sequence[Reference],
-    options: CertificateOptions,
-    error: float,
+def _heights(fan: Fan, tops: np.ndarray) -> np.ndarray:
+    """V at the saddles that curves come close to, to second order, shape ``(m,)``: curves turn off before."""
+    lowest = lowest_sheet(fan)
+    tree = cKDTree((fan.points[lowest] - fan.attractor) @ fan.metric.T)
+    distance, nearest = tree.query((tops - fan.attractor) @ fan.metric.T)
+    nearest = np.flatnonzero(lowest)[nearest[distance < CLOSE]]
+    offset = tops[distance < CLOSE] - fan.points[nearest]
+    slope = np.sum(offset * fan.momenta[nearest], axis=1)
+    bend = np.einsum("ni,nij,nj->n", offset, fan.hessians[nearest], offset) / 2
+    return np.maximum(fan.values[nearest] + slope + bend, fan.values[nearest] / 2)
+
+
+def _fan(
+    dynamics: Dynamics,
+    portrait: PhasePortrait,
+    attractor: np.ndarray,
     level: float,
     seed: int,
-) -> tuple[dict[str, Verdict], float]:
-    """The tests of either scope, and the error to be stated after them."""
-    followed, error, _ = check_characteristics(
-        candidate, found, references, error=error, options=options, level=level, seed=seed
-    )
-    tests = {
-        "hamilton_jacobi": check_hamilton_jacobi(candidate, found, limit=options.hamilton_jacobi),
-        "branch": check_branch(candidate, found, limit=options.branch, seed=seed),
-    }
-    if held_out.pairs is not None and not isinstance(found, GivenField):
-        tests["descent"] = check_descent(candidate, found, held_out.pairs, options=options, error=error)
-    tests["characteristics"] = followed
-    return tests, error
-
-
-def concluded(
-    tests: dict[str, Verdict], error: float, portrait: PhasePortrait, scope: str, tested_on: str
-) -> Certificate:
-    """The certificate of tests by name, with whatever is wrong with the phase portrait as a fault of them."""
-    fault = portrait.fault()
-    if fault is not None:
-        limit = tests["branch"].limit if "branch" in tests else 0.0
-        tests["branch"] = Verdict(np.inf, limit, False, fault)
-    refused = [verdict.reason for verdict in tests.values() if not verdict.passed]
-    return Certificate(tests, error, "; ".join(dict.fromkeys(refused)), scope, tested_on)
-
-
-def worse_of(one: Verdict | None, two: Verdict) -> Verdict:
-    """Of two verdicts of one test the one that decides."""
-    if one is None:
-        return two
-    return max(one, two, key=lambda verdict: (not verdict.passed, verdict.value / (verdict.limit or 1.0)))
-
-
-def same_place(one: np.ndarray, two: np.ndarray) -> bool:
-    """Whether two attractors are one: both are the same root of the same f."""
-    return np.array_equal(one, two)
-
-
-def candidate_of_well(well: Well, portrait: PhasePortrait, points: np.ndarray) -> Candidate:
-    """V of a well, to be tested on points ``(n, d)``."""
-    mine = [one for one in portrait.attractors if same_place(one.position, well.attractor)]
-    return Candidate(well.values, well.gradients, well.hessians, None, points, mine)
-
-
-def sublevel_points(wells: Sequence[Well]) -> list[np.ndarray]:
-    """Points of the fit of each well, below a share of its level: where two routes are compared."""
-    return [well.points[well.values(well.points) < SHARE * well.level] for well in wells]
-
-
-def error_of_well(well: Well, found: IdentifiedField, portrait: PhasePortrait, seed: int) -> float:
-    """The error of V that is stated of a well, over the points of its fit."""
-    return stated_error(candidate_of_well(well, portrait, sublevel_points([well])[0]), found, seed=seed)[0]
-
-
-def explained_difference(options: CertificateOptions, *errors: float) -> float:
-    """Difference of two routes that their errors explain; one that cannot be stated explains nothing."""
-    return HARMLESS + sum(min(error, options.error) for error in errors)
-
-
-def certify_formulas(
-    formulas: SymbolicDecomposition,
-    found: IdentifiedField,
-    portrait: PhasePortrait,
-    held_out: HeldOut,
-    *,
-    options: CertificateOptions,
-    prediction: Verdict,
-    references: Sequence[Reference],
-    relative_error: float = 0.0,
-    wells: Sequence[Well] = (),
-    compared: bool = False,
-    seed: int = 0,
-) -> Certificate:
-    """Certificate of one formula for the whole region.
-
-    Parameters
-    ----------
-    formulas
-        V and g.
-    found, portrait
-        F, identified without V, and the phase portrait that follows from it.
-    held_out
-        States and pairs of the region for which the formula claims to hold.
-    options
-        The limits.
-    prediction
-        The verdict on f.
-    references
-        V by characteristics about every attractor.
-    relative_error
-        Relative standard error of V from the uncertainty of f.
-    wells
-        By the local route, to be compared with.
-    compared
-        Whether both routes were asked for: then a formula that only one of them found is refused.
-    seed
-        Draws of f, and the points on which the error is estimated.
-    """
-    candidate = _of_formulas(formulas, held_out.points, portrait, relative_error)
-    return _certify(
-        candidate, found, portrait, held_out, options=options, prediction=prediction,
-        references=references, wells=wells, compared=compared, seed=seed,
+    **options: Any,
+) -> Fan:
+    return adapted_fan(
+        dynamics, attractor, level=level, box=portrait.box, generator=np.random.default_rng(seed),
+        gap=GAP, spacing=_spacing(len(attractor)), most_steps=MOST_STEPS, start=START,
+        start_degree=START_DEGREE if len(attractor) <= 4 else 4, **{"tolerance": TOLERANCE} | options,
     )  # fmt: skip
 
 
-def _certify(
-    candidate: Candidate,
-    found: IdentifiedField,
-    portrait: PhasePortrait,
-    held_out: HeldOut,
-    *,
-    options: CertificateOptions,
-    prediction: Verdict,
-    references: Sequence[Reference],
-    wells: Sequence[Well],
-    compared: bool,
-    seed: int,
-) -> Certificate:
-    error, _ = stated_error(candidate, found, seed=seed)
-    tests, error = common_tests(candidate, found, held_out, references, options, error, np.inf, seed)
-    tests["identity"] = check_identity(candidate, found, limit=options.identity)
-    from_field = STATED * candidate.relative_error
-    tests["error"] = check_error(error - from_field, limit=options.error, from_field=from_field)
-    if portrait.attractors:
-        tests["existence"] = check_existence(found, portrait, seed=seed)
-    if wells:
-        # The local route shares the error of f, and has the rest of its own.
-        own = [error_of_well(well, found, portrait, seed) for well in wells]
-        tests["agreement"] = check_agreement(
-            candidate.values, wells, sublevel_points(wells),
-            limit=explained_difference(options, error, max(own)) + 6 * candidate.relative_error,
-        )  # fmt: skip
-    elif compared:
-        tests["agreement"] = Verdict(np.inf, 0.0, False, ALONE)
-    tests["prediction"] = prediction
-    return concluded(tests, error, portrait, "region", held_out.described)
-
-
-def _of_formulas(
-    formulas: SymbolicDecomposition, points: np.ndarray, portrait: PhasePortrait, relative_error: float
-) -> Candidate:
-    symbols, d = formulas.symbols, len(formulas.symbols)
-    second = [slope.diff(symbol) for slope in formulas.gradient for symbol in symbols]
-    hessian = compile_formulas(second, symbols)
-    together, gradient = formulas.evaluate, formulas.evaluate_gradient
-    return Candidate(
-        values=lambda x: together(np.ascontiguousarray(x.T))[0],
-        gradients=lambda x: gradient(np.ascontiguousarray(x.T)).T,
-        hessians=lambda x: hessian(np.ascontiguousarray(x.T)).T.reshape(-1, d, d),
-        circulatory=lambda x: together(np.ascontiguousarray(x.T))[1 : d + 1].T,
-        points=points,
-        attractors=portrait.attractors,
-        relative_error=relative_error,
-    )
-
-
-LEAST_CLAIMED = 0.5  # of the states in a well: a formula that holds at fewer is none of the well (a choice)
-
-
-def certify_wells(
-    refined: Refined,
-    portrait: PhasePortrait,
-    held_out: HeldOut,
-    *,
-    options: CertificateOptions,
-    prediction: Verdict,
-    references: Sequence[Reference],
-    compared: bool = True,
-    seed: int = 0,
-) -> Certificate:
-    """Certificate of one formula for each attractor, the worst of them deciding.
-
-    The Hessian of the local route is M by construction, so that its branch test passes by itself; what tests
-    it are the characteristics. Each formula is tested on held-out states of its own well where it claims to
-    hold, and it has to claim more than half of them.
-    """
-    found = refined.found
-    wells = refined.wells or refined.network_wells
-    each = _of_each(wells, found, portrait, held_out, options, references, seed)
-    tests, error = each.tests, each.error
-    if portrait.attractors:
-        tests["existence"] = check_existence(found, portrait, seed=seed)
-    if refined.wells and refined.network_wells:
-        pairs = [
-            (one, two)
-            for one in refined.network_wells
-            for two in refined.wells
-            if same_place(one.attractor, two.attractor)
-        ]
-        for one, two in pairs:
-            its = error_of_well(one, found, portrait, seed)
-            verdict = check_agreement(
-                one.values, [two], sublevel_points([two]), limit=explained_difference(options, error, its)
-            )
-            tests["agreement"] = worse_of(tests.get("agreement"), verdict)
-        if len(pairs) < len(portrait.attractors):
-            tests["agreement"] = Verdict(
-                np.inf, 0.0, False, "the network route found no formula for some well"
-            )
-    elif compared:
-        tests["agreement"] = Verdict(np.inf, 0.0, False, ALONE)
-    tests["prediction"] = prediction
-    return concluded(tests, error, portrait, "wells", each.tested_on)
-
-
-def certify_given_wells(
-    wells: Sequence[Well],
-    found: GivenField,
-    portrait: PhasePortrait,
-    points: np.ndarray,
-    *,
-    options: CertificateOptions,
-    references: Sequence[Reference],
-    seed: int = 0,
-) -> Certificate:
-    """Certificate of one formula for each attractor of given equations, the worst of them deciding.
-
-    Nothing was recorded: what tests predictions, motion, and whether uncertain wells exist has no object. The
-    others are those of `certify_wells`.
-
-    Parameters
-    ----------
-    wells
-        V about the attractors.
-    found, portrait
-        f and D, and what follows from them.
-    points
-        States of the domain that no fit saw, shape ``(n, d)``.
-    options, references, seed
-        As for `certify_wells`.
-    """
-    each = _of_each(wells, found, portrait, HeldOut(points, None), options, references, seed)
-    return concluded(each.tests, each.error, portrait, "wells", each.tested_on)
-
-
-@dataclass(frozen=True)
-class _OfEach:
-    """Tests of one formula for each attractor, the worst verdict of each test, and the error to be stated."""
-
-    tests: dict[str, Verdict]
-    error: float
-    tested_on: str
-
-
-def _of_each(
-    wells: Sequence[Well],
-    found: AnyField,
-    portrait: PhasePortrait,
-    held_out: HeldOut,
-    options: CertificateOptions,
-    references: Sequence[Reference],
-    seed: int,
-) -> _OfEach:
-    tests: dict[str, Verdict] = {}
-    error = 0.0 if wells else np.inf
-    own_error, from_field = error, 0.0
-    tested = []
-    advice = "" if isinstance(found, GivenField) else "record more there, or "
-    for well in wells:
-        own = [
-            place for place, one in enumerate(portrait.attractors) if same_place(one.position, well.attractor)
-        ]
-        mine = [one for one in references if same_place(one.attractor, well.attractor)]
-        part = part_of(held_out, well, basin_region(portrait, own[0]), mine[0] if mine else None)
-        tested.append(part.described)
-        if part.claimed < LEAST_CLAIMED:
-            reason = (
-                f"V claims to hold at {part.claimed:.0%} of the held-out states in the well about"
-                f" {position_text(well.attractor)}: {advice}raise refinement.degrees"
-            )
-            tests["hamilton_jacobi"] = Verdict(np.inf, options.hamilton_jacobi, False, reason)
-            error = own_error = np.inf
-            continue
-        candidate = candidate_of_well(well, portrait, part.points)
-        its, _ = stated_error(candidate, found, seed=seed)
-        # Characteristics follow the same f: what f's uncertainty adds explains no difference from them.
-        made, its = common_tests(candidate, found, part, mine, options, its, well.level, seed)
-        uncertain = STATED * _error_from_field(well, found, part.points, seed)
-        own_error, from_field = max(own_error, its), max(from_field, uncertain)
-        its += uncertain
-        for name, verdict in made.items():
-            tests[name] = worse_of(tests.get(name), verdict)
-        error = max(error, its)
-    missing = len(portrait.attractors) - len(wells)
-    if missing or not wells:
-        reason = f"{missing} of {len(portrait.attractors)} attractors have no formula"
-        tests["branch"] = Verdict(np.inf, options.branch, False, reason)
-    tests["error"] = check_error(own_error, limit=options.error, from_field=from_field)
-    return _OfEach(tests, error, "; ".join(dict.fromkeys(tested)))
-
-
-def _error_from_field(well: Well, found: AnyField, points: np.ndarray, seed: int) -> float:
-    """Relative standard error of V over points, from what is not known of f."""
-    generator = np.random.default_rng(seed)
-    x = points[generator.choice(len(points), min(ERROR_POINTS, len(points)), replace=False)]
-    return relative_error(found, well.gradients, well.attractor, x, well.values(x))
+def _spacing(dimension: int) -> float:
+    """Distance of points along curves, the level being at 1; one state has two curves only."""
+    return 0.1 if dimension > 1 else 0.02

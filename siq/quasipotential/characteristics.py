@@ -1,8 +1,4 @@
-"""Characteristics of the Hamilton–Jacobi equation: V along curves that leave an attractor.
-
-Positions x, momenta p, the value V along the way, and the tangents (X, P) that tell how neighbouring
-trajectories lie. The equations stand in `siq.quasipotential.characteristics`; here they are evaluated for
-many rows at once.
+"""Characteristics of the Hamilton–Jacobi equation: V along curves that leave an attractor, and its errors.
 
 From the Hamiltonian ``H = p·f + p·Dp`` with ``p = ∇V``:
 
@@ -19,26 +15,34 @@ Neighbouring curves may meet. With the curves go their tangents ``X = ∂x, P = 
 with ``G_ik = J_ik + 2 ((∂_k D)p)_i``, which is J where D is constant; and where ``det X`` vanishes
 lies a *caustic*: V has no derivative there, and what the curve carries beyond is not the quasipotential.
 Every curve ends at its first caustic. A curve can lose its meaning before that, where another sheet arrives
-with less action: see `lowest_sheet`.
+with less action: see `lowest_sheet`. Curves leave an attractor at rates that differ by direction, so that
+evenly spread starts end in a few bundles; new curves are put between neighbours that end far apart.
 
-Curves leave an attractor at rates that differ by direction, so that evenly spread starts end in a few bundles
-along the fastest directions. New curves are therefore put between neighbours that end far apart.
+Where V is a formula, the curve that ends at x is the ascending path ``dx/dt = f + 2D∇V``, which can be
+followed back. Changes δf and δD change V, to first order, by ``δV(x) = -∫ (p·δf + p·δD p) dt`` along it: the
+action is stationary there, so that the path itself need not be changed. The integral is linear in the
+coefficients of f and of D; their covariance does the rest.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 from enum import IntEnum
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 from scipy.spatial import ConvexHull, cKDTree
 
+from siq.inference.field_estimate import AnyField, GivenField, IdentifiedField
 from siq.numerics.integration import dormand_prince_step, next_step
 from siq.quasipotential.power_series import quasipotential_series
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import hessian_at
+
+Function = Callable[[np.ndarray], np.ndarray]
+norm = partial(np.linalg.norm, axis=1)
 
 
 class HamiltonianFlow:
@@ -269,150 +273,92 @@ def characteristics(
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     series = quasipotential_series(dynamics, flow.center, degree=start_degree)
     x = flow.center + np.sqrt(start) * directions @ flow.units.T
-    initial = flow.pack(x, series.gradient(x), series.evaluate(x), series.hessian(x))
+    initial = flow.pack(x, series.gradients(x), series.values(x), series.hessians(x))
     if time_limit is None:
         time_limit = LONGEST_TIME / np.abs(np.linalg.eigvals(flow.jacobian).real).min()
+    box = np.asarray(box, dtype=float)
 
-    run = _Run(flow, np.asarray(box, dtype=float), spacing, time_limit, tolerance, most_steps)
-    states, curve, ends = run.follow(initial)
-    met = ends[curve] == End.CAUSTIC
-    met &= np.append(curve[1:] != curve[:-1], True)
-    points, momenta, values, hessians = flow.unpack(states)
+    def relative(error: np.ndarray, state: np.ndarray) -> np.ndarray:
+        y, q, v, _, _ = flow.parts(state)
+        y_error, q_error, v_error, x_error, p_error = flow.parts(error)
+        worst = norm(np.concatenate([y_error, q_error], axis=1)) / norm(np.concatenate([y, q], axis=1))
+        worst = np.maximum(worst, np.abs(v_error) / v)
+        frames = np.concatenate([x_error, p_error], axis=1)
+        return np.maximum(worst, np.linalg.norm(frames, axis=(1, 2))) / tolerance
+
+    def reason(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+        """An `End` where a step from `before` to `after` leads to one, otherwise -1."""
+        y, _, v, tangents, _ = flow.parts(after)
+        found = np.full(len(after), -1)
+        x = flow.points(y)
+        found[np.any((x < box[:, 0]) | (x > box[:, 1]), axis=1)] = End.BOX
+        found[v >= 1] = End.LEVEL
+        found[crossed(flow.parts(before)[3], tangents)] = End.CAUSTIC
+        return found
+
+    # Many curves at once, each with a step of its own, until each has ended.
+    count = len(initial)
+    states, times, ends = initial.copy(), np.zeros(count), np.full(count, End.STALLED, dtype=int)
+    steps = np.full(count, 0.1 / np.linalg.norm(flow.jacobian, 2))
+    last_steps = np.zeros(count)
+    running = np.arange(count)
+    kept, kept_curves = [initial], [running]
+    for _ in range(most_steps):
+        if not len(running):
+            break
+        y_rate = flow.parts(flow.rates(states[running]))[0]
+        step = np.minimum(steps[running], spacing / np.maximum(norm(y_rate), 1e-300))
+        step = np.minimum(step, time_limit - times[running])
+        with np.errstate(all="ignore"):
+            new, error = dormand_prince_step(flow.rates, states[running], step)
+            size = relative(error, states[running])
+        accepted = size <= 1
+        steps[running] = next_step(step, size)
+        ended = np.zeros(len(running), dtype=bool)
+        ended[accepted] = reason(states[running[accepted]], new[accepted]) >= 0
+        last_steps[running[ended]] = step[ended]
+        on = running[accepted & ~ended]
+        states[on] = flow.orthonormal(new[accepted & ~ended])
+        times[on] += step[accepted & ~ended]
+        kept.append(states[on])
+        kept_curves.append(on)
+        late = times[running] >= time_limit * (1 - 1e-12)
+        ends[running[late]] = End.TIME
+        # To stay longer would be wrong as well as slow: from there on errors of p grow instead of decay.
+        y, q, *_ = flow.parts(states[running])
+        resting = norm(q) < RESTING * norm(y)
+        ends[running[resting]] = End.REST
+        stalled = steps[running] < 1e-13 * time_limit
+        running = running[~(ended | late | resting | stalled)]
+    # The last states before the ends within a step are found by halving it.
+    crossing = np.flatnonzero(last_steps)
+    before, low, high = states[crossing], np.zeros(len(crossing)), last_steps[crossing]
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2
+        found = reason(before, dormand_prince_step(flow.rates, before, middle)[0])
+        low, high = np.where(found >= 0, low, middle), np.where(found >= 0, middle, high)
+    kept.append(dormand_prince_step(flow.rates, before, low)[0])
+    ends[crossing] = reason(before, dormand_prince_step(flow.rates, before, high)[0])
+    curve = np.concatenate([*kept_curves, crossing])
+    order = np.argsort(curve, kind="stable")
+    curve = curve[order]
+    met = (ends[curve] == End.CAUSTIC) & np.append(curve[1:] != curve[:-1], True)
+    points, momenta, values, hessians = flow.unpack(np.concatenate(kept)[order])
     return Fan(
-        attractor=flow.center,
-        hessian=flow.hessian,
-        level=level,
-        points=points[~met],
-        momenta=momenta[~met],
-        values=values[~met],
-        hessians=hessians[~met],
-        curve=curve[~met],
-        directions=directions,
-        ends=ends,
-        caustic_points=points[met],
-        caustic_values=values[met],
-        caustic_curves=curve[met],
-    )
+        flow.center, flow.hessian, level, points[~met], momenta[~met], values[~met], hessians[~met],
+        curve[~met], directions, ends, points[met], values[met], curve[met],
+    )  # fmt: skip
 
 
 def join(first: Fan, second: Fan) -> Fan:
     """Two fans of the same attractor and level as one; the curves of the second are counted on."""
     shift = len(first.directions)
-
-    def both(name: str) -> np.ndarray:
-        return np.concatenate([getattr(first, name), getattr(second, name)])
-
-    return replace(
-        first,
-        points=both("points"),
-        momenta=both("momenta"),
-        values=both("values"),
-        hessians=both("hessians"),
-        curve=np.concatenate([first.curve, second.curve + shift]),
-        directions=both("directions"),
-        ends=both("ends"),
-        caustic_points=both("caustic_points"),
-        caustic_values=both("caustic_values"),
-        caustic_curves=np.concatenate([first.caustic_curves, second.caustic_curves + shift]),
-    )
-
-
-class _Run:
-    """Many curves at once, each with a step of its own, until each has ended."""
-
-    def __init__(
-        self,
-        flow: HamiltonianFlow,
-        box: np.ndarray,
-        spacing: float,
-        time_limit: float,
-        tolerance: float,
-        most_steps: int,
-    ) -> None:
-        self.flow, self.box, self.spacing = flow, box, spacing
-        self.time_limit, self.tolerance, self.most_steps = time_limit, tolerance, most_steps
-
-    def follow(self, initial: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """States of all points, the curve of each, and why each curve ends."""
-        count = len(initial)
-        states, times, ends = initial.copy(), np.zeros(count), np.full(count, End.STALLED, dtype=int)
-        steps = np.full(count, 0.1 / np.linalg.norm(self.flow.jacobian, 2))
-        last_steps = np.zeros(count)
-        running = np.arange(count)
-        kept, kept_curves = [initial], [running]
-        for _ in range(self.most_steps):
-            if not len(running):
-                break
-            step = np.minimum(steps[running], self._longest(states[running]))
-            step = np.minimum(step, self.time_limit - times[running])
-            with np.errstate(all="ignore"):
-                new, error = dormand_prince_step(self.flow.rates, states[running], step)
-                relative = self._relative(error, states[running])
-            accepted = relative <= 1
-            steps[running] = next_step(step, relative)
-            ended = np.zeros(len(running), dtype=bool)
-            ended[accepted] = self._ended(states[running[accepted]], new[accepted])
-            last_steps[running[ended]] = step[ended]
-            on = running[accepted & ~ended]
-            states[on] = self.flow.orthonormal(new[accepted & ~ended])
-            times[on] += step[accepted & ~ended]
-            kept.append(states[on])
-            kept_curves.append(on)
-            late = times[running] >= self.time_limit * (1 - 1e-12)
-            ends[running[late]] = End.TIME
-            resting = self._resting(states[running])
-            ends[running[resting]] = End.REST
-            stalled = steps[running] < 1e-13 * self.time_limit
-            running = running[~(ended | late | resting | stalled)]
-        crossing = np.flatnonzero(last_steps)
-        final, ends[crossing] = self._locate(states[crossing], last_steps[crossing])
-        all_states = np.concatenate([*kept, final])
-        curves = np.concatenate([*kept_curves, crossing])
-        order = np.argsort(curves, kind="stable")
-        return all_states[order], curves[order], ends
-
-    def _longest(self, state: np.ndarray) -> np.ndarray:
-        y_rate = self.flow.parts(self.flow.rates(state))[0]
-        return self.spacing / np.maximum(np.linalg.norm(y_rate, axis=1), 1e-300)
-
-    def _relative(self, error: np.ndarray, state: np.ndarray) -> np.ndarray:
-        y, q, v, _, _ = self.flow.parts(state)
-        y_error, q_error, v_error, x_error, p_error = self.flow.parts(error)
-        distance = np.linalg.norm(np.concatenate([y, q], axis=1), axis=1)
-        worst = np.linalg.norm(np.concatenate([y_error, q_error], axis=1), axis=1) / distance
-        worst = np.maximum(worst, np.abs(v_error) / v)
-        frames = np.concatenate([x_error, p_error], axis=1)
-        return np.maximum(worst, np.linalg.norm(frames, axis=(1, 2))) / self.tolerance
-
-    def _resting(self, state: np.ndarray) -> np.ndarray:
-        # To stay longer would be wrong as well as slow: from there on errors of p grow instead of decay.
-        y, q, _, _, _ = self.flow.parts(state)
-        return np.linalg.norm(q, axis=1) < RESTING * np.linalg.norm(y, axis=1)
-
-    def _ended(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-        return self._reason(before, after) >= 0
-
-    def _reason(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-        """An `End` where a step from `before` to `after` leads to one, otherwise -1."""
-        y, _, v, tangents, _ = self.flow.parts(after)
-        reason = np.full(len(after), -1)
-        x = self.flow.points(y)
-        reason[np.any((x < self.box[:, 0]) | (x > self.box[:, 1]), axis=1)] = End.BOX
-        reason[v >= 1] = End.LEVEL
-        reason[crossed(self.flow.parts(before)[3], tangents)] = End.CAUSTIC
-        return reason
-
-    def _locate(self, before: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The last states before the ends within a step, and the reasons."""
-        low, high, reason = np.zeros(len(step)), step.copy(), np.full(len(step), -1)
-        for _ in range(HALVINGS):
-            middle = (low + high) / 2
-            found = self._reason(before, dormand_prince_step(self.flow.rates, before, middle)[0])
-            reason = np.where(found >= 0, found, reason)
-            low, high = np.where(found >= 0, low, middle), np.where(found >= 0, middle, high)
-        state = dormand_prince_step(self.flow.rates, before, low)[0]
-        final = dormand_prince_step(self.flow.rates, before, high)[0]
-        return state, self._reason(before, final)
+    names = [one.name for one in fields(Fan) if one.name not in ("attractor", "hessian", "level")]
+    both = {name: [getattr(first, name), getattr(second, name)] for name in names}
+    for name in ("curve", "caustic_curves"):
+        both[name][1] = both[name][1] + shift
+    joined: dict[str, Any] = {name: np.concatenate(pair) for name, pair in both.items()}
+    return replace(first, **joined)
 
 
 def crossed(before: np.ndarray, after: np.ndarray) -> np.ndarray:
@@ -433,22 +379,6 @@ CLOSEST = 1e-12  # of directions: what cannot be told apart is not divided furth
 CHUNK = 2048  # numerical: curves followed together, as fit into the cache
 MOST_PARTS = 8  # into which a gap is divided at once
 BENT = 0.03  # of the level: a larger term of second order is no correction
-
-
-@dataclass(frozen=True)
-class Caustic:
-    """Where the quasipotential of a fan first has no derivative for lack of a single direction.
-
-    Attributes
-    ----------
-    position
-        Shape ``(d,)``.
-    value
-        V there, not U.
-    """
-
-    position: np.ndarray
-    value: float
 
 
 def even_directions(dimension: int, count: int, *, generator: np.random.Generator) -> np.ndarray:
@@ -510,8 +440,8 @@ def adapted_fan(
     return fan
 
 
-def first_caustic(fan: Fan) -> Caustic | None:
-    """The lowest caustic that a curve of the fan meets, or None.
+def first_caustic(fan: Fan) -> tuple[np.ndarray, float] | None:
+    """The lowest caustic that a curve of the fan meets, its position and V there; or None.
 
     V is the value along the curve. The lowest sheet may have ended before; and curves between those of the
     fan may meet the caustic a little lower.
@@ -519,7 +449,7 @@ def first_caustic(fan: Fan) -> Caustic | None:
     if not len(fan.caustic_values):
         return None
     lowest = int(np.argmin(fan.caustic_values))
-    return Caustic(fan.caustic_points[lowest], float(fan.caustic_values[lowest]))
+    return fan.caustic_points[lowest], float(fan.caustic_values[lowest])
 
 
 def lowest_sheet(fan: Fan, *, distance: float = 0.06, margin: float = 2e-3) -> np.ndarray:
@@ -629,3 +559,157 @@ def _neighbours(directions: np.ndarray) -> np.ndarray:
     size = facets.shape[1]
     edges = np.concatenate([facets[:, [a, b]] for a in range(size) for b in range(a)])
     return np.unique(np.sort(edges, axis=1), axis=0)
+
+
+RELAXATIONS = 12.0  # times 1/slowest rate: e^-12 of V is left at the beginning of an ascending path
+HEUN_STEP = 0.3  # of 1/fastest rate: Heun's rule is then good to some per cent of an error
+FEWEST_STEPS, MOST_HEUN_STEPS = 200, 4000  # numerical
+FAR = 3.0  # of the box's width from its middle: a path so far out does not come from the attractor
+ARRIVED = 0.02  # of the box's width: as far from the attractor a path may begin, V being known by its square
+UNKNOWN = 0.1  # share of the points whose error may stay unknown, at the rim of a well
+
+
+def fastest_rate(dynamics: Dynamics, x: np.ndarray, width: np.ndarray) -> float:
+    """The 99 % quantile over points of the norm of the Jacobian, states being measured in their widths."""
+    width = np.where(width > 0, width, 1.0)
+    scaled = dynamics.jacobian(x) * width / width[:, None]
+    return float(np.quantile(np.linalg.norm(scaled, axis=(1, 2)), 0.99))
+
+
+def ascending_integrals(
+    gradient: Function,
+    dynamics: Dynamics,
+    x: np.ndarray,
+    integrand: Callable[..., np.ndarray],
+    *,
+    middle: np.ndarray,
+    width: np.ndarray,
+    slowest: float,
+    fastest: float,
+    fewest_steps: int = FEWEST_STEPS,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Integrals over time along the paths ``dx/dt = f + 2D∇V`` that end at points, by Heun's rule.
+
+    Parameters
+    ----------
+    gradient
+        ∇V, points ``(n, d)`` to ``(n, d)``.
+    dynamics
+        f and D.
+    x
+        Where the paths end, shape ``(n, d)``.
+    integrand
+        Of points, ∇V, f and D∇V there: to ``(n, k)``.
+    middle, width
+        Of the box of the states, shape ``(d,)``: a path that leaves it by `FAR` times its width in any state
+        has run away, whatever the units.
+    slowest, fastest
+        Rates that set how long, and how finely, the paths are followed back.
+    fewest_steps
+        Of each path.
+
+    Returns
+    -------
+    integrals
+        Shape ``(n, k)``.
+    beginnings
+        Where the paths come from, shape ``(n, d)``.
+    lost
+        Mask of those that run away, shape ``(n,)``.
+    """
+    steps = int(np.clip(RELAXATIONS / slowest * fastest / HEUN_STEP, fewest_steps, MOST_HEUN_STEPS))
+    step = RELAXATIONS / slowest / steps
+    far = FAR * np.where(width > 0, width, 1.0)
+
+    def terms(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        slope = gradient(points)
+        return slope, dynamics.drift(points), dynamics.diffusion.push(points, slope)
+
+    lost = np.zeros(len(x), dtype=bool)
+    with np.errstate(over="ignore", invalid="ignore"):
+        slope, flow, push = terms(x)
+        velocity, before = -(flow + 2 * push), integrand(x, slope, flow, push)
+        total = np.zeros_like(before)
+        for _ in range(steps):
+            _, flow, push = terms(x + step * velocity)
+            moved = x + step / 2 * (velocity - (flow + 2 * push))
+            lost |= ~(np.abs(moved - middle) < far).all(axis=1)
+            x = np.where(lost[:, None], x, moved)
+            slope, flow, push = terms(x)
+            velocity, after = -(flow + 2 * push), integrand(x, slope, flow, push)
+            total += step / 2 * (before + after)
+            before = after
+    return total, x, lost
+
+
+def potential_slopes(
+    found: IdentifiedField, gradient: Function, attractor: np.ndarray, x: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """∂V/∂Ξ at points, by every coefficient that f might have, and ∂V/∂θ by those of an estimated εD.
+
+    Shapes ``(n, q, d)`` and ``(n, k)``; NaN where no ascending path comes from the attractor. The arguments
+    are those of `potential_errors`.
+    """
+    dynamics, q, d = found.dynamics, found.library.size, found.library.dimension
+    rates = -np.linalg.eigvals(dynamics.jacobian(attractor[None])[0]).real
+    places = np.concatenate([x, attractor[None]])
+    # Of a few points some state may hardly differ: paths to them use what V allows them in each.
+    hessian, offset = hessian_at(dynamics, attractor), x - attractor
+    highest = float(np.einsum("ni,ij,nj->n", offset, hessian, offset).max())
+    width = np.maximum(np.ptp(places, axis=0), np.sqrt(highest * np.diag(np.linalg.inv(hessian))))
+    width = np.where(width > 0, width, 1.0)
+
+    def by_coefficients(
+        points: np.ndarray, slope: np.ndarray, flow: np.ndarray, push: np.ndarray
+    ) -> np.ndarray:
+        of_field = np.einsum("nq,nd->nqd", found.library.evaluate(points), slope).reshape(len(points), -1)
+        return np.column_stack([of_field, found.noise_slopes(points, slope)])
+
+    total, beginnings, lost = ascending_integrals(
+        gradient, dynamics, x, by_coefficients, middle=(places.max(axis=0) + places.min(axis=0)) / 2,
+        width=width, slowest=rates.min(), fastest=fastest_rate(dynamics, x, width),
+    )  # fmt: skip
+    lost |= ~(np.abs(beginnings - attractor) < ARRIVED * width).all(axis=1)
+    total = np.where(lost[:, None], np.nan, -total)
+    return total[:, : q * d].reshape(-1, q, d), total[:, q * d :]
+
+
+def potential_errors(found: AnyField, gradient: Function, attractor: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Standard errors of ``V(x) - V(attractor)``, from what is not known of f, and of a D that was estimated.
+
+    Parameters
+    ----------
+    found
+        f with the covariance of its coefficients, and its doubts about which terms there are; D likewise.
+    gradient
+        ∇V, points ``(n, d)`` to ``(n, d)``.
+    attractor
+        From which V rises, shape ``(d,)``.
+    x
+        Where the errors are wanted, shape ``(n, d)``.
+
+    Returns
+    -------
+    numpy.ndarray
+        Shape ``(n,)``; zero where f carries no noise, NaN where no ascending path comes from the attractor.
+    """
+    if isinstance(found, GivenField) or found.noise_free or not len(x):
+        return np.zeros(len(x))
+    of_field, of_noise = potential_slopes(found, gradient, attractor, x)
+    return np.asarray(np.sqrt(found.variance(of_field) + found.noise_variance(of_noise)))
+
+
+def relative_error(
+    found: AnyField, gradient: Function, attractor: np.ndarray, x: np.ndarray, values: np.ndarray
+) -> float:
+    """Root mean square of the standard errors of V (`potential_errors`) over that of its values at points.
+
+    Infinite where the errors of more than a tenth of the points cannot be told.
+    """
+    if isinstance(found, GivenField) or found.noise_free or not len(x):
+        return 0.0
+    errors = potential_errors(found, gradient, attractor, x)
+    known = np.isfinite(errors)
+    if known.mean() < 1 - UNKNOWN:
+        return np.inf
+    return float(np.linalg.norm(errors[known]) / np.linalg.norm(values[known]))

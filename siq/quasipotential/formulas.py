@@ -1,9 +1,8 @@
-"""Symbolic decompositions: the formulas of V, g and f, and their file `model.json`.
+"""Symbolic decompositions ``f = -D∇V + g``: the formulas of V, g and f, and their file `model.json`.
 
-A formula is a sympy expression of the states. `model.json` (`siq.quasipotential.formulas`) is how it travels.
-
-Polynomials stand as ``{"center", "scale", "exponents", "coefficients"}``, meaning
-``Σ c Π ((x - center)/scale)^e`` in the states' own units; anything else as ``{"formula": "text"}``.
+A formula is a sympy expression of the states. In the file polynomials stand as ``{"center", "scale",
+"exponents", "coefficients"}``, meaning ``Σ c Π ((x - center)/scale)^e`` in the states' own units; anything
+else as ``{"formula": "text"}``. What was written is read back as the same objects.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ import sympy
 from siq.errors import InputError, NumericalFailure
 from siq.inference.library import CandidateLibrary, linear_combination
 from siq.numerics.files import whole_file
-from siq.quasipotential.hamilton_jacobi import PowerBasis
+from siq.quasipotential.hamilton_jacobi import LibraryBasis, PowerBasis
 from siq.quasipotential.wells import TOLERANCE, DegreeTrial, Well
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
@@ -137,18 +136,14 @@ def decomposition_from_coefficients(
     NumericalFailure
         When V is nowhere finite on the points.
     """
-
-    def expression(coefficients: np.ndarray) -> sympy.Expr:
-        chosen = np.flatnonzero(coefficients)
-        return sympy.Add(*(sympy.Float(float(coefficients[k]), 17) * library.terms[k] for k in chosen))
-
-    value = expression(potential)
+    basis = LibraryBasis(library, np.arange(library.size))
+    value = basis.expression(potential)
     lowest = minimum(value, library.symbols, points)
     return SymbolicDecomposition(
         symbols=library.symbols,
         potential=value - sympy.Float(lowest, 17),
-        circulatory=tuple(expression(column) for column in circulatory.T),
-        vector_field=tuple(expression(column) for column in vector_field.T),
+        circulatory=tuple(basis.expression(column) for column in circulatory.T),
+        vector_field=tuple(basis.expression(column) for column in vector_field.T),
     )
 
 
@@ -226,17 +221,7 @@ def expression_from_data(data: Mapping[str, Any], symbols: Sequence[sympy.Symbol
     """The formula that `expression_to_data` wrote; text goes through the whitelist of formulas."""
     if "formula" in data:
         return parse_formula(data["formula"], {symbol.name: symbol for symbol in symbols})
-    scaled = [
-        symbol if (center, scale) == (0, 1) else (symbol - center) / scale
-        for symbol, center, scale in zip(symbols, data["center"], data["scale"], strict=True)
-    ]
-    return sympy.Add(
-        *(
-            sympy.Float(float(coefficient), 17)
-            * sympy.Mul(*(s ** int(e) for s, e in zip(scaled, exponents, strict=True)))
-            for exponents, coefficient in zip(data["exponents"], data["coefficients"], strict=True)
-        )
-    )
+    return basis_from_data(data, tuple(symbols)).expression(data["coefficients"])
 
 
 def model_to_data(

@@ -1,7 +1,8 @@
-"""The Hamilton–Jacobi equation ``∇V·(f + D∇V) = 0``, solved by Gauss–Newton for V in a basis.
+"""The Hamilton–Jacobi equation ``∇V·(f + D∇V) = 0``, solved for a V that is linear in its weights.
 
-Both give their functions, gradients and Hessians at points; see `siq.quasipotential.hamilton_jacobi` for what
-is done with them.
+V is a sum of functions of a `Basis`: powers about an attractor, or a library of candidates. At points the
+equation is a system of quadratic equations for the coefficients, which is solved by damped Gauss–Newton
+(`gauss_newton`), where V is not smooth everywhere with weights that fall with the residual (`robust_fit`).
 
 The equation has false solutions that are just as exact as the true one: V flat along a direction, V = 0, and
 one for every invariant subspace of the linearisation. Where the iteration ends depends on where it starts;
@@ -26,6 +27,10 @@ from siq.systems.equilibria import measure_at
 from siq.systems.formulas import compile_formulas
 
 MOST_POWERS = 260  # more make every Gauss–Newton step take seconds
+VANISHING = 1e-8  # of f: where D∇V is smaller, Gauss–Newton is on its way to V = 0, which is a solution, too
+INDEPENDENT = 1e-5  # diagonal of a triangular factor: below this share columns are not independent enough
+STEEP = 3.0  # of the median residual: what is larger counts less and less
+UNDETERMINED = 1e-10  # of the largest singular value: combinations of functions that the points leave open
 
 
 class Basis(Protocol):
@@ -148,15 +153,17 @@ class PowerBasis:
 
     def hessians(self, x: np.ndarray) -> np.ndarray:
         """Points ``(n, d)`` to Hessians ``(n, d, d, m)``."""
-        powers = self._powers(x)
-        d = len(self.symbols)
-        rows = [np.stack([self._product(powers, (i, j)) for j in range(d)], axis=1) for i in range(d)]
-        return np.stack(rows, axis=1)
+        powers, d = self._powers(x), len(self.symbols)
+        values = np.empty((len(x), d, d, self.size))
+        for i in range(d):
+            for j in range(i + 1):
+                values[:, i, j] = values[:, j, i] = self._product(powers, (i, j))
+        return values
 
     def expression(self, coefficients: np.ndarray) -> sympy.Expr:
         """The sum as a formula of the states."""
         scaled = [
-            (symbol - sympy.Float(float(c), 17)) / sympy.Float(float(s), 17)
+            symbol if (c, s) == (0, 1) else (symbol - sympy.Float(float(c), 17)) / sympy.Float(float(s), 17)
             for symbol, c, s in zip(self.symbols, self.center, self.scale, strict=True)
         ]
         return sympy.Add(
@@ -188,6 +195,35 @@ class PowerBasis:
         return result.T
 
 
+class Expansion:
+    """V = Σ c_k φ_k: the functions φ of a basis, with coefficients of the shape ``(m,)``."""
+
+    basis: PowerBasis
+    coefficients: np.ndarray
+
+    @property
+    def degree(self) -> int:
+        """Highest power."""
+        return int(self.basis.exponents.sum(axis=1).max())
+
+    def values(self, x: np.ndarray) -> np.ndarray:
+        """V at points ``(n, d)``, shape ``(n,)``."""
+        return self.basis.values(x) @ self.coefficients
+
+    def gradients(self, x: np.ndarray) -> np.ndarray:
+        """∇V at points, shape ``(n, d)``."""
+        return self.basis.gradients(x) @ self.coefficients
+
+    def hessians(self, x: np.ndarray) -> np.ndarray:
+        """∇²V at points, shape ``(n, d, d)``."""
+        return self.basis.hessians(x) @ self.coefficients
+
+    @property
+    def expression(self) -> sympy.Expr:
+        """V as a formula of the states, in powers of ``(x - center)/scale``."""
+        return self.basis.expression(self.coefficients)
+
+
 def affordable_degree(dimension: int, degree: int) -> int:
     """The highest degree up to `degree`, but at least 2, with no more than `MOST_POWERS` powers."""
     while degree > 2 and math.comb(dimension + degree, degree) > MOST_POWERS:
@@ -201,13 +237,6 @@ def power_basis(
     """All powers of degree 2 up to `degree` about a center; the quadratic ones come first."""
     exponents = [row for row in monomial_exponents(len(symbols), degree) if sum(row) >= 2]
     return PowerBasis(symbols, np.asarray(center, dtype=float), scale, np.array(exponents))
-
-
-VANISHING = 1e-8  # of f: where D∇V is smaller, Gauss–Newton is on its way to V = 0, which is a solution, too
-INDEPENDENT = 1e-5  # diagonal of a triangular factor: below this share columns are not independent enough
-
-STEEP = 3.0  # of the median residual: what is larger counts less and less
-UNTOLD = 1e-10  # of the largest singular value: combinations of functions that the points leave open
 
 
 @dataclass(frozen=True)
@@ -279,58 +308,6 @@ def relative_residuals(equation: HamiltonJacobi, coefficients: np.ndarray) -> np
     slope = equation.slopes(coefficients)
     size = np.sqrt(equation.measure.contract(equation.points, slope))
     return np.asarray(np.abs(equation.residual(coefficients)) / np.where(size > 0, size, np.inf))
-
-
-def robust(equation: HamiltonJacobi, coefficients: np.ndarray, *, finest: float) -> HamiltonJacobi:
-    """The equation with weights that fall with the square of what is left (Cauchy's).
-
-    Parameters
-    ----------
-    equation, coefficients
-        What is left is that of this formula.
-    finest
-        Residual below which nothing is an outlier.
-    """
-    rest = relative_residuals(equation, coefficients)
-    scale = max(STEEP * float(np.median(rest)), finest)
-    return replace(equation, weight=equation.weight / np.sqrt(1 + (rest / scale) ** 2))
-
-
-def orthonormalised(equation: HamiltonJacobi, free: np.ndarray) -> tuple[HamiltonJacobi, np.ndarray]:
-    """The equation in combinations of the free functions whose gradients are orthonormal over the points.
-
-    Powers are all but dependent over a sublevel set that is narrow, or bent; their combinations are not, and
-    Gauss–Newton then gets on by the normal equations. Combinations that the points do not tell are left out.
-
-    Parameters
-    ----------
-    equation
-        At points.
-    free
-        Which functions are combined, as a mask; the others stay and come last.
-
-    Returns
-    -------
-    equation
-        In the k combinations and the functions that stay.
-    turned
-        Shape ``(m, k + s)``: the old coefficients are this times the new ones.
-    """
-    roots = equation.measure.root_at(equation.points)
-    stacked = np.einsum("nij,nim->njm", roots, equation.gradients[:, :, free], optimize=True)
-    scale = np.sqrt((stacked**2).sum(axis=(0, 1)))
-    scale = np.where(scale > 0, scale, 1.0)
-    upper = np.linalg.qr((stacked / scale).reshape(-1, stacked.shape[2]), mode="r")
-    _, sizes, right = np.linalg.svd(upper)
-    told = sizes > UNTOLD * sizes[0]
-    combined = right[told].T / sizes[told] / scale[:, None] * np.sqrt(len(equation.points))
-    m, k, stay = len(free), int(told.sum()), np.flatnonzero(~free)
-    turned = np.zeros((m, k + len(stay)))
-    turned[np.ix_(np.flatnonzero(free), np.arange(k))] = combined
-    turned[stay, k + np.arange(len(stay))] = 1.0
-    n, d = equation.points.shape
-    gradients = (equation.gradients.reshape(n * d, m) @ turned).reshape(n, d, -1)
-    return replace(equation, gradients=gradients), turned
 
 
 @dataclass(frozen=True)
@@ -477,3 +454,70 @@ def sensitivity(
     scale = np.linalg.norm(jacobian, axis=0)
     scale = np.where(scale > 0, scale, 1.0)
     return -np.linalg.lstsq(jacobian / scale, forcing, rcond=1e-11)[0] / scale[:, None]
+
+
+def robust_fit(
+    equation: HamiltonJacobi,
+    start: np.ndarray,
+    free: np.ndarray,
+    *,
+    rounds: int,
+    finest: float,
+    steps: int,
+    orthonormal: bool = False,
+) -> np.ndarray:
+    """Coefficients by Gauss–Newton with weights that fall with the square of the residual (Cauchy's).
+
+    Where V stops to be smooth, by caustics or by a kink, the residual is large and counts for nothing,
+    instead of spoiling the formula elsewhere.
+
+    Parameters
+    ----------
+    equation, start
+        At points, and coefficients to start from, shape ``(m,)``.
+    free
+        Which coefficients may change, as a mask.
+    rounds, steps
+        How often the weights are made, and the most steps of Gauss–Newton with each of them.
+    finest
+        Residual below which nothing is an outlier.
+    orthonormal
+        Whether to fit combinations of functions that are orthonormal over the points.
+    """
+    theta, moving = start, free
+    if orthonormal:
+        equation, turned = _orthonormalised(equation, free)
+        moving = np.arange(turned.shape[1]) < turned.shape[1] - int((~free).sum())
+        theta = np.linalg.lstsq(turned[free], start[free], rcond=None)[0]
+        theta[~moving] = start[~free]
+    for _ in range(rounds):
+        rest = relative_residuals(equation, theta)
+        scale = max(STEEP * float(np.median(rest)), finest)
+        weighted = replace(equation, weight=equation.weight / np.sqrt(1 + (rest / scale) ** 2))
+        theta = gauss_newton(weighted, theta, free=moving, steps=steps).coefficients
+    return np.asarray(turned @ theta) if orthonormal else theta
+
+
+def _orthonormalised(equation: HamiltonJacobi, free: np.ndarray) -> tuple[HamiltonJacobi, np.ndarray]:
+    """The equation in combinations of the free functions whose gradients are orthonormal over the points.
+
+    Powers are all but dependent over a sublevel set that is narrow, or bent; their combinations are not, and
+    Gauss–Newton then gets on by the normal equations. Combinations that the points leave open are left out;
+    the functions that are not free stay and come last. Also returned is the matrix, ``(m, k + s)``, by which
+    the new coefficients are multiplied to give the old ones.
+    """
+    roots = equation.measure.root_at(equation.points)
+    stacked = np.einsum("nij,nim->njm", roots, equation.gradients[:, :, free], optimize=True)
+    scale = np.sqrt((stacked**2).sum(axis=(0, 1)))
+    scale = np.where(scale > 0, scale, 1.0)
+    upper = np.linalg.qr((stacked / scale).reshape(-1, stacked.shape[2]), mode="r")
+    _, sizes, right = np.linalg.svd(upper)
+    determined = sizes > UNDETERMINED * sizes[0]
+    combined = right[determined].T / sizes[determined] / scale[:, None] * np.sqrt(len(equation.points))
+    m, k, stay = len(free), int(determined.sum()), np.flatnonzero(~free)
+    turned = np.zeros((m, k + len(stay)))
+    turned[np.ix_(np.flatnonzero(free), np.arange(k))] = combined
+    turned[stay, k + np.arange(len(stay))] = 1.0
+    n, d = equation.points.shape
+    gradients = (equation.gradients.reshape(n * d, m) @ turned).reshape(n, d, -1)
+    return replace(equation, gradients=gradients), turned

@@ -133,11 +133,13 @@ class HamiltonianProblem:
 
     def slope(self, y: np.ndarray) -> np.ndarray:
         """Q of the power series at points, ``(n, d)``."""
-        return np.asarray(self.series.gradient(self.flow.points(y)) @ self.flow.units / (2 * self.flow.level))
+        return np.asarray(
+            self.series.gradients(self.flow.points(y)) @ self.flow.units / (2 * self.flow.level)
+        )
 
     def curvature(self, y: np.ndarray) -> np.ndarray:
         """∂q/∂y of the power series at points, ``(n, d, d)``."""
-        hessians = self.series.hessian(self.flow.points(y))
+        hessians = self.series.hessians(self.flow.points(y))
         return np.asarray(self.flow.units.T @ hessians @ self.flow.units / (2 * self.flow.level))
 
     def fixed(self, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -33,10 +33,10 @@ from siq.data.two_states import RecordStates
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import IdentifiedField
 from siq.quasipotential.certificate import Certificate
+from siq.quasipotential.characteristics import potential_errors
 from siq.quasipotential.occupancy import VisitTest
 from siq.quasipotential.rates import Exit, NoiseStrength, dwell_time
 from siq.quasipotential.transitions import Transition, missing_diffusion
-from siq.quasipotential.uncertainty import potential_errors
 from siq.quasipotential.wells import Well
 from siq.systems.cycles import Cycle
 from siq.systems.dynamics import Dynamics

@@ -1,14 +1,5 @@
 """The power series of V at an attractor, order by order (Al'brekht's method).
 
-With ``V = ½ yᵀMy + ⅙ T(y, y, y)``, y = x - A, the third powers of the Hamilton–Jacobi equation say
-
-    T(y, y, By) = -(My)·F(y, y) - 2 (My)ᵀ(∂D·y)(My),    B = J + 2DM,
-
-F being the second derivatives of f. In Schur's form of B, which is triangular, each T_i follows from those
-before it by Sylvester's equation. So it takes d⁴ operations, where a power series of degree 3 as in
-`siq.quasipotential.power_series` solves equations with d³/6 unknowns. Eigenvectors would do, too, but those
-of a long chain that turns are all but parallel.
-
 Around a stable equilibrium A of a smooth f the quasipotential is smooth, and the Hamilton–Jacobi equation
 ``∇V·(f + D∇V) = 0`` fixes its Taylor coefficients one degree after another. With ``y = x - A``, ``J`` the
 Jacobian at A and ``M`` the Hessian of V there, the part of degree k obeys the linear system
@@ -19,6 +10,14 @@ with ``2 ≤ a < k, a + b = k + 1`` in the first sum and ``2 ≤ a, c < k, a + c
 where D_e is the part of degree e of D; on the left D is its value at A. The eigenvalues of the left
 side are sums of k eigenvalues of -J, never zero at an attractor: the series exists
 and is unique once M is chosen as the solution of full rank.
+
+Of many states the third powers alone are affordable. With ``V = ½ yᵀMy + ⅙ T(y, y, y)`` they say
+
+    T(y, y, By) = -(My)·F(y, y) - 2 (My)ᵀ(∂D·y)(My),    B = J + 2DM,
+
+F being the second derivatives of f. In Schur's form of B, which is triangular, each T_i follows from those
+before it by Sylvester's equation. So `cubic_series` takes d⁴ operations, where the system above has d³/6
+unknowns. Eigenvectors would do, too, but those of a long chain that turns are all but parallel.
 """
 
 from __future__ import annotations
@@ -29,9 +28,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
+import scipy.special
 import sympy
 
 from siq.inference.library import monomial_exponents
+from siq.quasipotential.hamilton_jacobi import Expansion, PowerBasis
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import classify, hessian_at
 from siq.systems.formulas import compile_formulas
@@ -45,12 +46,12 @@ class CubicSeries:
     square: np.ndarray
     cube: np.ndarray
 
-    def gradient(self, x: np.ndarray) -> np.ndarray:
+    def gradients(self, x: np.ndarray) -> np.ndarray:
         """First derivatives at points: ``(n, d)`` to ``(n, d)``."""
         y = x - self.center
         return np.asarray(y @ self.square + np.einsum("ijk,nj,nk->ni", self.cube, y, y, optimize=True) / 2)
 
-    def hessian(self, x: np.ndarray) -> np.ndarray:
+    def hessians(self, x: np.ndarray) -> np.ndarray:
         """Second derivatives at points: ``(n, d)`` to ``(n, d, d)``."""
         return np.asarray(self.square + np.einsum("ijk,nk->nij", self.cube, x - self.center))
 
@@ -78,67 +79,11 @@ def cubic_series(dynamics: Dynamics, attractor: np.ndarray) -> CubicSeries:
 
 
 @dataclass(frozen=True)
-class PowerSeries:
-    """A polynomial in ``x - center``; points come as rows.
+class PowerSeries(Expansion):
+    """A Taylor polynomial about ``basis.center``, in the units of the states."""
 
-    Attributes
-    ----------
-    center
-        Shape ``(d,)``, in the states' units.
-    exponents
-        Shape ``(m, d)``, integers: the powers of each term.
-    coefficients
-        Shape ``(m,)``: the value is ``Σ_k coefficients[k] Π_i (x - center)_i ** exponents[k, i]``.
-    """
-
-    center: np.ndarray
-    exponents: np.ndarray
+    basis: PowerBasis
     coefficients: np.ndarray
-
-    @property
-    def dimension(self) -> int:
-        """Number of states, d."""
-        return len(self.center)
-
-    @property
-    def degree(self) -> int:
-        """Highest total degree of a term."""
-        return int(self.exponents.sum(axis=1).max())
-
-    def evaluate(self, x: np.ndarray) -> np.ndarray:
-        """Values at points: ``(n, d)`` to ``(n,)``."""
-        return self._derivative(self._powers(x), ())
-
-    def gradient(self, x: np.ndarray) -> np.ndarray:
-        """First derivatives at points: ``(n, d)`` to ``(n, d)``."""
-        powers = self._powers(x)
-        return np.stack([self._derivative(powers, (i,)) for i in range(self.dimension)], axis=1)
-
-    def hessian(self, x: np.ndarray) -> np.ndarray:
-        """Second derivatives at points: ``(n, d)`` to ``(n, d, d)``."""
-        powers, d = self._powers(x), self.dimension
-        values = np.empty((len(x), d, d))
-        for i in range(d):
-            for j in range(i + 1):
-                values[:, i, j] = values[:, j, i] = self._derivative(powers, (i, j))
-        return values
-
-    def _powers(self, x: np.ndarray) -> np.ndarray:
-        powers = np.ones((self.degree + 1, self.dimension, len(x)))
-        np.cumprod(np.broadcast_to((x - self.center).T, powers[1:].shape), axis=0, out=powers[1:])
-        return powers
-
-    def _derivative(self, powers: np.ndarray, along: tuple[int, ...]) -> np.ndarray:
-        exponents, coefficients = self.exponents.copy(), self.coefficients
-        for state in along:
-            coefficients = coefficients * exponents[:, state]
-            exponents[:, state] -= 1
-        used = coefficients != 0
-        exponents, coefficients = exponents[used], coefficients[used]
-        values = np.ones((len(exponents), powers.shape[2]))
-        for state in range(self.dimension):
-            values *= powers[exponents[:, state], state]
-        return coefficients @ values
 
 
 def quasipotential_series(dynamics: Dynamics, attractor: np.ndarray, *, degree: int) -> PowerSeries:
@@ -168,7 +113,7 @@ def quasipotential_series(dynamics: Dynamics, attractor: np.ndarray, *, degree: 
         raise ValueError(f"a series of degree {degree} was asked for; V begins with degree 2")
     center = np.asarray(attractor, dtype=float)
     basis = _Homogeneous(dynamics.dimension, degree)
-    force = _taylor(dynamics, center, basis, degree - 1)
+    force = _expanded("f", dynamics.formulas, dynamics.symbols, center, basis, degree - 1)
     jacobian = dynamics.jacobian(center[None])[0]
     if classify(dynamics, center).kind != "attractor":
         raise ValueError(
@@ -177,9 +122,16 @@ def quasipotential_series(dynamics: Dynamics, attractor: np.ndarray, *, degree: 
     hessian = hessian_at(dynamics, center)
     # States in units of their spread: without this the systems mix coefficients of very different sizes.
     scale = np.sqrt(np.diag(np.linalg.inv(hessian)))
-    _check_equilibrium(force[0][:, 0], jacobian, center, scale)
+    step = np.abs(np.linalg.solve(jacobian, force[0][:, 0]))
+    if not np.all((step <= 1e-6 * np.abs(center).max()) | (step <= 1e-9 * scale)):
+        raise ValueError(f"{center.tolist()} is no equilibrium: f is {force[0][:, 0].tolist()} there")
     force = [part * basis.scales(k, scale) / scale[:, None] for k, part in enumerate(force)]
-    noise = _taylor_of_noise(dynamics, center, basis, degree - 2)
+    diffusion, d = dynamics.diffusion, dynamics.dimension
+    noise = [diffusion.matrix[:, :, None]] if diffusion.constant else []
+    if not diffusion.constant:
+        entries = [entry for row in diffusion.formulas for entry in row]
+        parts_of_noise = _expanded("D", entries, dynamics.symbols, center, basis, degree - 2)
+        noise = [part.reshape(d, d, -1) for part in parts_of_noise]
     own = np.outer(scale, scale)[:, :, None]
     noise = [part * basis.scales(k, scale) / own for k, part in enumerate(noise)]
     hessian = hessian * np.outer(scale, scale)
@@ -195,23 +147,16 @@ def quasipotential_series(dynamics: Dynamics, attractor: np.ndarray, *, degree: 
             known += basis.dot(gradients[a], a - 1, noise[0][:, :, 0] @ gradients[k + 2 - a], k + 1 - a)
         for e in range(1, len(noise)):
             for a in range(2, k - e + 1):  # and c = k + 2 - a - e is at least 2
-                pushed = basis.push(noise[e], e, gradients[k + 2 - a - e], k + 1 - a - e)
+                momenta = gradients[k + 2 - a - e]
+                pushed = np.stack([basis.dot(row, e, momenta, k + 1 - a - e) for row in noise[e]])
                 known += basis.dot(gradients[a], a - 1, pushed, k + 1 - a)
         parts[k] = np.linalg.solve(basis.advection(flow, k), -known)
         gradients[k] = basis.gradient(parts[k], k)
+    exponents = np.concatenate([basis.exponents[k] for k in parts])
     return PowerSeries(
-        center=center,
-        exponents=np.concatenate([basis.exponents[k] for k in parts]),
-        coefficients=np.concatenate([part / basis.scales(k, scale) for k, part in parts.items()]),
+        PowerBasis(dynamics.symbols, center, np.ones(len(center)), exponents),
+        np.concatenate([part / basis.scales(k, scale) for k, part in parts.items()]),
     )
-
-
-def _check_equilibrium(
-    force: np.ndarray, jacobian: np.ndarray, center: np.ndarray, scale: np.ndarray
-) -> None:
-    step = np.abs(np.linalg.solve(jacobian, force))
-    if not np.all((step <= 1e-6 * np.abs(center).max()) | (step <= 1e-9 * scale)):
-        raise ValueError(f"{center.tolist()} is no equilibrium: f is {force.tolist()} there")
 
 
 class _Homogeneous:
@@ -262,10 +207,6 @@ class _Homogeneous:
             minlength=len(self.exponents[degree]),
         )
 
-    def push(self, noise: np.ndarray, degree: int, gradient: np.ndarray, gradient_degree: int) -> np.ndarray:
-        """Σ_j D_ij p_j of polynomials, ``(d, d, n)`` and ``(d, m)``, to ``(d, l)``."""
-        return np.stack([self.dot(row, degree, gradient, gradient_degree) for row in noise])
-
     def advection(self, flow: np.ndarray, degree: int) -> np.ndarray:
         """Matrix of ``P ↦ (flow y)·∇P`` on polynomials P of a degree."""
         exponents, units = self.exponents[degree], np.eye(self.dimension, dtype=int)
@@ -278,25 +219,8 @@ class _Homogeneous:
         return matrix
 
 
-def _taylor(dynamics: Dynamics, center: np.ndarray, basis: _Homogeneous, degree: int) -> list[np.ndarray]:
-    """Taylor coefficients of f at the center: for each degree the components, ``(d, n)``."""
-    return _expanded("f", dynamics.formulas, dynamics.symbols, center, basis, degree)
-
-
-def _taylor_of_noise(
-    dynamics: Dynamics, center: np.ndarray, basis: _Homogeneous, degree: int
-) -> list[np.ndarray]:
-    """Taylor coefficients of D at the center, ``(d, d, n)`` for each degree, or for the first."""
-    diffusion, d = dynamics.diffusion, dynamics.dimension
-    if diffusion.constant:
-        return [diffusion.matrix[:, :, None]]
-    flat = [entry for row in diffusion.formulas for entry in row]
-    parts = _expanded("D", flat, dynamics.symbols, center, basis, degree)
-    return [part.reshape(d, d, -1) for part in parts]
-
-
 def _expanded(
-    what: str,
+    name: str,
     formulas: Sequence[sympy.Expr],
     symbols: Sequence[sympy.Symbol],
     center: np.ndarray,
@@ -304,45 +228,19 @@ def _expanded(
     degree: int,
 ) -> list[np.ndarray]:
     """Taylor coefficients of formulas at the center: for each degree of each formula, ``(m, n)``."""
-    if all(formula.is_polynomial(*symbols) for formula in formulas):
-        parts = _shifted(formulas, symbols, center, basis, degree)
-    else:
-        parts = _differentiated(formulas, symbols, center, basis, degree)
-    if not all(np.isfinite(part).all() for part in parts):
-        raise ValueError(f"{what} has no finite derivatives up to order {degree} at {center.tolist()}")
-    return parts
-
-
-def _shifted(
-    formulas: Sequence[sympy.Expr],
-    symbols: Sequence[sympy.Symbol],
-    center: np.ndarray,
-    basis: _Homogeneous,
-    degree: int,
-) -> list[np.ndarray]:
-    # x^β = Σ_α binomial(β, α) center^(β - α) y^α: nothing is differentiated, nothing truncated.
     parts = [np.zeros((len(formulas), len(basis.exponents[k]))) for k in range(degree + 1)]
-    for component, formula in enumerate(formulas):
-        terms = sympy.Poly(formula, *symbols).terms()
-        powers = np.array([monomial for monomial, _ in terms])
-        coefficients = np.array([float(coefficient) for _, coefficient in terms])
-        highest = max(int(powers.max()), degree)
-        binomial = np.array([[math.comb(n, k) for k in range(highest + 1)] for n in range(highest + 1)])
-        for k, part in enumerate(parts):
-            for place, lower in enumerate(basis.exponents[k]):
-                choices = np.prod(binomial[powers, lower], axis=1, dtype=float)
-                rest = np.prod(center ** np.maximum(powers - lower, 0), axis=1)
-                part[component, place] = np.sum(coefficients * choices * rest)
-    return parts
-
-
-def _differentiated(
-    formulas: Sequence[sympy.Expr],
-    symbols: Sequence[sympy.Symbol],
-    center: np.ndarray,
-    basis: _Homogeneous,
-    degree: int,
-) -> list[np.ndarray]:
+    if all(formula.is_polynomial(*symbols) for formula in formulas):
+        # x^β = Σ_α binomial(β, α) center^(β - α) y^α: nothing is differentiated, nothing truncated.
+        for component, formula in enumerate(formulas):
+            terms = sympy.Poly(formula, *symbols).terms()
+            powers = np.array([monomial for monomial, _ in terms])
+            coefficients = np.array([float(coefficient) for _, coefficient in terms])
+            for k, part in enumerate(parts):
+                for place, lower in enumerate(basis.exponents[k]):
+                    choices = np.prod(scipy.special.comb(powers, lower), axis=1)
+                    rest = np.prod(center ** np.maximum(powers - lower, 0), axis=1)
+                    part[component, place] = np.sum(coefficients * choices * rest)
+        return parts
     derivatives = {(0,) * len(symbols): list(formulas)}
     for block in basis.exponents[1 : degree + 1]:
         for row in block:
@@ -355,4 +253,7 @@ def _differentiated(
     table = values.reshape(len(derivatives), len(formulas)).T
     factorials = np.array([math.prod(math.factorial(power) for power in row) for row in derivatives])
     blocks = np.cumsum([len(block) for block in basis.exponents[:degree]])
-    return np.split(table / factorials, blocks, axis=1)
+    parts = np.split(table / factorials, blocks, axis=1)
+    if not all(np.isfinite(part).all() for part in parts):
+        raise ValueError(f"{name} has no finite derivatives up to order {degree} at {center.tolist()}")
+    return parts

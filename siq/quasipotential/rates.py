@@ -501,8 +501,8 @@ class _Frame:
         here = np.zeros((1, len(self.end)))
         flow = self.jacobian(here)[0] + 2 * self.diffusion(here)[0] @ self.at_attractor
         y = np.linalg.solve(flow, self.points[0]) * np.array([[1.0], [-1.0]])
-        p = self.series.gradient(self.start + y @ self.units.T) @ self.units / self.unit
-        odd = self.rise(y, p, self.given(self.series.hessian, y))
+        p = self.series.gradients(self.start + y @ self.units.T) @ self.units / self.unit
+        odd = self.rise(y, p, self.given(self.series.hessians, y))
         return float(odd[0] - odd[1]) / 2
 
     def given(self, hessian: Callable[[np.ndarray], np.ndarray], y: np.ndarray) -> np.ndarray:
@@ -529,7 +529,7 @@ class _Frame:
             product = m @ jacobians[index]
             return -self.pace[index] * (product + product.T + 2 * m @ noise[index] @ m + bends[index])
 
-        m = _imposed(self.given(self.series.hessian, self.points[:1])[0], self.velocities[0], forces[0])
+        m = _imposed(self.given(self.series.hessians, self.points[:1])[0], self.velocities[0], forces[0])
         kept = [m]
         for index in range(0, len(self.points) - 2, 2):
             h = self.grid[index + 2] - self.grid[index]

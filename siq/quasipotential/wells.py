@@ -1,4 +1,4 @@
-"""V about one attractor: the local route from f alone, grown outwards to the lowest saddle.
+"""V about one attractor: the local route from f alone, grown outwards to the lowest saddle and beyond.
 
 No single formula can hold over several wells, since V has a kink between them; about one attractor it is
 smooth, below its lowest saddle and often beyond. Away from recorded states that lead to the attractor, and
@@ -6,18 +6,13 @@ where the formula does not solve the Hamilton–Jacobi equation, nothing is clai
 
 At the attractor the Hessian of V is M, which follows from the Jacobian of f, and it is kept. The higher
 powers are found by Gauss–Newton on the Hamilton–Jacobi equation, in a sublevel set that grows from a small
-ellipsoid. No network takes part. Beyond the lowest saddle the well ends, and nothing is claimed there.
+ellipsoid (`grow_well`); the network route grows from values of V_θ instead, with all powers free
+(`fit_well`). From its saddle a formula is taken on to a higher level by robust fits (`extend_well`).
 
 For given equations the path of least action to the lowest saddle comes first, so that the depth of the well
-is known. V is grown once, in the lowest powers that follow it up there (`siq.quasipotential.wells`). From
-there every higher degree starts on the whole sublevel set, from the formula of the degree below: grown by
-itself it would be an extrapolation at each level, which of high powers is bad. The fits are made in
-combinations of powers that are orthonormal over the sublevel set.
-
-A formula grown to its saddle (`siq.quasipotential.wells`) is taken on to a higher level by a robust fit of
-the Hamilton–Jacobi equation: where V stops to be smooth, by caustics or by a kink, the residual is large and
-counts for nothing, instead of spoiling the formula elsewhere. Where it stays large, nothing is claimed. This
-is the V of an attractor for all that follows: certificate, landscape, files.
+is known. V is grown once, in the lowest powers that follow it up there. From there every higher degree starts
+on the whole sublevel set, from the formula of the degree below: grown by itself it would be an extrapolation
+at each level, which of high powers is bad. `local_well` chooses the degree.
 """
 
 from __future__ import annotations
@@ -25,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import sympy
@@ -35,16 +30,15 @@ from scipy.spatial import cKDTree
 
 from siq.errors import NumericalFailure
 from siq.quasipotential.hamilton_jacobi import (
-    UNTOLD,
-    HamiltonJacobi,
+    UNDETERMINED,
+    Expansion,
     PowerBasis,
     affordable_degree,
     equation_at,
     gauss_newton,
-    orthonormalised,
     power_basis,
     relative_residuals,
-    robust,
+    robust_fit,
 )
 from siq.systems.basins import Basin
 from siq.systems.cycles import Cycle
@@ -67,7 +61,63 @@ TOLERANCE = 0.05  # residual at a point up to which a formula is believed: V is 
 ROUNDING = 1e-16  # of what is usual: |∇V| |f| so close to the attractor says nothing
 NEGATIVE = 1e-9  # of the level: V so far below zero is rounding
 NOTHING = 1e-14  # of the largest coefficient, or of the size of a well: rounding of the fit
-NEAR = 2.5  # of the spacing of the points: further away there were no points
+NEIGHBOUR_SPACINGS = 2.5  # of the spacing of recorded states: further away nothing was recorded
+
+
+class RecordedRegion:
+    """The neighbourhood of recorded states that lead to one attractor.
+
+    Parameters
+    ----------
+    states
+        From which f leads to the attractor, shape ``(n, d)``.
+    elsewhere
+        Those from which it leads elsewhere or nowhere, shape ``(m, d)``; None for none.
+    width
+        Shape ``(d,)``: distances are shares of it.
+    """
+
+    def __init__(self, states: np.ndarray, elsewhere: np.ndarray | None, width: np.ndarray) -> None:
+        self._width = np.where(width > 0, width, 1.0)
+        places = states / self._width
+        self._tree = cKDTree(places)
+        # Of the 2d-th neighbour: states on one descent lie closer to each other than descents do.
+        neighbours = min(2 * len(width) + 1, len(states))
+        self._spacing = np.atleast_2d(self._tree.query(places, k=neighbours)[0])[:, -1]
+        some = elsewhere is not None and len(elsewhere)
+        self._elsewhere = cKDTree(elsewhere / self._width) if some else None
+
+    @classmethod
+    def of_basin(cls, portrait: PhasePortrait, index: int) -> RecordedRegion:
+        """The region of ``portrait.attractors[index]``, in shares of the recorded box."""
+        descents = portrait.descents
+        others = states_elsewhere(portrait, index)
+        away = [descents.paths[descents.ends != index][:, 0], *([] if others is None else [others])]
+        basin, box = portrait.basins[index], portrait.box
+        return cls(basin.points(np.arange(len(basin.chosen))), np.concatenate(away), box[:, 1] - box[:, 0])
+
+    def _closer_elsewhere(self, places: np.ndarray, distance: np.ndarray) -> np.ndarray:
+        if self._elsewhere is None:
+            return np.zeros(len(places), dtype=bool)
+        return np.asarray(self._elsewhere.query(places)[0] < distance)
+
+    def across(self, x: np.ndarray) -> np.ndarray:
+        """Mask of points ``(n, d)`` that lie closer to states which lead elsewhere."""
+        places = x / self._width
+        return self._closer_elsewhere(places, self._tree.query(places)[0])
+
+    def recorded(self, x: np.ndarray) -> np.ndarray:
+        """Mask of points ``(n, d)`` among the states that lead to the attractor."""
+        places = x / self._width
+        distance, nearest = self._tree.query(places)
+        near = distance <= NEIGHBOUR_SPACINGS * self._spacing[nearest]
+        return np.asarray(near & ~self._closer_elsewhere(places, distance))
+
+
+def states_elsewhere(portrait: PhasePortrait, index: int) -> np.ndarray | None:
+    """Recorded states from which f leads to other attractors, shape ``(m, d)``; None for none."""
+    others = [one for number, one in enumerate(portrait.basins) if number != index]
+    return np.concatenate([one.points(np.arange(len(one.chosen))) for one in others]) if others else None
 
 
 @dataclass(frozen=True)
@@ -92,11 +142,11 @@ class DegreeTrial:
 
 
 @dataclass(frozen=True, eq=False)
-class Well:
-    """V about an attractor. U is 2V.
+class Well(Expansion):
+    """V about an attractor, in powers about it. U is 2V.
 
-    Main attributes
-    ---------------
+    Attributes
+    ----------
     dynamics
         f and D.
     attractor
@@ -107,9 +157,6 @@ class Well:
         V of the lowest saddle, or, where there is none, of the last point that recordings reach.
     saddle
         Position of that saddle, None where recordings end before one.
-
-    Other attributes
-    ----------------
     residual
         Relative Hamilton–Jacobi residual on the points of the fit.
     points
@@ -142,26 +189,9 @@ class Well:
             object.__setattr__(self, "reach", self.level)
 
     @property
-    def degree(self) -> int:
-        """Highest power."""
-        return int(self.basis.exponents.sum(axis=1).max())
-
-    @property
     def inside(self) -> np.ndarray:
         """The points of the fit below the level, shape ``(m, d)``."""
         return np.asarray(self.points[self.values(self.points) < self.level])
-
-    def values(self, x: np.ndarray) -> np.ndarray:
-        """The formula at points ``(n, d)``, believed there or not: shape ``(n,)``."""
-        return self.basis.values(x) @ self.coefficients
-
-    def gradients(self, x: np.ndarray) -> np.ndarray:
-        """∇V at points, shape ``(n, d)``."""
-        return self.basis.gradients(x) @ self.coefficients
-
-    def hessians(self, x: np.ndarray) -> np.ndarray:
-        """∇²V at points, shape ``(n, d, d)``."""
-        return self.basis.hessians(x) @ self.coefficients
 
     def known_values(self, x: np.ndarray) -> np.ndarray:
         """V at points ``(n, d)``: shape ``(n,)``, NaN where the formula is not to be believed."""
@@ -199,12 +229,7 @@ class Well:
         if x.shape[1] == 1:
             known = self.points if self.saddle is None else np.append(self.points, self.saddle[None], axis=0)
             return reached & (x[:, 0] >= known.min()) & (x[:, 0] <= known.max())
-        tree, spacing = self._places
-        own, nearest = tree.query(x / self._width)
-        reached &= own <= NEAR * spacing[nearest]
-        if self._others is not None:  # behind the ridge the formula would go on down to the other attractor
-            reached &= own < self._others.query(x / self._width)[0]
-        return reached
+        return reached & self._region.recorded(x)
 
     def _terms(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         slope, flow, noise = self.gradients(x), self.dynamics.drift(x), self.dynamics.diffusion
@@ -222,30 +247,9 @@ class Well:
         return size if size > 0 else float(np.finfo(float).tiny) / ROUNDING
 
     @cached_property
-    def _others(self) -> cKDTree | None:
-        if self.elsewhere is None or not len(self.elsewhere):
-            return None
-        return cKDTree(self.elsewhere / self._width)
-
-    @cached_property
-    def _width(self) -> np.ndarray:
-        width: np.ndarray = np.ptp(self.points, axis=0)
-        return width
-
-    @cached_property
-    def _places(self) -> tuple[cKDTree, np.ndarray]:
-        places = self.points / self._width
-        tree = cKDTree(places)
-        # Of the d-th neighbour: points on one descent lie closer to each other than descents do.
-        spacing = tree.query(places, k=2 * places.shape[1] + 1)[0][:, -1]
-        return tree, spacing
-
-    # The formula for others.
-
-    @property
-    def expression(self) -> sympy.Expr:
-        """V as a formula of the states, in powers of ``(x - center)/scale``."""
-        return self.basis.expression(self.coefficients)
+    def _region(self) -> RecordedRegion:
+        # Behind the ridge the formula would go on down to the other attractor.
+        return RecordedRegion(self.points, self.elsewhere, np.ptp(self.points, axis=0))
 
     @property
     def formula(self) -> Formula:
@@ -283,6 +287,31 @@ class Well:
         return julia_source(self.formula)
 
 
+@dataclass(frozen=True, eq=False)
+class Depth:
+    """How deep a well is, as the path of least action to its lowest saddle tells.
+
+    Attributes
+    ----------
+    saddle
+        That saddle, or the unstable cycle that bounds the well.
+    points
+        Along the path, shape ``(n, d)``.
+    values, slopes
+        V and ∇V there, shape ``(n,)`` and ``(n, d)``.
+    """
+
+    saddle: Equilibrium | Cycle
+    points: np.ndarray
+    values: np.ndarray
+    slopes: np.ndarray
+
+    @property
+    def value(self) -> float:
+        """V at the saddle."""
+        return float(self.values[-1])
+
+
 FIRST_SHARE = 0.05  # of a known depth: the first level
 GROWTH = 1.5  # of the level, from one fit to the next
 REACH = 0.25  # of the distance at which the level lies: how far new points may be from those of the last fit
@@ -298,6 +327,144 @@ LOW = 4  # powers up to this one are fitted to a network's V, and those above be
 NO_SOLUTION = 0.2  # relative residual from which on a start has led nowhere
 FLAT = 1e-6  # of the largest curvature at an attractor: V with a smaller one has no minimum there
 CLOSE = 0.1  # of the recorded box: a saddle so close to the points of the fit has been reached
+STEP = 1.06  # of the level, from one robust fit to the next
+FINEST = 1e-5  # residual below which nothing is an outlier
+ROBUST_FIT: dict[str, Any] = {"finest": FINEST, "steps": 6}
+# Few points lie where a well is narrow.
+FIT_TO_KNOWN_DEPTH: dict[str, Any] = {"finest": 0.01, "steps": 8, "orthonormal": True}
+BESIDE = 0.05  # of the extent of the well: states so close to the path are below a level where the path is
+PATH_FROM, PATH_TO = 0.02, 0.98  # of the depth: where the path tells ∇V
+MOST_POINTS_TO_KNOWN_DEPTH = 5000  # of one fit
+RUNAWAY = 1.5  # of a level: where the formula of the degree below is higher, a lower V is an extrapolation
+WORSE = 3.0  # times the residual of the degree below: a higher one that is worse by that has run away
+ENDED = 2  # higher degrees in a row that do not improve: there is nothing more to be had
+HELD_OUT = 4  # every so manieth point is kept for choosing the degree
+
+
+Degree = Annotated[int, Field(ge=2, le=16)]
+
+
+@pydantic_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class WellOptions:
+    """How V about an attractor is sought, and where it is believed.
+
+    Attributes
+    ----------
+    degrees
+        Highest powers that are tried, one after the other.
+    accuracy
+        Relative Hamilton–Jacobi residual below which no higher power is tried.
+    reach
+        Level up to which a formula is sought, as a share of V at the lowest saddle.
+    tolerance
+        Largest relative Hamilton–Jacobi residual at a point where a formula is believed.
+    """
+
+    degrees: Annotated[tuple[Degree, ...], Field(min_length=1)] = (4, 6, 8, 10, 12)
+    accuracy: Annotated[float, Field(gt=0)] = FINEST
+    reach: Annotated[float, Field(gt=0, le=3)] = 1.2
+    tolerance: Annotated[float, Field(gt=0, lt=1)] = TOLERANCE
+
+
+def local_well(
+    dynamics: Dynamics,
+    portrait: PhasePortrait,
+    index: int,
+    *,
+    options: WellOptions,
+    seed: int = 0,
+    depth: Depth | None = None,
+) -> Well:
+    """V about one attractor, of the lowest degree that no other betters by much.
+
+    Parameters
+    ----------
+    dynamics
+        f and D.
+    portrait
+        Attractors, saddles and basins.
+    index
+        Which attractor.
+    options
+        Degrees, reach and tolerance.
+    seed
+        Decides which points are used where there are too many.
+    depth
+        The lowest saddle with V there, where the path of least action has told it before, as it does for
+        given equations.
+
+    Raises
+    ------
+    NumericalFailure
+        When no degree gives a formula.
+    """
+    attractor, basin = portrait.attractors[index], portrait.basins[index]
+    saddles = portrait.saddles[index] if depth is None else [depth.saddle]
+    rows = np.arange(len(basin.chosen))
+    kept = rows[rows % HELD_OUT != 0]
+    wells: list[Well] = []
+    failure, idle = NumericalFailure("no degree is affordable"), 0
+    for degree in options.degrees:
+        if wells and affordable_degree(dynamics.dimension, degree) < degree:
+            break
+        generator = np.random.default_rng(seed)
+        try:
+            if depth is None or not wells:
+                well = grow_well(
+                    dynamics, attractor, basin, saddles, degree=degree, generator=generator,
+                    depth=None if depth is None else depth.value,
+                )  # fmt: skip
+            else:  # the same formula in powers up to a higher degree; the lower ones come first
+                lower = wells[-1]
+                basis = power_basis(lower.basis.symbols, lower.basis.center, lower.basis.scale, degree=degree)
+                padding = np.zeros(basis.size - lower.basis.size)
+                coefficients = np.concatenate([lower.coefficients, padding])
+                well = replace(lower, basis=basis, coefficients=coefficients)
+            if depth is not None:
+                start, goal = well, options.reach * depth.value
+                told = {"goal": goal, "rows": kept, "depth": depth, "generator": generator}
+                well = extend_well(start, basin, **told)
+                if wells and not well.residual < WORSE * wells[-1].residual:  # the path may start it far off
+                    again = extend_well(start, basin, by_path=False, **told)
+                    well = min(well, again, key=lambda one: one.residual)
+        except NumericalFailure as error:  # of one degree: another may do
+            failure = error
+            continue
+        if depth is not None and wells and not well.residual < wells[-1].residual:
+            idle += 1
+            if idle == ENDED or not well.residual < WORSE * wells[-1].residual:
+                break
+            continue
+        wells.append(well)
+        idle = 0
+        if well.residual < options.accuracy:
+            break
+    if not wells:
+        raise failure
+    if depth is None:
+        # No formula tells V of the saddle as well as the finest does.
+        goal = options.reach * wells[-1].level
+        wells = [extend_well(well, basin, goal=goal, rows=kept) for well in wells]
+    elsewhere = states_elsewhere(portrait, index)
+    wells = [replace(well, tolerance=options.tolerance, elsewhere=elsewhere) for well in wells]
+    x = basin.points(rows[rows % HELD_OUT == 0])
+    reached = [well.reaches(x) for well in wells]
+    most = max(int(mask.sum()) for mask in reached)
+    trials = []
+    for well, mask in zip(wells, reached, strict=True):
+        residual = well.residual_at(x[mask])
+        believed = int((residual <= well.tolerance).sum())
+        median = float(np.median(residual)) if len(residual) else np.inf
+        trials.append(DegreeTrial(well.degree, well.basis.size, median, believed / max(most, 1)))
+    return replace(wells[best_trial(trials)], trials=tuple(trials))
+
+
+def best_trial(trials: Sequence[DegreeTrial]) -> int:
+    """Index of the first trial whose coverage and residual no other betters by much."""
+    coverage = max(trial.covered for trial in trials)
+    good = [index for index, trial in enumerate(trials) if trial.covered >= coverage - 0.005]
+    finest = min(trials[index].residual for index in good)
+    return next(index for index in good if trials[index].residual <= max(2 * finest, FINEST))
 
 
 def grow_well(
@@ -357,9 +524,8 @@ def grow_well(
     if depth is not None:
         level = min(level, FIRST_SHARE * depth)
     return _grown(
-        dynamics, basin, saddles, basis, coefficients, free=free, metric=hessian,
-        level=level, fitted=np.zeros(0, dtype=int), generator=generator,
-        depth=depth,
+        dynamics, basin, saddles, basis, coefficients, free=free, metric=hessian, level=level,
+        fitted=np.zeros(0, dtype=int), generator=generator, depth=depth,
     )  # fmt: skip
 
 
@@ -379,22 +545,11 @@ def _grown(
 ) -> Well:
     """V grown from a start, level by level, to its lowest saddle or to the end of the recorded region.
 
-    Parameters
-    ----------
-    basis, coefficients
-        The start.
-    free
-        Which coefficients may change, as a mask.
-    metric
-        In which distances are measured, shape ``(d, d)``: the Hessian of V at the attractor.
-    level
-        The first one.
-    fitted
-        Rows of ``basin.chosen`` on which the start was fitted, as far as it was.
-    dynamics, basin, saddles, generator, depth
-        As for `grow_well`.
+    `metric` is the Hessian of V at the attractor, in which distances are measured; `fitted` has the rows of
+    ``basin.chosen`` on which the start was fitted. The other arguments are as for `grow_well`.
     """
     attractor = basis.center
+    place = f"the attractor near {attractor.round(4)}"
     flat = basin.states.reshape(-1, len(attractor))
     functions = basis.values(flat)
 
@@ -402,7 +557,14 @@ def _grown(
         return (functions @ current).reshape(basin.states.shape[:2])
 
     tops = np.array([one.position for one in saddles]).reshape(-1, len(attractor))
+    at_tops = basis.values(tops)
     width = np.ptp(flat, axis=0)
+
+    def close(points: np.ndarray) -> np.ndarray:
+        """Mask of the saddles that points of a fit have reached."""
+        distances = [np.abs((points - top) / width).max(axis=1).min() for top in tops]
+        return np.array(distances) < CLOSE
+
     values = along(coefficients)
     residual, points, last, recorded = np.inf, np.zeros((0, len(attractor))), False, 0.0
     places = basin.points(np.arange(len(basin.chosen))) @ np.linalg.cholesky(metric)
@@ -419,14 +581,23 @@ def _grown(
             rows = np.sort(generator.choice(rows, MOST_POINTS, replace=False))
         points = basin.points(rows)
         if len(points) < 2 * basis.size:
-            raise NumericalFailure(_too_few(attractor, len(points), before=before, needed=2 * basis.size))
+            if not before:
+                raise NumericalFailure(f"only {len(points)} recorded states lead to {place}")
+            raise NumericalFailure(
+                f"V about {place} leaves the recorded states: it came from {before} to {len(points)} and"
+                f" needs {2 * basis.size}"
+            )
         equation = equation_at(basis, points, dynamics, attractor=attractor)
         steps, tolerance = (40, 1e-13) if last else (8, ON_THE_WAY)
         solution = gauss_newton(equation, coefficients, free=free, steps=steps, tolerance=tolerance)
         coefficients, residual = solution.coefficients, solution.residual
         values = along(coefficients)
         recorded = _recorded(basin.starts(values), len(attractor))
-        limit = depth or min(_lowest(basis.values(tops) @ coefficients, tops, points, width, level), recorded)
+        # Far from the points of the fit V is an extrapolation: a saddle that seems to lie lower than points
+        # already reached does not count, unless they are close to it.
+        heights = at_tops @ coefficients
+        believed = (heights > (1 - AT_LEVEL) * level) | close(points)
+        limit = depth or min(float(heights[believed & (heights > 0)].min(initial=np.inf)), recorded)
         if last and abs(limit - level) < SETTLED * level and len(fitted) <= (1 + SETTLED) * before:
             break
         if any(abs(limit - one) < REPEATED * level for one in ends):  # from here on in circles
@@ -435,51 +606,19 @@ def _grown(
             ends.append(level)
         last = GROWTH * level >= limit
         level = limit if last else GROWTH * level
+    saddle = None
     if depth is not None:
         saddle = tops[0] if level == depth and residual < NO_SOLUTION else None
-    else:
-        saddle, level = _end(basis.values(tops) @ coefficients, tops, points, width, level)
+    elif len(tops):
+        heights = at_tops @ coefficients
+        nearest = int(np.argmin(np.abs(heights - level)))
+        if abs(heights[nearest] - level) < (4 if close(points)[nearest] else 1) * AT_LEVEL * level:
+            saddle, level = tops[nearest], float(heights[nearest])
     # A V that vanishes is a solution too, and the end of what starts far from any other.
     if not (np.isfinite(residual) and level > 0) or (saddle is None and level < (1 - SETTLED) * recorded):
         degree = int(basis.exponents.sum(axis=1).max())
-        raise NumericalFailure(
-            f"powers of degree {degree} do not follow V from the attractor near {attractor.round(4)} up to a"
-            " saddle"
-        )
+        raise NumericalFailure(f"powers of degree {degree} do not follow V from {place} up to a saddle")
     return Well(dynamics, attractor, basis, coefficients, level, saddle, residual, points)
-
-
-def _end(
-    heights: np.ndarray, tops: np.ndarray, points: np.ndarray, width: np.ndarray, level: float
-) -> tuple[np.ndarray | None, float]:
-    """The saddle at which growing has ended, with V there; None where it ended before one."""
-    if not len(tops):
-        return None, level
-    nearest = int(np.argmin(np.abs(heights - level)))
-    beside = _distances(tops[nearest : nearest + 1], points, width)[0] < CLOSE
-    if abs(heights[nearest] - level) < (4 if beside else 1) * AT_LEVEL * level:
-        return tops[nearest], float(heights[nearest])
-    return None, level
-
-
-def _too_few(attractor: np.ndarray, count: int, *, before: int, needed: int) -> str:
-    """Why a fit cannot go on, in words: few states lead to the attractor, or V has left them."""
-    place = f"the attractor near {attractor.round(4)}"
-    if not before:
-        return f"only {count} recorded states lead to {place}"
-    return f"V about {place} leaves the recorded states: it came from {before} to {count} and needs {needed}"
-
-
-def _lowest(
-    heights: np.ndarray, tops: np.ndarray, points: np.ndarray, width: np.ndarray, level: float
-) -> float:
-    """V of the lowest saddle, as far as the current V can be believed there.
-
-    Far from the points of the fit it is an extrapolation: a saddle that seems to lie lower than points
-    already reached does not count, unless they are close to it.
-    """
-    believed = (heights > (1 - AT_LEVEL) * level) | (_distances(tops, points, width) < CLOSE)
-    return float(heights[believed & (heights > 0)].min(initial=np.inf))
 
 
 def _recorded(starts: np.ndarray, dimension: int) -> float:
@@ -489,11 +628,6 @@ def _recorded(starts: np.ndarray, dimension: int) -> float:
     highest start lies on the way down from it.
     """
     return float(np.quantile(starts, HIGHEST if dimension > 1 else 1.0))
-
-
-def _distances(tops: np.ndarray, points: np.ndarray, width: np.ndarray) -> np.ndarray:
-    """Of each saddle from the nearest point of a fit, as a share of the recorded box."""
-    return np.array([np.abs((points - top) / width).max(axis=1).min() for top in tops])
 
 
 def fit_well(
@@ -576,9 +710,8 @@ def fit_well(
             continue
         try:
             return _grown(
-                dynamics, basin, saddles, basis, start,
-                free=np.ones(basis.size, dtype=bool), metric=metric, level=first, fitted=rows,
-                generator=generator,
+                dynamics, basin, saddles, basis, start, free=np.ones(basis.size, dtype=bool), metric=metric,
+                level=first, fitted=rows, generator=generator,
             )  # fmt: skip
         except NumericalFailure as error:
             failure = error
@@ -586,174 +719,89 @@ def fit_well(
     raise failure
 
 
-STEP = 1.06  # of the level, from one fit to the next
-REWEIGHTINGS = 3
-ITERATIONS = 8  # of Gauss–Newton between two reweightings
-FINEST = 0.01  # residual below which nothing is an outlier: few points lie where a well is narrow
-BESIDE = 0.05  # of the extent of the well: states so close to the path are below a level where the path is
-PATH_FROM, PATH_TO = 0.02, 0.98  # of the depth: where the path tells ∇V
-RAISED_WELLS_MOST_POINTS = 5000  # of one fit
-RUNAWAY = 1.5  # of a level: where the formula of the degree below is higher, a lower V is an extrapolation
-GAP = 0.25  # of the distance at which the level lies: as far new points may be from those of the last fit
-WORSE = 3.0  # times the residual of the degree below: a higher one that is worse by that has run away
-ENDED = 2  # higher degrees in a row that do not improve: there is nothing more to be had
-
-
-@dataclass(frozen=True, eq=False)
-class Depth:
-    """How deep a well is, as the path of least action to its lowest saddle tells.
-
-    Attributes
-    ----------
-    saddle
-        That saddle, or the unstable cycle that bounds the well.
-    points
-        Along the path, shape ``(n, d)``.
-    values, slopes
-        V and ∇V there, shape ``(n,)`` and ``(n, d)``.
-    """
-
-    saddle: Equilibrium | Cycle
-    points: np.ndarray
-    values: np.ndarray
-    slopes: np.ndarray
-
-    @property
-    def value(self) -> float:
-        """V at the saddle."""
-        return float(self.values[-1])
-
-
-def raised_wells(
-    dynamics: Dynamics,
-    attractor: Equilibrium,
+def extend_well(
+    well: Well,
     basin: Basin,
-    depth: Depth,
     *,
-    options: WellOptions,
-    rows: np.ndarray,
-    seed: int = 0,
-) -> list[Well]:
-    """V about an attractor by rising degree, each sought up to ``options.reach`` of the depth.
+    goal: float,
+    rows: np.ndarray | None = None,
+    depth: Depth | None = None,
+    generator: np.random.Generator | None = None,
+    by_path: bool = True,
+) -> Well:
+    """Take a formula on, from its well to a higher level, by robust fits of the Hamilton–Jacobi equation.
 
     Parameters
     ----------
-    dynamics
-        f and D.
-    attractor
-        Where V is zero.
+    well
+        V up to the lowest saddle; see `grow_well`.
     basin
-        States that lead there.
-    depth
-        Of the well.
-    options
-        Degrees, accuracy and reach.
+        What leads to the attractor. Only such states are asked: across the ridge another well begins.
+    goal
+        Level of V to be reached.
     rows
-        Rows of ``basin.chosen`` that may be used.
-    seed
-        Decides which points are used where there are too many.
+        Rows of ``basin.chosen`` that may be used; default all.
+    depth
+        Of the well, where the path of least action has told it before. Then the formula may be one of lower
+        powers in a basis of higher ones.
+    generator
+        Decides which points are used where there are too many, for a known depth.
+    by_path
+        Whether a fit to a known depth begins with ∇V along the path.
 
     Raises
     ------
     NumericalFailure
-        When no degree follows V up to the saddle.
+        When the formula does not follow V to a known depth.
     """
-    wells: list[Well] = []
-    failure, idle = NumericalFailure("no degree is affordable"), 0
-    for degree in options.degrees:
-        if wells and affordable_degree(dynamics.dimension, degree) < degree:
-            break
-        generator = np.random.default_rng(seed)
-        try:
-            if wells:
-                start = _embedded(wells[-1], degree)
-            else:
-                start = grow_well(
-                    dynamics, attractor, basin, [depth.saddle], degree=degree, generator=generator,
-                    depth=depth.value,
-                )  # fmt: skip
-            well = _raised(start, basin, depth, options.reach, rows, generator)
-            if wells and not well.residual < WORSE * wells[-1].residual:  # the path may start it too far off
-                again = _raised(start, basin, depth, options.reach, rows, generator, by_path=False)
-                well = min(well, again, key=lambda one: one.residual)
-        except NumericalFailure as error:  # of one degree: another may do
-            failure = error
-            continue
-        if wells and not well.residual < wells[-1].residual:
-            idle += 1
-            if idle == ENDED or not well.residual < WORSE * wells[-1].residual:
-                break
-            continue
-        wells.append(well)
-        idle = 0
-        if well.residual < options.accuracy:
-            break
-    if not wells:
-        raise failure
-    return wells
-
-
-def _embedded(well: Well, degree: int) -> Well:
-    """The same formula in powers up to a higher degree; the lower ones come first."""
-    basis = power_basis(well.basis.symbols, well.basis.center, well.basis.scale, degree=degree)
-    coefficients = np.zeros(basis.size)
-    coefficients[: well.basis.size] = well.coefficients
-    return replace(well, basis=basis, coefficients=coefficients)
-
-
-def _raised(
-    start: Well,
-    basin: Basin,
-    depth: Depth,
-    reach: float,
-    rows: np.ndarray,
-    generator: np.random.Generator,
-    *,
-    by_path: bool = True,
-) -> Well:
-    """A formula fitted from 0.9 of the depth to its reach, level by level; begun on the path, or not."""
-    goal, level = reach * depth.value, min(0.9 * start.level, reach * depth.value)
-    shape, flat = basin.states.shape[:2], basin.states.reshape(-1, basin.states.shape[2])
-    functions = start.basis.values(flat)
-    before = (functions @ start.coefficients).reshape(shape)
-    free = start.basis.exponents.sum(axis=1) > 2
-    metric = np.linalg.cholesky(hessian_at(start.dynamics, start.attractor))
-    places = basin.points(np.arange(len(basin.chosen))) @ metric
-    fitted = basin.below(before, level)
-    # Where the well narrows towards its saddle, V in lower powers may be far off, and few states be below it.
-    way = depth.points @ metric
-    distance, nearest = cKDTree(way).query(places)
-    beside = np.where(distance < BESIDE * np.sqrt(2 * depth.value), depth.values[nearest], np.inf)
-    coefficients = start.coefficients
-    if by_path:
-        coefficients = _towards_path(start, basin.points(fitted), depth, free)
+    allowed = np.arange(len(basin.chosen)) if rows is None else rows
+    functions = well.basis.values(basin.states.reshape(-1, basin.states.shape[2]))
+    shape, free = basin.states.shape[:2], well.basis.exponents.sum(axis=1) > 2
+    coefficients, level = well.coefficients, min(0.9 * well.level, goal)
+    options, rounds = (ROBUST_FIT, 4) if depth is None else (FIT_TO_KNOWN_DEPTH, 3)
+    if depth is not None:
+        metric = np.linalg.cholesky(hessian_at(well.dynamics, well.attractor))
+        places = basin.points(np.arange(len(basin.chosen))) @ metric
+        lower = (functions @ coefficients).reshape(shape)
+        fitted = basin.below(lower, level)
+        # Where the well narrows towards its saddle, V in lower powers may be far off, and few states below.
+        distance, nearest = cKDTree(depth.points @ metric).query(places)
+        beside = np.where(distance < BESIDE * np.sqrt(2 * depth.value), depth.values[nearest], np.inf)
+        if by_path:
+            coefficients = _towards_path(well, basin.points(fitted), depth, free)
     while True:
-        along = (functions @ coefficients).reshape(shape)
-        chosen = np.intersect1d(basin.below(along, level), basin.below(before, RUNAWAY * level))
-        if len(fitted) and len(chosen):
-            away = cKDTree(places[fitted]).query(places[chosen])[0]
-            chosen = chosen[away < GAP * np.sqrt(2 * level)]
-        fitted = chosen = np.union1d(chosen, np.flatnonzero(beside < level))
-        used = np.intersect1d(chosen, rows)
-        if len(used) > RAISED_WELLS_MOST_POINTS:
-            used = np.sort(generator.choice(used, RAISED_WELLS_MOST_POINTS, replace=False))
-        if len(used) < 2 * start.basis.size:
+        chosen = basin.below((functions @ coefficients).reshape(shape), level)
+        if depth is not None:
+            chosen = np.intersect1d(chosen, basin.below(lower, RUNAWAY * level))
+            if len(fitted) and len(chosen):
+                away = cKDTree(places[fitted]).query(places[chosen])[0]
+                chosen = chosen[away < REACH * np.sqrt(2 * level)]
+            fitted = chosen = np.union1d(chosen, np.flatnonzero(beside < level))
+        chosen = used = np.intersect1d(chosen, allowed)
+        if depth is not None and len(used) > MOST_POINTS_TO_KNOWN_DEPTH:
+            assert generator is not None
+            used = np.sort(generator.choice(used, MOST_POINTS_TO_KNOWN_DEPTH, replace=False))
+        if depth is not None and len(used) < 2 * well.basis.size:
             raise NumericalFailure(
-                f"V about the attractor near {start.attractor.round(4)} is told by {len(used)} states alone"
+                f"V about the attractor near {well.attractor.round(4)} is told by {len(used)} states alone"
             )
-        equation = equation_at(start.basis, basin.points(used), start.dynamics, attractor=start.attractor)
+        equation = equation_at(well.basis, basin.points(used), well.dynamics, attractor=well.attractor)
+        # On the way up one round keeps the formula close enough to be taken further.
         last = level >= goal
-        coefficients = _robust(equation, coefficients, free, rounds=REWEIGHTINGS if last else 1)
+        coefficients = robust_fit(equation, coefficients, free, rounds=rounds if last else 1, **options)
         if last:
             break
         level = min(goal, STEP * level)
     residual = float(np.median(relative_residuals(equation, coefficients)))
-    if not np.isfinite(residual):
-        raise NumericalFailure(f"powers of degree {start.degree} do not follow V to its saddle")
+    if depth is not None and not np.isfinite(residual):
+        raise NumericalFailure(f"powers of degree {well.degree} do not follow V to its saddle")
+    top = well.level if depth is None else depth.value
+    if depth is None and well.saddle is not None:
+        # A formula that goes on smoothly behind a kink is above V, never below.
+        top = min(top, float(well.basis.values(well.saddle[None])[0] @ coefficients))
     return replace(
-        start, coefficients=coefficients, level=depth.value, reach=goal, residual=residual,
-        points=basin.points(np.intersect1d(fitted, rows)),
-    )  # fmt: skip
+        well, coefficients=coefficients, level=top, reach=goal, residual=residual, points=basin.points(chosen)
+    )
 
 
 def _towards_path(well: Well, x: np.ndarray, depth: Depth, free: np.ndarray) -> np.ndarray:
@@ -783,108 +831,8 @@ def _towards_path(well: Well, x: np.ndarray, depth: Depth, free: np.ndarray) -> 
     scale = np.linalg.norm(matrix, axis=0)
     scale = np.where(scale > 0, scale, 1.0)
     coefficients = well.coefficients.copy()
-    coefficients[free] += np.linalg.lstsq(matrix / scale, right, rcond=UNTOLD)[0] / scale
+    coefficients[free] += np.linalg.lstsq(matrix / scale, right, rcond=UNDETERMINED)[0] / scale
     return coefficients
-
-
-def _robust(
-    equation: HamiltonJacobi, coefficients: np.ndarray, free: np.ndarray, *, rounds: int
-) -> np.ndarray:
-    """Gauss–Newton in orthonormal combinations, with weights that fall with what is left."""
-    turned_equation, turned = orthonormalised(equation, free)
-    stay = int((~free).sum())
-    moving = np.arange(turned.shape[1]) < turned.shape[1] - stay
-    theta = np.linalg.lstsq(turned[free], coefficients[free], rcond=None)[0]
-    theta[~moving] = coefficients[~free]
-    for _ in range(rounds):
-        weighted = robust(turned_equation, theta, finest=FINEST)
-        theta = gauss_newton(weighted, theta, free=moving, steps=ITERATIONS).coefficients
-    return np.asarray(turned @ theta)
-
-
-LOCAL_WELLS_REWEIGHTINGS = 4
-LOCAL_WELLS_FINEST = 1e-5  # residual below which nothing is an outlier
-HELD_OUT = 4  # every so manieth point is kept for choosing the degree
-
-Degree = Annotated[int, Field(ge=2, le=16)]
-
-
-@pydantic_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class WellOptions:
-    """How V about an attractor is sought, and where it is believed.
-
-    Attributes
-    ----------
-    degrees
-        Highest powers that are tried, one after the other.
-    accuracy
-        Relative Hamilton–Jacobi residual below which no higher power is tried.
-    reach
-        Level up to which a formula is sought, as a share of V at the lowest saddle.
-    tolerance
-        Largest relative Hamilton–Jacobi residual at a point where a formula is believed.
-    """
-
-    degrees: Annotated[tuple[Degree, ...], Field(min_length=1)] = (4, 6, 8, 10, 12)
-    accuracy: Annotated[float, Field(gt=0)] = LOCAL_WELLS_FINEST
-    reach: Annotated[float, Field(gt=0, le=3)] = 1.2
-    tolerance: Annotated[float, Field(gt=0, lt=1)] = TOLERANCE
-
-
-def local_well(
-    dynamics: Dynamics,
-    portrait: PhasePortrait,
-    index: int,
-    *,
-    options: WellOptions,
-    seed: int = 0,
-    depth: Depth | None = None,
-) -> Well:
-    """V about one attractor, of the lowest degree that no other betters by much.
-
-    Parameters
-    ----------
-    dynamics
-        f and D.
-    portrait
-        Attractors, saddles and basins.
-    index
-        Which attractor.
-    options
-        Degrees, reach and tolerance.
-    seed
-        Decides which points are used where there are too many.
-    depth
-        The lowest saddle with V there, where the path of least action has told it before, as it does for
-        given equations.
-
-    Raises
-    ------
-    NumericalFailure
-        When no degree gives a formula.
-    """
-    basin = portrait.basins[index]
-    rows = np.arange(len(basin.chosen))
-    elsewhere = states_elsewhere(portrait, index)
-    kept = rows[rows % HELD_OUT != 0]
-    if depth is None:
-        grown = _grown_wells(dynamics, portrait, index, options, seed)
-        # No formula tells V of the saddle as well as the finest does.
-        goal = options.reach * grown[-1].level
-        extended = [extend_well(well, basin, goal=goal, rows=kept) for well in grown]
-    else:
-        extended = raised_wells(
-            dynamics, portrait.attractors[index], basin, depth, options=options, rows=kept, seed=seed
-        )
-    wells = [replace(well, tolerance=options.tolerance, elsewhere=elsewhere) for well in extended]
-    trials = _trials(wells, basin.points(rows[rows % HELD_OUT == 0]))
-    return replace(wells[best_trial(trials)], trials=trials)
-
-
-def states_elsewhere(portrait: PhasePortrait, index: int) -> np.ndarray | None:
-    """Recorded states from which f leads to other attractors, shape ``(m, d)``; None for none."""
-    others = [one for number, one in enumerate(portrait.basins) if number != index]
-    return np.concatenate([one.points(np.arange(len(one.chosen))) for one in others]) if others else None
 
 
 def surveyed(well: Well, dynamics: Dynamics, portrait: PhasePortrait, index: int) -> Well:
@@ -907,96 +855,3 @@ def surveyed(well: Well, dynamics: Dynamics, portrait: PhasePortrait, index: int
         points=basin.points(basin.below(along, well.reach)),
         elsewhere=states_elsewhere(portrait, index),
     )
-
-
-def _grown_wells(
-    dynamics: Dynamics, portrait: PhasePortrait, index: int, options: WellOptions, seed: int
-) -> list[Well]:
-    """V up to the saddle by the degrees in their order, until one is exact or the next is too many powers."""
-    wells: list[Well] = []
-    failure = NumericalFailure("no degree is affordable")
-    for degree in options.degrees:
-        if wells and affordable_degree(dynamics.dimension, degree) < degree:
-            break
-        try:
-            well = grow_well(
-                dynamics, portrait.attractors[index], portrait.basins[index], portrait.saddles[index],
-                degree=degree, generator=np.random.default_rng(seed),
-            )  # fmt: skip
-        except NumericalFailure as error:  # of one degree: another may do
-            failure = error
-            continue
-        wells.append(well)
-        if well.residual < options.accuracy:
-            break
-    if not wells:
-        raise failure
-    return wells
-
-
-def extend_well(well: Well, basin: Basin, *, goal: float, rows: np.ndarray | None = None) -> Well:
-    """Take a formula on, from its well to a higher level, by robust fits of the Hamilton–Jacobi equation.
-
-    Parameters
-    ----------
-    well
-        V up to the lowest saddle; see `grow_well`.
-    basin
-        What leads to the attractor. Only such states are asked: across the ridge another well begins.
-    goal
-        Level of V to be reached.
-    rows
-        Rows of ``basin.chosen`` that may be used; default all.
-    """
-    allowed = np.arange(len(basin.chosen)) if rows is None else rows
-    functions = well.basis.values(basin.states.reshape(-1, basin.states.shape[2]))
-    free = well.basis.exponents.sum(axis=1) > 2
-    coefficients = well.coefficients
-    level = min(0.9 * well.level, goal)
-    while True:
-        along = (functions @ coefficients).reshape(basin.states.shape[:2])
-        points = basin.points(np.intersect1d(basin.below(along, level), allowed))
-        equation = equation_at(well.basis, points, well.dynamics, attractor=well.attractor)
-        # On the way up one round keeps the formula close enough to be taken further.
-        coefficients = _robust_local_wells(
-            equation, coefficients, free, rounds=LOCAL_WELLS_REWEIGHTINGS if level >= goal else 1
-        )
-        if level >= goal:
-            break
-        level = min(goal, STEP * level)
-    residual = float(np.median(relative_residuals(equation, coefficients)))
-    top = well.level
-    if well.saddle is not None:  # a formula that goes on smoothly behind a kink is above V, never below
-        top = min(top, float(well.basis.values(well.saddle[None])[0] @ coefficients))
-    return replace(well, coefficients=coefficients, level=top, reach=goal, residual=residual, points=points)
-
-
-def _robust_local_wells(
-    equation: HamiltonJacobi, coefficients: np.ndarray, free: np.ndarray, *, rounds: int
-) -> np.ndarray:
-    """Gauss–Newton with weights that fall with what is left."""
-    for _ in range(rounds):
-        weighted = robust(equation, coefficients, finest=LOCAL_WELLS_FINEST)
-        coefficients = gauss_newton(weighted, coefficients, free=free, steps=6).coefficients
-    return coefficients
-
-
-def _trials(wells: Sequence[Well], x: np.ndarray) -> tuple[DegreeTrial, ...]:
-    """What each degree is worth on points that took no part in its fit."""
-    reached = [well.reaches(x) for well in wells]
-    most = max(int(mask.sum()) for mask in reached)
-    trials = []
-    for well, mask in zip(wells, reached, strict=True):
-        residual = well.residual_at(x[mask])
-        believed = int((residual <= well.tolerance).sum())
-        median = float(np.median(residual)) if len(residual) else np.inf
-        trials.append(DegreeTrial(well.degree, well.basis.size, median, believed / max(most, 1)))
-    return tuple(trials)
-
-
-def best_trial(trials: Sequence[DegreeTrial]) -> int:
-    """Index of the first trial whose coverage and residual no other betters by much."""
-    coverage = max(trial.covered for trial in trials)
-    good = [index for index, trial in enumerate(trials) if trial.covered >= coverage - 0.005]
-    finest = min(trials[index].residual for index in good)
-    return next(index for index in good if trials[index].residual <= max(2 * finest, LOCAL_WELLS_FINEST))

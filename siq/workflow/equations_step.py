@@ -19,8 +19,7 @@ from pydantic.dataclasses import dataclass
 from siq.errors import InputError, NumericalFailure
 from siq.inference.field_estimate import GivenField
 from siq.numerics.randomness import Purpose, generator
-from siq.quasipotential.certificate import caustics_below, certify_given_wells
-from siq.quasipotential.certificate_characteristics import references_about
+from siq.quasipotential.certificate import Evidence, caustics_below, certify, references_about
 from siq.quasipotential.certificate_tests import CertificateOptions
 from siq.quasipotential.landscape import Landscape, LandscapeOptions, NoLandscape
 from siq.quasipotential.landscape_assembly import assembled
@@ -136,12 +135,12 @@ def landscape_of_equations(
             _well(system, portrait, ways, index, settings, notes) for index in range(len(portrait.attractors))
         ]
         sought = [well for well in wells if well is not None]
-        certificate = certify_given_wells(
-            sought, found, portrait, _unseen(system, sought, draw), options=settings.certificate,
-            references=references_about(
-                system, portrait, depths=_depths(portrait, ways), seed=settings.seed
-            ), seed=settings.seed,
+        references = references_about(system, portrait, depths=_depths(portrait, ways), seed=settings.seed)
+        evidence = Evidence(
+            found, portrait, _unseen(system, sought, draw), references=references,
+            options=settings.certificate, seed=settings.seed,
         )  # fmt: skip
+        certificate = certify(sought, evidence)
         notes += caustics_below(system, sought, portrait, certificate.error, seed=settings.seed)
     wells += [None] * len(portrait.cycles)
     noises = settings.landscape.noise_intensities

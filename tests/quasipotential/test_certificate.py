@@ -37,23 +37,24 @@ from siq.inference.residuals import prediction_errors
 from siq.networks.decomposition import shuffled
 from siq.networks.networks import Networks, at_rest, initial_layers
 from siq.numerics.least_squares import representative_subset
-from siq.quasipotential.certificate import Certificate, HeldOut, certify_formulas, certify_wells
-from siq.quasipotential.certificate_characteristics import Reference, check_characteristics, references_about
+from siq.quasipotential.certificate import Certificate, Evidence, certify, references_about
 from siq.quasipotential.certificate_tests import (
     Candidate,
     CertificateOptions,
     PredictionLimits,
+    Reference,
     Verdict,
     check_agreement,
     check_branch,
+    check_characteristics,
     check_hamilton_jacobi,
     check_prediction,
     stated_error,
 )
 from siq.quasipotential.characteristics import Fan, adapted_fan, lowest_sheet
 from siq.quasipotential.formulas import exact_decomposition
+from siq.quasipotential.global_formula import fit_values, refine_globally
 from siq.quasipotential.hamilton_jacobi import LibraryBasis
-from siq.quasipotential.refinement import Refined, fit_values, refine_globally
 from siq.quasipotential.wells import Well, grow_well
 from siq.systems.dynamics import Dynamics
 from siq.systems.phase_portrait import PhasePortrait
@@ -85,17 +86,25 @@ def certified(
     formulas = exact_decomposition(known.dynamics, 2 * potential)
     if circulatory is not None:
         formulas = replace(formulas, circulatory=circulatory)
-    return certify_formulas(
-        formulas, found, portrait_of(known, 300, share=share), held_out_of(known, share=share),
-        options=CertificateOptions(), prediction=prediction, wells=wells,
-        references=references_of(known, share=share), relative_error=relative_error,
+    evidence = evidence_of(known, found, prediction=prediction, share=share)
+    return certify(formulas, evidence, others=wells, relative_error=relative_error)
+
+
+def evidence_of(
+    known: KnownSystem,
+    found: IdentifiedField | None = None,
+    *,
+    prediction: Verdict = PASSED,
+    share: float = 0.6,
+    held_out: int = 150,
+    count: int = 300,
+) -> Evidence:
+    """States from all over the domain, where each comes to in a hundredth of a time unit, characteristics."""
+    x0 = uniform_points(known, held_out, seed=5, share=share)
+    return Evidence(
+        found or exact_field(known, degree_of(known)), portrait_of(known, count, share=share), x0,
+        pairs_from(known, x0, 0.01), references_of(known, share=share, count=count), prediction=prediction,
     )  # fmt: skip
-
-
-def held_out_of(known: KnownSystem, *, share: float = 0.6, count: int = 150) -> HeldOut:
-    """States from all over the domain, and where each comes to in a hundredth of a time unit."""
-    x0 = uniform_points(known, count, seed=5, share=share)
-    return HeldOut(x0, pairs_from(known, x0, 0.01))
 
 
 def pairs_from(known: KnownSystem, x0: np.ndarray, h: float) -> SnapshotPairs:
@@ -372,12 +381,10 @@ def test_every_other_invariant_subspace_is_refused(dimension: int, rotation: flo
         as_dict = potential.as_coefficients_dict()
         coefficients = np.array([float(as_dict.get(term, 0)) for term in library.terms])
         own = coefficients[1:]
-        candidate = in_basis(basis, own, points, portrait)
-        equation = check_hamilton_jacobi(candidate, found, limit=0.05)
-        branch = check_branch(candidate, found, limit=0.01)
-        followed, _, _ = check_characteristics(
-            candidate, found, references_of(known), error=1e-6, options=CertificateOptions()
-        )
+        candidate = replace(in_basis(basis, own, points, portrait), references=references_of(known))
+        equation = check_hamilton_jacobi(candidate, found, CertificateOptions())
+        branch = check_branch(candidate, found, CertificateOptions())
+        followed, _ = check_characteristics(candidate, found, CertificateOptions(), error=1e-6)
         if np.allclose(hessian, true, rtol=1e-6, atol=1e-8):
             accepted += 1
             assert equation.passed
@@ -515,15 +522,14 @@ def test_a_well_of_another_system_is_refused_by_the_agreement_alone() -> None:
 def test_agreement_is_relative_and_up_to_a_constant() -> None:
     known = archetype(2)
     wells = wells_of(known)
-    points = [well.points for well in wells]
 
     def scaled(at: np.ndarray) -> np.ndarray:
         return 1.01 * potential_values(known, at) + 5
 
-    verdict = check_agreement(scaled, wells, points, limit=0.02)
+    verdict = check_agreement(scaled, wells, limit=0.02)
     assert verdict.passed
     assert verdict.value == pytest.approx(0.01, rel=1e-6)
-    assert not check_agreement(scaled, wells, points, limit=0.009).passed
+    assert not check_agreement(scaled, wells, limit=0.009).passed
 
 
 def held_out(known: KnownSystem) -> Recordings:
@@ -586,32 +592,18 @@ def test_the_uncertainty_of_f_widens_the_limits_and_no_more() -> None:
 
 def test_a_well_that_is_missing_is_refused() -> None:
     known = archetype(2)
-    refined = of_wells(known, wells_of(known)[:1])
-    certificate = certify_wells(
-        refined, portrait_of(known, 300, share=0.6), held_out_of(known), options=CertificateOptions(),
-        prediction=PASSED, references=references_of(known), compared=False,
-    )  # fmt: skip
+    certificate = certify(wells_of(known)[:1], evidence_of(known))
     assert "branch" in refusals(certificate)
     assert "1 of 2 attractors have no formula" in certificate.reason
 
 
-def of_wells(known: KnownSystem, wells: tuple[Well, ...], others: tuple[Well, ...] = ()) -> Refined:
-    found = exact_field(known, degree_of(known))
-    return Refined(found, found.library, None, None, None, None, np.inf, False, wells, others, ())
-
-
 def test_wells_by_both_routes_must_agree() -> None:
     known = archetype(2)
-    wells, setting = wells_of(known), portrait_of(known, 300, share=0.6)
-    options, other = CertificateOptions(), wells_of(maier_stein(1))
-    foreign = tuple(
-        replace(two, attractor=one.attractor) for one, two in zip(wells, other, strict=True)
-    )  # fmt: skip
-    seen = (setting, held_out_of(known))
-    told = {"options": options, "prediction": PASSED, "references": references_of(known)}
-    same = certify_wells(of_wells(known, wells, wells), *seen, **told)
+    wells, other = wells_of(known), wells_of(maier_stein(1))
+    foreign = tuple(replace(two, attractor=one.attractor) for one, two in zip(wells, other, strict=True))
+    same = certify(wells, evidence_of(known), others=wells, compared=True)
     assert same.certified, same.reason
-    different = certify_wells(of_wells(known, wells, foreign), *seen, **told)
+    different = certify(wells, evidence_of(known), others=foreign, compared=True)
     assert refusals(different) == {"agreement"}
 
 
@@ -637,11 +629,7 @@ def test_the_error_that_is_stated_lies_above_the_true_one(beta: float, barrier: 
         known.dynamics, setting.attractors[0], setting.basins[0], setting.saddles[0],
         degree=8, generator=np.random.default_rng(0),
     )  # fmt: skip
-    certificate = certify_wells(
-        of_wells(known, (well,)), setting, held_out_of(known, share=1.0, count=600),
-        options=CertificateOptions(), prediction=PASSED,
-        references=references_of(known, share=1.0, count=400), compared=False,
-    )  # fmt: skip
+    certificate = certify([well], evidence_of(known, share=1.0, held_out=600, count=400))
     fan = fan_of(beta, barrier / 2)
     kept = lowest_sheet(fan)
     at, exact = fan.points[kept], fan.values[kept]
@@ -661,9 +649,7 @@ def test_without_an_attractor_no_error_can_be_stated() -> None:
         values=lambda at: potential_values(known, at), gradients=lambda at: at, hessians=lambda at: at,
         circulatory=None, points=uniform_points(known, 20), attractors=(),
     )  # fmt: skip
-    error, worst = stated_error(candidate, exact_field(known, 3))
-    assert error == np.inf
-    assert worst is None
+    assert stated_error(candidate, exact_field(known, 3)) == np.inf
 
 
 def test_a_phase_portrait_with_a_fault_refuses_whatever_else_passes() -> None:
@@ -673,9 +659,6 @@ def test_a_phase_portrait_with_a_fault_refuses_whatever_else_passes() -> None:
     faulty: PhasePortrait = replace(setting, descents=escaped)
     assert faulty.fault() is not None
     formulas = exact_decomposition(known.dynamics, 2 * known.potential)
-    certificate = certify_formulas(
-        formulas, exact_field(known, 3), faulty, held_out_of(known), options=CertificateOptions(),
-        prediction=PASSED, references=references_of(known),
-    )  # fmt: skip
+    certificate = certify(formulas, replace(evidence_of(known), portrait=faulty))
     assert not certificate.certified
     assert "another attractor" in certificate.reason

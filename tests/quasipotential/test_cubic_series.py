@@ -22,8 +22,8 @@ def test_it_is_the_power_series_of_degree_three(dimension: int) -> None:
         cubic_series(known.dynamics, attractor),
         quasipotential_series(known.dynamics, attractor, degree=3),
     )
-    assert cubic.gradient(x) == pytest.approx(whole.gradient(x), abs=1e-10)
-    assert cubic.hessian(x) == pytest.approx(whole.hessian(x), abs=1e-10)
+    assert cubic.gradients(x) == pytest.approx(whole.gradients(x), abs=1e-10)
+    assert cubic.hessians(x) == pytest.approx(whole.hessians(x), abs=1e-10)
 
 
 def test_of_a_long_chain_that_turns_it_is_exact() -> None:

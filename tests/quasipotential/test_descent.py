@@ -26,7 +26,7 @@ OPTIONS = CertificateOptions()
 NOISE = 0.02  # ε: the noise per unit of time is ε D
 
 
-def candidate_of(known: KnownSystem, factor: float = 1.0) -> Candidate:
+def candidate_of(known: KnownSystem, pairs: SnapshotPairs, factor: float = 1.0) -> Candidate:
     portrait = portrait_of(known, 300, share=0.6)
     return Candidate(
         values=lambda at: factor * potential_values(known, at),
@@ -35,6 +35,7 @@ def candidate_of(known: KnownSystem, factor: float = 1.0) -> Candidate:
         circulatory=None,
         points=uniform_points(known, 200, share=0.6),
         attractors=portrait.attractors,
+        pairs=pairs,
     )
 
 
@@ -55,16 +56,14 @@ def pairs_of(
 @pytest.mark.parametrize("build", [lambda: archetype(2), lambda: maier_stein(1)])
 def test_without_noise_the_true_v_falls_along_every_pair(build: Callable[[], KnownSystem]) -> None:
     known = build()
-    verdict = check_descent(candidate_of(known), exact_field(known, 3), pairs_of(known), options=OPTIONS)
+    verdict = check_descent(candidate_of(known, pairs_of(known)), exact_field(known, 3), OPTIONS)
     assert verdict.passed and verdict.value == 0
 
 
 def test_it_is_the_recorded_motion_that_counts_and_not_the_identified_f() -> None:
     known = maier_stein(1)
     # f is the right one, and ∇V·f < 0 everywhere; the recordings go the other way.
-    verdict = check_descent(
-        candidate_of(known), exact_field(known, 3), pairs_of(known, sign=-1.0), options=OPTIONS
-    )
+    verdict = check_descent(candidate_of(known, pairs_of(known, sign=-1.0)), exact_field(known, 3), OPTIONS)
     assert not verdict.passed and verdict.value > 0.9
     assert verdict.reason == "V does not fall along the recordings"
 
@@ -76,7 +75,7 @@ def test_a_share_of_the_pairs_may_rise() -> None:
     mixed = SnapshotPairs(down.x0, xh, down.h, down.recording)
     for limit, passes in [(0.05, True), (0.01, False)]:
         verdict = check_descent(
-            candidate_of(known), exact_field(known, 3), mixed, options=CertificateOptions(descent=limit)
+            candidate_of(known, mixed), exact_field(known, 3), CertificateOptions(descent=limit)
         )
         assert verdict.value == pytest.approx(0.02, abs=2e-3)
         assert verdict.passed is passes
@@ -89,7 +88,7 @@ def test_with_noise_v_falls_in_the_mean_as_fast_as_it_has_to(factor: float, pass
     known = maier_stein(1)
     found = exact_field(known, 3, relative_error=np.sqrt(NOISE))
     verdict = check_descent(
-        candidate_of(known, factor), found, pairs_of(known, noise=NOISE), options=OPTIONS, error=1e-3
+        candidate_of(known, pairs_of(known, noise=NOISE), factor), found, OPTIONS, error=1e-3
     )
     assert verdict.passed is passes, (verdict.value, verdict.limit)
     assert (verdict.value <= verdict.limit) is passes
@@ -99,12 +98,10 @@ def test_longer_steps_change_the_mean_by_as_much_as_is_allowed_for() -> None:
     known = maier_stein(1)
     found = exact_field(known, 3, relative_error=np.sqrt(NOISE))
     pairs = pairs_of(known, h=0.1, noise=NOISE, count=10_000)
-    assert check_descent(candidate_of(known), found, pairs, options=OPTIONS).passed
+    assert check_descent(candidate_of(known, pairs), found, OPTIONS).passed
 
 
 def test_too_few_pairs_are_no_test() -> None:
     known = maier_stein(1)
-    verdict = check_descent(
-        candidate_of(known), exact_field(known, 3), pairs_of(known, count=20), options=OPTIONS
-    )
+    verdict = check_descent(candidate_of(known, pairs_of(known, count=20)), exact_field(known, 3), OPTIONS)
     assert not verdict.passed and "only 20 pairs" in verdict.reason

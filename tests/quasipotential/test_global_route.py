@@ -19,7 +19,7 @@ from known_systems import (
 
 from siq.inference.field_estimate import IdentifiedField
 from siq.inference.library import CandidateLibrary
-from siq.quasipotential.refinement import GlobalPotential, fit_values, refine_globally
+from siq.quasipotential.global_formula import GlobalPotential, fit_values, refine_globally
 from siq.systems.dynamics import Dynamics
 
 SYSTEMS = {

@@ -17,6 +17,7 @@ from known_systems import (
 )
 
 from siq.inference.library import candidate_library
+from siq.quasipotential.global_formula import field_terms
 from siq.quasipotential.hamilton_jacobi import (
     HamiltonJacobi,
     LibraryBasis,
@@ -26,7 +27,6 @@ from siq.quasipotential.hamilton_jacobi import (
     relative_residual,
     sensitivity,
 )
-from siq.quasipotential.refinement import field_terms
 from siq.systems.dynamics import Dynamics
 
 pytestmark = pytest.mark.portable

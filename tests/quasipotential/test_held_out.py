@@ -7,14 +7,14 @@ import pytest
 from known_systems import maier_stein, portrait_of, uniform_points
 
 from siq.data.recordings import SnapshotPairs
-from siq.quasipotential.certificate import HeldOut, part_of
-from siq.quasipotential.certificate_characteristics import FEWEST, Reference, follow_well
-from siq.quasipotential.certificate_tests import basin_region
-from siq.quasipotential.wells import Well, grow_well
+from siq.inference.field_estimate import GivenField
+from siq.quasipotential.certificate import Evidence, candidate_in_well, follow_well
+from siq.quasipotential.certificate_tests import FEWEST, Reference
+from siq.quasipotential.wells import RecordedRegion, Well, grow_well
 
 KNOWN = maier_stein(1)
 PORTRAIT = portrait_of(KNOWN, 300, share=0.6)
-REGION = basin_region(PORTRAIT, 0)
+REGION = RecordedRegion.of_basin(PORTRAIT, 0)
 
 
 @pytest.fixture(scope="module")
@@ -30,10 +30,12 @@ def reference() -> Reference:
     return follow_well(KNOWN.dynamics, PORTRAIT, 0)
 
 
-def held_out(count: int) -> HeldOut:
+def held_out(count: int, reference: Reference | None) -> Evidence:
     x0 = uniform_points(KNOWN, count, seed=7, share=0.6)
     xh = x0 + 0.01 * KNOWN.dynamics.drift(x0)
-    return HeldOut(x0, SnapshotPairs(x0, xh, np.full(count, 0.01), np.arange(count)))
+    pairs = SnapshotPairs(x0, xh, np.full(count, 0.01), np.arange(count))
+    references = () if reference is None else (reference,)
+    return Evidence(GivenField(KNOWN.dynamics), PORTRAIT, x0, pairs, references)
 
 
 def test_a_basin_is_told_by_recorded_descents() -> None:
@@ -45,13 +47,13 @@ def test_a_basin_is_told_by_recorded_descents() -> None:
 
 
 def test_they_are_held_out_states_of_the_well_and_of_no_other(well: Well, reference: Reference) -> None:
-    given = held_out(400)
-    part = part_of(given, well, REGION, reference)
+    given = held_out(400, reference)
+    part = candidate_in_well(well, given)
     rows = {tuple(row) for row in given.points}
     assert len(part.points) >= FEWEST and all(tuple(row) in rows for row in part.points)
     assert (part.points[:, 0] * well.attractor[0] > 0).all()
     assert (well.values(part.points) < 0.9 * well.level).all()
-    assert part.claimed == 1.0 and "all held out" in part.described
+    assert part.claimed == 1.0 and "all held out" in part.tested_on
     # Pairs count by their first sample alone.
     inside = {tuple(row) for row in part.points}
     assert {tuple(row) for row in part.pairs.x0} == inside
@@ -60,15 +62,15 @@ def test_they_are_held_out_states_of_the_well_and_of_no_other(well: Well, refere
 def test_where_they_are_few_characteristics_give_more_and_it_is_said(
     well: Well, reference: Reference
 ) -> None:
-    part = part_of(held_out(40), well, REGION, reference)
+    part = candidate_in_well(well, held_out(40, reference))
     assert len(part.points) > FEWEST
-    assert "reached by characteristics" in part.described
-    alone = part_of(held_out(40), well, REGION, None)
-    assert 0 < len(alone.points) < FEWEST and "characteristics" not in alone.described
+    assert "reached by characteristics" in part.tested_on
+    alone = candidate_in_well(well, held_out(40, None))
+    assert 0 < len(alone.points) < FEWEST and "characteristics" not in alone.tested_on
 
 
 def test_a_formula_answers_where_it_claims_to_hold(well: Well, reference: Reference) -> None:
     # An other curvature across: the residual is large, and the formula claims hardly anything.
     wrong = np.where(well.basis.exponents[:, 1] == 2, 3.0, 1.0) * well.coefficients
     other = Well(well.dynamics, well.attractor, well.basis, wrong, well.level, well.saddle, 1.0, well.points)
-    assert part_of(held_out(400), other, REGION, reference).claimed < 0.5
+    assert candidate_in_well(other, held_out(400, reference)).claimed < 0.5

@@ -98,9 +98,9 @@ def test_the_powers_near_an_attractor_are_those_of_the_series(beta: float) -> No
     series = quasipotential_series(known.dynamics, well.attractor, degree=8)
     angles = np.linspace(0, 2 * np.pi, 20)
     x = well.attractor + 0.1 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    np.testing.assert_allclose(well.values(x), series.evaluate(x), rtol=2e-3)
+    np.testing.assert_allclose(well.values(x), series.values(x), rtol=2e-3)
     np.testing.assert_allclose(
-        well.hessians(well.attractor[None])[0], series.hessian(well.attractor[None])[0], atol=1e-12
+        well.hessians(well.attractor[None])[0], series.hessians(well.attractor[None])[0], atol=1e-12
     )
 
 

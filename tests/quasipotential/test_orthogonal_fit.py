@@ -17,7 +17,7 @@ from known_systems import (
 )
 
 from siq.inference.field_estimate import IdentifiedField
-from siq.quasipotential.refinement import OrthogonalFit, fit_orthogonal, refine_globally
+from siq.quasipotential.global_formula import OrthogonalFit, fit_orthogonal, refine_globally
 from siq.systems.diffusion import Diffusion
 
 pytestmark = pytest.mark.portable

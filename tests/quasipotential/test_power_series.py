@@ -44,21 +44,21 @@ EXACT = {
 @pytest.mark.parametrize("known", EXACT.values(), ids=EXACT)
 def test_a_polynomial_quasipotential_is_found_exactly(known: KnownSystem) -> None:
     series = series_of(known, 5)
-    points = around(series.center, 1.0)
-    at_attractor = potential_values(known, series.center[None])
+    points = around(series.basis.center, 1.0)
+    at_attractor = potential_values(known, series.basis.center[None])
     expected = potential_values(known, points) - at_attractor
-    np.testing.assert_allclose(series.evaluate(points), expected, rtol=1e-11, atol=1e-12)
+    np.testing.assert_allclose(series.values(points), expected, rtol=1e-11, atol=1e-12)
     np.testing.assert_allclose(
-        series.gradient(points), potential_gradient(known, points), rtol=1e-11, atol=1e-11
+        series.gradients(points), potential_gradient(known, points), rtol=1e-11, atol=1e-11
     )
 
 
 def test_the_second_derivatives_are_those_of_the_gradient() -> None:
     series = series_of(maier_stein(3), 6)
-    points, step = around(series.center, 0.5, 20), 1e-5
+    points, step = around(series.basis.center, 0.5, 20), 1e-5
     for state, shift in enumerate(step * np.eye(2)):
-        slope = (series.gradient(points + shift) - series.gradient(points - shift)) / (2 * step)
-        np.testing.assert_allclose(series.hessian(points)[:, state], slope, rtol=1e-8, atol=1e-8)
+        slope = (series.gradients(points + shift) - series.gradients(points - shift)) / (2 * step)
+        np.testing.assert_allclose(series.hessians(points)[:, state], slope, rtol=1e-8, atol=1e-8)
 
 
 @pytest.mark.parametrize("degree", [2, 3, 5, 6, 8])
@@ -67,8 +67,8 @@ def test_the_residual_falls_as_the_power_after_the_degree(degree: int) -> None:
     series = series_of(known, degree)
 
     def residual(radius: float) -> float:
-        points = around(series.center, radius)
-        slope = series.gradient(points)
+        points = around(series.basis.center, radius)
+        slope = series.gradients(points)
         return float(np.abs(np.sum(slope * (known.dynamics.drift(points) + slope), axis=1)).max())
 
     # Small enough that the next power rules, large enough that it stands above rounding.
@@ -83,9 +83,9 @@ def test_the_series_turns_with_the_states() -> None:
     back = dict(zip(known.dynamics.symbols, turn.T @ np.array([u, v]), strict=True))
     turned = Dynamics.of((u, v), tuple(turn @ np.array([f.subs(back) for f in known.dynamics.formulas])))
     series = series_of(known, 6)
-    other = quasipotential_series(turned, turn @ series.center, degree=6)
-    points = around(series.center, 0.5)
-    np.testing.assert_allclose(other.evaluate(points @ turn.T), series.evaluate(points), rtol=1e-11)
+    other = quasipotential_series(turned, turn @ series.basis.center, degree=6)
+    points = around(series.basis.center, 0.5)
+    np.testing.assert_allclose(other.values(points @ turn.T), series.values(points), rtol=1e-11)
 
 
 def test_the_series_scales_with_the_states_and_the_time() -> None:
@@ -97,10 +97,10 @@ def test_the_series_scales_with_the_states_and_the_time() -> None:
     diffusion = speed * np.diag(scale**2)
     series = series_of(known, 6)
     other = quasipotential_series(
-        Dynamics.of((u, v), equations, diffusion=diffusion), scale * series.center, degree=6
+        Dynamics.of((u, v), equations, diffusion=diffusion), scale * series.basis.center, degree=6
     )
-    points = around(series.center, 0.5)
-    np.testing.assert_allclose(other.evaluate(points * scale), series.evaluate(points), rtol=1e-11)
+    points = around(series.basis.center, 0.5)
+    np.testing.assert_allclose(other.values(points * scale), series.values(points), rtol=1e-11)
 
 
 def test_a_field_that_is_no_polynomial_is_expanded_by_its_derivatives() -> None:
@@ -111,7 +111,7 @@ def test_a_field_that_is_no_polynomial_is_expanded_by_its_derivatives() -> None:
     series = quasipotential_series(dynamics, np.zeros(2), degree=7)
     points = around(np.zeros(2), 0.1)
     expected = sympy.lambdify([x, y], potential)(*points.T) - 2
-    np.testing.assert_allclose(series.evaluate(points), expected, atol=1e-11)
+    np.testing.assert_allclose(series.values(points), expected, atol=1e-11)
 
 
 @pytest.mark.parametrize(("dimension", "degree"), [(3, 6), (4, 5)])

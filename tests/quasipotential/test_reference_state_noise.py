@@ -42,7 +42,7 @@ def test_a_polynomial_potential_is_found_exactly_by_its_series(dimension: int, w
     series = quasipotential_series(known.dynamics, center, degree=5)
     points = center + np.random.default_rng(0).normal(size=(50, dimension))
     expected = potential_values(known, points) - potential_values(known, center[None])
-    np.testing.assert_allclose(series.evaluate(points), expected, rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(series.values(points), expected, rtol=1e-10, atol=1e-10)
 
 
 def test_the_series_of_one_state_is_that_of_the_quadrature() -> None:
@@ -50,7 +50,7 @@ def test_the_series_of_one_state_is_that_of_the_quadrature() -> None:
     series = quasipotential_series(known.dynamics, known.attractors[1], degree=8)
     for x in (0.9, 1.1):
         expected = potential_of_one_state(known, 1.0, x)
-        assert series.evaluate(np.array([[x]]))[0] == pytest.approx(expected, rel=2e-6)
+        assert series.values(np.array([[x]]))[0] == pytest.approx(expected, rel=2e-6)
 
 
 @pytest.mark.parametrize("which", [0, 1])

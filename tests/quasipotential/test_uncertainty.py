@@ -9,7 +9,7 @@ from known_systems import KnownSystem, exact_field
 
 from siq.inference.field_estimate import IdentifiedField, NoiseFormula, constant_noise
 from siq.inference.selection import RivalTerms
-from siq.quasipotential.uncertainty import potential_errors, potential_slopes, relative_error
+from siq.quasipotential.characteristics import potential_errors, potential_slopes, relative_error
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import hessian_at
 

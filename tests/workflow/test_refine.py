@@ -10,13 +10,12 @@ import pytest
 import sympy
 
 from siq.data.recordings import SnapshotPairs
+from siq.quasipotential import refinement
 from siq.quasipotential.certificate import Certificate
 from siq.quasipotential.certificate_tests import Verdict
-from siq.quasipotential.refinement import Refined, RefinementOptions
+from siq.quasipotential.refinement import Refined, RefinementOptions, every_well_held_out
 from siq.systems.dynamics import Dynamics
 from siq.systems.phase_portrait import phase_portrait
-from siq.workflow import refinement_step
-from siq.workflow.refinement_step import every_well_held_out
 
 PASSED, REFUSED = Verdict(0.0, 1.0, True), Verdict(2.0, 1.0, False, "it is no solution")
 
@@ -38,20 +37,21 @@ def test_the_wells_carry_the_certificate_where_one_formula_is_refused(
 ) -> None:
     well: Any = object()
     found = Refined(
-        None, None, np.ones(1), np.ones((1, 1)), np.eye(1), np.ones((1, 1)), 0.01, True, (well,), (), (),  # type: ignore[arg-type]
+        None, None, 0.01, (well,), (), (), np.ones(1), np.ones((1, 1)), np.eye(1), np.ones((1, 1)), True,  # type: ignore[arg-type]
     )  # fmt: skip
-    monkeypatch.setattr(refinement_step, "refine", lambda *_, **__: found)
-    monkeypatch.setattr(refinement_step, "formula_library", lambda *_: None)
-    monkeypatch.setattr(refinement_step, "relative_error_of", lambda *_: 0.0)
+    monkeypatch.setattr(refinement, "refine", lambda *_, **__: found)
+    monkeypatch.setattr(refinement, "formula_library", lambda *_: None)
+    monkeypatch.setattr(refinement, "relative_error_of", lambda *_: 0.0)
     monkeypatch.setattr(
-        refinement_step, "refined_decomposition", lambda one, _: SimpleNamespace(potential=one.potential)
+        refinement, "refined_decomposition", lambda one, _: SimpleNamespace(potential=one.potential)
     )
-    ground: Any = SimpleNamespace(
-        found=None, portrait=None, points=None, number=0,
-        certify=lambda *_, **__: certificate(formula, "region"),
-        certify_wells=lambda *_, **__: certificate(wells, "wells"),
-    )  # fmt: skip
-    refined, formulas, made = refinement_step.refined_by_routes(ground, RefinementOptions(), None, None)
+
+    def certified(one: Any, *_: Any, **__: Any) -> Certificate:
+        return certificate(wells, "wells") if one == (well,) else certificate(formula, "region")
+
+    monkeypatch.setattr(refinement, "certify", certified)
+    context: Any = SimpleNamespace(found=None, portrait=None, points=None, number=0, evidence=None)
+    refined, formulas, made = refinement.refined_by_routes(context, RefinementOptions(), None, None)
     assert made.scope == scope
     assert (formulas.potential is not None) == whole
     assert made.certified == (PASSED in (formula, wells))

@@ -1,0 +1,399 @@
+"""One formula of V, with g, for the whole recorded region, in the functions of a candidate library.
+
+Gauss–Newton on the Hamilton–Jacobi equation starts from the V of networks or of wells with all functions of
+the library; then those that their own standard errors do not tell from zero are dropped one by one
+(`refine_globally`). Neither M nor anything else that the local route uses takes part.
+
+An f identified from noisy data has no exact decomposition on the terms that V and g have: its coefficients
+err independently. Given those terms, only few of its coefficients are free: f = -D∇V + g with ∇V·g = 0
+identically. The generalised least-squares fit of f within that family uses all of the data's information
+about V, which solving the Hamilton–Jacobi equation for the f found does not (`fit_orthogonal`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+import scipy.special
+
+from siq.inference.field_estimate import IdentifiedField
+from siq.inference.library import CandidateLibrary
+from siq.quasipotential.hamilton_jacobi import (
+    HamiltonJacobi,
+    equation_at,
+    gauss_newton,
+    potential_basis,
+    sensitivity,
+)
+from siq.quasipotential.wells import Well
+
+LOWER_PARTS = (0.7, 0.5, 0.3)  # of the points, by V
+STEPS = 50
+RANK = 1e-7  # singular values below this share of the largest are no constraint of their own
+
+
+@dataclass(frozen=True)
+class GlobalPotential:
+    """V over one library, refined.
+
+    Attributes
+    ----------
+    library
+        The q functions.
+    coefficients
+        Of V, shape ``(q,)``.
+    sensitivity
+        ∂ξ/∂c, shape ``(q, p)``: how they follow the p coefficients of f.
+    covariance
+        Shape ``(q, q)``, zero for terms that are not there.
+    residual
+        Relative Hamilton–Jacobi residual on the points of the fit.
+    converged
+        Whether Gauss–Newton settled.
+    """
+
+    library: CandidateLibrary
+    coefficients: np.ndarray
+    sensitivity: np.ndarray
+    covariance: np.ndarray
+    residual: float
+    converged: bool
+
+
+def fit_values(library: CandidateLibrary, x: np.ndarray, potential: np.ndarray) -> np.ndarray:
+    """Coefficients of V, shape ``(q,)``, by least squares of its values at points ``(n, d)``."""
+    return _least_squares(library, [x], [potential])
+
+
+def fit_wells(library: CandidateLibrary, wells: Sequence[Well]) -> np.ndarray:
+    """Coefficients of V, shape ``(q,)``, by least squares of the V of several wells within each of them.
+
+    How deep the wells are among each other is left open: each has a constant of its own.
+    """
+    inside = [well.inside for well in wells]
+    return _least_squares(library, inside, [well.values(x) for well, x in zip(wells, inside, strict=True)])
+
+
+def _least_squares(
+    library: CandidateLibrary, points: Sequence[np.ndarray], values: Sequence[np.ndarray]
+) -> np.ndarray:
+    """Coefficients of V from its values at groups of points, each group with a constant of its own.
+
+    Every group counts as much as any other, however many points it has.
+    """
+    basis, counts = potential_basis(library), [len(x) for x in points]
+    weight = np.repeat([1 / np.sqrt(max(count, 1)) for count in counts], counts)
+    constants = np.repeat(np.eye(len(points)), counts, axis=0)
+    functions = np.column_stack([basis.values(np.concatenate(points)), constants])
+    scale = np.sqrt((functions**2).mean(axis=0))
+    scale = np.where(scale > 0, scale, 1.0)
+    matrix = weight[:, None] * functions / scale
+    solution = np.linalg.lstsq(matrix, weight * np.concatenate(values), rcond=1e-10)[0] / scale
+    coefficients = np.zeros(library.size)
+    coefficients[basis.chosen] = solution[: basis.size]
+    return coefficients
+
+
+def network_starts(
+    library: CandidateLibrary,
+    found: IdentifiedField,
+    points: np.ndarray,
+    potential: np.ndarray,
+) -> Iterator[np.ndarray]:
+    """Starts for V from its values by the networks, one after the other until one serves.
+
+    The first is the fit of all values. Networks are worst where recordings are few, far out, and Gauss–Newton
+    may follow them to a false solution; the further ones are refined on lower and lower parts of V first.
+
+    Parameters
+    ----------
+    library, found, points
+        As for `refine_globally`.
+    potential
+        V_θ at the points, shape ``(n,)``.
+    """
+    yield fit_values(library, points, potential)
+    for share in LOWER_PARTS:
+        part = potential <= np.quantile(potential, share)
+        if part.sum() > 2 * library.size:
+            start = fit_values(library, points[part], potential[part])
+            yield refine_globally(start, library, found, points[part], sparse=False).coefficients
+
+
+def refine_globally(
+    start: np.ndarray,
+    library: CandidateLibrary,
+    found: IdentifiedField,
+    points: np.ndarray,
+    *,
+    false_terms: float = 0.01,
+    precision: float = 1e-7,
+    sparse: bool = True,
+) -> GlobalPotential:
+    """Refine V from a start, and keep only the terms that the data support.
+
+    Parameters
+    ----------
+    start
+        Coefficients of V over the library, shape ``(q,)``.
+    library
+        The functions that V may use.
+    found
+        The identified f with its uncertainty.
+    points
+        Where the equation is asked for, shape ``(n, d)``.
+    false_terms
+        Probability that the uncertainty of f alone brings any false term into V.
+    precision
+        Terms that contribute less than this share of V are dropped in any case.
+    sparse
+        Whether to drop terms at all.
+    """
+    basis = potential_basis(library)
+    equation = equation_at(basis, points, found.dynamics)
+    solution = gauss_newton(equation, start[basis.chosen])
+    critical = float(-scipy.special.ndtri(false_terms / (2 * basis.size)))
+    # Dropping terms changes the others, hence the errors: repeat until nothing more can go.
+    for _ in range(6 if sparse else 0):
+        kept = _eliminate(equation, solution.coefficients, found, critical=critical, precision=precision)
+        if len(kept) == basis.size or not len(kept):
+            break
+        equation, basis = equation.restricted(kept), basis.restricted(kept)
+        solution = gauss_newton(equation, solution.coefficients[kept])
+    response = sensitivity(
+        equation, solution.coefficients, field_terms=field_terms(found, equation.points),
+        components=found.support[:, 0],
+    )  # fmt: skip
+    # A residual that no V in this library can remove adds to the uncertainty.
+    jacobian = equation.jacobian(solution.coefficients)
+    scale = np.linalg.norm(jacobian, axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    inverse = np.linalg.pinv(jacobian / scale, rcond=1e-11)
+    residual = equation.residual(solution.coefficients)
+    freedom = max(len(residual) - len(scale), 1)
+    misfit = float(residual @ residual) / freedom * (inverse @ inverse.T) / np.outer(scale, scale)
+    q, p = library.size, len(found.support)
+    coefficients, sensitivities, covariance = np.zeros(q), np.zeros((q, p)), np.zeros((q, q))
+    coefficients[basis.chosen] = solution.coefficients
+    sensitivities[basis.chosen] = response
+    covariance[np.ix_(basis.chosen, basis.chosen)] = response @ found.covariance @ response.T + misfit
+    return GlobalPotential(
+        library, coefficients, sensitivities, covariance, solution.residual, solution.converged
+    )
+
+
+def field_terms(found: IdentifiedField, points: np.ndarray) -> np.ndarray:
+    """The function of each of the p coefficients of f at points, shape ``(n, p)``."""
+    return found.library.evaluate(points)[:, found.support[:, 1]]
+
+
+def _eliminate(
+    equation: HamiltonJacobi,
+    coefficients: np.ndarray,
+    found: IdentifiedField,
+    *,
+    critical: float,
+    precision: float,
+) -> np.ndarray:
+    """Backward elimination in the linearised equation: positions of the terms to be kept."""
+    jacobian = equation.jacobian(coefficients)
+    goal = jacobian @ coefficients - equation.residual(coefficients)
+    gradient = equation.gradients @ coefficients
+    forcing = -(
+        equation.weight[:, None] * gradient[:, found.support[:, 0]] * field_terms(found, equation.points)
+    )
+    # Everything depends on the points through a triangular matrix only.
+    triangle = np.asarray(np.linalg.qr(np.column_stack([jacobian, goal, forcing]), mode="r"))
+    m = len(coefficients)
+    spread = equation.sizes()
+    size = np.sqrt(equation.diffusion.contract(equation.points, gradient).mean()) or 1.0
+    rows = max(len(equation.points) - m, 1)
+    active = np.arange(m)
+    while len(active):
+        columns = triangle[:, active]
+        scale = np.linalg.norm(columns, axis=0)
+        scale = np.where(scale > 0, scale, 1.0)
+        # The inverse of least squares; by QR where columns are independent, which is ten times faster.
+        orthogonal, upper = np.linalg.qr(columns / scale)
+        diagonal = np.abs(np.diag(upper))
+        if diagonal.min() > 1e-10 * diagonal.max():
+            inverse = scipy.linalg.solve_triangular(upper, orthogonal.T)
+        else:
+            inverse = np.linalg.pinv(columns / scale, rcond=1e-11)
+        inverse = inverse / scale[:, None]
+        current = inverse @ triangle[:, m]
+        misfit = triangle[:, m] - columns @ current
+        response = inverse @ triangle[:, m + 1 :]
+        variance = np.einsum("mp,pq,mq->m", response, found.covariance, response)
+        variance = variance + misfit @ misfit / rows * (inverse**2).sum(axis=1)
+        contribution = np.abs(current) * spread[active] / size
+        strength = np.minimum(
+            np.abs(current) / (critical * np.sqrt(variance) + 1e-300), contribution / precision
+        )
+        weakest = int(np.argmin(strength))
+        if strength[weakest] >= 1:
+            break
+        active = np.delete(active, weakest)
+    return active
+
+
+@dataclass(frozen=True)
+class OrthogonalFit:
+    """V and g over the library of f, with ∇V·g = 0 identically.
+
+    Attributes
+    ----------
+    potential, circulatory
+        Coefficients of V, shape ``(q,)``, and of g, shape ``(q, d)``.
+    potential_covariance
+        Shape ``(q, q)``.
+    circulatory_errors
+        Standard errors of g, shape ``(q, d)``.
+    freedom
+        Number of constraints on the coefficients of f.
+    chi_square
+        Squared distance of the constrained f from the identified one, in its own covariance.
+    """
+
+    potential: np.ndarray
+    circulatory: np.ndarray
+    potential_covariance: np.ndarray
+    circulatory_errors: np.ndarray
+    freedom: int
+    chi_square: float
+
+    @property
+    def probability(self) -> float:
+        """Probability of so large a distance by chance: tiny where no such V and g exist."""
+        return float(scipy.special.chdtrc(self.freedom, self.chi_square)) if self.freedom else 1.0
+
+
+def fit_orthogonal(
+    found: IdentifiedField,
+    potential: np.ndarray,
+    circulatory: np.ndarray,
+    points: np.ndarray,
+) -> OrthogonalFit | None:
+    """Fit V and g on their terms so that f = -D∇V + g, ∇V·g = 0, is closest to the identified f.
+
+    Parameters
+    ----------
+    found
+        f with its covariance.
+    potential, circulatory
+        Coefficients to start from over the library of f, shapes ``(q,)`` and ``(q, d)``; those that are
+        zero stay so.
+    points
+        Where ∇V·g is asked to vanish, shape ``(n, d)``. More points than coefficients make it vanish
+        identically.
+
+    Returns
+    -------
+    OrthogonalFit or None
+        None where the iteration finds no decomposition that is orthogonal to rounding.
+    """
+    library = found.library
+    family = _Family(found, potential != 0, circulatory != 0, points)
+    theta = np.concatenate([potential[family.of_potential], circulatory.T[family.of_circulatory]])
+    whiten = scipy.linalg.solve_triangular(
+        np.linalg.cholesky(found.covariance), np.eye(len(found.support)), lower=True
+    )
+    # Coefficients in units of what each of them does to f, so that the units of the states do not matter.
+    design = whiten @ family.observed / family.scale
+    tangent = np.zeros((len(theta), 0))
+    rank = 0
+    for _ in range(STEPS):
+        violation, slope = family.constraints(theta)
+        left, singular, right = np.linalg.svd(slope / family.scale, full_matrices=True)
+        rank = int((singular > RANK * singular[0]).sum()) if len(singular) else 0
+        restore = -right[:rank].T @ ((left[:, :rank].T @ violation) / singular[:rank])
+        tangent = right[rank:].T
+        wanted = whiten @ found.values - design @ (theta * family.scale + restore)
+        step = restore.copy()
+        if tangent.shape[1]:
+            step += tangent @ np.linalg.lstsq(design @ tangent, wanted, rcond=None)[0]
+        theta = theta + step / family.scale
+        if np.linalg.norm(step) <= 1e-13 * np.linalg.norm(theta * family.scale):
+            break
+    violation, _slope = family.constraints(theta)
+    if not np.isfinite(theta).all() or np.abs(violation).max() > 1e-8:
+        return None
+    inverse = tangent @ np.linalg.pinv(design @ tangent) / family.scale[:, None]
+    covariance = inverse @ inverse.T
+    distance = whiten @ found.values - design @ (theta * family.scale)
+    q, d = library.size, library.dimension
+    count = int(family.of_potential.sum())
+    fitted_potential, fitted = np.zeros(q), np.zeros((d, q))
+    fitted_potential[family.of_potential] = theta[:count]
+    fitted[family.of_circulatory] = theta[count:]
+    potential_covariance, errors = np.zeros((q, q)), np.zeros((d, q))
+    terms = np.flatnonzero(family.of_potential)
+    potential_covariance[np.ix_(terms, terms)] = covariance[:count, :count]
+    errors[family.of_circulatory] = np.sqrt(np.maximum(np.diag(covariance)[count:], 0))
+    return OrthogonalFit(
+        fitted_potential, fitted.T, potential_covariance, errors.T,
+        freedom=len(found.values) - tangent.shape[1], chi_square=float(distance @ distance),
+    )  # fmt: skip
+
+
+class _Family:
+    """Fields f = -D∇V + g over given terms, linear in θ = (coefficients of V, of g), and ∇V·g."""
+
+    def __init__(
+        self,
+        found: IdentifiedField,
+        of_potential: np.ndarray,
+        of_circulatory: np.ndarray,
+        points: np.ndarray,
+    ) -> None:
+        library: CandidateLibrary = found.library
+        q, d = library.size, library.dimension
+        self.of_potential, self.of_circulatory = of_potential, of_circulatory.T
+        terms = np.flatnonzero(of_potential)
+        places = np.argwhere(self.of_circulatory)
+        downhill = library.downhill(found.diffusion)[:, :, terms]
+        whole = np.zeros((d, q, len(terms) + len(places)))
+        whole[:, :, : len(terms)] = -downhill
+        for column, (i, k) in enumerate(places):
+            whole[i, k, len(terms) + column] = 1.0
+        listed = np.zeros((d, q), dtype=bool)
+        listed[found.support[:, 0], found.support[:, 1]] = True
+        self.observed = whole[found.support[:, 0], found.support[:, 1]]
+        values = library.evaluate(points)
+        noise = found.diffusion
+        speed = np.sqrt(noise.squared_speed(points, found.dynamics.drift(points)))
+        usual = np.sqrt((speed**2).mean())
+        # What one unit of each term adds to f, relative to f.
+        sizes = np.sqrt(np.outer(np.diag(noise.precision), (values**2).mean(axis=0))) / usual
+        self.absent = (sizes[:, :, None] * whole)[~listed]
+        self.absent = self.absent[np.abs(self.absent).any(axis=1)]
+        self.gradients = np.einsum("nk,kij->nij", values, library.derivatives[:, :, terms])
+        self.circulation = np.zeros((len(points), d, len(places)))
+        for column, (i, k) in enumerate(places):
+            self.circulation[:, i, column] = values[:, k]
+        slopes = np.sqrt(noise.contract(points, self.gradients.transpose(0, 2, 1)))
+        scale = np.concatenate([np.sqrt((slopes**2).mean(axis=0)) / usual, sizes[self.of_circulatory]])
+        self.scale = np.where(scale > 0, scale, 1.0)
+        self.weight = 1 / np.maximum(speed, 1e-3 * speed.max()) / usual / np.sqrt(len(points))
+
+    def constraints(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Weighted ∇V·g at the points and the terms that f does not have, with their derivatives."""
+        count = self.gradients.shape[2]
+        gradient = self.gradients @ theta[:count]
+        circulation = self.circulation @ theta[count:]
+        weight = self.weight[:, None]
+        slope = np.concatenate(
+            [
+                weight * np.einsum("nd,ndj->nj", circulation, self.gradients),
+                weight * np.einsum("nd,ndj->nj", gradient, self.circulation),
+            ],
+            axis=1,
+        )
+        product = self.weight * (gradient * circulation).sum(axis=1)
+        return (
+            np.concatenate([product, self.absent @ theta]),
+            np.concatenate([slope, self.absent]),
+        )
