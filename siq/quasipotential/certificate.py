@@ -183,7 +183,7 @@ def certify(
     if isinstance(formulas, SymbolicDecomposition):
         scope, candidates = "region", [_candidate_of_region(formulas, evidence, relative_error)]
     else:
-        scope, candidates = "wells", [candidate_in_well(well, evidence) for well in wells]
+        scope, candidates = "wells", [_candidate_in_well(well, evidence) for well in wells]
     verdicts: dict[str, list[Verdict]] = {}
     error = own_error = 0.0 if candidates else np.inf
     from_field = 0.0
@@ -192,7 +192,7 @@ def certify(
             advice = "" if isinstance(found, GivenField) else "record more there, or "
             reason = (
                 f"V claims to hold at {candidate.claimed:.0%} of the held-out states in the well about"
-                f" {position_text(wells[number].attractor)}: {advice}raise refinement.degrees"
+                f" {_position_text(wells[number].attractor)}: {advice}raise refinement.degrees"
             )
             verdicts["hamilton_jacobi"] = [Verdict.refused(reason, options.hamilton_jacobi)]
             error = own_error = np.inf
@@ -229,7 +229,7 @@ def certify(
         if scope == "region":
             pairs = [(candidates[0].values, others, others)] if others else []
         else:
-            same = [(one, two) for one in others for two in wells if same_place(one, two)]
+            same = [(one, two) for one in others for two in wells if _same_place(one, two)]
             pairs = [(one.values, [two], [one]) for one, two in same]
         if others and scope == "wells" and len(pairs) < len(portrait.attractors):
             tests["agreement"] = Verdict.refused("the network route found no formula for some well")
@@ -239,7 +239,7 @@ def certify(
                 [
                     check_agreement(
                         values, two,
-                        limit=explained_difference(
+                        limit=_explained_difference(
                             options, error, max(_error_of_well(one, evidence) for one in erring)
                         )
                         + 6 * relative_error,
@@ -258,12 +258,12 @@ def certify(
     return Certificate(tests, error, "; ".join(dict.fromkeys(refused)), scope, tested_on)
 
 
-def explained_difference(options: CertificateOptions, *errors: float) -> float:
+def _explained_difference(options: CertificateOptions, *errors: float) -> float:
     """Difference of two routes that their errors explain; one that cannot be stated explains nothing."""
     return HARMLESS + sum(min(error, options.error) for error in errors)
 
 
-def same_place(one: Well, two: Well) -> bool:
+def _same_place(one: Well, two: Well) -> bool:
     """Whether two wells are about one attractor: both are the same root of the same f."""
     return np.array_equal(one.attractor, two.attractor)
 
@@ -289,7 +289,7 @@ def _candidate_of_region(
     )
 
 
-def candidate_in_well(well: Well, evidence: Evidence) -> Candidate:
+def _candidate_in_well(well: Well, evidence: Evidence) -> Candidate:
     """V about an attractor, to be tested on what lies in its well below `SHARE` of its level.
 
     It makes no claim where its own residual is large, as at a caustic: `claimed` has the share of the states
@@ -342,7 +342,7 @@ def _error_from_field(well: Well, points: np.ndarray, evidence: Evidence) -> flo
     return relative_error(evidence.found, well.gradients, well.attractor, x, well.values(x))
 
 
-def position_text(position: np.ndarray) -> str:
+def _position_text(position: np.ndarray) -> str:
     """A state as it stands in the reasons of a certificate."""
     return np.array2string(position, precision=4, suppress_small=True, separator=", ")
 
@@ -373,8 +373,8 @@ def caustics_below(
         if (caustic := first_caustic(fan)) is not None:
             where, value = caustic
             notes.append(
-                f"characteristics from the attractor {position_text(well.attractor)} cross at a caustic from"
-                f" {position_text(where)} on, where U = {2 * value:.4g}: V has no smooth form there, and no"
+                f"characteristics from the attractor {_position_text(well.attractor)} cross at a caustic from"
+                f" {_position_text(where)} on, where U = {2 * value:.4g}: V has no smooth form there, and no"
                 " formula follows it"
             )
     return tuple(notes)
@@ -398,37 +398,36 @@ STARTS = 0.9  # share of the recorded starts below the first level where no sadd
 def references_about(
     dynamics: Dynamics, portrait: PhasePortrait, *, depths: Sequence[float] | None = None, seed: int = 0
 ) -> tuple[Reference, ...]:
-    """V by characteristics about every attractor of a phase portrait; see `follow_well` for the depths."""
-    known = [np.inf] * len(portrait.attractors) if depths is None else depths
-    return tuple(
-        follow_well(dynamics, portrait, index, depth=depth, seed=seed) for index, depth in enumerate(known)
-    )
-
-
-def follow_well(
-    dynamics: Dynamics, portrait: PhasePortrait, index: int, *, depth: float = np.inf, seed: int = 0
-) -> Reference:
-    """V by characteristics about one attractor, as far as they may be believed.
+    """V by characteristics about every attractor of a phase portrait.
 
     Parameters
     ----------
     dynamics
         f, twice differentiable, and D.
-    portrait, index
-        Where to compare, and which attractor.
-    depth
-        V at the lowest saddle, where it is known: higher up nothing is compared. Where curves bundle, none
-        of a few in search of it may come close.
+    portrait
+        Where to compare.
+    depths
+        V at the lowest saddle of each well, where it is known: higher up nothing is compared.
     seed
         Draws directions where there are more than two states, and thins the points.
+    """
+    known = [np.inf] * len(portrait.attractors) if depths is None else depths
+    return tuple(
+        _follow_well(dynamics, portrait, index, depth=depth, seed=seed) for index, depth in enumerate(known)
+    )
 
-    Returns
-    -------
-    Reference
-        With a fault where characteristics give none.
+
+def _follow_well(
+    dynamics: Dynamics, portrait: PhasePortrait, index: int, *, depth: float = np.inf, seed: int = 0
+) -> Reference:
+    """V by characteristics about one attractor, as far as they may be believed.
+
+    Where the depth, V at the lowest saddle, is known, nothing is compared higher up: where curves bundle,
+    none of a few in search of it may come close. The seed draws directions where there are more than two
+    states, and thins the points. The reference has a fault where characteristics give none.
     """
     attractor = portrait.attractors[index].position
-    name = position_text(attractor)
+    name = _position_text(attractor)
     region = RecordedRegion.of_basin(portrait, index)
 
     def without(fault: str) -> Reference:

@@ -316,7 +316,7 @@ def check_branch(
     )
 
 
-def residual_integral(
+def _residual_integral(
     gradient: Function, dynamics: Dynamics, x: np.ndarray, *, box: np.ndarray, slowest: float, fastest: float
 ) -> np.ndarray:
     """∫∣∇V·(f + D∇V)∣ dt along the ascending paths that end at points ``(n, d)``: shape ``(n,)``.
@@ -346,7 +346,7 @@ def stated_error(candidate: Candidate, found: AnyField, *, seed: int = 0) -> flo
     rows = generator.choice(len(candidate.points), min(ERROR_POINTS, len(candidate.points)), replace=False)
     x = candidate.points[rows]
     places = np.concatenate([candidate.points, [one.position for one in candidate.attractors]])
-    integral = residual_integral(
+    integral = _residual_integral(
         candidate.gradients, found.dynamics, x,
         box=np.stack([places.min(axis=0), places.max(axis=0)], axis=1),
         slowest=min(-one.eigenvalues.real.max() for one in candidate.attractors),
@@ -598,7 +598,7 @@ SINGULAR = 1e-13  # of a Jacobian: one that is singular to rounding need not sto
 LARGEST_SHARE = 0.05  # of the draws in which an equilibrium may be lost: what is claimed is claimed at 95 %
 
 
-def lost_shares(
+def _lost_shares(
     found: IdentifiedField, equilibria: Sequence[Equilibrium], *, box: np.ndarray, seed: int = 0
 ) -> np.ndarray:
     """Share of the f that the data allow in which each equilibrium does not exist: shape ``(k,)``.
@@ -607,17 +607,6 @@ def lost_shares(
     identified f to the drawn one by Newton's method, in small steps. It is lost where it vanishes together
     with another one, where its stability changes, and where it has jumped to another one that is followed as
     well.
-
-    Parameters
-    ----------
-    found
-        f with its uncertainty.
-    equilibria
-        Of the identified f.
-    box
-        Shape ``(d, 2)``: the recorded region.
-    seed
-        Of the draws.
     """
     if found.noise_free or not equilibria:
         return np.zeros(len(equilibria))
@@ -678,7 +667,7 @@ def check_existence(found: IdentifiedField, portrait: PhasePortrait, *, seed: in
     """Whether attractors and the saddles between them exist with the whole uncertainty of f."""
     saddles = {one.position.tobytes(): one for around in portrait.saddles for one in around}
     claimed = [*portrait.attractors, *saddles.values()]
-    shares = lost_shares(found, claimed, box=portrait.box, seed=seed)
+    shares = _lost_shares(found, claimed, box=portrait.box, seed=seed)
     if not len(shares):
         return Verdict(0.0, LARGEST_SHARE, True)
     worst = int(np.argmax(shares))

@@ -94,7 +94,7 @@ class HamiltonianFlow:
     def velocities(
         self, y: np.ndarray, q: np.ndarray, turned: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """ẏ, q̇ and v̇ at positions and momenta ``(n, d)``; `turned` is that of `linear`, where it is known."""
+        """ẏ, q̇ and v̇ at positions and momenta ``(n, d)``; `turned` as of `linear`, where it is known."""
         force = self.dynamics.drift(self.points(y)) @ self.inverse.T
         push = (self.at(y) @ q[:, :, None])[:, :, 0]
         if turned is None:
@@ -238,7 +238,7 @@ def characteristics(
     Parameters
     ----------
     dynamics
-        f, twice differentiable.
+        f, twice differentiable, and D.
     attractor
         A, shape ``(d,)``, a stable equilibrium.
     level
@@ -246,7 +246,7 @@ def characteristics(
     box
         Shape ``(d, 2)``, in the states' units.
     directions
-        Shape ``(c, d)``: where the curves start; of any length. See `siq.quasipotential.characteristics`.
+        Shape ``(c, d)``: where the curves start; of any length.
     start
         V on the first ellipsoid, as a share of the level.
     start_degree
@@ -261,13 +261,6 @@ def characteristics(
         Local error, relative to the distance from A, to V and to the tangents.
     most_steps
         Of any curve: what takes more, in a stiff system, ends as `End.STALLED`.
-
-    Notes
-    -----
-    Curves that cross without a caustic of their own are not noticed here: see
-    `lowest_sheet`. Near an attractor with different rates most directions end close
-    together: see `adapted_fan`. Past another equilibrium errors grow, so that a level
-    far above the barrier gives less accurate curves.
     """
     flow = HamiltonianFlow(dynamics, np.asarray(attractor, dtype=float), level)
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
@@ -350,7 +343,7 @@ def characteristics(
     )  # fmt: skip
 
 
-def join(first: Fan, second: Fan) -> Fan:
+def _join(first: Fan, second: Fan) -> Fan:
     """Two fans of the same attractor and level as one; the curves of the second are counted on."""
     shift = len(first.directions)
     names = [one.name for one in fields(Fan) if one.name not in ("attractor", "hessian", "level")]
@@ -381,7 +374,7 @@ MOST_PARTS = 8  # into which a gap is divided at once
 BENT = 0.03  # of the level: a larger term of second order is no correction
 
 
-def even_directions(dimension: int, count: int, *, generator: np.random.Generator) -> np.ndarray:
+def _even_directions(dimension: int, count: int, *, generator: np.random.Generator) -> np.ndarray:
     """Unit vectors, shape ``(count, d)``: even in the plane, the first along the first axis; else random."""
     if dimension == 1:
         return np.array([[1.0], [-1.0]])
@@ -414,19 +407,14 @@ def adapted_fan(
     generator
         Draws the first directions where there are more than two states.
     count, most
-        Number of curves at first, and at most.
+        Number of curves at first, and at most: in four and more dimensions that is what limits the spread.
     rounds
         How often curves are put in between, up to seven into every gap.
     gap
-        Distance between the ends of neighbours that is close enough; the level is at about 1.
-
-    Returns
-    -------
-    Fan
-        In the order in which the curves were added. Where a saddle or a caustic parts neighbours, a gap stays
-        however many curves are put into it. In four and more dimensions `most` is what limits the spread.
+        Distance between the ends of neighbours that is close enough; the level is at about 1. Where a saddle
+        or a caustic parts neighbours, a gap stays however many curves are put into it.
     """
-    directions = even_directions(dynamics.dimension, count, generator=generator)
+    directions = _even_directions(dynamics.dimension, count, generator=generator)
 
     def follow(starts: np.ndarray) -> Fan:
         return characteristics(dynamics, attractor, level=level, box=box, directions=starts, **options)
@@ -436,7 +424,7 @@ def adapted_fan(
         between = _between(fan, gap)[: most - len(fan.directions)]
         if not len(between):
             break
-        fan = join(fan, follow(between))
+        fan = _join(fan, follow(between))
     return fan
 
 
@@ -453,32 +441,17 @@ def first_caustic(fan: Fan) -> tuple[np.ndarray, float] | None:
 
 
 def lowest_sheet(fan: Fan, *, distance: float = 0.06, margin: float = 2e-3) -> np.ndarray:
-    """Which points may be taken as values of V: no neighbour says that less action would do.
+    """Mask of the points of a fan that may be taken as values of V, shape ``(n,)``.
 
     A neighbour within `distance` says what V should be at a point by its own V, gradient and curvature. Where
-    this is lower than the point's V by more than the margin, the point lies on an upper sheet: another curve
-    gets there with less action. It then drops out with all that follows on its curve, for what is not
-    optimal once never becomes so again.
+    this is lower than the point's V by more than the margin, a share of the level, the point lies on an upper
+    sheet: another curve gets there with less action. It then drops out with all that follows on its curve,
+    for what is not optimal once never becomes so again. The distance, in the metric in which the level is at
+    about 1, should exceed the gaps of the fan.
 
-    Parameters
-    ----------
-    fan
-        Curves about one attractor.
-    distance
-        In the metric in which the level is at about 1. Should exceed the gaps of the fan.
-    margin
-        As a share of the level.
-
-    Returns
-    -------
-    numpy.ndarray
-        Shape ``(n,)``, a mask of the fan's points.
-
-    Notes
-    -----
-    Limits: an upper sheet is only seen where the fan has curves of the lower sheet within `distance`, not
-    in its gaps, nor where those curves ended at a box or at a caustic; and close to a kink of V, where
-    the sheets differ by less than the margin, points of both are kept, too high by at most the margin.
+    An upper sheet is only seen where the fan has curves of the lower sheet within `distance`, not in its
+    gaps, nor where those curves ended at a box or at a caustic; and close to a kink of V, where the sheets
+    differ by less than the margin, points of both are kept, too high by at most the margin.
     """
     scaled = (fan.points - fan.attractor) @ fan.metric.T
     eigenvalues, vectors = np.linalg.eigh(fan.hessians)
@@ -507,18 +480,10 @@ def lowest_sheet(fan: Fan, *, distance: float = 0.06, margin: float = 2e-3) -> n
 def value_near(fan: Fan, x: np.ndarray, *, sheet: np.ndarray, distance: float = 0.1) -> np.ndarray:
     """V at points, to second order from the nearest point of a fan: ``(m, d)`` to ``(m,)``.
 
-    Parameters
-    ----------
-    fan
-        Curves about one attractor.
-    x
-        Where V is wanted.
-    sheet
-        Which points of the fan may be used, shape ``(n,)``; see `lowest_sheet`.
-    distance
-        Beyond it, in the metric in which the level is at about 1, the value is NaN; so it is where the second
-        order is no small correction, close to a caustic. The error is of third order in the distance, but
-        where V has a kink between x and the nearest point, of first.
+    `sheet` masks the points of the fan that may be used, see `lowest_sheet`. Beyond `distance`, in the metric
+    in which the level is at about 1, the value is NaN; so it is where the second order is no small
+    correction, close to a caustic. The error is of third order in the distance, but where V has a kink
+    between x and the nearest point, of first.
     """
     points = fan.points[sheet]
     found, nearest = cKDTree((points - fan.attractor) @ fan.metric.T).query(
@@ -592,10 +557,8 @@ def ascending_integrals(
 
     Parameters
     ----------
-    gradient
-        ∇V, points ``(n, d)`` to ``(n, d)``.
-    dynamics
-        f and D.
+    gradient, dynamics
+        ∇V, points ``(n, d)`` to ``(n, d)``; f and D.
     x
         Where the paths end, shape ``(n, d)``.
     integrand
@@ -603,19 +566,13 @@ def ascending_integrals(
     middle, width
         Of the box of the states, shape ``(d,)``: a path that leaves it by `FAR` times its width in any state
         has run away, whatever the units.
-    slowest, fastest
-        Rates that set how long, and how finely, the paths are followed back.
-    fewest_steps
-        Of each path.
+    slowest, fastest, fewest_steps
+        Rates, and a number of steps, that set how long, and how finely, the paths are followed back.
 
     Returns
     -------
-    integrals
-        Shape ``(n, k)``.
-    beginnings
-        Where the paths come from, shape ``(n, d)``.
-    lost
-        Mask of those that run away, shape ``(n,)``.
+    integrals, beginnings, lost
+        Shapes ``(n, k)``, ``(n, d)`` and ``(n,)``: the last is a mask of the paths that run away.
     """
     steps = int(np.clip(RELAXATIONS / slowest * fastest / HEUN_STEP, fewest_steps, MOST_HEUN_STEPS))
     step = RELAXATIONS / slowest / steps
@@ -642,13 +599,12 @@ def ascending_integrals(
     return total, x, lost
 
 
-def potential_slopes(
+def _potential_slopes(
     found: IdentifiedField, gradient: Function, attractor: np.ndarray, x: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """∂V/∂Ξ at points, by every coefficient that f might have, and ∂V/∂θ by those of an estimated εD.
 
-    Shapes ``(n, q, d)`` and ``(n, k)``; NaN where no ascending path comes from the attractor. The arguments
-    are those of `potential_errors`.
+    Shapes ``(n, q, d)`` and ``(n, k)``; NaN where no ascending path comes from the attractor.
     """
     dynamics, q, d = found.dynamics, found.library.size, found.library.dimension
     rates = -np.linalg.eigvals(dynamics.jacobian(attractor[None])[0]).real
@@ -695,7 +651,7 @@ def potential_errors(found: AnyField, gradient: Function, attractor: np.ndarray,
     """
     if isinstance(found, GivenField) or found.noise_free or not len(x):
         return np.zeros(len(x))
-    of_field, of_noise = potential_slopes(found, gradient, attractor, x)
+    of_field, of_noise = _potential_slopes(found, gradient, attractor, x)
     return np.asarray(np.sqrt(found.variance(of_field) + found.noise_variance(of_noise)))
 
 

@@ -38,10 +38,8 @@ class SymbolicDecomposition:
         The d states.
     potential
         V, zero at its minimum; None where no single formula holds over the wells.
-    circulatory
-        Components of g; none where there is no V.
-    vector_field
-        Components of f.
+    circulatory, vector_field
+        Components of g, none where there is no V, and of f.
     wells
         V about each attractor, zero there and valid below a level, where it was found.
     standard_errors
@@ -124,10 +122,8 @@ def decomposition_from_coefficients(
     ----------
     library
         The q functions.
-    potential
-        Coefficients of V, shape ``(q,)``.
-    circulatory, vector_field
-        Coefficients of g and f, shape ``(q, d)``.
+    potential, circulatory, vector_field
+        Coefficients of V, shape ``(q,)``, and of g and f, shape ``(q, d)``.
     points
         Shape ``(n, d)``; the minimum is sought within their box, from the lowest of them.
 
@@ -138,7 +134,7 @@ def decomposition_from_coefficients(
     """
     basis = LibraryBasis(library, np.arange(library.size))
     value = basis.expression(potential)
-    lowest = minimum(value, library.symbols, points)
+    lowest = _minimum(value, library.symbols, points)
     return SymbolicDecomposition(
         symbols=library.symbols,
         potential=value - sympy.Float(lowest, 17),
@@ -147,25 +143,12 @@ def decomposition_from_coefficients(
     )
 
 
-def minimum(
+def _minimum(
     expression: sympy.Expr, symbols: Sequence[sympy.Symbol], points: np.ndarray, *, starts: int = 8
 ) -> float:
-    """Smallest value of an expression within the box of some points.
+    """Smallest value of an expression within the box of points ``(n, d)``.
 
-    Parameters
-    ----------
-    expression
-        A function of `symbols`.
-    symbols
-        The d states.
-    points
-        Shape ``(n, d)``. Descents start from the lowest of them that do not lie side by side.
-    starts
-        Number of descents.
-
-    Returns
-    -------
-    float
+    Descents start from the lowest of the points that do not lie side by side.
     """
     together = compile_formulas([expression, *(expression.diff(s) for s in symbols)], tuple(symbols))
     values = together(points.T)[0]

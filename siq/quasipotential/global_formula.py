@@ -7,7 +7,7 @@ the library; then those that their own standard errors do not tell from zero are
 An f identified from noisy data has no exact decomposition on the terms that V and g have: its coefficients
 err independently. Given those terms, only few of its coefficients are free: f = -D∇V + g with ∇V·g = 0
 identically. The generalised least-squares fit of f within that family uses all of the data's information
-about V, which solving the Hamilton–Jacobi equation for the f found does not (`fit_orthogonal`).
+about V, which solving the Hamilton–Jacobi equation for the f found does not (`_fit_orthogonal`).
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ from siq.quasipotential.hamilton_jacobi import (
 from siq.quasipotential.wells import Well
 
 LOWER_PARTS = (0.7, 0.5, 0.3)  # of the points, by V
-STEPS = 50
+IMPLAUSIBLE = 1e-4  # a probability below which no orthogonal fit is believed
+FIT_POINTS = 400  # where ∇V·g is asked to vanish in a joint fit
+STEPS = 50  # of it
 RANK = 1e-7  # singular values below this share of the largest are no constraint of their own
 
 
 @dataclass(frozen=True)
 class GlobalPotential:
-    """V over one library, refined.
+    """V over a library of q functions, refined.
 
     Attributes
     ----------
-    library
-        The q functions.
     coefficients
         Of V, shape ``(q,)``.
     sensitivity
@@ -103,17 +103,10 @@ def network_starts(
     points: np.ndarray,
     potential: np.ndarray,
 ) -> Iterator[np.ndarray]:
-    """Starts for V from its values by the networks, one after the other until one serves.
+    """Starts for V from its values V_θ by the networks, one after the other until one serves.
 
     The first is the fit of all values. Networks are worst where recordings are few, far out, and Gauss–Newton
     may follow them to a false solution; the further ones are refined on lower and lower parts of V first.
-
-    Parameters
-    ----------
-    library, found, points
-        As for `refine_globally`.
-    potential
-        V_θ at the points, shape ``(n,)``.
     """
     yield fit_values(library, points, potential)
     for share in LOWER_PARTS:
@@ -164,7 +157,7 @@ def refine_globally(
         equation, basis = equation.restricted(kept), basis.restricted(kept)
         solution = gauss_newton(equation, solution.coefficients[kept])
     response = sensitivity(
-        equation, solution.coefficients, field_terms=field_terms(found, equation.points),
+        equation, solution.coefficients, field_terms=_field_terms(found, equation.points),
         components=found.support[:, 0],
     )  # fmt: skip
     # A residual that no V in this library can remove adds to the uncertainty.
@@ -185,7 +178,7 @@ def refine_globally(
     )
 
 
-def field_terms(found: IdentifiedField, points: np.ndarray) -> np.ndarray:
+def _field_terms(found: IdentifiedField, points: np.ndarray) -> np.ndarray:
     """The function of each of the p coefficients of f at points, shape ``(n, p)``."""
     return found.library.evaluate(points)[:, found.support[:, 1]]
 
@@ -203,7 +196,7 @@ def _eliminate(
     goal = jacobian @ coefficients - equation.residual(coefficients)
     gradient = equation.gradients @ coefficients
     forcing = -(
-        equation.weight[:, None] * gradient[:, found.support[:, 0]] * field_terms(found, equation.points)
+        equation.weight[:, None] * gradient[:, found.support[:, 0]] * _field_terms(found, equation.points)
     )
     # Everything depends on the points through a triangular matrix only.
     triangle = np.asarray(np.linalg.qr(np.column_stack([jacobian, goal, forcing]), mode="r"))
@@ -241,8 +234,8 @@ def _eliminate(
 
 
 @dataclass(frozen=True)
-class OrthogonalFit:
-    """V and g over the library of f, with ∇V·g = 0 identically.
+class RegionFormula:
+    """V and g over the library of f.
 
     Attributes
     ----------
@@ -252,48 +245,90 @@ class OrthogonalFit:
         Shape ``(q, q)``.
     circulatory_errors
         Standard errors of g, shape ``(q, d)``.
-    freedom
-        Number of constraints on the coefficients of f.
-    chi_square
-        Squared distance of the constrained f from the identified one, in its own covariance.
+    joint
+        Whether V and g were fitted together at the Cramér–Rao bound, with ∇V·g = 0 identically.
+    freedom, chi_square
+        Of such a fit the number of constraints on the coefficients of f, and the squared distance of the
+        constrained f from the identified one, in its own covariance.
     """
 
     potential: np.ndarray
     circulatory: np.ndarray
     potential_covariance: np.ndarray
     circulatory_errors: np.ndarray
-    freedom: int
-    chi_square: float
+    joint: bool = False
+    freedom: int = 0
+    chi_square: float = 0.0
 
     @property
     def probability(self) -> float:
         """Probability of so large a distance by chance: tiny where no such V and g exist."""
         return float(scipy.special.chdtrc(self.freedom, self.chi_square)) if self.freedom else 1.0
 
+    def relative_error(self, functions: np.ndarray) -> float:
+        """Relative standard error of V over points at which the library has values, shape ``(n, q)``."""
+        values = functions @ self.potential
+        lowest = int(np.argmin(values))
+        difference = functions - functions[lowest]
+        variance = np.einsum("nq,qr,nr->n", difference, self.potential_covariance, difference)
+        size = np.linalg.norm(values - values[lowest])
+        return float(np.sqrt(np.maximum(variance, 0).sum()) / size)
 
-def fit_orthogonal(
+
+def with_circulation(
+    best: GlobalPotential,
+    found: IdentifiedField,
+    points: np.ndarray,
+    *,
+    false_terms: float,
+    precision: float,
+    single_formula: float,
+) -> RegionFormula | None:
+    """The circulation g = f + D∇V with its uncertainty, on the terms that differ from zero.
+
+    Under noise V and g are fitted together: V may fail the Hamilton–Jacobi equation of the identified f by as
+    much as f errs. What tells whether that is all is the joint fit: an f that V and g make up exactly, and
+    that the data allow. Where there is none V has to solve the equation as without noise; None where it does
+    not.
+    """
+    library = best.library
+    q, d = library.size, library.dimension
+    downhill = library.downhill(found.diffusion)
+    circulatory = found.coefficients + np.einsum("ikj,j->ki", downhill, best.coefficients)
+    # δg = δf + D∇δV with δV = S δf, coefficient by coefficient
+    response = np.einsum("ikj,jp->ikp", downhill, best.sensitivity)
+    for column, (component, term) in enumerate(found.support):
+        response[component, term, column] += 1.0
+    errors = np.sqrt(np.einsum("ikp,pr,ikr->ki", response, found.covariance, response))
+    values = library.evaluate(points)
+    size = np.sqrt((values**2).mean(axis=0))[:, None]
+    speed = np.sqrt((found.dynamics.drift(points) ** 2).mean(axis=0))[None, :]
+    critical = float(-scipy.special.ndtri(false_terms / (2 * q * d)))
+    weak = np.abs(circulatory) * size < precision * speed.max()
+    if not found.noise_free:
+        weak |= np.abs(circulatory) < critical * errors
+    circulatory = np.where(weak, 0.0, circulatory)
+    if not found.noise_free:
+        rows = np.unique(np.linspace(0, len(points) - 1, FIT_POINTS).astype(int))
+        fit = _fit_orthogonal(found, best.coefficients, circulatory, points[rows])
+        if fit is not None and fit.probability >= IMPLAUSIBLE:
+            return fit
+        if best.residual >= single_formula:
+            return None
+    return RegionFormula(best.coefficients, circulatory, best.covariance, np.where(weak, 0.0, errors))
+
+
+def _fit_orthogonal(
     found: IdentifiedField,
     potential: np.ndarray,
     circulatory: np.ndarray,
     points: np.ndarray,
-) -> OrthogonalFit | None:
+) -> RegionFormula | None:
     """Fit V and g on their terms so that f = -D∇V + g, ∇V·g = 0, is closest to the identified f.
 
-    Parameters
-    ----------
-    found
-        f with its covariance.
-    potential, circulatory
-        Coefficients to start from over the library of f, shapes ``(q,)`` and ``(q, d)``; those that are
-        zero stay so.
-    points
-        Where ∇V·g is asked to vanish, shape ``(n, d)``. More points than coefficients make it vanish
-        identically.
-
-    Returns
-    -------
-    OrthogonalFit or None
-        None where the iteration finds no decomposition that is orthogonal to rounding.
+    It starts from coefficients over the library of f, shapes ``(q,)`` and ``(q, d)``; those that are zero
+    stay so. ∇V·g is asked to vanish at points; more of them than coefficients make it vanish identically.
+    None where the iteration finds no decomposition that is orthogonal to rounding.
     """
     library = found.library
     family = _Family(found, potential != 0, circulatory != 0, points)
@@ -333,8 +368,8 @@ def fit_orthogonal(
     terms = np.flatnonzero(family.of_potential)
     potential_covariance[np.ix_(terms, terms)] = covariance[:count, :count]
     errors[family.of_circulatory] = np.sqrt(np.maximum(np.diag(covariance)[count:], 0))
-    return OrthogonalFit(
-        fitted_potential, fitted.T, potential_covariance, errors.T,
+    return RegionFormula(
+        fitted_potential, fitted.T, potential_covariance, errors.T, joint=True,
         freedom=len(found.values) - tangent.shape[1], chi_square=float(distance @ distance),
     )  # fmt: skip
 

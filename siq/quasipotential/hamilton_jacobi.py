@@ -55,15 +55,7 @@ class Basis(Protocol):
 
 @dataclass(frozen=True)
 class LibraryBasis:
-    """The functions of a candidate library that V may use, without the constant.
-
-    Attributes
-    ----------
-    library
-        The library.
-    chosen
-        Shape ``(m,)``: which of its functions.
-    """
+    """The functions of a candidate library that V may use, those in the places `chosen`."""
 
     library: CandidateLibrary
     chosen: np.ndarray
@@ -119,17 +111,7 @@ def potential_basis(library: CandidateLibrary) -> LibraryBasis:
 
 @dataclass(frozen=True)
 class PowerBasis:
-    """Products of powers of ``(x - center)/scale``.
-
-    Attributes
-    ----------
-    symbols
-        The d states.
-    center, scale
-        Shape ``(d,)``.
-    exponents
-        Shape ``(m, d)``.
-    """
+    """Products of powers of ``(x - center)/scale``, with exponents of the shape ``(m, d)``."""
 
     symbols: tuple[sympy.Symbol, ...]
     center: np.ndarray
@@ -245,12 +227,10 @@ class HamiltonJacobi:
 
     Attributes
     ----------
-    points
-        Shape ``(n, d)``.
+    points, flow
+        x and f there, shape ``(n, d)``.
     gradients
         ∂θ_j/∂x_i at the points, shape ``(n, d, m)``.
-    flow
-        f at the points, shape ``(n, d)``.
     diffusion
         D.
     weight
@@ -312,17 +292,10 @@ def relative_residuals(equation: HamiltonJacobi, coefficients: np.ndarray) -> np
 
 @dataclass(frozen=True)
 class Solution:
-    """Where Gauss–Newton ended.
+    """Coefficients where Gauss–Newton ended, and whether its last step was too small to matter.
 
-    Attributes
-    ----------
-    coefficients
-        Shape ``(m,)``.
-    residual
-        Root mean square of the weighted residual, divided by that of ∇V: the mean of
-        ``∣∇V·(f + D∇V)∣ / (∣∇V∣ ∣f∣)``.
-    converged
-        Whether the last step was too small to matter.
+    The residual is the root mean square of the weighted one, divided by that of ∇V: the mean of
+    ``∣∇V·(f + D∇V)∣ / (∣∇V∣ ∣f∣)``.
     """
 
     coefficients: np.ndarray
@@ -373,7 +346,13 @@ def gauss_newton(
     free = np.ones(len(start), dtype=bool) if free is None else free
     scale = equation.sizes()
     scale = np.where(scale > 0, scale, 1.0)
-    residual, size = _relative(equation, coefficients)
+
+    def relative(current: np.ndarray) -> tuple[np.ndarray, float]:
+        """The residual over rms of ∇V, shape ``(n,)``, and that rms."""
+        size = equation.size(current)
+        return equation.residual(current) / max(size, 1e-300), size
+
+    residual, size = relative(coefficients)
     converged = not free.any()
     for _ in range(steps if free.any() else 0):
         if size == 0:
@@ -386,7 +365,7 @@ def gauss_newton(
         while True:
             trial = coefficients.copy()
             trial[free] += length * step
-            attempt, size = _relative(equation, trial)
+            attempt, size = relative(trial)
             if np.linalg.norm(attempt) < np.linalg.norm(residual) or length < 1e-3:
                 break
             length /= 2
@@ -399,13 +378,7 @@ def gauss_newton(
         if not improved or change <= tolerance * reached or gain < 1e-7:
             converged = True
             break
-    return Solution(coefficients, relative_residual(equation, coefficients), converged)
-
-
-def _relative(equation: HamiltonJacobi, coefficients: np.ndarray) -> tuple[np.ndarray, float]:
-    """The residual over rms of ∇V, shape ``(n,)``, and that rms."""
-    size = equation.size(coefficients)
-    return equation.residual(coefficients) / max(size, 1e-300), size
+    return Solution(coefficients, _relative_residual(equation, coefficients), converged)
 
 
 def _least_squares(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -425,7 +398,7 @@ def _least_squares(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     return np.linalg.lstsq(matrix, right, rcond=1e-11)[0]
 
 
-def relative_residual(equation: HamiltonJacobi, coefficients: np.ndarray) -> float:
+def _relative_residual(equation: HamiltonJacobi, coefficients: np.ndarray) -> float:
     """Rms of the weighted residual over rms of ∇V; infinite for V = 0, or all but 0."""
     gradient = equation.slopes(coefficients)
     squared = equation.measure.contract(equation.points, gradient)
@@ -437,16 +410,10 @@ def relative_residual(equation: HamiltonJacobi, coefficients: np.ndarray) -> flo
 def sensitivity(
     equation: HamiltonJacobi, coefficients: np.ndarray, *, field_terms: np.ndarray, components: np.ndarray
 ) -> np.ndarray:
-    """How the coefficients of V follow those of f, to first order: ∂ξ/∂c, shape ``(m, p)``.
+    """∂ξ/∂c, shape ``(m, p)``: how coefficients of V follow the p coefficients of f, to first order.
 
-    Parameters
-    ----------
-    equation, coefficients
-        A solution.
-    field_terms
-        The functions of the p coefficients of f at the points, shape ``(n, p)``.
-    components
-        Shape ``(p,)``: the component of f that each belongs to.
+    `field_terms` has the functions of these at the points, shape ``(n, p)``, and `components` the component
+    of f that each belongs to, shape ``(p,)``.
     """
     gradient = equation.slopes(coefficients)
     forcing = equation.weight[:, None] * gradient[:, components] * field_terms

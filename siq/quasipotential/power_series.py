@@ -39,7 +39,7 @@ from siq.systems.formulas import compile_formulas
 
 
 @dataclass(frozen=True)
-class CubicSeries:
+class _CubicSeries:
     """``½ yᵀMy + ⅙ T(y, y, y)``: M of the shape ``(d, d)``, T of ``(d, d, d)``."""
 
     center: np.ndarray
@@ -56,7 +56,7 @@ class CubicSeries:
         return np.asarray(self.square + np.einsum("ijk,nk->nij", self.cube, x - self.center))
 
 
-def cubic_series(dynamics: Dynamics, attractor: np.ndarray) -> CubicSeries:
+def cubic_series(dynamics: Dynamics, attractor: np.ndarray) -> _CubicSeries:
     """V about an attractor, shape ``(d,)``, to its third powers."""
     place = attractor[None]
     square, noise = hessian_at(dynamics, attractor), dynamics.diffusion
@@ -75,7 +75,7 @@ def cubic_series(dynamics: Dynamics, attractor: np.ndarray) -> CubicSeries:
         cube[i] = scipy.linalg.solve_sylvester(triangle.T + triangle[i, i] * one, triangle, rest)
     back = unitary.conj()
     whole = np.einsum("ijk,ai,bj,ck->abc", cube, back, back, back, optimize=True)
-    return CubicSeries(attractor, square, np.ascontiguousarray(whole.real))
+    return _CubicSeries(attractor, square, np.ascontiguousarray(whole.real))
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,6 @@ from functools import cached_property
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import scipy.special
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as pydantic_dataclass
 
@@ -54,6 +53,7 @@ from siq.quasipotential.certificate_tests import (
     Function,
     Reference,
     Verdict,
+    sublevel_points,
 )
 from siq.quasipotential.formulas import (
     SymbolicDecomposition,
@@ -62,12 +62,12 @@ from siq.quasipotential.formulas import (
 )
 from siq.quasipotential.global_formula import (
     GlobalPotential,
-    OrthogonalFit,
-    fit_orthogonal,
+    RegionFormula,
     fit_values,
     fit_wells,
     network_starts,
     refine_globally,
+    with_circulation,
 )
 from siq.quasipotential.hamilton_jacobi import affordable_degree, potential_basis
 from siq.quasipotential.occupancy import RecordTest, record_test
@@ -79,11 +79,10 @@ logger = logging.getLogger(__name__)
 
 Route = Literal["network", "local"]
 
-IMPLAUSIBLE = 1e-4  # a probability below which no orthogonal fit is believed
 NETWORK_DEGREE = 8  # highest power of a well by the network route, whose start knows no more
 ON_SOME = "noise acts on some states only: V has one formula for each well, and none over all of them"
 ELSEWHERE = "where D depends on the state no single formula is sought: each well has its own"
-FIT_POINTS = 400  # where ∇V·g is asked to vanish in a joint fit
+NOT_ORTHOGONAL = "V and g have no exactly orthogonal form on their terms: they are fitted one by one"
 
 
 @pydantic_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -132,25 +131,16 @@ class Refined:
     found
         The identified f.
     library
-        The functions of the formulas below: those of f and of V together.
+        The functions of a formula for the region: those of f and of V together.
     residual
-        Relative Hamilton–Jacobi residual of V.
-    wells
-        By the local route, one for each attractor.
-    network_wells
-        By the network route, where it found no single formula.
+        Relative Hamilton–Jacobi residual of V there.
+    wells, network_wells
+        By the local route, one for each attractor; and by the network route, where it found no formula for
+        the region.
     notes
         What could not be done, in words.
-    potential
-        Coefficients of V over the library, shape ``(q,)``, where one formula holds over the whole region.
-    circulatory
-        Those of g, shape ``(q, d)``.
-    potential_covariance
-        Shape ``(q, q)``.
-    circulatory_errors
-        Standard errors of g, shape ``(q, d)``.
-    joint
-        Whether V and g were fitted together at the Cramér–Rao bound.
+    formula
+        V and g where one formula holds over the whole region.
     """
 
     found: IdentifiedField
@@ -159,11 +149,7 @@ class Refined:
     wells: tuple[Well, ...]
     network_wells: tuple[Well, ...] = ()
     notes: tuple[str, ...] = ()
-    potential: np.ndarray | None = None
-    circulatory: np.ndarray | None = None
-    potential_covariance: np.ndarray | None = None
-    circulatory_errors: np.ndarray | None = None
-    joint: bool = False
+    formula: RegionFormula | None = None
 
 
 def formula_library(found: IdentifiedField, options: RefinementOptions) -> CandidateLibrary:
@@ -221,7 +207,7 @@ def refine(
     """
     notes: list[str] = []
     routes = options.with_routes(networks=network is not None).routes or ()
-    found = over_library(found, library)
+    found = _over_library(found, library)
     wells: tuple[Well, ...] = ()
     if "local" in routes:
         wells, notes = local_wells(found, portrait, options=options, seed=seed)
@@ -281,9 +267,14 @@ def refine(
             groups = [network_wells, *([well] for well in network_wells if len(network_wells) > 1)]
             seek(fit_wells(library, group) for group in groups)
         if best is not None and good():
-            whole = _with_circulation(best, found, points, options, wells, notes)
+            whole = with_circulation(
+                best, found, points, false_terms=options.false_terms, precision=options.precision,
+                single_formula=options.single_formula,
+            )  # fmt: skip
             if whole is not None:
-                return whole
+                if not (whole.joint or found.noise_free):
+                    notes.append(NOT_ORTHOGONAL)
+                return Refined(found, library, best.residual, wells, (), tuple(notes), whole)
         notes.append("no single formula in this library holds over the whole recorded region")
     return Refined(
         found, library, np.inf if best is None else best.residual, tuple(wells),
@@ -291,7 +282,7 @@ def refine(
     )  # fmt: skip
 
 
-def over_library(found: IdentifiedField, library: CandidateLibrary) -> IdentifiedField:
+def _over_library(found: IdentifiedField, library: CandidateLibrary) -> IdentifiedField:
     """F over another library that holds all its functions."""
     if found.library is library:
         return found
@@ -329,65 +320,13 @@ def local_wells(
     return tuple(wells), notes
 
 
-def _with_circulation(
-    best: GlobalPotential,
-    found: IdentifiedField,
-    points: np.ndarray,
-    options: RefinementOptions,
-    wells: Sequence[Well],
-    notes: list[str],
-) -> Refined | None:
-    """The circulation g = f + D∇V with its uncertainty, on the terms that differ from zero.
-
-    Under noise V and g are fitted together: V may fail the Hamilton–Jacobi equation of the identified f by as
-    much as f errs. What tells whether that is all is the joint fit: an f that V and g make up exactly, and
-    that the data allow. Where there is none V has to solve the equation as without noise; None where it does
-    not.
-    """
-    library = best.library
-    q, d = library.size, library.dimension
-    downhill = library.downhill(found.diffusion)
-    circulatory = found.coefficients + np.einsum("ikj,j->ki", downhill, best.coefficients)
-    # δg = δf + D∇δV with δV = S δf, coefficient by coefficient
-    response = np.einsum("ikj,jp->ikp", downhill, best.sensitivity)
-    for column, (component, term) in enumerate(found.support):
-        response[component, term, column] += 1.0
-    errors = np.sqrt(np.einsum("ikp,pr,ikr->ki", response, found.covariance, response))
-    values = library.evaluate(points)
-    size = np.sqrt((values**2).mean(axis=0))[:, None]
-    speed = np.sqrt((found.dynamics.drift(points) ** 2).mean(axis=0))[None, :]
-    critical = float(-scipy.special.ndtri(options.false_terms / (2 * q * d)))
-    weak = np.abs(circulatory) * size < options.precision * speed.max()
-    if not found.noise_free:
-        weak |= np.abs(circulatory) < critical * errors
-    circulatory = np.where(weak, 0.0, circulatory)
-    fit: OrthogonalFit | None = None
-    if not found.noise_free:
-        rows = np.unique(np.linspace(0, len(points) - 1, FIT_POINTS).astype(int))
-        fit = fit_orthogonal(found, best.coefficients, circulatory, points[rows])
-        if fit is None or fit.probability < IMPLAUSIBLE:
-            fit = None
-            if best.residual >= options.single_formula:
-                return None
-            notes.append("V and g have no exactly orthogonal form on their terms: they are fitted one by one")
-    if fit is None:
-        return Refined(
-            found, library, best.residual, tuple(wells), (), tuple(notes), best.coefficients, circulatory,
-            best.covariance, np.where(weak, 0.0, errors),
-        )  # fmt: skip
-    return Refined(
-        found, library, best.residual, tuple(wells), (), tuple(notes), fit.potential, fit.circulatory,
-        fit.potential_covariance, fit.circulatory_errors, joint=True,
-    )  # fmt: skip
-
-
-def refined_decomposition(refined: Refined, points: np.ndarray) -> SymbolicDecomposition:
+def _refined_decomposition(refined: Refined, points: np.ndarray) -> SymbolicDecomposition:
     """V, g and f of a refinement, V zero at its minimum within the box of recorded states ``(n, d)``.
 
     f is that which was identified, so that f = -D∇V + g is a statement and no definition. Where there is
     one attractor only, its well's formula stands for the whole where no other was found.
     """
-    library, found = refined.library, refined.found
+    library, found, formula = refined.library, refined.found, refined.formula
     wells = refined.wells or refined.network_wells
 
     def named(errors: np.ndarray) -> dict[str, float]:
@@ -397,34 +336,19 @@ def refined_decomposition(refined: Refined, points: np.ndarray) -> SymbolicDecom
         return {f"{letter}_{state}": named(errors[:, i]) for i, state in enumerate(library.states)}
 
     errors = by_component("f", found.standard_errors)
-    if refined.potential is None:
+    if formula is None:
         return SymbolicDecomposition(library.symbols, None, (), found.dynamics.formulas, wells, errors)
-    assert refined.circulatory is not None and refined.potential_covariance is not None
-    assert refined.circulatory_errors is not None
     formulas = decomposition_from_coefficients(
-        library, potential=refined.potential, circulatory=refined.circulatory,
-        vector_field=np.zeros_like(refined.circulatory), points=points,
+        library, potential=formula.potential, circulatory=formula.circulatory,
+        vector_field=np.zeros_like(formula.circulatory), points=points,
     )  # fmt: skip
     # The constant is minus the minimum; at the minimum its own place does not matter to first order.
-    at = library.evaluate(points[np.argmin(library.evaluate(points) @ refined.potential)][None])[0]
-    constant = float(np.sqrt(at @ refined.potential_covariance @ at))
-    of_potential = named(np.sqrt(np.diag(refined.potential_covariance))) | {"1": constant}
+    at = library.evaluate(points[np.argmin(library.evaluate(points) @ formula.potential)][None])[0]
+    constant = float(np.sqrt(at @ formula.potential_covariance @ at))
+    of_potential = named(np.sqrt(np.diag(formula.potential_covariance))) | {"1": constant}
     errors |= {"V": of_potential, "U": {term: 2 * error for term, error in of_potential.items()}}
-    errors |= by_component("g", refined.circulatory_errors)
+    errors |= by_component("g", formula.circulatory_errors)
     return replace(formulas, vector_field=found.dynamics.formulas, wells=wells, standard_errors=errors)
-
-
-def relative_error_of(refined: Refined, points: np.ndarray) -> float:
-    """Relative standard error of V over points, from the uncertainty of f alone."""
-    if refined.potential is None or refined.potential_covariance is None or refined.found.noise_free:
-        return 0.0
-    functions = refined.library.evaluate(points)
-    values = functions @ refined.potential
-    lowest = int(np.argmin(values))
-    difference = functions - functions[lowest]
-    variance = np.einsum("nq,qr,nr->n", difference, refined.potential_covariance, difference)
-    size = np.linalg.norm(values - values[lowest])
-    return float(np.sqrt(np.maximum(variance, 0).sum()) / size)
 
 
 class RefinementContext:
@@ -489,7 +413,7 @@ class RefinementContext:
             pairs = coarse_pairs(recordings, memory[0], lost=memory[1])
         self.portrait: PhasePortrait = phase_portrait(self.found.dynamics, self.points, seed=number)
         if not self.found.noise_free:
-            mask = every_well_held_out(self.portrait, pairs, mask)
+            mask = _every_well_held_out(self.portrait, pairs, mask)
         self.pairs = pairs.take(mask[pairs.recording])
         self.recordings, self.unseen = recordings, mask
 
@@ -517,7 +441,7 @@ class RefinementContext:
             return RecordTest(missing=str(error))
 
 
-def every_well_held_out(portrait: PhasePortrait, pairs: SnapshotPairs, mask: np.ndarray) -> np.ndarray:
+def _every_well_held_out(portrait: PhasePortrait, pairs: SnapshotPairs, mask: np.ndarray) -> np.ndarray:
     """Held-out recordings, more of them where those that there are never come into some well.
 
     Recordings under noise may stay in one well for good, and the test of motion in another would have nothing
@@ -542,7 +466,7 @@ def every_well_held_out(portrait: PhasePortrait, pairs: SnapshotPairs, mask: np.
     return mask
 
 
-def refined_by_routes(
+def _refined_by_routes(
     context: RefinementContext,
     options: RefinementOptions,
     network: Function | None,
@@ -554,27 +478,25 @@ def refined_by_routes(
         context.found, context.portrait, library=formula_library(context.found, options), formula=formula,
         network=network, points=context.points, options=options, seed=context.number,
     )  # fmt: skip
-    formulas = refined_decomposition(refined, context.points)
+    formulas = _refined_decomposition(refined, context.points)
     both = refined.wells and refined.network_wells
     wells, others = refined.wells or refined.network_wells, refined.network_wells if both else ()
     if formulas.potential is None:
         return refined, formulas, certify(wells, context.evidence, others=others, compared=compared)
     certificate = certify(
         formulas, context.evidence, others=refined.wells, compared=compared,
-        relative_error=relative_error_of(refined, context.points),
+        relative_error=0.0 if refined.formula is None or context.found.noise_free
+        else refined.formula.relative_error(refined.library.evaluate(context.points)),
     )  # fmt: skip
     if certificate.certified or not refined.wells:
         return refined, formulas, certificate
     # One formula for all wells is an extra. What refuses it is no word against the wells.
     note = f"no single formula holds over the wells: {certificate.reason}"
-    alone = Refined(
-        refined.found, refined.library, refined.residual, refined.wells, refined.network_wells,
-        (*refined.notes, note),
-    )  # fmt: skip
+    alone = replace(refined, formula=None, notes=(*refined.notes, note))
     of_wells = certify(wells, context.evidence, others=others, compared=compared)
     if not of_wells.certified:
         return refined, formulas, certificate
-    return alone, refined_decomposition(alone, context.points), of_wells
+    return alone, _refined_decomposition(alone, context.points), of_wells
 
 
 @dataclass(frozen=True)
@@ -608,7 +530,7 @@ def refine_and_certify(context: RefinementContext, regressed: SymbolicDecomposit
         library = formula_library(context.found, context.options)
         formula = np.array([named.get(name, 0.0) for name in library.names])
     network = None if context.networks is None else _potential_of(context.networks)
-    refined, formulas, certificate = refined_by_routes(context, context.options, network, formula)
+    refined, formulas, certificate = _refined_by_routes(context, context.options, network, formula)
     caustics = caustics_below(
         context.found.dynamics, refined.wells or refined.network_wells, context.portrait, certificate.error,
         seed=context.number,
@@ -656,7 +578,7 @@ def control(
     randomised = _potential_of(shuffled(context.networks, generator=draw))
     options = replace(context.options, routes=("network",))
     try:
-        _, formulas, made = refined_by_routes(context, options, randomised, None)
+        _, formulas, made = _refined_by_routes(context, options, randomised, None)
     except (NumericalFailure, np.linalg.LinAlgError) as error:
         nothing = Verdict.refused(
             f"refinement from random weights led to no V: {error}", context.limits.hamilton_jacobi
@@ -703,29 +625,16 @@ CHECK_DEGREES = (4, 6, 8)  # of the wells with which networks are compared, to s
 CHECK_SHARE = 0.75  # of the recorded points, the lowest in V, on which one formula is tried
 
 
-@dataclass(frozen=True)
 class TrainingCheck:
-    """Whether refinement will succeed from the networks of a run.
+    """Whether refinement will succeed from networks of a run, given its f and recorded states ``(n, d)``."""
 
-    Attributes
-    ----------
-    found
-        The identified f.
-    portrait
-        Attractors and basins.
-    wells
-        V about each attractor by the local route, to be compared with.
-    library
-        Powers for V, with the functions of f.
-    options
-        When the check passes.
-    """
-
-    found: IdentifiedField
-    portrait: PhasePortrait
-    wells: tuple[Well, ...]
-    library: CandidateLibrary
-    options: CheckOptions
+    def __init__(self, found: IdentifiedField, x: np.ndarray, *, options: CheckOptions, seed: int) -> None:
+        points = x[evenly_spread(x, generator=np.random.default_rng(seed))]
+        self.options, self.portrait = options, phase_portrait(found.dynamics, points, seed=seed)
+        refinement = RefinementOptions(degrees=CHECK_DEGREES)
+        self.wells, _ = local_wells(found, self.portrait, options=refinement, seed=seed)
+        self.library = joint_library(found.library, degree=options.degree, potential_degree=options.degree)
+        self.found = _over_library(found, self.library)
 
     def hopeless(self) -> str | None:
         """Why no training can pass, in words; None where one can."""
@@ -738,10 +647,7 @@ class TrainingCheck:
         """Whether refinement will succeed from the networks of one run."""
         if self.hopeless() is not None:
             return False
-
-        def potential(x: np.ndarray) -> np.ndarray:
-            return networks.evaluate(x).potential
-
+        potential = _potential_of(networks)
         return self._single_formula(potential) or self._by_wells(potential)
 
     def _single_formula(self, potential: Function) -> bool:
@@ -751,8 +657,8 @@ class TrainingCheck:
         start = fit_values(self.library, points[below], values[below])
         result = refine_globally(start, self.library, self.found, points[below], sparse=False)
         basis = potential_basis(self.library)
-        coefficients = result.coefficients[basis.chosen]
-        worst = max(self._difference(well, lambda x: basis.values(x) @ coefficients) for well in self.wells)
+        own = result.coefficients[basis.chosen]
+        worst = max(_relative_difference(lambda x: basis.values(x) @ own, well) for well in self.wells)
         logger.info("check of one formula: residual %.1e, difference %.1e", result.residual, worst)
         return result.residual < self.options.residual / 10 and worst < self.options.difference
 
@@ -765,26 +671,16 @@ class TrainingCheck:
                 )  # fmt: skip
             except NumericalFailure:
                 return False
-            difference = self._difference(local, well.values)
+            difference = _relative_difference(well.values, local)
             logger.info("check of a well: residual %.1e, difference %.1e", well.residual, difference)
             allowed = self.options.difference + 2 * (local.residual + well.residual)
             if well.residual > self.options.residual or difference > allowed:
                 return False
         return True
 
-    def _difference(self, well: Well, values: Function) -> float:
-        """Relative difference of V from that of the local route, in a well."""
-        x = well.points[well.values(well.points) < 0.9 * well.level]
-        other = values(x) - values(well.attractor[None])
-        return float(np.linalg.norm(other - well.values(x)) / np.linalg.norm(well.values(x)))
 
-
-def training_check(
-    found: IdentifiedField, x: np.ndarray, *, options: CheckOptions, seed: int
-) -> TrainingCheck:
-    """Prepare the check of one run from its identified f and recorded states ``(n, d)``."""
-    points = x[evenly_spread(x, generator=np.random.default_rng(seed))]
-    setting = phase_portrait(found.dynamics, points, seed=seed)
-    wells, _ = local_wells(found, setting, options=RefinementOptions(degrees=CHECK_DEGREES), seed=seed)
-    library = joint_library(found.library, degree=options.degree, potential_degree=options.degree)
-    return TrainingCheck(over_library(found, library), setting, wells, library, options)
+def _relative_difference(values: Function, well: Well) -> float:
+    """Relative difference of V by another route from that of a well, within it."""
+    x = sublevel_points(well)
+    other = values(x) - values(well.attractor[None])
+    return float(np.linalg.norm(other - well.values(x)) / np.linalg.norm(well.values(x)))

@@ -6,8 +6,8 @@ where the formula does not solve the Hamilton–Jacobi equation, nothing is clai
 
 At the attractor the Hessian of V is M, which follows from the Jacobian of f, and it is kept. The higher
 powers are found by Gauss–Newton on the Hamilton–Jacobi equation, in a sublevel set that grows from a small
-ellipsoid (`grow_well`); the network route grows from values of V_θ instead, with all powers free
-(`fit_well`). From its saddle a formula is taken on to a higher level by robust fits (`extend_well`).
+ellipsoid (`_grow_well`); the network route grows from values of V_θ instead, with all powers free
+(`fit_well`). From its saddle a formula is taken on to a higher level by robust fits (`_extend_well`).
 
 For given equations the path of least action to the lowest saddle comes first, so that the depth of the well
 is known. V is grown once, in the lowest powers that follow it up there. From there every higher degree starts
@@ -410,7 +410,7 @@ def local_well(
         generator = np.random.default_rng(seed)
         try:
             if depth is None or not wells:
-                well = grow_well(
+                well = _grow_well(
                     dynamics, attractor, basin, saddles, degree=degree, generator=generator,
                     depth=None if depth is None else depth.value,
                 )  # fmt: skip
@@ -423,9 +423,9 @@ def local_well(
             if depth is not None:
                 start, goal = well, options.reach * depth.value
                 told = {"goal": goal, "rows": kept, "depth": depth, "generator": generator}
-                well = extend_well(start, basin, **told)
+                well = _extend_well(start, basin, **told)
                 if wells and not well.residual < WORSE * wells[-1].residual:  # the path may start it far off
-                    again = extend_well(start, basin, by_path=False, **told)
+                    again = _extend_well(start, basin, by_path=False, **told)
                     well = min(well, again, key=lambda one: one.residual)
         except NumericalFailure as error:  # of one degree: another may do
             failure = error
@@ -444,7 +444,7 @@ def local_well(
     if depth is None:
         # No formula tells V of the saddle as well as the finest does.
         goal = options.reach * wells[-1].level
-        wells = [extend_well(well, basin, goal=goal, rows=kept) for well in wells]
+        wells = [_extend_well(well, basin, goal=goal, rows=kept) for well in wells]
     elsewhere = states_elsewhere(portrait, index)
     wells = [replace(well, tolerance=options.tolerance, elsewhere=elsewhere) for well in wells]
     x = basin.points(rows[rows % HELD_OUT == 0])
@@ -467,7 +467,7 @@ def best_trial(trials: Sequence[DegreeTrial]) -> int:
     return next(index for index in good if trials[index].residual <= max(2 * finest, FINEST))
 
 
-def grow_well(
+def _grow_well(
     dynamics: Dynamics,
     attractor: Equilibrium,
     basin: Basin,
@@ -477,31 +477,12 @@ def grow_well(
     generator: np.random.Generator,
     depth: float | None = None,
 ) -> Well:
-    """V about an attractor up to its lowest saddle.
+    """V about an attractor up to its lowest saddle, from M outwards.
 
-    Parameters
-    ----------
-    dynamics
-        f and D.
-    attractor
-        Where V is zero.
-    basin
-        Recorded points that lead to it; the well cannot reach beyond them.
-    saddles
-        The saddles next to it.
-    degree
-        Highest power.
-    generator
-        Decides which points are used where there are too many.
-    depth
-        V at the lowest of the saddles, which then is the only one given, where the path of least action has
-        told it before; by default V itself has to find its lowest saddle.
-
-    Raises
-    ------
-    NumericalFailure
-        When too few recorded states lead to the attractor, or the powers can follow V neither up to a
-        saddle nor to the end of the recorded region.
+    `basin` has the recorded points that lead to the attractor, beyond which the well cannot reach, and
+    `saddles` those next to it. Where the path of least action has told the depth V of the lowest saddle
+    before, that saddle is the only one. Fails with `NumericalFailure` when too few states lead to the
+    attractor, or the powers can follow V neither up to a saddle nor to the end of the recorded region.
     """
     hessian = hessian_at(dynamics, attractor.position)
     extent = np.sqrt(np.diag(np.linalg.inv(hessian)))
@@ -546,7 +527,7 @@ def _grown(
     """V grown from a start, level by level, to its lowest saddle or to the end of the recorded region.
 
     `metric` is the Hessian of V at the attractor, in which distances are measured; `fitted` has the rows of
-    ``basin.chosen`` on which the start was fitted. The other arguments are as for `grow_well`.
+    ``basin.chosen`` on which the start was fitted. The other arguments are as for `_grow_well`.
     """
     attractor = basis.center
     place = f"the attractor near {attractor.round(4)}"
@@ -622,11 +603,8 @@ def _grown(
 
 
 def _recorded(starts: np.ndarray, dimension: int) -> float:
-    """The level that recordings reach, of V at the starts of descents, shape ``(n,)``.
-
-    Below it there may be states to every side without a start; but of one state whatever lies below its
-    highest start lies on the way down from it.
-    """
+    """The level that recordings reach, of V at the starts of descents, shape ``(n,)``."""
+    # Of one state whatever lies below its highest start lies on the way down from it.
     return float(np.quantile(starts, HIGHEST if dimension > 1 else 1.0))
 
 
@@ -643,18 +621,21 @@ def fit_well(
 ) -> Well:
     """V about an attractor by the network route: from values of V, refined without M.
 
-    Where one formula cannot hold over several wells, the network route takes each for itself. It starts on
-    the states where the network says that V is low, since networks are worst far out, and which are low is
-    all that it has of them in the end: from there V grows by itself, as in the local route, but with all
-    powers free. Were it fitted on what the network takes for the well, it would have to be compared with the
-    local route at states beyond, where it says nothing.
+    It starts on the states where the network says that V is low, since networks are worst far out, and which
+    are low is all that it has of them in the end: from there V grows by itself, as in the local route, but
+    with all powers free. Were it fitted on what the network takes for the well, it would have to be compared
+    with the local route at states beyond, where it says nothing.
 
     Parameters
     ----------
+    dynamics, attractor, basin, saddles
+        f and D, where V is zero, the recorded states that lead there, and the saddles next to it.
     potential
         V_θ, points ``(n, d)`` to values ``(n,)``, up to a constant.
-    dynamics, attractor, basin, saddles, degree, generator
-        As for `grow_well`.
+    degree
+        Highest power.
+    generator
+        Decides which points are used where there are too many.
     steps
         Most steps of Gauss–Newton at the start.
 
@@ -719,7 +700,7 @@ def fit_well(
     raise failure
 
 
-def extend_well(
+def _extend_well(
     well: Well,
     basin: Basin,
     *,
@@ -729,30 +710,11 @@ def extend_well(
     generator: np.random.Generator | None = None,
     by_path: bool = True,
 ) -> Well:
-    """Take a formula on, from its well to a higher level, by robust fits of the Hamilton–Jacobi equation.
+    """Take a formula on, from its well to a higher level `goal`, by robust fits of the equation.
 
-    Parameters
-    ----------
-    well
-        V up to the lowest saddle; see `grow_well`.
-    basin
-        What leads to the attractor. Only such states are asked: across the ridge another well begins.
-    goal
-        Level of V to be reached.
-    rows
-        Rows of ``basin.chosen`` that may be used; default all.
-    depth
-        Of the well, where the path of least action has told it before. Then the formula may be one of lower
-        powers in a basis of higher ones.
-    generator
-        Decides which points are used where there are too many, for a known depth.
-    by_path
-        Whether a fit to a known depth begins with ∇V along the path.
-
-    Raises
-    ------
-    NumericalFailure
-        When the formula does not follow V to a known depth.
+    Only states that lead to the attractor are asked: across the ridge another well begins. Where the depth of
+    the well is known before, the formula may be one of lower powers in a basis of higher ones, and the fit
+    begins with ∇V along the path, unless `by_path` is false.
     """
     allowed = np.arange(len(basin.chosen)) if rows is None else rows
     functions = well.basis.values(basin.states.reshape(-1, basin.states.shape[2]))
@@ -805,9 +767,9 @@ def extend_well(
 
 
 def _towards_path(well: Well, x: np.ndarray, depth: Depth, free: np.ndarray) -> np.ndarray:
-    """Coefficients of a formula that is left as it is at points, but for the path, whose ∇V is known.
+    """Coefficients of a formula that stays as it is at points, but for the path, whose ∇V is known.
 
-    They are but a start: what is fitted from there is the equation alone.
+    They are but a start: the equation alone is fitted from there.
     """
     noise = measure_at(well.dynamics, well.attractor)
     rising = (depth.values > PATH_FROM * depth.value) & (depth.values < PATH_TO * depth.value)
@@ -836,17 +798,7 @@ def _towards_path(well: Well, x: np.ndarray, depth: Depth, free: np.ndarray) -> 
 
 
 def surveyed(well: Well, dynamics: Dynamics, portrait: PhasePortrait, index: int) -> Well:
-    """A formula read from a file, with the recorded states that tell where it holds.
-
-    Parameters
-    ----------
-    well
-        The formula; it stays as it is.
-    dynamics
-        f and D.
-    portrait, index
-        Of the recordings, and which of its attractors is the well's.
-    """
+    """A formula read from a file, with the recorded states that tell where it holds."""
     basin = portrait.basins[index]
     along = well.values(basin.states.reshape(-1, basin.states.shape[2])).reshape(basin.states.shape[:2])
     return replace(

@@ -395,7 +395,7 @@ def _checks(
     settings: TrainSettings, runs: Mapping[int, RunToTrain], data: Mapping[int, TrainingData]
 ) -> Checks:
     """The check of every run whose vector field is known; the others train for all their steps."""
-    from siq.quasipotential.refinement import training_check
+    from siq.quasipotential.refinement import TrainingCheck
 
     ready, faults = {}, {}
     for number, part in data.items():
@@ -404,7 +404,7 @@ def _checks(
             continue
         x = part.training.x0
         try:
-            ready[number] = training_check(record.found, x, options=options, seed=number)
+            ready[number] = TrainingCheck(record.found, x, options=options, seed=number)
         except (NumericalFailure, np.linalg.LinAlgError) as error:
             faults[number] = f"the check of the training could not be prepared: {error}"
     return Checks(ready, faults)

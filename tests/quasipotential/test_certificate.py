@@ -55,7 +55,7 @@ from siq.quasipotential.characteristics import Fan, adapted_fan, lowest_sheet
 from siq.quasipotential.formulas import exact_decomposition
 from siq.quasipotential.global_formula import fit_values, refine_globally
 from siq.quasipotential.hamilton_jacobi import LibraryBasis
-from siq.quasipotential.wells import Well, grow_well
+from siq.quasipotential.wells import Well, _grow_well
 from siq.systems.dynamics import Dynamics
 from siq.systems.phase_portrait import PhasePortrait
 from siq.systems.simulation import SimulationOptions, simulate_snapshots
@@ -142,7 +142,7 @@ def refusals(certificate: Certificate) -> set[str]:
 def wells_of(known: KnownSystem, *, degree: int = 4, share: float = 0.6) -> tuple[Well, ...]:
     found = portrait_of(known, 300, share=share)
     return tuple(
-        grow_well(
+        _grow_well(
             known.dynamics, attractor, found.basins[index], found.saddles[index],
             degree=degree, generator=np.random.default_rng(0),
         )
@@ -625,7 +625,7 @@ def fan_of(beta: float, level: float) -> Fan:
 def test_the_error_that_is_stated_lies_above_the_true_one(beta: float, barrier: float) -> None:
     known = maier_stein(beta)
     setting = portrait_of(known, 400)
-    well = grow_well(
+    well = _grow_well(
         known.dynamics, setting.attractors[0], setting.basins[0], setting.saddles[0],
         degree=8, generator=np.random.default_rng(0),
     )  # fmt: skip

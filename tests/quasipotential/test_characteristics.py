@@ -19,7 +19,7 @@ from known_systems import (
     potential_values,
 )
 
-from siq.quasipotential.certificate import Certificate, follow_well
+from siq.quasipotential.certificate import Certificate, _follow_well
 from siq.quasipotential.certificate_tests import (
     FEWEST,
     SHARE,
@@ -41,7 +41,7 @@ SADDLES = {"archetype": 0.5, "Maier-Stein": 0.25}
 @functools.cache
 def reference_of_name(name: str) -> Reference:
     known = SYSTEMS[name]
-    return follow_well(known.dynamics, portrait_of(known, 300, share=0.6), 0)
+    return _follow_well(known.dynamics, portrait_of(known, 300, share=0.6), 0)
 
 
 def candidate_of(
@@ -109,7 +109,7 @@ def test_what_is_too_stiff_is_told() -> None:
     x, y = sympy.symbols("x y", real=True)
     known = double_well(2)
     stiff = replace(known.dynamics, equations=(known.dynamics.equations[0], -20_000 * (y - x / 2)))
-    found = follow_well(stiff, portrait_of(known, 300, share=0.6), 0)
+    found = _follow_well(stiff, portrait_of(known, 300, share=0.6), 0)
     assert "characteristics" in found.fault and "from the attractor [-" in found.fault
     verdict, _ = check_characteristics(candidate_of(known, found), exact_field(known, 3), OPTIONS, error=1e-6)
     assert not verdict.passed and verdict.reason == found.fault

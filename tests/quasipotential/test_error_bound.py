@@ -15,7 +15,7 @@ from known_systems import (
     uniform_points,
 )
 
-from siq.quasipotential.certificate_tests import SAFETY, residual_integral
+from siq.quasipotential.certificate_tests import SAFETY, _residual_integral
 from siq.systems.dynamics import Dynamics
 
 pytestmark = pytest.mark.portable
@@ -25,7 +25,7 @@ Gradient = Callable[[np.ndarray], np.ndarray]
 
 def integral(known: KnownSystem, gradient: Gradient, x: np.ndarray) -> np.ndarray:
     rates = [np.linalg.eigvals(known.dynamics.jacobian(one[None])[0]).real for one in known.attractors]
-    return residual_integral(
+    return _residual_integral(
         gradient, known.dynamics, x, box=known.domain,
         slowest=-max(rate.max() for rate in rates),
         fastest=float(np.linalg.norm(known.dynamics.jacobian(x), axis=(1, 2)).max()),
@@ -106,8 +106,8 @@ def test_other_units_give_the_same_bound() -> None:
         return 1.1 * potential_gradient(known, points) * [1.0, 0.8]
 
     options = {"slowest": 2.0, "fastest": 10.0}
-    one = residual_integral(wrong, known.dynamics, x, box=known.domain, **options)
-    two = residual_integral(
+    one = _residual_integral(wrong, known.dynamics, x, box=known.domain, **options)
+    two = _residual_integral(
         lambda points: wrong(points / units) / units,
         scaled,
         x * units,
@@ -123,7 +123,7 @@ def test_a_path_has_run_away_in_whatever_units_the_other_state_is(units: np.ndar
     x, y = sympy.symbols("x y", real=True)
     dynamics = Dynamics.of((x, y), (-x * float(units[0]) / float(units[0]), y * 0 + 2 * float(units[1])))
     starts = np.array([[0.5, 0.5], [0.2, -0.5]]) * units
-    found = residual_integral(
+    found = _residual_integral(
         lambda points: np.column_stack([points[:, 0], np.zeros(len(points))]), dynamics, starts,
         box=np.array([[-1.0, 1.0], [-1.0, 1.0]]) * units[:, None], slowest=1.0, fastest=1.0,
     )  # fmt: skip

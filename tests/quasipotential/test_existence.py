@@ -10,7 +10,7 @@ from scipy.special import ndtr
 
 from siq.inference.field_estimate import IdentifiedField
 from siq.inference.selection import RivalTerms
-from siq.quasipotential.certificate_tests import check_existence, lost_shares
+from siq.quasipotential.certificate_tests import _lost_shares, check_existence
 from siq.systems.dynamics import Dynamics
 from siq.systems.phase_portrait import PhasePortrait, phase_portrait
 
@@ -33,7 +33,7 @@ def two_wells(height: float, error: float) -> tuple[IdentifiedField, PhasePortra
 @pytest.mark.parametrize("ratio", [1.0, 1.5, 3.0])
 def test_the_share_of_lost_wells_is_the_probability_that_there_is_none(ratio: float) -> None:
     found, portrait = two_wells(0.2, 0.2 / ratio)
-    shares = lost_shares(found, portrait.equilibria, box=portrait.box)
+    shares = _lost_shares(found, portrait.equilibria, box=portrait.box)
     assert len(shares) == 3
     assert shares == pytest.approx(np.full(3, ndtr(-ratio)), abs=CHANCE / 2)
 
@@ -54,7 +54,7 @@ def test_rivals_of_the_terms_count() -> None:
     found, portrait = two_wells(0.2, 0.01)
     doubt = np.zeros((1, found.library.size, 2))
     doubt[0, list(found.library.terms).index(X), 0] = 0.2
-    shares = lost_shares(
+    shares = _lost_shares(
         replace(found, rivals=RivalTerms(0 * doubt[0], doubt)), portrait.attractors, box=portrait.box
     )
     assert shares == pytest.approx(np.full(2, ndtr(-1.0)), abs=CHANCE / 2)

@@ -8,9 +8,9 @@ from known_systems import maier_stein, portrait_of, uniform_points
 
 from siq.data.recordings import SnapshotPairs
 from siq.inference.field_estimate import GivenField
-from siq.quasipotential.certificate import Evidence, candidate_in_well, follow_well
+from siq.quasipotential.certificate import Evidence, _candidate_in_well, _follow_well
 from siq.quasipotential.certificate_tests import FEWEST, Reference
-from siq.quasipotential.wells import RecordedRegion, Well, grow_well
+from siq.quasipotential.wells import RecordedRegion, Well, _grow_well
 
 KNOWN = maier_stein(1)
 PORTRAIT = portrait_of(KNOWN, 300, share=0.6)
@@ -19,7 +19,7 @@ REGION = RecordedRegion.of_basin(PORTRAIT, 0)
 
 @pytest.fixture(scope="module")
 def well() -> Well:
-    return grow_well(
+    return _grow_well(
         KNOWN.dynamics, PORTRAIT.attractors[0], PORTRAIT.basins[0], PORTRAIT.saddles[0],
         degree=4, generator=np.random.default_rng(0),
     )  # fmt: skip
@@ -27,7 +27,7 @@ def well() -> Well:
 
 @pytest.fixture(scope="module")
 def reference() -> Reference:
-    return follow_well(KNOWN.dynamics, PORTRAIT, 0)
+    return _follow_well(KNOWN.dynamics, PORTRAIT, 0)
 
 
 def held_out(count: int, reference: Reference | None) -> Evidence:
@@ -48,7 +48,7 @@ def test_a_basin_is_told_by_recorded_descents() -> None:
 
 def test_they_are_held_out_states_of_the_well_and_of_no_other(well: Well, reference: Reference) -> None:
     given = held_out(400, reference)
-    part = candidate_in_well(well, given)
+    part = _candidate_in_well(well, given)
     rows = {tuple(row) for row in given.points}
     assert len(part.points) >= FEWEST and all(tuple(row) in rows for row in part.points)
     assert (part.points[:, 0] * well.attractor[0] > 0).all()
@@ -62,10 +62,10 @@ def test_they_are_held_out_states_of_the_well_and_of_no_other(well: Well, refere
 def test_where_they_are_few_characteristics_give_more_and_it_is_said(
     well: Well, reference: Reference
 ) -> None:
-    part = candidate_in_well(well, held_out(40, reference))
+    part = _candidate_in_well(well, held_out(40, reference))
     assert len(part.points) > FEWEST
     assert "reached by characteristics" in part.tested_on
-    alone = candidate_in_well(well, held_out(40, None))
+    alone = _candidate_in_well(well, held_out(40, None))
     assert 0 < len(alone.points) < FEWEST and "characteristics" not in alone.tested_on
 
 
@@ -73,4 +73,4 @@ def test_a_formula_answers_where_it_claims_to_hold(well: Well, reference: Refere
     # An other curvature across: the residual is large, and the formula claims hardly anything.
     wrong = np.where(well.basis.exponents[:, 1] == 2, 3.0, 1.0) * well.coefficients
     other = Well(well.dynamics, well.attractor, well.basis, wrong, well.level, well.saddle, 1.0, well.points)
-    assert candidate_in_well(other, held_out(400, reference)).claimed < 0.5
+    assert _candidate_in_well(other, held_out(400, reference)).claimed < 0.5

@@ -26,7 +26,7 @@ from siq.quasipotential.formulas import model_to_data, read_model, write_model
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.landscape_assembly import find_landscape
 from siq.quasipotential.landscape_files import read_landscape, write_landscape
-from siq.quasipotential.refinement import RefinementOptions, refine, refined_decomposition
+from siq.quasipotential.refinement import RefinementOptions, _refined_decomposition, refine
 from siq.quasipotential.wells import WellOptions
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
@@ -50,7 +50,7 @@ def test_the_wells_of_both_files_are_the_same(tmp_path: Path) -> None:
         options=RefinementOptions(routes=("local",), degrees=(4, 6)),
     )  # fmt: skip
     model = tmp_path / "model.json"
-    write_model(model, model_to_data({"refined": refined_decomposition(refined, points)}, {}))
+    write_model(model, model_to_data({"refined": _refined_decomposition(refined, points)}, {}))
     # Another portrait, from other recorded states, as the landscape's own.
     landscape = find_landscape(found, portrait_of(known, 350), wells=read_model(model)[0]["refined"].wells)
     write_landscape(tmp_path / "quasipotential.json", landscape, dynamics=found.dynamics)

@@ -22,14 +22,14 @@ from known_systems import (
 from siq.errors import NumericalFailure
 from siq.quasipotential.power_series import quasipotential_series
 from siq.quasipotential.refinement import RefinementOptions, refine
-from siq.quasipotential.wells import Well, best_trial, fit_well, grow_well
+from siq.quasipotential.wells import Well, _grow_well, best_trial, fit_well
 from siq.systems.basins import Basin, Descents, basin_of
 from siq.systems.formulas import compile_formulas
 from siq.systems.phase_portrait import PhasePortrait, phase_portrait
 
 
 def grown(known: KnownSystem, found: PhasePortrait, index: int, degree: int = 4) -> Well:
-    return grow_well(
+    return _grow_well(
         known.dynamics, found.attractors[index], found.basins[index], found.saddles[index],
         degree=degree, generator=np.random.default_rng(0),
     )  # fmt: skip
@@ -142,7 +142,7 @@ def test_without_recorded_states_there_is_no_well() -> None:
     basin = found.basins[0]
     few = Basin(basin.states[:3], basin.chosen[basin.chosen[:, 0] < 3][:10])
     with pytest.raises(NumericalFailure, match="recorded states lead to the attractor"):
-        grow_well(
+        _grow_well(
             known.dynamics, found.attractors[0], few, found.saddles[0],
             degree=4, generator=np.random.default_rng(0),
         )  # fmt: skip

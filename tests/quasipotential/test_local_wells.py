@@ -26,9 +26,9 @@ from siq.quasipotential.wells import (
     DegreeTrial,
     Well,
     WellOptions,
+    _extend_well,
+    _grow_well,
     best_trial,
-    extend_well,
-    grow_well,
     local_well,
 )
 from siq.systems.basins import Basin, follow
@@ -212,7 +212,7 @@ def relative_error(values: np.ndarray, exact: np.ndarray) -> float:
 
 
 def grown(known: KnownSystem, found: PhasePortrait, index: int, degree: int) -> Well:
-    return grow_well(
+    return _grow_well(
         known.dynamics, found.attractors[index], found.basins[index], found.saddles[index],
         degree=degree, generator=np.random.default_rng(0),
     )  # fmt: skip
@@ -222,7 +222,7 @@ def test_the_powers_at_the_attractor_are_kept() -> None:
     known = maier_stein(3)
     found = landscape(known, share=1.0)
     well = grown(known, found, 0, 6)
-    wider = extend_well(well, found.basins[0], goal=1.3 * well.level)
+    wider = _extend_well(well, found.basins[0], goal=1.3 * well.level)
     quadratic = well.basis.exponents.sum(axis=1) == 2
     np.testing.assert_array_equal(wider.coefficients[quadratic], well.coefficients[quadratic])
     assert wider.reach == pytest.approx(1.3 * well.level)
@@ -247,7 +247,7 @@ def test_only_the_rows_that_are_allowed_are_fitted() -> None:
     found = landscape(known)
     basin, well = found.basins[0], grown(known, found, 0, 4)
     rows = np.arange(1, len(basin.chosen), 3)
-    wider = extend_well(well, basin, goal=1.2 * well.level, rows=rows)
+    wider = _extend_well(well, basin, goal=1.2 * well.level, rows=rows)
     allowed = {tuple(point) for point in basin.points(rows)}
     assert {tuple(point) for point in wider.points} <= allowed
 
@@ -266,7 +266,7 @@ def test_points_that_contradict_the_formula_do_not_spoil_it() -> None:
     disturbed = Disturbed.of(known.dynamics.symbols, known.dynamics.formulas, diffusion=known.diffusion)
     x = well.points
     exact = potential_values(known, x) - potential_values(known, well.attractor[None])
-    wider = extend_well(replace(well, dynamics=disturbed), found.basins[0], goal=1.2 * well.level)
+    wider = _extend_well(replace(well, dynamics=disturbed), found.basins[0], goal=1.2 * well.level)
     assert np.abs(wider.values(x) - exact).max() < 1e-6 * well.level
     plain = gauss_newton(
         equation_at(well.basis, wider.points, disturbed),
@@ -281,7 +281,7 @@ def test_a_caustic_is_left_out_and_spoils_nothing() -> None:
     known, barrier = maier_stein(10), 0.34004
     found = portrait_of(known)
     well = grown(known, found, 0, 8)
-    wider = extend_well(well, found.basins[0], goal=1.2 * well.level)
+    wider = _extend_well(well, found.basins[0], goal=1.2 * well.level)
     fan = adapted_fan(
         known.dynamics, known.attractors[0], level=0.9 * barrier / 2,
         box=np.array([[-2.0, 0.0], [-1.5, 1.5]]), generator=np.random.default_rng(0),

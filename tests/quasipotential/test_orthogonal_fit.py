@@ -17,7 +17,7 @@ from known_systems import (
 )
 
 from siq.inference.field_estimate import IdentifiedField
-from siq.quasipotential.global_formula import OrthogonalFit, fit_orthogonal, refine_globally
+from siq.quasipotential.global_formula import RegionFormula, _fit_orthogonal, refine_globally
 from siq.systems.diffusion import Diffusion
 
 pytestmark = pytest.mark.portable
@@ -68,9 +68,9 @@ def drawn(found: IdentifiedField, seed: int) -> IdentifiedField:
 
 def fitted(
     known: KnownSystem, found: IdentifiedField, potential: np.ndarray, circulatory: np.ndarray
-) -> OrthogonalFit | None:
+) -> RegionFormula | None:
     x = uniform_points(known, 300, share=0.6)
-    return fit_orthogonal(found, potential, circulatory, x)
+    return _fit_orthogonal(found, potential, circulatory, x)
 
 
 @pytest.mark.parametrize("name", SYSTEMS)
@@ -114,7 +114,7 @@ def test_errors_are_as_large_as_stated_and_smaller_than_without_the_constraint(n
     scores, scores_of_g, errors, others, chances = [], [], [], [], []
     for seed in range(30):
         found = drawn(center, seed)
-        fit = fit_orthogonal(found, potential, circulatory, x)
+        fit = _fit_orthogonal(found, potential, circulatory, x)
         assert fit is not None
         stated = np.sqrt(np.diag(fit.potential_covariance))[terms]
         error = (fit.potential - potential)[terms]
@@ -173,7 +173,7 @@ def test_more_terms_than_needed_cost_precision_only() -> None:
 
 
 def test_no_freedom_left_is_no_evidence() -> None:
-    fit = OrthogonalFit(
+    fit = RegionFormula(
         np.zeros(1), np.zeros((1, 1)), np.zeros((1, 1)), np.zeros((1, 1)), freedom=0, chi_square=0.0
     )
     assert fit.probability == 1.0
@@ -195,8 +195,8 @@ def test_other_units_give_the_same_fit(units: np.ndarray) -> None:
         covariance=found.covariance * np.outer(change, change),
         diffusion=Diffusion(known.diffusion * np.outer(units, units)),
     )  # fmt: skip
-    one = fit_orthogonal(found, potential, circulatory, x)
-    two = fit_orthogonal(
+    one = _fit_orthogonal(found, potential, circulatory, x)
+    two = _fit_orthogonal(
         scaled, potential / factors, circulatory * units / factors[:, None], x * units,
     )  # fmt: skip
     assert one is not None

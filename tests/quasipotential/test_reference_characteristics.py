@@ -19,11 +19,11 @@ from scipy.integrate import solve_ivp
 from siq.quasipotential.characteristics import (
     End,
     Fan,
+    _even_directions,
+    _join,
     adapted_fan,
     characteristics,
-    even_directions,
     first_caustic,
-    join,
     lowest_sheet,
     value_near,
 )
@@ -35,7 +35,7 @@ SADDLE_LEVEL = 0.25  # of V along the axis; the barrier itself is lower for β >
 
 
 def fan_of(known: KnownSystem, *, level: float, count: int = 32, which: int = 0, **options: Any) -> Fan:
-    directions = even_directions(known.dynamics.dimension, count, generator=np.random.default_rng(0))
+    directions = _even_directions(known.dynamics.dimension, count, generator=np.random.default_rng(0))
     options = {"box": known.domain, "directions": directions} | options
     return characteristics(known.dynamics, known.attractors[which], level=level, **options)
 
@@ -147,10 +147,10 @@ def test_the_caustic_is_found_on_the_axis(beta: float) -> None:
     caustic = first_caustic(fan)
     assert caustic is not None
     x = focus_on_the_axis(beta)
-    np.testing.assert_allclose(caustic.position, [x, 0], atol=1e-6)
-    assert caustic.value == pytest.approx((x**4 / 2 - x**2 + 0.5) / 2, abs=1e-6)
+    np.testing.assert_allclose(caustic[0], [x, 0], atol=1e-6)
+    assert caustic[1] == pytest.approx((x**4 / 2 - x**2 + 0.5) / 2, abs=1e-6)
     on_axis = fan.curve == int(fan.caustic_curves[np.argmin(fan.caustic_values)])
-    assert fan.values[on_axis].max() < caustic.value  # nothing beyond it is handed on
+    assert fan.values[on_axis].max() < caustic[1]  # nothing beyond it is handed on
 
 
 @pytest.mark.parametrize(("beta", "caustic"), [(3, False), (10, True)])
@@ -192,7 +192,7 @@ def test_curves_that_have_crossed_the_axis_are_not_on_the_lowest_sheet(strong: F
     sheet = lowest_sheet(strong)
     side = np.sign((strong.points - strong.attractor) @ strong.metric.T[:, 1])
     began = side[np.searchsorted(strong.curve, np.arange(len(strong.directions)))]
-    past = (strong.points[:, 0] > caustic.position[0]) & (strong.values > caustic.value)
+    past = (strong.points[:, 0] > caustic[0][0]) & (strong.values > caustic[1])
     crossed = past & (side * began[strong.curve] < 0)
     deep = crossed & (np.abs(strong.points[:, 1]) > 0.03)
     assert deep.sum() > 20
@@ -275,7 +275,7 @@ def test_joined_fans_count_their_curves_on() -> None:
     known = maier_stein(10)
     first = fan_of(known, level=0.24, box=WELL, count=8)
     second = fan_of(known, level=0.24, box=WELL, directions=np.array([[1.0, 0.0], [1.0, 0.1]]))
-    both = join(first, second)
+    both = _join(first, second)
     assert both.curve.max() == 9
     assert (np.diff(both.curve) >= 0).all()
     np.testing.assert_array_equal(both.points[both.curve == 9], second.points[second.curve == 1])

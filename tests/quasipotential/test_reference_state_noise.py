@@ -9,7 +9,7 @@ from known_noise import multiplicative, one_state, potential_of_one_state
 from known_systems import potential_gradient, potential_values
 
 from siq.errors import NumericalFailure
-from siq.quasipotential.characteristics import characteristics, even_directions
+from siq.quasipotential.characteristics import _even_directions, characteristics
 from siq.quasipotential.power_series import quasipotential_series
 from siq.systems.diffusion import Diffusion
 from siq.systems.equilibria import hessian_at
@@ -22,7 +22,7 @@ def test_characteristics_carry_the_given_potential_and_its_derivatives(dimension
     center = known.attractors[1]
     fan = characteristics(
         known.dynamics, center, level=0.2, box=known.domain,
-        directions=even_directions(dimension, 12, generator=np.random.default_rng(0)),
+        directions=_even_directions(dimension, 12, generator=np.random.default_rng(0)),
     )  # fmt: skip
     expected = potential_values(known, fan.points) - potential_values(known, center[None])
     assert expected.max() > 0.1

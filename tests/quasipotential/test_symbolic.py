@@ -8,9 +8,9 @@ from known_systems import exact_archetype
 from siq.errors import NumericalFailure
 from siq.inference.library import candidate_library
 from siq.quasipotential.formulas import (
+    _minimum,
     decomposition_from_coefficients,
     exact_decomposition,
-    minimum,
     term_coefficients,
 )
 from siq.systems.dynamics import Dynamics
@@ -36,7 +36,7 @@ def test_the_minimum_within_the_box_of_the_points_is_found(
     if lowest is None:
         grid = np.linspace(-2, 2, 400_001)
         lowest = float(sympy.lambdify([x, y], expression)(grid, -0.7).min())
-    found = minimum(expression, (x, y), POINTS)
+    found = _minimum(expression, (x, y), POINTS)
     assert found == pytest.approx(lowest, rel=1e-9, abs=1e-10)
 
 
@@ -45,12 +45,12 @@ def test_the_deeper_of_two_wells_is_found_even_where_points_are_rare() -> None:
     crowd = np.random.default_rng(1).normal([-1, 0], 0.05, size=(5000, 2))
     points = np.concatenate([crowd, POINTS[:40]])
     deepest = min(well.subs({x: root, y: 0}) for root in np.roots([4, 0, -4, -0.02]).real)
-    assert minimum(well, (x, y), points) == pytest.approx(float(deepest), abs=1e-9)
+    assert _minimum(well, (x, y), points) == pytest.approx(float(deepest), abs=1e-9)
 
 
 def test_a_formula_that_is_nowhere_finite_is_a_numerical_failure() -> None:
     with pytest.raises(NumericalFailure, match="nowhere finite"), np.errstate(invalid="ignore"):
-        minimum(sympy.sqrt(-1 - x**2 - sympy.Symbol("y", real=True) ** 2 + 0.5), (x, y), POINTS)
+        _minimum(sympy.sqrt(-1 - x**2 - sympy.Symbol("y", real=True) ** 2 + 0.5), (x, y), POINTS)
 
 
 def test_formulas_from_coefficients_evaluate_as_the_library_does() -> None:
@@ -66,7 +66,7 @@ def test_formulas_from_coefficients_evaluate_as_the_library_does() -> None:
     np.testing.assert_allclose(values[3:].T, theta @ vector_field, rtol=1e-10, atol=1e-10)
     shift = theta @ potential - values[0]
     np.testing.assert_allclose(shift, shift[0], atol=1e-10)
-    assert -1e-9 < values[0].min() < 0.5  # V is zero at its minimum, which lies between points
+    assert -1e-9 < values[0].min() < 0.5  # V is zero at its _minimum, which lies between points
     gradient = np.stack([theta @ library.derivatives[:, i] @ potential for i in range(2)])
     np.testing.assert_allclose(found.evaluate_gradient(POINTS.T), gradient, rtol=1e-9, atol=1e-9)
 

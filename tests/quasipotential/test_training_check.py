@@ -9,12 +9,12 @@ import pytest
 from known_systems import KnownSystem, archetype, exact_field, limit_cycle, linear_system, potential_values
 
 from siq.networks.decomposition import CheckOptions
-from siq.quasipotential.refinement import TrainingCheck, training_check
+from siq.quasipotential.refinement import TrainingCheck
 
 
 def check_of(known: KnownSystem, degree: int = 3) -> TrainingCheck:
     x = np.random.default_rng(0).uniform(*known.domain.T, (1500, len(known.domain)))
-    return training_check(exact_field(known, degree), x, options=CheckOptions(), seed=0)
+    return TrainingCheck(exact_field(known, degree), x, options=CheckOptions(), seed=0)
 
 
 def verdict(checked: TrainingCheck, potential) -> bool:

@@ -9,7 +9,7 @@ from known_systems import KnownSystem, exact_field
 
 from siq.inference.field_estimate import IdentifiedField, NoiseFormula, constant_noise
 from siq.inference.selection import RivalTerms
-from siq.quasipotential.characteristics import potential_errors, potential_slopes, relative_error
+from siq.quasipotential.characteristics import _potential_slopes, potential_errors, relative_error
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import hessian_at
 
@@ -46,7 +46,7 @@ def test_slopes_are_those_of_the_hessian_of_a_linear_system_that_turns() -> None
     rows = tuple(sum(jacobian[i, j] * (X, Y)[j] for j in range(2)) for i in range(2))
     found, origin = field(rows, noise, degree=1), np.zeros(2)
     hessian = hessian_at(found.dynamics, origin)
-    slopes, _ = potential_slopes(found, lambda x: x @ hessian, origin, POINTS)
+    slopes, _ = _potential_slopes(found, lambda x: x @ hessian, origin, POINTS)
     names = list(found.library.names)
     for column, (component, term) in enumerate(found.support):
         values = [found.values.copy(), found.values.copy()]

@@ -183,7 +183,7 @@ def test_why_a_check_could_not_be_prepared_is_the_reason(
     def refuse(*arguments: object, **named: object) -> None:
         raise NumericalFailure("the attractors cannot be told apart")
 
-    monkeypatch.setattr("siq.quasipotential.refinement.training_check", refuse)
+    monkeypatch.setattr("siq.quasipotential.refinement.TrainingCheck", refuse)
     options = replace(BRIEF, check=CheckOptions(first=10, every=10, attempts=2))
     settings = replace(SETTINGS, training=options).of(training_step.TrainSettings)
     runs = {0: training_step.RunToTrain(recordings, analysis.identified.record)}

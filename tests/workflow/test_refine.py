@@ -13,7 +13,8 @@ from siq.data.recordings import SnapshotPairs
 from siq.quasipotential import refinement
 from siq.quasipotential.certificate import Certificate
 from siq.quasipotential.certificate_tests import Verdict
-from siq.quasipotential.refinement import Refined, RefinementOptions, every_well_held_out
+from siq.quasipotential.global_formula import RegionFormula
+from siq.quasipotential.refinement import Refined, RefinementOptions, _every_well_held_out
 from siq.systems.dynamics import Dynamics
 from siq.systems.phase_portrait import phase_portrait
 
@@ -36,22 +37,20 @@ def test_the_wells_carry_the_certificate_where_one_formula_is_refused(
     monkeypatch: pytest.MonkeyPatch, formula: Verdict, wells: Verdict, scope: str, whole: bool
 ) -> None:
     well: Any = object()
-    found = Refined(
-        None, None, 0.01, (well,), (), (), np.ones(1), np.ones((1, 1)), np.eye(1), np.ones((1, 1)), True,  # type: ignore[arg-type]
-    )  # fmt: skip
+    one = RegionFormula(np.ones(1), np.ones((1, 1)), np.eye(1), np.ones((1, 1)), joint=True)
+    found = Refined(SimpleNamespace(noise_free=True), None, 0.01, (well,), formula=one)  # type: ignore[arg-type]
     monkeypatch.setattr(refinement, "refine", lambda *_, **__: found)
     monkeypatch.setattr(refinement, "formula_library", lambda *_: None)
-    monkeypatch.setattr(refinement, "relative_error_of", lambda *_: 0.0)
     monkeypatch.setattr(
-        refinement, "refined_decomposition", lambda one, _: SimpleNamespace(potential=one.potential)
+        refinement, "_refined_decomposition", lambda one, _: SimpleNamespace(potential=one.formula)
     )
 
     def certified(one: Any, *_: Any, **__: Any) -> Certificate:
         return certificate(wells, "wells") if one == (well,) else certificate(formula, "region")
 
     monkeypatch.setattr(refinement, "certify", certified)
-    context: Any = SimpleNamespace(found=None, portrait=None, points=None, number=0, evidence=None)
-    refined, formulas, made = refinement.refined_by_routes(context, RefinementOptions(), None, None)
+    context: Any = SimpleNamespace(found=found.found, portrait=None, points=None, number=0, evidence=None)
+    refined, formulas, made = refinement._refined_by_routes(context, RefinementOptions(), None, None)
     assert made.scope == scope
     assert (formulas.potential is not None) == whole
     assert made.certified == (PASSED in (formula, wells))
@@ -68,6 +67,6 @@ def test_recordings_of_every_well_are_held_out_where_they_stay_in_theirs() -> No
     recording = np.repeat(np.arange(5), 200)
     pairs = SnapshotPairs(x0=x0, xh=x0, h=np.full(1000, 0.1), recording=recording)
     mask = np.array([True, False, False, False, False])
-    found = every_well_held_out(portrait, pairs, mask)
+    found = _every_well_held_out(portrait, pairs, mask)
     assert found.tolist()[:2] == [True, False] and found[2:].sum() == 1
-    assert every_well_held_out(portrait, pairs, found).tolist() == found.tolist()
+    assert _every_well_held_out(portrait, pairs, found).tolist() == found.tolist()
