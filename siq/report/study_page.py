@@ -257,7 +257,7 @@ def study_page(
         steps=results.tables["outcomes"].drop(columns=[] if several else "run"),
         machine=f"{named}; {machine}, {os.cpu_count()} cores",
         printed=_printed(study, given=given is not None),
-        spent=None if timings is None else timings.groupby("step")["seconds"].sum(),
+        spent={} if timings is None else timings.groupby("step")["seconds"].sum().to_dict(),
     )
 
 

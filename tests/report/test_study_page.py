@@ -87,6 +87,7 @@ def page_of(
     tables |= {
         "rrmse": as_table("rrmse", rrmse), "certificates": as_table("certificates", tests),
         "outcomes": as_table("outcomes", outcomes),
+        "timings": as_table("timings", [{"run": 0, "step": "identify", "seconds": 1.6}]),
     }  # fmt: skip
     if record:
         tables["record"] = as_table("record", record)
@@ -126,6 +127,7 @@ def test_the_answer_then_formulas_then_evidence_then_workings(tmp_path: Path) ->
         "Formulas", "How far it can be trusted", "The landscape in full", "The recordings and the workings",
         "How to run it again", "The study and the versions",
     ]  # fmt: skip
+    assert content.sections[-1].text[-1] == "Processor time by step: identify 2 s."
     folded = [section.heading for section in content.sections if section.folded]
     assert folded == ["The recordings and the workings", "The study and the versions"]
 
