@@ -45,7 +45,7 @@ from siq.systems.continuation import (
     BifurcationCurve,
     Branch,
     Branches,
-    CurveSeed,
+    CurveKind,
     ParameterFamily,
     follow_branches,
     follow_curves,
@@ -354,7 +354,7 @@ def _seeds(
     points: Sequence[SweptPoint],
     limits: tuple[float, float],
     along: int,
-) -> Iterator[CurveSeed]:
+) -> Iterator[tuple[CurveKind, np.ndarray, np.ndarray]]:
     """Folds and Hopf points on all lines along one parameter."""
     other = 1 - along
     for value in sorted({point.values[other] for point in points}):
@@ -369,7 +369,7 @@ def _seeds(
         for one in follow_branches(line, names[along], limits, known).bifurcations:
             if one.kind != "branch point":
                 place = np.array([one.value, value] if along == 0 else [value, one.value])
-                yield CurveSeed(one.kind, place, one.state)
+                yield one.kind, place, one.state
 
 
 def curve_rows(curves: Sequence[BifurcationCurve]) -> list[dict[str, object]]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import sympy
 
-from siq.systems.continuation import CurveSeed, follow_curves
+from siq.systems.continuation import CurveKind, follow_curves
 from siq.systems.dynamics import Dynamics
 
 pytestmark = pytest.mark.portable
@@ -19,8 +19,8 @@ def cusp() -> Dynamics:
     return Dynamics.of((x,), (a + b * x - x**3,), domain=[(-2, 2)], parameters={a: 0.0, b: 1.0})
 
 
-def fold(first: float, second: float, *state: float) -> CurveSeed:
-    return CurveSeed("fold", np.array([first, second]), np.array(state))
+def fold(first: float, second: float, *state: float) -> tuple[CurveKind, np.ndarray, np.ndarray]:
+    return ("fold", np.array([first, second]), np.array(state))
 
 
 def test_the_folds_of_a_cusp_lie_on_its_curve_and_pass_through_it():
@@ -60,7 +60,7 @@ def test_the_hopf_points_of_the_brusselator_lie_at_b_of_one_plus_a_squared():
         (x, y), (a - (b + 1) * x + x**2 * y, b * x - x**2 * y), domain=[(0, 5), (0, 5)],
         parameters={a: 1.0, b: 2.0},
     )  # fmt: skip
-    seed = CurveSeed("Hopf", np.array([1.0, 2.0]), np.array([1.0, 2.0]))
+    seed = ("Hopf", np.array([1.0, 2.0]), np.array([1.0, 2.0]))
     (curve,) = follow_curves(brusselator, {"a": (0.5, 1.5), "b": (1.0, 4.0)}, [seed])
     first, second = curve.values.T
     assert second == pytest.approx(1 + first**2, abs=1e-10)
@@ -74,7 +74,7 @@ def test_hopf_points_end_where_they_meet_the_folds():
     system = Dynamics.of(
         (x, y), (y, a + b * x + x**2 - x * y), domain=[(-2, 2), (-2, 2)], parameters={a: 0.0, b: -1.0}
     )
-    seeds = [CurveSeed("Hopf", np.array([0.0, -0.25]), np.zeros(2)), fold(0.25, 1.0, -0.5, 0.0)]
+    seeds = [("Hopf", np.array([0.0, -0.25]), np.zeros(2)), fold(0.25, 1.0, -0.5, 0.0)]
     hopf, folds = follow_curves(system, {"a": (-1.0, 1.0), "b": (-1.0, 1.5)}, seeds)
     assert hopf.kind == "Hopf" and np.abs(hopf.values[:, 0]).max() < 1e-10
     assert hopf.frequencies**2 == pytest.approx(-hopf.values[:, 1], abs=1e-10)
@@ -94,7 +94,7 @@ def test_a_third_state_does_not_matter():
 
 
 def test_what_is_no_fold_or_lies_outside_gives_no_curve():
-    far = CurveSeed("Hopf", np.zeros(2), np.zeros(1))
+    far = ("Hopf", np.zeros(2), np.zeros(1))
     assert follow_curves(cusp(), LIMITS, [fold(0.9, 1.0, 0.0), fold(0, 0, 5.0), far]) == []
     with pytest.raises(ValueError, match="two parameters"):
         follow_curves(cusp(), {"a": (-1.0, 1.0)}, [])
