@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
+from siq.quasipotential.landscape_assembly import EquationSettings, landscape_from_equations
 from siq.systems.cards import load_system
 from siq.validation.escapes import neighbourhood, simulate_escapes
-from siq.workflow.equations_step import EquationSettings, landscape_of_equations
 
 CARD = Path(__file__).parents[1] / "config" / "systems" / "consumer-resource.yaml"
 PUBLISHED = (0.007056, 0.00092975)  # Φ of the saddle from (1.4049, 2.8081) and from (4.9040, 4.0619)
@@ -28,7 +28,7 @@ FOLLOWED = 60  # times the mean that the law foretells
 
 if __name__ == "__main__":
     system = load_system(CARD)
-    found = landscape_of_equations(system, EquationSettings(), formulas=False)
+    found = landscape_from_equations(system, EquationSettings(), formulas=False)
     for way, published in zip(found.transitions, PUBLISHED, strict=True):
         ours = way.barrier / 2
         print(f"from A{way.start + 1}: ours {ours:.8f}, published {published:g}, {published / ours - 1:+.1%}")

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from siq.networks.training import train
     from siq.quasipotential.formulas import SymbolicDecomposition, read_model
     from siq.quasipotential.landscape import Landscape, NoLandscape
+    from siq.quasipotential.landscape_assembly import EquationSettings
     from siq.report.plots.diagnosis import plot_diagnosis
     from siq.report.plots.prediction import plot_residuals
     from siq.report.plots.quasipotential import plot_quasipotential
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
     from siq.systems.formulas import Formula, parse_formula
     from siq.systems.simulation import SimulationOptions, simulate_snapshots
     from siq.validation.reference_systems import reference_systems, reference_table
-    from siq.workflow.equations_step import EquationSettings
     from siq.workflow.pipeline import PipelineSettings
     from siq.workflow.study import Study, load_study
     from siq.workflow.sweep_step import Sweep, sweep
@@ -95,7 +95,7 @@ _MODULES = {
     "Diagnosis": "siq.diagnosis.diagnosis",
     "Diffusion": "siq.systems.diffusion",
     "Dynamics": "siq.systems.dynamics",
-    "EquationSettings": "siq.workflow.equations_step",
+    "EquationSettings": "siq.quasipotential.landscape_assembly",
     "Formula": "siq.systems.formulas",
     "InputError": "siq.errors",
     "Landscape": "siq.quasipotential.landscape",

@@ -7,7 +7,7 @@ import functools
 import numpy as np
 from known_systems import KnownSystem, double_well, maier_stein, portrait_of, potential_values
 
-from siq.quasipotential.landscape import GlobalQuasipotential, global_quasipotential
+from siq.quasipotential.landscape import GlobalQuasipotential, heights_of_attractors
 from siq.quasipotential.wells import WellOptions, local_well
 
 
@@ -36,4 +36,4 @@ def matched(which: str) -> tuple[KnownSystem, GlobalQuasipotential]:
     bottoms = potential_values(known, np.stack([one.position for one in found.attractors]))
     barriers = np.full((2, 2), np.inf)
     barriers[0, 1], barriers[1, 0] = 2 * (top - bottoms)
-    return known, global_quasipotential(local, barriers)
+    return known, GlobalQuasipotential(tuple(local), heights_of_attractors(barriers))

@@ -42,11 +42,17 @@ UPWARDS: frozenset[tuple[str, str]] = frozenset(
         ("siq.diagnosis.statement", "siq.report.diagnosis_text"),
         ("siq.quasipotential.landscape", "siq.report.landscape"),
         ("siq.quasipotential.landscape", "siq.report.plots.quasipotential"),
-        ("siq.quasipotential.landscape", "siq.workflow.comparison_steps"),
-        ("siq.quasipotential.landscape", "siq.workflow.equations_step"),
-        ("siq.quasipotential.landscape", "siq.workflow.outcomes"),
         ("siq.quasipotential.landscape", "siq.workflow.pipeline"),
         ("siq.workflow.sweep_step", "siq.report.plots.sweep"),
+    }
+)
+
+
+# Thin methods of a class that call, within its package, what is made of it.
+WITHIN: frozenset[tuple[str, str]] = frozenset(
+    {
+        ("siq.quasipotential.landscape", "siq.quasipotential.landscape_assembly"),
+        ("siq.quasipotential.landscape", "siq.quasipotential.landscape_comparison"),
     }
 )
 
@@ -117,7 +123,11 @@ def test_imports_go_downwards_only() -> None:
 def test_modules_do_not_import_each_other_in_a_circle() -> None:
     """At load time none does; when called, only the thin methods may."""
     graph = {
-        module: {target for target, _ in arrows if (module, target) not in UPWARDS}
+        module: {
+            target
+            for target, called in arrows
+            if (module, target) not in UPWARDS and not (called and (module, target) in WITHIN)
+        }
         for module, arrows in ARROWS.items()
     }
     try:

@@ -22,7 +22,7 @@ def landscape(
         {
             "start": index, "end": (index + 1) % len(places) if len(places) > 1 else None,
             "saddle": [0.0] * d, "barrier": barrier, "error": 0.01, "standard_error": 0.01,
-            "minimum_action": barrier, "prefactor": prefactor, "exponent": 0.0, "notes": [],
+            "minimum_action": barrier, "prefactor": prefactor, "exponent": 0.0, "remarks": [],
         }
         for index, barrier in enumerate(barriers)
     ]  # fmt: skip
@@ -41,5 +41,5 @@ def landscape(
     ]
     return {
         "states": ["x", "y", "z"][:d], "units": [units] * d, "time_unit": time, "noise": noise,
-        "equilibria": equilibria, "wells": wells, "transitions": ways, "notes": [],
+        "equilibria": equilibria, "wells": wells, "transitions": ways, "remarks": [],
     }  # fmt: skip

@@ -1,19 +1,5 @@
 """Minimum action paths by Hamilton's equations, where noise acts on some states only.
 
-The path is that of `siq.quasipotential.hamiltonian_paths`: it leaves an attractor as the power series of V
-says, and ends at a given state, or as it comes to a saddle.
-
-About an attractor Hamilton's equations are linear, which makes the first guess exact; and about a saddle,
-which continues a solution to it.
-
-A particle whose friction and noise balance everywhere goes up as it comes down, with its velocity reversed:
-``x(-t), -v(-t)`` is the path of least action itself. Where they balance nearly, it is a first guess of the
-whole path. It winds about the attractor as often as the path does, which no curve to the saddle tells at weak
-damping.
-
-Along a motion whose positions have the velocities v, the noise has to push by ``2 D p_v = v̇ - f_v``, and
-Hamilton's equation of p_v, ``ṗ_v = -p_x - J_vvᵀ p_v`` where D is constant along v, gives the momenta of x.
-
 Of a D without inverse no action of a curve can be formed: most curves cannot be followed at all. Its paths of
 least action are still the solutions of
 
@@ -29,10 +15,14 @@ The other condition, ``p = -λ w·(x - S)/(w·Dw) w``, follows, as H vanishes fr
 close to S the solution ends. Both boundary conditions and the equations are solved together, by collocation
 on a mesh of its own (`scipy.integrate.solve_bvp`).
 
-The first guess is exact: about A the equations are linear. From there the end is moved along a curve to S, in
-steps as long as Newton's method follows, and the solution with it. Curves that differ may lead to paths that
-differ. Where V is smooth along a path, the tangents of its neighbours stay apart (`siq.reference.
-characteristics`); if they do not, it is no minimum.
+About A the equations are linear, which makes the first guess exact. From there the end is moved along a curve
+to S, in steps as long as Newton's method follows. Curves that differ may lead to paths that differ. A path is
+a minimum only if the tangents of its neighbours stay apart along it (`siq.quasipotential.characteristics`).
+
+Where friction and noise balance, a particle goes up as it comes down, with its velocity reversed: the way
+down, ``x(-t), -v(-t)``, is then a first guess of the whole path, which winds about the attractor as often as
+the path does. Along it the noise pushes by ``2 D p_v = v̇ - f_v``, and Hamilton's equation of p_v,
+``ṗ_v = -p_x - J_vvᵀ p_v`` where D is constant along v, gives the momenta of x.
 
 References
 ----------
@@ -52,15 +42,35 @@ from scipy.interpolate import Akima1DInterpolator, PchipInterpolator
 
 from siq.errors import NumericalFailure
 from siq.quasipotential.characteristics import HamiltonianFlow, crossed
+from siq.quasipotential.path_chains import MinimumActionPath
 from siq.quasipotential.power_series import cubic_series, quasipotential_series
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import classify, hessian_at
 
-MOST_STATES = 8  # for a series of degree 4; beyond, of degree 3
-APPROACH = 0.1  # of the distance from A to S, in the metric of M: how far from S the end is at first
-MOST_NODES = 50_000  # numerical, a guard on memory
-FINER, ENOUGH = 6, 1000  # times the nodes of its guess, or so many: a mesh that needs more has no solution
+MOST_STATES_OF_DEGREE_4 = 8  # beyond, the power series is of degree 3
 REST = 1e-5  # |f| at an equilibrium, in units of the flow
+MOST_NODES = 50_000  # numerical, a guard on memory
+MESH_GROWTH, ENOUGH_NODES = 6, 1000  # times the nodes of a guess, or so many: a finer mesh has no solution
+
+# In units of the distance from A to S, in the metric of M.
+START = 0.003  # where solutions begin, and the power series errs by its fifth power
+FIRST_END = 0.1  # there the first end lies
+LONGEST_STEP = 0.3  # of the end; it is halved where Newton's method does not follow ...
+SHORTEST_STEP = 0.004  # ... and a curve given up below this: it leaves the well, or V is not smooth there
+BENDS, BEND = 4, 0.4  # curves beside the straight one, and how far they leave it
+APPROACH, LAST_APPROACH = 0.1, 0.002  # how far from S the end is at first, and in the answer
+APPROACH_FACTOR = 3.0  # by so much nearer in one step
+LEAST_SHARE = 0.05  # numerical: of the way to the conditions at the saddle, in one step
+SAME_PATH, COMPARED_TIMES = 0.03, 400  # solutions further apart, at so many times, are two
+CENTRAL_SPACING = 0.005  # nearer to A points lie no closer together
+SPACING = 0.05  # of the distance from A: between two points of the answer
+FEWEST_POINTS, MOST_POINTS = 400, 20_000  # of the answer
+
+SPIRAL_STEP = 0.3  # of the shortest time of the linear equations: steps of a first guess
+REVERSED_PACE = 3  # times as many points as a first guess has: momenta are differences of it
+REVERSED_ACCURACY = 1e-9  # of the way down, relative: it winds often
+ROUGH, SWITCHED, FINE = 1e-3, 1e-5, 1e-6  # residuals of collocation: on the way, at the saddle, of the answer
+GAUSS = np.polynomial.legendre.leggauss(3)  # exact to the order of collocation
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +92,7 @@ class HamiltonianProblem:
         self.flow = HamiltonianFlow(dynamics, attractor, level)
         self.dimension = dynamics.dimension
         self.end = self.flow.inverse @ offset
-        many = self.dimension > MOST_STATES
+        many = self.dimension > MOST_STATES_OF_DEGREE_4
         self.series = (
             cubic_series(dynamics, attractor)
             if many
@@ -196,293 +206,17 @@ class HamiltonianProblem:
                 found = solve_bvp(
                     rates, ends, guess.times, guess.at(guess.times), p=np.zeros(1) if further else None,
                     fun_jac=derivatives, bc_jac=slopes, tol=tolerance, bc_tol=min(tolerance, 1e-6),
-                    max_nodes=min(max(FINER * len(guess.times), ENOUGH), MOST_NODES),
+                    max_nodes=min(max(MESH_GROWTH * len(guess.times), ENOUGH_NODES), MOST_NODES),
                 )  # fmt: skip
             except (ValueError, np.linalg.LinAlgError):  # not finite, where a trial has run away
                 return None
         return Solution(found.sol, found.x) if found.success else None
 
 
-def interpolated(times: np.ndarray, states: np.ndarray) -> Solution:
+def _interpolated(times: np.ndarray, states: np.ndarray) -> Solution:
     """States ``(n, 2d)`` at times, as a first guess."""
     curve = Akima1DInterpolator(times, states)
     return Solution(lambda t: np.asarray(curve(t)).T, times)
-
-
-FIRST = 0.1  # of the distance from A to S, in the metric of M: there the first end lies
-START = 0.003  # of it: where solutions begin, and the power series errs by its fifth power
-ROUGH = 1e-3  # relative residual of collocation, on the way
-LONGEST = 0.3  # of the distance: step of the end; it is halved where Newton's method does not follow ...
-SHORTEST = 0.004  # ... and a curve given up below this: it leaves the well, or V is not smooth there
-BENDS, BEND = 4, 0.4  # curves beside the straight one, and how far they leave it, as a share of the distance
-SPIRAL = 0.3  # of the shortest time of the linear equations: steps of a first guess
-
-
-def last_states(problem: HamiltonianProblem, beside: np.ndarray | None) -> list[np.ndarray]:
-    """Where the end is moved to: itself, or states before the saddle, one of which will do."""
-    if problem.unstable is None:
-        return [problem.end]
-    return [_before(problem, beside, one) for one in problem.arrivals]
-
-
-def curves_to(
-    problem: HamiltonianProblem, last: np.ndarray, further: Sequence[np.ndarray]
-) -> list[np.ndarray]:
-    """Along which the end is moved: straight, and bent to some sides."""
-    share = np.linspace(0, 1, 201)[:, None]
-    straight = share * last
-    across = np.linalg.svd(last[None])[2][1 : BENDS // 2 + 1]
-    bent = [straight + BEND * side * np.sin(np.pi * share) * way for way in across for side in (1, -1)]
-    return [straight, *bent, *((one - problem.flow.center) @ problem.flow.inverse.T for one in further)]
-
-
-def way_down(problem: HamiltonianProblem, beside: np.ndarray | None, last: np.ndarray) -> np.ndarray | None:
-    """The way down taken backwards: V falls along it, so that it crosses no ridge, but it may wind."""
-    if beside is None or problem.unstable is None:
-        return None
-    down = (beside - problem.flow.center) @ problem.flow.inverse.T
-    far = down[np.linalg.norm(down - problem.end, axis=1) >= APPROACH]
-    return np.vstack([far[::-1], last])
-
-
-def _before(problem: HamiltonianProblem, beside: np.ndarray | None, arrival: np.ndarray) -> np.ndarray:
-    """A state before the saddle, on the side of A."""
-    side = np.sign(problem.left @ -problem.end)
-    if beside is not None:
-        down = (beside - problem.flow.center) @ problem.flow.inverse.T
-        far = np.flatnonzero(np.linalg.norm(down - problem.end, axis=1) >= APPROACH)
-        side = np.sign(problem.left @ (down[far[0]] - problem.end))
-    return np.asarray(problem.end + side * APPROACH * arrival / np.linalg.norm(arrival))
-
-
-def followed(problem: HamiltonianProblem, curve: np.ndarray) -> Solution | None:
-    """The solution at the end of a curve, None where one of the steps fails."""
-    outside = np.linalg.norm(curve, axis=1) >= FIRST
-    curve = curve[int(np.flatnonzero(~outside).max(initial=0)) + 1 :]
-    along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))]
-
-    def at(place: float) -> np.ndarray:
-        return np.array([np.interp(place, along, column) for column in curve.T])
-
-    solution = problem.solved(_linear(problem, at(0.0)), problem.fixed(at(0.0)), ROUGH)
-    before: tuple[Solution, float] | None = None
-    place, step, failed = 0.0, LONGEST, False
-    while solution is not None and place < along[-1]:
-        ahead = min(place + step, along[-1])
-        guess = longer(problem, solution)
-        if before is not None:
-            guess = _predicted(guess, before[0], (ahead - place) / (place - before[1]))
-        moved = problem.solved(guess, problem.fixed(at(ahead)), ROUGH)
-        if moved is None:
-            step, failed = step / 2, True
-            if step < SHORTEST:
-                return None
-            continue
-        before = solution, place
-        solution, place = moved, ahead
-        step, failed = (step if failed else min(1.5 * step, LONGEST)), False
-    return solution
-
-
-def _linear(problem: HamiltonianProblem, last: np.ndarray) -> Solution:
-    """The way to a point close to A, were f linear: q = y there."""
-    back = scipy.linalg.expm(-SPIRAL / problem.fastest * problem.growth)
-    y = [last]
-    while np.linalg.norm(y[-1]) > START and len(y) < MOST_NODES:
-        y.append(back @ y[-1])
-    states = np.array(y[::-1])
-    times = SPIRAL / problem.fastest * np.arange(1 - len(y), 1)
-    return interpolated(times, np.concatenate([states, states], axis=1))
-
-
-def longer(problem: HamiltonianProblem, solution: Solution) -> Solution:
-    """The same at evenly spaced times, begun so close to A as the power series asks for."""
-    first = solution.at(solution.times[:1])[: problem.dimension, 0]
-    if np.linalg.norm(first) > START:
-        before = _linear(problem, first)
-        times = np.r_[before.times[:-1] + solution.times[0], solution.times]
-        states = np.concatenate([before.at(before.times[:-1]), solution.at(solution.times)], axis=1)
-        solution = interpolated(times, states.T)
-    count = int(-solution.times[0] * problem.fastest / SPIRAL) + 2
-    return Solution(solution.at, np.linspace(solution.times[0], 0.0, count))
-
-
-def onward(problem: HamiltonianProblem, solution: Solution, distance: float) -> Solution:
-    """The same, continued by the linear equations to a distance from the saddle."""
-    d, rate = problem.dimension, problem.unstable
-    assert rate is not None
-    final = solution.at(np.zeros(1))[:, 0]
-    fastest = np.abs(np.linalg.eigvals(problem.jacobian)).max()
-    step = SPIRAL / fastest
-    whole = np.block([[problem.jacobian, 2 * problem.noise], [np.zeros((d, d)), -problem.jacobian.T]])
-    flow = scipy.linalg.expm(step * whole)
-    states = [np.concatenate([final[:d] - problem.end, final[d:]])]
-    height = float(problem.left @ states[0][:d])
-    while np.linalg.norm(states[-1][:d]) > distance and len(states) < MOST_NODES:
-        ahead = flow @ states[-1]
-        height *= np.exp(-step * rate)
-        # What grows is not there: of the two parts along w either follows from the height.
-        ahead[:d] += problem.right * (height - problem.left @ ahead[:d])
-        ahead[d:] = -rate * height / problem.push * problem.left
-        states.append(ahead)
-    further = np.array(states[1:]).reshape(-1, 2 * d) + np.r_[problem.end, np.zeros(d)]
-    times = np.r_[solution.times, step * np.arange(1, len(states))]
-    rows = np.concatenate([solution.at(solution.times).T, further])
-    return interpolated(times - times[-1], rows)
-
-
-def _predicted(guess: Solution, before: Solution, share: float) -> Solution:
-    """A solution moved on by a share of what it has moved from the one before, as far as both go back."""
-
-    def at(times: np.ndarray) -> np.ndarray:
-        own, common = guess.at(times), times >= before.times[0]
-        own[:, common] += share * (own[:, common] - before.at(times[common]))
-        return own
-
-    return Solution(at, guess.times)
-
-
-ACCURACY = 1e-9  # of the way down, relative: it winds often
-PACE = 3  # times as many points as a first guess has: momenta are differences of it
-
-
-def reversed_motion(problem: HamiltonianProblem, beside: np.ndarray | None) -> Solution | None:
-    """A first guess of the path to a saddle: the way down, with velocities reversed.
-
-    Parameters
-    ----------
-    problem
-        From an attractor to a saddle.
-    beside
-        A trajectory of f from the saddle to the attractor, shape ``(k, d)``.
-
-    Returns
-    -------
-    Solution or None
-        It ends before the saddle. None where states are not positions and their velocities, noise acts on
-        others than velocities, or the way down is not known.
-    """
-    dynamics, flow = problem.flow.dynamics, problem.flow
-    places = velocities_of(dynamics)
-    if places is None or beside is None or problem.unstable is None:
-        return None
-    positions, velocities = places
-    down = _way_down(problem, beside)
-    if down is None:
-        return None
-    step = SPIRAL / problem.fastest / PACE
-    x = down.copy()
-    x[:, velocities] *= -1
-    noise = dynamics.diffusion.at(x)[:, velocities[:, None], velocities]
-    # On the way down velocities change by f_v at their own sign; reversed, they change by the same.
-    missing = (dynamics.drift(down) - dynamics.drift(x))[:, velocities]
-    momenta = np.zeros_like(x)
-    try:
-        pushed = np.linalg.solve(2 * noise, missing[:, :, None])[:, :, 0]
-    except np.linalg.LinAlgError:
-        return None
-    momenta[:, velocities] = pushed
-    turned = dynamics.jacobian(x)[:, velocities[:, None], velocities]
-    pulled = np.gradient(pushed, step, axis=0) + (turned.transpose(0, 2, 1) @ pushed[:, :, None])[:, :, 0]
-    momenta[:, positions] = -pulled
-    y = (x - flow.center) @ flow.inverse.T
-    q = momenta @ flow.units / (2 * flow.level)
-    times = step * np.arange(1 - len(x), 1)
-    guess = interpolated(times, np.concatenate([y, q], axis=1))
-    return Solution(guess.at, times[::-PACE][::-1])
-
-
-def velocities_of(dynamics: Dynamics) -> tuple[np.ndarray, np.ndarray] | None:
-    """The places of positions and of their velocities, in the same order; None where there are other states.
-
-    Noise acts on velocities alone.
-    """
-    symbols = list(dynamics.symbols)
-    defined = [
-        (place, symbols.index(formula))
-        for place, formula in enumerate(dynamics.formulas)
-        if formula in symbols
-    ]
-    positions, velocities = np.array(defined, dtype=int).reshape(-1, 2).T
-    if not np.array_equal(np.sort(np.r_[positions, velocities]), np.arange(len(symbols))):
-        return None
-    noise = dynamics.diffusion.formulas
-    return None if any(noise[place][place] != 0 for place in positions) else (positions, velocities)
-
-
-def _way_down(problem: HamiltonianProblem, beside: np.ndarray) -> np.ndarray | None:
-    """The way down in reverse, from close to A to before the saddle: states at even times, ``(n, d)``."""
-    dynamics, flow = problem.flow.dynamics, problem.flow
-    y = (beside - flow.center) @ flow.inverse.T
-    far = np.flatnonzero(np.linalg.norm(y - problem.end, axis=1) >= APPROACH)
-    if not len(far):
-        return None
-
-    def arrives(_: float, x: np.ndarray) -> float:
-        return float(np.linalg.norm(flow.inverse @ (x - flow.center))) - START
-
-    arrives.terminal = True  # type: ignore[attr-defined]
-    step = SPIRAL / problem.fastest / PACE
-    motion = solve_ivp(
-        lambda _, x: dynamics.drift(x[None])[0],
-        (0.0, step * MOST_NODES),
-        beside[far[0]],
-        events=arrives,
-        method="DOP853",
-        rtol=ACCURACY,
-        atol=ACCURACY * np.abs(beside - flow.center).max(axis=0),
-        dense_output=True,
-    )
-    if motion.status != 1:  # it does not come to A
-        return None
-    times = np.arange(0.0, motion.t[-1], step)
-    return np.asarray(motion.sol(times[::-1]).T)
-
-
-LAST = 0.002  # of the distance from A to S, in the metric of M: how far from S the end is in the answer
-LEAST_SHARE = 0.05  # numerical: of the way to the conditions at the saddle, in one step
-NEARER = 3.0  # by so much in one step
-SWITCHED, FINE = 1e-5, 1e-6  # relative residuals of collocation, at the saddle and of the answer
-APART, COMPARED = 0.03, 400  # of the distance, at so many times: solutions further apart are two
-CENTRAL = 0.005  # of the distance to the end: nearer to A points lie no closer together
-TURN = 0.05  # of this distance, or of that from A: between two points of the answer
-FEWEST, MOST = 400, 20_000  # points of the answer
-GAUSS = np.polynomial.legendre.leggauss(3)  # exact to the order of collocation
-
-
-@dataclass(frozen=True, eq=False)
-class HamiltonianPath:
-    """A solution of Hamilton's equations from an attractor to a state.
-
-    Attributes
-    ----------
-    points, momenta
-        Shape ``(n, d)``, in the states' units, from the attractor to the end.
-    values
-        Shape ``(n,)``: V, not U, up to each point.
-    times
-        Shape ``(n,)``: zero at the last point of the solution; infinite at equilibria, where it does not
-        come to.
-    error
-        By how much V at the end differs from that of the mesh before.
-    residual
-        Largest ``|p·f + p·Dp|``, as a share of the largest ``|p·f| + p·Dp``.
-    smooth
-        Whether no neighbour crosses it: only then it is a minimum.
-    """
-
-    points: np.ndarray
-    momenta: np.ndarray
-    values: np.ndarray
-    times: np.ndarray
-    error: float
-    residual: float
-    smooth: bool
-
-    @property
-    def action(self) -> float:
-        """Of the whole path, the barrier of U if the end is a saddle."""
-        return 2 * float(self.values[-1])
 
 
 def hamiltonian_paths(
@@ -493,7 +227,7 @@ def hamiltonian_paths(
     beside: np.ndarray | None = None,
     tolerance: float = 1e-5,
     curves: Sequence[np.ndarray] = (),
-) -> list[HamiltonianPath]:
+) -> list[MinimumActionPath]:
     """Solutions from an attractor to a state, by rising action, those that are minima first.
 
     Parameters
@@ -521,24 +255,43 @@ def hamiltonian_paths(
             " sought from stable equilibria alone"
         )
     problem = HamiltonianProblem(dynamics, attractor, end)
-    found: list[HamiltonianPath] = []
-    backwards = _of_reversed_motion(problem, beside)
-    known = [] if backwards is None else [backwards]
-    path = None if backwards is None else _finished(problem, backwards, tolerance)
-    found += [] if path is None else [path]
-    for last in last_states(problem, beside):
+    found: list[MinimumActionPath] = []
+    known: list[Solution] = []
+
+    def finished(solution: Solution | None) -> None:
+        path = None if solution is None else _finished(problem, solution, tolerance)
+        found.extend([] if path is None else [path])
+
+    def apart(one: Solution, two: Solution) -> bool:
+        """Whether two solutions that end at one state come from different sides."""
+        times = np.linspace(max(one.times[0], two.times[0]), 0.0, COMPARED_TIMES)
+        difference = one.at(times)[: problem.dimension] - two.at(times)[: problem.dimension]
+        return bool(np.abs(difference).max() > SAME_PATH)
+
+    guess = _reversed_motion(problem, beside)
+    if guess is not None:
+        last = guess.at(np.zeros(1))[: problem.dimension, 0]
+        backwards = problem.solved(guess, problem.fixed(last), ROUGH)
+        known += [] if backwards is None else [backwards]
+        finished(backwards)
+    share = np.linspace(0, 1, 201)[:, None]
+    given = [(one - problem.flow.center) @ problem.flow.inverse.T for one in curves]
+    for last in _last_states(problem, beside):
         solutions = list(known)
-        for curve in curves_to(problem, last, curves):
-            solution = followed(problem, curve)
-            if solution is None or any(not _apart(solution, one, problem.dimension) for one in solutions):
-                continue
-            solutions.append(solution)
-            path = _finished(problem, solution, tolerance)
-            found += [] if path is None else [path]
-        way = None if found else way_down(problem, beside, last)
-        if way is not None and (solution := followed(problem, way)) is not None:
-            path = _finished(problem, solution, tolerance)
-            found += [] if path is None else [path]
+        across = np.linalg.svd(last[None])[2][1 : BENDS // 2 + 1]
+        bent = [
+            share * last + BEND * side * np.sin(np.pi * share) * way for way in across for side in (1, -1)
+        ]
+        for curve in (share * last, *bent, *given):
+            solution = _followed(problem, curve)
+            if solution is not None and all(apart(solution, one) for one in solutions):
+                solutions.append(solution)
+                finished(solution)
+        if not found and beside is not None and problem.unstable is not None:
+            # The way down taken backwards: V falls along it, so that it crosses no ridge, but it may wind.
+            down = (beside - problem.flow.center) @ problem.flow.inverse.T
+            far = down[np.linalg.norm(down - problem.end, axis=1) >= APPROACH]
+            finished(_followed(problem, np.vstack([far[::-1], last])))
         if found:
             break
     if not found:
@@ -548,21 +301,175 @@ def hamiltonian_paths(
     return sorted(found, key=lambda path: (not path.smooth, path.action))
 
 
-def _of_reversed_motion(problem: HamiltonianProblem, beside: np.ndarray | None) -> Solution | None:
-    """The solution next to the way down with velocities reversed, which ends where that does."""
-    guess = reversed_motion(problem, beside)
-    if guess is None:
+def _last_states(problem: HamiltonianProblem, beside: np.ndarray | None) -> list[np.ndarray]:
+    """Where the end is moved to: itself, or states before the saddle on the side of A."""
+    if problem.unstable is None:
+        return [problem.end]
+    side = np.sign(problem.left @ -problem.end)
+    if beside is not None:
+        down = (beside - problem.flow.center) @ problem.flow.inverse.T
+        far = np.flatnonzero(np.linalg.norm(down - problem.end, axis=1) >= APPROACH)
+        side = np.sign(problem.left @ (down[far[0]] - problem.end))
+    return [problem.end + side * APPROACH * one / np.linalg.norm(one) for one in problem.arrivals]
+
+
+def _followed(problem: HamiltonianProblem, curve: np.ndarray) -> Solution | None:
+    """The solution at the end of a curve, None where one of the steps fails."""
+    outside = np.linalg.norm(curve, axis=1) >= FIRST_END
+    curve = curve[int(np.flatnonzero(~outside).max(initial=0)) + 1 :]
+    along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))]
+
+    def at(place: float) -> np.ndarray:
+        return np.array([np.interp(place, along, column) for column in curve.T])
+
+    def moved_on(guess: Solution, before: Solution, share: float) -> Solution:
+        """Moved on by a share of what it has moved from the one before, as far as both go back."""
+
+        def states(times: np.ndarray) -> np.ndarray:
+            own, common = guess.at(times), times >= before.times[0]
+            own[:, common] += share * (own[:, common] - before.at(times[common]))
+            return own
+
+        return Solution(states, guess.times)
+
+    solution = problem.solved(_linear(problem, at(0.0)), problem.fixed(at(0.0)), ROUGH)
+    before: tuple[Solution, float] | None = None
+    place, step, failed = 0.0, LONGEST_STEP, False
+    while solution is not None and place < along[-1]:
+        ahead = min(place + step, along[-1])
+        guess = _longer(problem, solution)
+        if before is not None:
+            guess = moved_on(guess, before[0], (ahead - place) / (place - before[1]))
+        moved = problem.solved(guess, problem.fixed(at(ahead)), ROUGH)
+        if moved is None:
+            step, failed = step / 2, True
+            if step < SHORTEST_STEP:
+                return None
+            continue
+        before = solution, place
+        solution, place = moved, ahead
+        step, failed = (step if failed else min(1.5 * step, LONGEST_STEP)), False
+    return solution
+
+
+def _linear(problem: HamiltonianProblem, last: np.ndarray) -> Solution:
+    """The way to a point close to A, were f linear: q = y there."""
+    back = scipy.linalg.expm(-SPIRAL_STEP / problem.fastest * problem.growth)
+    y = [last]
+    while np.linalg.norm(y[-1]) > START and len(y) < MOST_NODES:
+        y.append(back @ y[-1])
+    states = np.array(y[::-1])
+    times = SPIRAL_STEP / problem.fastest * np.arange(1 - len(y), 1)
+    return _interpolated(times, np.concatenate([states, states], axis=1))
+
+
+def _longer(problem: HamiltonianProblem, solution: Solution) -> Solution:
+    """A solution at evenly spaced times, begun so close to A as the power series asks for."""
+    first = solution.at(solution.times[:1])[: problem.dimension, 0]
+    if np.linalg.norm(first) > START:
+        before = _linear(problem, first)
+        times = np.r_[before.times[:-1] + solution.times[0], solution.times]
+        states = np.concatenate([before.at(before.times[:-1]), solution.at(solution.times)], axis=1)
+        solution = _interpolated(times, states.T)
+    count = int(-solution.times[0] * problem.fastest / SPIRAL_STEP) + 2
+    return Solution(solution.at, np.linspace(solution.times[0], 0.0, count))
+
+
+def _onward(problem: HamiltonianProblem, solution: Solution, distance: float) -> Solution:
+    """A solution continued by the linear equations to a distance from the saddle."""
+    d, rate = problem.dimension, problem.unstable
+    assert rate is not None
+    final = solution.at(np.zeros(1))[:, 0]
+    fastest = np.abs(np.linalg.eigvals(problem.jacobian)).max()
+    step = SPIRAL_STEP / fastest
+    whole = np.block([[problem.jacobian, 2 * problem.noise], [np.zeros((d, d)), -problem.jacobian.T]])
+    flow = scipy.linalg.expm(step * whole)
+    states = [np.concatenate([final[:d] - problem.end, final[d:]])]
+    height = float(problem.left @ states[0][:d])
+    while np.linalg.norm(states[-1][:d]) > distance and len(states) < MOST_NODES:
+        ahead = flow @ states[-1]
+        height *= np.exp(-step * rate)
+        # What grows is not there: of the two parts along w either follows from the height.
+        ahead[:d] += problem.right * (height - problem.left @ ahead[:d])
+        ahead[d:] = -rate * height / problem.push * problem.left
+        states.append(ahead)
+    further = np.array(states[1:]).reshape(-1, 2 * d) + np.r_[problem.end, np.zeros(d)]
+    times = np.r_[solution.times, step * np.arange(1, len(states))]
+    rows = np.concatenate([solution.at(solution.times).T, further])
+    return _interpolated(times - times[-1], rows)
+
+
+def _reversed_motion(problem: HamiltonianProblem, beside: np.ndarray | None) -> Solution | None:
+    """A first guess of the path to a saddle, which ends before it: the way down with velocities reversed.
+
+    `beside` is a trajectory of f from the saddle to the attractor, shape ``(k, d)``. There is none where
+    states are not positions and their velocities, noise acts on others than velocities, or the way down is
+    not known.
+    """
+    dynamics, flow = problem.flow.dynamics, problem.flow
+    places = _velocities_of(dynamics)
+    if places is None or beside is None or problem.unstable is None:
         return None
-    return problem.solved(guess, problem.fixed(guess.at(np.zeros(1))[: problem.dimension, 0]), ROUGH)
+    positions, velocities = places
+    far = np.flatnonzero(
+        np.linalg.norm((beside - flow.center) @ flow.inverse.T - problem.end, axis=1) >= APPROACH
+    )
+    if not len(far):
+        return None
+
+    def arrives(_: float, x: np.ndarray) -> float:
+        return float(np.linalg.norm(flow.inverse @ (x - flow.center))) - START
+
+    arrives.terminal = True  # type: ignore[attr-defined]
+    step = SPIRAL_STEP / problem.fastest / REVERSED_PACE
+    motion = solve_ivp(
+        lambda _, x: dynamics.drift(x[None])[0], (0.0, step * MOST_NODES), beside[far[0]], method="DOP853",
+        rtol=REVERSED_ACCURACY, atol=REVERSED_ACCURACY * np.abs(beside - flow.center).max(axis=0),
+        events=arrives, dense_output=True,
+    )  # fmt: skip
+    if motion.status != 1:  # it does not come to A
+        return None
+    down = np.asarray(motion.sol(np.arange(0.0, motion.t[-1], step)[::-1]).T)
+    x = down.copy()
+    x[:, velocities] *= -1
+    noise = dynamics.diffusion.at(x)[:, velocities[:, None], velocities]
+    # On the way down velocities change by f_v at their own sign; reversed, they change by the same.
+    missing = (dynamics.drift(down) - dynamics.drift(x))[:, velocities]
+    momenta = np.zeros_like(x)
+    try:
+        pushed = np.linalg.solve(2 * noise, missing[:, :, None])[:, :, 0]
+    except np.linalg.LinAlgError:
+        return None
+    momenta[:, velocities] = pushed
+    turned = dynamics.jacobian(x)[:, velocities[:, None], velocities]
+    pulled = np.gradient(pushed, step, axis=0) + (turned.transpose(0, 2, 1) @ pushed[:, :, None])[:, :, 0]
+    momenta[:, positions] = -pulled
+    y = (x - flow.center) @ flow.inverse.T
+    q = momenta @ flow.units / (2 * flow.level)
+    times = step * np.arange(1 - len(x), 1)
+    guess = _interpolated(times, np.concatenate([y, q], axis=1))
+    return Solution(guess.at, times[::-REVERSED_PACE][::-1])
 
 
-def _apart(one: Solution, two: Solution, dimension: int) -> bool:
-    """Whether two solutions that end at one state come from different sides."""
-    times = np.linspace(max(one.times[0], two.times[0]), 0.0, COMPARED)
-    return bool(np.abs(one.at(times)[:dimension] - two.at(times)[:dimension]).max() > APART)
+def _velocities_of(dynamics: Dynamics) -> tuple[np.ndarray, np.ndarray] | None:
+    """The places of positions and of their velocities, in the same order; None where there are other states.
+
+    Noise acts on velocities alone.
+    """
+    symbols = list(dynamics.symbols)
+    defined = [
+        (place, symbols.index(formula))
+        for place, formula in enumerate(dynamics.formulas)
+        if formula in symbols
+    ]
+    positions, velocities = np.array(defined, dtype=int).reshape(-1, 2).T
+    if not np.array_equal(np.sort(np.r_[positions, velocities]), np.arange(len(symbols))):
+        return None
+    noise = dynamics.diffusion.formulas
+    return None if any(noise[place][place] != 0 for place in positions) else (positions, velocities)
 
 
-def _finished(problem: HamiltonianProblem, solution: Solution, tolerance: float) -> HamiltonianPath | None:
+def _finished(problem: HamiltonianProblem, solution: Solution, tolerance: float) -> MinimumActionPath | None:
     """The path of a solution that ends close to the end: on to it, and solved as finely as is asked."""
     if problem.unstable is None:
         ended: Solution | None = solution
@@ -576,14 +483,14 @@ def _finished(problem: HamiltonianProblem, solution: Solution, tolerance: float)
             return None
         ended = _as_at_saddle(problem, known)
         distance = APPROACH
-        while ended is not None and distance > LAST:
-            distance /= NEARER
-            ended = onward(problem, ended, distance)
+        while ended is not None and distance > LAST_APPROACH:
+            distance /= APPROACH_FACTOR
+            ended = _onward(problem, ended, distance)
             ended = problem.solved(ended, problem.at_saddle(ended), ROUGH)
         if ended is None:
             return None
         last = problem.at_saddle(ended)
-    rough = None if ended is None else problem.solved(longer(problem, ended), last, ROUGH / 10)
+    rough = None if ended is None else problem.solved(_longer(problem, ended), last, ROUGH / 10)
     if rough is None:
         return None
     fine: Solution | None = None
@@ -595,7 +502,7 @@ def _finished(problem: HamiltonianProblem, solution: Solution, tolerance: float)
         before, value, rough = value, _values(problem, fine)[-1], fine
         if abs(value - before) <= tolerance * value:
             break
-    return _path(problem, rough, abs(value - before))
+    return _path(problem, rough, abs(value - before), tolerance)
 
 
 def _as_at_saddle(problem: HamiltonianProblem, solution: Solution) -> Solution | None:
@@ -639,14 +546,16 @@ def _values(problem: HamiltonianProblem, solution: Solution) -> np.ndarray:
     return np.append(values, values[-1] + rest)
 
 
-def _path(problem: HamiltonianProblem, solution: Solution, error: float) -> HamiltonianPath:
+def _path(
+    problem: HamiltonianProblem, solution: Solution, error: float, tolerance: float
+) -> MinimumActionPath:
     d, flow = problem.dimension, problem.flow
     z = solution.at(solution.times).T
     velocity = np.linalg.norm(problem.rates(z.T)[:d].T, axis=1)
     # About A the path may wind: points lie as close as their distance from it, and from the end, asks for.
-    pace = velocity / (np.linalg.norm(z[:, :d], axis=1) + CENTRAL)
+    pace = velocity / (np.linalg.norm(z[:, :d], axis=1) + CENTRAL_SPACING)
     measure = np.r_[0.0, np.cumsum((pace[1:] + pace[:-1]) / 2 * np.diff(solution.times))]
-    count = int(np.clip(measure[-1] / TURN, FEWEST, MOST))
+    count = int(np.clip(measure[-1] / SPACING, FEWEST_POINTS, MOST_POINTS))
     times = PchipInterpolator(measure, solution.times)(np.linspace(0.0, measure[-1], count))
     times[0], times[-1] = solution.times[0], 0.0
     z = solution.at(times).T
@@ -663,9 +572,11 @@ def _path(problem: HamiltonianProblem, solution: Solution, error: float) -> Hami
     else:
         values = values[:-1]
     y, q, values = np.vstack([np.zeros(d), y]), np.vstack([np.zeros(d), q]), np.r_[0.0, values]
-    return HamiltonianPath(
-        flow.points(y), 2 * flow.level * q @ flow.inverse, flow.level * values, times,
-        flow.level * error, residual, _smooth(problem, solution),
+    values, error, smooth = 2 * flow.level * values, 2 * flow.level * error, _smooth(problem, solution)
+    return MinimumActionPath(
+        points=flow.points(y), momenta=2 * flow.level * q @ flow.inverse, values=values,
+        action=float(values[-1]), error=error, residual=residual,
+        converged=smooth and bool(error <= tolerance * values[-1]), times=times, smooth=smooth,
     )  # fmt: skip
 
 

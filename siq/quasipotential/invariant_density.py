@@ -34,10 +34,9 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import scipy.integrate
@@ -1010,27 +1009,30 @@ def simulated_shares(sampled: SampledPotential, start: np.ndarray, samples: np.n
         return WellShares(counted / counted.sum(), changed)
 
 
-def shares_by_rates(transitions: Sequence[Mapping[str, Any]], count: int, *, intensity: float) -> np.ndarray:
+def shares_by_rates(
+    ways: Sequence[tuple[int, int | None, float | None, float | None]], count: int, *, intensity: float
+) -> np.ndarray:
     """The wells' shares that the mean escape times imply, prefactors included; NaN where one is not known.
 
     Unlike the integral of exp(-U/ε) over a well this has the prefactor of the density in it.
 
     Parameters
     ----------
-    transitions
-        ``start end barrier prefactor`` of every way between wells (`siq.quasipotential.landscape_files`).
+    ways
+        Start, end, barrier and prefactor of every way out, these NaN or None where not known; ways that end
+        at no well (None) do not count.
     count
         Number of wells, k.
     intensity
         ε.
     """
-    ways = [way for way in transitions if way["end"] is not None]
-    if any(way["barrier"] is None or way["prefactor"] is None for way in ways):
+    table = np.array([way for way in ways if way[1] is not None], dtype=float).reshape(-1, 4)
+    if not np.isfinite(table).all():
         return np.full(count, np.nan)
     rates = np.zeros((count, count))
-    lowest = min((way["barrier"] for way in ways), default=0.0)  # or all rates would be zero at a small ε
-    for way in ways:
-        rates[way["start"], way["end"]] += np.exp((lowest - way["barrier"]) / intensity) / way["prefactor"]
+    lowest = table[:, 2].min(initial=np.inf)  # or all rates would be zero at a small ε
+    for start, end, barrier, prefactor in table:
+        rates[int(start), int(end)] += np.exp((lowest - barrier) / intensity) / prefactor
     np.fill_diagonal(rates, 0.0)
     # Grassmann, Taksar and Heyman's elimination: nothing is subtracted from rates, so that tiny ones count.
     for k in range(count - 1, 0, -1):

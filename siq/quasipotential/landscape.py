@@ -1,4 +1,4 @@
-"""The landscape of a vector field: attractors, wells, transitions, and U over all of them.
+"""The landscape of a vector field: attractors, wells, transitions, and U = 2V over all of them.
 
 About each attractor i the quasipotential is ``U_i(x)``, zero there. The one that the invariant distribution
 follows, ``p ~ exp(-U/ε)``, is
@@ -9,7 +9,8 @@ where W_i is the least total of barriers over all trees of transitions that end 
 A. Wentzell, *Random Perturbations of Dynamical Systems*, chapter 6). For two wells this says that both local
 formulas have the same value at the saddle between them.
 
-It is found by `siq.quasipotential.landscape_assembly`; here is what can be asked of it.
+A `Landscape` is data with answers. `siq.quasipotential.landscape_assembly` finds it, and
+`siq.quasipotential.landscape_files` stores it.
 """
 
 from __future__ import annotations
@@ -26,21 +27,30 @@ import pandas as pd
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as pydantic_dataclass
 
-from siq.data.inspection import seen_states
-from siq.data.recordings import Recordings, recordings_of
-from siq.data.selection import joined
+from siq.data.recordings import Recordings
 from siq.data.two_states import RecordStates
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import IdentifiedField
 from siq.quasipotential.certificate import Certificate
 from siq.quasipotential.characteristics import potential_errors
 from siq.quasipotential.occupancy import VisitTest
-from siq.quasipotential.rates import Exit, NoiseStrength, dwell_time
+from siq.quasipotential.rates import EscapeRate, NoiseStrength, mean_residence_time
 from siq.quasipotential.transitions import Transition, missing_diffusion
 from siq.quasipotential.wells import Well
+from siq.remarks import Remark
+from siq.report.remarks import sentence
 from siq.systems.cycles import Cycle
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import Equilibrium
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from siq.quasipotential.landscape_assembly import EquationSettings
+    from siq.workflow.pipeline import PipelineSettings
+
+MOST_WELLS = 6  # of which all trees can be counted
+LEVEL_TOLERANCE = 1e-6  # numerical, of the level of a well: two values of U are one
 
 
 @pydantic_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -79,20 +89,17 @@ class NoLandscape(NumericalFailure):
     def __init__(
         self, reason: str, states: RecordStates | None = None, dynamics: Dynamics | None = None
     ) -> None:
-        super().__init__(" ".join(told_without_landscape(reason, states)))
+        super().__init__(" ".join(sentences_without_landscape(reason, states)))
         self.reason = reason
         self.states = states
         self.dynamics = dynamics
 
 
-def told_without_landscape(reason: str, states: RecordStates | None) -> list[str]:
-    """The sentences that stand where a landscape would: what is known without one, and why there is none."""
+def sentences_without_landscape(reason: str, states: RecordStates | None) -> list[str]:
+    """What is known without a landscape, and why there is none."""
     seen = "" if states is None else states.sentence()
     missing = f"{'But no' if seen else 'No'} landscape was found: {reason}."
     return [seen, missing] if seen else [missing]
-
-
-MOST_WELLS = 6  # of which all trees can be counted
 
 
 @dataclass(frozen=True)
@@ -127,14 +134,6 @@ def least_over_wells(values: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(least), least, np.nan)
 
 
-def matched(wells: Sequence[Well | None], heights: np.ndarray) -> GlobalQuasipotential | None:
-    """U over all wells, None where a well has no formula or no height."""
-    known = tuple(one for one in wells if one is not None)
-    if not known or len(known) < len(wells) or not np.isfinite(heights).all():
-        return None
-    return GlobalQuasipotential(known, heights)
-
-
 def heights_of_attractors(barriers: np.ndarray) -> np.ndarray:
     """U at the attractors from the barriers between them.
 
@@ -157,48 +156,22 @@ def heights_of_attractors(barriers: np.ndarray) -> np.ndarray:
     count = len(barriers)
     if count > MOST_WELLS:
         raise NumericalFailure(f"there are {count} attractors; heights are found for {MOST_WELLS} at most")
-    totals = np.array([_least_tree(barriers, root) for root in range(count)])
+    totals = np.full(count, np.inf)
+    for root in range(count):
+        others = [index for index in range(count) if index != root]
+        for targets in itertools.product(range(count), repeat=count - 1):
+            step = dict(zip(others, targets, strict=True))
+            total = float(sum(barriers[start, end] for start, end in step.items()))
+            ends = others
+            if total < totals[root]:
+                for _ in others:  # of a tree every branch has arrived at the root by then
+                    ends = [step.get(index, root) for index in ends]
+                totals[root] = total if all(end == root for end in ends) else totals[root]
     if not np.isfinite(totals).all():
         raise NumericalFailure(
             "no transitions over known saddles connect all attractors: their heights are not known"
         )
     return np.asarray(totals - totals.min())
-
-
-def _least_tree(barriers: np.ndarray, root: int) -> float:
-    """The least total of barriers over trees in which every attractor leads to the root."""
-    others = [i for i in range(len(barriers)) if i != root]
-    least = np.inf
-    for targets in itertools.product(range(len(barriers)), repeat=len(others)):
-        step = dict(zip(others, targets, strict=True))
-        total = sum(barriers[i, j] for i, j in step.items())
-        if total < least and all(_arrives(step, i, root) for i in others):
-            least = float(total)
-    return 0.0 if not others else least
-
-
-def _arrives(step: dict[int, int], start: int, root: int) -> bool:
-    seen: set[int] = set()
-    while start != root:
-        if start in seen:
-            return False
-        seen.add(start)
-        start = step[start]
-    return True
-
-
-def global_quasipotential(wells: Sequence[Well], barriers: np.ndarray) -> GlobalQuasipotential:
-    """Match local formulas; `barriers` as for `heights_of_attractors`."""
-    return GlobalQuasipotential(tuple(wells), heights_of_attractors(barriers))
-
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from siq.workflow.equations_step import EquationSettings
-    from siq.workflow.pipeline import PipelineSettings
-
-SAME = 1e-6  # numerical, of the level of a well: two values of U are one
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -227,20 +200,18 @@ class Landscape:
         Share of the evenly spread recorded states from which f leads to each attractor, shape ``(k,)``.
     heights
         U at the attractors, shape ``(k,)``; NaN where transitions do not connect them.
-
-    Notes
-    -----
-        What could not be done, in words.
+    remarks
+        What could not be done.
     position_errors
         Standard error of each attractor's position, shape ``(k, d)``; None where not known.
     noise
         Strength of the noise that drives the system, None where nobody knows it.
-    found
-        The identified f with its uncertainty, None where f is given.
+    field_estimate
+        The identified f with its uncertainty; None where f is given, and after reading from a file.
     visits
-        How long visits to the wells last, as counted on the recordings and as f and D say; empty where this
-        was not compared.
-    seen
+        Mean residence times as counted on the recordings and as f and D say; empty where this was not
+        compared.
+    recorded_states
         The two states between which the recordings hop by themselves, without any formula; None where
         nothing is known of them, or several wells are certified.
     given
@@ -256,13 +227,13 @@ class Landscape:
     wells: tuple[Well | None, ...]
     transitions: tuple[Transition, ...]
     heights: np.ndarray
-    notes: tuple[str, ...]
+    remarks: tuple[Remark, ...] = ()
     certificate: Certificate | None = None
     position_errors: np.ndarray | None = None
     noise: NoiseStrength | None = None
-    found: IdentifiedField | None = None
+    field_estimate: IdentifiedField | None = None
     visits: tuple[VisitTest, ...] = ()
-    seen: RecordStates | None = None
+    recorded_states: RecordStates | None = None
     given: bool = False
     parting: tuple[Cycle, ...] = ()
 
@@ -314,22 +285,9 @@ class Landscape:
         V &= 0.25 \Delta_{x}^{4} + 1.0 \Delta_{x}^{3} + 1.0 \Delta_{x}^{2} + 0.5 y^{2}
         \end{aligned}
         """
-        from siq.workflow.outcomes import why_no_landscape
-        from siq.workflow.pipeline import PipelineSettings, analyse
+        from siq.workflow.pipeline import landscape_from_recordings
 
-        settings, trajectories = settings or PipelineSettings(), recordings_of(recordings)
-        if hidden_velocities:
-            settings = replace(
-                settings, identification=replace(settings.identification, hidden_velocities=True)
-            )
-        analysis = analyse(trajectories, settings)
-        found = None if analysis.landscape is None else analysis.landscape.landscape
-        certified = found is not None and found.certificate is not None and found.certificate.certified
-        whole = certified and found is not None and len(found.attractors) > 1
-        seen = None if whole else seen_states(joined(trajectories))
-        if found is None:
-            raise NoLandscape(why_no_landscape(analysis.outcomes), seen, analysis.dynamics)
-        return replace(found, seen=seen)
+        return landscape_from_recordings(recordings, settings, hidden_velocities=hidden_velocities)
 
     @classmethod
     def from_equations(
@@ -342,7 +300,7 @@ class Landscape:
         system
             A system card, or `siq.Dynamics` with its domain.
         settings
-            Of all steps; see `siq.workflow.equations_step.EquationSettings`.
+            Of all steps; see `siq.quasipotential.landscape_assembly.EquationSettings`.
 
         Raises
         ------
@@ -365,9 +323,19 @@ class Landscape:
         >>> landscape.certificate.certified
         True
         """
-        from siq.workflow.equations_step import EquationSettings, landscape_of_equations, usable_system
+        from siq.quasipotential.landscape_assembly import landscape_from_equations
 
-        return landscape_of_equations(usable_system(system), settings or EquationSettings())
+        return landscape_from_equations(system, settings)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """The remarks as sentences."""
+        return tuple(map(sentence, self.remarks))
+
+    @property
+    def seen(self) -> RecordStates | None:
+        """Another name of `recorded_states`."""
+        return self.recorded_states
 
     @property
     def cycles(self) -> tuple[Cycle, ...]:
@@ -381,16 +349,20 @@ class Landscape:
         return replace(self, dynamics=dynamics, wells=wells)
 
     @cached_property
-    def over_wells(self) -> GlobalQuasipotential | None:
+    def global_quasipotential(self) -> GlobalQuasipotential | None:
         """U over all wells, None where a well has no formula or no height."""
-        return matched(self.wells, self.heights)
+        known = tuple(one for one in self.wells if one is not None)
+        if not known or len(known) < len(self.wells) or not np.isfinite(self.heights).all():
+            return None
+        return GlobalQuasipotential(known, self.heights)
 
     def quasipotential(self, points: np.ndarray) -> np.ndarray:
         """U at points ``(n, d)``, zero at the deepest attractor: shape ``(n,)``, NaN where not known."""
         x = np.asarray(points, dtype=float)
         if x.ndim != 2 or x.shape[1] != self.dynamics.dimension:
             raise ValueError(f"the points have the shape {x.shape}; give (n, {self.dynamics.dimension})")
-        return np.full(len(x), np.nan) if self.over_wells is None else self.over_wells(x)
+        whole = self.global_quasipotential
+        return np.full(len(x), np.nan) if whole is None else whole(x)
 
     def quasipotential_errors(self, points: np.ndarray) -> np.ndarray:
         """Standard errors of U at points ``(n, d)``, above the attractor of the well that each lies in.
@@ -403,15 +375,18 @@ class Landscape:
         """
         x = np.asarray(points, dtype=float)
         errors = np.full(len(x), np.nan)
-        if self.found is None or self.over_wells is None:
+        if self.field_estimate is None or self.global_quasipotential is None:
             return errors
-        whole = self.over_wells(x)
+        whole = self.global_quasipotential(x)
         for well, height in zip(self.wells, self.heights, strict=True):
             if well is None:
                 continue
-            mine = np.isfinite(whole) & (2 * well.known_values(x) + height <= whole + SAME * well.level)
+            mine = np.isfinite(whole) & (
+                2 * well.known_values(x) + height <= whole + LEVEL_TOLERANCE * well.level
+            )
             if mine.any():
-                errors[mine] = 2 * potential_errors(self.found, well.gradients, well.attractor, x[mine])
+                found = self.field_estimate
+                errors[mine] = 2 * potential_errors(found, well.gradients, well.attractor, x[mine])
         return errors
 
     def potential(self, well: int = 0) -> Well:
@@ -447,7 +422,7 @@ class Landscape:
         )
 
     def dwell_times(self, *, noise: float | None = None) -> pd.DataFrame:
-        """How long each well lasts in the mean, one row for every attractor.
+        """Mean residence times, one row for every attractor.
 
         Parameters
         ----------
@@ -471,13 +446,13 @@ class Landscape:
             raise ValueError("no noise is known, and how long a well lasts follows from it; give 'noise'")
         rows = []
         for index in range(len(self.attractors)):
-            found = dwell_time(self.exits(index), strength)
+            found = mean_residence_time(self.exits(index), strength)
             said = (np.nan,) * 3 if found is None else (found.value, found.data_error, found.law_error)
             rows.append((index, *said))
         return pd.DataFrame(rows, columns=["attractor", "mean_time", "data_error", "law_error"])
 
-    def exits(self, well: int) -> list[Exit]:
-        """The ways out of a well with what its times follow from."""
+    def exits(self, well: int) -> list[EscapeRate]:
+        """The laws of all ways out of a well, with their errors."""
         return [way.exit for way in self.transitions if way.start == well]
 
     def escape_times(self, *, noise: float) -> pd.DataFrame:
@@ -502,11 +477,19 @@ class Landscape:
         """
         if (missing := missing_diffusion(self.dynamics)) is not None:
             raise ValueError(missing)
-        rows = [(way.start, way.end, *_mean_time(way, noise)) for way in self.transitions]
+        rows = []
+        for way in self.transitions:
+            time, note = np.nan, "; ".join(way.notes)
+            if way.rate is not None:
+                try:
+                    time = way.rate.mean_time(noise)
+                except NumericalFailure as error:
+                    note = str(error)
+            rows.append((way.start, way.end, time, note))
         table = pd.DataFrame(rows, columns=["start", "end", "mean_time", "note"])
         return table.astype({"start": int, "end": "Int64", "mean_time": float})
 
-    def beside(self, equations: Landscape, *, noise: float | None = None) -> pd.DataFrame:
+    def compare_with(self, equations: Landscape, *, noise: float | None = None) -> pd.DataFrame:
         """Barriers, prefactors and mean times of trajectories beside those of the equations behind them.
 
         Parameters
@@ -529,9 +512,11 @@ class Landscape:
         ValueError
             When the states are not the same, or D is not.
         """
-        from siq.workflow.comparison_steps import compared
+        from siq.quasipotential.landscape_comparison import compare_with
 
-        return compared(equations, self, noise=noise)
+        return compare_with(equations, self, noise=noise)
+
+    beside = compare_with
 
     def report(self) -> str:
         """What was found, as text."""
@@ -562,12 +547,3 @@ class Landscape:
         from siq.report.plots.quasipotential import plot_quasipotential
 
         return plot_quasipotential(self, ax=ax)
-
-
-def _mean_time(way: Transition, noise: float) -> tuple[float, str]:
-    if way.rate is None:
-        return np.nan, "; ".join(way.notes)
-    try:
-        return way.rate.mean_time(noise), "; ".join(way.notes)
-    except NumericalFailure as error:
-        return np.nan, str(error)

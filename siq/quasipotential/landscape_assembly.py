@@ -1,23 +1,83 @@
-"""How is the landscape of a vector field found, and what is it put together from?"""
+"""Landscapes found: of a vector field that was identified from recordings, and of given equations.
+
+Of an identified f the wells are those of the refinement, or local formulas about the attractors that recorded
+states lead to. Of given equations equilibria are sought over the domain, the paths of least action lead from
+each attractor to the saddles next to it, and these tell how deep each well is before V about it is sought,
+degree by degree. V is certified by characteristics, as that of recordings is.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+from pydantic import ConfigDict
+from pydantic.dataclasses import dataclass
 
-from siq.errors import NumericalFailure
+from siq.errors import InputError, NumericalFailure
 from siq.inference.field_estimate import AnyField, GivenField, IdentifiedField
-from siq.quasipotential.certificate import Certificate
-from siq.quasipotential.landscape import Landscape, heights_of_attractors
+from siq.numerics.randomness import Purpose, generator
+from siq.quasipotential.certificate import (
+    Certificate,
+    Evidence,
+    caustics_below,
+    certify,
+    references_about,
+)
+from siq.quasipotential.certificate_tests import CertificateOptions
+from siq.quasipotential.landscape import (
+    Landscape,
+    LandscapeOptions,
+    NoLandscape,
+    heights_of_attractors,
+)
+from siq.quasipotential.path_chains import evenly
 from siq.quasipotential.rates import NoiseStrength
+from siq.quasipotential.refinement import RefinementOptions
 from siq.quasipotential.transitions import Transition, position_standard_errors, transitions, ways_out
-from siq.quasipotential.wells import Well, WellOptions, local_well, surveyed
+from siq.quasipotential.wells import Depth, Well, WellOptions, local_well, surveyed
+from siq.remarks import Remark
+from siq.systems.basins import enlarged
+from siq.systems.cards import load_system
 from siq.systems.cycles import Cycle
-from siq.systems.equilibria import Equilibrium
-from siq.systems.phase_portrait import PhasePortrait
+from siq.systems.dynamics import Dynamics
+from siq.systems.equilibria import Equilibrium, hessian_at, spread_evenly, unreached_states
+from siq.systems.phase_portrait import (
+    MOST_SEARCHED,
+    PhasePortrait,
+    domain_portrait,
+    high_dimensional_portrait,
+)
+from siq.systems.simulation import fault_over_domain
 
-SAME = 1e-6  # of the recorded box: one attractor, from different starts
+ATTRACTOR_MATCH_TOLERANCE = 1e-6  # of the recorded box: one attractor, from different starts
+STATES_ALONG_PATH = 300  # from the neighbourhood of which further descents start
+PATH_NEIGHBOURHOOD = (0.02, 0.05, 0.1)  # of the extent of the well: how far from the path
+UNSEEN_STATES = 1024  # of the domain, and of the box of each well, that no fit sees
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class EquationSettings:
+    """What the landscape of equations depends on, beside the equations.
+
+    Attributes
+    ----------
+    seed
+        Of the sequences of states that stand for the domain.
+    refinement
+        How V about an attractor is sought: degrees, accuracy, reach and tolerance.
+    certificate
+        The limits of its tests.
+    landscape
+        ε for which escape times are given: the first of `noise_intensities`.
+    """
+
+    seed: int = 0
+    refinement: RefinementOptions = RefinementOptions()
+    certificate: CertificateOptions = CertificateOptions()
+    landscape: LandscapeOptions = LandscapeOptions()
 
 
 def find_landscape(
@@ -49,28 +109,177 @@ def find_landscape(
     seed
         Decides which points are used where there are too many.
     """
-    notes = [fault] if (fault := portrait.fault()) is not None else []
-    if wells is None:
-        kept = _wells(found, portrait, options or WellOptions(), seed, notes)
-    else:
-        kept = [_given(wells, found, portrait, index, notes) for index in range(len(portrait.attractors))]
+    fault, kept = portrait.fault(), list[Well | None]()
+    remarks = [] if fault is None else [Remark("quasipotential.reason", {"reason": fault})]
+    width = portrait.box[:, 1] - portrait.box[:, 0]
+    for index, one in enumerate(portrait.attractors):
+        if wells is None:
+            kept.append(_local_well(found.dynamics, portrait, index, options, seed, remarks))
+            continue
+        given = [
+            well
+            for well in wells
+            if np.abs((well.attractor - one.position) / width).max() < ATTRACTOR_MATCH_TOLERANCE
+        ]
+        kept.append(surveyed(given[0], found.dynamics, portrait, index) if given else None)
+        if not given:
+            remarks.append(Remark("quasipotential.no_refined_formula", {"place": _place(one.position)}))
     ways = transitions(found, ways_out(found.dynamics, portrait), kept)
-    return assembled(found, portrait, kept, ways, notes, certificate=certificate, noise=noise)
+    return _assembled(found, portrait, kept, ways, remarks, certificate=certificate, noise=noise)
 
 
-def assembled(
+def landscape_from_equations(
+    system: str | Path | Dynamics, settings: EquationSettings | None = None, *, formulas: bool = True
+) -> Landscape:
+    """The landscape of given equations: no recordings, no sampling, no training.
+
+    Parameters
+    ----------
+    system
+        A system card, or f and D with their domain.
+    settings
+        Of all steps.
+    formulas
+        Whether U is written as a formula. Barriers and times follow from the paths alone, which takes a small
+        part of the time.
+
+    Raises
+    ------
+    InputError
+        For a card that cannot be read, or a system that has no quasipotential.
+    NoLandscape
+        When it has no attractor in its domain.
+    """
+    system, settings = usable_system(system), settings or EquationSettings()
+    many = system.dimension > MOST_SEARCHED
+    try:
+        portrait = (high_dimensional_portrait if many else domain_portrait)(system, seed=settings.seed)
+    except NumericalFailure as error:
+        raise NoLandscape(str(error), None, system) from None
+    fault, points = portrait.fault(), len(portrait.attractors)
+    if not (portrait.attractors or portrait.cycles):
+        raise NoLandscape(fault or "f has no stable equilibrium in the domain", None, system)
+    reasons = [*([] if fault is None else [fault]), *portrait.notes]
+    remarks = [Remark("quasipotential.reason", {"reason": one}) for one in reasons]
+    if portrait.cycles:
+        beside_points = Remark("quasipotential.cycle_beside_formulas")
+        remarks.append(beside_points if points else Remark("quasipotential.cycles_alone"))
+        if not system.diffusion.regular:
+            remarks.append(Remark("quasipotential.cycles_need_noise_on_every_state"))
+        elif system.dimension > 2:
+            remarks.append(Remark("quasipotential.unstable_cycles_sought_along_boundaries"))
+    found, ways = GivenField(system), ways_out(system, portrait, beyond_region=True)
+    wells: list[Well | None] = [None] * points
+    certificate = None
+    if many and formulas and points:
+        remarks.append(Remark("quasipotential.too_many_states", {"states": system.dimension}))
+    elif formulas and points:
+        draw, seed = generator(settings.seed, Purpose.LANDSCAPE), settings.seed
+        lowest = [_lowest(ways, index) for index in range(points)]
+        portrait = _with_states_along_paths(system, portrait, lowest, draw)
+        wells = [
+            _local_well(
+                system, portrait, index, settings.refinement, seed, remarks,
+                depth=None if way is None or way.path is None else Depth(
+                    way.saddle, way.path.uphill.points, way.path.uphill.values / 2, way.path.uphill.momenta
+                ),
+            )
+            for index, way in enumerate(lowest)
+        ]  # fmt: skip
+        sought = [well for well in wells if well is not None]
+        boxes = [np.stack([well.points.min(axis=0), well.points.max(axis=0)], axis=1) for well in sought]
+        unseen = [spread_evenly(box, UNSEEN_STATES, generator=draw) for box in (system.box, *boxes)]
+        depths = [np.inf if way is None or way.path is None else way.path.uphill.action / 2 for way in lowest]
+        evidence = Evidence(
+            found, portrait, np.concatenate(unseen), options=settings.certificate, seed=seed,
+            references=references_about(system, portrait, depths=depths, seed=seed),
+        )  # fmt: skip
+        certificate = certify(sought, evidence)
+        caustics = caustics_below(system, sought, portrait, certificate.error, seed=seed)
+        remarks += [Remark("quasipotential.reason", {"reason": one}) for one in caustics]
+    wells += [None] * len(portrait.cycles)
+    noises = settings.landscape.noise_intensities
+    return _assembled(
+        found, portrait, wells, transitions(found, ways, wells), remarks, certificate=certificate,
+        noise=NoiseStrength(noises[0]) if noises else None,
+    )  # fmt: skip
+
+
+def usable_system(system: str | Path | Dynamics) -> Dynamics:
+    """A system whose landscape can be worked out, read from its card where a path is given.
+
+    Raises
+    ------
+    InputError
+        In one sentence, for a card that cannot be read and a system that has no landscape.
+    """
+    given = system if isinstance(system, Dynamics) else load_system(system)
+    if (fault := fault_for_landscape(given, directly=False)) is not None:
+        keys, what, remedy = fault
+        named = given.name or "the system" if isinstance(system, Dynamics) else system
+        raise InputError(named, ".".join(keys), what, remedy)
+    return given
+
+
+def fault_for_landscape(system: Dynamics, *, directly: bool) -> tuple[tuple[str, ...], str, str] | None:
+    """Why no landscape of a system can be worked out: the place in its card, the fault and the remedy.
+
+    Parameters
+    ----------
+    system
+        As its card says.
+    directly
+        Whether noise has to act on every state, as trajectories ask for, or may reach it by way of others.
+    """
+    if not system.autonomous:
+        key, what = ("inputs", "inputs") if system.inputs else ("equations", "time")
+        remedy = f"leave the {what} out, or use the card in a study of mismatch"
+        return (key,), "a driven system has no quasipotential", remedy
+    for name, limits in zip(system.states, system.limits, strict=True):
+        if np.isnan(limits).any():
+            what = f"the state '{name}' has no domain, in which a simulation could begin"
+            return ("states", name), what, "add 'domain: [lower, upper]' to it"
+    if directly and not system.diffusion.regular:
+        what = "the noise does not reach every state directly, as it has to where f comes from trajectories"
+        remedy = (
+            "give a positive definite matrix, or ask for the landscape of these equations: 'from: equations'"
+        )
+        return ("diffusion",), what, remedy
+    if still := unreached_states(system):
+        what = f"the noise does not reach {' and '.join(still)}, neither directly nor by way of other states"
+        return (
+            ("diffusion",),
+            what,
+            f"let it act on {still[0]} or on a state in its equation, or leave it out",
+        )
+    if (found := fault_over_domain(system)) is not None:
+        remedy = "choose a domain in which it has a value"
+        return ("equations", found[0]), f"the equation {found[1]}", remedy
+    return None
+
+
+def _assembled(
     found: AnyField,
     portrait: PhasePortrait,
     wells: Sequence[Well | None],
     ways: Sequence[Transition],
-    notes: list[str],
+    remarks: list[Remark],
     *,
     certificate: Certificate | None,
     noise: NoiseStrength | None,
 ) -> Landscape:
-    """The landscape of what was found; the arguments are those of `Landscape` and of `find_landscape`."""
+    """The landscape of what was found, with the heights of its attractors."""
     ends = portrait.descents.ends
     settled: tuple[Equilibrium | Cycle, ...] = (*portrait.attractors, *portrait.cycles)
+    barriers, heights = np.full((len(settled), len(settled)), np.inf), np.zeros(0)
+    for way in ways:
+        if way.end is not None and np.isfinite(way.barrier):
+            barriers[way.start, way.end] = min(barriers[way.start, way.end], way.barrier)
+    try:
+        heights = heights_of_attractors(barriers) if settled else heights
+    except NumericalFailure as error:
+        remarks.append(Remark("quasipotential.reason", {"reason": str(error)}))
+        heights = np.full(len(settled), np.nan)
     return Landscape(
         found.dynamics,
         portrait.equilibria,
@@ -78,8 +287,8 @@ def assembled(
         np.array([float((ends == index).mean()) for index in range(len(settled))]),
         tuple(wells),
         tuple(ways),
-        _heights(len(settled), ways, notes),
-        tuple(notes),
+        heights,
+        tuple(remarks),
         certificate,
         np.array([position_standard_errors(found, one.position) for one in settled]),
         noise,
@@ -89,39 +298,49 @@ def assembled(
     )
 
 
-def _wells(
-    found: IdentifiedField, portrait: PhasePortrait, options: WellOptions, seed: int, notes: list[str]
-) -> list[Well | None]:
-    wells: list[Well | None] = []
-    for index, one in enumerate(portrait.attractors):
-        try:
-            wells.append(local_well(found.dynamics, portrait, index, options=options, seed=seed))
-        except NumericalFailure as error:
-            notes.append(f"no formula about {one.position.round(4).tolist()}: {error}")
-            wells.append(None)
-    return wells
-
-
-def _given(
-    wells: Sequence[Well], found: IdentifiedField, portrait: PhasePortrait, index: int, notes: list[str]
+def _local_well(
+    dynamics: Dynamics,
+    portrait: PhasePortrait,
+    index: int,
+    options: WellOptions | None,
+    seed: int,
+    remarks: list[Remark],
+    *,
+    depth: Depth | None = None,
 ) -> Well | None:
-    """The well of an attractor among those of the refinement."""
-    place = portrait.attractors[index].position
-    width = portrait.box[:, 1] - portrait.box[:, 0]
-    for well in wells:
-        if np.abs((well.attractor - place) / width).max() < SAME:
-            return surveyed(well, found.dynamics, portrait, index)
-    notes.append(f"refinement found no formula about {place.round(4).tolist()}")
-    return None
-
-
-def _heights(count: int, ways: Sequence[Transition], notes: list[str]) -> np.ndarray:
-    barriers = np.full((count, count), np.inf)
-    for way in ways:
-        if way.end is not None and np.isfinite(way.barrier):
-            barriers[way.start, way.end] = min(barriers[way.start, way.end], way.barrier)
+    """V about one attractor; a remark where none was found."""
     try:
-        return heights_of_attractors(barriers) if count else np.zeros(0)
+        return local_well(dynamics, portrait, index, options=options or WellOptions(), seed=seed, depth=depth)
     except NumericalFailure as error:
-        notes.append(str(error))
-        return np.full(count, np.nan)
+        values = {"place": _place(portrait.attractors[index].position), "reason": str(error)}
+        remarks.append(Remark("quasipotential.no_formula", values))
+        return None
+
+
+def _place(position: np.ndarray) -> list[float]:
+    return [float(value) for value in position.round(4)]
+
+
+def _lowest(ways: Sequence[Transition], index: int) -> Transition | None:
+    """The way out of a well with the least action, None where there is none."""
+    mine = [way for way in ways if way.start == index and way.path is not None]
+    return min(mine, key=lambda way: way.path.uphill.action if way.path else np.inf, default=None)
+
+
+def _with_states_along_paths(
+    system: Dynamics, portrait: PhasePortrait, lowest: Sequence[Transition | None], draw: np.random.Generator
+) -> PhasePortrait:
+    """The portrait with more states about the lowest way out of each well, where it may be narrow."""
+    basins = list(portrait.basins)
+    for index, (one, way) in enumerate(zip(portrait.attractors, lowest, strict=True)):
+        if way is None or way.path is None or system.dimension == 1:
+            continue
+        extent = np.linalg.inv(np.linalg.cholesky(hessian_at(system, one.position)))
+        extent *= np.sqrt(way.path.uphill.action)
+        along = evenly(way.path.uphill.points, STATES_ALONG_PATH)
+        starts = [along + share * draw.standard_normal(along.shape) @ extent for share in PATH_NEIGHBOURHOOD]
+        basins[index] = enlarged(
+            system, basins[index], index, portrait.attractors, np.concatenate(starts), box=portrait.box,
+            generator=draw,
+        )  # fmt: skip
+    return replace(portrait, basins=tuple(basins))

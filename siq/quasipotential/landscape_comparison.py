@@ -1,50 +1,56 @@
-"""Comparison of landscapes: with references, and with that of given equations.
+"""Comparison of landscapes: with independent references, and with that of given equations.
 
-Characteristics of the Hamilton–Jacobi equation (any dimension), an ordered line integral method on a mesh
-(two states), and minimum action paths. None has an ansatz for V; none sees recordings, networks or formulas.
+References are characteristics of the Hamilton–Jacobi equation (any dimension), an ordered line integral
+method on a mesh (two states), and minimum action paths. None has an ansatz for V; none sees recordings,
+networks or formulas.
 
-Where the equations of a simulated system are known, their own landscape (`siq.workflow.equations_step`) tells
-every barrier, prefactor and mean time without any trajectory. It scores the landscape that was learned, and
-is no input of it. Both are taken as plain data (`siq.quasipotential.landscape_files`).
-
-An attractor of the trajectories is that attractor of the equations to which it is nearest among all their
+Where the equations of a simulated system are known, their own landscape tells every barrier, prefactor and
+mean time without any trajectory. It scores the landscape that was learned, and is no input of it. An
+attractor of the trajectories is that attractor of the equations to which it is nearest among all their
 equilibria, in shares of the domain; of several, the nearest one. Ways out have the same two ends, and the
-nearest saddle where there are several.
-
-U is in the unit of D, so that only landscapes of one D can be compared: of the D of both no more may differ
-than the errors of one that was estimated leave open.
+nearest saddle where there are several. U is in the unit of D, so that only landscapes of one D can be
+compared: of the D of both no more may differ than the errors of one that was estimated leave open.
 """
 
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from siq.errors import InputError, NumericalFailure
 from siq.inference.field_estimate import STANDARD_ERRORS, IdentifiedField
 from siq.numerics.files import whole_file
 from siq.numerics.text import place_text
 from siq.quasipotential.characteristics import adapted_fan, lowest_sheet, value_near
-from siq.quasipotential.landscape import heights_of_attractors, least_over_wells
-from siq.quasipotential.landscape_files import exits_of
+from siq.quasipotential.landscape import Landscape, heights_of_attractors, least_over_wells
 from siq.quasipotential.paths import minimum_action_path
-from siq.quasipotential.rates import NoiseStrength, dwell_time
+from siq.quasipotential.rates import NoiseStrength, mean_residence_time
 from siq.quasipotential.wells import Well
+from siq.remarks import Remark
+from siq.report.remarks import sentence
+from siq.systems.cycles import Cycle
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.systems.phase_portrait import PhasePortrait
 
-GRID = 161  # points along each of two states
-SCATTERED = 4000  # points of a fan where there are more states
-CURVES = 400
-GAP = 0.04  # between the ends of neighbouring curves, in units in which the level is at about 1
-NEAR = 0.06  # of a point of a curve, in the same units: V is told from its nearest
-WIDER = 0.25  # of the box, by which curves may leave it
+GRID_POINTS = 161  # along each of two states
+SCATTERED_POINTS = 4000  # of a fan where there are more states
+MOST_CURVES = 400
+CURVE_GAP = 0.04  # between the ends of neighbouring curves, in units in which the level is at about 1
+CURVE_DISTANCE = 0.06  # of a point of a curve, in the same units: V is told from its nearest
+BOX_MARGIN = 0.25  # of the box, by which curves may leave it
+
+WELL_SHARE = 0.9  # of its barrier: below it a well is compared
+OVERALL_LEVEL = 1.1  # of the highest saddle of U
+ATTRACTOR_MATCH_TOLERANCE = 0.02  # of the region: attractors so close to the reference's are the same
+
+DIFFUSION_ROUNDING = 1e-9  # numerical, of D: two formulas of the same matrix
+NOT_SHOWN = Remark("quasipotential.not_shown_by_trajectories")
 
 Potential = Callable[[np.ndarray], np.ndarray]
 """U at points ``(n, d)``, NaN where it is not known; up to a constant."""
@@ -133,69 +139,51 @@ def reference_landscape(
     attractors = np.array([one.position for one in portrait.attractors])
     if not len(attractors):
         raise NumericalFailure("f has no attractor, so that there is no landscape to compare with")
-    actions = _actions(dynamics, portrait)
+    # Least action from each attractor to each saddle next to it, (k, s), infinite elsewhere.
+    saddles = list({tuple(one.position): one for row in portrait.saddles for one in row}.values())
+    count = len(attractors)
+    actions = np.full((count, max(len(saddles), 1)), np.inf)
+    for index, attractor in enumerate(attractors):
+        around = {tuple(saddle.position) for saddle in portrait.saddles[index]}
+        for column, saddle in enumerate(saddles):
+            if tuple(saddle.position) in around:
+                path = minimum_action_path(dynamics, attractor, saddle.position)
+                actions[index, column] = path.action
     barriers = actions.min(axis=1)
     lowest = np.where(np.isfinite(barriers), barriers, np.nan)
     if np.isnan(lowest).all():
         raise NumericalFailure("no saddle parts the attractors, so that no level tells where to compare")
     levels = reach * np.where(np.isnan(lowest), np.nanmax(lowest), lowest)
-    wide = box + WIDER * np.ptp(box, axis=1)[:, None] * np.array([-1.0, 1.0])
+    wide = box + BOX_MARGIN * np.ptp(box, axis=1)[:, None] * np.array([-1.0, 1.0])
     fans = [
         adapted_fan(
             dynamics, one, level=level / 2, box=wide, generator=generator,
-            most=CURVES, gap=GAP,
+            most=MOST_CURVES, gap=CURVE_GAP,
         )
         for one, level in zip(attractors, levels, strict=True)
     ]  # fmt: skip
     sheets = [lowest_sheet(fan) for fan in fans]
     if dynamics.dimension <= 2:
-        axes = [np.linspace(low, high, GRID) for low, high in box]
+        axes = [np.linspace(low, high, GRID_POINTS) for low, high in box]
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, dynamics.dimension)
     else:
         known = np.concatenate([fan.points[sheet] for fan, sheet in zip(fans, sheets, strict=True)])
-        points = known[generator.permutation(len(known))[:SCATTERED]]
+        points = known[generator.permutation(len(known))[:SCATTERED_POINTS]]
     values = np.stack(
         [
-            2 * value_near(fan, points, sheet=sheet, distance=NEAR)
+            2 * value_near(fan, points, sheet=sheet, distance=CURVE_DISTANCE)
             for fan, sheet in zip(fans, sheets, strict=True)
         ]
     )
-    on_mesh, mesh_barriers = np.full(values.shape, np.nan), np.full(len(attractors), np.nan)
-    for index, one in enumerate(attractors if dynamics.dimension == 2 and mesh is not None else ()):
-        potential = mesh(one, levels[index] / 2) if mesh is not None else None
+    on_mesh, mesh_barriers = np.full(values.shape, np.nan), np.full(count, np.nan)
+    for index, one in enumerate(attractors if dynamics.dimension == 2 else ()):
+        potential = None if mesh is None else mesh(one, levels[index] / 2)
         if potential is None:
             continue
         on_mesh[index] = 2 * potential(points)
         tops = np.array([saddle.position for saddle in portrait.saddles[index]]).reshape(-1, 2)
         if len(tops):
             mesh_barriers[index] = np.nanmin(2 * potential(tops), initial=np.inf)
-    return ReferenceLandscape(
-        attractors, points, values, on_mesh, barriers, mesh_barriers, _heights(actions, len(attractors))
-    )
-
-
-def no_reference(dimension: int, reason: str) -> ReferenceLandscape:
-    """What stands in the place of a reference where there is none, with the reason."""
-    of_none, nothing = np.zeros((0, dimension)), np.zeros(0)
-    return ReferenceLandscape(
-        of_none, of_none, np.zeros((0, 0)), np.zeros((0, 0)), nothing, nothing, nothing, reason
-    )
-
-
-def _actions(dynamics: Dynamics, portrait: PhasePortrait) -> np.ndarray:
-    """Least action from each attractor to each saddle next to it, shape ``(k, s)``, infinite elsewhere."""
-    saddles = list({tuple(one.position): one for row in portrait.saddles for one in row}.values())
-    actions = np.full((len(portrait.attractors), max(len(saddles), 1)), np.inf)
-    for index, one in enumerate(portrait.attractors):
-        beside = {tuple(saddle.position) for saddle in portrait.saddles[index]}
-        for column, saddle in enumerate(saddles):
-            if tuple(saddle.position) in beside:
-                path = minimum_action_path(dynamics, one.position, saddle.position)
-                actions[index, column] = path.action
-    return actions
-
-
-def _heights(actions: np.ndarray, count: int) -> np.ndarray:
     between = np.full((count, count), np.inf)
     for i in range(count):
         for j in range(count):
@@ -203,9 +191,18 @@ def _heights(actions: np.ndarray, count: int) -> np.ndarray:
             if i != j and shared.any():
                 between[i, j] = actions[i][shared].min()
     try:
-        return heights_of_attractors(between)
+        heights = heights_of_attractors(between)
     except NumericalFailure:
-        return np.full(count, np.nan)
+        heights = np.full(count, np.nan)
+    return ReferenceLandscape(attractors, points, values, on_mesh, barriers, mesh_barriers, heights)
+
+
+def no_reference(dimension: int, reason: str) -> ReferenceLandscape:
+    """An empty reference, with the reason why there is none."""
+    of_none, nothing = np.zeros((0, dimension)), np.zeros(0)
+    return ReferenceLandscape(
+        of_none, of_none, np.zeros((0, 0)), np.zeros((0, 0)), nothing, nothing, nothing, reason
+    )
 
 
 def write_reference(path: str | Path, reference: ReferenceLandscape) -> None:
@@ -223,10 +220,6 @@ def read_reference(path: str | Path) -> ReferenceLandscape:
             return ReferenceLandscape(**arrays | {"reason": str(arrays["reason"])})
     except (OSError, ValueError, EOFError, KeyError, TypeError, zipfile.BadZipFile):
         raise InputError(path, "", "it is no reference landscape", "make it again") from None
-
-
-WELL_SHARE = 0.9  # of its barrier: below it a well is compared
-OVERALL = 1.1  # of the highest saddle of U
 
 
 @dataclass(frozen=True)
@@ -254,11 +247,6 @@ class ErrorInRegion:
     error_everywhere: float = float("nan")
 
 
-def well_region(index: int) -> str:
-    """What the region of a well is called in tables."""
-    return f"A{index + 1}, below {WELL_SHARE:g} of its barrier"
-
-
 def compare_wells(reference: ReferenceLandscape, wells: Mapping[int, Well]) -> list[ErrorInRegion]:
     """Formulas of wells against characteristics, each below a share of its barrier.
 
@@ -273,13 +261,12 @@ def compare_wells(reference: ReferenceLandscape, wells: Mapping[int, Well]) -> l
     for index in range(len(reference.attractors)):
         inside = reference.below(index, WELL_SHARE)
         exact = reference.characteristics[index][inside]
-        if index not in wells:
-            rows.append(ErrorInRegion(well_region(index), len(exact), 0.0, float("nan")))
-            continue
-        x = reference.points[inside]
-        row = _compared(well_region(index), 2 * wells[index].known_values(x), exact)
-        everywhere = relative_l2(2 * wells[index].values(x), exact)
-        rows.append(ErrorInRegion(row.region, row.points, row.covered, row.error, everywhere))
+        values, everywhere = np.full(len(exact), np.nan), np.nan
+        if index in wells:
+            x = reference.points[inside]
+            values = 2 * wells[index].known_values(x)
+            everywhere = relative_l2(2 * wells[index].values(x), exact)
+        rows.append(_compared(_well_region(index), values, exact, everywhere))
     return rows
 
 
@@ -297,7 +284,7 @@ def compare_estimate(
         inside = reference.below(index, WELL_SHARE)
         at = float(potential(attractor[None])[0])
         exact = reference.characteristics[index][inside]
-        rows.append(_compared(well_region(index), values[inside] - at, exact))
+        rows.append(_compared(_well_region(index), values[inside] - at, exact))
     rows.append(compare_overall(reference, values, below=below, shifted=True))
     return rows
 
@@ -315,10 +302,52 @@ def compare_overall(
     return _compared(f"U < {level:.4g}", own, exact[inside])
 
 
+def compare_landscape(
+    reference: ReferenceLandscape, landscape: Landscape, *, below: float | None
+) -> list[ErrorInRegion]:
+    """Local formulas, their minimum over all wells below a level, and barriers, against a reference."""
+    width, pairs = np.ptp(reference.points, axis=0), dict[int, int]()
+    for place, one in enumerate(landscape.attractors):
+        distance = np.abs((reference.attractors - one.position) / width).max(axis=1)
+        if distance.min() < ATTRACTOR_MATCH_TOLERANCE:
+            pairs[int(np.argmin(distance))] = place
+    local = {index: well for index, place in pairs.items() if (well := landscape.wells[place]) is not None}
+    rows = compare_wells(reference, local)
+    if (whole := landscape.global_quasipotential) is not None:
+        rows.append(compare_overall(reference, whole(reference.points), below=below))
+    for index, place in pairs.items():
+        barriers = [way.barrier for way in landscape.transitions if way.start == place]
+        lowest = min((one for one in barriers if np.isfinite(one) and one), default=np.nan)
+        error = float(abs(lowest / reference.barriers[index] - 1))
+        rows.append(ErrorInRegion(f"barrier from A{index + 1}", 1, float(np.isfinite(error)), error))
+    return rows
+
+
+def compare_mesh(reference: ReferenceLandscape, *, below: float | None) -> list[ErrorInRegion]:
+    """The reference's own mesh against its characteristics, and its barriers against the least action."""
+    errors = np.abs(reference.mesh_barriers / reference.barriers - 1)
+    return [
+        compare_overall(reference, reference.mesh_values, below=below),
+        *(
+            ErrorInRegion(f"barrier from A{index + 1}", 1, 1.0, float(one))
+            for index, one in enumerate(errors)
+        ),
+    ]
+
+
+def compare_with_mesh(values: np.ndarray, mesh: np.ndarray, *, below: float) -> ErrorInRegion:
+    """An estimate of U against a mesh that is known up to a constant, below a level above its minimum."""
+    exact = mesh - np.nanmin(mesh)
+    inside = np.nan_to_num(exact, nan=np.inf) < below
+    own, exact = values[inside], exact[inside]
+    error = relative_l2(own - np.median(own - exact), exact)
+    return ErrorInRegion(f"U < {below:.4g}", int(inside.sum()), 1.0, error)
+
+
 def overall_level(reference: ReferenceLandscape) -> float:
     """The level below which landscapes are compared by default: somewhat above the highest saddle."""
     tops = reference.heights + reference.barriers
-    return float(OVERALL * tops[np.isfinite(tops)].max(initial=0.0))
+    return float(OVERALL_LEVEL * tops[np.isfinite(tops)].max(initial=0.0))
 
 
 def relative_l2(values: np.ndarray, exact: np.ndarray) -> float:
@@ -327,72 +356,61 @@ def relative_l2(values: np.ndarray, exact: np.ndarray) -> float:
     return float(np.linalg.norm(values - exact)) / size if size > 0 else float("nan")
 
 
-def _compared(region: str, values: np.ndarray, exact: np.ndarray) -> ErrorInRegion:
+def _well_region(index: int) -> str:
+    return f"A{index + 1}, below {WELL_SHARE:g} of its barrier"
+
+
+def _compared(
+    region: str, values: np.ndarray, exact: np.ndarray, everywhere: float = np.nan
+) -> ErrorInRegion:
     known = np.isfinite(values)
     covered = float(known.mean()) if len(values) else 0.0
-    return ErrorInRegion(region, len(exact), covered, relative_l2(values[known], exact[known]))
+    return ErrorInRegion(region, len(exact), covered, relative_l2(values[known], exact[known]), everywhere)
 
 
-MISSED = "the trajectories do not show it"
-FURTHER = "the equations have no such"
-CYCLE = "limit cycles are not compared"
-
-ROUNDING = 1e-9  # numerical, of D: two formulas of the same matrix
-
-Plain = Mapping[str, Any]
+COLUMNS = (
+    "item", "quantity", "noise", "equations", "trajectories", "standard_error", "relative_difference",
+    "in_errors", "note",
+)  # fmt: skip
+"""Of the table that compares a landscape with that of its equations."""
 
 
-@dataclass(frozen=True)
-class Difference:
-    """One number of the equations beside that of the trajectories.
+def compare_with(equations: Landscape, learned: Landscape, *, noise: float | None = None) -> pd.DataFrame:
+    """The table of `siq.Landscape.compare_with`.
 
-    Attributes
+    Parameters
     ----------
-    item
-        ``A1`` for the first attractor of the equations, ``A1 to A2`` for a way out of it.
-    quantity
-        ``barrier``, ``prefactor`` or ``mean time``.
-    equations, trajectories
-        The number by either, NaN where it is not known.
-    standard_error
-        Of that of the trajectories, as these state it; NaN where they state none.
+    equations, learned
+        The landscapes by either.
     noise
-        ε of a mean time, NaN of the others.
-    note
-        What is missing, in words.
+        ε of mean times; None for none.
+
+    Raises
+    ------
+    ValueError
+        When the states are not the same, or D is not.
     """
-
-    item: str
-    quantity: str
-    equations: float
-    trajectories: float
-    standard_error: float = np.nan
-    noise: float = np.nan
-    note: str = ""
-
-    @property
-    def relative_difference(self) -> float:
-        """By which share the trajectories are off."""
-        return self.trajectories / self.equations - 1 if self.equations else np.nan
-
-    @property
-    def in_errors(self) -> float:
-        """The same in standard errors; NaN where there are none."""
-        known = self.standard_error > 0
-        return (self.trajectories - self.equations) / self.standard_error if known else np.nan
+    table = pd.DataFrame(
+        differences(equations, learned, noises=() if noise is None else (noise,)), columns=list(COLUMNS)
+    )
+    places = np.array([one.position for one in (*equations.attractors, *equations.equilibria)])
+    check_same_noise(equations.dynamics, learned.dynamics, places, found=learned.field_estimate)
+    return table.fillna({"note": ""})
 
 
 def differences(
-    equations: Plain, trajectories: Plain, *, box: np.ndarray, noises: Sequence[float] = ()
-) -> list[Difference]:
-    """Every barrier, prefactor and mean time of two landscapes beside each other.
+    equations: Landscape, trajectories: Landscape, *, noises: Sequence[float] = ()
+) -> list[dict[str, object]]:
+    """Every barrier, prefactor and mean time of two landscapes beside each other, as rows of a table.
+
+    ``item`` is ``A1`` for the first attractor of the equations, ``A1 to A2`` for a way out of it, and
+    ``quantity`` is ``barrier``, ``prefactor`` or ``mean time``; of a row that is missed it is empty, and
+    ``note`` says what is missing. Numbers that are not known are NaN.
 
     Parameters
     ----------
     equations, trajectories
-        The landscapes, as `siq.quasipotential.landscape_files.landscape_data` has them.
-    box
-        The domain of the equations, shape ``(d, 2)``.
+        The landscapes; the equations have a domain.
     noises
         ε for which mean times are compared.
 
@@ -401,16 +419,112 @@ def differences(
     ValueError
         When the states are not the same.
     """
-    if list(equations["states"]) != list(trajectories["states"]):
+    if equations.dynamics.states != trajectories.dynamics.states:
         raise ValueError("the landscapes are of different states")
-    pairs = _pairs(equations, trajectories, np.ptp(np.asarray(box, dtype=float), axis=1))
-    found: list[Difference] = []
-    for index, one in enumerate(equations["wells"]):
+    pairs = _matched_attractors(equations, trajectories)
+    rows = _differences_of_ways(equations, trajectories, pairs)
+    for index, one in enumerate(equations.attractors):
         for noise in noises:
-            found.append(_time(equations, trajectories, index, pairs.get(index), noise))
-        if "cycle" in one or index not in pairs:
-            found.append(_absent(f"A{index + 1}", CYCLE if "cycle" in one else MISSED))
-    return [*_of_ways(equations, trajectories, pairs), *found]
+            # The law is the same for both, so that its error is not counted.
+            exact = mean_residence_time(equations.exits(index), NoiseStrength(noise))
+            own = pairs.get(index)
+            found = (
+                None if own is None else mean_residence_time(trajectories.exits(own), NoiseStrength(noise))
+            )
+            rows.append(
+                _difference(
+                    f"A{index + 1}", "mean time",
+                    np.nan if exact is None else exact.value,
+                    np.nan if found is None else found.value,
+                    np.nan if found is None else found.value * found.data_error,
+                    noise=noise,
+                )
+            )  # fmt: skip
+        if isinstance(one, Cycle) or index not in pairs:
+            not_compared = Remark("quasipotential.limit_cycle_not_compared")
+            remark = not_compared if isinstance(one, Cycle) else NOT_SHOWN
+            rows.append(_difference(f"A{index + 1}", "", note=sentence(remark)))
+    return rows
+
+
+def _difference(
+    item: str,
+    quantity: str,
+    equations: float = np.nan,
+    trajectories: float = np.nan,
+    standard_error: float = np.nan,
+    *,
+    noise: float = np.nan,
+    note: str = "",
+) -> dict[str, object]:
+    """One number by the equations and by the trajectories; the standard error is that of the latter."""
+    known = standard_error > 0
+    return {
+        "item": item,
+        "quantity": quantity,
+        "noise": noise,
+        "equations": equations,
+        "trajectories": trajectories,
+        "standard_error": standard_error,
+        "relative_difference": trajectories / equations - 1 if equations else np.nan,
+        "in_errors": (trajectories - equations) / standard_error if known else np.nan,
+        "note": note,
+    }
+
+
+def _matched_attractors(equations: Landscape, trajectories: Landscape) -> dict[int, int]:
+    """For each attractor of the equations that the trajectories show, its place among theirs."""
+    width = np.ptp(equations.dynamics.box, axis=1)
+    points = [one for one in equations.attractors if not isinstance(one, Cycle)]  # cycles follow after points
+    others = [one for one in equations.equilibria if one.kind != "attractor"]
+    places = np.array([one.position for one in (*points, *others)], dtype=float)
+    nearest: dict[int, tuple[float, int]] = {}
+    for place, one in enumerate(trajectories.attractors):
+        if isinstance(one, Cycle) or not len(places):
+            continue
+        distance = np.linalg.norm((places - one.position) / width, axis=1)
+        index = int(distance.argmin())
+        if index < len(points):
+            nearest[index] = min(nearest.get(index, (np.inf, -1)), (float(distance[index]), place))
+    return {index: place for index, (_, place) in nearest.items()}
+
+
+def _differences_of_ways(
+    equations: Landscape, trajectories: Landscape, pairs: Mapping[int, int]
+) -> list[dict[str, object]]:
+    """Barrier and prefactor of every way out, first those of the equations, then what these have not."""
+
+    def named(start: int | None, end: int | None) -> str:
+        first = "a further state" if start is None else f"A{start + 1}"
+        last = "outside" if end is None else "a further state" if end < 0 else f"A{end + 1}"
+        return f"{first} to {last}"
+
+    left, rows = list(trajectories.transitions), []
+    for way in equations.transitions:
+        item = named(way.start, way.end)
+        ends = (pairs.get(way.start), None if way.end is None else pairs.get(way.end, -1))
+        same = [one for one in left if (one.start, one.end) == ends]
+        if not same:
+            rows.append(_difference(item, "barrier", way.barrier, note=sentence(NOT_SHOWN)))
+            continue
+        distances = [float(np.linalg.norm(one.place - way.place)) for one in same]
+        own = same[int(np.argmin(distances))]
+        left = [one for one in left if one is not own]
+        rows.append(_difference(item, "barrier", way.barrier, own.barrier, own.error))
+        exact, found = (np.nan if one.rate is None else _known(one.rate.prefactor) for one in (way, own))
+        error = np.nan if own.rate is None else found * _known(own.rate.prefactor_error)  # that of ln K
+        note = "; ".join(way.notes) if np.isnan(exact) else ""
+        rows.append(_difference(item, "prefactor", exact, found, error, note=note))
+    back = {place: index for index, place in pairs.items()}
+    for own in left:
+        item = named(back.get(own.start), None if own.end is None else back.get(own.end, -1))
+        further = Remark("quasipotential.not_of_the_equations")
+        rows.append(_difference(item, "barrier", np.nan, own.barrier, note=sentence(further)))
+    return rows
+
+
+def _known(value: float | None) -> float:
+    return np.nan if value is None else float(value)
 
 
 def check_same_noise(
@@ -442,102 +556,16 @@ def check_same_noise(
     errors = np.zeros(len(places))
     if found is not None:
         errors = np.sqrt(found.noise_variance(found.noise_slopes(places, momenta)))
-    apart = ~(np.abs(difference) <= ROUNDING + STANDARD_ERRORS * errors)
+    apart = ~(np.abs(difference) <= DIFFUSION_ROUNDING + STANDARD_ERRORS * errors)
     if apart.any():
         place = places[[np.argmax(apart)]]
+
+        def rows(noise: Diffusion) -> list[list[float]]:
+            return [[float(f"{each:.4g}") for each in row] for row in noise.at(place)[0]]
+
         where = "" if one.constant and other.constant else f" at {place_text(place[0])}"
         raise ValueError(
-            f"U is in the unit of D, and D is not the same: the equations have {_rows(one, place)}{where},"
-            f" the trajectories {_rows(other, place)}; give both the same, recordings by"
+            f"U is in the unit of D, and D is not the same: the equations have {rows(one)}{where},"
+            f" the trajectories {rows(other)}; give both the same, recordings by"
             " StateSpace(diffusion=...), or compare ΔU/ε"
         )
-
-
-def _rows(noise: Diffusion, place: np.ndarray) -> list[list[float]]:
-    """D at a state, ``(1, d)``, to four digits."""
-    return [[float(f"{each:.4g}") for each in row] for row in noise.at(place)[0]]
-
-
-def difference_rows(found: Sequence[Difference]) -> list[dict[str, object]]:
-    """Differences as rows of a table."""
-    return [
-        {
-            "item": one.item,
-            "quantity": one.quantity,
-            "noise": one.noise,
-            "equations": one.equations,
-            "trajectories": one.trajectories,
-            "standard_error": one.standard_error,
-            "relative_difference": one.relative_difference,
-            "in_errors": one.in_errors,
-            "note": one.note,
-        }
-        for one in found
-    ]
-
-
-def _absent(item: str, note: str) -> Difference:
-    return Difference(item, "", np.nan, np.nan, note=note)
-
-
-def _pairs(equations: Plain, trajectories: Plain, width: np.ndarray) -> dict[int, int]:
-    """For each attractor of the equations that the trajectories show, its place among theirs."""
-    wells = [one for one in equations["wells"] if "cycle" not in one]  # cycles follow after points
-    others = [one["position"] for one in equations["equilibria"] if one["kind"] != "attractor"]
-    places = np.array([*(one["attractor"] for one in wells), *others], dtype=float)
-    nearest: dict[int, tuple[float, int]] = {}
-    for place, well in enumerate(trajectories["wells"]):
-        if "cycle" in well or not len(places):
-            continue
-        distance = np.linalg.norm((places - np.array(well["attractor"])) / width, axis=1)
-        index = int(distance.argmin())
-        if index < len(wells):
-            nearest[index] = min(nearest.get(index, (np.inf, -1)), (float(distance[index]), place))
-    return {index: place for index, (_, place) in nearest.items()}
-
-
-def _of_ways(equations: Plain, trajectories: Plain, pairs: Mapping[int, int]) -> Iterator[Difference]:
-    """Barrier and prefactor of every way out, first those of the equations, then what these have not."""
-    left = list(trajectories["transitions"])
-    for way in equations["transitions"]:
-        item = _named(way["start"], way["end"])
-        ends = (pairs.get(way["start"]), None if way["end"] is None else pairs.get(way["end"], -1))
-        same = [one for one in left if (one["start"], one["end"]) == ends]
-        if not same:
-            yield Difference(item, "barrier", _number(way["barrier"]), np.nan, note=MISSED)
-            continue
-        own = min(same, key=lambda one: float(np.linalg.norm(np.subtract(one["saddle"], way["saddle"]))))
-        left.remove(own)
-        error = _number(own.get("error", own["standard_error"]))
-        yield Difference(item, "barrier", _number(way["barrier"]), _number(own["barrier"]), error)
-        factor = _number(own["prefactor"])
-        error = factor * _number(own.get("prefactor_error"))  # which is that of its logarithm
-        why = "" if way["prefactor"] is not None else "; ".join(way["notes"])
-        yield Difference(item, "prefactor", _number(way["prefactor"]), factor, error, note=why)
-    back = {place: index for index, place in pairs.items()}
-    for own in left:
-        item = _named(back.get(own["start"]), None if own["end"] is None else back.get(own["end"], -1))
-        yield Difference(item, "barrier", np.nan, _number(own["barrier"]), note=FURTHER)
-
-
-def _named(start: int | None, end: int | None) -> str:
-    """A way out by the attractors of the equations."""
-    first = "a further state" if start is None else f"A{start + 1}"
-    return f"{first} to " + ("outside" if end is None else "a further state" if end < 0 else f"A{end + 1}")
-
-
-def _time(equations: Plain, trajectories: Plain, well: int, own: int | None, noise: float) -> Difference:
-    """How long a well lasts; the law is the same for both, so that its error is not counted."""
-    exact = dwell_time(exits_of(equations, well), NoiseStrength(noise))
-    found = None if own is None else dwell_time(exits_of(trajectories, own), NoiseStrength(noise))
-    return Difference(
-        f"A{well + 1}", "mean time",
-        np.nan if exact is None else exact.value,
-        np.nan if found is None else found.value,
-        np.nan if found is None else found.value * found.data_error,
-        noise,
-    )  # fmt: skip
-
-
-def _number(value: float | None) -> float:
-    return np.nan if value is None else float(value)

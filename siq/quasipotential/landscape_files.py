@@ -2,74 +2,50 @@
 
 Powers stand as in `siq.quasipotential.formulas`. Each well has the points of its fit, away from which nothing
 is claimed; the vector field, which tells where a formula solves the Hamilton–Jacobi equation, stands in
-`vector_field.json`.
+`vector_field.json`. `read_landscape` gives the `Landscape` back.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from siq.data.two_states import DwellCount
 from siq.errors import InputError
 from siq.numerics.files import whole_file
+from siq.quasipotential.certificate import Certificate
+from siq.quasipotential.certificate_tests import Verdict
 from siq.quasipotential.formulas import basis_from_data, powers_to_data
-from siq.quasipotential.landscape import GlobalQuasipotential, Landscape, matched
+from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.occupancy import VisitTest
-from siq.quasipotential.rates import Exit, TurnLoss
+from siq.quasipotential.paths import MinimumActionPath, TransitionPath
+from siq.quasipotential.rates import EnergyLossPerCycle, EscapeRate, NoiseStrength
 from siq.quasipotential.transitions import Transition
 from siq.quasipotential.wells import Well
+from siq.remarks import Remark
 from siq.systems.cycles import Cycle
 from siq.systems.dynamics import Dynamics
+from siq.systems.equilibria import Equilibrium
 
-DIGITS = 8  # of points of a fit, which only tell where a formula holds
-
-
-@dataclass(frozen=True)
-class StoredLandscape:
-    """What `write_landscape` keeps.
-
-    Attributes
-    ----------
-    quasipotential
-        U over all wells, None where it is not known.
-    wells
-        V about each attractor, None where there is none.
-    data
-        Everything, as plain data: equilibria, wells, transitions with their paths, notes.
-    """
-
-    quasipotential: GlobalQuasipotential | None
-    wells: tuple[Well | None, ...]
-    data: Mapping[str, Any]
+DIGITS = 8  # of points of a fit and of a path, which tell where a formula holds and where to draw
+PATH_FIGURES = ("error", "residual", "converged", "smooth")  # of a path, as they are stored
 
 
-def write_landscape(path: str | Path, landscape: Landscape, *, dynamics: Dynamics) -> None:
-    """Write a landscape whole or not at all."""
-    data = landscape_data(landscape, dynamics=dynamics)
-    with whole_file(path) as partial:
-        partial.write_text(json.dumps(data, allow_nan=False) + "\n", encoding="utf-8")
-
-
-def landscape_data(landscape: Landscape, *, dynamics: Dynamics) -> dict[str, Any]:
-    """A landscape as plain data, as it stands in the file."""
-    errors = landscape.position_errors
-    noise = landscape.noise
-    return {
-        "states": [symbol.name for symbol in dynamics.symbols],
+def landscape_data(landscape: Landscape) -> dict[str, Any]:
+    """A landscape as plain data, as it stands in the file (docs/reference/tables.md)."""
+    errors, noise, certificate = landscape.position_errors, landscape.noise, landscape.certificate
+    data: dict[str, Any] = {
+        "states": [symbol.name for symbol in landscape.dynamics.symbols],
         "units": list(landscape.dynamics.units),
         "time_unit": landscape.dynamics.time_unit,
         "noise": None if noise is None else asdict(noise),
         "equilibria": [
-            {
-                "position": one.position.tolist(),
-                "kind": one.kind,
-                "eigenvalues": [[value.real, value.imag] for value in one.eigenvalues.tolist()],
-            }
+            {"position": one.position.tolist(), "kind": one.kind, "eigenvalues": _pairs(one.eigenvalues)}
             for one in landscape.equilibria
         ],
         "wells": [
@@ -78,55 +54,71 @@ def landscape_data(landscape: Landscape, *, dynamics: Dynamics) -> dict[str, Any
                 "standard_errors": None if errors is None else [_number(one) for one in errors[index]],
                 "basin": float(basin),
                 "height": _number(height),
-                "V": None if well is None else _formula(well),
+                "V": None if well is None else _well_data(well),
             }
-            | ({"cycle": _cycle(attractor)} if isinstance(attractor, Cycle) else {})
+            | ({"cycle": _cycle_data(attractor)} if isinstance(attractor, Cycle) else {})
             for index, (attractor, basin, height, well) in enumerate(
                 zip(landscape.attractors, landscape.basins, landscape.heights, landscape.wells, strict=True)
             )
         ],
-        "transitions": [_transition(one) for one in landscape.transitions],
-        "visits": [_visits(one) for one in landscape.visits],
-        "notes": list(landscape.notes),
-    } | _of_given(landscape)
-
-
-def _cycle(one: Cycle) -> dict[str, Any]:
-    return {
-        "period": one.period,
-        "multipliers": [[value.real, value.imag] for value in one.multipliers.astype(complex).tolist()],
-        "points": _rounded(one.points),
+        "transitions": [_transition_data(one) for one in landscape.transitions],
+        "visits": [_visits_data(one) for one in landscape.visits],
+        "remarks": [one.as_data() for one in landscape.remarks],
     }
+    if landscape.given:  # no other file could hold its certificate
+        data |= {"given": True, "certificate": None if certificate is None else certificate.as_data()}
+        data |= {"parting": list(map(_cycle_data, landscape.parting))} if landscape.parting else {}
+    return data
 
 
-def _of_given(landscape: Landscape) -> dict[str, Any]:
-    """What a landscape of equations has beside: no other file could hold its certificate."""
-    if not landscape.given:
-        return {}
-    certificate = landscape.certificate
-    cycles = {"parting": [_cycle(one) for one in landscape.parting]} if landscape.parting else {}
-    return {"given": True, "certificate": None if certificate is None else certificate.as_data()} | cycles
+def _transition_data(one: Transition) -> dict[str, Any]:
+    rate, path = one.rate, None if one.path is None else one.path.uphill
+    return {
+        "start": one.start,
+        "end": one.end,
+        "saddle": one.place.tolist(),
+        "barrier": _number(one.barrier),
+        "formula_share": _number(one.formula_share),
+        "standard_error": _number(one.standard_error),
+        "error": _number(one.error),
+        "by_rivals": _number(one.by_rivals),
+        "minimum_action": None if path is None else path.action,
+        "prefactor": None if rate is None else rate.prefactor,
+        "turn": None if rate is None or rate.turn is None else asdict(rate.turn),
+        "prefactor_error": None if rate is None else rate.prefactor_error,
+        "prefactor_covariance": 0.0 if rate is None else rate.covariance,
+        "noise_leverage": one.leverage,
+        "exponent": None if rate is None else rate.exponent,
+        "uphill": None if path is None else path.points.tolist(),
+        "downhill": None if one.path is None else one.path.downhill.tolist(),
+        "path": None
+        if path is None
+        else {
+            "momenta": _rounded(path.momenta),
+            "values": _rounded(path.values[None])[0],
+            "rivals": list(path.rivals),
+            **{name: getattr(path, name) for name in PATH_FIGURES},
+        },
+        "remarks": [remark.as_data() for remark in one.remarks],
+        "law_remarks": [] if rate is None else [remark.as_data() for remark in rate.remarks],
+    } | ({"over_cycle": one.saddle.period} if isinstance(one.saddle, Cycle) else {})
 
 
-def _visits(one: VisitTest) -> dict[str, Any]:
+def _visits_data(one: VisitTest) -> dict[str, Any]:
     lowest, highest = one.whole.limits
     return {
-        "well": one.well,
-        "visits": one.whole.visits,
-        "counted": _number(one.whole.mean),
-        "lowest": lowest,
-        "highest": _number(highest),
-        "predicted": one.predicted,
-        "error": one.predicted * one.error,
-        "method": one.method,
-    }
+        "well": one.well, "visits": one.whole.visits, "time": one.whole.time,
+        "counted": _number(one.whole.mean), "lowest": lowest, "highest": _number(highest),
+        "predicted": one.predicted, "error": one.predicted * one.error, "method": one.method,
+        "held_out": asdict(one.held_out), "probability": one.probability,
+    }  # fmt: skip
 
 
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
+def _cycle_data(one: Cycle) -> dict[str, Any]:
+    return {"period": one.period, "multipliers": _pairs(one.multipliers), "points": _rounded(one.points)}
 
 
-def _formula(well: Well) -> dict[str, Any]:
+def _well_data(well: Well) -> dict[str, Any]:
     return powers_to_data(well) | {
         "level": well.reach,
         "depth": well.level,
@@ -142,31 +134,142 @@ def _rounded(points: np.ndarray) -> list[list[float]]:
     return [[float(f"{value:.{DIGITS}g}") for value in row] for row in points]
 
 
-def _transition(one: Transition) -> dict[str, Any]:
-    rate, path = one.rate, one.path
-    return {
-        "start": one.start,
-        "end": one.end,
-        "saddle": one.place.tolist(),
-        "barrier": _number(one.barrier),
-        "formula_share": _number(one.formula_share),
-        "standard_error": _number(one.standard_error),
-        "error": _number(one.error),
-        "by_rivals": _number(one.by_rivals),
-        "minimum_action": None if path is None else path.uphill.action,
-        "prefactor": None if rate is None else rate.prefactor,
-        "turn": None if rate is None or rate.turn is None else asdict(rate.turn),
-        "prefactor_error": None if one.prefactor_error is None else one.prefactor_error.standard_error,
-        "prefactor_covariance": 0.0 if one.prefactor_error is None else one.prefactor_error.covariance,
-        "noise_leverage": one.leverage,
-        "exponent": None if rate is None else rate.exponent,
-        "uphill": None if path is None else path.uphill.points.tolist(),
-        "downhill": None if path is None else path.downhill.tolist(),
-        "notes": list(one.notes),
-    } | ({"over_cycle": one.saddle.period} if isinstance(one.saddle, Cycle) else {})
+def _pairs(values: np.ndarray) -> list[list[float]]:
+    """Complex numbers as real and imaginary parts."""
+    return [[value.real, value.imag] for value in values.astype(complex).tolist()]
 
 
-def read_landscape(path: str | Path, *, dynamics: Dynamics) -> StoredLandscape | None:
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _known(value: float | None) -> float:
+    return np.nan if value is None else float(value)
+
+
+def landscape_from_data(data: Mapping[str, Any], dynamics: Dynamics) -> Landscape:
+    """The landscape that `landscape_data` wrote, of an f that stands elsewhere.
+
+    What is rounded there comes back rounded. The estimate of f, the certificate of a landscape from
+    recordings, and the states of the record have files of their own.
+    """
+    if list(data["states"]) != [symbol.name for symbol in dynamics.symbols]:
+        raise ValueError("the landscapes are of different states")
+    units = tuple(data.get("units") or ("1",) * dynamics.dimension)
+    dynamics = replace(dynamics, units=units, time_unit=data.get("time_unit") or "1")
+    equilibria = tuple(
+        Equilibrium(np.array(one["position"]), _complex(one["eigenvalues"]), one["kind"])
+        for one in data["equilibria"]
+    )
+
+    def cycle(one: Mapping[str, Any], first: Sequence[float] | None = None) -> Cycle:
+        points = np.array(one["points"])
+        points[0] = points[0] if first is None else first
+        return Cycle(points, one["period"], _complex(one["multipliers"]))
+
+    def equilibrium(place: Sequence[float]) -> Equilibrium:
+        same = (one for one in equilibria if np.array_equal(one.position, place))
+        return next(same, Equilibrium(np.array(place), np.full(len(place), np.nan), "degenerate"))
+
+    parting = tuple(map(cycle, data.get("parting", ())))
+    transitions = []
+    for one in data["transitions"]:
+        saddle: Equilibrium | Cycle = equilibrium(one["saddle"])
+        if "over_cycle" in one:
+            saddle = min(parting, key=lambda each: abs(each.period - one["over_cycle"]))
+        transitions.append(_transition_from_data(one, saddle, "cycle" in data["wells"][one["start"]]))
+    wells = data["wells"]
+    errors = [one["standard_errors"] for one in wells]
+    return Landscape(
+        dynamics,
+        equilibria,
+        tuple(
+            cycle(one["cycle"], one["attractor"]) if "cycle" in one else equilibrium(one["attractor"])
+            for one in wells
+        ),
+        np.array([one["basin"] for one in wells]),
+        tuple(_well_from_data(one, dynamics) for one in wells),
+        tuple(transitions),
+        np.array([_known(one["height"]) for one in wells]),
+        tuple(map(Remark.from_data, data["remarks"])),
+        _certificate_from_data(data.get("certificate")),
+        np.array(errors, dtype=float) if errors and None not in errors else None,
+        None if data.get("noise") is None else NoiseStrength(**data["noise"]),
+        visits=tuple(_visits_from_data(one) for one in data.get("visits") or ()),
+        given=bool(data.get("given")),
+        parting=parting,
+    )
+
+
+def _transition_from_data(
+    one: Mapping[str, Any], saddle: Equilibrium | Cycle, from_cycle: bool
+) -> Transition:
+    path, rate, kept = None, None, one["path"]
+    if kept is not None:
+        uphill = MinimumActionPath(
+            np.array(one["uphill"]), np.array(kept["momenta"]), np.array(kept["values"]),
+            one["minimum_action"], rivals=tuple(kept["rivals"]),
+            **{name: kept[name] for name in PATH_FIGURES},
+        )  # fmt: skip
+        path = TransitionPath(uphill, np.array(one["downhill"]))
+    if one["prefactor"] is not None:
+        rate = EscapeRate(
+            one["minimum_action"], one["prefactor"], one["exponent"],
+            tuple(map(Remark.from_data, one["law_remarks"])),
+            EnergyLossPerCycle(**one["turn"]) if one["turn"] else None,
+            prefactor_error=one["prefactor_error"], covariance=one["prefactor_covariance"],
+        )  # fmt: skip
+    return Transition(
+        one["start"], one["end"], saddle, path, _known(one["barrier"]), _known(one["formula_share"]),
+        _known(one["standard_error"]), rate, tuple(map(Remark.from_data, one["remarks"])),
+        one["noise_leverage"], _known(one["by_rivals"]), from_cycle,
+    )  # fmt: skip
+
+
+def _visits_from_data(one: Mapping[str, Any]) -> VisitTest:
+    return VisitTest(
+        one["well"], DwellCount(**one["held_out"]), DwellCount(one["visits"], one["time"]), one["predicted"],
+        one["error"] / one["predicted"], one["method"], one["probability"],
+    )  # fmt: skip
+
+
+def _well_from_data(data: Mapping[str, Any], dynamics: Dynamics) -> Well | None:
+    powers, d = data["V"], dynamics.dimension
+    if powers is None:
+        return None
+    return Well(
+        dynamics, np.array(data["attractor"]), basis_from_data(powers, dynamics.symbols),
+        np.array(powers["coefficients"]), powers["depth"],
+        None if powers["saddle"] is None else np.array(powers["saddle"]), powers["residual"],
+        np.array(powers["points"]).reshape(-1, d), powers["level"], powers["tolerance"],
+        np.array(powers["elsewhere"]).reshape(-1, d),
+    )  # fmt: skip
+
+
+def _certificate_from_data(data: Mapping[str, Any] | None) -> Certificate | None:
+    if data is None:
+        return None
+    tests = {
+        name: Verdict(_known(one["value"]), one["limit"], one["passed"], one["reason"])
+        for name, one in data["tests"].items()
+    }
+    error = np.inf if data["stated_error"] is None else data["stated_error"]
+    return Certificate(tests, error, data["reason"], data["scope"], data["tested_on"])
+
+
+def _complex(pairs: Sequence[Sequence[float]]) -> np.ndarray:
+    values = np.array([complex(*one) for one in pairs])
+    return values if values.imag.any() else values.real
+
+
+def write_landscape(path: str | Path, landscape: Landscape) -> None:
+    """Write a landscape as `quasipotential.json`, whole or not at all."""
+    data = landscape_data(landscape)
+    with whole_file(path) as partial:
+        partial.write_text(json.dumps(data, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def read_landscape(path: str | Path, *, dynamics: Dynamics) -> Landscape | None:
     """Read what `write_landscape` wrote; None where the file is empty since there was nothing to write.
 
     Parameters
@@ -183,46 +286,6 @@ def read_landscape(path: str | Path, *, dynamics: Dynamics) -> StoredLandscape |
     """
     try:
         text = Path(path).read_text(encoding="utf-8")
-        if not text:
-            return None
-        data = json.loads(text)
-        wells = tuple(_well(well, dynamics) for well in data["wells"])
-        heights = np.array([well["height"] for well in data["wells"]], dtype=float)
-        return StoredLandscape(matched(wells, heights), wells, data)
+        return landscape_from_data(json.loads(text), dynamics) if text else None
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(path, "", f"it is no landscape ({type(error).__name__})", "make it again") from None
-
-
-def exits_of(data: Mapping[str, Any], well: int) -> list[Exit]:
-    """The ways out of a well of a landscape as plain data; a barrier that nobody knows is NaN."""
-    return [
-        Exit(
-            _known(way["barrier"]),
-            _known(way.get("error", way["standard_error"])),
-            way["prefactor"],
-            way.get("prefactor_error"),
-            way.get("prefactor_covariance", 0.0),
-            way.get("noise_leverage", 1.0),
-            TurnLoss(**way["turn"]) if way.get("turn") else None,
-        )
-        for way in data["transitions"]
-        if way["start"] == well
-    ]
-
-
-def _known(value: float | None) -> float:
-    return np.nan if value is None else float(value)
-
-
-def _well(data: Mapping[str, Any], dynamics: Dynamics) -> Well | None:
-    powers = data["V"]
-    if powers is None:
-        return None
-    d = dynamics.dimension
-    return Well(
-        dynamics, np.array(data["attractor"]), basis_from_data(powers, dynamics.symbols),
-        np.array(powers["coefficients"]), powers.get("depth", powers["level"]),
-        None if powers["saddle"] is None else np.array(powers["saddle"]), powers["residual"],
-        np.array(powers["points"]).reshape(-1, d), powers["level"], powers["tolerance"],
-        np.array(powers["elsewhere"]).reshape(-1, d),
-    )  # fmt: skip

@@ -59,7 +59,7 @@ from siq.inference.field_estimate import IdentifiedField, field_dynamics
 from siq.numerics.randomness import normal_draws
 from siq.numerics.text import place_text
 from siq.quasipotential.certificate_tests import Verdict
-from siq.quasipotential.rates import NoiseStrength, dwell_time
+from siq.quasipotential.rates import NoiseStrength, mean_residence_time
 from siq.quasipotential.transitions import transitions, ways_out
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import hessian_at
@@ -484,7 +484,7 @@ def predicted_visits(
     ways = transitions(found, ways_out(found.dynamics, portrait), [None] * count)
     times, missing = [], []
     for well, one in enumerate(portrait.attractors):
-        found_time = dwell_time([way.exit for way in ways if way.start == well], noise)
+        found_time = mean_residence_time([way.exit for way in ways if way.start == well], noise)
         if found_time is None or not found_time.complete:
             missing.append(place_text(one.position))
         else:

@@ -1,27 +1,29 @@
-"""Minimum action paths as chains of points: their action, its descent, and the spacing of points.
+"""Minimum action paths as chains of points: action, descent, and the spacing of points.
 
-Along a stable cycle V is zero, and a path may wind on it at no cost for as long as it likes: it has no first
-state. It is followed from a tube on, on which V is ``½ ρ·Hρ``, ρ being the offset from the next state of the
-cycle and H the curvature of V there (`siq.systems.cycles.hessians_along`). A path to an unstable cycle
-winds on it in the end; from a tube on what is left of its action is ``ρ·Hρ``, with the curvature of what it
-costs to reach the cycle.
+The action of a curve φ from A to B, whatever the time it takes, is
 
-First guesses are trajectories of Hamilton's equations that start on all sides of a small tube, or of a small
-ellipsoid, with the momentum ``p = Hρ``. One of them passes close to
-the end.
+    S = ∫ (|f| |φ'| - f·φ') ds,    a·b = aᵀD⁻¹b,
 
-Everything is in units in which the distance of both ends, D and the derivatives of f are of size one. What
-the chains are for is said in `siq.quasipotential.paths`.
+and each segment of a chain has the action of a straight line with f of its middle. Everything is in units in
+which the distance of both ends, D and the derivatives of f are of size one.
 
-About an attractor or a cycle a path may wind for long, and a chain is continued there as linear dynamics
-goes, to where its level is as small as is asked for.
+Points are moved across the chain by Newton's method. It is damped by the action of a chain whose times are
+frozen at ``|Δφ|/|f|``, an upper bound of S that touches it: a large step for paths that wind about an
+attractor, where a gradient would be useless.
 
-By Newton's method, with steps across the chain, damped by an upper bound of the action that touches it.
+About an attractor a chain begins on a small ellipsoid, on which U is ``y·My``. About a stable cycle, on which
+a path may wind at no cost, it begins on a thin tube: there U is ``ρ·Hρ``, ρ being the offset from the next
+state of the cycle and H the curvature of V (`siq.systems.cycles.hessians_along`). A path to an unstable cycle
+ends on a tube, with the curvature of what is left of its action. Beyond both a chain is continued as linear
+dynamics goes.
+
+References
+----------
+M. Heymann and E. Vanden-Eijnden, Comm. Pure Appl. Math. 61 (2008) 1052: the geometric action.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,25 +33,97 @@ from scipy.interpolate import Akima1DInterpolator, CubicSpline
 from scipy.spatial import cKDTree
 
 from siq.errors import NumericalFailure
-from siq.numerics.integration import dormand_prince_step, next_step
 from siq.systems.cycles import Cycle, hessians_along
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import classify, hessian_at
 
-FINER = 8  # places between two points of a cycle, from which the closest one is sought
-NEWTON_STEPS = 4  # from there: the error is squared in each
-AWAY = 3e-4  # of the distance to be gone: how far from an attractor first guesses start
-PHASES, SIDES = 48, 2  # of first guesses; sides for each state beyond the second
-POINTS_OF_TWO = 96  # around a point
-MOST_STEPS = 4000
-ACCURACY = 1e-6  # numerical, of the distance: of one step of a first guess
-LONGEST_STEP = 0.03  # of the distance, or of the size of the cycle
-GONE = 6.0  # distances: what is so far away does not come back
-CLOSE = 0.05  # of the distance: so close to the end a first guess counts as having arrived
-PASSED = 0.3  # of the distance: and so close as one that has passed it by
-CHOSEN = 2  # first guesses of either kind that are tried
-UNLIKE = 0.02  # share of the action by which two of them differ
+REST = 1e-5  # |f| at an equilibrium, in units of the Jacobian and the distance
+NO_ACTION = 1e-7  # of ∫|f||φ'|ds: less is a path without noise
+CYCLE_GRID = 8  # places between two points of a cycle, from which the closest one is sought
+NEWTON_STEPS_TO_CYCLE = 4  # from there: the error is squared in each
+CYCLE_SHIFT = 1e-3  # of the upper bound of S: above the error of tubes, below what parts two minima
+
+START_LEVEL = 1e-6  # of the action: U on the ellipsoid where a chain begins
+CENTRAL_SPACING = 0.005  # of the distance to the end: nearer to the attractor points lie no closer together
+COINCIDENCE = 1e-14  # numerical, of the length: neighbours so close are one point
+MOST_NODES = 60_000  # numerical, a guard on memory: 60 000 blocks of d × d
+MOST_TURNS, STEPS_PER_TURN = 300, 64  # of a path from or to a cycle, within linear dynamics
+SPIRAL_STEP = 0.15  # of the shortest time of the linear dynamics
+
+KICKS = (0.3, 0.1, 0.03, 0.01)  # of the distance: tried from a chain that is at rest and no minimum
+SMALLEST_SHIFT, LARGEST_SHIFT = 1e-3, 1e12  # of Newton's matrix
+LEAST_GAIN, GOOD_GAIN = 0.05, 0.7  # of what a step promised: it is taken; the next one is bolder
+MOST_STEPS, MOST_RESPACINGS, MOST_KICKS = 150, 40, 3
+UNEVEN = 1.6  # longest to shortest segment at which a chain is spaced anew
+COARSE, FINE = 1e-7, 1e-12  # share of S that a step must still gain, for first guesses and for the answer
+
+MOST_BENDS = 6  # directions of bent first guesses: each costs as much as the path itself
+BEND = 0.4  # of the distance: how far bent first guesses leave the straight line
+
+
+@dataclass(frozen=True)
+class MinimumActionPath:
+    """The path of least action between two states: a chain, or a solution of Hamilton's equations.
+
+    Attributes
+    ----------
+    points
+        Shape ``(n, d)``, in the states' units: from the start to the end, both included.
+    momenta
+        Shape ``(n, d)``: p there, which is ∇V where V is smooth; the path follows ``ẋ = f + 2Dp``.
+    values
+        Shape ``(n,)``: the action up to each point, that is U, not V, if the start is an attractor.
+    action
+        Of the whole path: the barrier of U, if the end is a saddle.
+    error
+        Estimated error of the finest chain or mesh, from the two finest ones. That of `action`, which like
+        points, momenta and values of a chain is extrapolated from both, is mostly far smaller.
+    residual
+        Largest ``|p·f + p·Dp|`` along the path, as a share of the largest ``|p·f| + p·Dp``.
+    converged
+        Whether the path is a minimum, and its error within the tolerance.
+    rivals
+        Actions of other minima that were found from other first guesses, by rising action; of
+        chains to about a thousandth, as these are short. One with the same action is a mirror image, mostly.
+    times
+        Shape ``(n,)``, of a solution of Hamilton's equations: zero at its last point; infinite at equilibria,
+        where it does not come to. None of a chain.
+    smooth
+        Whether no neighbouring solution crosses the path; only then it is a minimum.
+    """
+
+    points: np.ndarray
+    momenta: np.ndarray
+    values: np.ndarray
+    action: float
+    error: float
+    residual: float
+    converged: bool
+    rivals: tuple[float, ...] = ()
+    times: np.ndarray | None = None
+    smooth: bool = True
+
+
+@dataclass(frozen=True)
+class TransitionPath:
+    """The most probable way from one attractor to another: up to a saddle, and down without noise.
+
+    Attributes
+    ----------
+    uphill
+        From the attractor to the saddle.
+    downhill
+        Shape ``(n, d)``: the trajectory of f from the saddle to the other attractor, whose action is zero.
+    """
+
+    uphill: MinimumActionPath
+    downhill: np.ndarray
+
+    @property
+    def points(self) -> np.ndarray:
+        """All points, shape ``(m, d)``; the saddle stands there once."""
+        return np.vstack([self.uphill.points, self.downhill[1:]])
 
 
 class Tube:
@@ -70,12 +144,12 @@ class Tube:
         places = np.arange(n + 1)
         self.curve = CubicSpline(places, np.vstack([points, points[:1]]), bc_type="periodic")
         self.costs = CubicSpline(places, np.concatenate([hessians, hessians[:1]]), bc_type="periodic")
-        self.tree = cKDTree(self.curve(np.arange(FINER * n) / FINER))
+        self.tree = cKDTree(self.curve(np.arange(CYCLE_GRID * n) / CYCLE_GRID))
 
     def place(self, y: np.ndarray) -> np.ndarray:
         """Where on the cycle the state next to each point lies: ``(n, d)`` to ``(n,)``."""
-        place = self.tree.query(np.nan_to_num(y))[1] / FINER
-        for _ in range(NEWTON_STEPS):
+        place = self.tree.query(np.nan_to_num(y))[1] / CYCLE_GRID
+        for _ in range(NEWTON_STEPS_TO_CYCLE):
             along, bent = self.curve(place, 1), self.curve(place, 2)
             offset = y - self.curve(place)
             curved = np.sum(along**2, axis=1) - np.sum(offset * bent, axis=1)
@@ -95,7 +169,7 @@ class Tube:
 
     def onto(self, y: np.ndarray, level: float) -> np.ndarray:
         """A point moved along the slope to where the cost is as given: ``(d,)`` to ``(d,)``."""
-        for _ in range(NEWTON_STEPS):
+        for _ in range(NEWTON_STEPS_TO_CYCLE):
             slope = self.slope(y)
             steepness = float(slope @ slope)
             if not steepness > 0:
@@ -138,128 +212,6 @@ class Bowl:
         return 2 * self.hessian
 
 
-def first_guesses(
-    dynamics: Dynamics,
-    start: np.ndarray | Cycle,
-    end: np.ndarray | Cycle,
-    hessians: np.ndarray,
-    unit: np.ndarray,
-) -> list[np.ndarray]:
-    """Curves from beside a start to an end, by rising action.
-
-    Parameters
-    ----------
-    dynamics
-        f and D.
-    start, end
-        Points ``(d,)`` or cycles.
-    hessians
-        The curvature of V: ``(d, d)`` at a point, ``(n, d, d)`` along a cycle.
-    unit
-        Shape ``(d, d)``: its columns are steps of one distance.
-    """
-    inverse = np.linalg.inv(unit)
-    states, momenta = _beside(start, hessians, unit)
-    ways, actions = _followed(dynamics, states, momenta, inverse)
-    target = cKDTree((end.points if isinstance(end, Cycle) else end[None]) @ inverse.T)
-    found = []
-    for way, action in zip(ways, actions, strict=True):
-        away = target.query(way @ inverse.T)[0]
-        close = max(CLOSE, float(away.min()))
-        arrived = int(np.argmax(away <= close))
-        left = np.flatnonzero(away[arrived:] > 2 * close)
-        nearest = int(arrived + np.argmin(away[arrived : arrived + (left[0] if len(left) else len(away))]))
-        curve = way[: nearest + 1] if isinstance(end, Cycle) else np.vstack([way[: nearest + 1], end])
-        if nearest > 0:
-            found.append((float(away[nearest]), float(action[nearest]), curve))
-    found.sort(key=lambda one: one[1])
-    least = min((one[0] for one in found), default=np.inf)
-    chosen: list[tuple[float, float, np.ndarray]] = []
-    # A lower path may have passed the end by further than one that is not the lowest.
-    for close in (max(CLOSE, least), max(PASSED, least)):
-        new: list[tuple[float, float, np.ndarray]] = []
-        for one in found:
-            known = any(abs(one[1] - other[1]) <= UNLIKE * abs(other[1]) for other in (*chosen, *new))
-            if one[0] <= close and not known and len(new) < CHOSEN:
-                new.append(one)
-        chosen += new
-    return [curve for _, _, curve in chosen]
-
-
-def _beside(
-    start: np.ndarray | Cycle, hessians: np.ndarray, unit: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """States on all sides of a start, and the momenta there."""
-    d = len(unit)
-    draw = np.random.default_rng(0)
-    if isinstance(start, Cycle):
-        rows = np.linspace(0, len(start.points), PHASES, endpoint=False).astype(int)
-        # The axes of the curvature, of which the first one is along the flow, and directions between them.
-        across = np.linalg.eigh(unit.T @ hessians[rows] @ unit)[1].transpose(0, 2, 1)[:, 1:]
-        between = draw.standard_normal((SIDES * (d - 2), d - 1))
-        sides = np.concatenate([np.eye(d - 1), -np.eye(d - 1), between])
-        sides /= np.linalg.norm(sides, axis=1, keepdims=True)
-        offset = AWAY * np.einsum("sa,nai->nsi", sides, across) @ unit.T
-        momenta = np.einsum("nij,nsj->nsi", hessians[rows], offset)
-        states = start.points[rows][:, None] + offset
-        return states.reshape(-1, d), momenta.reshape(-1, d)
-    directions = draw.standard_normal((POINTS_OF_TWO * (d - 1), d))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    offset = AWAY * directions @ unit.T
-    return start + offset, offset @ hessians
-
-
-def _followed(
-    dynamics: Dynamics, states: np.ndarray, momenta: np.ndarray, inverse: np.ndarray
-) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Trajectories of Hamilton's equations, and the action along each."""
-    n, d = states.shape
-
-    def rates(z: np.ndarray) -> np.ndarray:
-        x, p = z[:, :d], z[:, d : 2 * d]
-        push = dynamics.diffusion.push(x, p)
-        falls = -np.einsum("nij,ni->nj", dynamics.jacobian(x), p) - dynamics.diffusion.contract(x, p, 1)
-        return np.column_stack([dynamics.drift(x) + 2 * push, falls, 2 * np.sum(p * push, axis=1)])
-
-    z = np.column_stack([states, momenta, np.zeros(n)])
-    first = states @ inverse.T
-    kept: list[np.ndarray] = [z.copy()]
-    alive = np.arange(n)
-    rate = np.linalg.norm(rates(z)[:, :d] @ inverse.T, axis=1).max()
-    longest = LONGEST_STEP * max(1.0, float(np.linalg.norm(np.ptp(first, axis=0))))
-    steps = np.full(n, longest / rate)
-    for _ in range(MOST_STEPS):
-        with np.errstate(all="ignore"):
-            speed = np.linalg.norm(rates(z[alive])[:, :d] @ inverse.T, axis=1)
-            step = np.minimum(steps[alive], longest / np.maximum(speed, 1e-300))
-            moved, error = dormand_prince_step(rates, z[alive], step)
-            relative = np.abs(error[:, :d] @ inverse.T).max(axis=1) / ACCURACY
-        steps[alive] = next_step(step, relative)
-        taken = np.isfinite(moved).all(axis=1) & (relative <= 1)
-        z[alive[taken]] = moved[taken]
-        kept.append(z.copy())
-        away = np.linalg.norm(z[alive][:, :d] @ inverse.T - first[alive], axis=1)
-        alive = alive[away < GONE]
-        if not len(alive):
-            break
-    ways = np.stack(kept, axis=1)
-    return list(ways[:, :, :d]), list(ways[:, :, -1])
-
-
-AT_REST = 1e-5  # |f| at a state that counts as an equilibrium, in units of the Jacobian and the distance
-FLAT = 1e-3  # of the upper bound of S: numerical, above the error of tubes, below what parts two minima
-NO_ACTION = 1e-7  # of ∫|f||φ'|ds: less is a path without noise
-
-
-@dataclass(frozen=True)
-class DiscretisedPath:
-    """Points ``(n, d)`` in the units of a problem, their action, and whether it is a minimum."""
-
-    points: np.ndarray
-    action: float
-    minimum: bool
-
-
 @dataclass(frozen=True)
 class Segments:
     """f of the middles, the differences and the sizes of both: ``(n - 1, d)`` and ``(n - 1,)``.
@@ -285,6 +237,20 @@ class Segments:
         """D⁻¹ of the middles, ``(n - 1, d, d)``."""
         return self.whitening.transpose(0, 2, 1) @ self.whitening
 
+    @property
+    def effort(self) -> float:
+        """The integral ``∫ |f| |φ'| ds``, with which an action is compared that may be zero."""
+        return float(np.sum(self.speed * self.length))
+
+
+@dataclass(frozen=True)
+class DiscretisedPath:
+    """Points ``(n, d)`` in the units of a problem, their action, and whether it is a minimum."""
+
+    points: np.ndarray
+    action: float
+    minimum: bool
+
 
 class PathProblem:
     """Chains between two states, in units in which D at the start, their distance and ∂f/∂x are of size one.
@@ -304,45 +270,46 @@ class PathProblem:
         *,
         measure: Diffusion | None = None,
     ) -> None:
-        around, onto = (one if isinstance(one, Cycle) else None for one in (start, end))
-        start, end = _closest_states(start, end)
-        noise = dynamics.diffusion.frozen(start) if measure is None else measure
-        distance = float(np.linalg.norm(noise.whitening @ (end - start)))
+        around, onto = (each if isinstance(each, Cycle) else None for each in (start, end))
+        # Of cycles, the states that are closest to the other end.
+        one, two = (each.points if isinstance(each, Cycle) else each[None] for each in (start, end))
+        away = np.linalg.norm(one[:, None] - two, axis=2)
+        row, column = np.unravel_index(int(np.argmin(away)), away.shape)
+        first, last = one[row], two[column]
+        noise = dynamics.diffusion.frozen(first) if measure is None else measure
+        distance = float(np.linalg.norm(noise.whitening @ (last - first)))
         if not distance > 0:
-            raise ValueError(f"the path is to end where it starts, at {start.tolist()}")
-        self.dynamics, self.start, self.units = dynamics, start, distance * noise.root
+            raise ValueError(f"the path is to end where it starts, at {first.tolist()}")
+        self.dynamics, self.start, self.units = dynamics, first, distance * noise.root
         self.inverse = noise.whitening / distance
         self.constant = dynamics.diffusion.constant
-        self.noise = dynamics.diffusion.in_units(start, self.units, distance**2)
-        jacobians = self.inverse @ dynamics.jacobian(np.stack([start, end])) @ self.units
+        self.noise = dynamics.diffusion.in_units(first, self.units, distance**2)
+        jacobians = self.inverse @ dynamics.jacobian(np.stack([first, last])) @ self.units
         self.rate = float(np.linalg.norm(jacobians, axis=(1, 2)).max())
         self.unit = distance**2 * self.rate  # of the action
-        self.end = self.inverse @ (end - start)
+        self.end = self.inverse @ (last - first)
         self.hessian: np.ndarray | None = None
         self.begin: Bowl | Tube | None = None
         self.finish: Tube | None = None
+
+        def tube(cycle: Cycle, hessians: np.ndarray) -> Tube:
+            points = (cycle.points - self.start) @ self.inverse.T
+            return Tube(points, self.units.T @ hessians @ self.units / self.unit, cycle.period * self.rate)
+
         if onto is not None:
-            self.finish = self._tube(onto, hessians_along(dynamics, onto, reaching=True))
+            self.finish = tube(onto, hessians_along(dynamics, onto, reaching=True))
         if around is not None:
-            self.begin = self._tube(around, hessians_along(dynamics, around))
-            return
-        resting = np.linalg.norm(self.force(np.zeros((1, len(start))))) < AT_REST
-        if resting and classify(dynamics, start).kind == "attractor":
-            hessian = hessian_at(dynamics, start)
-            self.hessian = self.units.T @ hessian @ self.units / self.unit
+            self.begin = tube(around, hessians_along(dynamics, around))
+        elif self.rests(np.zeros(len(first))) and classify(dynamics, first).kind == "attractor":
+            self.hessian = self.units.T @ hessian_at(dynamics, first) @ self.units / self.unit
             self.begin = Bowl(self.hessian)
+        # By how much of the upper bound S may fail to curve upwards at a minimum: about cycles any phase may
+        # be as good as any other.
+        self.flat = CYCLE_SHIFT if isinstance(self.begin, Tube) or self.finish is not None else 0.0
 
-    def _tube(self, cycle: Cycle, hessians: np.ndarray) -> Tube:
-        points = (cycle.points - self.start) @ self.inverse.T
-        return Tube(points, self.units.T @ hessians @ self.units / self.unit, cycle.period * self.rate)
-
-    @property
-    def flat(self) -> float:
-        """By how much of the upper bound S may fail to curve upwards at a minimum.
-
-        About cycles any phase may be as good as any other.
-        """
-        return FLAT if isinstance(self.begin, Tube) or self.finish is not None else 0.0
+    def rests(self, y: np.ndarray) -> bool:
+        """Whether f vanishes at a state, to rounding."""
+        return bool(np.linalg.norm(self.force(y[None])) < REST)
 
     def scaled(self, x: np.ndarray) -> np.ndarray:
         """Points in the units of the problem, from its start to its end."""
@@ -358,7 +325,7 @@ class PathProblem:
         return self.start + y @ self.units.T
 
     def force(self, y: np.ndarray) -> np.ndarray:
-        """F, ``(n, d)``."""
+        """f at points, ``(n, d)``."""
         return self.dynamics.drift(self.unscaled(y)) @ self.inverse.T / self.rate
 
     def jacobian(self, y: np.ndarray) -> np.ndarray:
@@ -403,31 +370,10 @@ class PathProblem:
             except NumericalFailure:
                 return np.inf
 
-    def effort(self, y: np.ndarray) -> float:
-        """The integral ``∫ |f| |φ'| ds``, with which an action is compared that may be zero."""
-        parts = self.segments(y)
-        return float(np.sum(parts.speed * parts.length))
-
-
-def _closest_states(start: np.ndarray | Cycle, end: np.ndarray | Cycle) -> tuple[np.ndarray, np.ndarray]:
-    """Of two states or cycles, the two states that are closest to each other."""
-    one, two = (each.points if isinstance(each, Cycle) else each[None] for each in (start, end))
-    away = np.linalg.norm(one[:, None] - two, axis=2)
-    row, column = np.unravel_index(int(np.argmin(away)), away.shape)
-    return one[row], two[column]
-
 
 def products(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     """Of each matrix with its vector: ``(n, d, d)`` and ``(n, d)`` to ``(n, d)``."""
     return np.asarray((matrices @ vectors[:, :, None])[:, :, 0])
-
-
-START_SHARE = 1e-6  # of the action: U on the ellipsoid where a chain begins
-CENTRAL = 0.005  # of the distance to the end: nearer to the attractor points lie no closer together
-COINCIDING = 1e-14  # numerical, of the length: neighbours so close are one point
-MOST_NODES = 60_000  # numerical, a guard on memory: 60 000 blocks of d × d
-MOST_TURNS, STEPS_OF_A_TURN = 300, 64  # of a path from or to a cycle, within linear dynamics
-SPIRAL_STEP = 0.15  # of the shortest time of the linear dynamics
 
 
 def spaced(problem: PathProblem, y: np.ndarray, count: int, level: float) -> np.ndarray:
@@ -443,7 +389,7 @@ def spaced(problem: PathProblem, y: np.ndarray, count: int, level: float) -> np.
     if level > 0 and problem.finish is not None:
         y = np.vstack([y, _winding(problem, problem.finish, y[-1], level, 1.0)])
     length = np.r_[0, np.cumsum(np.linalg.norm(np.diff(y, axis=0), axis=1))]
-    apart = np.append(np.diff(length) > COINCIDING * length[-1], True)
+    apart = np.append(np.diff(length) > COINCIDENCE * length[-1], True)
     length, y = length[apart], y[apart]
     curve = Akima1DInterpolator(length, y)
     dense = np.interp(np.arange(0, len(y) - 0.95, 0.1), np.arange(len(y)), length)
@@ -463,7 +409,7 @@ def relative_lengths(problem: PathProblem, y: np.ndarray) -> np.ndarray:
     forward, middles = np.diff(y, axis=0), (y[1:] + y[:-1]) / 2
     if problem.hessian is None:
         return np.linalg.norm(forward, axis=1)
-    near = np.sqrt(problem.level(middles)) + CENTRAL * np.sqrt(problem.level(problem.end[None]))
+    near = np.sqrt(problem.level(middles)) + CENTRAL_SPACING * np.sqrt(problem.level(problem.end[None]))
     return np.sqrt(problem.level(forward)) / near
 
 
@@ -498,7 +444,7 @@ def _winding(problem: PathProblem, tube: Tube, last: np.ndarray, level: float, s
         return np.zeros((0, len(last)))
     way = solve_ivp(
         rates, (0.0, MOST_TURNS * tube.period), last, rtol=1e-4, atol=1e-6,
-        max_step=tube.period / STEPS_OF_A_TURN, events=arrives,
+        max_step=tube.period / STEPS_PER_TURN, events=arrives,
     )  # fmt: skip
     return np.asarray(way.y[:, 1:].T)
 
@@ -508,14 +454,6 @@ def evenly(points: np.ndarray, count: int) -> np.ndarray:
     along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
     places = np.linspace(0, along[-1], count)
     return np.stack([np.interp(places, along, column) for column in points.T], axis=1)
-
-
-KICKS = (0.3, 0.1, 0.03, 0.01)  # of the distance: tried from a chain that is at rest and no minimum
-SMALLEST_SHIFT, LARGEST_SHIFT = 1e-3, 1e12  # of Newton's matrix
-LEAST_GAIN, GOOD_GAIN = 0.05, 0.7  # of what a step promised: it is taken; the next one is bolder
-STEPS, RESPACINGS, MOST_KICKS = 150, 40, 3
-UNEVEN = 1.6  # longest to shortest segment at which a chain is spaced anew
-COARSE, FINE = 1e-7, 1e-12  # share of S that a step must still gain, for first guesses and for the answer
 
 
 def descended(
@@ -539,14 +477,16 @@ def descended(
     first
         Whether it starts far from a minimum.
     """
-    level = START_SHARE * action
+    level = START_LEVEL * action
+    # Share of S that a step must still gain: of tubes, the third order that their cost leaves out.
+    fine = START_LEVEL**1.5 if problem.flat > 0 else FINE
     y = spaced(problem, y, count, level)
     if y.shape[1] == 1:
         return DiscretisedPath(y, problem.action(y), True)
     action, shift, spacings, kicks = problem.action(y), 1.0, 0, 0
-    for _ in range(STEPS):
+    for _ in range(MOST_STEPS):
         across = Across(problem, y)
-        resting = (COARSE if first else _fine(problem)) * action + np.finfo(float).eps * across.effort
+        resting = (COARSE if first else fine) * action + np.finfo(float).eps * across.effort
         gained, expected = 0.0, np.inf
         while shift < LARGEST_SHIFT:
             step = across.step(shift)
@@ -565,7 +505,7 @@ def descended(
             shift *= 0.2 if gained > GOOD_GAIN * expected else 1.0
             shift = max(shift if shift > 1e-8 else 0.0, problem.flat)
             measure = relative_lengths(problem, y)
-            if first and spacings < RESPACINGS and measure.max() > UNEVEN * measure.min():
+            if first and spacings < MOST_RESPACINGS and measure.max() > UNEVEN * measure.min():
                 y = spaced(problem, y, count, level)
                 action, spacings = problem.action(y), spacings + 1
         elif across.step(problem.flat) is None:
@@ -583,11 +523,6 @@ def descended(
     return DiscretisedPath(y, action, False)
 
 
-def _fine(problem: PathProblem) -> float:
-    """Share of S that a step must still gain: of tubes, the third order that their cost leaves out."""
-    return START_SHARE**1.5 if problem.flat > 0 else FINE
-
-
 class Across:
     """Moves of a chain across itself: slope and second derivatives of S, in banded form.
 
@@ -599,7 +534,7 @@ class Across:
 
     def __init__(self, problem: PathProblem, y: np.ndarray) -> None:
         parts, dimension = problem.segments(y), y.shape[1]
-        self.y, self.effort = y, float(np.sum(parts.speed * parts.length))
+        self.y, self.effort = y, parts.effort
         self.range = slice(1 if problem.begin is None else 0, -1 if problem.finish is None else None)
         times = (parts.length / parts.speed)[:, None, None]
         metric, middles, jacobian = parts.metric, parts.middles, problem.jacobian(parts.middles)
@@ -624,11 +559,12 @@ class Across:
         slope[:-1] += by_middle / 2 - twice
         longer, share = -2 * forward / times[:, 0], (0.25 / (parts.speed * parts.length))[:, None, None]
         pushed = metric @ turned
-        frozen = _Blocks(times * turned.transpose(0, 2, 1) @ pushed, -pushed, metric / times)
-        exact = _Blocks(
-            frozen.middle + bent - share * _outer(slower, slower),
-            frozen.mixed - share * _outer(longer, slower),
-            frozen.forward - share * _outer(longer, longer),
+        # Second derivatives of the segments by middles, by differences and middles, and by differences.
+        frozen = (times * turned.transpose(0, 2, 1) @ pushed, -pushed, metric / times)
+        exact = (
+            frozen[0] + bent - share * (slower[:, :, None] * slower[:, None]),
+            frozen[1] - share * (longer[:, :, None] * slower[:, None]),
+            frozen[2] - share * (longer[:, :, None] * longer[:, None]),
         )
         first, last = np.zeros((2, dimension, dimension))
         if problem.begin is not None:
@@ -638,15 +574,16 @@ class Across:
             slope[-1] += problem.finish.slope(y[-1])
             last = problem.finish.curvature(y[-1])
         self.problem = problem
-        normal = _normals(y)
+        # Orthonormal directions across the chain at its points, shape (n, d, d - 1).
+        normal = np.linalg.svd(np.gradient(y, axis=0)[:, None, :])[2][:, 1:].transpose(0, 2, 1)
         if isinstance(problem.begin, Tube):  # along the tube, on which the chain begins, and ends
             normal[0] = np.linalg.svd(problem.begin.slope(y[0])[None])[2][1:].T
         if problem.finish is not None:
             normal[-1] = np.linalg.svd(problem.finish.slope(y[-1])[None])[2][1:].T
         self.normal = normal[self.range]
         self.slope = np.einsum("nij,ni->nj", self.normal, slope[self.range]).ravel()
-        self.exact = exact.banded(self.normal, self.range.start, (first, last))
-        self.frozen = frozen.banded(self.normal, self.range.start, (first, last))
+        self.exact = _banded(*exact, self.normal, self.range.start, (first, last))
+        self.frozen = _banded(*frozen, self.normal, self.range.start, (first, last))
 
     def step(self, shift: float) -> np.ndarray | None:
         """Newton's step with a shift; None where the matrix is not positive definite."""
@@ -675,107 +612,39 @@ class Across:
         return [side * size * way for size in KICKS for side in (1, -1)]
 
 
-@dataclass(frozen=True)
-class _Blocks:
-    """Second derivatives of the segments by middles and differences, ``(n - 1, d, d)`` each."""
+def _banded(
+    middle: np.ndarray,
+    mixed: np.ndarray,
+    forward: np.ndarray,
+    normal: np.ndarray,
+    start: int,
+    ends: tuple[np.ndarray, np.ndarray],
+) -> np.ndarray:
+    """The matrix of the moves ``normal`` from point `start` on, in the lower form of scipy's solvers.
 
-    middle: np.ndarray
-    mixed: np.ndarray  # difference before middle
-    forward: np.ndarray
-
-    def banded(self, normal: np.ndarray, start: int, ends: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-        """The matrix of the moves ``normal`` from point `start` on, in the lower form of scipy's solvers.
-
-        `ends` are added to the blocks of the first point and of the last.
-        """
-        count, _, m = normal.shape
-        transposed = self.mixed.transpose(0, 2, 1)
-        both = (self.mixed + transposed) / 2
-        diagonal = np.zeros((len(self.middle) + 1, *ends[0].shape))
-        diagonal[1:] += self.middle / 4 + self.forward + both
-        diagonal[:-1] += self.middle / 4 + self.forward - both
-        diagonal[0] += ends[0]
-        diagonal[-1] += ends[1]
-        # Row of the next point, column of this one.
-        below = self.middle / 4 - self.forward + (self.mixed - transposed) / 2
-        turned = normal.transpose(0, 2, 1)
-        diagonal = turned @ diagonal[start : start + count] @ normal
-        below = turned[1:] @ below[start : start + count - 1] @ normal[:-1]
-        matrix = np.zeros((2 * m, count * m))
-        for column in range(m):
-            for row in range(column, m):
-                matrix[row - column, column::m] = diagonal[:, row, column]
-            for row in range(m):
-                matrix[m + row - column, column::m][: count - 1] = below[:, row, column]
-        return matrix
-
-
-def _outer(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    return left[:, :, None] * right[:, None, :]
-
-
-def _normals(y: np.ndarray) -> np.ndarray:
-    """Orthonormal directions across a chain at its points, shape ``(n, d, d - 1)``."""
-    along = np.gradient(y, axis=0)
-    return np.linalg.svd(along[:, None, :])[2][:, 1:].transpose(0, 2, 1)
-
-
-def path_nodes(problem: PathProblem, chain: DiscretisedPath) -> np.ndarray:
-    """Points, momenta, and actions up to there, shape ``(n, 2d + 1)``."""
-    y, parts = chain.points, problem.segments(chain.points)
-    # Momenta of the middles, carried over half a segment with ṗ = -Jᵀp - p·(∂D)p; both sides agree at a
-    # minimum.
-    times = (parts.length / parts.speed)[:, None]
-    middle = products(parts.metric, (parts.forward / times - parts.force) / 2)
-    change = np.einsum("nij,ni->nj", problem.jacobian(parts.middles), middle)
-    if not problem.constant:
-        change += problem.noise.contract(parts.middles, middle, 1)
-    turn = times / 2 * change
-    p = np.empty_like(y)
-    p[1:-1] = (middle[1:] + turn[1:] + middle[:-1] - turn[:-1]) / 2
-    p[0] = middle[0] + turn[0] if problem.begin is None else problem.begin.slope(y[0]) / 2
-    p[-1] = middle[-1] - turn[-1] if problem.finish is None else -problem.finish.slope(y[-1]) / 2
-    values = problem.level(y[:1]) + np.r_[0.0, np.cumsum(parts.actions)]
-    return np.column_stack([y, p, values])
-
-
-def hamiltonian_residual(problem: PathProblem, nodes: np.ndarray) -> float:
-    """The largest Hamiltonian, in proportion to its parts."""
-    y, p = np.split(nodes[:, :-1], 2, axis=1)
-    force = problem.force(y)
-    drift = np.sum(p * force, axis=1)
-    push = np.sum((p if problem.constant else products(problem.noise.at(y), p)) * p, axis=1)
-    scale = max((np.abs(drift) + push).max(), NO_ACTION * np.sum(force**2, axis=1).max())
-    return float(np.abs(drift + push).max() / scale)
-
-
-def extrapolated(problem: PathProblem, coarse: DiscretisedPath, fine: DiscretisedPath) -> np.ndarray:
-    """Nodes without the error of second order, from a chain and one with half its spacing.
-
-    Where the two differ by more than their errors, by a turn about the attractor say, they do not match, and
-    the finer one stands for itself.
+    It is made of second derivatives of the segments, ``(n - 1, d, d)`` each: by middles, by differences and
+    middles, and by differences. `ends` are added to the blocks of the first point and of the last.
     """
-    action = max((4 * fine.action - coarse.action) / 3, 0.0)
-    second = path_nodes(problem, fine)
-    nodes = (4 * second[::2] - path_nodes(problem, coarse)) / 3
-    if not hamiltonian_residual(problem, nodes) < hamiltonian_residual(problem, second):
-        nodes = second
-        nodes[:, -1] *= action / max(fine.action, np.finfo(float).tiny)
-    d, ends = problem.end.size, np.zeros((2, nodes.shape[1]))
-    if problem.finish is not None:
-        ends[1, :d] = problem.finish.closest(nodes[-1:, :d])[0]
-        nodes[-1, -1] = action - problem.remaining(nodes[-1, :d])
-        nodes = np.vstack([nodes, ends[1:]])
-    nodes[-1, -1] = action
-    if problem.begin is None:
-        return nodes
-    ends[0, :d] = problem.begin.closest(nodes[:1, :d])[0]
-    return np.vstack([ends[:1], nodes])
-
-
-MOST_BENDS = 6  # directions of bent first guesses: each costs as much as the path itself
-BEND = 0.4  # of the distance: how far bent first guesses leave the straight line
-APART = 0.03  # of the distance: minima further apart are two
+    count, _, m = normal.shape
+    transposed = mixed.transpose(0, 2, 1)
+    both = (mixed + transposed) / 2
+    diagonal = np.zeros((len(middle) + 1, *ends[0].shape))
+    diagonal[1:] += middle / 4 + forward + both
+    diagonal[:-1] += middle / 4 + forward - both
+    diagonal[0] += ends[0]
+    diagonal[-1] += ends[1]
+    # Row of the next point, column of this one.
+    below = middle / 4 - forward + (mixed - transposed) / 2
+    turned = normal.transpose(0, 2, 1)
+    diagonal = turned @ diagonal[start : start + count] @ normal
+    below = turned[1:] @ below[start : start + count - 1] @ normal[:-1]
+    matrix = np.zeros((2 * m, count * m))
+    for column in range(m):
+        for row in range(column, m):
+            matrix[row - column, column::m] = diagonal[:, row, column]
+        for row in range(m):
+            matrix[m + row - column, column::m][: count - 1] = below[:, row, column]
+    return matrix
 
 
 def first_chains(problem: PathProblem) -> tuple[list[np.ndarray], float]:
@@ -791,24 +660,8 @@ def first_chains(problem: PathProblem) -> tuple[list[np.ndarray], float]:
     chains += [line + BEND * side * np.sin(np.pi * share) * way for way in across for side in (1, -1)]
     if problem.hessian is None:
         return chains, 0.0
-    linear = np.vstack([spiral(problem, problem.end, START_SHARE), problem.end])
+    linear = np.vstack([spiral(problem, problem.end, START_LEVEL), problem.end])
     forward = np.diff(linear @ np.linalg.cholesky(problem.hessian), axis=0)
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
     turns = np.arccos(np.clip(np.sum(forward[1:] * forward[:-1], axis=1), -1, 1))
     return [linear, *chains], float(turns.sum())
-
-
-def rivals_of(chains: Sequence[DiscretisedPath], best: DiscretisedPath) -> list[DiscretisedPath]:
-    """The minima that lie apart from the first chain, from what has become of it, and from each other."""
-
-    def tree(chain: DiscretisedPath) -> cKDTree:
-        length = np.linalg.norm(np.diff(chain.points, axis=0), axis=1).sum()
-        return cKDTree(evenly(chain.points, int(5 * length / APART) + 2))
-
-    rivals: list[DiscretisedPath] = []
-    trees = [tree(chains[0]), tree(best)]
-    for chain in chains[1:]:
-        if chain.minimum and all(other.query(chain.points)[0].max() > APART for other in trees):
-            rivals.append(chain)
-            trees.append(tree(chain))
-    return rivals

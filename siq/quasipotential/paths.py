@@ -1,37 +1,27 @@
 """Minimum action paths between attractors, saddles and cycles.
 
-The action of a curve φ from A to B, whatever the time it takes, is
+The least action from an attractor A to a state B of its well is ``U(B) - U(A)``, U = 2V. Nothing is taken
+from the methods that find V: what is used is f with its derivatives. Where noise acts on every state a path
+is a chain of points (`siq.quasipotential.path_chains`); where it acts on some only, a solution of Hamilton's
+equations (`siq.quasipotential.hamiltonian_paths`).
 
-    S = ∫ (|f| |φ'| - f·φ') ds,    a·b = aᵀD⁻¹b,
-
-and its minimum is ``U(B) - U(A)``, U = 2V, if A is an attractor in whose well B lies. Nothing is taken from
-the methods that find V: what is used is f with its derivatives.
-
-The curve is a chain of points. Each segment has the action of a straight line with f of its middle, and the
-points are moved across the chain by Newton's method. It is damped with the action of a chain whose times are
-frozen at ``|Δφ|/|f|``, which is never below S: a large step for paths that wind about an attractor, where a
-gradient would be useless. About an attractor the chain begins on a small ellipsoid, on which V is ``½ y·My``.
-
-Where D has no inverse, as noise acts on some states only, a curve has no action that could be made minimal,
-and Hamilton's equations are solved instead (`siq.quasipotential.hamiltonian_paths`).
-
-References
-----------
-M. Heymann and E. Vanden-Eijnden, Comm. Pure Appl. Math. 61 (2008) 1052: the geometric action.
-
-A cycle is an attractor as a point is: a path may leave it at any phase. What parts two basins may be a
-saddle, or an unstable cycle, on which the path ends at any phase, too. From there f leads on.
+A cycle is an attractor as a point is: a path may leave it at any phase. The separatrix between two basins may
+hold a saddle, or an unstable cycle, on which the path ends at any phase, too. From there f leads on. First
+guesses of paths from or to cycles are trajectories of Hamilton's equations that start on all sides of a small
+tube, or of a small ellipsoid, with the momentum ``p = Hρ``, H being the curvature of V.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 from scipy.integrate import solve_ivp
+from scipy.spatial import cKDTree
 
 from siq.errors import NumericalFailure
+from siq.numerics.integration import dormand_prince_step, next_step
 from siq.quasipotential.hamiltonian_paths import hamiltonian_paths
 from siq.quasipotential.path_chains import (
     MOST_NODES,
@@ -40,84 +30,47 @@ from siq.quasipotential.path_chains import (
     PathProblem,
     descended,
     evenly,
-    extrapolated,
     first_chains,
-    first_guesses,
-    hamiltonian_residual,
-    rivals_of,
+    products,
     spaced,
 )
+from siq.quasipotential.path_chains import MinimumActionPath as MinimumActionPath
+from siq.quasipotential.path_chains import TransitionPath as TransitionPath
 from siq.systems.basins import ends_of
 from siq.systems.cycles import Cycle, hessians_along, unstable_direction
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import Equilibrium, measure_at
 from siq.systems.phase_portrait import PhasePortrait
 
-FOLLOWED = 4000  # points of a way down that Hamilton's equations are told, which may wind
+DESCENT_POINTS = 4000  # of a way down that Hamilton's equations are told, which may wind
 TURN = 0.15  # radian from one segment of the first chain to the next
-UNSTABLE_START = 1e-4  # of the distance: where the way down from a saddle starts
-ARRIVED = 1e-3  # of the distance: where it ends
-FAR = 20.0  # in distances: where it has missed the target
-AT_REST = ARRIVED**3  # speed, in units of the linearised equations: where it has ended elsewhere
-PRECISION = AT_REST / 10  # of a step: what jitters about a rest by more than its speed never comes to rest
-LONGEST_DESCENT = 1e5  # in units of the shortest time of the linearised equations
+SAME_PATH = 0.03  # of the distance: minima further apart are two
 
+# The way down from a saddle, in units of the distance to its end and of the linearised equations.
+UNSTABLE_START = 1e-4  # where it starts
+ARRIVAL = 1e-3  # where it ends
+MISSED = 20.0  # where it has missed the target
+REST_SPEED = ARRIVAL**3  # where it has ended elsewhere
+STEP_PRECISION = REST_SPEED / 10  # what jitters about a rest by more than its speed never comes to rest
+LONGEST_DESCENT = 1e5  # in units of the shortest time
 
-@dataclass(frozen=True)
-class MinimumActionPath:
-    """The path of least action between two states.
+# The way down about cycles, in units of the domain.
+SEPARATRIX_OFFSET = 1e-3  # from where f leads on, beside what parts two basins
+CYCLE_ARRIVAL = 1e-2  # so close to an attractor it is drawn
+LONGEST_PERIODS = 100.0  # in which it has to be there
+CYCLE_DESCENT_POINTS = 200
 
-    Attributes
-    ----------
-    points
-        Shape ``(n, d)``, in the states' units: from the start to the end, both included.
-    momenta
-        Shape ``(n, d)``: p there, which is ∇V where V is smooth; the path follows ``ẋ = f + 2Dp``.
-    values
-        Shape ``(n,)``: the action up to each point, that is U, not V, if the start is an attractor.
-    action
-        Of the whole path, extrapolated from the two finest chains: the barrier of U, if the end is a saddle.
-    error
-        Estimated error of the finest chain, from these two; that of `action` is mostly far smaller. Points,
-        momenta and values are extrapolated in the same way.
-    residual
-        Largest ``|p·f + p·Dp|`` along the path, as a share of the largest ``|p·f| + p·Dp``.
-    converged
-        Whether the chain is a minimum, and its error within the tolerance.
-    rivals
-        Actions of other minima that were found from other first guesses, by rising action and to about a
-        thousandth, as their chains are short. One with the same action is a mirror image, mostly.
-    """
-
-    points: np.ndarray
-    momenta: np.ndarray
-    values: np.ndarray
-    action: float
-    error: float
-    residual: float
-    converged: bool
-    rivals: tuple[float, ...] = ()
-
-
-@dataclass(frozen=True)
-class TransitionPath:
-    """The most probable way from one attractor to another: up to a saddle, and down without noise.
-
-    Attributes
-    ----------
-    uphill
-        From the attractor to the saddle.
-    downhill
-        Shape ``(n, d)``: the trajectory of f from the saddle to the other attractor, whose action is zero.
-    """
-
-    uphill: MinimumActionPath
-    downhill: np.ndarray
-
-    @property
-    def points(self) -> np.ndarray:
-        """All points, shape ``(m, d)``; the saddle stands there once."""
-        return np.vstack([self.uphill.points, self.downhill[1:]])
+# First guesses of paths from or to cycles, in units of the distance.
+GUESS_START = 3e-4  # from an attractor
+PHASES, SIDES = 48, 2  # of first guesses; sides for each state beyond the second
+GUESSES_PER_STATE = 96  # around a point, for each state beyond the first
+MOST_GUESS_STEPS = 4000
+GUESS_ACCURACY = 1e-6  # numerical: of one step
+LONGEST_GUESS_STEP = 0.03  # or of the size of the cycle
+GUESS_REACH = 6.0  # what is so far away does not come back
+GUESS_ARRIVAL, GUESS_PASSED = 0.05, 0.3  # so close to the end one has arrived, or has passed it by
+MOST_GUESSES = 2  # of either kind that are tried
+ACTION_DIFFERENCE = 0.02  # share of the action by which two of them differ
 
 
 def minimum_action_path(
@@ -169,7 +122,11 @@ def minimum_action_path(
             raise NumericalFailure("paths from and to cycles need noise on every state of its own")
         return _by_hamilton(dynamics, start, end, tolerance, initial or ())
     problem = PathProblem(dynamics, start, end)
-    own, turning = first_chains(problem) if problem.flat == 0 else _about_cycles(problem, start, end)
+    if problem.flat == 0:
+        own, turning = first_chains(problem)
+    else:
+        own = [problem.scaled(one) for one in _first_guesses(problem, start, end)]
+        turning = max((_turning(chain) for chain in own), default=0.0)
     guesses = own if initial is None else [problem.scaled(np.asarray(one, dtype=float)) for one in initial]
     count = min(max(nodes, int(turning / TURN)), MOST_NODES // 4)
     chains: list[DiscretisedPath] = []
@@ -193,10 +150,10 @@ def minimum_action_path(
             problem, coarse.points, 2 * len(coarse.points) - 1, coarse.action, first=not coarse.minimum
         )
         error = abs(fine.action - coarse.action) / 3
-        known = error <= max(tolerance * fine.action, NO_ACTION * problem.effort(fine.points))
-    line = extrapolated(problem, coarse, fine)
+        known = error <= max(tolerance * fine.action, NO_ACTION * problem.segments(fine.points).effort)
+    line = _extrapolated(problem, coarse, fine)
     # Rivals have the error of short chains, which they share with the first one.
-    shares = [one.action / max(chains[0].action, np.finfo(float).tiny) for one in rivals_of(chains, fine)]
+    shares = [one.action / max(chains[0].action, np.finfo(float).tiny) for one in _other_minima(chains, fine)]
     points, momenta = np.split(line[:, :-1], 2, axis=1)
     return MinimumActionPath(
         points=problem.unscaled(points),
@@ -204,32 +161,79 @@ def minimum_action_path(
         values=problem.unit * line[:, -1],
         action=problem.unit * float(line[-1, -1]),
         error=problem.unit * error,
-        residual=hamiltonian_residual(problem, line),
+        residual=_hamiltonian_residual(problem, line),
         converged=fine.minimum and known,
         rivals=tuple(float(problem.unit * line[-1, -1] * share) for share in shares),
     )
 
 
-def _about_cycles(
-    problem: PathProblem, start: np.ndarray | Cycle, end: np.ndarray | Cycle
-) -> tuple[list[np.ndarray], float]:
-    """First chains from or to a cycle, and by how many radian the one that turns most does."""
-    dynamics = problem.dynamics
-    if isinstance(start, Cycle):
-        hessians = hessians_along(dynamics, start)
-    elif problem.hessian is not None:
-        hessians = problem.inverse.T @ problem.hessian @ problem.inverse * problem.unit
-    else:
-        raise NumericalFailure("a path to a cycle has to begin at an attractor")
-    chains = [problem.scaled(one) for one in first_guesses(dynamics, start, end, hessians, problem.units)]
-    return chains, max((_turning(chain) for chain in chains), default=0.0)
+def _path_nodes(problem: PathProblem, chain: DiscretisedPath) -> np.ndarray:
+    """Points, momenta, and actions up to there, shape ``(n, 2d + 1)``."""
+    y, parts = chain.points, problem.segments(chain.points)
+    # Momenta of the middles, carried over half a segment with ṗ = -Jᵀp - p·(∂D)p; both sides agree at a
+    # minimum.
+    times = (parts.length / parts.speed)[:, None]
+    middle = products(parts.metric, (parts.forward / times - parts.force) / 2)
+    change = np.einsum("nij,ni->nj", problem.jacobian(parts.middles), middle)
+    if not problem.constant:
+        change += problem.noise.contract(parts.middles, middle, 1)
+    turn = times / 2 * change
+    p = np.empty_like(y)
+    p[1:-1] = (middle[1:] + turn[1:] + middle[:-1] - turn[:-1]) / 2
+    p[0] = middle[0] + turn[0] if problem.begin is None else problem.begin.slope(y[0]) / 2
+    p[-1] = middle[-1] - turn[-1] if problem.finish is None else -problem.finish.slope(y[-1]) / 2
+    values = problem.level(y[:1]) + np.r_[0.0, np.cumsum(parts.actions)]
+    return np.column_stack([y, p, values])
 
 
-def _turning(chain: np.ndarray) -> float:
-    """By how many radian a chain turns."""
-    forward = np.diff(evenly(chain, FOLLOWED), axis=0)
-    forward /= np.maximum(np.linalg.norm(forward, axis=1, keepdims=True), np.finfo(float).tiny)
-    return float(np.arccos(np.clip(np.sum(forward[1:] * forward[:-1], axis=1), -1, 1)).sum())
+def _hamiltonian_residual(problem: PathProblem, nodes: np.ndarray) -> float:
+    """The largest Hamiltonian, in proportion to its parts."""
+    y, p = np.split(nodes[:, :-1], 2, axis=1)
+    force = problem.force(y)
+    drift = np.sum(p * force, axis=1)
+    push = np.sum((p if problem.constant else products(problem.noise.at(y), p)) * p, axis=1)
+    scale = max((np.abs(drift) + push).max(), NO_ACTION * np.sum(force**2, axis=1).max())
+    return float(np.abs(drift + push).max() / scale)
+
+
+def _extrapolated(problem: PathProblem, coarse: DiscretisedPath, fine: DiscretisedPath) -> np.ndarray:
+    """Nodes without the error of second order, from a chain and one with half its spacing.
+
+    Where the two differ by more than their errors, by a turn about the attractor say, they do not match, and
+    the finer one stands for itself.
+    """
+    action = max((4 * fine.action - coarse.action) / 3, 0.0)
+    second = _path_nodes(problem, fine)
+    nodes = (4 * second[::2] - _path_nodes(problem, coarse)) / 3
+    if not _hamiltonian_residual(problem, nodes) < _hamiltonian_residual(problem, second):
+        nodes = second
+        nodes[:, -1] *= action / max(fine.action, np.finfo(float).tiny)
+    d, ends = problem.end.size, np.zeros((2, nodes.shape[1]))
+    if problem.finish is not None:
+        ends[1, :d] = problem.finish.closest(nodes[-1:, :d])[0]
+        nodes[-1, -1] = action - problem.remaining(nodes[-1, :d])
+        nodes = np.vstack([nodes, ends[1:]])
+    nodes[-1, -1] = action
+    if problem.begin is None:
+        return nodes
+    ends[0, :d] = problem.begin.closest(nodes[:1, :d])[0]
+    return np.vstack([ends[:1], nodes])
+
+
+def _other_minima(chains: Sequence[DiscretisedPath], best: DiscretisedPath) -> list[DiscretisedPath]:
+    """The minima that lie apart from the first chain, from what has become of it, and from each other."""
+
+    def tree(chain: DiscretisedPath) -> cKDTree:
+        length = np.linalg.norm(np.diff(chain.points, axis=0), axis=1).sum()
+        return cKDTree(evenly(chain.points, int(5 * length / SAME_PATH) + 2))
+
+    rivals: list[DiscretisedPath] = []
+    trees = [tree(chains[0]), tree(best)]
+    for chain in chains[1:]:
+        if chain.minimum and all(other.query(chain.points)[0].max() > SAME_PATH for other in trees):
+            rivals.append(chain)
+            trees.append(tree(chain))
+    return rivals
 
 
 def _by_hamilton(
@@ -237,20 +241,14 @@ def _by_hamilton(
 ) -> MinimumActionPath:
     """The path where noise acts on some states only."""
     try:
-        beside: np.ndarray | None = descent(dynamics, end, start, FOLLOWED)
+        beside: np.ndarray | None = descent(dynamics, end, start, DESCENT_POINTS)
     except NumericalFailure:  # the end is no saddle, or one from which f leads elsewhere
         beside = None
     found = hamiltonian_paths(dynamics, start, end, beside=beside, tolerance=tolerance, curves=curves)
     best = found[0]
-    known = best.error <= tolerance * best.values[-1]
-    return MinimumActionPath(
-        points=best.points,
-        momenta=best.momenta,
-        values=2 * best.values,
-        action=best.action,
-        error=2 * best.error,
-        residual=best.residual,
-        converged=best.smooth and known and best.action <= min(one.action for one in found),
+    return replace(
+        best,
+        converged=best.converged and best.action <= min(one.action for one in found),
         rivals=tuple(one.action for one in found[1:] if one.smooth),
     )
 
@@ -299,20 +297,20 @@ def descent(dynamics: Dynamics, saddle: np.ndarray, target: np.ndarray, nodes: i
         return problem.force(y[None])[0]
 
     def arrives(_: float, y: np.ndarray) -> float:
-        return float(np.linalg.norm(y - problem.end) - ARRIVED)
+        return float(np.linalg.norm(y - problem.end) - ARRIVAL)
 
     def leaves(_: float, y: np.ndarray) -> float:
-        return float(FAR - np.linalg.norm(y))
+        return float(MISSED - np.linalg.norm(y))
 
     def rests(_: float, y: np.ndarray) -> float:
-        return float(np.linalg.norm(problem.force(y[None])) - AT_REST)
+        return float(np.linalg.norm(problem.force(y[None])) - REST_SPEED)
 
     for event in (arrives, leaves, rests):
         event.terminal, event.direction = True, -1  # type: ignore[attr-defined]
     for side in (1, -1):
         begin = side * UNSTABLE_START * upwards / np.linalg.norm(upwards)
         way = solve_ivp(
-            rates, [0, LONGEST_DESCENT], begin, method="DOP853", rtol=PRECISION, atol=1e-12,
+            rates, [0, LONGEST_DESCENT], begin, method="DOP853", rtol=STEP_PRECISION, atol=1e-12,
             dense_output=True, events=[arrives, leaves, rests],
         )  # fmt: skip
         if len(way.t_events[0]):
@@ -323,15 +321,9 @@ def descent(dynamics: Dynamics, saddle: np.ndarray, target: np.ndarray, nodes: i
     raise NumericalFailure(f"f does not lead from the saddle {saddle.tolist()} to {target.tolist()}")
 
 
-BESIDE = 1e-3  # of the domain: from where f leads on, beside what parts two basins
-CYCLE_WAYS_ARRIVED = 1e-2  # of the domain: so close to an attractor a way down is drawn
-LONGEST = 100.0  # periods, in which it has to be there
-POINTS = 200  # of a way down
-
-
 def both_sides(dynamics: Dynamics, cycle: Cycle, portrait: PhasePortrait) -> np.ndarray:
     """Where f leads from both sides of an unstable cycle: numbers of attractors, -1 elsewhere."""
-    starts = _beside(dynamics, cycle, 0, portrait.box)
+    starts = _states_beside(dynamics, cycle, 0, portrait.box)
     return ends_of(dynamics, starts, portrait.attractors, portrait.cycles, box=portrait.box)
 
 
@@ -373,7 +365,7 @@ def way_about_cycles(
     return TransitionPath(uphill, _downhill(dynamics, over, uphill.points[-1], settled[end], portrait.box))
 
 
-def _beside(dynamics: Dynamics, over: Equilibrium | Cycle, place: int, box: np.ndarray) -> np.ndarray:
+def _states_beside(dynamics: Dynamics, over: Equilibrium | Cycle, place: int, box: np.ndarray) -> np.ndarray:
     """Two states on either side of a saddle, or of a point of an unstable cycle."""
     width = np.ptp(box, axis=1)
     if isinstance(over, Cycle):
@@ -381,7 +373,7 @@ def _beside(dynamics: Dynamics, over: Equilibrium | Cycle, place: int, box: np.n
     else:
         values, vectors = np.linalg.eig(dynamics.jacobian(over.position[None])[0])
         direction, position = vectors[:, np.argmax(values.real)].real, over.position
-    direction = BESIDE * direction / np.abs(direction / width).max()
+    direction = SEPARATRIX_OFFSET * direction / np.abs(direction / width).max()
     return np.stack([position + direction, position - direction])
 
 
@@ -407,15 +399,123 @@ def _downhill(
 
     def arrives(_: float, y: np.ndarray) -> float:
         if isinstance(target, Cycle):
-            return float(target.distances((y * width)[None], scale=width)[0] - CYCLE_WAYS_ARRIVED)
-        return float(np.linalg.norm(y - target / width) - CYCLE_WAYS_ARRIVED)
+            return float(target.distances((y * width)[None], scale=width)[0] - CYCLE_ARRIVAL)
+        return float(np.linalg.norm(y - target / width) - CYCLE_ARRIVAL)
 
     arrives.terminal = True  # type: ignore[attr-defined]
-    for start in _beside(dynamics, over, place, box):
+    for start in _states_beside(dynamics, over, place, box):
         way = solve_ivp(
-            rates, (0.0, LONGEST * period), start / width, rtol=1e-6, atol=1e-8, max_step=period / 40,
+            rates, (0.0, LONGEST_PERIODS * period), start / width, rtol=1e-6, atol=1e-8, max_step=period / 40,
             events=arrives,
         )  # fmt: skip
         if len(way.t_events[0]):
-            return evenly(np.vstack([begin[None], way.y.T * width]), POINTS)
+            return evenly(np.vstack([begin[None], way.y.T * width]), CYCLE_DESCENT_POINTS)
     raise NumericalFailure("f does not lead on to the attractor behind what parts the basins")
+
+
+def _turning(chain: np.ndarray) -> float:
+    """By how many radian a chain turns."""
+    forward = np.diff(evenly(chain, DESCENT_POINTS), axis=0)
+    forward /= np.maximum(np.linalg.norm(forward, axis=1, keepdims=True), np.finfo(float).tiny)
+    return float(np.arccos(np.clip(np.sum(forward[1:] * forward[:-1], axis=1), -1, 1)).sum())
+
+
+def _first_guesses(
+    problem: PathProblem, start: np.ndarray | Cycle, end: np.ndarray | Cycle
+) -> list[np.ndarray]:
+    """Curves from beside a start to an end, one of them a cycle, by rising action."""
+    if isinstance(start, Cycle):
+        hessians = hessians_along(problem.dynamics, start)
+    elif problem.hessian is not None:
+        hessians = problem.inverse.T @ problem.hessian @ problem.inverse * problem.unit
+    else:
+        raise NumericalFailure("a path to a cycle has to begin at an attractor")
+    unit = problem.units
+    inverse = np.linalg.inv(unit)
+    states, momenta = _states_around(start, hessians, unit)
+    ways, actions = _hamiltonian_trajectories(problem.dynamics, states, momenta, inverse)
+    target = cKDTree((end.points if isinstance(end, Cycle) else end[None]) @ inverse.T)
+    found = []
+    for way, action in zip(ways, actions, strict=True):
+        away = target.query(way @ inverse.T)[0]
+        close = max(GUESS_ARRIVAL, float(away.min()))
+        arrived = int(np.argmax(away <= close))
+        left = np.flatnonzero(away[arrived:] > 2 * close)
+        nearest = int(arrived + np.argmin(away[arrived : arrived + (left[0] if len(left) else len(away))]))
+        curve = way[: nearest + 1] if isinstance(end, Cycle) else np.vstack([way[: nearest + 1], end])
+        if nearest > 0:
+            found.append((float(away[nearest]), float(action[nearest]), curve))
+    found.sort(key=lambda one: one[1])
+    least = min((one[0] for one in found), default=np.inf)
+    chosen: list[tuple[float, float, np.ndarray]] = []
+    # A lower path may have passed the end by further than one that is not the lowest.
+    for close in (max(GUESS_ARRIVAL, least), max(GUESS_PASSED, least)):
+        new: list[tuple[float, float, np.ndarray]] = []
+        for one in found:
+            known = any(
+                abs(one[1] - other[1]) <= ACTION_DIFFERENCE * abs(other[1]) for other in (*chosen, *new)
+            )
+            if one[0] <= close and not known and len(new) < MOST_GUESSES:
+                new.append(one)
+        chosen += new
+    return [curve for _, _, curve in chosen]
+
+
+def _states_around(
+    start: np.ndarray | Cycle, hessians: np.ndarray, unit: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """States on all sides of a start, and the momenta there."""
+    d = len(unit)
+    draw = np.random.default_rng(0)
+    if isinstance(start, Cycle):
+        rows = np.linspace(0, len(start.points), PHASES, endpoint=False).astype(int)
+        # The axes of the curvature, of which the first one is along the flow, and directions between them.
+        across = np.linalg.eigh(unit.T @ hessians[rows] @ unit)[1].transpose(0, 2, 1)[:, 1:]
+        between = draw.standard_normal((SIDES * (d - 2), d - 1))
+        sides = np.concatenate([np.eye(d - 1), -np.eye(d - 1), between])
+        sides /= np.linalg.norm(sides, axis=1, keepdims=True)
+        offset = GUESS_START * np.einsum("sa,nai->nsi", sides, across) @ unit.T
+        momenta = np.einsum("nij,nsj->nsi", hessians[rows], offset)
+        states = start.points[rows][:, None] + offset
+        return states.reshape(-1, d), momenta.reshape(-1, d)
+    directions = draw.standard_normal((GUESSES_PER_STATE * (d - 1), d))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    offset = GUESS_START * directions @ unit.T
+    return start + offset, offset @ hessians
+
+
+def _hamiltonian_trajectories(
+    dynamics: Dynamics, states: np.ndarray, momenta: np.ndarray, inverse: np.ndarray
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Trajectories of Hamilton's equations, and the action along each."""
+    n, d = states.shape
+
+    def rates(z: np.ndarray) -> np.ndarray:
+        x, p = z[:, :d], z[:, d : 2 * d]
+        push = dynamics.diffusion.push(x, p)
+        falls = -np.einsum("nij,ni->nj", dynamics.jacobian(x), p) - dynamics.diffusion.contract(x, p, 1)
+        return np.column_stack([dynamics.drift(x) + 2 * push, falls, 2 * np.sum(p * push, axis=1)])
+
+    z = np.column_stack([states, momenta, np.zeros(n)])
+    first = states @ inverse.T
+    kept: list[np.ndarray] = [z.copy()]
+    alive = np.arange(n)
+    rate = np.linalg.norm(rates(z)[:, :d] @ inverse.T, axis=1).max()
+    longest = LONGEST_GUESS_STEP * max(1.0, float(np.linalg.norm(np.ptp(first, axis=0))))
+    steps = np.full(n, longest / rate)
+    for _ in range(MOST_GUESS_STEPS):
+        with np.errstate(all="ignore"):
+            speed = np.linalg.norm(rates(z[alive])[:, :d] @ inverse.T, axis=1)
+            step = np.minimum(steps[alive], longest / np.maximum(speed, 1e-300))
+            moved, error = dormand_prince_step(rates, z[alive], step)
+            relative = np.abs(error[:, :d] @ inverse.T).max(axis=1) / GUESS_ACCURACY
+        steps[alive] = next_step(step, relative)
+        taken = np.isfinite(moved).all(axis=1) & (relative <= 1)
+        z[alive[taken]] = moved[taken]
+        kept.append(z.copy())
+        away = np.linalg.norm(z[alive][:, :d] @ inverse.T - first[alive], axis=1)
+        alive = alive[away < GUESS_REACH]
+        if not len(alive):
+            break
+    ways = np.stack(kept, axis=1)
+    return list(ways[:, :, :d]), list(ways[:, :, -1])

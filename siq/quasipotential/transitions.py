@@ -2,8 +2,14 @@
 
 A barrier of U is what the formula of V says of the path of least action, from the attractor to where the
 formula is believed for the last time, and the action of the path from there to the saddle, where formulas
-are at their worst. The action of the whole path, which knows no formula, stands beside it. Where the terms of
-f are in doubt, the mean over rival terms moves the barrier (`siq.inference.selection`).
+are at their worst. The action of the whole path, which knows no formula, stands beside it.
+
+A change of f by coefficients c, and one of D, change the action by
+
+    ∂U/∂c = -2 ∫ p·∂f/∂c dt,    ∂U/∂D = -2 ∫ p·∂D p dt
+
+along the path, on which it is least. Where the terms of f are in doubt, the mean over alternative terms moves
+the barrier (`siq.inference.selection`).
 """
 
 from __future__ import annotations
@@ -25,8 +31,10 @@ from siq.quasipotential.paths import (
     transition_path,
     way_about_cycles,
 )
-from siq.quasipotential.rates import EscapeRate, Exit, PrefactorError, escape_rate, prefactor_error
+from siq.quasipotential.rates import EscapeRate, escape_rate, prefactor_error
 from siq.quasipotential.wells import Well
+from siq.remarks import Remark
+from siq.report.remarks import sentence
 from siq.systems.basins import leads_back, neighbours
 from siq.systems.cycles import Cycle
 from siq.systems.dynamics import Dynamics
@@ -35,11 +43,10 @@ from siq.systems.phase_portrait import PhasePortrait
 
 logger = logging.getLogger(__name__)
 
-WORTH_A_WORD = 0.5  # of its standard error, by which rival terms move a barrier (a choice)
-DIFFERENT = 0.02  # share of a barrier by which two ways to it may differ without a word
-FEW_STATES = 8  # up to which first guesses of a path bend to all sides
-GUESSED = 200  # points of one that is a way down taken backwards
-OUTWARDS = "behind the saddle f leads out of the region"
+NOTEWORTHY_CHANGE = 0.5  # of its standard error, by which alternative terms move a barrier (a choice)
+NOTEWORTHY_DIFFERENCE = 0.02  # share of a barrier by which formula and path may differ without a remark
+MOST_STATES_OF_BENT_GUESSES = 8  # up to which first guesses of a path bend to all sides
+GUESS_POINTS = 200  # of one that is a way down taken backwards
 PATH_TOLERANCE = 1e-5  # of the action; prefactors follow the end of the path and need more than barriers
 
 
@@ -47,8 +54,8 @@ PATH_TOLERANCE = 1e-5  # of the action; prefactors follow the end of the path an
 class Transition:
     """The way out of one well over one saddle.
 
-    Attributes
-    ----------
+    Main attributes
+    ---------------
     start, end
         Indices of the attractors; `end` is None where the saddle leads back, or out of the recorded region.
     saddle
@@ -57,34 +64,43 @@ class Transition:
         The path of least action and the way down, None where none was found.
     barrier
         ΔU by the formula and the end of the path; NaN where neither is known.
-    formula_share
-        Share of the barrier that the formula accounts for.
     standard_error
         Of the barrier, from the uncertainty of f.
+    rate
+        Law of the mean escape time at the action of the path, with the error of its prefactor; None where it
+        fails.
+    remarks
+        What is not known.
+
+    Other attributes
+    ----------------
+    formula_share
+        Share of the barrier that the formula accounts for.
     by_rivals
         What other terms of f that fit nearly as well have added to the barrier, in the mean.
-    rate
-        Law of the mean escape time, None where it fails.
-    notes
-        What is not known, in words.
-    prefactor_error
-        Of that law, from the uncertainty of f; None where not known.
     leverage
         Relative standard error of ΔU/ε from an estimated D over that of ε.
+    from_cycle
+        Whether the attractor is a cycle.
     """
 
     start: int
     end: int | None
     saddle: Equilibrium | Cycle
     path: TransitionPath | None
-    barrier: float
-    formula_share: float
-    standard_error: float
-    rate: EscapeRate | None
-    notes: tuple[str, ...] = ()
-    prefactor_error: PrefactorError | None = None
+    barrier: float = np.nan
+    formula_share: float = np.nan
+    standard_error: float = np.nan
+    rate: EscapeRate | None = None
+    remarks: tuple[Remark, ...] = ()
     leverage: float = 1.0
     by_rivals: float = 0.0
+    from_cycle: bool = False
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """The remarks as sentences."""
+        return tuple(map(sentence, self.remarks))
 
     @property
     def place(self) -> np.ndarray:
@@ -100,48 +116,16 @@ class Transition:
         return float(np.hypot(self.standard_error, self.barrier - self.by_rivals - self.path.uphill.action))
 
     @property
-    def exit(self) -> Exit:
-        """What the time of this way out follows from."""
-        known, rate = self.prefactor_error, self.rate
-        prefactor, turn = (None, None) if rate is None else (rate.prefactor, rate.turn)
-        if known is None:
-            return Exit(self.barrier, self.error, prefactor, leverage=self.leverage, turn=turn)
-        return Exit(
-            self.barrier, self.error, prefactor, known.standard_error, known.covariance, self.leverage, turn
+    def exit(self) -> EscapeRate:
+        """The law at the barrier, with all errors; without a prefactor where it fails."""
+        return replace(
+            self.rate or EscapeRate(self.barrier, np.nan),
+            barrier=self.barrier, standard_error=self.error, leverage=self.leverage,
         )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class WayOut:
-    """The path of least action out of one well over one saddle, before any formula.
-
-    Attributes
-    ----------
-    start, end, saddle
-        As of a `Transition`.
-    path
-        None where none was found.
-    note
-        Why not, in words.
-    from_cycle
-        Whether the attractor is a cycle.
-    """
-
-    start: int
-    end: int | None
-    saddle: Equilibrium | Cycle
-    path: TransitionPath | None
-    note: str = ""
-    from_cycle: bool = False
-
-    @property
-    def about_cycles(self) -> bool:
-        """Whether the path begins on a cycle, or leads over one."""
-        return self.from_cycle or isinstance(self.saddle, Cycle)
-
-
-def ways_out(dynamics: Dynamics, portrait: PhasePortrait, *, beyond_region: bool = False) -> list[WayOut]:
-    """Every way out of every well over the saddles next to it, from f alone.
+def ways_out(dynamics: Dynamics, portrait: PhasePortrait, *, beyond_region: bool = False) -> list[Transition]:
+    """Every way out of every well over the saddles next to it, from f alone: without barriers and rates.
 
     Parameters
     ----------
@@ -153,76 +137,64 @@ def ways_out(dynamics: Dynamics, portrait: PhasePortrait, *, beyond_region: bool
         Whether a saddle behind which lies no attractor of the region is a way out, too: of a given f the
         path up to it is as good as any other. Of an identified one nothing is known beyond.
     """
-    ways = _ways_over_cycles(dynamics, portrait)
-    points = len(portrait.attractors)
-    for index in range(points + len(portrait.cycles)):
-        for saddle in portrait.saddles[index]:
-            beyond = neighbours(
-                dynamics, saddle, portrait.attractors, box=portrait.box, cycles=portrait.cycles
-            ) - {index}
-            if not beyond and beyond_region:
-                ways += _way_beyond(dynamics, portrait, index, saddle)
+    ways: list[Transition] = []
+    nothing: tuple[Remark, ...] = ()
+    points, box, cycles = len(portrait.attractors), portrait.box, portrait.cycles
+    for cycle in portrait.parting:
+        sides = [int(one) for one in both_sides(dynamics, cycle, portrait)]
+        for start, beyond in (sides, sides[::-1]) if sides[0] != sides[1] else ():
+            if start < 0:
                 continue
-            if not beyond:
-                note = "behind the saddle lies no other attractor of the recorded region"
-                ways.append(WayOut(index, None, saddle, None, note))
-                continue
-            end = min(beyond)
+            end, remarks = None if beyond < 0 else beyond, nothing
+            if end is None:
+                remarks = (Remark("quasipotential.leads_out", {"over": "unstable cycle"}),)
             try:
-                if max(index, end) >= points:
-                    path = way_about_cycles(dynamics, portrait, index, saddle, end, tolerance=PATH_TOLERANCE)
-                    ways.append(WayOut(index, end, saddle, path))
-                    continue
-                attractor = portrait.attractors[index]
-                path = transition_path(
-                    dynamics, attractor.position, saddle.position, portrait.attractors[end].position,
-                    tolerance=PATH_TOLERANCE, initial=_first_guesses(dynamics, attractor, saddle),
-                )  # fmt: skip
-                ways.append(WayOut(index, end, saddle, path))
+                path = way_about_cycles(dynamics, portrait, start, cycle, end, tolerance=PATH_TOLERANCE)
+                ways.append(Transition(start, end, cycle, path, remarks=remarks))
             except NumericalFailure as error:
-                ways.append(WayOut(index, end, saddle, None, str(error)))
+                ways.append(_without_path(start, end, cycle, error))
+    settled: list[np.ndarray | Cycle] = [*(one.position for one in portrait.attractors), *cycles]
+    for index in range(points + len(cycles)):
+        for saddle in portrait.saddles[index]:
+            around = neighbours(dynamics, saddle, portrait.attractors, box=box, cycles=cycles)
+            end = min(around - {index}, default=None)
+            remarks = nothing
+            if end is None and not beyond_region:
+                remark = Remark("quasipotential.nothing_beyond_saddle")
+                ways.append(Transition(index, None, saddle, None, remarks=(remark,)))
+                continue
+            if end is None and leads_back(dynamics, saddle, portrait.attractors, box=box, cycles=cycles):
+                continue
+            try:
+                if end is None:
+                    uphill = minimum_action_path(
+                        dynamics, settled[index], saddle.position, tolerance=PATH_TOLERANCE
+                    )
+                    path = TransitionPath(uphill, saddle.position[None])
+                    remarks = (Remark("quasipotential.leads_out", {"over": "saddle"}),)
+                elif max(index, end) >= points:
+                    path = way_about_cycles(dynamics, portrait, index, saddle, end, tolerance=PATH_TOLERANCE)
+                else:
+                    attractor, guesses = portrait.attractors[index].position, None
+                    if dynamics.dimension > MOST_STATES_OF_BENT_GUESSES:
+                        # The way down taken backwards, and the straight line.
+                        down = descent(dynamics, saddle.position, attractor, GUESS_POINTS)
+                        guesses = [down[::-1], np.stack([attractor, saddle.position])]
+                    path = transition_path(
+                        dynamics, attractor, saddle.position, portrait.attractors[end].position,
+                        tolerance=PATH_TOLERANCE, initial=guesses,
+                    )  # fmt: skip
+                ways.append(Transition(index, end, saddle, path, remarks=remarks))
+            except NumericalFailure as error:
+                ways.append(_without_path(index, end, saddle, error))
     return [replace(way, from_cycle=way.start >= points) for way in ways]
 
 
-def _ways_over_cycles(dynamics: Dynamics, portrait: PhasePortrait) -> list[WayOut]:
-    """The ways over unstable cycles, from both sides of each."""
-    ways = []
-    for cycle in portrait.parting:
-        sides = [int(one) for one in both_sides(dynamics, cycle, portrait)]
-        if sides[0] == sides[1]:
-            continue
-        for start, beyond in (sides, sides[::-1]):
-            if start < 0:
-                continue
-            end, note = (None, OUTWARDS.replace("saddle", "unstable cycle")) if beyond < 0 else (beyond, "")
-            try:
-                path = way_about_cycles(dynamics, portrait, start, cycle, end, tolerance=PATH_TOLERANCE)
-                ways.append(WayOut(start, end, cycle, path, note))
-            except NumericalFailure as error:
-                ways.append(WayOut(start, end, cycle, None, str(error)))
-    return ways
-
-
-def _first_guesses(
-    dynamics: Dynamics, attractor: Equilibrium, saddle: Equilibrium
-) -> list[np.ndarray] | None:
-    """Of many states the way down taken backwards, and the straight line; of few None, for the usual ones."""
-    if dynamics.dimension <= FEW_STATES:
-        return None
-    down = descent(dynamics, saddle.position, attractor.position, GUESSED)
-    return [down[::-1], np.stack([attractor.position, saddle.position])]
-
-
-def _way_beyond(dynamics: Dynamics, portrait: PhasePortrait, index: int, saddle: Equilibrium) -> list[WayOut]:
-    """The way over a saddle from which f leads out of the region; none where it leads back on both sides."""
-    if leads_back(dynamics, saddle, portrait.attractors, box=portrait.box, cycles=portrait.cycles):
-        return []
-    settled: list[np.ndarray | Cycle] = [*(one.position for one in portrait.attractors), *portrait.cycles]
-    try:
-        uphill = minimum_action_path(dynamics, settled[index], saddle.position, tolerance=PATH_TOLERANCE)
-    except NumericalFailure as error:
-        return [WayOut(index, None, saddle, None, str(error))]
-    return [WayOut(index, None, saddle, TransitionPath(uphill, saddle.position[None]), OUTWARDS)]
+def _without_path(
+    start: int, end: int | None, saddle: Equilibrium | Cycle, error: NumericalFailure
+) -> Transition:
+    remark = Remark("quasipotential.no_path", {"reason": str(error)})
+    return Transition(start, end, saddle, None, remarks=(remark,))
 
 
 def missing_diffusion(dynamics: Dynamics) -> str | None:
@@ -242,9 +214,7 @@ def missing_diffusion(dynamics: Dynamics) -> str | None:
 
 
 def transitions(
-    found: AnyField,
-    ways: Sequence[WayOut],
-    wells: Sequence[Well | None],
+    found: AnyField, ways: Sequence[Transition], wells: Sequence[Well | None]
 ) -> list[Transition]:
     """Ways out with their barriers and escape times.
 
@@ -255,46 +225,51 @@ def transitions(
     ways
         See `ways_out`.
     wells
-        The formula about each attractor, None where there is none.
+        The formula about each attractor, cycles after points; None where there is none.
     """
-    return [_transition(found, way, wells[way.start]) for way in ways]
-
-
-def _transition(found: AnyField, way: WayOut, well: Well | None) -> Transition:
-    path = way.path
-    if path is None:
-        return Transition(way.start, way.end, way.saddle, None, np.nan, np.nan, np.nan, None, (way.note,))
-    notes = [way.note] if way.note else []
-    if not path.uphill.converged:
-        notes.append("the minimum action path is not converged")
-    rate, missing = None, missing_diffusion(found.dynamics)
-    of_prefactor: PrefactorError | None = None
-    try:
-        if way.about_cycles:
-            raise NumericalFailure("no law is implemented for ways that begin or end on a cycle")
-        if missing is not None:
-            raise NumericalFailure(missing)
-        rate = escape_rate(found.dynamics, path.uphill, beyond=way.end is not None)
-        notes += rate.notes
-        of_prefactor = prefactor_error(found, path.uphill)
-    except (NumericalFailure, np.linalg.LinAlgError) as error:
-        notes.append(f"no escape time: {error}")
-    barrier, share = path.uphill.action, 0.0
-    if well is not None:
-        barrier, share = barrier_by_formula(path, well)
-        if abs(barrier / path.uphill.action - 1) > DIFFERENT:
-            notes.append("the formula and the path alone give different barriers")
-        if isinstance(found, GivenField) and path.uphill.converged:  # nothing about f is to be averaged over
-            barrier, share = path.uphill.action, 0.0
-    logger.info("barrier of U from attractor %d: %.5g by formula, %.5g by the path", way.start, barrier,
-                path.uphill.action)  # fmt: skip
-    spread, by_rivals = barrier_uncertainty(path, found)
-    if abs(by_rivals) > WORTH_A_WORD * spread:
-        notes.append(f"{by_rivals:+.2g} of the barrier is due to other terms of f that fit nearly as well")
-    return Transition(
-        way.start, way.end, way.saddle, path, barrier + by_rivals, share, spread, rate,
-        tuple(dict.fromkeys(notes)), of_prefactor, noise_leverage(path.uphill, found.dynamics), by_rivals,
-    )  # fmt: skip
+    found_ways = []
+    missing = missing_diffusion(found.dynamics)
+    for way in ways:
+        path, well = way.path, wells[way.start]
+        if path is None:
+            found_ways.append(way)
+            continue
+        remarks, rate = list(way.remarks), None
+        if not path.uphill.converged:
+            remarks.append(Remark("quasipotential.path_not_converged"))
+        try:
+            if way.from_cycle or isinstance(way.saddle, Cycle):
+                raise NumericalFailure("no law is implemented for ways that begin or end on a cycle")
+            if missing is not None:
+                raise NumericalFailure(missing)
+            rate = escape_rate(found.dynamics, path.uphill, beyond=way.end is not None)
+            remarks += rate.remarks
+            error, covariance = prefactor_error(found, path.uphill)
+            rate = replace(rate, prefactor_error=error, covariance=covariance)
+        except (NumericalFailure, np.linalg.LinAlgError) as failure:
+            remarks.append(Remark("quasipotential.no_escape_time", {"reason": str(failure)}))
+        barrier, share = path.uphill.action, 0.0
+        if well is not None:
+            barrier, share = barrier_by_formula(path, well)
+            if abs(barrier / path.uphill.action - 1) > NOTEWORTHY_DIFFERENCE:
+                remarks.append(Remark("quasipotential.formula_differs_from_path"))
+            if isinstance(found, GivenField) and path.uphill.converged:  # nothing about f is to be averaged
+                barrier, share = path.uphill.action, 0.0
+        logger.info(
+            "barrier of U from attractor %d: %.5g by formula, %.5g by the path",
+            way.start, barrier, path.uphill.action,
+        )  # fmt: skip
+        spread, by_rivals = barrier_uncertainty(path, found)
+        if abs(by_rivals) > NOTEWORTHY_CHANGE * spread:
+            remarks.append(Remark("quasipotential.barrier_by_alternative_terms", {"change": by_rivals}))
+        found_ways.append(
+            replace(
+                way, barrier=barrier + by_rivals, formula_share=share, standard_error=spread, rate=rate,
+                remarks=tuple({str(one): one for one in remarks}.values()), by_rivals=by_rivals,
+                leverage=noise_leverage(path.uphill, found.dynamics),
+            )
+        )  # fmt: skip
+    return found_ways
 
 
 def barrier_by_formula(path: TransitionPath, well: Well) -> tuple[float, float]:
@@ -310,19 +285,14 @@ def barrier_by_formula(path: TransitionPath, well: Well) -> tuple[float, float]:
 
 
 def barrier_uncertainty(path: TransitionPath, found: AnyField) -> tuple[float, float]:
-    """Standard error of a barrier of U from that of f, to first order, and what the mean over rivals adds.
-
-    The action ``½∫∣ẋ - f∣² dt`` is minimal along the path, so that a change of f changes it by
-
-        ∂U/∂c = -2 ∫ p·∂f/∂c dt.
-    """
+    """Standard error of a barrier of U from that of f, to first order, and what alternative terms add."""
     if isinstance(found, GivenField):
         return 0.0, 0.0
-    middle, force, spent = _along(path.uphill, found.dynamics)
+    middle, force, spent = _pieces(path.uphill, found.dynamics)
     terms = found.library.evaluate(middle)
     slope = -2 * np.einsum("n,nq,nd->qd", spent, terms, force)
     variance, by_rivals = float(found.variance(slope, of_mean=True)), float(found.mean_change(slope))
-    if found.noise is not None:  # and by ∂U/∂D = -2 ∫ p·∂D p dt
+    if found.noise is not None:
         slope = -2 * (spent[:, None] * found.noise.push_slopes(middle, force)).sum(axis=0) / found.intensity
         variance += float(slope @ found.noise.covariance @ slope)
     return float(np.sqrt(max(variance, 0.0))), by_rivals
@@ -335,7 +305,7 @@ def noise_leverage(path: MinimumActionPath, dynamics: Dynamics) -> float:
     is estimated from n residuals of d states, and A = ∫ p pᵀ dt, that makes ``2 √(d tr (AD)²)/ΔU``: 1 where
     the path spends its action on all states alike, and √d where on one of them.
     """
-    middle, force, spent = _along(path, dynamics)
+    middle, force, spent = _pieces(path, dynamics)
     pushed = np.einsum("n,ni,nj->ij", spent, dynamics.diffusion.push(middle, force), force)
     total = float(np.trace(pushed))
     if not total > 0:
@@ -343,18 +313,16 @@ def noise_leverage(path: MinimumActionPath, dynamics: Dynamics) -> float:
     return float(np.sqrt(dynamics.dimension * max(np.trace(pushed @ pushed), 0.0)) / total)
 
 
-def _along(path: MinimumActionPath, dynamics: Dynamics) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _pieces(path: MinimumActionPath, dynamics: Dynamics) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """States, momenta and times of the pieces of a path."""
     middle = (path.points[1:] + path.points[:-1]) / 2
     force = (path.momenta[1:] + path.momenta[:-1]) / 2
-    flow, move = (
-        dynamics.drift(middle) + 2 * dynamics.diffusion.push(middle, force),
-        np.diff(path.points, axis=0),
-    )
+    flow = dynamics.drift(middle) + 2 * dynamics.diffusion.push(middle, force)
     measure = measure_at(dynamics, path.points[0])
-    speed, length = (np.sqrt(measure.squared_speed(middle, one)) for one in (flow, move))
-    spent = np.where(speed > 0, length / np.where(speed > 0, speed, 1.0), 0.0)
-    return middle, force, spent
+    speed, length = (
+        np.sqrt(measure.squared_speed(middle, one)) for one in (flow, np.diff(path.points, axis=0))
+    )
+    return middle, force, np.where(speed > 0, length / np.where(speed > 0, speed, 1.0), 0.0)
 
 
 def position_standard_errors(found: AnyField, position: np.ndarray) -> np.ndarray:

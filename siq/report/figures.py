@@ -26,9 +26,8 @@ from siq.networks.decomposition import TrainedNetworks
 from siq.networks.regression import RegressionOptions, highest_used, points_below
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.formulas import SymbolicDecomposition
-from siq.quasipotential.landscape import GlobalQuasipotential, LandscapeOptions
+from siq.quasipotential.landscape import GlobalQuasipotential, Landscape, LandscapeOptions
 from siq.quasipotential.landscape_comparison import Potential, ReferenceLandscape, overall_level
-from siq.quasipotential.landscape_files import StoredLandscape
 from siq.report.formatting import texts
 from siq.report.page import ReportFigure
 from siq.report.plots import (
@@ -245,7 +244,7 @@ def landscape_figures(
     *,
     degrees: pd.DataFrame,
     escape: pd.DataFrame,
-    landscape: StoredLandscape | None = None,
+    landscape: Landscape | None = None,
     reference: ReferenceLandscape | None = None,
     networks: TrainedNetworks | None = None,
     formulas: Mapping[str, SymbolicDecomposition] | None = None,
@@ -276,7 +275,7 @@ def landscape_figures(
     }
     if landscape is None or reference is None or reference.reason or reference.points.shape[1] > 2:
         return figures
-    names, x, potential = landscape.data["states"], reference.points, landscape.quasipotential
+    names, x, potential = landscape.dynamics.states, reference.points, landscape.global_quasipotential
     assert potential is not None  # U is known over all wells
     below = settings.landscape.compare_below or overall_level(reference)
     inside = np.nan_to_num(reference.values, nan=np.inf) < below
@@ -382,7 +381,7 @@ DRAWN_TABLES = ("coefficients", "rrmse", "training", "prediction", "record", "re
 
 
 def representative_run(
-    shown: Shown, models: ModelFiles, complete: tuple[int, StoredLandscape] | None
+    shown: Shown, models: ModelFiles, complete: tuple[int, Landscape] | None
 ) -> RepresentativeRun:
     """The refined formula, or else the landscape, or else the formula as published.
 
@@ -397,7 +396,7 @@ def representative_run(
     """
     run, landscape = shown.run, None
     if complete is not None:
-        run, landscape = complete[0], complete[1].quasipotential
+        run, landscape = complete[0], complete[1].global_quasipotential
     if run is None:
         return RepresentativeRun(0, None, None, None)
     formulas = models.formulas(run)

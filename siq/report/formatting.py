@@ -40,7 +40,7 @@ from siq.numerics.text import (
     unit_text,
     value_text,
 )
-from siq.quasipotential.rates import DWELL_TIMES_FEWEST, MeanTime
+from siq.quasipotential.rates import MIN_BARRIER_OVER_NOISE, MeanTime
 from siq.report.summary import LandscapeSummary, VisitSummary, WellSummary
 from siq.systems.formulas import CONSTANTS, FUNCTIONS, parse_formula
 
@@ -161,7 +161,7 @@ def environment() -> Environment:
         "place": position_text,
     }
     made.tests["finite"] = lambda value: bool(np.isfinite(value))
-    made.globals["law_from"] = DWELL_TIMES_FEWEST
+    made.globals["law_from"] = MIN_BARRIER_OVER_NOISE
     return made
 
 

@@ -18,7 +18,7 @@ import pandas as pd
 from siq.data.two_states import RecordStates
 from siq.numerics.text import MINUS, range_text, unit_text, value_text
 from siq.quasipotential.landscape import Landscape
-from siq.quasipotential.rates import NoiseStrength, exit_time
+from siq.quasipotential.rates import NoiseStrength, mean_exit_time
 from siq.report.formatting import counted_text, paragraphs, percent_text, predicted_text, texts, time_text
 from siq.report.summary import LandscapeSummary, VisitSummary, settled, summarise, well_name
 from siq.workflow.outcomes import Method
@@ -139,7 +139,7 @@ def exits_table(summary: LandscapeSummary) -> tuple[pd.DataFrame, pd.DataFrame]:
     rows, numbers = [], []
     for way in summary.ways:
         known = math.isfinite(way.barrier)
-        mean = None if summary.noise is None or not known else exit_time(way.law, summary.noise)
+        mean = None if summary.noise is None or not known else mean_exit_time(way.law, summary.noise)
         start, end = well_name(way.start), "" if way.end is None else well_name(way.end)
         place = _place(summary, way.saddle)
         if math.isfinite(way.period):

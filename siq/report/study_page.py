@@ -28,7 +28,7 @@ from siq.inference.identification import FieldRecord
 from siq.numerics.files import whole_file
 from siq.numerics.text import unit_text, value_text
 from siq.quasipotential.formulas import SymbolicDecomposition
-from siq.quasipotential.landscape import told_without_landscape
+from siq.quasipotential.landscape import sentences_without_landscape
 from siq.quasipotential.wells import Well
 from siq.report.figures import LEADING, figure_of, figures_of, shown_figures
 from siq.report.formatting import (
@@ -287,13 +287,13 @@ def _answer(results: StudyResults, *, certified: bool) -> list[str]:
     summary, outcomes = results.landscape, results.tables["outcomes"].fillna({"reason": ""})
     if results.system is not None and summary is None:
         reason = next((str(reason) for reason in outcomes["reason"] if reason), "there is no stable state")
-        return told_without_landscape(reason, None)
+        return sentences_without_landscape(reason, None)
     if results.system is None and (summary is None or not summary.wells):
         reason = why_no_landscape(
             Outcome(int(row["run"]), Step(row["step"]), Status(row["status"]), str(row["reason"]))
             for row in outcomes.to_dict("records")
         )
-        return told_without_landscape(reason, results.seen)
+        return sentences_without_landscape(reason, results.seen)
     assert summary is not None
     return answer_lines(summary, seen=results.seen, certified=certified)
 

@@ -22,9 +22,17 @@ from siq.data.recordings import Recordings
 from siq.numerics.text import place_text, squared
 from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.quasipotential.landscape import Landscape, least_over_wells
-from siq.quasipotential.landscape_files import StoredLandscape, exits_of, landscape_data
-from siq.quasipotential.rates import Exit, MeanTime, NoiseStrength, dwell_time
+from siq.quasipotential.landscape_files import landscape_data
+from siq.quasipotential.rates import (
+    EnergyLossPerCycle,
+    EscapeRate,
+    MeanTime,
+    NoiseStrength,
+    mean_residence_time,
+)
 from siq.quasipotential.wells import Well
+from siq.remarks import Remark
+from siq.report.remarks import sentence
 from siq.systems.cycles import Cycle
 from siq.systems.dynamics import Dynamics, symbol
 from siq.systems.formulas import compile_formulas
@@ -149,7 +157,7 @@ class WellSummary:
     depth_error: float
     beyond: str | None
     known_up_to: float
-    exits: tuple[Exit, ...]
+    exits: tuple[EscapeRate, ...]
     leverage: float = 1.0
     visits: VisitSummary | None = None
     cycle: Cycle | None = None
@@ -161,7 +169,7 @@ class WellSummary:
 
     def time(self, noise: NoiseStrength | None) -> MeanTime | None:
         """The mean residence time under some noise, None where it is not known."""
-        return dwell_time(self.exits, noise)
+        return mean_residence_time(self.exits, noise)
 
     def relative_depth(self, noise: NoiseStrength | None) -> tuple[float, float]:
         """ΔU/ε with its standard error, NaN where no noise is known."""
@@ -192,6 +200,8 @@ class ExitSummary:
         That of the path alone, None where there is no path.
     remarks
         What has to be known of it.
+    no_time_reason
+        Why there is no law of its mean time; empty where there is one.
     period
         Of the unstable cycle that takes the place of the saddle, NaN of a saddle.
     """
@@ -203,9 +213,10 @@ class ExitSummary:
     standard_error: float
     uphill: np.ndarray
     downhill: np.ndarray
-    law: Exit
+    law: EscapeRate
     minimum_action: float | None = None
     remarks: tuple[str, ...] = ()
+    no_time_reason: str = ""
     period: float = math.nan
 
 
@@ -286,13 +297,12 @@ class LandscapeSummary:
     @property
     def has_times(self) -> bool:
         """Whether some exit has a law of its mean time."""
-        return any(way.law.prefactor is not None for way in self.ways)
+        return any(math.isfinite(way.law.prefactor) for way in self.ways)
 
     @property
     def no_time_reason(self) -> str:
         """Why an exit has no law of its mean time, as far as that is known."""
-        without = [way.remarks for way in self.ways if way.law.prefactor is None and way.remarks]
-        return without[0][-1].split(": ", 1)[-1] if without else ""
+        return next((way.no_time_reason for way in self.ways if way.no_time_reason), "")
 
     @property
     def cycles(self) -> tuple[np.ndarray, ...]:
@@ -421,7 +431,7 @@ def chosen_states(landscape: LandscapeSummary, states: Sequence[str] | None) -> 
 
 
 def summarise(
-    landscape: Landscape | StoredLandscape | Mapping[str, Any] | None,
+    landscape: Landscape | Mapping[str, Any] | None,
     recordings: Recordings | np.ndarray | None = None,
     *,
     dynamics: Dynamics | None = None,
@@ -433,11 +443,9 @@ def summarise(
     Parameters
     ----------
     landscape
-        The landscape, what `siq.quasipotential.landscape_files.read_landscape` read, or the content of the
-        file alone, without formulas; None where recordings led to none.
+        The landscape, or the content of its file alone, without formulas; None where recordings led to none.
     recordings
-        Recorded states, or an array ``(n, d)`` of them; by default those that a landscape in memory was
-        fitted to.
+        Recorded states, or an array ``(n, d)`` of them; by default those that a landscape was fitted to.
     dynamics
         f and D, of a landscape from a file.
     formula
@@ -453,9 +461,7 @@ def summarise(
         if points is None:
             fitted = [well.points for well in wells if well is not None]
             points = np.concatenate([np.zeros((0, dynamics.dimension)), *fitted])
-        data: Mapping[str, Any] = landscape_data(landscape, dynamics=dynamics)
-    elif isinstance(landscape, StoredLandscape):
-        data, wells = landscape.data, landscape.wells
+        data: Mapping[str, Any] = landscape_data(landscape)
     elif landscape is None:
         assert isinstance(recordings, Recordings)  # which have names and units
         data = {"states": recordings.names, "units": [unit or "1" for unit in recordings.units]}
@@ -514,7 +520,7 @@ def summarise(
         noise=None if noise is None else NoiseStrength(**noise),
         given=bool(data.get("given")),
         run=int(data.get("run", 0)),
-        remarks=tuple(data.get("notes", ())),
+        remarks=_sentences(data.get("remarks", ())),
         unstable_cycles=tuple(_cycle(one) for one in data.get("parting", ())),
         formulas=tuple(wells),
         points=points,
@@ -574,8 +580,6 @@ def _well(
 
 
 def _ways(data: Mapping[str, Any], dimension: int) -> tuple[ExitSummary, ...]:
-    laws = {index: iter(exits_of(data, index)) for index in range(len(data["wells"]))}
-
     def path(points: Any) -> np.ndarray:
         return np.reshape(np.array(points or [], dtype=float), (-1, dimension))
 
@@ -588,9 +592,22 @@ def _ways(data: Mapping[str, Any], dimension: int) -> tuple[ExitSummary, ...]:
             standard_error=_number(one.get("error", one["standard_error"])),
             uphill=path(one.get("uphill")),
             downhill=path(one.get("downhill")),
-            law=next(laws[one["start"]]),
+            law=EscapeRate(
+                _number(one["barrier"]),
+                _number(one["prefactor"]),
+                turn=EnergyLossPerCycle(**one["turn"]) if one.get("turn") else None,
+                standard_error=_number(one.get("error", one["standard_error"])),
+                prefactor_error=one.get("prefactor_error"),
+                covariance=one.get("prefactor_covariance", 0.0),
+                leverage=one.get("noise_leverage", 1.0),
+            ),
             minimum_action=one["minimum_action"],
-            remarks=tuple(one["notes"]),
+            remarks=_sentences(one["remarks"]),
+            no_time_reason="".join(
+                each["values"]["reason"]
+                for each in one["remarks"]
+                if each["code"] == "quasipotential.no_escape_time"
+            ),
             period=_number(one.get("over_cycle")),
         )
         for one in data["transitions"]
@@ -607,6 +624,10 @@ def settled(position: Any, errors: Any, size: np.ndarray) -> tuple[np.ndarray, n
 def _cycle(data: Mapping[str, Any]) -> Cycle:
     multipliers = np.array([complex(*value) for value in data["multipliers"]])
     return Cycle(np.array(data["points"], dtype=float), float(data["period"]), multipliers)
+
+
+def _sentences(remarks: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
+    return tuple(sentence(Remark.from_data(one)) for one in remarks)
 
 
 def _closed(cycle: Cycle) -> np.ndarray:

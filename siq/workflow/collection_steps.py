@@ -195,9 +195,10 @@ def run_overview(settings: LandscapeSettings, given: RunToShow) -> dict[str, Any
     )  # fmt: skip
     if found.landscape is None or found.record is None or not found.landscape.attractors:
         return None
-    data = landscape_data(found.landscape, dynamics=found.record.found.dynamics)
+    data = landscape_data(found.landscape)
     # No formula about a single well was sought, so that none is missed.
-    data["notes"] = [note for note in data["notes"] if "refinement found no formula" not in note]
+    missed = "quasipotential.no_refined_formula"
+    data["remarks"] = [one for one in data["remarks"] if one["code"] != missed]
     return {"run": given.number} | data
 
 

@@ -24,33 +24,32 @@ from siq.networks.decomposition import TrainedNetworks
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.quasipotential.landscape import Landscape, LandscapeOptions, NoLandscape
+from siq.quasipotential.landscape_assembly import EquationSettings, landscape_from_equations
 from siq.quasipotential.landscape_comparison import (
     ErrorInRegion,
     Potential,
     ReferenceLandscape,
-    check_same_noise,
     compare_estimate,
-    compare_overall,
-    compare_wells,
-    difference_rows,
+    compare_landscape,
+    compare_mesh,
+    compare_with_mesh,
     differences,
     no_reference,
     overall_level,
     reference_landscape,
-    relative_l2,
 )
-from siq.quasipotential.landscape_files import StoredLandscape, landscape_data, read_landscape
+from siq.quasipotential.landscape_files import landscape_from_data, read_landscape
+from siq.quasipotential.transitions import Transition
 from siq.systems.dynamics import Dynamics
 from siq.systems.phase_portrait import evenly_spread, phase_portrait
 from siq.validation.escapes import Neighbourhood, neighbourhood, simulate_escapes
 from siq.validation.mesh import mesh_potential
-from siq.workflow.equations_step import EquationSettings, landscape_of_equations
 from siq.workflow.published import PublishedFigure, published_potentials
 from siq.workflow.settings import STRICT, StateSpace
 from siq.workflow.tables import as_table, concatenate
 
 
-def read_stored(field: str | Path, landscape: str | Path) -> StoredLandscape | None:
+def read_stored(field: str | Path, landscape: str | Path) -> Landscape | None:
     """The landscape of a run, None where there is none."""
     record = read_field(field)
     if record is None:
@@ -60,11 +59,11 @@ def read_stored(field: str | Path, landscape: str | Path) -> StoredLandscape | N
 
 def first_stored(
     fields: Sequence[str | Path], landscapes: Sequence[str | Path]
-) -> tuple[int, StoredLandscape] | None:
+) -> tuple[int, Landscape] | None:
     """The first run with a U over all wells; those after it are not read."""
     for run, (field, landscape) in enumerate(zip(fields, landscapes, strict=True)):
         stored = read_stored(field, landscape)
-        if stored is not None and stored.quasipotential is not None:
+        if stored is not None and stored.global_quasipotential is not None:
             return run, stored
     return None
 
@@ -99,7 +98,6 @@ def run(settings: ReferenceSettings, system: Dynamics) -> ReferenceLandscape:
 
 
 DRAWS = 100  # of the digits that a published formula does not print
-SAME = 0.02  # of the region: attractors of a run so close to the reference's are the same
 NONE_OF_OURS = -1  # the run of what was published, or of a mesh
 TABLE = "landscape_errors"
 
@@ -118,7 +116,7 @@ class RunToCompare:
     """What a run says of U: its landscape, its formulas by method, its networks, as far as there are any."""
 
     number: int
-    landscape: StoredLandscape | None
+    landscape: Landscape | None
     formulas: Mapping[str, SymbolicDecomposition]
     networks: TrainedNetworks | None
 
@@ -144,7 +142,8 @@ def run_landscape_errors(
     tables = []
     for one in runs:
         if one.landscape is not None:
-            tables.append(_of_landscape(one.number, reference, one.landscape, below))
+            compared = compare_landscape(reference, one.landscape, below=below)
+            tables.append(_rows(one.number, "local formulas", compared))
         for method, formulas in one.formulas.items():
             if formulas.potential is not None:
                 compared = compare_estimate(reference, _of_formula(formulas), below=below)
@@ -153,7 +152,7 @@ def run_landscape_errors(
             compared = compare_estimate(reference, _of_networks(one.networks), below=below)
             tables.append(_rows(one.number, "networks", compared))
     if np.isfinite(reference.mesh).any():
-        tables.append(_of_mesh(reference, below))
+        tables.append(_rows(NONE_OF_OURS, "mesh", compare_mesh(reference, below=below)))
     if published is not None:
         tables += _of_published(settings, published, reference)
     return concatenate(TABLE, tables)
@@ -161,44 +160,6 @@ def run_landscape_errors(
 
 def _rows(number: int, source: str, comparisons: Sequence[ErrorInRegion]) -> pd.DataFrame:
     return as_table(TABLE, [{"run": number, "source": source} | asdict(one) for one in comparisons])
-
-
-def _matching(reference: ReferenceLandscape, stored: StoredLandscape) -> dict[int, int]:
-    """For each attractor of the reference, the well of the run that has it."""
-    width = np.ptp(reference.points, axis=0)
-    pairs = {}
-    for place, well in enumerate(stored.data["wells"]):
-        distance = np.abs((reference.attractors - np.array(well["attractor"])) / width).max(axis=1)
-        if distance.min() < SAME:
-            pairs[int(np.argmin(distance))] = place
-    return pairs
-
-
-def _of_landscape(
-    number: int, reference: ReferenceLandscape, stored: StoredLandscape, below: float | None
-) -> pd.DataFrame:
-    """Local formulas, their minimum over all wells, and their barriers."""
-    pairs = _matching(reference, stored)
-    local = {index: one for index, place in pairs.items() if (one := stored.wells[place]) is not None}
-    comparisons = compare_wells(reference, local)
-    if stored.quasipotential is not None:
-        comparisons.append(compare_overall(reference, stored.quasipotential(reference.points), below=below))
-    for index, place in pairs.items():
-        ways = [way for way in stored.data["transitions"] if way["start"] == place and way["barrier"]]
-        lowest = min((way["barrier"] for way in ways), default=float("nan"))
-        error = abs(lowest / reference.barriers[index] - 1)
-        comparisons.append(ErrorInRegion(f"barrier from A{index + 1}", 1, float(np.isfinite(error)), error))
-    return _rows(number, "local formulas", comparisons)
-
-
-def _of_mesh(reference: ReferenceLandscape, below: float | None) -> pd.DataFrame:
-    """The reference's own mesh against its characteristics, and its barriers against the least action."""
-    whole = compare_overall(reference, reference.mesh_values, below=below)
-    errors = np.abs(reference.mesh_barriers / reference.barriers - 1)
-    barriers = [
-        ErrorInRegion(f"barrier from A{index + 1}", 1, 1.0, float(one)) for index, one in enumerate(errors)
-    ]
-    return _rows(NONE_OF_OURS, "mesh", [whole, *barriers])
 
 
 def _of_formula(one: SymbolicDecomposition) -> Potential:
@@ -209,15 +170,6 @@ def _of_formula(one: SymbolicDecomposition) -> Potential:
 def _of_networks(one: TrainedNetworks) -> Potential:
     """U of networks as a function of points in rows."""
     return lambda x: 2 * one.evaluate(x).potential
-
-
-def _of_two(values: np.ndarray, mesh: np.ndarray, level: float) -> ErrorInRegion:
-    """An estimate of U against a mesh that is known up to a constant, below a level above its minimum."""
-    exact = mesh - np.nanmin(mesh)
-    inside = np.nan_to_num(exact, nan=np.inf) < level
-    own, exact = values[inside], exact[inside]
-    error = relative_l2(own - np.median(own - exact), exact)
-    return ErrorInRegion(f"U < {level:.4g}", int(inside.sum()), 1.0, error)
 
 
 def _of_published(
@@ -240,7 +192,7 @@ def _of_published(
         if formulas:  # the paper's own comparison, in its Appendix E
             level = overall_level(reference) if below is None else below
             values = formulas[0](reference.points)
-            both = [_of_two(values, published.mesh(reference.points), level)]
+            both = [compare_with_mesh(values, published.mesh(reference.points), below=level)]
             tables.append(_rows(NONE_OF_OURS, "published formula, against the published mesh", both))
     return tables
 
@@ -272,43 +224,38 @@ def run_escapes(
     landscapes
         `quasipotential.json` of every run, None where there is none.
     """
-    complete = [
-        one
-        for one in landscapes
-        if one is not None and all(well["height"] is not None for well in one["wells"])
-    ]
+    read = (None if one is None else landscape_from_data(one, system) for one in landscapes)
+    complete = next((one for one in read if one is not None and np.isfinite(one.heights).all()), None)
+    if complete is None:
+        return as_table("escape", [])
     rows = []
-    for way in complete[0]["transitions"] if complete else []:
-        if way["prefactor"] is None or way["barrier"] is None or way["end"] is None:
+    for way in complete.transitions:
+        if way.rate is None or not np.isfinite(way.barrier) or way.end is None:
             continue
         for number, intensity in enumerate(settings.landscape.noise_intensities):
-            draw = generator(settings.seed, Purpose.ESCAPE, str(way["start"]), str(number))
-            row = _simulated(system, complete[0], way, intensity, draw)
-            name = f"A{way['start'] + 1} to A{way['end'] + 1}"
+            draw = generator(settings.seed, Purpose.ESCAPE, str(way.start), str(number))
+            row = _simulated(system, complete, way, intensity, draw)
+            name = f"A{way.start + 1} to A{way.end + 1}"
             rows.append({"transition": name, "intensity": intensity} | row)
     return as_table("escape", rows)
 
 
 def _simulated(
-    system: Dynamics,
-    landscape: Mapping[str, Any],
-    way: Mapping[str, Any],
-    intensity: float,
-    draw: np.random.Generator,
+    system: Dynamics, landscape: Landscape, way: Transition, intensity: float, draw: np.random.Generator
 ) -> dict[str, object]:
     """The simulated mean time of one way out, at one intensity."""
-    starts = [np.array(well["attractor"]) for well in landscape["wells"]]
+    assert way.rate is not None and way.rate.prefactor is not None
+    starts = [one.position for one in landscape.attractors]
     targets: list[Neighbourhood] = []
     for index, position in enumerate(starts):
-        barriers = [
-            one["barrier"] for one in landscape["transitions"] if one["start"] == index and one["barrier"]
-        ]
-        if index != way["start"] and barriers:
+        barriers = [one.barrier for one in landscape.transitions if one.start == index]
+        barriers = [one for one in barriers if np.isfinite(one) and one]
+        if index != way.start and barriers:
             targets.append(neighbourhood(system, position, level=NEIGHBOURHOOD * min(barriers) / 2))
-    predicted = way["prefactor"] * np.exp(way["barrier"] / intensity)
+    predicted = way.rate.prefactor * np.exp(way.barrier / intensity)
     try:
         found = simulate_escapes(
-            system, starts[way["start"]], targets, intensity=intensity,
+            system, starts[way.start], targets, intensity=intensity,
             longest=FOLLOWED * predicted, generator=draw, walkers=WALKERS,
         )  # fmt: skip
     except (NumericalFailure, ValueError) as error:
@@ -329,30 +276,6 @@ class BesideEquationsSettings:
 
     seed: int
     landscape: LandscapeOptions
-
-
-def compared(equations: Landscape, learned: Landscape, *, noise: float | None = None) -> pd.DataFrame:
-    """What `siq.quasipotential.landscape.Landscape.beside` says.
-
-    Parameters
-    ----------
-    equations, learned
-        The landscapes by either.
-    noise
-        ε of mean times; None for none.
-
-    Raises
-    ------
-    ValueError
-        When the states are not the same, or D is not.
-    """
-    both = (landscape_data(one, dynamics=one.dynamics) for one in (equations, learned))
-    found = differences(*both, box=equations.dynamics.box, noises=() if noise is None else (noise,))
-    places = np.array([one.position for one in (*equations.attractors, *equations.equilibria)])
-    check_same_noise(equations.dynamics, learned.dynamics, places, found=learned.found)
-    return as_table(BESIDE_EQUATIONS_TABLE, [{"run": 0} | row for row in difference_rows(found)]).drop(
-        columns="run"
-    )
 
 
 def run_beside_equations(
@@ -376,24 +299,24 @@ def run_beside_equations(
     """
     try:
         # Barriers and prefactors follow from paths of least action; formulas have references of their own.
-        found = landscape_of_equations(system, EquationSettings(seed=settings.seed), formulas=False)
+        found = landscape_from_equations(system, EquationSettings(seed=settings.seed), formulas=False)
     except (NumericalFailure, np.linalg.LinAlgError) as error:
         reason = error.reason if isinstance(error, NoLandscape) else str(error)
         return as_table(
             BESIDE_EQUATIONS_TABLE, [{"run": NO_RUN, "note": f"the equations have no landscape: {reason}"}]
         )
-    equations = landscape_data(found, dynamics=system)
     rows: list[dict[str, object]] = []
-    for number, one in enumerate(runs):
-        if one is None:
+    for number, data in enumerate(runs):
+        if data is None:
             rows.append({"run": number, "note": "the run has no landscape"})
             continue
-        shown = one.get("noise")
-        noises = settings.landscape.noise_intensities or (() if shown is None else (shown["intensity"],))
         try:
-            compared = differences(equations, one, box=system.box, noises=noises)
+            one = landscape_from_data(data, system)
+            shown = () if one.noise is None else (one.noise.intensity,)
+            noises = settings.landscape.noise_intensities or shown
+            compared = differences(found, one, noises=noises)
         except ValueError as error:
             rows.append({"run": number, "note": str(error)})
             continue
-        rows += [{"run": number} | row for row in difference_rows(compared)]
+        rows += [{"run": number} | row for row in compared]
     return as_table(BESIDE_EQUATIONS_TABLE, rows)

@@ -32,7 +32,7 @@ from siq.quasipotential.invariant_density import (
     total_variation,
     walk,
 )
-from siq.quasipotential.landscape_files import StoredLandscape
+from siq.quasipotential.landscape import Landscape
 from siq.systems.dynamics import Dynamics
 from siq.systems.simulation import simulate_stationary
 from siq.workflow.published import PublishedFigure, published_formula
@@ -80,7 +80,7 @@ class LandscapeShown:
     """The formulas of all wells of a run."""
 
     run: int
-    landscape: StoredLandscape
+    landscape: Landscape
 
 
 Shown = FormulaShown | LandscapeShown
@@ -192,7 +192,7 @@ def _of_landscape(
     seed: int,
 ) -> _Rows:
     """From the formulas of all wells, where these are believed."""
-    stored, potential = shown.landscape, shown.landscape.quasipotential
+    stored, potential = shown.landscape, shown.landscape.global_quasipotential
     assert potential is not None
     identified, count = potential.wells[0].dynamics, len(potential.wells)
     try:
@@ -202,6 +202,7 @@ def _of_landscape(
         logger.warning("%s", error)
         return _Rows([], [], [])
     lowest = lowest_possible(coarse, identified)
+    laws = [(way.start, way.end, way.barrier, way.exit.prefactor) for way in stored.transitions]
     rows, densities, shares = [], [], []
     for intensity in intensities:
         try:
@@ -233,7 +234,7 @@ def _of_landscape(
         )
         rows += _of_published(published, system, samples, intensity)
         simulated = simulated_shares(fine, start, samples)
-        by_rates = shares_by_rates(stored.data["transitions"], count, intensity=intensity)
+        by_rates = shares_by_rates(laws, count, intensity=intensity)
         shares += [
             {
                 "run": shown.run,

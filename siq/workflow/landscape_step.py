@@ -22,9 +22,10 @@ from siq.quasipotential.landscape import Landscape, LandscapeOptions
 from siq.quasipotential.landscape_assembly import find_landscape
 from siq.quasipotential.landscape_files import write_landscape
 from siq.quasipotential.occupancy import VisitTest
-from siq.quasipotential.rates import MeanTime, NoiseStrength, dwell_time, exit_time
+from siq.quasipotential.rates import MeanTime, NoiseStrength, mean_exit_time, mean_residence_time
 from siq.quasipotential.refinement import RefinementOptions
 from siq.quasipotential.wells import Well, best_trial
+from siq.remarks import Remark
 from siq.systems.cycles import Cycle
 from siq.systems.phase_portrait import evenly_spread, phase_portrait
 from siq.workflow.outcomes import Method, Outcome, Status, Step, write_outcomes
@@ -64,7 +65,7 @@ def landscape_rows(run: int, found: Landscape, remark: str | None = None) -> pd.
                 "U": tops.get(place(one.position), np.nan) if index is None else found.heights[index],
                 "basin": np.nan if index is None else found.basins[index],
             }
-            | ({} if index is None else _time(found, dwell_time(found.exits(index), found.noise)))
+            | ({} if index is None else _time(found, mean_residence_time(found.exits(index), found.noise)))
         )
     rows += [_cycle_row(run, found, one, names, tops) for one in (*found.cycles, *found.parting)]
     for way in found.transitions:
@@ -84,7 +85,7 @@ def landscape_rows(run: int, found: Landscape, remark: str | None = None) -> pd.
                 "barrier_over_noise": np.nan if noise is None else way.barrier / noise.intensity,
                 "note": "; ".join([*way.notes, *([] if remark is None else [remark])]),
             }
-            | _time(found, None if noise is None else exit_time(way.exit, noise))
+            | _time(found, None if noise is None else mean_exit_time(way.exit, noise))
         )
     return as_table("landscape", rows)
 
@@ -184,12 +185,13 @@ def run(
         )  # fmt: skip
     except (NumericalFailure, np.linalg.LinAlgError) as error:
         return FoundLandscape(None, record, Outcome(number, Step.LANDSCAPE, Status.FAILED, str(error)))
-    whole = found.over_wells is not None and not found.notes
+    whole = found.global_quasipotential is not None and not found.notes
     status = Status.OK if whole else Status.WARNING
     outcome = Outcome(number, Step.LANDSCAPE, status, "; ".join(found.notes))
     note = record.diffusion_source.note
     if note is not None:
-        found = replace(found, notes=(*found.notes, note))
+        remark = Remark("quasipotential.reason", {"reason": note})
+        found = replace(found, remarks=(*found.remarks, remark))
     # The attractors of both steps are those of one f: where they differ in number, indices mean nothing.
     if visits and max(one.well for one in visits) < len(found.attractors):
         found = replace(found, visits=visits)
@@ -234,7 +236,7 @@ def write(
     if found.landscape is None or found.record is None:
         Path(quasipotential).touch()
     else:
-        write_landscape(quasipotential, found.landscape, dynamics=found.record.found.dynamics)
+        write_landscape(quasipotential, found.landscape)
         rows, accuracy = (
             landscape_rows(number, found.landscape, found.record.diffusion_source.note),
             degree_rows(number, found.landscape),

@@ -8,22 +8,25 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass as plain_dataclass
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, TypeVar
 
+import pandas as pd
 from pydantic.dataclasses import dataclass
 
-from siq.data.recordings import Recordings
-from siq.data.selection import in_stretches
+from siq.data.inspection import seen_states
+from siq.data.recordings import Recordings, recordings_of
+from siq.data.selection import in_stretches, joined
 from siq.data.two_states import without_slow_drift
 from siq.inference.identification import IdentificationOptions
 from siq.networks.decomposition import TrainingOptions
 from siq.networks.regression import RegressionOptions
 from siq.quasipotential.certificate_tests import CertificateOptions, PredictionLimits
-from siq.quasipotential.landscape import LandscapeOptions
+from siq.quasipotential.landscape import Landscape, LandscapeOptions, NoLandscape
 from siq.quasipotential.refinement import RefinementOptions
 from siq.systems.dynamics import Dynamics
 from siq.workflow import identification_step, landscape_step, refinement_step, regression_step, training_step
-from siq.workflow.outcomes import Outcome
+from siq.workflow.outcomes import Outcome, why_no_landscape
 from siq.workflow.settings import STRICT, Sampling, StateSpace
 from siq.workflow.training_step import TrainedRun, not_trained
 
@@ -165,3 +168,23 @@ def analyse(
             visits=() if refined.record is None else refined.record.visits,
         )  # fmt: skip
     return Analysis(identified, trained, regressed, refined, found)
+
+
+def landscape_from_recordings(
+    recordings: str | Path | Recordings | pd.DataFrame,
+    settings: PipelineSettings | None = None,
+    *,
+    hidden_velocities: bool = False,
+) -> Landscape:
+    """The landscape that recordings show; see `siq.Landscape.from_recordings`."""
+    settings, trajectories = settings or PipelineSettings(), recordings_of(recordings)
+    if hidden_velocities:
+        settings = replace(settings, identification=replace(settings.identification, hidden_velocities=True))
+    analysis = analyse(trajectories, settings)
+    found = None if analysis.landscape is None else analysis.landscape.landscape
+    certified = found is not None and found.certificate is not None and found.certificate.certified
+    whole = certified and found is not None and len(found.attractors) > 1
+    seen = None if whole else seen_states(joined(trajectories))
+    if found is None:
+        raise NoLandscape(why_no_landscape(analysis.outcomes), seen, analysis.dynamics)
+    return replace(found, recorded_states=seen)

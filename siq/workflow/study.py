@@ -12,7 +12,6 @@ from decimal import Decimal
 from pathlib import Path
 from typing import Annotated, Literal
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from siq.data.columns import read_heading, usable_name
@@ -25,12 +24,12 @@ from siq.networks.regression import RegressionOptions
 from siq.numerics.files import read_document, validate
 from siq.quasipotential.certificate_tests import CertificateOptions
 from siq.quasipotential.landscape import LandscapeOptions
+from siq.quasipotential.landscape_assembly import fault_for_landscape
 from siq.quasipotential.refinement import RefinementOptions
 from siq.systems.cards import DiffusionEntry, Name, Number, SystemCard, build_system, read_diffusion
 from siq.systems.dynamics import Dynamics, symbol
-from siq.systems.equilibria import unreached_states
 from siq.systems.formulas import FormulaError
-from siq.systems.simulation import SimulationEntry, complete, fault_over_domain
+from siq.systems.simulation import SimulationEntry, complete
 
 MOST_POINTS = 10_000  # values of one parameter, or of two together: a slip of the step would ask for more
 
@@ -399,43 +398,6 @@ def _with_landscape(path: Path, *, directly: bool) -> Dynamics:
         keys, what, remedy = fault
         raise InputError(document.file, document.place(keys), what, remedy)
     return system
-
-
-def fault_for_landscape(system: Dynamics, *, directly: bool) -> tuple[tuple[str, ...], str, str] | None:
-    """Why no landscape of a system can be worked out: the place in its card, the fault and the remedy.
-
-    Parameters
-    ----------
-    system
-        As its card says.
-    directly
-        Whether noise has to act on every state, as trajectories ask for, or may reach it by way of others.
-    """
-    if not system.autonomous:
-        key, what = ("inputs", "inputs") if system.inputs else ("equations", "time")
-        remedy = f"leave the {what} out, or use the card in a study of mismatch"
-        return (key,), "a driven system has no quasipotential", remedy
-    for name, limits in zip(system.states, system.limits, strict=True):
-        if np.isnan(limits).any():
-            what = f"the state '{name}' has no domain, in which a simulation could begin"
-            return ("states", name), what, "add 'domain: [lower, upper]' to it"
-    if directly and not system.diffusion.regular:
-        what = "the noise does not reach every state directly, as it has to where f comes from trajectories"
-        remedy = (
-            "give a positive definite matrix, or ask for the landscape of these equations: 'from: equations'"
-        )
-        return ("diffusion",), what, remedy
-    if still := unreached_states(system):
-        what = f"the noise does not reach {' and '.join(still)}, neither directly nor by way of other states"
-        return (
-            ("diffusion",),
-            what,
-            f"let it act on {still[0]} or on a state in its equation, or leave it out",
-        )
-    if (found := fault_over_domain(system)) is not None:
-        remedy = "choose a domain in which it has a value"
-        return ("equations", found[0]), f"the equation {found[1]}", remedy
-    return None
 
 
 def check_states(study: Study, states: Sequence[str], *, file: str) -> None:

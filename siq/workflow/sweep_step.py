@@ -1,8 +1,8 @@
 """The step that follows landscapes along control parameters.
 
-Equilibria, paths of least action and escape times by `siq.workflow.equations_step`, without formulas of U. A
-point knows of no noise and of no other point, so that a change of the range, or of the noise, leaves those
-that there are.
+Equilibria, paths of least action and escape times by `siq.quasipotential.landscape_assembly`, without
+formulas of U. A point knows of no noise and of no other point, so that a change of the range, or of the
+noise, leaves those that there are.
 
 Those on one stable stretch of a branch of equilibria that does not turn back. A stretch ends at a fold, at a
 Hopf point, and where branches meet.
@@ -38,7 +38,12 @@ from siq.numerics.files import read_document, validate, whole_file
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.invariant_density import shares_by_rates
 from siq.quasipotential.landscape import LandscapeOptions, NoLandscape
-from siq.quasipotential.rates import Exit, NoiseStrength, dwell_time
+from siq.quasipotential.landscape_assembly import (
+    EquationSettings,
+    landscape_from_equations,
+    usable_system,
+)
+from siq.quasipotential.rates import EscapeRate, NoiseStrength, mean_residence_time
 from siq.quasipotential.transitions import Transition
 from siq.systems.cards import ParameterEntry, SystemCard, build_system, load_system
 from siq.systems.continuation import (
@@ -54,7 +59,6 @@ from siq.systems.continuation import (
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import all_equilibria
 from siq.systems.phase_portrait import MOST_SEARCHED, UNSETTLED
-from siq.workflow.equations_step import EquationSettings, landscape_of_equations, usable_system
 from siq.workflow.settings import STRICT
 from siq.workflow.study import SweepOptions
 from siq.workflow.tables import as_table, write_table
@@ -87,9 +91,10 @@ class SweptWay:
     prefactor: float | None
     note: str = ""
 
-    def as_exit(self) -> Exit:
+    def as_exit(self) -> EscapeRate:
         """What its time follows from."""
-        return Exit(np.nan if self.barrier is None else self.barrier, 0.0, self.prefactor)
+        barrier, prefactor = (np.nan if one is None else one for one in (self.barrier, self.prefactor))
+        return EscapeRate(barrier, prefactor)
 
 
 @pydantic_dataclass(frozen=True, config=PLAIN)
@@ -174,7 +179,7 @@ def point_at(
     except InputError as error:
         return SweptPoint(values, (), reason=f"{error.fault}; {error.remedy}")
     try:
-        found = landscape_of_equations(system, EquationSettings(seed=settings.seed), formulas=False)
+        found = landscape_from_equations(system, EquationSettings(seed=settings.seed), formulas=False)
     except (NumericalFailure, np.linalg.LinAlgError) as error:
         reason = error.reason if isinstance(error, NoLandscape) else str(error)
         return SweptPoint(values, _resting(system, settings), reason=reason)
@@ -464,10 +469,7 @@ def _weights(point: SweptPoint, noise: float | None) -> np.ndarray:
         return np.full(count, np.nan)
     if count == 1:
         return np.ones(1)
-    listed = [
-        {"start": way.start, "end": way.end, "barrier": way.barrier, "prefactor": way.prefactor}
-        for way in between
-    ]
+    listed = [(way.start, way.end, way.barrier, way.prefactor) for way in between]
     return shares_by_rates(listed, count, intensity=noise)
 
 
@@ -482,7 +484,9 @@ def _exits(point: SweptPoint, index: int, number: Sequence[int], noise: float | 
         return {"note": ALONE if alone else told or "; ".join(point.notes) or UNKNOWN}
     lowest = min(known, key=lambda way: np.inf if way.barrier is None else way.barrier)
     notes = [way.note for way in mine if way.note]
-    time = dwell_time([way.as_exit() for way in mine], None if noise is None else NoiseStrength(noise))
+    time = mean_residence_time(
+        [way.as_exit() for way in mine], None if noise is None else NoiseStrength(noise)
+    )
     if noise is not None and time is None:
         notes.append(f"no time: the noise {noise:g} is not below the barrier, or the law has no prefactor")
     if time is not None and not time.complete:

@@ -30,7 +30,7 @@ import pandas as pd
 from scipy.integrate import cumulative_simpson
 from scipy.interpolate import PchipInterpolator
 
-from siq.quasipotential.rates import DWELL_TIMES_FEWEST
+from siq.quasipotential.rates import MIN_BARRIER_OVER_NOISE
 from siq.workflow.sweep_step import ALONE, Sweep
 
 WITHIN = 32  # steps of the integral between two times: Simpson's error falls as their fourth power
@@ -109,13 +109,13 @@ def probability_of_tipping(
     )
     error = np.where(unknown | ended, np.inf, wrong / np.where(integral > 0, integral, np.inf))
     integral = np.where(ended, np.inf, integral)
-    valid = error < 1 / DWELL_TIMES_FEWEST
+    valid = error < 1 / MIN_BARRIER_OVER_NOISE
     reasons = [
         (ended, "the well has ended"),
         (unknown & ~ended, "the sweep knows no rate of this well here, or knew none before"),
         (
             ~valid & (law > drift),
-            f"it was left where its barrier is below {DWELL_TIMES_FEWEST:g} times the noise",
+            f"it was left where its barrier is below {MIN_BARRIER_OVER_NOISE:g} times the noise",
         ),
         (~valid & (drift >= law), "the parameter changes faster than the well relaxes"),
     ]

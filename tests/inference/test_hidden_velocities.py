@@ -23,7 +23,7 @@ from siq.inference.library import candidate_library
 from siq.inference.noisy_sensor import of_all_states
 from siq.inference.observation import smoothed_motion, unbroken, velocity_names
 from siq.quasipotential.landscape import Landscape
-from siq.quasipotential.rates import covariance_axes
+from siq.quasipotential.rates import _covariance_axes
 from siq.quasipotential.transitions import barrier_uncertainty, ways_out
 from siq.systems.phase_portrait import evenly_spread, phase_portrait
 from siq.workflow import identification_step, recordings_step
@@ -209,7 +209,7 @@ def test_ring_downs_of_positions_in_different_units_show_no_unit_matrix(
 
 
 def test_what_is_known_exactly_has_no_axis() -> None:
-    axes = covariance_axes(np.diag([0.0, 4.0, 0.0, 9.0]), np.random.default_rng(0))
+    axes = _covariance_axes(np.diag([0.0, 4.0, 0.0, 9.0]), np.random.default_rng(0))
     np.testing.assert_allclose(sum(np.outer(one, one) for one in axes), np.diag([0.0, 4.0, 0.0, 9.0]))
     assert len(axes) == 2
 

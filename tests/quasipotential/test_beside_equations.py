@@ -9,32 +9,31 @@ import sympy
 
 from siq.data.recordings import Recordings
 from siq.quasipotential.landscape import Landscape, LandscapeOptions
-from siq.quasipotential.landscape_comparison import (
-    CYCLE,
-    FURTHER,
-    MISSED,
-    check_same_noise,
-    difference_rows,
-    differences,
-)
+from siq.quasipotential.landscape_assembly import EquationSettings, landscape_from_equations
+from siq.quasipotential.landscape_comparison import check_same_noise, differences
 from siq.quasipotential.landscape_files import landscape_data
+from siq.remarks import Remark
 from siq.report.landscape import comparison_table
+from siq.report.remarks import sentence
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.workflow import comparison_steps
 from siq.workflow.comparison_steps import BesideEquationsSettings
-from siq.workflow.equations_step import EquationSettings, landscape_of_equations
 from siq.workflow.tables import COLUMNS
 
 X, Y = sympy.symbols("x y", real=True)
 NOISE = 0.05
+MISSED, FURTHER, CYCLE = (
+    sentence(Remark(f"quasipotential.{code}"))
+    for code in ("not_shown_by_trajectories", "not_of_the_equations", "limit_cycle_not_compared")
+)
 
 
 def paths_of(formulas: tuple[sympy.Expr, ...], domain: list[tuple[float, float]]) -> Landscape:
     """The landscape of equations without formulas of U."""
     states = (X, Y)[: len(formulas)]
     system = Dynamics.of(states, formulas, domain=domain)
-    return landscape_of_equations(system, EquationSettings(), formulas=False)
+    return landscape_from_equations(system, EquationSettings(), formulas=False)
 
 
 def wells(height: float = 1.0, *, low: float = -2.0) -> Landscape:
@@ -43,7 +42,7 @@ def wells(height: float = 1.0, *, low: float = -2.0) -> Landscape:
 
 
 def test_the_differences_are_those_of_the_formulas():
-    table = wells(1.1).beside(wells(), noise=NOISE).set_index(["item", "quantity"])
+    table = wells(1.1).compare_with(wells(), noise=NOISE).set_index(["item", "quantity"])
     for way in ("A1 to A2", "A2 to A1"):
         assert table.loc[(way, "barrier"), "equations"] == pytest.approx(0.5, rel=1e-6)
         assert table.loc[(way, "barrier"), "relative_difference"] == pytest.approx(1.21 - 1, rel=1e-5)
@@ -55,9 +54,9 @@ def test_the_differences_are_those_of_the_formulas():
 
 def test_what_trajectories_do_not_show_is_missed_and_what_they_show_beside_is_told():
     both, one = wells(), wells(low=0.5)
-    missed = one.beside(both).set_index("item")
+    missed = one.compare_with(both).set_index("item")
     assert list(missed[missed["note"] == MISSED].index) == ["A1 to A2", "A2 to A1", "A1"]
-    further = both.beside(one)
+    further = both.beside(one)  # the name that it had
     assert set(further.loc[further["note"] == FURTHER, "item"]) == {
         "A1 to a further state",
         "a further state to A1",
@@ -67,12 +66,12 @@ def test_what_trajectories_do_not_show_is_missed_and_what_they_show_beside_is_to
 
 def test_an_attractor_next_to_the_saddle_of_the_equations_is_none_of_theirs():
     near = wells(0.01)  # at ±0.1, with the saddle of the equations between them
-    assert (near.beside(wells())["note"] != "").all()
+    assert (near.compare_with(wells())["note"] != "").all()
 
 
 def test_landscapes_of_different_states_are_refused():
     with pytest.raises(ValueError, match="different states"):
-        wells().beside(paths_of((X - X**3, -Y), [(-2, 2), (-1, 1)]))
+        wells().compare_with(paths_of((X - X**3, -Y), [(-2, 2), (-1, 1)]))
 
 
 @pytest.mark.parametrize(
@@ -84,10 +83,10 @@ def test_landscapes_of_different_states_are_refused():
 )
 def test_landscapes_of_different_noise_are_refused(diffusion: object, shown: str) -> None:
     system = Dynamics.of((X,), (X - X**3,), diffusion=diffusion, domain=[(-2, 2)])  # type: ignore[arg-type]
-    other = landscape_of_equations(system, EquationSettings(), formulas=False)
+    other = landscape_from_equations(system, EquationSettings(), formulas=False)
     with pytest.raises(ValueError, match=shown):
-        other.beside(wells())
-    assert (other.beside(other)["relative_difference"] == 0).all()
+        other.compare_with(wells())
+    assert (other.compare_with(other)["relative_difference"] == 0).all()
 
 
 def test_noise_in_two_states_is_compared_in_its_own_unit() -> None:
@@ -103,9 +102,7 @@ def test_noise_in_two_states_is_compared_in_its_own_unit() -> None:
 def test_a_limit_cycle_is_named_and_not_compared():
     radius = X**2 + Y**2
     cycle = paths_of((X * (1 - radius) - Y, Y * (1 - radius) + X), [(-1.6, 1.6)] * 2)
-    (told,) = difference_rows(
-        differences(*[landscape_data(cycle, dynamics=cycle.dynamics)] * 2, box=cycle.dynamics.box)
-    )
+    (told,) = differences(cycle, cycle)
     assert told["note"] == CYCLE and told["item"] == "A1"
 
 
@@ -114,14 +111,14 @@ def test_what_was_learned_is_within_its_errors_and_what_it_states_is_taken():
     starts = draw.uniform(-1.5, 1.5, (60, 1))
     x = starts / np.sqrt(starts**2 + (1 - starts**2) * np.exp(-2 * t))  # ẋ = x - x³
     learned = Landscape.from_recordings(Recordings.from_arrays(t, x[:, :, None], names=["x"]))
-    barriers = learned.beside(wells()).query("quantity == 'barrier'")
+    barriers = learned.compare_with(wells()).query("quantity == 'barrier'")
     assert (barriers["relative_difference"].abs() < 1e-3).all() and len(barriers) == 2
 
 
 def test_the_step_names_the_run_and_says_why_there_is_nothing_to_compare():
     settings = BesideEquationsSettings(seed=0, landscape=LandscapeOptions(noise_intensities=(NOISE,)))
     found = wells()
-    data = landscape_data(wells(1.1), dynamics=found.dynamics)
+    data = landscape_data(wells(1.1))
     table = comparison_steps.run_beside_equations(settings, found.dynamics, [data, None, data])
     assert list(table.columns) == list(COLUMNS["beside_equations"])
     assert list(table.groupby("run").size()) == [6, 1, 6]
@@ -134,8 +131,8 @@ def test_the_step_names_the_run_and_says_why_there_is_nothing_to_compare():
 def test_the_page_says_the_largest_difference():
     settings = BesideEquationsSettings(seed=0, landscape=LandscapeOptions(noise_intensities=(NOISE,)))
     found = wells()
-    near = landscape_data(wells(1.01), dynamics=found.dynamics)
-    far = landscape_data(wells(1.1), dynamics=found.dynamics)
+    near = landscape_data(wells(1.01))
+    far = landscape_data(wells(1.1))
     several = comparison_steps.run_beside_equations(settings, found.dynamics, [near, far])
     shown = comparison_table(several)
     assert len(shown) == 6 and shown["largest difference"].iloc[0] == "21 %"

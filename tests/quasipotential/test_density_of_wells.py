@@ -256,7 +256,7 @@ def test_without_a_step_bias_the_variance_of_a_turning_system_is_that_of_its_noi
 
 
 def way(start: int, end: int | None, barrier: float | None, prefactor: float | None) -> dict[str, object]:
-    return {"start": start, "end": end, "barrier": barrier, "prefactor": prefactor}
+    return start, end, barrier, prefactor
 
 
 def test_shares_by_rates_are_those_of_the_jumps() -> None:
@@ -270,7 +270,7 @@ def test_shares_by_rates_are_those_of_the_jumps() -> None:
     ]
     rates = np.zeros((3, 3))
     for one in three:
-        rates[one["start"], one["end"]] = np.exp(-one["barrier"] / 0.2) / one["prefactor"]
+        rates[one[:2]] = np.exp(-one[2] / 0.2) / one[3]
     np.testing.assert_allclose(shares_by_rates(three, 3, intensity=0.2), stationary(rates), rtol=1e-12)
     assert np.isnan(shares_by_rates([*ways[:1], way(1, 0, 0.3, None)], 2, intensity=0.1)).all()
     assert np.isnan(shares_by_rates(ways[:1], 2, intensity=0.1)).all()

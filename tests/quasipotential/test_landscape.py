@@ -28,6 +28,7 @@ from siq.quasipotential.landscape_assembly import find_landscape
 from siq.quasipotential.landscape_files import read_landscape, write_landscape
 from siq.quasipotential.refinement import RefinementOptions, _refined_decomposition, refine
 from siq.quasipotential.wells import WellOptions
+from siq.remarks import Remark, has_code
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 
@@ -42,6 +43,10 @@ def double() -> Landscape:
     )  # fmt: skip
 
 
+def said(reason: str) -> Remark:
+    return Remark("quasipotential.reason", {"reason": reason})
+
+
 def test_the_wells_of_both_files_are_the_same(tmp_path: Path) -> None:
     known = maier_stein(3)
     found, points = exact_field(known, 3), uniform_points(known, 300)
@@ -53,7 +58,7 @@ def test_the_wells_of_both_files_are_the_same(tmp_path: Path) -> None:
     write_model(model, model_to_data({"refined": _refined_decomposition(refined, points)}, {}))
     # Another portrait, from other recorded states, as the landscape's own.
     landscape = find_landscape(found, portrait_of(known, 350), wells=read_model(model)[0]["refined"].wells)
-    write_landscape(tmp_path / "quasipotential.json", landscape, dynamics=found.dynamics)
+    write_landscape(tmp_path / "quasipotential.json", landscape)
     stored = read_landscape(tmp_path / "quasipotential.json", dynamics=found.dynamics)
     assert stored is not None and len(landscape.wells) == 2 and not landscape.notes
     for ours, theirs in zip(refined.wells, stored.wells, strict=True):
@@ -69,7 +74,8 @@ def test_an_attractor_without_a_refined_well_is_said() -> None:
     known = maier_stein(1)
     landscape = find_landscape(exact_field(known, 3), portrait_of(known, 250, share=0.8), wells=())
     assert landscape.wells == (None, None)
-    assert any("refinement found no formula" in note for note in landscape.notes)
+    assert has_code(landscape.remarks, "quasipotential.no_refined_formula")
+    assert landscape.notes[0].startswith("refinement found no formula about [")
     assert all(np.isfinite(way.barrier) for way in landscape.transitions)  # by the path alone
 
 
@@ -119,7 +125,7 @@ def test_no_escape_times_without_d_of_a_system_of_second_order() -> None:
 
 
 def test_a_well_that_was_not_found_is_asked_for_in_vain() -> None:
-    nothing = replace(double(), wells=(None, double().wells[1]), notes=("too few states",))
+    nothing = replace(double(), wells=(None, double().wells[1]), remarks=(said("too few states"),))
     with pytest.raises(NumericalFailure, match="about attractor 0: too few states"):
         nothing.potential()
     assert np.isnan(nothing.quasipotential(np.zeros((3, 2)))).all()
@@ -140,11 +146,11 @@ def test_the_formula_of_a_well_can_be_taken_elsewhere() -> None:
 
 def test_the_report_has_verdict_attractors_and_barriers() -> None:
     certificate = Certificate({"characteristics": Verdict(0.0, 0.01, True)}, 0.01, "")
-    text = replace(double(), certificate=certificate, notes=("a limit cycle <x>",)).report()
+    text = replace(double(), certificate=certificate, remarks=(said("a limit cycle <x>"),)).report()
     assert "The formulas are certified: U is right to within 1 % of its height." in text
     assert repr(double()) == "<Landscape of (x, y): 2 attractors, 2 ways out>"
     assert "a limit cycle <x>" in text and "Ways out, and their barriers of U:" in text and "A  B" in text
-    page = replace(double(), notes=("a limit cycle <x>",))._repr_html_()
+    page = replace(double(), remarks=(said("a limit cycle <x>"),))._repr_html_()
     assert "No test was made" in page and "&lt;x&gt;" in page and page.count("<table") == 2
 
 

@@ -160,7 +160,7 @@ def test_characteristics_are_the_reference_of_one_state() -> None:
 
 def test_the_density_of_one_state_is_exact_from_either_formula() -> None:
     known, landscape, noise = three_roots(), from_recordings(), 0.2
-    potential = landscape.over_wells
+    potential = landscape.global_quasipotential
     assert potential is not None
     fine, coarse = (sample_potential(potential, known.domain, cells=cells) for cells in (4000, 2000))
     density = known_density(fine, coarse, lowest_possible(coarse, known.dynamics), intensity=noise)

@@ -10,11 +10,11 @@ from known_systems import KnownSystem, exact_field
 from siq.inference.field_estimate import IdentifiedField
 from siq.quasipotential.paths import MinimumActionPath, minimum_action_path
 from siq.quasipotential.rates import (
-    MOST_AXES,
-    Exit,
+    MAX_COVARIANCE_AXES,
+    EscapeRate,
     NoiseStrength,
-    covariance_axes,
-    exit_time,
+    _covariance_axes,
+    mean_exit_time,
     prefactor_error,
 )
 from siq.quasipotential.transitions import noise_leverage
@@ -35,31 +35,34 @@ def well() -> tuple[IdentifiedField, MinimumActionPath]:
 
 def test_the_error_is_that_of_the_law(well: tuple[IdentifiedField, MinimumActionPath]) -> None:
     # K = 2π/(a √2) and ΔU = a²/2b: ln K errs as ln a does, and against ΔU.
-    error = prefactor_error(*well)
-    assert error is not None
-    assert error.standard_error == pytest.approx(ERROR, rel=0.05)
-    assert error.covariance == pytest.approx(-(ERROR**2), rel=0.05)
+    error, covariance = prefactor_error(*well)
+    assert error == pytest.approx(ERROR, rel=0.05)
+    assert covariance == pytest.approx(-(ERROR**2), rel=0.05)
 
 
 def test_without_noise_there_is_none(well: tuple[IdentifiedField, MinimumActionPath]) -> None:
     found, path = well
-    error = prefactor_error(replace(found, residual_ratio=1e-9), path)
-    assert error is not None and error.standard_error == 0
+    assert prefactor_error(replace(found, residual_ratio=1e-9), path) == (0, 0)
 
 
 def test_axes_make_up_the_covariance() -> None:
     draw = np.random.default_rng(0)
     few, many = (np.cov(draw.standard_normal((3 * count, count)).T) for count in (5, 20))
-    axes = np.array(covariance_axes(few, draw))
+    axes = np.array(_covariance_axes(few, draw))
     assert axes.T @ axes == pytest.approx(few)
-    drawn = [np.array(covariance_axes(many, draw)) for _ in range(800)]
-    assert all(one.shape == (MOST_AXES, 20) for one in drawn)
+    drawn = [np.array(_covariance_axes(many, draw)) for _ in range(800)]
+    assert all(one.shape == (MAX_COVARIANCE_AXES, 20) for one in drawn)
     assert sum(one.T @ one for one in drawn) / 800 == pytest.approx(many, abs=0.1)
 
 
 def test_barrier_and_prefactor_err_together() -> None:
-    apart = exit_time(Exit(0.5, 0.01, 4.0, 0.08, 0.0), NoiseStrength(0.1))
-    against = exit_time(Exit(0.5, 0.01, 4.0, 0.08, -0.01 * 0.08), NoiseStrength(0.1))
+    apart = mean_exit_time(
+        EscapeRate(0.5, 4.0, standard_error=0.01, prefactor_error=0.08), NoiseStrength(0.1)
+    )
+    against = mean_exit_time(
+        EscapeRate(0.5, 4.0, standard_error=0.01, prefactor_error=0.08, covariance=-0.01 * 0.08),
+        NoiseStrength(0.1),
+    )
     assert apart is not None and against is not None
     assert apart.data_error == pytest.approx(np.hypot(0.1, 0.08))
     assert against.data_error == pytest.approx(0.02)
@@ -70,8 +73,8 @@ def test_an_estimated_noise_counts_by_the_states_that_the_path_takes(
 ) -> None:
     found, path = well
     assert noise_leverage(path, found.dynamics) == pytest.approx(np.sqrt(2), rel=1e-3)
-    way = Exit(0.5, 0.0, 4.0, 0.0, 0.0, leverage=float(np.sqrt(2)))
-    time = exit_time(way, NoiseStrength(0.1, 0.001))
+    way = EscapeRate(0.5, 4.0, prefactor_error=0.0, leverage=float(np.sqrt(2)))
+    time = mean_exit_time(way, NoiseStrength(0.1, 0.001))
     assert time is not None and time.data_error == pytest.approx(5 * 0.01 * np.sqrt(2))
 
 

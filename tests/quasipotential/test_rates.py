@@ -22,7 +22,7 @@ from scipy.integrate import solve_ivp
 
 from siq.errors import NumericalFailure
 from siq.quasipotential.paths import MinimumActionPath
-from siq.quasipotential.rates import EscapeRate, escape_rate, mean_escape_time
+from siq.quasipotential.rates import EscapeRate, NoiseStrength, escape_rate, mean_residence_time
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import find_equilibria, hessian_at
 from siq.systems.formulas import compile_formulas
@@ -44,7 +44,7 @@ def test_with_one_state_the_law_is_the_limit_of_the_exact_time() -> None:
     known = double_well(1)
     rate = rate_of(known, np.sort(np.roots([1, 0, -1, 0.1]).real)[1:2])
     assert rate.exponent == pytest.approx(0, abs=1e-5)
-    assert rate.notes == ()
+    assert rate.remarks == ()
     first, second = (
         line_exit_time(known, rate.barrier / one) / rate.mean_time(rate.barrier / one) for one in (20, 40)
     )
@@ -114,7 +114,7 @@ def test_maier_and_steins_integral_below_the_critical_strength(beta: float) -> N
     exact = solve_ivp(rates, [start, -1e-6], [2, 0], method="DOP853", rtol=1e-10, atol=1e-12).y
     rate = rate_of(maier_stein(beta), np.zeros(2))
     assert rate.exponent == pytest.approx(exact[1, -1], abs=1e-3)
-    assert "nearly equal" in rate.notes[0]
+    assert rate.remarks[0].code == "quasipotential.law_sets_in_late_by_resonance"
 
 
 @pytest.mark.parametrize("beta", [5, 10])
@@ -137,8 +137,9 @@ def oblique(stable: float) -> KnownSystem:
 def test_a_saddle_that_attracts_slowly_is_refused_in_general() -> None:
     with pytest.raises(NumericalFailure, match="not smooth"):
         rate_of(oblique(0.7), np.zeros(2))
-    assert "sets in late" in rate_of(oblique(1.5), np.zeros(2)).notes[0]
-    assert rate_of(oblique(2.5), np.zeros(2)).notes == ()
+    late = rate_of(oblique(1.5), np.zeros(2)).remarks[0]
+    assert late.code == "quasipotential.law_sets_in_late_by_turning"
+    assert rate_of(oblique(2.5), np.zeros(2)).remarks == ()
 
 
 @pytest.mark.slow
@@ -210,13 +211,14 @@ def test_the_resonators_rates_stay_where_they_are() -> None:
     known, saddle = resonator()
     rates = [rate_of(known, saddle, which=which) for which in (0, 1)]
     np.testing.assert_allclose([rate.prefactor for rate in rates], [1.2515e4, 4.046e3], rtol=4e-3)
-    assert all(rate.notes == () for rate in rates)
+    assert all(rate.remarks == () for rate in rates)
 
 
 def test_rates_add() -> None:
     rate = EscapeRate(barrier=1.0, prefactor=2.0, exponent=0.0)
     assert rate.mean_time(0.25) == pytest.approx(2 * np.exp(4))
-    assert mean_escape_time([rate, rate], 0.25) == pytest.approx(np.exp(4))
+    both = mean_residence_time([rate, rate], NoiseStrength(0.25))
+    assert both is not None and both.value == pytest.approx(np.exp(4))
     with pytest.raises(NumericalFailure, match="far below the barrier"):
         rate.mean_time(1.5)
 
@@ -225,9 +227,8 @@ def test_a_second_path_and_a_path_that_is_not_converged_are_noted() -> None:
     known = archetype(2)
     path = path_of(known, np.zeros(2))
     doubtful = replace(path, converged=False, rivals=(path.action,))
-    notes = escape_rate(known.dynamics, doubtful).notes
-    assert "not converged" in notes[0]
-    assert "second path" in notes[1]
+    codes = [one.code for one in escape_rate(known.dynamics, doubtful).remarks]
+    assert codes == ["quasipotential.path_not_converged", "quasipotential.second_path_of_same_action"]
 
 
 def test_the_gradient_of_v_is_what_the_path_carries() -> None:

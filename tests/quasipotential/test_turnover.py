@@ -7,13 +7,13 @@ import sympy
 from siq.errors import NumericalFailure
 from siq.quasipotential.paths import minimum_action_path
 from siq.quasipotential.rates import (
-    Exit,
+    EnergyLossPerCycle,
+    EscapeRate,
     NoiseStrength,
-    TurnLoss,
-    depopulation,
+    depopulation_factor,
+    energy_loss_per_cycle,
     escape_rate,
-    exit_time,
-    turn_loss,
+    mean_exit_time,
 )
 from siq.systems.dynamics import Dynamics
 from siq.validation.escapes import neighbourhood, simulate_escapes
@@ -22,11 +22,11 @@ X, V, Y, W = sympy.symbols("x v y w", real=True)
 
 
 def test_strong_losses_leave_the_law_as_it_is_and_weak_ones_limit_the_rate() -> None:
-    assert depopulation(100.0) == pytest.approx(1, abs=1e-9)
-    assert depopulation(1e-4) == pytest.approx(1e-4, rel=0.01)  # the rate of energy diffusion
-    assert TurnLoss(100.0, 100.0, exact=True).factor(1.0) == pytest.approx(1, abs=1e-9)
+    assert depopulation_factor(100.0) == pytest.approx(1, abs=1e-9)
+    assert depopulation_factor(1e-4) == pytest.approx(1e-4, rel=0.01)  # the rate of energy diffusion
+    assert EnergyLossPerCycle(100.0, 100.0, exact=True).factor(1.0) == pytest.approx(1, abs=1e-9)
     # Of two wells half of what crosses comes back.
-    assert TurnLoss(1e-4, 1e-4, exact=True).factor(1.0) == pytest.approx(0.5e-4, rel=0.01)
+    assert EnergyLossPerCycle(1e-4, 1e-4, exact=True).factor(1.0) == pytest.approx(0.5e-4, rel=0.01)
 
 
 @pytest.mark.parametrize("speed", [1.0, 3.0])
@@ -37,7 +37,7 @@ def test_the_loss_of_a_cubic_well_is_exact(speed: float) -> None:
         (X, V), (speed * V, -friction * V - (X - X**2) / speed), diffusion=np.diag([0.0, noise])
     )
     path = minimum_action_path(system, np.zeros(2), np.array([1.0, 0.0]))
-    loss = turn_loss(system, path, beyond=False)
+    loss = energy_loss_per_cycle(system, path, beyond=False)
     assert loss is not None and loss.exact and loss.beyond is None
     assert loss.own == pytest.approx(2 * friction**2 / noise * 1.2 / speed**2, rel=1e-4)
 
@@ -52,8 +52,8 @@ def test_two_weakly_damped_particles_have_a_time_only_where_it_is_known() -> Non
     with pytest.raises(NumericalFailure, match="damping is too weak"):
         rate.mean_time(path.action / 2)
     assert np.isfinite(rate.mean_time(rate.turn.own / 20))
-    way = Exit(path.action, 0.0, rate.prefactor, turn=rate.turn)
-    assert exit_time(way, NoiseStrength(path.action / 2)) is None
+    way = EscapeRate(path.action, rate.prefactor, turn=rate.turn)
+    assert mean_exit_time(way, NoiseStrength(path.action / 2)) is None
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ from siq.quasipotential.landscape_assembly import find_landscape
 from siq.quasipotential.landscape_files import landscape_data
 from siq.quasipotential.rates import NoiseStrength
 from siq.quasipotential.wells import WellOptions
+from siq.remarks import Remark
 from siq.report.landscape import answer_lines, equilibria_table, exits_table, times_table, wells_table
 from siq.report.summary import summarise, well_name
 
@@ -70,7 +71,8 @@ def test_a_well_below_the_noise_has_no_time() -> None:
 def test_where_the_law_fails_it_is_said_why() -> None:
     data = landscape([[-0.5], [0.5]], [0.8, 0.9], noise=NOISE, prefactor=None)
     for way in data["transitions"]:
-        way["notes"] = ["no escape time: V is not smooth at the saddle"]
+        reason = {"reason": "V is not smooth at the saddle"}
+        way["remarks"] = [Remark("quasipotential.no_escape_time", reason).as_data()]
     assert "lasts" not in headline(data)
     assert "No time can be given for A and B: V is not smooth at the saddle." in remarks(data)
 
@@ -81,7 +83,9 @@ def test_one_stable_state_and_none() -> None:
     assert headline(alone).startswith("The recordings show one stable state, at x")
     assert headline(alone).endswith("U is known up to 1.200\u00a0µm²/s above it.")
     assert remarks(alone) == []
-    none = landscape([], []) | {"notes": ["they end on a limit cycle"]}
+    none = landscape([], []) | {
+        "remarks": [Remark("quasipotential.reason", {"reason": "they end on a limit cycle"}).as_data()]
+    }
     assert headline(none) == "No stable state was found in the recorded region: they end on a limit cycle."
 
 
@@ -134,7 +138,7 @@ def test_text_and_page_say_the_same_sentence(noise: NoiseStrength | None) -> Non
         exact_field(known, 3, relative_error=1e-3), portrait_of(known, 250, share=0.8),
         options=WellOptions(degrees=(4,)), noise=noise,
     )  # fmt: skip
-    data = landscape_data(found, dynamics=found.dynamics)
+    data = landscape_data(found)
     text = found.report()
     assert text.splitlines()[0] == headline(data)
     assert ("lasts" in headline(data)) == (noise is not None)

@@ -21,7 +21,7 @@ from siq.quasipotential.invariant_density import (
 from siq.quasipotential.landscape import Landscape, LandscapeOptions
 from siq.quasipotential.landscape_assembly import find_landscape
 from siq.quasipotential.landscape_comparison import reference_landscape
-from siq.quasipotential.landscape_files import StoredLandscape, read_landscape, write_landscape
+from siq.quasipotential.landscape_files import read_landscape, write_landscape
 from siq.quasipotential.wells import WellOptions
 from siq.report.figures import LandscapeFiguresSettings, landscape_figures, project_landscape
 from siq.report.plots import plot_components, plot_invariant_distribution
@@ -45,9 +45,9 @@ def landscape() -> Landscape:
 @pytest.fixture(scope="module")
 def figures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Figure | None]:
     file = tmp_path_factory.mktemp("one") / "quasipotential.json"
-    write_landscape(file, landscape(), dynamics=KNOWN.dynamics)
+    write_landscape(file, landscape())
     stored = read_landscape(file, dynamics=KNOWN.dynamics)
-    assert isinstance(stored, StoredLandscape)
+    assert stored is not None
     reference = reference_landscape(
         KNOWN.dynamics, portrait_of(KNOWN), box=KNOWN.domain, reach=1.2, generator=np.random.default_rng(0)
     )
@@ -69,7 +69,7 @@ def test_the_errors_are_a_curve_too(figures: dict[str, Figure | None]) -> None:
 
 
 def test_the_density_is_a_curve_over_a_histogram() -> None:
-    potential = landscape().over_wells
+    potential = landscape().global_quasipotential
     assert potential is not None
     fine, coarse = (sample_potential(potential, KNOWN.domain, cells=cells) for cells in (400, 200))
     found = known_density(fine, coarse, lowest_possible(coarse, KNOWN.dynamics), intensity=0.1)
@@ -90,7 +90,7 @@ def test_the_density_is_a_curve_over_a_histogram() -> None:
 
 
 def test_the_components_of_a_landscape_of_one_state_are_curves() -> None:
-    potential = landscape().over_wells
+    potential = landscape().global_quasipotential
     assert potential is not None
     fields = project_landscape(potential, domain=KNOWN.domain, trajectories=(), resolution=41)
     assert fields.quasipotential is not None and fields.quasipotential.shape == (1, 41)

@@ -22,6 +22,7 @@ from scipy.integrate import quad
 
 from siq.errors import InputError
 from siq.quasipotential.landscape import Landscape, LandscapeOptions, NoLandscape
+from siq.quasipotential.landscape_assembly import EquationSettings, landscape_from_equations
 from siq.quasipotential.landscape_files import landscape_data
 from siq.quasipotential.paths import minimum_action_path
 from siq.report.summary import summarise
@@ -29,7 +30,6 @@ from siq.systems.cards import load_system
 from siq.systems.cycles import hessians_along
 from siq.systems.dynamics import Dynamics
 from siq.validation.mesh import mesh_quasipotential
-from siq.workflow.equations_step import EquationSettings, landscape_of_equations
 from siq.workflow.landscape_step import landscape_rows
 
 X, Y, Z = sympy.symbols("x y z", real=True)
@@ -225,7 +225,7 @@ def test_a_limit_cycle_is_an_attractor_without_a_formula() -> None:
     np.testing.assert_allclose(curvature, 2, rtol=1e-7)
     rows = landscape_rows(0, landscape).set_index("kind")
     assert rows.loc["cycle", "item"] == "A1" and rows.loc["cycle", "note"].startswith("period 3.1415927")
-    (stored,) = landscape_data(landscape, dynamics=landscape.dynamics)["wells"]
+    (stored,) = landscape_data(landscape)["wells"]
     assert stored["cycle"]["period"] == cycle.period and len(stored["cycle"]["points"]) == len(cycle.points)
     (line,) = summarise(landscape).cycles
     np.testing.assert_allclose(np.linalg.norm(line, axis=1), 1, rtol=1e-6)
@@ -297,7 +297,7 @@ def test_formulas_hold_where_noise_acts_on_one_state_and_nothing_is_conserved(ca
 def test_barriers_of_textbook_systems_of_one_state_are_those_of_a_quadrature(name: str) -> None:
     """``ΔU = -∫ 2f/D dx`` from the attractor to the threshold, with the D(x) of chemistry in one of them."""
     system = load_system(SYSTEMS / f"{name}.yaml")
-    landscape = landscape_of_equations(system, EquationSettings(), formulas=False)
+    landscape = landscape_from_equations(system, EquationSettings(), formulas=False)
     assert len(landscape.attractors) == 2
 
     def slope(x: float) -> float:

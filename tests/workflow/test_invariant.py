@@ -36,7 +36,7 @@ def files(found: Analysis, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pa
     record = found.identified.record
     assert record is not None and found.landscape is not None and found.landscape.landscape is not None
     write_field(field, record, IdentificationOptions())
-    write_landscape(landscape, found.landscape.landscape, dynamics=record.found.dynamics)
+    write_landscape(landscape, found.landscape.landscape)
     return field, landscape
 
 
@@ -63,7 +63,7 @@ def test_the_first_landscape_with_heights_is_read_and_gives_the_same_u(
     assert first is not None and found.landscape is not None and found.landscape.landscape is not None
     assert first[0] == 1
     x = np.array([[1.0, 0.0], [-0.7, 0.1], [0.5, -0.2]])
-    assert first[1].quasipotential is not None
+    assert first[1].global_quasipotential is not None
     np.testing.assert_allclose(first[1].quasipotential(x), found.landscape.landscape.quasipotential(x))
 
 

@@ -13,7 +13,7 @@ from siq.report.formatting import texts
 from siq.report.study_page import PageSettings
 from siq.workflow.comparison_steps import BesideEquationsSettings
 from siq.workflow.recordings_step import DrawSettings
-from siq.workflow.equations_step import EquationSettings
+from siq.quasipotential.landscape_assembly import EquationSettings
 from siq.workflow.comparison_steps import EscapesSettings
 from siq.workflow.identification_step import IdentifySettings
 from siq.workflow.invariant_step import InvariantSettings

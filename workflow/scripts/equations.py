@@ -4,13 +4,14 @@ from workflow.warm import run_warm
 
 run_warm()
 
+from siq.quasipotential.landscape_assembly import EquationSettings
 from siq.systems.cards import load_system
 from siq.workflow import equations_step
 from step import job
 
 if __name__ == "__main__":
     with job() as now:
-        found = equations_step.run(now.settings(equations_step.EquationSettings), load_system(now.input.card))
+        found = equations_step.run(now.settings(EquationSettings), load_system(now.input.card))
         names = ("landscape", "degrees", "certificates", "outcomes")
         equations_step.write(
             found,

@@ -8,6 +8,8 @@ import shutil
 from importlib.metadata import version
 from pathlib import Path
 
+import numpy as np
+
 import siq
 from siq.numerics.files import whole_file
 from siq.quasipotential.landscape_files import read_landscape
@@ -25,7 +27,7 @@ if __name__ == "__main__":
         system = load_system(now.input.card)
         stored = read_landscape(now.input.quasipotential, dynamics=system)
         tables = {name: read_table(path) for name in COLUMNS if (path := now.given(name)) is not None}
-        summary = None if stored is None else summarise(stored, dynamics=system)
+        summary = None if stored is None else summarise(stored, np.zeros((0, system.dimension)))
         study = now.settings(PageSettings).study
         drawn = Path(now.output.figures)
         drawn.mkdir(parents=True, exist_ok=True)
@@ -37,6 +39,7 @@ if __name__ == "__main__":
         view = None
         if summary is not None and system.dimension > 2:
             view = interactive_view(summary)
+        certificate = None if stored is None else stored.certificate
         results = StudyResults(
             tables,
             Path(now.input.landscape).parent,
@@ -45,7 +48,7 @@ if __name__ == "__main__":
             landscape=summary,
             interactive=view,
             system=system,
-            certificate=None if stored is None else stored.data.get("certificate"),
+            certificate=None if certificate is None else certificate.as_data(),
         )
         versions = {"siq": siq.__version__} | {name: version(name) for name in ("numpy", "snakemake")}
         page = study_page(study, results, command=now.params.command, versions=versions)
