@@ -32,6 +32,7 @@ from siq.quasipotential.certificate_tests import (
     STATED,
     Candidate,
     CertificateOptions,
+    Function,
     Reference,
     Verdict,
     check_agreement,
@@ -51,14 +52,14 @@ from siq.quasipotential.characteristics import (
     adapted_fan,
     first_caustic,
     lowest_sheet,
-    relative_error,
 )
+from siq.quasipotential.characteristics import relative_error as field_error
 from siq.quasipotential.formulas import SymbolicDecomposition
-from siq.quasipotential.wells import RecordedRegion, Well
+from siq.quasipotential.wells import Well
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import hessian_at
 from siq.systems.formulas import compile_formulas
-from siq.systems.phase_portrait import PhasePortrait
+from siq.systems.phase_portrait import PhasePortrait, RecordedRegion
 
 INDEPENDENT = ("characteristics",)  # tests of V that share nothing with a fit of V but f and D
 ALONE = "only one of the two routes that the study names led to a formula"
@@ -214,7 +215,9 @@ def certify(
         uncertain = STATED * candidate.relative_error
         own_error = max(own_error, its - uncertain)
         if wells:
-            uncertain = STATED * _error_from_field(wells[number], candidate.points, evidence)
+            well, generator, count = wells[number], np.random.default_rng(seed), len(candidate.points)
+            x = candidate.points[generator.choice(count, min(ERROR_POINTS, count), replace=False)]
+            uncertain = STATED * field_error(found, well.gradients, well.attractor, x, well.values(x))
             its += uncertain
         error, from_field = max(error, its), max(from_field, uncertain)
     tests = {name: Verdict.worst(made) for name, made in verdicts.items()}
@@ -226,27 +229,25 @@ def certify(
     if not isinstance(found, GivenField):
         if portrait.attractors:
             tests["existence"] = check_existence(found, portrait, seed=seed)
-        if scope == "region":
-            pairs = [(candidates[0].values, others, others)] if others else []
-        else:
-            same = [(one, two) for one in others for two in wells if _same_place(one, two)]
-            pairs = [(one.values, [two], [one]) for one, two in same]
-        if others and scope == "wells" and len(pairs) < len(portrait.attractors):
+        # Both routes share the error of f, and have the rest of their own. One that cannot be stated explains
+        # nothing of their difference.
+        compare: list[tuple[Function, Sequence[Well], Sequence[Well]]] = [
+            (one.values, [two], [one])
+            for one in others
+            for two in wells
+            if (one.attractor == two.attractor).all()
+        ]
+        if scope == "region" and others:
+            compare = [(candidates[0].values, others, others)]
+        if others and scope == "wells" and len(compare) < len(portrait.attractors):
             tests["agreement"] = Verdict.refused("the network route found no formula for some well")
         elif others:
-            # Both routes share the error of f, and have the rest of their own.
-            tests["agreement"] = Verdict.worst(
-                [
-                    check_agreement(
-                        values, two,
-                        limit=_explained_difference(
-                            options, error, max(_error_of_well(one, evidence) for one in erring)
-                        )
-                        + 6 * relative_error,
-                    )
-                    for values, two, erring in pairs
-                ]
-            )  # fmt: skip
+            agreement = []
+            for values, two, erring in compare:
+                its = max(_error_of_well(one, evidence) for one in erring)
+                limit = HARMLESS + min(error, options.error) + min(its, options.error) + 6 * relative_error
+                agreement.append(check_agreement(values, two, limit=limit))
+            tests["agreement"] = Verdict.worst(agreement)
         elif compared:
             tests["agreement"] = Verdict.refused(ALONE)
         if evidence.prediction is not None:
@@ -256,16 +257,6 @@ def certify(
     refused = [verdict.reason for verdict in tests.values() if not verdict.passed]
     tested_on = "; ".join(dict.fromkeys(candidate.tested_on for candidate in candidates))
     return Certificate(tests, error, "; ".join(dict.fromkeys(refused)), scope, tested_on)
-
-
-def _explained_difference(options: CertificateOptions, *errors: float) -> float:
-    """Difference of two routes that their errors explain; one that cannot be stated explains nothing."""
-    return HARMLESS + sum(min(error, options.error) for error in errors)
-
-
-def _same_place(one: Well, two: Well) -> bool:
-    """Whether two wells are about one attractor: both are the same root of the same f."""
-    return np.array_equal(one.attractor, two.attractor)
 
 
 def _candidate_of_region(
@@ -333,13 +324,6 @@ def _error_of_well(well: Well, evidence: Evidence) -> float:
     mine = [one for one in evidence.portrait.attractors if np.array_equal(one.position, well.attractor)]
     candidate = Candidate(well.values, well.gradients, well.hessians, None, sublevel_points(well), mine)
     return stated_error(candidate, evidence.found, seed=evidence.seed)
-
-
-def _error_from_field(well: Well, points: np.ndarray, evidence: Evidence) -> float:
-    """Relative standard error of V over points, from what is not known of f."""
-    generator = np.random.default_rng(evidence.seed)
-    x = points[generator.choice(len(points), min(ERROR_POINTS, len(points)), replace=False)]
-    return relative_error(evidence.found, well.gradients, well.attractor, x, well.values(x))
 
 
 def _position_text(position: np.ndarray) -> str:

@@ -25,8 +25,8 @@ from siq.quasipotential.hamilton_jacobi import (
     HamiltonJacobi,
     equation_at,
     gauss_newton,
+    left_inverse,
     potential_basis,
-    sensitivity,
 )
 from siq.quasipotential.wells import Well
 
@@ -156,18 +156,13 @@ def refine_globally(
             break
         equation, basis = equation.restricted(kept), basis.restricted(kept)
         solution = gauss_newton(equation, solution.coefficients[kept])
-    response = sensitivity(
-        equation, solution.coefficients, field_terms=_field_terms(found, equation.points),
-        components=found.support[:, 0],
-    )  # fmt: skip
-    # A residual that no V in this library can remove adds to the uncertainty.
-    jacobian = equation.jacobian(solution.coefficients)
-    scale = np.linalg.norm(jacobian, axis=0)
-    scale = np.where(scale > 0, scale, 1.0)
-    inverse = np.linalg.pinv(jacobian / scale, rcond=1e-11)
+    # Coefficients of V follow those of f to first order; a residual that no V here can remove adds to their
+    # uncertainty.
+    inverse = left_inverse(equation.jacobian(solution.coefficients))
+    response = -inverse @ _forcing(equation, solution.coefficients, found)
     residual = equation.residual(solution.coefficients)
-    freedom = max(len(residual) - len(scale), 1)
-    misfit = float(residual @ residual) / freedom * (inverse @ inverse.T) / np.outer(scale, scale)
+    freedom = max(len(residual) - len(inverse), 1)
+    misfit = float(residual @ residual) / freedom * (inverse @ inverse.T)
     q, p = library.size, len(found.support)
     coefficients, sensitivities, covariance = np.zeros(q), np.zeros((q, p)), np.zeros((q, q))
     coefficients[basis.chosen] = solution.coefficients
@@ -178,9 +173,11 @@ def refine_globally(
     )
 
 
-def _field_terms(found: IdentifiedField, points: np.ndarray) -> np.ndarray:
-    """The function of each of the p coefficients of f at points, shape ``(n, p)``."""
-    return found.library.evaluate(points)[:, found.support[:, 1]]
+def _forcing(equation: HamiltonJacobi, coefficients: np.ndarray, found: IdentifiedField) -> np.ndarray:
+    """Derivative of the residual by each of the p coefficients of f, shape ``(n, p)``."""
+    components, functions = found.support.T
+    slopes = equation.slopes(coefficients)[:, components]
+    return equation.weight[:, None] * slopes * found.library.evaluate(equation.points)[:, functions]
 
 
 def _eliminate(
@@ -194,15 +191,12 @@ def _eliminate(
     """Backward elimination in the linearised equation: positions of the terms to be kept."""
     jacobian = equation.jacobian(coefficients)
     goal = jacobian @ coefficients - equation.residual(coefficients)
-    gradient = equation.gradients @ coefficients
-    forcing = -(
-        equation.weight[:, None] * gradient[:, found.support[:, 0]] * _field_terms(found, equation.points)
-    )
+    forcing = -_forcing(equation, coefficients, found)
     # Everything depends on the points through a triangular matrix only.
     triangle = np.asarray(np.linalg.qr(np.column_stack([jacobian, goal, forcing]), mode="r"))
     m = len(coefficients)
     spread = equation.sizes()
-    size = np.sqrt(equation.diffusion.contract(equation.points, gradient).mean()) or 1.0
+    size = np.sqrt(equation.diffusion.contract(equation.points, equation.slopes(coefficients)).mean()) or 1.0
     rows = max(len(equation.points) - m, 1)
     active = np.arange(m)
     while len(active):

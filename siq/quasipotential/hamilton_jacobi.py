@@ -407,20 +407,11 @@ def _relative_residual(equation: HamiltonJacobi, coefficients: np.ndarray) -> fl
     return float(np.sqrt((equation.residual(coefficients) ** 2).mean() / squared.mean()))
 
 
-def sensitivity(
-    equation: HamiltonJacobi, coefficients: np.ndarray, *, field_terms: np.ndarray, components: np.ndarray
-) -> np.ndarray:
-    """∂ξ/∂c, shape ``(m, p)``: how coefficients of V follow the p coefficients of f, to first order.
-
-    `field_terms` has the functions of these at the points, shape ``(n, p)``, and `components` the component
-    of f that each belongs to, shape ``(p,)``.
-    """
-    gradient = equation.slopes(coefficients)
-    forcing = equation.weight[:, None] * gradient[:, components] * field_terms
-    jacobian = equation.jacobian(coefficients)
+def left_inverse(jacobian: np.ndarray) -> np.ndarray:
+    """The inverse of least squares, shape ``(m, n)``, of columns that may be of very different sizes."""
     scale = np.linalg.norm(jacobian, axis=0)
     scale = np.where(scale > 0, scale, 1.0)
-    return -np.linalg.lstsq(jacobian / scale, forcing, rcond=1e-11)[0] / scale[:, None]
+    return np.asarray(np.linalg.pinv(jacobian / scale, rcond=1e-11) / scale[:, None])
 
 
 def robust_fit(

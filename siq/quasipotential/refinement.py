@@ -72,8 +72,8 @@ from siq.quasipotential.global_formula import (
 from siq.quasipotential.hamilton_jacobi import affordable_degree, potential_basis
 from siq.quasipotential.occupancy import RecordTest, record_test
 from siq.quasipotential.rates import NoiseStrength
-from siq.quasipotential.wells import RecordedRegion, Well, WellOptions, fit_well, local_well
-from siq.systems.phase_portrait import PhasePortrait, evenly_spread, phase_portrait
+from siq.quasipotential.wells import Well, WellOptions, fit_well, local_well
+from siq.systems.phase_portrait import PhasePortrait, RecordedRegion, evenly_spread, phase_portrait
 
 logger = logging.getLogger(__name__)
 

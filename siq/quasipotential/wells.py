@@ -55,69 +55,12 @@ from siq.systems.formulas import (
     julia_source,
     numpy_source,
 )
-from siq.systems.phase_portrait import PhasePortrait
+from siq.systems.phase_portrait import PhasePortrait, RecordedRegion, states_elsewhere
 
 TOLERANCE = 0.05  # residual at a point up to which a formula is believed: V is then off by some per cent
 ROUNDING = 1e-16  # of what is usual: |∇V| |f| so close to the attractor says nothing
 NEGATIVE = 1e-9  # of the level: V so far below zero is rounding
 NOTHING = 1e-14  # of the largest coefficient, or of the size of a well: rounding of the fit
-NEIGHBOUR_SPACINGS = 2.5  # of the spacing of recorded states: further away nothing was recorded
-
-
-class RecordedRegion:
-    """The neighbourhood of recorded states that lead to one attractor.
-
-    Parameters
-    ----------
-    states
-        From which f leads to the attractor, shape ``(n, d)``.
-    elsewhere
-        Those from which it leads elsewhere or nowhere, shape ``(m, d)``; None for none.
-    width
-        Shape ``(d,)``: distances are shares of it.
-    """
-
-    def __init__(self, states: np.ndarray, elsewhere: np.ndarray | None, width: np.ndarray) -> None:
-        self._width = np.where(width > 0, width, 1.0)
-        places = states / self._width
-        self._tree = cKDTree(places)
-        # Of the 2d-th neighbour: states on one descent lie closer to each other than descents do.
-        neighbours = min(2 * len(width) + 1, len(states))
-        self._spacing = np.atleast_2d(self._tree.query(places, k=neighbours)[0])[:, -1]
-        some = elsewhere is not None and len(elsewhere)
-        self._elsewhere = cKDTree(elsewhere / self._width) if some else None
-
-    @classmethod
-    def of_basin(cls, portrait: PhasePortrait, index: int) -> RecordedRegion:
-        """The region of ``portrait.attractors[index]``, in shares of the recorded box."""
-        descents = portrait.descents
-        others = states_elsewhere(portrait, index)
-        away = [descents.paths[descents.ends != index][:, 0], *([] if others is None else [others])]
-        basin, box = portrait.basins[index], portrait.box
-        return cls(basin.points(np.arange(len(basin.chosen))), np.concatenate(away), box[:, 1] - box[:, 0])
-
-    def _closer_elsewhere(self, places: np.ndarray, distance: np.ndarray) -> np.ndarray:
-        if self._elsewhere is None:
-            return np.zeros(len(places), dtype=bool)
-        return np.asarray(self._elsewhere.query(places)[0] < distance)
-
-    def across(self, x: np.ndarray) -> np.ndarray:
-        """Mask of points ``(n, d)`` that lie closer to states which lead elsewhere."""
-        places = x / self._width
-        return self._closer_elsewhere(places, self._tree.query(places)[0])
-
-    def recorded(self, x: np.ndarray) -> np.ndarray:
-        """Mask of points ``(n, d)`` among the states that lead to the attractor."""
-        places = x / self._width
-        distance, nearest = self._tree.query(places)
-        near = distance <= NEIGHBOUR_SPACINGS * self._spacing[nearest]
-        return np.asarray(near & ~self._closer_elsewhere(places, distance))
-
-
-def states_elsewhere(portrait: PhasePortrait, index: int) -> np.ndarray | None:
-    """Recorded states from which f leads to other attractors, shape ``(m, d)``; None for none."""
-    others = [one for number, one in enumerate(portrait.basins) if number != index]
-    return np.concatenate([one.points(np.arange(len(one.chosen))) for one in others]) if others else None
 
 
 @dataclass(frozen=True)
@@ -619,30 +562,14 @@ def fit_well(
     generator: np.random.Generator,
     steps: int = 60,
 ) -> Well:
-    """V about an attractor by the network route: from values of V, refined without M.
+    """V about an attractor by the network route: from values V_θ, up to a constant, refined without M.
 
     It starts on the states where the network says that V is low, since networks are worst far out, and which
     are low is all that it has of them in the end: from there V grows by itself, as in the local route, but
     with all powers free. Were it fitted on what the network takes for the well, it would have to be compared
-    with the local route at states beyond, where it says nothing.
-
-    Parameters
-    ----------
-    dynamics, attractor, basin, saddles
-        f and D, where V is zero, the recorded states that lead there, and the saddles next to it.
-    potential
-        V_θ, points ``(n, d)`` to values ``(n,)``, up to a constant.
-    degree
-        Highest power.
-    generator
-        Decides which points are used where there are too many.
-    steps
-        Most steps of Gauss–Newton at the start.
-
-    Raises
-    ------
-    NumericalFailure
-        When the networks leave too few states for a start, or no start grows to a well.
+    with the local route at states beyond, where it says nothing. The other arguments are those of the local
+    route; `steps` are the most of Gauss–Newton at the start. Fails with `NumericalFailure` when the networks
+    leave too few states for a start, or no start grows to a well.
     """
     lowest = float(potential(attractor.position[None])[0])
     flat = basin.states.reshape(-1, basin.states.shape[2])

@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from siq.errors import NumericalFailure
 from siq.numerics.least_squares import representative_subset
@@ -38,6 +39,7 @@ from siq.systems.equilibria import (
 STARTS = 1500  # recorded points from which f is followed
 NEWTON_STARTS = 400
 UNSETTLED = 0.02  # share of the recorded points: as many may be slow, on the ridge between two wells
+NEIGHBOUR_SPACINGS = 2.5  # of the spacing of recorded states: further away nothing was recorded
 APART = 0.04  # of each state's range: starts that cover the recorded region evenly
 
 
@@ -366,3 +368,59 @@ def high_dimensional_portrait(dynamics: Dynamics, *, seed: int = 0) -> PhasePort
         saddles_beside(dynamics, saddles, attractors, box=box), (), descents,
         recurrence_beyond(dynamics, descents, box=box, rate=rate), (), tuple(notes),
     )  # fmt: skip
+
+
+class RecordedRegion:
+    """The neighbourhood of recorded states that lead to one attractor.
+
+    Parameters
+    ----------
+    states
+        From which f leads to the attractor, shape ``(n, d)``.
+    elsewhere
+        Those from which it leads elsewhere or nowhere, shape ``(m, d)``; None for none.
+    width
+        Shape ``(d,)``: distances are shares of it.
+    """
+
+    def __init__(self, states: np.ndarray, elsewhere: np.ndarray | None, width: np.ndarray) -> None:
+        self._width = np.where(width > 0, width, 1.0)
+        places = states / self._width
+        self._tree = cKDTree(places)
+        # Of the 2d-th neighbour: states on one descent lie closer to each other than descents do.
+        neighbours = min(2 * len(width) + 1, len(states))
+        self._spacing = np.atleast_2d(self._tree.query(places, k=neighbours)[0])[:, -1]
+        some = elsewhere is not None and len(elsewhere)
+        self._elsewhere = cKDTree(elsewhere / self._width) if some else None
+
+    @classmethod
+    def of_basin(cls, portrait: PhasePortrait, index: int) -> RecordedRegion:
+        """The region of ``portrait.attractors[index]``, in shares of the recorded box."""
+        descents = portrait.descents
+        others = states_elsewhere(portrait, index)
+        away = [descents.paths[descents.ends != index][:, 0], *([] if others is None else [others])]
+        basin, box = portrait.basins[index], portrait.box
+        return cls(basin.points(np.arange(len(basin.chosen))), np.concatenate(away), box[:, 1] - box[:, 0])
+
+    def _closer_elsewhere(self, places: np.ndarray, distance: np.ndarray) -> np.ndarray:
+        if self._elsewhere is None:
+            return np.zeros(len(places), dtype=bool)
+        return np.asarray(self._elsewhere.query(places)[0] < distance)
+
+    def across(self, x: np.ndarray) -> np.ndarray:
+        """Mask of points ``(n, d)`` that lie closer to states which lead elsewhere."""
+        places = x / self._width
+        return self._closer_elsewhere(places, self._tree.query(places)[0])
+
+    def recorded(self, x: np.ndarray) -> np.ndarray:
+        """Mask of points ``(n, d)`` among the states that lead to the attractor."""
+        places = x / self._width
+        distance, nearest = self._tree.query(places)
+        near = distance <= NEIGHBOUR_SPACINGS * self._spacing[nearest]
+        return np.asarray(near & ~self._closer_elsewhere(places, distance))
+
+
+def states_elsewhere(portrait: PhasePortrait, index: int) -> np.ndarray | None:
+    """Recorded states from which f leads to other attractors, shape ``(m, d)``; None for none."""
+    others = [one for number, one in enumerate(portrait.basins) if number != index]
+    return np.concatenate([one.points(np.arange(len(one.chosen))) for one in others]) if others else None

@@ -10,7 +10,8 @@ from siq.data.recordings import SnapshotPairs
 from siq.inference.field_estimate import GivenField
 from siq.quasipotential.certificate import Evidence, _candidate_in_well, _follow_well
 from siq.quasipotential.certificate_tests import FEWEST, Reference
-from siq.quasipotential.wells import RecordedRegion, Well, _grow_well
+from siq.quasipotential.wells import Well, _grow_well
+from siq.systems.phase_portrait import RecordedRegion
 
 KNOWN = maier_stein(1)
 PORTRAIT = portrait_of(KNOWN, 300, share=0.6)
