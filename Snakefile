@@ -12,25 +12,12 @@ configfile: configuration(given=bool(workflow.overwrite_configfiles))
 
 
 include: "workflow/rules/common.smk"
-include: "workflow/rules/examples.smk"
-include: "workflow/rules/data.smk"
-include: "workflow/rules/identify.smk"
-include: "workflow/rules/train.smk"
-include: "workflow/rules/regress.smk"
-include: "workflow/rules/refine.smk"
-include: "workflow/rules/score.smk"
+include: "workflow/rules/statistics.smk"
 include: "workflow/rules/landscape.smk"
-include: "workflow/rules/collect.smk"
-include: "workflow/rules/invariant.smk"
-include: "workflow/rules/report.smk"
+include: "workflow/rules/pages.smk"
 include: "workflow/rules/equations.smk"
-include: "workflow/rules/sweep.smk"
-include: "workflow/rules/reproduce.smk"
-include: "workflow/rules/cases.smk"
 include: "workflow/rules/mismatch.smk"
-include: "workflow/rules/proof_common.smk"
 include: "workflow/rules/proof.smk"
-include: "workflow/rules/proof_foreign.smk"
 
 
 report: "workflow/report/workflow.rst"

@@ -21,10 +21,10 @@ for package, name in (
     ("mismatch", "mechanisms.yaml"),
     ("report", "templates/base.html.j2"),
     (".", "py.typed"),
-    ("cli/shipped", "Snakefile"),
-    ("cli/shipped", "config/systems/archetype3d.yaml"),
-    ("cli/shipped", "workflow/rules/common.smk"),
-    ("cli/shipped", "profiles/default/config.yaml"),
+    ("workflow/shipped", "Snakefile"),
+    ("workflow/shipped", "config/systems/archetype3d.yaml"),
+    ("workflow/shipped", "workflow/rules/common.smk"),
+    ("workflow/shipped", "profiles/default/config.yaml"),
 ):
     assert resources.files("siq").joinpath(package, name).is_file(), f"{package}/{name} is not in the wheel"
 

@@ -49,7 +49,7 @@ from siq.quasipotential.refinement import RefinementOptions, formula_library, lo
 from siq.systems.phase_portrait import PhasePortrait
 from siq.systems.simulation import SimulationOptions, simulate_snapshots
 from siq.workflow import training_step
-from siq.workflow.settings import Sampling, StateSpace
+from siq.workflow.settings import PipelineSettings, Sampling, StateSpace
 
 SYSTEMS = {
     "Maier–Stein, β = 1": (maier_stein(1), 3),
@@ -69,7 +69,7 @@ def networks_of(known: KnownSystem, steps: int) -> list[TrainedNetworks]:
     """Networks of `TRAININGS` runs, each with recordings of its own, trained side by side."""
     options = TrainingOptions(widths=(16, 16), steps=steps, check=None, batch_size=128)
     space = StateSpace(diffusion=known.diffusion.tolist())
-    settings = training_step.TrainSettings(steps, space, Sampling(pair_step=0.01), options)
+    settings = PipelineSettings(seed=steps, space=space, sampling=Sampling(pair_step=0.01), training=options)
     runs = {}
     for number in range(TRAININGS):
         draw = np.random.default_rng([steps, number])

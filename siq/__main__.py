@@ -2,6 +2,6 @@
 
 import sys
 
-from siq.cli.main import main
+from siq.workflow.command import main
 
 sys.exit(main())

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
-from importlib import metadata
 from pathlib import Path
 
 DISTRIBUTION = "quasipotential"  # what pip installs; the name `siq` is another project's there
@@ -13,7 +11,11 @@ def version() -> str:
     """The version in pyproject.toml: of the checkout that this file lies in, else of the installation."""
     checkout = Path(__file__).parents[1] / "pyproject.toml"
     if checkout.is_file():
+        import tomllib  # here, so that `siq --help` answers at once
+
         project = tomllib.loads(checkout.read_text(encoding="utf-8")).get("project", {})
         if project.get("name") == DISTRIBUTION:
             return str(project["version"])
-    return metadata.version(DISTRIBUTION)
+    from importlib.metadata import version as installed
+
+    return installed(DISTRIBUTION)

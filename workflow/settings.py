@@ -5,12 +5,11 @@ from __future__ import annotations
 import importlib.util
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
-
-from pydantic import TypeAdapter
 
 from siq.data.inspection import read_pairs
 from siq.errors import InputError, suggestion
@@ -19,7 +18,7 @@ from siq.systems.cards import check_name, load_exact
 from siq.systems.dynamics import Dynamics
 from siq.version import DISTRIBUTION
 from siq.workflow.published import load_published
-from siq.workflow.settings import StudyParts, settings_of
+from siq.workflow.settings import PipelineSettings, card_content, card_content_beside, settings_of
 from siq.workflow.study import Study, check_states, completed, load_study_system
 from workflow.places import BASE, config_path, names_in, needed_file, published_figures, system_card
 
@@ -100,13 +99,13 @@ class CheckedStudy:
         recordings = self.study.recordings
         if recordings is None or recordings.file.startswith("results/"):
             return
-        parts = StudyParts(self.study, self.system)
+        space = self.settings.space
         found, _ = read_pairs(
             self.source(),
-            states=parts.space.names,
-            units=parts.space.units,
+            states=space.names,
+            units=space.units,
             pair_step=recordings.pair_step,
-            hidden_velocities=parts.hidden_velocities,
+            hidden_velocities=self.study.identification.hidden_velocities,
         )
         for name in found.names:
             try:
@@ -128,13 +127,36 @@ class CheckedStudy:
             return None
         return str(published_figures(self.study.published, start=self.folder))
 
-    def exact(self) -> str | None:
-        """The card's exact answer as text, on which scoring alone depends."""
-        return None if (card := self.card()) is None else str(load_exact(card))
+    def _domain(self) -> list[list[float]] | None:
+        """The box that the card gives."""
+        return None if self.system is None or self.system.domain is None else self.system.domain.tolist()
 
-    def settings(self, cls: type[Any]) -> dict[str, Any]:
-        """The settings of a step as plain data, which Snakemake can compare and a script restores."""
-        return TypeAdapter(cls).dump_python(settings_of(cls, self.study, self.system), mode="json")
+    @cached_property
+    def settings(self) -> PipelineSettings:
+        """The settings of all steps."""
+        return settings_of(self.study, self.system)
+
+    def options(self, names: Sequence[str]) -> dict[str, Any]:
+        """What a task depends on as plain data, which Snakemake compares: parts of the settings, and others.
+
+        ``card`` is what a simulation takes from the card, so that another title makes nothing anew;
+        ``card_but_for_swept`` leaves out values that each point of a sweep has of its own; ``exact`` is the
+        card's exact answer, on which scoring alone depends; ``study`` is all of it, which the page prints.
+        """
+        swept = self.study.sweep
+        others: dict[str, Callable[[], Any]] = {
+            "card": lambda: card_content(self.system),
+            "card_but_for_swept": lambda: card_content_beside(self.card(), swept.names if swept else ()),
+            "exact": lambda: None if (card := self.card()) is None else str(load_exact(card)),
+            "study": lambda: self.study.model_dump(mode="json"),
+            "sweep": lambda: None if swept is None else swept.model_dump(mode="json"),
+            "command": self.command,
+            "every_run": lambda: self.study.landscape is not None,
+            "runs": lambda: self.study.runs,
+            "domain": self._domain,
+        }
+        parts = self.settings.parts([name for name in names if name not in others])
+        return parts | {name: others[name]() for name in names if name in others}
 
 
 class Studies(Mapping[str, CheckedStudy]):

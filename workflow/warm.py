@@ -1,14 +1,13 @@
 """A warm interpreter: every job of a workflow starts where its imports are done already.
 
 A step of a run takes seconds, and the imports of numpy, sympy, torch and pysindy as long again. So one
-process imports them, once for each script that asks; every job is a fork of it. `serve` is that process,
+process imports them, once for each task; every job is a fork of it. `serve` is that process,
 which the Snakefile starts; `run_warm` is what a script calls first. Files, rules and jobs stay one a run.
 Where there is no such process, as on systems that cannot fork, a script runs as it would by itself.
 """
 
 from __future__ import annotations
 
-import ast
 import contextlib
 import importlib
 import json
@@ -35,6 +34,7 @@ LONGEST_REQUEST = 1 << 20
 class Request(TypedDict):
     """What a job asks for."""
 
+    task: str
     script: str
     folder: str
     path: list[str]
@@ -70,7 +70,7 @@ def start() -> subprocess.Popen[bytes] | None:
     return process
 
 
-def run_warm() -> None:
+def run_warm(task: str) -> None:
     """Run the script that calls this in a fork of the warm interpreter, and end with its exit code.
 
     Returns at once where there is none, or where this is that fork. To be called before the imports that take
@@ -85,6 +85,7 @@ def run_warm() -> None:
     except OSError:
         return
     request: Request = {
+        "task": task,
         "script": str(Path(sys.argv[0]).resolve()),  # Snakemake runs a copy, which says what the job is
         "folder": str(Path.cwd()),
         "path": sys.path,
@@ -112,9 +113,8 @@ def serve(listening: socket.socket, folder: Path) -> None:
             connection.close()
             continue
         sys.path[:] = request["path"]
-        for module in _imported(Path(request["script"])):
-            with contextlib.suppress(Exception):  # the script says itself what is wrong with it
-                importlib.import_module(module)
+        with contextlib.suppress(Exception):  # the job says itself what is wrong
+            _load(request["task"])
         if os.fork() == 0:
             listening.close()
             _become(request, descriptors, connection)
@@ -123,20 +123,13 @@ def serve(listening: socket.socket, folder: Path) -> None:
         connection.close()
 
 
-def _imported(script: Path) -> list[str]:
-    """The modules that a script imports from this library or from others, found from its text."""
-    try:
-        statements = ast.parse(script.read_text(encoding="utf-8")).body
-    except (OSError, SyntaxError):
-        return []
-    modules = []
-    for statement in statements:
-        if isinstance(statement, ast.Import):
-            modules += [alias.name for alias in statement.names]
-        elif isinstance(statement, ast.ImportFrom) and statement.module:
-            modules += [statement.module, *(f"{statement.module}.{alias.name}" for alias in statement.names)]
-    # What stands beside the script, such as its own helpers, is the job's.
-    return [module for module in modules if module.partition(".")[0] not in {script.stem, "step"}]
+def _load(task: str) -> None:
+    """Import what a task imports when it runs, once for all of its jobs."""
+    from workflow.versions import imports_of_task
+
+    for module in imports_of_task(task):
+        with contextlib.suppress(ImportError):  # a name in a module, and no module
+            importlib.import_module(module)
 
 
 def _end_with_workflow(folder: Path) -> None:

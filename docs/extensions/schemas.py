@@ -160,7 +160,7 @@ class CommandLine(SphinxDirective):
     def run(self) -> list[nodes.Node]:
         """Ask the parser of `siq.cli` itself."""
         try:
-            parser = importlib.import_module("siq.cli.main").parser()
+            parser = importlib.import_module("siq.workflow.command").parser()
         except ImportError:
             return self.parse_text_to_nodes("`siq --help` prints every command with its options.")
         result: list[nodes.Node] = [_code(parser.format_help())]

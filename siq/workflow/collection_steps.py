@@ -18,7 +18,6 @@ import pandas as pd
 
 from siq.data.recordings import Recordings
 from siq.inference.identification import FieldRecord
-from siq.numerics.files import whole_file
 from siq.quasipotential.formulas import SymbolicDecomposition, read_model
 from siq.quasipotential.landscape_files import landscape_data
 from siq.quasipotential.wells import Well
@@ -182,11 +181,6 @@ def _has_wells(data: Mapping[str, Any] | None) -> bool:
     return bool(data) and bool((data or {}).get("wells"))
 
 
-def of_stored(run: int, data: Mapping[str, Any]) -> dict[str, Any]:
-    """The overview of a run whose landscape was found."""
-    return {"run": run} | dict(data)
-
-
 def run_overview(settings: LandscapeSettings, given: RunToShow) -> dict[str, Any] | None:
     """The overview of a run whose landscape nobody asked for; None where it has none."""
     found = landscape_step.run(
@@ -200,10 +194,3 @@ def run_overview(settings: LandscapeSettings, given: RunToShow) -> dict[str, Any
     missed = "quasipotential.no_refined_formula"
     data["remarks"] = [one for one in data["remarks"] if one["code"] != missed]
     return {"run": given.number} | data
-
-
-def write(path: str | Path, overview: Mapping[str, Any] | None) -> None:
-    """Write `overview.json`, an empty file where there is nothing to show."""
-    with whole_file(path) as partial:
-        text = "" if overview is None else json.dumps(overview, allow_nan=False) + "\n"
-        partial.write_text(text, encoding="utf-8")

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass as plain_dataclass
-from pathlib import Path
+from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from siq.errors import NumericalFailure
 from siq.quasipotential.landscape import Landscape, NoLandscape
 from siq.quasipotential.landscape_assembly import EquationSettings, landscape_from_equations
-from siq.quasipotential.landscape_files import write_landscape
 from siq.systems.dynamics import Dynamics
 from siq.workflow.landscape_step import degree_rows, landscape_rows
 from siq.workflow.outcomes import Method, Outcome, Status, Step
-from siq.workflow.tables import as_table, write_table
+from siq.workflow.tables import as_table
 
 
 @plain_dataclass(frozen=True)
@@ -25,6 +22,26 @@ class FoundOfEquations:
 
     landscape: Landscape | None
     outcome: Outcome
+
+    def files(self) -> dict[str, Any]:
+        """By the names of the rule."""
+        rows = {name: as_table(name, []) for name in ("landscape", "degrees", "certificates")}
+        if self.landscape is not None:
+            certificate = self.landscape.certificate
+            tests = {} if certificate is None else certificate.tests
+            rows = {
+                "landscape": landscape_rows(0, self.landscape),
+                "degrees": degree_rows(0, self.landscape),
+                "certificates": as_table(
+                    "certificates",
+                    [
+                        {"run": 0, "method": str(Method.REFINED), "test": name} | verdict.as_data()
+                        for name, verdict in tests.items()
+                    ],
+                ),
+            }
+        outcome = self.outcome.as_data() | {"step": self.outcome.step, "status": self.outcome.status}
+        return {"quasipotential": self.landscape, "outcomes": as_table("outcomes", [outcome])} | rows
 
 
 def run(settings: EquationSettings, system: Dynamics) -> FoundOfEquations:
@@ -37,37 +54,3 @@ def run(settings: EquationSettings, system: Dynamics) -> FoundOfEquations:
     whole = found.global_quasipotential is not None
     outcome = Outcome(0, Step.LANDSCAPE, Status.OK if whole else Status.WARNING, "; ".join(found.notes))
     return FoundOfEquations(found, outcome)
-
-
-def write(found: FoundOfEquations, *, quasipotential: str | Path, tables: Mapping[str, str | Path]) -> None:
-    """Write `quasipotential.json`, empty where there is no landscape, and the tables by name.
-
-    Parameters
-    ----------
-    found
-        What `run` gave.
-    quasipotential
-        Its file.
-    tables
-        Files of ``landscape``, ``degrees``, ``certificates`` and ``outcomes``.
-    """
-    rows: dict[str, pd.DataFrame] = {name: as_table(name, []) for name in tables}
-    kept = found.outcome
-    rows["outcomes"] = as_table("outcomes", [kept.as_data() | {"step": kept.step, "status": kept.status}])
-    if found.landscape is None:
-        Path(quasipotential).touch()
-    else:
-        write_landscape(quasipotential, found.landscape)
-        rows["landscape"] = landscape_rows(0, found.landscape)
-        rows["degrees"] = degree_rows(0, found.landscape)
-        certificate = found.landscape.certificate
-        made = {} if certificate is None else certificate.tests
-        rows["certificates"] = as_table(
-            "certificates",
-            [
-                {"run": 0, "method": str(Method.REFINED), "test": name} | verdict.as_data()
-                for name, verdict in made.items()
-            ],
-        )
-    for name, path in tables.items():
-        write_table(path, rows[name])

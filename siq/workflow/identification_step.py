@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass as plain_dataclass
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydantic.dataclasses import dataclass
@@ -31,9 +31,7 @@ from siq.inference.identification import (
     carries_noise,
     field_library,
     identify_vector_field,
-    read_field,
     with_stability,
-    write_field,
 )
 from siq.inference.instrumental_variables import (
     identify_from_earlier,
@@ -74,7 +72,7 @@ from siq.inference.residuals import (
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.certificate_tests import PredictionLimits, Verdict, check_prediction
 from siq.systems.diffusion import Diffusion
-from siq.workflow.outcomes import Outcome, Status, Step, read_outcomes, write_outcomes
+from siq.workflow.outcomes import Outcome, Status, Step
 from siq.workflow.settings import STRICT, Sampling, StateSpace
 
 SUSPECT = -1.0  # standard errors of the correlation of neighbouring residuals
@@ -526,6 +524,10 @@ class Identified:
     record: FieldRecord | None
     outcome: Outcome
 
+    def files(self) -> dict[str, Any]:
+        """By the names of the rule."""
+        return {"field": self.record, "identify_outcome": [self.outcome]}
+
 
 def run(settings: IdentifySettings, recordings: Recordings | None, *, number: int) -> Identified:
     """F of run `number`, from its recordings; None where drawing them failed."""
@@ -706,19 +708,3 @@ def _held_out_verdict(
         held_out_ratio=squares[0] / squares[1],
         limits=limits,
     )
-
-
-def read(field: str | Path, outcome: str | Path) -> Identified:
-    """What `write` wrote."""
-    return Identified(read_field(field), read_outcomes(outcome)[0])
-
-
-def write(
-    identified: Identified, settings: IdentifySettings, *, field: str | Path, outcome: str | Path
-) -> None:
-    """Write f, an empty file where none was found, and what became of the step."""
-    if identified.record is None:
-        Path(field).touch()
-    else:
-        write_field(field, identified.record, settings.identification)
-    write_outcomes(outcome, [identified.outcome])

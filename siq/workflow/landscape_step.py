@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass as plain_dataclass
 from dataclasses import replace
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -17,10 +17,8 @@ from siq.inference.identification import FieldRecord
 from siq.inference.noisy_sensor import of_all_states
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.certificate import Certificate
-from siq.quasipotential.formulas import read_model
 from siq.quasipotential.landscape import Landscape, LandscapeOptions
 from siq.quasipotential.landscape_assembly import find_landscape
-from siq.quasipotential.landscape_files import write_landscape
 from siq.quasipotential.occupancy import VisitTest
 from siq.quasipotential.rates import MeanTime, NoiseStrength, mean_exit_time, mean_residence_time
 from siq.quasipotential.refinement import RefinementOptions
@@ -28,9 +26,9 @@ from siq.quasipotential.wells import Well, best_trial
 from siq.remarks import Remark
 from siq.systems.cycles import Cycle
 from siq.systems.phase_portrait import evenly_spread, phase_portrait
-from siq.workflow.outcomes import Method, Outcome, Status, Step, write_outcomes
+from siq.workflow.outcomes import Outcome, Status, Step
 from siq.workflow.settings import STRICT, Sampling, StateSpace
-from siq.workflow.tables import as_table, write_table
+from siq.workflow.tables import as_table
 
 
 def place(position: np.ndarray) -> str:
@@ -152,6 +150,19 @@ class FoundLandscape:
     record: FieldRecord | None
     outcome: Outcome
 
+    def files(self) -> dict[str, Any]:
+        """By the names of the rule."""
+        number, stored = self.outcome.run, None
+        rows, accuracy = as_table("landscape", []), as_table("degrees", [])
+        if self.landscape is not None and self.record is not None:
+            stored = self.landscape
+            rows = landscape_rows(number, self.landscape, self.record.diffusion_source.note)
+            accuracy = degree_rows(number, self.landscape)
+        return {
+            "quasipotential": stored, "landscape": rows, "degrees": accuracy,
+            "landscape_outcome": [self.outcome],
+        }  # fmt: skip
+
 
 def run(
     settings: LandscapeSettings,
@@ -215,32 +226,3 @@ def units_of(recordings: Recordings, space: StateSpace) -> tuple[tuple[str, ...]
         for name, unit in zip(recordings.names, recordings.units, strict=True)
     )
     return states, recordings.time_unit or space.unit("t", unknown="1")
-
-
-def read_wells(model: str | Path) -> tuple[Well, ...]:
-    """V about the attractors as refinement wrote it to `model.json`."""
-    formulas, _ = read_model(model)
-    return formulas[Method.REFINED].wells if Method.REFINED in formulas else ()
-
-
-def write(
-    found: FoundLandscape,
-    *,
-    quasipotential: str | Path,
-    table: str | Path,
-    degrees: str | Path,
-    outcome: str | Path,
-) -> None:
-    """Write `quasipotential.json` with its tables, an empty file and none where there is no landscape."""
-    number, rows, accuracy = found.outcome.run, as_table("landscape", []), as_table("degrees", [])
-    if found.landscape is None or found.record is None:
-        Path(quasipotential).touch()
-    else:
-        write_landscape(quasipotential, found.landscape)
-        rows, accuracy = (
-            landscape_rows(number, found.landscape, found.record.diffusion_source.note),
-            degree_rows(number, found.landscape),
-        )
-    write_table(table, rows)
-    write_table(degrees, accuracy)
-    write_outcomes(outcome, [found.outcome])

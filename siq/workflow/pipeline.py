@@ -1,92 +1,33 @@
-"""Pipeline: all that a run of recordings gives, in memory: f, networks, V with its certificate, landscape.
+"""All that a run of recordings gives, in memory: f, networks, V with its certificate, landscape.
 
-The same functions as in the workflow, without its files.
+The tasks of the workflow, chained without its files.
 """
 
 from __future__ import annotations
 
-import dataclasses
-from dataclasses import dataclass as plain_dataclass
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import pandas as pd
-from pydantic.dataclasses import dataclass
 
 from siq.data.inspection import seen_states
 from siq.data.recordings import Recordings, recordings_of
 from siq.data.selection import in_stretches, joined
 from siq.data.two_states import without_slow_drift
-from siq.inference.identification import IdentificationOptions
-from siq.networks.decomposition import TrainingOptions
-from siq.networks.regression import RegressionOptions
-from siq.quasipotential.certificate_tests import CertificateOptions, PredictionLimits
-from siq.quasipotential.landscape import Landscape, LandscapeOptions, NoLandscape
-from siq.quasipotential.refinement import RefinementOptions
+from siq.quasipotential.landscape import Landscape, NoLandscape
 from siq.systems.dynamics import Dynamics
-from siq.workflow import identification_step, landscape_step, refinement_step, regression_step, training_step
+from siq.workflow import identification_step, landscape_step, refinement_step, regression_step, steps
 from siq.workflow.outcomes import Outcome, why_no_landscape
-from siq.workflow.settings import STRICT, Sampling, StateSpace
-from siq.workflow.training_step import TrainedRun, not_trained
+from siq.workflow.settings import PipelineSettings
+from siq.workflow.tasks import Given, results
+from siq.workflow.training_step import TrainedRun, trained_run
 
-Settings = TypeVar("Settings")
-
-
-@dataclass(frozen=True, config=STRICT)
-class PipelineSettings:
-    """What the analysis of recordings depends on; the defaults need no networks.
-
-    Attributes
-    ----------
-    seed
-        Of everything random.
-    space
-        The states, and D.
-    sampling
-        How samples make pairs.
-    identification, regression, refinement, certificate
-        The parameters of the steps.
-    training
-        How two networks are trained; None trains none, and V comes from the local route alone.
-    published_method
-        Whether the published regression is made of the networks, beside the refined formulas.
-    landscape
-        How the landscape is found; None finds none.
-    """
-
-    seed: int = 0
-    space: StateSpace = StateSpace()
-    sampling: Sampling = Sampling()
-    identification: IdentificationOptions = IdentificationOptions()
-    training: TrainingOptions | None = None
-    published_method: bool = True
-    regression: RegressionOptions = RegressionOptions()
-    refinement: RefinementOptions = RefinementOptions()
-    certificate: CertificateOptions = CertificateOptions()
-    landscape: LandscapeOptions | None = LandscapeOptions()
-
-    def __post_init__(self) -> None:
-        if self.training is not None and self.identification.hidden_velocities:
-            raise ValueError(
-                "networks know recorded states only, and velocities are hidden; leave 'training' out"
-            )
-
-    @property
-    def prediction(self) -> PredictionLimits:
-        """The certificate's limits for f."""
-        return self.certificate.of_f
-
-    def of(self, cls: type[Settings]) -> Settings:
-        """The settings of one step."""
-        named: dict[str, Any] = {
-            field.name: getattr(self, field.name)
-            for field in dataclasses.fields(cls)  # type: ignore[arg-type]
-        }
-        return cls(**named)
+__all__ = ["Analysis", "PipelineSettings", "analyse", "landscape_from_recordings"]
 
 
-@plain_dataclass(frozen=True)
+@dataclass(frozen=True)
 class Analysis:
     """What the steps found; each has its outcome, and says why where it has no result.
 
@@ -143,31 +84,27 @@ def analyse(
         Also where a step failed, which its outcome then says.
     """
     settings = settings or PipelineSettings()
-    recordings = in_stretches(
-        without_slow_drift(recordings), hidden_velocities=settings.identification.hidden_velocities
-    )
-    identified = identification_step.run(
-        settings.of(identification_step.IdentifySettings), recordings, number=number
-    )
-    trained, regressed = not_trained(number), None
-    refinement = settings.refinement.with_routes(networks=settings.training is not None)
-    settings = replace(settings, refinement=refinement)
-    if settings.training is not None:
-        given = {number: training_step.RunToTrain(recordings, identified.record)}
-        trained = training_step.run(settings.of(training_step.TrainSettings), given, device=device).of(number)
-        if settings.published_method:
-            regressed = regression_step.run(settings.of(regression_step.RegressSettings), recordings, trained)
-    formulas = None if regressed is None else regressed.formulas
-    to_refine = refinement_step.RunToRefine(recordings, identified, trained, formulas)
-    refined = refinement_step.run(settings.of(refinement_step.RefineSettings), to_refine)
-    found = None
-    if settings.landscape is not None:
-        found = landscape_step.run(
-            settings.of(landscape_step.LandscapeSettings), recordings, identified.record, number=number,
-            wells=refined.wells, certificate=refined.certificate,
-            visits=() if refined.record is None else refined.record.visits,
-        )  # fmt: skip
-    return Analysis(identified, trained, regressed, refined, found)
+    networks, hidden = settings.training is not None, settings.identification.hidden_velocities
+    settings = replace(settings, refinement=settings.refinement.with_routes(networks=networks))
+    made: dict[str, Any] = {
+        "recordings": in_stretches(without_slow_drift(recordings), hidden_velocities=hidden)
+    }
+
+    def run(one: Callable[[Given, PipelineSettings], Any]) -> Any:
+        block = one is steps.train  # whose runs train side by side; here there is one
+        values = {name: [value] for name, value in made.items()} if block else dict(made)
+        found = one(Given(values=values, number=number, device=device), settings)
+        made.update(results(found))
+        return found
+
+    identified = run(steps.identify)
+    if networks:
+        run(steps.train)
+    trained = trained_run(made.get("networks"), made.get("train_outcome"), number=number)
+    regressed = run(steps.regress) if networks and settings.published_method else None
+    made["refined"] = refined = run(steps.refine)
+    landscape = run(steps.landscape) if settings.landscape is not None else None
+    return Analysis(identified, trained, regressed, refined, landscape)
 
 
 def landscape_from_recordings(

@@ -5,49 +5,29 @@ from __future__ import annotations
 from dataclasses import dataclass as plain_dataclass
 from dataclasses import replace
 from pathlib import Path
-
-from pydantic.dataclasses import dataclass
+from typing import Any
 
 from siq.data.inspection import read_pairs
-from siq.data.recordings import Recordings, read_recordings, write_recordings
+from siq.data.recordings import Recordings
 from siq.data.selection import in_stretches, resample_recordings
 from siq.data.two_states import without_slow_drift
 from siq.errors import NumericalFailure
-from siq.inference.identification import read_field
 from siq.inference.noisy_sensor import of_all_states
 from siq.numerics.randomness import Purpose, generator
 from siq.systems.cards import load_system
 from siq.systems.dynamics import Dynamics
-from siq.systems.simulation import SimulationOptions, simulate_snapshots
-from siq.workflow.outcomes import Outcome, Status, Step, write_outcomes
-from siq.workflow.settings import STRICT, Sampling, StateSpace
-
-
-def read_run(path: str | Path) -> Recordings | None:
-    """The trajectories of a run, or None where drawing them failed and left an empty file."""
-    return read_recordings(path) if Path(path).stat().st_size else None
+from siq.systems.simulation import simulate_snapshots
+from siq.workflow.files import read
+from siq.workflow.outcomes import Outcome, Status, Step
+from siq.workflow.settings import PipelineSettings
 
 
 def read_states(path: str | Path, field: str | Path) -> Recordings | None:
-    """The same with velocities that were not recorded, as the identified f of the run has them."""
-    recordings, record = read_run(path), read_field(field)
+    """Trajectories of a run, with velocities that were not recorded as its identified f has them."""
+    recordings, record = read("recordings", path), read("field", field)
     if recordings is None or record is None:
         return recordings
     return of_all_states(recordings, record, pair_step=None)
-
-
-@dataclass(frozen=True, config=STRICT)
-class DrawSettings:
-    """What drawing depends on; `simulation` is None where recordings take its place.
-
-    Of the identification it is told one thing: whether the recordings are positions (`hidden_velocities`).
-    """
-
-    seed: int
-    space: StateSpace
-    sampling: Sampling
-    simulation: SimulationOptions | None
-    hidden_velocities: bool = False
 
 
 @plain_dataclass(frozen=True)
@@ -57,8 +37,12 @@ class Drawn:
     recordings: Recordings | None
     outcome: Outcome
 
+    def files(self) -> dict[str, Any]:
+        """By the names of the rule."""
+        return {"recordings": self.recordings, "draw_outcome": [self.outcome]}
 
-def run(settings: DrawSettings, source: Dynamics | Recordings, *, number: int) -> Drawn:
+
+def run(settings: PipelineSettings, source: Dynamics | Recordings, *, number: int) -> Drawn:
     """The trajectories of run `number`.
 
     Parameters
@@ -71,7 +55,8 @@ def run(settings: DrawSettings, source: Dynamics | Recordings, *, number: int) -
         Of the run.
     """
     if isinstance(source, Recordings):
-        source = in_stretches(without_slow_drift(source), hidden_velocities=settings.hidden_velocities)
+        hidden = settings.identification.hidden_velocities
+        source = in_stretches(without_slow_drift(source), hidden_velocities=hidden)
         if number > 0:
             draw = generator(settings.seed, number, Purpose.RESAMPLE)
             source = resample_recordings(source, generator=draw)
@@ -85,7 +70,7 @@ def run(settings: DrawSettings, source: Dynamics | Recordings, *, number: int) -
         return Drawn(None, Outcome(number, Step.SIMULATE, Status.FAILED, str(error)))
 
 
-def read(path: str | Path, settings: DrawSettings) -> Dynamics | Recordings:
+def source_of(path: str | Path, settings: PipelineSettings) -> Dynamics | Recordings:
     """The card that is simulated, or the recordings in its place.
 
     Raises
@@ -100,7 +85,7 @@ def read(path: str | Path, settings: DrawSettings) -> Dynamics | Recordings:
         states=settings.space.names,
         units=settings.space.units,
         pair_step=settings.sampling.pair_step,
-        hidden_velocities=settings.hidden_velocities,
+        hidden_velocities=settings.identification.hidden_velocities,
     )
     space = settings.space
     units = tuple(
@@ -110,12 +95,3 @@ def read(path: str | Path, settings: DrawSettings) -> Dynamics | Recordings:
     return replace(
         recordings, units=units, time_unit=recordings.time_unit or space.unit("t", unknown="") or None
     )
-
-
-def write(drawn: Drawn, *, recordings: str | Path, outcome: str | Path) -> None:
-    """Write the trajectories, an empty file where there are none, and what became of the step."""
-    if drawn.recordings is None:
-        Path(recordings).touch()
-    else:
-        write_recordings(recordings, drawn.recordings)
-    write_outcomes(outcome, [drawn.outcome])

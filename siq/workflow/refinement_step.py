@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass as plain_dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,7 @@ from siq.errors import NumericalFailure
 from siq.numerics.text import place_text
 from siq.quasipotential.certificate import Certificate, certify, uncertified
 from siq.quasipotential.certificate_tests import CertificateOptions
-from siq.quasipotential.formulas import SymbolicDecomposition, model_to_data, write_model
+from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.quasipotential.occupancy import RecordTest
 from siq.quasipotential.refinement import (
     Refinement,
@@ -33,9 +32,9 @@ from siq.quasipotential.refinement import (
 from siq.quasipotential.wells import Well
 from siq.systems.phase_portrait import PhasePortrait
 from siq.workflow.identification_step import Identified
-from siq.workflow.outcomes import Method, Outcome, Status, Step, write_outcomes
+from siq.workflow.outcomes import Method, Outcome, Status, Step
 from siq.workflow.settings import STRICT, Sampling
-from siq.workflow.tables import as_table, write_table
+from siq.workflow.tables import as_table
 from siq.workflow.training_step import TrainedRun
 
 
@@ -86,6 +85,17 @@ class RefinedRun:
     refinement: Refinement | None = None
     portrait: PhasePortrait | None = None
     states: tuple[str, ...] = ()
+
+    def files(self) -> dict[str, Any]:
+        """By the names of the rule."""
+        number = self.outcome.run
+        attractors = () if self.portrait is None else [one.position for one in self.portrait.attractors]
+        return {
+            "model": (self.formulas, self.certificates),
+            "refine_outcome": [self.outcome],
+            "record": visit_rows(number, self.record, attractors),
+            "record_density": density_rows(number, self.record, attractors, self.states),
+        }
 
     @property
     def wells(self) -> tuple[Well, ...]:
@@ -197,22 +207,3 @@ def density_rows(
         for place in range(len(one.counted))
     ]
     return as_table("record_density", rows)
-
-
-def write(
-    refined: RefinedRun,
-    *,
-    model: str | Path,
-    outcome: str | Path,
-    record: str | Path,
-    record_density: str | Path,
-) -> None:
-    """Write `model.json`, what became of the step, and the tables of the test against the record."""
-    number = refined.outcome.run
-    attractors = () if refined.portrait is None else [one.position for one in refined.portrait.attractors]
-    write_table(record, visit_rows(number, refined.record, attractors))
-    write_table(record_density, density_rows(number, refined.record, attractors, refined.states))
-    formulas = {str(method): one for method, one in refined.formulas.items()}
-    certificates = {str(method): one for method, one in refined.certificates.items()}
-    write_model(model, model_to_data(formulas, certificates))
-    write_outcomes(outcome, [refined.outcome])

@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass as plain_dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic.dataclasses import dataclass
 
 from siq.data.recordings import Recordings, snapshot_pairs
 from siq.errors import NumericalFailure
 from siq.inference.library import candidate_library
 from siq.networks.decomposition import TrainedNetworks
-from siq.networks.regression import RegressionOptions, RegressionResult, points_below, sparse_decomposition
+from siq.networks.regression import RegressionResult, points_below, sparse_decomposition
 from siq.quasipotential.formulas import (
     SymbolicDecomposition,
     decomposition_from_coefficients,
-    model_to_data,
-    write_model,
 )
 from siq.systems.diffusion import Diffusion
-from siq.workflow.outcomes import Method, Outcome, Status, Step, write_outcomes
-from siq.workflow.settings import STRICT, Sampling, StateSpace
+from siq.workflow.outcomes import Method, Outcome, Status, Step
+from siq.workflow.settings import PipelineSettings
 from siq.workflow.training_step import TrainedRun
 
 UNCERTIFIED = {
@@ -32,15 +28,6 @@ UNCERTIFIED = {
 }
 
 
-@dataclass(frozen=True, config=STRICT)
-class RegressSettings:
-    """What the regression depends on."""
-
-    space: StateSpace
-    sampling: Sampling
-    regression: RegressionOptions
-
-
 @plain_dataclass(frozen=True)
 class Regressed:
     """The formulas of a run, None where there are none."""
@@ -48,8 +35,13 @@ class Regressed:
     formulas: SymbolicDecomposition | None
     outcome: Outcome
 
+    def files(self) -> dict[str, Any]:
+        """By the names of the rule."""
+        models = {} if self.formulas is None else {Method.REGRESSION: self.formulas}
+        return {"regression": (models, dict.fromkeys(models, UNCERTIFIED)), "regress_outcome": [self.outcome]}
 
-def run(settings: RegressSettings, recordings: Recordings | None, trained: TrainedRun) -> Regressed:
+
+def run(settings: PipelineSettings, recordings: Recordings | None, trained: TrainedRun) -> Regressed:
     """Formulas of the networks of one run."""
     number = trained.outcome.run
     if trained.networks is None or recordings is None:
@@ -64,7 +56,7 @@ def run(settings: RegressSettings, recordings: Recordings | None, trained: Train
 
 
 def _regressed(
-    settings: RegressSettings, recordings: Recordings, networks: TrainedNetworks
+    settings: PipelineSettings, recordings: Recordings, networks: TrainedNetworks
 ) -> tuple[SymbolicDecomposition, RegressionResult]:
     options = settings.regression
     points = snapshot_pairs(recordings, pair_step=settings.sampling.pair_step).x0
@@ -107,10 +99,3 @@ def _quality(result: RegressionResult) -> dict[str, Any]:
         "sparse_constraint_residual": result.sparse_constraint_residual,
         "misfit": np.round(result.misfit, 12).tolist(),
     }
-
-
-def write(regressed: Regressed, *, model: str | Path, outcome: str | Path) -> None:
-    """Write the formulas, as `model.json` has them, and what became of the step."""
-    models = {} if regressed.formulas is None else {str(Method.REGRESSION): regressed.formulas}
-    write_model(model, model_to_data(models, dict.fromkeys(models, UNCERTIFIED)))
-    write_outcomes(outcome, [regressed.outcome])

@@ -8,22 +8,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass as plain_dataclass
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from pydantic.dataclasses import dataclass
 
 from siq.inference.library import candidate_library
 from siq.inference.residuals import prediction_errors
 from siq.networks.decomposition import TrainedNetworks, shuffled
-from siq.networks.regression import RegressionOptions
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.systems.dynamics import Dynamics
 from siq.systems.simulation import SimulationOptions, simulate_snapshots
-from siq.workflow.outcomes import METHODS, Method, Outcome, Status, Step, write_outcomes
+from siq.workflow.outcomes import METHODS, Method, Outcome, Status, Step
 from siq.workflow.scoring import (
     coefficient_table,
     domain_grid,
@@ -32,25 +29,12 @@ from siq.workflow.scoring import (
     relative_root_mean_square_error,
     support_is_correct,
 )
-from siq.workflow.settings import STRICT
-from siq.workflow.tables import as_table, concatenate, write_table
+from siq.workflow.settings import PipelineSettings
+from siq.workflow.tables import as_table, concatenate
 from siq.workflow.training_step import TrainedRun
 
 COARSE = 50_000  # points of the grid on which the randomised network is scored
 UNSEEN = 1000  # trajectories that no run learns from (paper, section 3.1)
-
-
-@dataclass(frozen=True, config=STRICT)
-class ScoreSettings:
-    """What scoring depends on; `simulation` is None of recordings.
-
-    `methods` are those that the study asks for: each stands in the tables, also without a formula.
-    """
-
-    seed: int
-    regression: RegressionOptions
-    simulation: SimulationOptions | None
-    methods: tuple[Method, ...] = METHODS
 
 
 @plain_dataclass(frozen=True)
@@ -86,8 +70,13 @@ class Scored:
     certificates: pd.DataFrame
     outcome: Outcome
 
+    def files(self) -> dict[str, Any]:
+        """By the names of the rule."""
+        names = ("coefficients", "rrmse", "prediction", "certificates")
+        return {name: getattr(self, name) for name in names} | {"score_outcome": [self.outcome]}
 
-def run(settings: ScoreSettings, given: RunToScore) -> Scored:
+
+def run(settings: PipelineSettings, given: RunToScore) -> Scored:
     """Scores of one run."""
     number, system, exact = given.trained.outcome.run, given.system, given.exact
     options, tables = settings.regression, []
@@ -180,20 +169,3 @@ def _certificate_table(number: int, certificates: Mapping[str, Mapping[str, Any]
         for test, verdict in one["tests"].items()
     ]
     return as_table("certificates", rows)
-
-
-def write(
-    scored: Scored,
-    *,
-    coefficients: str | Path,
-    rrmse: str | Path,
-    prediction: str | Path,
-    certificates: str | Path,
-    outcome: str | Path,
-) -> None:
-    """Write the tables of a run, and what became of the step."""
-    write_table(coefficients, scored.coefficients)
-    write_table(rrmse, scored.rrmse)
-    write_table(prediction, scored.prediction)
-    write_table(certificates, scored.certificates)
-    write_outcomes(outcome, [scored.outcome])

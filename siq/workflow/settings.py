@@ -1,19 +1,22 @@
-"""The settings of a step, as a study and its card say them."""
+"""Settings of the analysis: one object for all steps, and how it follows from a study and its card."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, TypeAdapter
 from pydantic.dataclasses import dataclass as pydantic_dataclass
 
 from siq.errors import NumericalFailure
+from siq.inference.identification import IdentificationOptions
+from siq.networks.decomposition import TrainingOptions
+from siq.networks.regression import RegressionOptions
 from siq.numerics.files import read_document, validate
-from siq.quasipotential.certificate_tests import PredictionLimits
+from siq.quasipotential.certificate_tests import CertificateOptions, PredictionLimits
+from siq.quasipotential.landscape import LandscapeOptions
 from siq.quasipotential.refinement import RefinementOptions
 from siq.systems.cards import DiffusionEntry, SystemCard, diffusion_rows, read_diffusion
 from siq.systems.diffusion import Diffusion
@@ -93,96 +96,105 @@ class StateSpace:
 Settings = TypeVar("Settings")
 
 
-@dataclass(frozen=True)
-class StudyParts:
-    """What a study says, by the names that the settings of steps have for it.
+@pydantic_dataclass(frozen=True, config=STRICT)
+class PipelineSettings:
+    """What the analysis of recordings depends on; the defaults need no networks.
 
-    Whatever is not listed here is the study's own key of that name.
+    A task of the workflow is told the parts that it names and nothing else: only their change makes
+    its results anew; the rest keeps its default.
 
     Attributes
     ----------
-    study
-        The checked study, as a whole.
-    system
-        Its system, where it names one.
+    seed
+        Of everything random.
+    space
+        The states, and D.
+    sampling
+        How samples make pairs.
+    identification, regression, refinement, certificate
+        The parameters of the steps.
+    training
+        How two networks are trained; None trains none, and V comes from the local route alone.
+    published_method
+        Whether the published regression is made of the networks, beside the refined formulas.
+    landscape
+        How the landscape is found; None finds none.
+    simulation
+        What is simulated; None of recordings.
+    invariant
+        Noise intensities ε for which the invariant distribution is computed.
     """
 
-    study: Study
-    system: Dynamics | None
+    seed: int = 0
+    space: StateSpace = StateSpace()
+    sampling: Sampling = Sampling()
+    identification: IdentificationOptions = IdentificationOptions()
+    training: TrainingOptions | None = None
+    published_method: bool = True
+    regression: RegressionOptions = RegressionOptions()
+    refinement: RefinementOptions = RefinementOptions()
+    certificate: CertificateOptions = CertificateOptions()
+    landscape: LandscapeOptions | None = LandscapeOptions()
+    simulation: SimulationOptions | None = None
+    invariant: tuple[Annotated[float, Field(gt=0)], ...] = ()
 
-    @property
-    def simulation(self) -> SimulationOptions | None:
-        """What is simulated; None of recordings, so that nothing runs again for it."""
-        if self.study.recordings is not None or self.system is None:
-            return None
-        return complete(self.study.simulation, self.system).options()
-
-    @property
-    def sampling(self) -> Sampling:
-        """How samples make pairs: as the simulation had it, or as the study says of its recordings."""
-        if self.study.recordings is not None:
-            return Sampling(self.study.recordings.pair_step, self.study.recordings.integrator_step)
-        options = self.simulation
-        assert options is not None  # what is not recorded is simulated
-        noisy = options.noise_intensity > 0
-        return Sampling(options.pair_step, options.pair_step / options.substeps if noisy else None)
-
-    @property
-    def space(self) -> StateSpace:
-        """The states, their units and D, of the card where there is one."""
-        if self.system is not None:
-            units = dict(zip(self.system.states, self.system.units, strict=True))
-            units["t"] = self.system.time_unit
-            return StateSpace(self.system.states, units, self.system.diffusion.rows)
-        recordings = self.study.recordings
-        assert recordings is not None  # the schema asks for one of the two
-        return StateSpace(recordings.states, recordings.units, recordings.diffusion)
-
-    @property
-    def hidden_velocities(self) -> bool:
-        """Whether the recordings are positions, whose velocities are states, too."""
-        return self.study.identification.hidden_velocities
-
-    @property
-    def refinement(self) -> RefinementOptions:
-        """How V is refined, by the routes that there are."""
-        return self.study.refinement.with_routes(networks=self.study.training is not None)
-
-    @property
-    def methods(self) -> tuple[Method, ...]:
-        """Whose formulas a run has: without networks there is nothing to regress."""
-        return METHODS if self.study.training is not None else (Method.REFINED,)
+    def __post_init__(self) -> None:
+        if self.training is not None and self.identification.hidden_velocities:
+            raise ValueError(
+                "networks know recorded states only, and velocities are hidden; leave 'training' out"
+            )
 
     @property
     def prediction(self) -> PredictionLimits:
         """The certificate's limits for f."""
-        return self.study.certificate.of_f
+        return self.certificate.of_f
 
     @property
-    def domain(self) -> tuple[tuple[float, float], ...] | None:
-        """The box that the card says, in the states' units."""
-        if self.system is None or self.system.domain is None:
-            return None
-        return tuple((float(low), float(high)) for low, high in self.system.domain)
+    def methods(self) -> tuple[Method, ...]:
+        """Whose formulas a run has: without networks there is nothing to regress."""
+        return METHODS if self.published_method else (Method.REFINED,)
 
-    def part(self, name: str) -> Any:
-        """One part by its name."""
-        return getattr(self, name) if hasattr(self, name) else getattr(self.study, name)
+    def of(self, cls: type[Settings]) -> Settings:
+        """The settings of one step that has a class of its own for them."""
+        fields = dataclasses.fields(cls)  # type: ignore[arg-type]
+        return cls(**{field.name: getattr(self, field.name) for field in fields})
+
+    def parts(self, names: Sequence[str]) -> dict[str, Any]:
+        """Some parts as plain data, from which `PipelineSettings` is made again; ``a.b`` is b of a alone."""
+        plain, chosen = TypeAdapter(PipelineSettings).dump_python(self, mode="json"), dict[str, Any]()
+        for name in names:
+            part, _, inner = name.partition(".")
+            chosen[part] = plain[part] if not inner else chosen.get(part, {}) | {inner: plain[part][inner]}
+        return chosen
 
 
-def settings_of(cls: type[Settings], study: Study, system: Dynamics | None) -> Settings:
-    """The settings of a step, each field from the part of the study of the same name.
+def settings_of(study: Study, system: Dynamics | None) -> PipelineSettings:
+    """What a checked study, and its system where it names one, say of every step.
 
-    Parameters
-    ----------
-    cls
-        A settings class, such as `siq.workflow.identification_step.IdentifySettings`.
-    study, system
-        The checked study, and its system where it names one.
+    Of recordings nothing is simulated. States, units and D are those of the system where there is one.
+    Pairs of samples are as the simulation had them, or as the study says of its recordings.
     """
-    parts = StudyParts(study, system)
-    named = {field.name: parts.part(field.name) for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
-    return cls(**named)
+    recordings, simulation, sampling = study.recordings, None, Sampling()
+    if recordings is not None:
+        sampling = Sampling(recordings.pair_step, recordings.integrator_step)
+    elif system is not None and study.entrance == "trajectories":
+        simulation = complete(study.simulation, system).options()
+        noisy = simulation.noise_intensity > 0
+        step = simulation.pair_step
+        sampling = Sampling(step, step / simulation.substeps if noisy else None)
+    if system is not None:
+        units = dict(zip(system.states, system.units, strict=True)) | {"t": system.time_unit}
+        space = StateSpace(system.states, units, system.diffusion.rows)
+    else:
+        assert recordings is not None  # the schema asks for one of the two
+        space = StateSpace(recordings.states, recordings.units, recordings.diffusion)
+    networks = study.training is not None
+    return PipelineSettings(
+        seed=study.seed, space=space, sampling=sampling, identification=study.identification,
+        training=study.training, published_method=networks, regression=study.regression,
+        refinement=study.refinement.with_routes(networks=networks), certificate=study.certificate,
+        landscape=study.landscape, simulation=simulation, invariant=study.invariant,
+    )  # fmt: skip
 
 
 def card_content_beside(card: str | None, names: Sequence[str]) -> list[Any] | None:

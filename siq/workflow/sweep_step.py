@@ -30,14 +30,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 import sympy
-from pydantic import ConfigDict, TypeAdapter
+from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass as pydantic_dataclass
 
 from siq.errors import InputError, NumericalFailure, suggestion
-from siq.numerics.files import read_document, validate, whole_file
+from siq.numerics.files import read_document, validate
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.invariant_density import shares_by_rates
-from siq.quasipotential.landscape import LandscapeOptions, NoLandscape
+from siq.quasipotential.landscape import NoLandscape
 from siq.quasipotential.landscape_assembly import (
     EquationSettings,
     landscape_from_equations,
@@ -59,18 +59,9 @@ from siq.systems.continuation import (
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import all_equilibria
 from siq.systems.phase_portrait import MOST_SEARCHED, UNSETTLED
-from siq.workflow.settings import STRICT
-from siq.workflow.study import SweepOptions
-from siq.workflow.tables import as_table, write_table
+from siq.workflow.tables import as_table
 
 PLAIN = ConfigDict(extra="forbid", ser_json_inf_nan="constants")
-
-
-@pydantic_dataclass(frozen=True, config=STRICT)
-class PointSettings:
-    """What a point depends on, beside the equations at its value."""
-
-    seed: int = 0
 
 
 @pydantic_dataclass(frozen=True, config=PLAIN)
@@ -171,7 +162,7 @@ def with_parameters(system: str | Path | Dynamics, names: Sequence[str], values:
 
 
 def point_at(
-    system: str | Path | Dynamics, names: Sequence[str], values: tuple[float, ...], settings: PointSettings
+    system: str | Path | Dynamics, names: Sequence[str], values: tuple[float, ...], *, seed: int = 0
 ) -> SweptPoint:
     """The landscape at values of the parameters; where there is none, or f has no value, the reason."""
     try:
@@ -179,10 +170,10 @@ def point_at(
     except InputError as error:
         return SweptPoint(values, (), reason=f"{error.fault}; {error.remedy}")
     try:
-        found = landscape_from_equations(system, EquationSettings(seed=settings.seed), formulas=False)
+        found = landscape_from_equations(system, EquationSettings(seed=seed), formulas=False)
     except (NumericalFailure, np.linalg.LinAlgError) as error:
         reason = error.reason if isinstance(error, NoLandscape) else str(error)
-        return SweptPoint(values, _resting(system, settings), reason=reason)
+        return SweptPoint(values, _resting(system, seed), reason=reason)
     return SweptPoint(
         values,
         tuple(tuple(map(float, one.position)) for one in found.equilibria),
@@ -196,12 +187,12 @@ def point_at(
     )
 
 
-def _resting(system: Dynamics, settings: PointSettings) -> tuple[tuple[float, ...], ...]:
+def _resting(system: Dynamics, seed: int) -> tuple[tuple[float, ...], ...]:
     """Equilibria where there is no landscape: a branch may pass through them all the same."""
     if system.dimension > MOST_SEARCHED:
         return ()
     try:
-        draw = generator(settings.seed, Purpose.LANDSCAPE)
+        draw = generator(seed, Purpose.LANDSCAPE)
         found = all_equilibria(system, generator=draw).equilibria
     except (NumericalFailure, np.linalg.LinAlgError):
         return ()
@@ -212,17 +203,6 @@ def _as_way(way: Transition) -> SweptWay:
     barrier = float(way.barrier) if np.isfinite(way.barrier) else None
     prefactor = None if way.rate is None else float(way.rate.prefactor)
     return SweptWay(way.start, way.end, barrier, prefactor, "; ".join(way.notes))
-
-
-def write_point(path: str | Path, point: SweptPoint) -> None:
-    """Write a point as JSON."""
-    with whole_file(path) as partial:
-        partial.write_bytes(TypeAdapter(SweptPoint).dump_json(point))
-
-
-def read_point(path: str | Path) -> SweptPoint:
-    """Read what `write_point` wrote."""
-    return TypeAdapter(SweptPoint).validate_json(Path(path).read_bytes())
 
 
 DIGITS = 10  # of positions in tables
@@ -506,24 +486,6 @@ if TYPE_CHECKING:
 MOST_PARAMETERS = 2
 
 
-@pydantic_dataclass(frozen=True, config=STRICT)
-class SweepSettings:
-    """What the tables of a sweep depend on, beside its points."""
-
-    sweep: SweepOptions
-    landscape: LandscapeOptions
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Of the parameters."""
-        return self.sweep.names
-
-    @property
-    def noise(self) -> float | None:
-        """ε, the first of those that the study gives."""
-        return next(iter(self.landscape.noise_intensities), None)
-
-
 @plain_dataclass(frozen=True, eq=False, repr=False)
 class Sweep:
     """A landscape against one parameter, or two.
@@ -559,6 +521,13 @@ class Sweep:
     notes: tuple[str, ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
     curves: pd.DataFrame = field(default_factory=lambda: as_table("bifurcation_curves", []))
+
+    def files(self) -> dict[str, pd.DataFrame]:
+        """By the names of the rule."""
+        return {
+            "sweep": self.table, "sweep_ways": self.ways, "branches": self.branches,
+            "bifurcations": self.bifurcations, "bifurcation_curves": self.curves,
+        }  # fmt: skip
 
     def plot(self) -> Figure:
         """Equilibria, barriers and times against the parameter; of two, a map with its curves."""
@@ -638,8 +607,8 @@ def sweep(
     if isinstance(system, Dynamics):
         check_noise(system, named)
     grid = np.stack(np.meshgrid(*named.values(), indexing="ij"), axis=-1).reshape(-1, len(named))
-    names, settings = tuple(named), PointSettings(seed)
-    points = [point_at(system, names, tuple(map(float, one)), settings) for one in grid]
+    names = tuple(named)
+    points = [point_at(system, names, tuple(map(float, one)), seed=seed) for one in grid]
     return collected(base, names, points, noise=noise)
 
 
@@ -659,16 +628,6 @@ def check_names(system: Dynamics, names: Iterable[str]) -> None:
                 system.name or "the system", "parameters", f"there is no parameter '{name}'",
                 suggestion(name, known, otherwise=otherwise),
             )  # fmt: skip
-
-
-def write_tables(found: Sweep, files: Mapping[str, str | Path]) -> None:
-    """Write ``sweep``, ``sweep_ways``, ``branches``, ``bifurcations`` and ``bifurcation_curves``."""
-    tables = {
-        "sweep": found.table, "sweep_ways": found.ways, "branches": found.branches,
-        "bifurcations": found.bifurcations, "bifurcation_curves": found.curves,
-    }  # fmt: skip
-    for name, path in files.items():
-        write_table(path, tables[name])
 
 
 def collected(

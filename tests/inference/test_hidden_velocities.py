@@ -29,7 +29,7 @@ from siq.systems.phase_portrait import evenly_spread, phase_portrait
 from siq.workflow import identification_step, recordings_step
 from siq.workflow.outcomes import Status
 from siq.workflow.pipeline import PipelineSettings
-from siq.workflow.settings import Sampling, StateSpace
+from siq.workflow.settings import StateSpace
 
 FRICTION, SENSOR = 0.3, 0.02
 SETTINGS = PipelineSettings(identification=IdentificationOptions(degree=3, hidden_velocities=True))
@@ -155,12 +155,11 @@ def test_one_record_of_smooth_positions_is_enough(tmp_path: Path) -> None:
     path = tmp_path / "particle.parquet"
     write_recordings(path, recordings)
     alone, hidden = (
-        recordings_step.DrawSettings(0, StateSpace(), Sampling(), None, hidden_velocities=key)
-        for key in (False, True)
+        PipelineSettings(identification=IdentificationOptions(hidden_velocities=key)) for key in (False, True)
     )
     with pytest.raises(InputError, match="positions of something that has inertia, set 'identification"):
-        recordings_step.read(path, alone)
-    drawn = recordings_step.run(hidden, recordings_step.read(path, hidden), number=0).recordings
+        recordings_step.source_of(path, alone)
+    drawn = recordings_step.run(hidden, recordings_step.source_of(path, hidden), number=0).recordings
     assert drawn is not None and len(drawn.labels) >= STRETCHES
     done = identification_step.run(SETTINGS.of(identification_step.IdentifySettings), drawn, number=0)
     assert done.record is not None and done.record.prediction["passed"]

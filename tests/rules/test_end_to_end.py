@@ -140,7 +140,9 @@ def test_the_page_and_the_terminal_have_the_same_answer(finished):
 def test_the_page_beside_the_paper_takes_what_a_study_left(finished):
     study = load_study(finished.path("study.yaml"))
     system = load_system(finished.path("config/systems/archetype3d.yaml"))
-    own = settings_of(ReproductionSettings, completed(study, system), system)
+    whole = completed(study, system)
+    told, box = settings_of(whole, system), tuple(map(tuple, system.domain.tolist()))
+    own = ReproductionSettings(whole.runs, told.simulation, told.training, told.regression, box)
     figures = load_published(finished.path("config/published/archetype3d.yaml")).figures
     results = Results("mini", finished.path("results/mini"), own, figures, system)
     places = (

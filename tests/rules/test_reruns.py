@@ -4,20 +4,13 @@ import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import time
-from pathlib import Path
 
 import pandas as pd
 import pytest
 
-from workflow.code_digest import code_digest
-
 pytestmark = pytest.mark.workflow
 
-ROOT = Path(__file__).resolve().parents[2]
-SCRIPTS = sorted(path.name for path in (ROOT / "workflow" / "scripts").glob("*.py") if path.name != "step.py")
 DATA = "results/mini/runs/000/recordings.parquet"
 NETWORKS = "results/mini/training/000-000/networks.npz"
 MODEL = "results/mini/runs/000/model.json"
@@ -42,6 +35,7 @@ def would_run(project, *paths, change):
 def test_only_what_depends_on_a_change_runs_again(finished, tmp_path):
     project = finished.copied(tmp_path / "project")
     study, card = project.path("study.yaml"), project.path("config/systems/archetype3d.yaml")
+    versions = project.path("workflow/versions.json")
     regression = project.path("siq/networks/regression.py")
     dynamics = project.path("siq/systems/simulation.py")
     page = project.path("siq/report/study_page.py")
@@ -49,10 +43,17 @@ def test_only_what_depends_on_a_change_runs_again(finished, tmp_path):
     def what_no_model_depends_on():
         append(page)
         card.write_text(card.read_text().replace("Archetypal model", "Renamed model"))
+        append(regression)  # what its results are is said by the version of its task alone
         os.utime(dynamics)
 
-    assert would_run(project, page, card, dynamics, change=what_no_model_depends_on) == set()
-    assert would_run(project, regression, change=lambda: append(regression)) == {"regress", "refine"}
+    def raise_regress():
+        known = json.loads(versions.read_text())
+        known["regress"]["version"] += 1
+        versions.write_text(json.dumps(known))
+
+    unchanged = (page, card, dynamics, regression)
+    assert would_run(project, *unchanged, change=what_no_model_depends_on) == set()
+    assert would_run(project, versions, change=raise_regress) == {"regress", "refine"}
     steps = would_run(project, study, change=lambda: project.write_study(runs=2, steps=130))
     assert steps == {"train", "regress", "refine"}
     threshold = would_run(project, study, change=lambda: project.write_study(runs=2, threshold=0.2))
@@ -67,67 +68,6 @@ def test_what_a_plan_says_a_run_does(finished, tmp_path):
     project.make(MODEL)
     after = project.modified(DATA, NETWORKS, MODEL)
     assert [new != old for new, old in zip(after, before, strict=True)] == [False, False, True]
-
-
-# Each file is loaded once, and what it imports while it is loaded is noted: a script has loaded its own
-# imports and, from one to the next, those of what it imports.
-IMPORTS = """
-import builtins, importlib, json, pathlib, runpy, sys
-root, usual = pathlib.Path(sys.argv[1]), builtins.__import__
-imported = {}
-
-def noted(name, given=None, local=None, members=(), level=0):
-    found = usual(name, given, local, members, level)
-    whole = (given or {}).get("__package__") if level else name
-    parts = [whole] if not level else [f"{whole}.{name}".rstrip(".")]
-    parts += [f"{parts[0]}.{each}" for each in members or ()]
-    imported.setdefault((given or {}).get("__file__"), []).extend(parts)
-    return found
-
-def files(name):
-    parts = name.split(".")
-    modules = [sys.modules.get(".".join(parts[: k + 1])) for k in range(len(parts))]
-    return [module.__file__ for module in modules if getattr(module, "__file__", None)]
-
-def loaded_by(file):
-    seen, waiting = set(), [file]
-    while waiting:
-        file = waiting.pop()
-        if file not in seen and pathlib.Path(file).is_relative_to(root):
-            seen.add(file)
-            waiting += [each for name in imported.get(file, ()) for each in files(name)]
-    return sorted(str(pathlib.Path(file).relative_to(root)) for file in seen)
-
-builtins.__import__ = noted
-for script in sys.argv[2:]:
-    path = str(root / "workflow" / "scripts" / script)
-    runpy.run_path(path, run_name="imported")
-    print(json.dumps([script, loaded_by(path)]), flush=True)
-"""
-
-
-@pytest.fixture(scope="module")
-def imported():
-    """The files of the project that each script imports, by the script's name."""
-    done = subprocess.run(
-        [sys.executable, "-c", IMPORTS, str(ROOT), *SCRIPTS],
-        env=os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'workflow' / 'scripts'}"},
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    found = dict(json.loads(line) for line in done.stdout.splitlines())
-    parts = ("siq", "workflow")
-    return {name: {file for file in files if Path(file).parts[0] in parts} for name, files in found.items()}
-
-
-@pytest.mark.xdist_group("imported")
-@pytest.mark.parametrize("script", SCRIPTS)
-def test_a_rule_names_every_module_that_its_script_imports(imported, script):
-    assert imported[script], "the script imports nothing of the project"
-    # How the interpreter was started changes nothing of what it computes.
-    assert imported[script] - {"workflow/warm.py"} <= set(code_digest(ROOT, script))
 
 
 def wait_for(pattern, process, *, within, seconds=120):

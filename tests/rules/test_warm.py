@@ -15,7 +15,7 @@ import pytest
 from workflow import warm
 
 ROOT = Path(__file__).resolve().parents[2]
-HEAD = "from workflow.warm import run_warm\nrun_warm()\nimport json\n"
+HEAD = "from workflow.warm import run_warm\nrun_warm('example_hopping')\nimport json\n"
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
 

@@ -6,6 +6,7 @@ network trains. ``make noise`` runs it; it takes minutes.
 
 import os
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -83,7 +84,7 @@ def one_run(run: int):
         regression=RegressionOptions(degree=5),
         landscape=None,
     )
-    drawing = recordings_step.DrawSettings(SEED, settings.space, sampling, SIMULATION)
+    drawing = replace(settings, seed=SEED, sampling=sampling, simulation=SIMULATION)
     recordings = recordings_step.run(drawing, load_system(CARD), number=run).recordings
     x = snapshot_pairs(recordings, pair_step=sampling.pair_step).x0
     formulas = analyse(recordings, settings, number=run).refined.formulas[Method.REFINED]

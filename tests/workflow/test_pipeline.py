@@ -43,7 +43,7 @@ BRIEF = replace(
 
 
 def drawn(*, number: int = 0) -> recordings_step.Drawn:
-    settings = recordings_step.DrawSettings(3, StateSpace(), SETTINGS.sampling, SIMULATION)
+    settings = replace(SETTINGS, simulation=SIMULATION)
     return recordings_step.run(settings, SYSTEM, number=number)
 
 
@@ -132,9 +132,7 @@ def test_the_regression_does_not_steer_the_refined_formulas(
 
 def test_networks_are_trained_with_the_d_that_the_noise_shows() -> None:
     noisy = replace(SIMULATION, pairs=40, noise_intensity=0.02)
-    found = recordings_step.run(
-        recordings_step.DrawSettings(3, StateSpace(), Sampling(), noisy), SYSTEM, number=0
-    ).recordings
+    found = recordings_step.run(PipelineSettings(seed=3, simulation=noisy), SYSTEM, number=0).recordings
     assert found is not None
     settings = PipelineSettings(
         sampling=Sampling(0.01, 0.002), training=replace(BRIEF, matching="explicit", steps=2)
@@ -143,7 +141,7 @@ def test_networks_are_trained_with_the_d_that_the_noise_shows() -> None:
         settings.of(identification_step.IdentifySettings), found, number=0
     ).record
     runs = {0: training_step.RunToTrain(found, record)}
-    networks = training_step.run(settings.of(training_step.TrainSettings), runs, device="cpu").of(0).networks
+    networks = training_step.run(settings, runs, device="cpu").networks[0]
     assert record is not None and networks is not None
     np.testing.assert_allclose(networks.diffusion, record.found.diffusion.matrix, rtol=1e-6)
     shape = KNOWN.diffusion / np.sqrt(np.linalg.det(KNOWN.diffusion))
@@ -154,15 +152,15 @@ def test_a_run_without_trajectories_is_skipped_by_every_step_after() -> None:
     settings = SETTINGS.of(identification_step.IdentifySettings)
     nothing = identification_step.run(settings, None, number=5)
     assert (nothing.outcome.run, nothing.outcome.status) == (5, Status.SKIPPED)
-    told = replace(SETTINGS, training=BRIEF).of(training_step.TrainSettings)
+    told = replace(SETTINGS, training=BRIEF)
     trained = training_step.run(told, {5: training_step.RunToTrain(None, None)})
-    assert not trained.networks and trained.of(5).networks is None
+    assert not trained.networks
     assert trained.outcomes[0].reason == "the run has no trajectories"
 
 
 def test_a_simulation_that_runs_to_infinity_fails_and_says_so() -> None:
     away = replace(SYSTEM, equations=tuple(symbol**3 for symbol in SYSTEM.symbols))
-    settings = recordings_step.DrawSettings(0, StateSpace(), Sampling(), replace(SIMULATION, interval=2.0))
+    settings = PipelineSettings(simulation=replace(SIMULATION, interval=2.0))
     found = recordings_step.run(settings, away, number=2)
     assert found.recordings is None
     assert (found.outcome.step, found.outcome.status) == (Step.SIMULATE, Status.FAILED)
@@ -171,7 +169,7 @@ def test_a_simulation_that_runs_to_infinity_fails_and_says_so() -> None:
 def test_recordings_are_taken_whole_by_the_first_run_and_resampled_by_others(
     recordings: Recordings,
 ) -> None:
-    settings = recordings_step.DrawSettings(0, StateSpace(), Sampling(), None)
+    settings = PipelineSettings()
     first, second = (recordings_step.run(settings, recordings, number=number) for number in (0, 1))
     assert first.recordings is recordings and second.recordings is not recordings
     assert first.outcome.step == second.outcome.step == Step.RESAMPLE
@@ -185,7 +183,7 @@ def test_why_a_check_could_not_be_prepared_is_the_reason(
 
     monkeypatch.setattr("siq.quasipotential.refinement.TrainingCheck", refuse)
     options = replace(BRIEF, check=CheckOptions(first=10, every=10, attempts=2))
-    settings = replace(SETTINGS, training=options).of(training_step.TrainSettings)
+    settings = replace(SETTINGS, training=options)
     runs = {0: training_step.RunToTrain(recordings, analysis.identified.record)}
     said = training_step.run(settings, runs, device="cpu").outcomes[0]
     assert said.status == Status.WARNING
@@ -222,7 +220,7 @@ def test_where_refinement_needs_no_networks_their_failure_is_a_note(
 
 
 def test_scores_are_in_the_columns_of_the_contract(analysis: Analysis) -> None:
-    settings = scoring_step.ScoreSettings(3, SETTINGS.regression, None)
+    settings = SETTINGS
     certificates = {str(name): one for name, one in analysis.refined.certificates.items()}
     formulas = {str(name): one for name, one in analysis.refined.formulas.items()}
     assert KNOWN.potential is not None

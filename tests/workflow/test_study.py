@@ -15,8 +15,6 @@ from siq.systems.dynamics import Dynamics
 from siq.systems.simulation import SimulationEntry, SimulationOptions
 from siq.workflow.outcomes import Method
 from siq.workflow.published import load_published
-from siq.workflow.refinement_step import RefineSettings
-from siq.workflow.scoring_step import ScoreSettings
 from siq.workflow.settings import settings_of
 from siq.workflow.study import load_study, load_study_system
 
@@ -54,11 +52,11 @@ def test_networks_take_part_where_a_study_asks_for_them_and_a_landscape_unless_i
 ) -> None:
     plain = load_study(write("name: plain\nsystem: archetype3d\n"))
     assert plain.training is None and plain.landscape is not None
-    assert settings_of(RefineSettings, plain, archetype).refinement.routes == ("local",)
-    assert settings_of(ScoreSettings, plain, archetype).methods == (Method.REFINED,)
+    assert settings_of(plain, archetype).refinement.routes == ("local",)
+    assert settings_of(plain, archetype).methods == (Method.REFINED,)
     asked = load_study(write("name: plain\nsystem: archetype3d\ntraining: {}\nlandscape: false\n"))
     assert asked.training == TrainingOptions() and asked.landscape is None
-    assert settings_of(RefineSettings, asked, archetype).refinement.routes == ("network", "local")
+    assert settings_of(asked, archetype).refinement.routes == ("network", "local")
     error = refusal(write("name: s\nsystem: a\nrefinement: {routes: [network]}\n"))
     assert "no networks are asked for" in error.fault and "training: {}" in error.remedy
 

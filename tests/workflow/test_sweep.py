@@ -3,21 +3,22 @@
 import numpy as np
 import pytest
 import sympy
+from pydantic import TypeAdapter
 
 from siq.errors import InputError
 from siq.quasipotential.landscape import Landscape
 from siq.systems.cards import load_system
 from siq.systems.dynamics import Dynamics
+from siq.workflow.files import write
+from siq.workflow.settings import PipelineSettings
 from siq.workflow.sweep_step import (
     ALONE,
-    PointSettings,
     Sweep,
+    SweptPoint,
     collected,
     point_at,
-    read_point,
     sweep,
     with_parameters,
-    write_point,
 )
 
 h, a, x, y = sympy.symbols("h a x y", real=True)
@@ -136,9 +137,10 @@ def test_a_parameter_that_is_not_there_is_told_with_those_that_are():
 
 
 def test_a_point_is_read_as_it_was_written(tmp_path):
-    point = point_at(cusp(), ("h",), (0.2,), PointSettings())
-    write_point(tmp_path / "h=0.2.json", point)
-    assert read_point(tmp_path / "h=0.2.json") == point
+    point = point_at(cusp(), ("h",), (0.2,), seed=0)
+    adapter = TypeAdapter(SweptPoint)
+    write("point", tmp_path / "h=0.2.json", point, PipelineSettings())
+    assert adapter.validate_json((tmp_path / "h=0.2.json").read_bytes()) == point
     again = collected(cusp(), ("h",), [point], noise=0.04)
     assert len(again.table) == 2 and len(again.ways) == 2
 

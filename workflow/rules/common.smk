@@ -1,38 +1,20 @@
-# Helpers of the rules: studies and their parameters, code dependencies by content, one workflow at a time.
+# Helpers of the rules: studies and their parameters, tasks and their versions, one workflow at a time.
 import sys
 from functools import cache
 from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from siq.cli.answers import Exit, answer_of_page
-from siq.numerics.files import files_of
 from siq.errors import InputError
-from siq.report.figures import FiguresSettings, LandscapeFiguresSettings
+from siq.numerics.files import files_of
 from siq.report.formatting import texts
-from siq.report.study_page import PageSettings
-from siq.workflow.comparison_steps import BesideEquationsSettings
-from siq.workflow.recordings_step import DrawSettings
-from siq.quasipotential.landscape_assembly import EquationSettings
-from siq.workflow.comparison_steps import EscapesSettings
-from siq.workflow.identification_step import IdentifySettings
-from siq.workflow.invariant_step import InvariantSettings
-from siq.workflow.landscape_step import LandscapeSettings
-from siq.workflow.comparison_steps import LandscapeErrorsSettings
-from siq.workflow.settings import card_content, card_content_beside
-from siq.workflow.comparison_steps import ReferenceSettings
-from siq.workflow.refinement_step import RefineSettings
-from siq.workflow.regression_step import RegressSettings
-from siq.workflow.scoring_step import ScoreSettings
-from siq.workflow.sweep_step import SweepSettings
-from siq.workflow.sweep_step import PointSettings
-from siq.workflow.training_step import TrainSettings
+from siq.workflow.answers import Exit, answer_of_page
 from siq.workflow.published import load_published
 from siq.workflow.study import point_name
-from workflow.code_digest import code_digest
-from workflow.reproduction import ReproductionSettings
-from workflow.places import BASE, config_path, find_file
+from workflow.places import config_path, find_file
 from workflow.settings import Studies, prepare_environment
+from workflow.tasks import TASKS
+from workflow.versions import versions
 from workflow.warm import start
 
 
@@ -51,8 +33,12 @@ except InputError as error:
 
 
 REPRODUCED = ["archetype3d", "archetype3d-noise", "archetype4d", "resonator"]
-CAPTIONS = {name: caption["text"] for name, caption in texts("captions")["figures"].items()}
-PLACES = {name: caption["part"] for name, caption in texts("captions")["figures"].items()}
+CAPTIONS = {
+    name: caption["text"] for name, caption in texts("captions")["figures"].items()
+}
+PLACES = {
+    name: caption["part"] for name, caption in texts("captions")["figures"].items()
+}
 
 
 wildcard_constraints:
@@ -73,21 +59,12 @@ def statistics_studies():
     return STUDIES.default_names()
 
 
-def settings_of(cls):
-    """Params function: the settings of a step as plain data, so that only their change reruns a rule."""
-    return lambda wildcards: study_of(wildcards).settings(cls)
-
-
-def card_says(wildcards):
-    """Params function: what a simulation takes from the card, so that another title reruns nothing."""
-    return card_content(study_of(wildcards).system)
-
-
-def card_beside_sweep(wildcards):
-    """Params function: the same but for the values of what is swept, which each point has of its own."""
-    study = study_of(wildcards)
-    swept = study.study.sweep
-    return card_content_beside(study.card(), () if swept is None else swept.names)
+def task(name):
+    """Params of a rule: its task, whose version says when results may change, and the options that it depends on."""
+    params = {"task": name, "version": versions()[name]}
+    if options := TASKS[name].options:
+        params["options"] = lambda wildcards: study_of(wildcards).options(options)
+    return params
 
 
 def points_of_sweep(wildcards):
@@ -122,16 +99,6 @@ def with_invariant(path):
         )
 
     return files
-
-
-def exact_answer(wildcards):
-    """Params function: the card's exact answer, which scoring alone depends on."""
-    return study_of(wildcards).exact()
-
-
-def code(script):
-    """Params function: fingerprint of the script and of every module of siq that it imports, by content."""
-    return lambda wildcards: code_digest(BASE, script)
 
 
 def block_of(wildcards):
@@ -319,7 +286,8 @@ def published_mesh_if_any(wildcards):
 def reproduced_settings(wildcards):
     """Params function: the settings of all studies that the page speaks of, those of the paper too."""
     names = [*REPRODUCED, "archetype3d-published", "resonator-published"]
-    return {name: STUDIES[name].settings(ReproductionSettings) for name in names}
+    keys = ("runs", "simulation", "training", "regression", "domain")
+    return {name: STUDIES[name].options(keys) for name in names}
 
 
 def of_reproduced(method):

@@ -1,4 +1,4 @@
-# Studies `from: equations`: the card alone, without a simulation, recordings or training.
+# Studies `from: equations`: the card alone, without a simulation, recordings or training; and along parameters.
 
 
 ruleorder: equations > collect
@@ -23,15 +23,12 @@ rule equations:
         study=STUDIES.pattern_of("equations"),
     conda:
         "../envs/siq.yaml"
-    threads: 1
     params:
-        code=code("equations.py"),
-        settings=settings_of(EquationSettings),
-        card=card_says,
+        **task("equations"),
     message:
         "{wildcards.study}: finding the landscape of the equations"
     script:
-        "../scripts/equations.py"
+        "../scripts/run_task.py"
 
 
 rule equations_invariant:
@@ -50,15 +47,12 @@ rule equations_invariant:
         study=STUDIES.pattern_of("equations"),
     conda:
         "../envs/siq.yaml"
-    threads: 1
     params:
-        code=code("invariant.py"),
-        settings=settings_of(InvariantSettings),
-        card=card_says,
+        **task("invariant"),
     message:
         "{wildcards.study}: computing the invariant distribution"
     script:
-        "../scripts/invariant.py"
+        "../scripts/run_task.py"
 
 
 rule equations_page:
@@ -101,13 +95,57 @@ rule equations_page:
         study=STUDIES.pattern_of("equations"),
     conda:
         "../envs/siq.yaml"
-    threads: 1
     params:
-        code=code("equations_page.py"),
-        command=lambda wildcards: study_of(wildcards).command(),
-        settings=settings_of(PageSettings),
-        card=card_says,
+        **task("equations_page"),
     message:
         "{wildcards.study}: writing the page"
     script:
-        "../scripts/equations_page.py"
+        "../scripts/run_task.py"
+
+
+rule sweep_point:
+    input:
+        card=card_if_any,
+    output:
+        point="results/{study}/sweep/{point}.json",
+    log:
+        "results/{study}/logs/sweep/{point}.log",
+    benchmark:
+        "results/{study}/benchmarks/sweep/{point}.tsv"
+    wildcard_constraints:
+        study=STUDIES.pattern_of("equations"),
+        point=r"\w+=[-+.e\d]+(,\w+=[-+.e\d]+)?",
+    conda:
+        "../envs/siq.yaml"
+    params:
+        **task("sweep_point"),
+    message:
+        "{wildcards.study}: the landscape at {wildcards.point}"
+    script:
+        "../scripts/run_task.py"
+
+
+rule sweep:
+    input:
+        card=card_if_any,
+        points=points_of_sweep,
+    output:
+        sweep="results/{study}/tables/sweep.parquet",
+        sweep_ways="results/{study}/tables/sweep_ways.parquet",
+        branches="results/{study}/tables/branches.parquet",
+        bifurcations="results/{study}/tables/bifurcations.parquet",
+        bifurcation_curves="results/{study}/tables/bifurcation_curves.parquet",
+    log:
+        "results/{study}/logs/sweep.log",
+    benchmark:
+        "results/{study}/benchmarks/sweep.tsv"
+    wildcard_constraints:
+        study=STUDIES.pattern_of("equations"),
+    conda:
+        "../envs/siq.yaml"
+    params:
+        **task("sweep"),
+    message:
+        "{wildcards.study}: branches, barriers and times against the parameter"
+    script:
+        "../scripts/run_task.py"

@@ -8,33 +8,31 @@ rule landscape:
         model="results/{study}/runs/{run}/model.json",
     output:
         quasipotential="results/{study}/runs/{run}/quasipotential.json",
-        table="results/{study}/runs/{run}/landscape.parquet",
+        landscape="results/{study}/runs/{run}/landscape.parquet",
         degrees="results/{study}/runs/{run}/degrees.parquet",
-        outcome="results/{study}/runs/{run}/landscape.json",
+        landscape_outcome="results/{study}/runs/{run}/landscape.json",
     log:
         "results/{study}/logs/{run}/landscape.log",
     benchmark:
         "results/{study}/benchmarks/{run}/landscape.tsv"
     conda:
         "../envs/siq.yaml"
-    threads: 1
     params:
-        code=code("landscape.py"),
-        settings=settings_of(LandscapeSettings),
+        **task("landscape"),
     message:
         "{wildcards.study}, run {wildcards.run}: finding the landscape"
     script:
-        "../scripts/landscape.py"
+        "../scripts/run_task.py"
 
 
 rule overview:
     # The landscape of the run that is shown; where the study asks for none, it is found for this run alone.
     input:
         rrmse="results/{study}/tables/rrmse.parquet",
-        models=all_runs("results/{study}/runs/{run}/model.json"),
-        fields=all_runs("results/{study}/runs/{run}/vector_field.json"),
+        model=all_runs("results/{study}/runs/{run}/model.json"),
+        field=all_runs("results/{study}/runs/{run}/vector_field.json"),
         recordings=all_runs("results/{study}/runs/{run}/recordings.parquet"),
-        landscapes=of_landscapes("results/{study}/runs/{run}/quasipotential.json"),
+        quasipotential=of_landscapes("results/{study}/runs/{run}/quasipotential.json"),
     output:
         overview="results/{study}/overview.json",
     log:
@@ -43,15 +41,12 @@ rule overview:
         "results/{study}/benchmarks/overview.tsv"
     conda:
         "../envs/siq.yaml"
-    threads: 1
     params:
-        code=code("overview.py"),
-        settings=settings_of(LandscapeSettings),
-        every_run=lambda wildcards: study_of(wildcards).study.landscape is not None,
+        **task("overview"),
     message:
         "{wildcards.study}: choosing the landscape that the page opens with"
     script:
-        "../scripts/overview.py"
+        "../scripts/run_task.py"
 
 
 rule reference:
@@ -59,32 +54,29 @@ rule reference:
     input:
         card=card_if_any,
     output:
-        "results/{study}/reference.npz",
+        reference="results/{study}/reference.npz",
     log:
         "results/{study}/logs/reference.log",
     benchmark:
         "results/{study}/benchmarks/reference.tsv"
     conda:
         "../envs/siq.yaml"
-    threads: 1
     params:
-        code=code("reference.py"),
-        settings=settings_of(ReferenceSettings),
-        card=card_says,
+        **task("reference"),
     message:
         "{wildcards.study}: computing references for the landscape"
     script:
-        "../scripts/reference.py"
+        "../scripts/run_task.py"
 
 
 rule landscape_errors:
     input:
         reference="results/{study}/reference.npz",
-        fields=all_runs("results/{study}/runs/{run}/vector_field.json"),
-        landscapes=all_runs("results/{study}/runs/{run}/quasipotential.json"),
-        models=all_runs("results/{study}/runs/{run}/model.json"),
+        field=all_runs("results/{study}/runs/{run}/vector_field.json"),
+        quasipotential=all_runs("results/{study}/runs/{run}/quasipotential.json"),
+        model=all_runs("results/{study}/runs/{run}/model.json"),
         networks=networks_of_runs("networks.npz"),
-        training=networks_of_runs("train.json"),
+        train_outcome=networks_of_runs("train.json"),
         published=published_if_any,
         mesh=published_mesh_if_any,
     output:
@@ -96,20 +88,18 @@ rule landscape_errors:
         "results/{study}/benchmarks/landscape_errors.tsv"
     conda:
         "../envs/siq.yaml"
-    threads: 1
     params:
-        code=code("landscape_errors.py"),
-        settings=settings_of(LandscapeErrorsSettings),
+        **task("landscape_errors"),
     message:
         "{wildcards.study}: holding the landscapes against the references"
     script:
-        "../scripts/landscape_errors.py"
+        "../scripts/run_task.py"
 
 
 rule beside_equations:
     # The landscape of the card's own equations beside those of the runs: scoring alone.
     input:
-        landscapes=all_runs("results/{study}/runs/{run}/quasipotential.json"),
+        quasipotential=all_runs("results/{study}/runs/{run}/quasipotential.json"),
         card=card_if_any,
     output:
         table="results/{study}/tables/beside_equations.parquet",
@@ -120,20 +110,17 @@ rule beside_equations:
         "results/{study}/benchmarks/beside_equations.tsv"
     conda:
         "../envs/siq.yaml"
-    threads: 1
     params:
-        code=code("beside_equations.py"),
-        settings=settings_of(BesideEquationsSettings),
-        card=card_says,
+        **task("beside_equations"),
     message:
         "{wildcards.study}: holding the landscapes against that of the equations"
     script:
-        "../scripts/beside_equations.py"
+        "../scripts/run_task.py"
 
 
 rule escapes:
     input:
-        landscapes=all_runs("results/{study}/runs/{run}/quasipotential.json"),
+        quasipotential=all_runs("results/{study}/runs/{run}/quasipotential.json"),
         card=card_if_any,
     output:
         table="results/{study}/tables/escape.parquet",
@@ -144,15 +131,12 @@ rule escapes:
         "results/{study}/benchmarks/escapes.tsv"
     conda:
         "../envs/siq.yaml"
-    threads: 1
     params:
-        code=code("escapes.py"),
-        settings=settings_of(EscapesSettings),
-        card=card_says,
+        **task("escapes"),
     message:
         "{wildcards.study}: simulating escapes"
     script:
-        "../scripts/escapes.py"
+        "../scripts/run_task.py"
 
 
 rule landscape_figures:
@@ -160,12 +144,12 @@ rule landscape_figures:
         reference=with_card("results/{study}/reference.npz"),
         escape=with_card("results/{study}/tables/escape.parquet"),
         degrees="results/{study}/tables/degrees.parquet",
-        fields=all_runs("results/{study}/runs/{run}/vector_field.json"),
-        landscapes=all_runs("results/{study}/runs/{run}/quasipotential.json"),
-        models=all_runs("results/{study}/runs/{run}/model.json"),
+        field=all_runs("results/{study}/runs/{run}/vector_field.json"),
+        quasipotential=all_runs("results/{study}/runs/{run}/quasipotential.json"),
+        model=all_runs("results/{study}/runs/{run}/model.json"),
         recordings=all_runs("results/{study}/runs/{run}/recordings.parquet"),
         networks=networks_of_runs("networks.npz"),
-        training=networks_of_runs("train.json"),
+        train_outcome=networks_of_runs("train.json"),
         published=published_if_any,
         mesh=published_mesh_if_any,
     output:
@@ -176,12 +160,37 @@ rule landscape_figures:
         "results/{study}/benchmarks/landscape_figures.tsv"
     conda:
         "../envs/siq.yaml"
-    threads: 1
     params:
-        code=code("landscape_figures.py"),
-        settings=settings_of(LandscapeFiguresSettings),
-        folder=lambda wildcards, output: output.drawn,
+        **task("landscape_figures"),
     message:
         "{wildcards.study}: drawing the landscape"
     script:
-        "../scripts/landscape_figures.py"
+        "../scripts/run_task.py"
+
+
+rule invariant:
+    input:
+        rrmse="results/{study}/tables/rrmse.parquet",
+        model=all_runs("results/{study}/runs/{run}/model.json"),
+        field=of_landscapes("results/{study}/runs/{run}/vector_field.json"),
+        quasipotential=of_landscapes("results/{study}/runs/{run}/quasipotential.json"),
+        card=card_if_any,
+        published=published_if_any,
+    output:
+        table="results/{study}/tables/invariant.parquet",
+        csv="results/{study}/tables/invariant.csv",
+        shares="results/{study}/tables/well_shares.parquet",
+        shares_csv="results/{study}/tables/well_shares.csv",
+        drawn=directory("results/{study}/drawn/invariant"),
+    log:
+        "results/{study}/logs/invariant.log",
+    benchmark:
+        "results/{study}/benchmarks/invariant.tsv"
+    conda:
+        "../envs/siq.yaml"
+    params:
+        **task("invariant"),
+    message:
+        "{wildcards.study}: computing the invariant distribution"
+    script:
+        "../scripts/run_task.py"

@@ -1,4 +1,72 @@
 # What physics a simulation lacks: the studies of config/mismatch/, and folders of cases (--config cases=DIR).
+from siq.data.public_recordings import BENCHMARKS
+from workflow.cases import Cases
+
+MISMATCH_TABLES = ["curves", "candidates", "held_out", "forces", "noise"]
+
+try:
+    CASES = Cases(config)
+except InputError as error:
+    say_and_stop(error)
+
+
+wildcard_constraints:
+    case="[A-Za-z0-9][A-Za-z0-9_.-]*",
+    benchmark="|".join(BENCHMARKS),
+
+
+def case_of(wildcards):
+    """The case of a job, checked when it is first asked for."""
+    try:
+        return CASES[wildcards.case]
+    except InputError as error:
+        say_and_stop(error)
+
+
+def case_file(name):
+    """Input function: a file of the case; card and study count by content, which is a parameter."""
+
+    def file(wildcards):
+        found = case_of(wildcards).inputs.get(name)
+        if found is None:
+            return []
+        return found if name == "recordings" else ancient(found)
+
+    return file
+
+
+def raw_file(wildcards):
+    try:
+        return CASES.raw_file(wildcards.benchmark)
+    except InputError as error:
+        say_and_stop(error)
+
+
+def scores_if_any(wildcards):
+    """Input function: scores in units of their own, which public benchmarks have."""
+    if case_of(wildcards).benchmark is None:
+        return []
+    return f"results/mismatch/{wildcards.case}/tables/official_tests.parquet"
+
+
+def mismatch_pages(wildcards):
+    """Input function: pages of the studies that can run; of the others it says what is missing."""
+    try:
+        names, missing = CASES.listed()
+    except InputError as error:
+        say_and_stop(error)
+    for sentence in missing:
+        print(sentence, file=sys.stderr)
+    return expand("results/mismatch/{case}/report.html", case=names)
+
+
+def diagnosed_pages(wildcards):
+    """Input function: the page of every case of the folder."""
+    try:
+        names = CASES.in_folder()
+    except InputError as error:
+        say_and_stop(error)
+    return expand("results/mismatch/{case}/report.html", case=names)
 
 
 localrules:
@@ -33,13 +101,12 @@ rule benchmark_recordings:
         "results/recordings/benchmarks/{benchmark}.tsv"
     conda:
         "../envs/siq.yaml"
-    threads: 1
     params:
-        code=code("benchmark_recordings.py"),
+        **task("benchmark_recordings"),
     message:
         "{wildcards.benchmark}: reading the recordings of the benchmark"
     script:
-        "../scripts/benchmark_recordings.py"
+        "../scripts/run_task.py"
 
 
 rule diagnosis:
@@ -66,14 +133,13 @@ rule diagnosis:
         "results/mismatch/{case}/benchmarks/diagnosis.tsv"
     conda:
         "../envs/siq.yaml"
-    threads: 1
     params:
-        code=code("diagnosis.py"),
+        **task("diagnosis"),
         content=lambda wildcards: case_of(wildcards).content,
     message:
         "{wildcards.case}: looking for what the simulation lacks"
     script:
-        "../scripts/diagnosis.py"
+        "../scripts/run_task.py"
 
 
 rule mismatch_landscape:
@@ -97,13 +163,12 @@ rule mismatch_landscape:
         "results/mismatch/{case}/benchmarks/landscape.tsv"
     conda:
         "../envs/siq.yaml"
-    threads: 1
     params:
-        code=code("mismatch_landscape.py"),
+        **task("mismatch_landscape"),
     message:
         "{wildcards.case}: working out what that does to wells and escape times"
     script:
-        "../scripts/mismatch_landscape.py"
+        "../scripts/run_task.py"
 
 
 rule official_tests:
@@ -125,14 +190,13 @@ rule official_tests:
         "results/mismatch/{case}/benchmarks/official_tests.tsv"
     conda:
         "../envs/siq.yaml"
-    threads: 1
     params:
-        code=code("official_tests.py"),
+        **task("official_tests"),
         benchmark=lambda wildcards: case_of(wildcards).benchmark,
     message:
         "{wildcards.case}: scoring the simulations in the official tests"
     script:
-        "../scripts/official_tests.py"
+        "../scripts/run_task.py"
 
 
 rule official_summary:
@@ -143,8 +207,8 @@ rule official_summary:
         runs=expand(
             "results/mismatch/{case}/tables/official_runs.parquet", case=BENCHMARKS
         ),
-        verdicts=expand("results/mismatch/{case}/verdict.json", case=BENCHMARKS),
-        cards=expand("results/mismatch/{case}/system.yaml", case=BENCHMARKS),
+        verdict=expand("results/mismatch/{case}/verdict.json", case=BENCHMARKS),
+        system=expand("results/mismatch/{case}/system.yaml", case=BENCHMARKS),
     output:
         table="results/official/table.parquet",
         csv="results/official/table.csv",
@@ -156,14 +220,13 @@ rule official_summary:
         "results/official/benchmarks/official_summary.tsv"
     conda:
         "../envs/siq.yaml"
-    threads: 1
     params:
-        code=code("official_summary.py"),
+        **task("official_summary"),
         benchmarks=list(BENCHMARKS),
     message:
         "putting the official tests of all benchmarks into one table"
     script:
-        "../scripts/official_summary.py"
+        "../scripts/run_task.py"
 
 
 rule mismatch_figures:
@@ -186,13 +249,12 @@ rule mismatch_figures:
         "results/mismatch/{case}/benchmarks/mismatch_figures.tsv"
     conda:
         "../envs/siq.yaml"
-    threads: 1
     params:
-        code=code("mismatch_figures.py"),
+        **task("mismatch_figures"),
     message:
         "{wildcards.case}: drawing what is missing"
     script:
-        "../scripts/mismatch_figures.py"
+        "../scripts/run_task.py"
 
 
 rule mismatch_page:
@@ -222,12 +284,11 @@ rule mismatch_page:
         "results/mismatch/{case}/benchmarks/mismatch_page.tsv"
     conda:
         "../envs/siq.yaml"
-    threads: 1
     params:
-        code=code("mismatch_page.py"),
+        **task("mismatch_page"),
         title=lambda wildcards: case_of(wildcards).title,
         command=lambda wildcards: case_of(wildcards).command,
     message:
         "{wildcards.case}: writing the report"
     script:
-        "../scripts/mismatch_page.py"
+        "../scripts/run_task.py"

@@ -1,5 +1,66 @@
 # The proof of the diagnosis: cases that conceal something, a diagnosis that cannot know what, and scores. And the
 # scores of cases that somebody else made (--config cases=DIR keys=DIR).
+from workflow.proof.sets import FOREIGN, load_proofs
+
+try:
+    PROOF_SETS = load_proofs(config_path("proof.yaml"))
+except InputError as error:
+    say_and_stop(error)
+
+PROOF_TITLES = {
+    "proof": "Proof of the diagnosis",
+    "proof_full": "Proof of the diagnosis, all cases",
+    "proof_foreign": "Proof of the diagnosis on random systems",
+    "proof_foreign_small": "Proof of the diagnosis on random systems, a few cases",
+}
+
+
+def proof_settings(wildcards):
+    """Params function: everything that a set of cases follows from, its seed included."""
+    return PROOF_SETS[wildcards.proof].model_dump(mode="json")
+
+
+def is_foreign(wildcards):
+    """Params function: whether a set is of the second generator."""
+    return wildcards.proof in FOREIGN
+
+
+def all_batches(pattern):
+    """Input function: one file for every batch of the set."""
+    return lambda wildcards: expand(
+        pattern,
+        proof=wildcards.proof,
+        batch=PROOF_SETS[wildcards.proof].batch_names(),
+    )
+
+
+def blind_names():
+    """Names of the cases that somebody else made."""
+    try:
+        return CASES.in_folder()
+    except InputError as error:
+        say_and_stop(error)
+
+
+def key_of(wildcards):
+    """Input function: the key of a case that somebody else made, with its arrays where there are any."""
+    folder = config.get("keys")
+    if folder is None:
+        say_and_stop(
+            "--config, keys: no folder is given; write --config cases=DIR keys=DIR."
+        )
+    names = (Path(folder) / f"{wildcards.case}.{kind}" for kind in ("json", "npz"))
+    found = [str(path) for path in names if path.is_file()]
+    if not found or not found[0].endswith(".json"):
+        say_and_stop(
+            f"{folder}, {wildcards.case}.json: the case has no key; add it, or take the case away."
+        )
+    return found
+
+
+def all_blind_scores(wildcards):
+    """Input function: the score of every case of the folder."""
+    return expand("results/blind-test/scores/{case}.parquet", case=blind_names())
 
 
 wildcard_constraints:
@@ -7,9 +68,14 @@ wildcard_constraints:
     batch="[0-9]+",
 
 
+ruleorder: score_foreign > score_proof
+
+
 localrules:
     proof,
     proof_full,
+    proof_foreign,
+    proof_foreign_small,
     blind_test,
 
 
@@ -21,6 +87,16 @@ rule proof:
 rule proof_full:
     input:
         "results/proof/proof_full/report.html",
+
+
+rule proof_foreign:
+    input:
+        "results/proof/proof_foreign/report.html",
+
+
+rule proof_foreign_small:
+    input:
+        "results/proof/proof_foreign_small/report.html",
 
 
 rule blind_test:
@@ -37,38 +113,35 @@ rule conceal:
         "results/proof/{proof}/logs/conceal/{batch}.log",
     benchmark:
         "results/proof/{proof}/benchmarks/conceal/{batch}.tsv"
-    wildcard_constraints:
-        proof=OWN_SETS,
     conda:
         "../envs/siq.yaml"
-    threads: 1
     params:
-        code=code("conceal.py"),
+        **task("conceal"),
         settings=proof_settings,
+        foreign=is_foreign,
     message:
         "{wildcards.proof}, batch {wildcards.batch}: concealing effects"
     script:
-        "../scripts/conceal.py"
+        "../scripts/run_task.py"
 
 
 rule published_digests:
     input:
         digests=all_batches("results/proof/{proof}/digests/{batch}.json"),
     output:
-        "results/proof/{proof}/digests.json",
+        joined="results/proof/{proof}/digests.json",
     log:
         "results/proof/{proof}/logs/published_digests.log",
     benchmark:
         "results/proof/{proof}/benchmarks/published_digests.tsv"
     conda:
         "../envs/siq.yaml"
-    threads: 1
     params:
-        code=code("published_digests.py"),
+        **task("published_digests"),
     message:
         "{wildcards.proof}: publishing the digests of all keys"
     script:
-        "../scripts/published_digests.py"
+        "../scripts/run_task.py"
 
 
 rule blind_diagnosis:
@@ -78,20 +151,19 @@ rule blind_diagnosis:
         digests="results/proof/{proof}/digests.json",
         dictionary="siq/diagnosis/mechanisms.yaml",
     output:
-        "results/proof/{proof}/verdicts/{batch}.json",
+        verdicts="results/proof/{proof}/verdicts/{batch}.json",
     log:
         "results/proof/{proof}/logs/blind_diagnosis/{batch}.log",
     benchmark:
         "results/proof/{proof}/benchmarks/blind_diagnosis/{batch}.tsv"
     conda:
         "../envs/siq.yaml"
-    threads: 1
     params:
-        code=code("blind_diagnosis.py"),
+        **task("blind_diagnosis"),
     message:
         "{wildcards.proof}, batch {wildcards.batch}: diagnosing"
     script:
-        "../scripts/blind_diagnosis.py"
+        "../scripts/run_task.py"
 
 
 rule open_keys:
@@ -100,23 +172,21 @@ rule open_keys:
         digests="results/proof/{proof}/digests.json",
         verdicts=all_batches("results/proof/{proof}/verdicts/{batch}.json"),
     output:
-        temp(directory("results/proof/{proof}/keys/{batch}")),
+        folder=temp(directory("results/proof/{proof}/keys/{batch}")),
     log:
         "results/proof/{proof}/logs/open_keys/{batch}.log",
     benchmark:
         "results/proof/{proof}/benchmarks/open_keys/{batch}.tsv"
-    wildcard_constraints:
-        proof=OWN_SETS,
     conda:
         "../envs/siq.yaml"
-    threads: 1
     params:
-        code=code("open_keys.py"),
+        **task("open_keys"),
         settings=proof_settings,
+        foreign=is_foreign,
     message:
         "{wildcards.proof}, batch {wildcards.batch}: opening the keys"
     script:
-        "../scripts/open_keys.py"
+        "../scripts/run_task.py"
 
 
 rule score_batch:
@@ -131,22 +201,20 @@ rule score_batch:
         "results/proof/{proof}/logs/score/{batch}.log",
     benchmark:
         "results/proof/{proof}/benchmarks/score/{batch}.tsv"
-    wildcard_constraints:
-        proof=OWN_SETS,
     conda:
         "../envs/siq.yaml"
-    threads: 1
     params:
-        code=code("score_batch.py"),
+        **task("score_batch"),
+        foreign=is_foreign,
     message:
         "{wildcards.proof}, batch {wildcards.batch}: holding verdicts against keys"
     script:
-        "../scripts/score_batch.py"
+        "../scripts/run_task.py"
 
 
 rule collect_scores:
     input:
-        all_batches("results/proof/{proof}/scores/{batch}.parquet"),
+        scores=all_batches("results/proof/{proof}/scores/{batch}.parquet"),
     output:
         table="results/proof/{proof}/tables/score.parquet",
         csv="results/proof/{proof}/tables/score.csv",
@@ -154,17 +222,15 @@ rule collect_scores:
         "results/proof/{proof}/logs/collect_scores.log",
     benchmark:
         "results/proof/{proof}/benchmarks/collect_scores.tsv"
-    wildcard_constraints:
-        proof=OWN_SETS,
     conda:
         "../envs/siq.yaml"
-    threads: 1
     params:
-        code=code("collect_scores.py"),
+        **task("collect_scores"),
+        foreign=is_foreign,
     message:
         "{wildcards.proof}: collecting scores"
     script:
-        "../scripts/collect_scores.py"
+        "../scripts/run_task.py"
 
 
 rule score_proof:
@@ -185,20 +251,50 @@ rule score_proof:
         "results/proof/{proof}/logs/page.log",
     benchmark:
         "results/proof/{proof}/benchmarks/page.tsv"
-    wildcard_constraints:
-        proof=OWN_SETS,
     conda:
         "../envs/siq.yaml"
-    threads: 1
     params:
-        code=code("proof_page.py"),
+        **task("score_proof"),
         title=lambda wildcards: PROOF_TITLES[wildcards.proof],
         settings=proof_settings,
         command=lambda wildcards: f"snakemake --cores 2 {wildcards.proof}",
     message:
         "{wildcards.proof}: writing the report"
     script:
-        "../scripts/proof_page.py"
+        "../scripts/run_task.py"
+
+
+rule score_foreign:
+    input:
+        scores="results/proof/{proof}/tables/score.parquet",
+    output:
+        html=report(
+            "results/proof/{proof}/report.html",
+            caption="../report/proof.rst",
+            category="Blind test of the diagnosis",
+            labels={"shows": "{proof}", "kind": "page"},
+        ),
+        figure="results/proof/{proof}/figures/gains.svg",
+        png="results/proof/{proof}/figures/gains.png",
+        targets="results/proof/{proof}/tables/targets.parquet",
+        csv="results/proof/{proof}/tables/targets.csv",
+    log:
+        "results/proof/{proof}/logs/page.log",
+    benchmark:
+        "results/proof/{proof}/benchmarks/page.tsv"
+    wildcard_constraints:
+        proof="|".join(FOREIGN),
+    conda:
+        "../envs/siq.yaml"
+    params:
+        **task("score_foreign"),
+        title=lambda wildcards: PROOF_TITLES[wildcards.proof],
+        settings=proof_settings,
+        command=lambda wildcards: f"snakemake --cores 2 {wildcards.proof}",
+    message:
+        "{wildcards.proof}: writing the report"
+    script:
+        "../scripts/run_task.py"
 
 
 rule score_case:
@@ -218,19 +314,19 @@ rule score_case:
         "results/blind-test/benchmarks/score/{case}.tsv"
     conda:
         "../envs/siq.yaml"
-    threads: 1
     params:
-        code=code("score_case.py"),
+        **task("score_case"),
+        foreign=False,
         content=lambda wildcards: case_of(wildcards).content,
     message:
         "{wildcards.case}: holding the verdict against the key"
     script:
-        "../scripts/score_case.py"
+        "../scripts/run_task.py"
 
 
 rule score_cases:
     input:
-        all_blind_scores,
+        scores=all_blind_scores,
     output:
         table="results/blind-test/tables/score.parquet",
         csv="results/blind-test/tables/score.csv",
@@ -240,13 +336,13 @@ rule score_cases:
         "results/blind-test/benchmarks/score_cases.tsv"
     conda:
         "../envs/siq.yaml"
-    threads: 1
     params:
-        code=code("collect_scores.py"),
+        **task("collect_scores"),
+        foreign=False,
     message:
         "collecting the scores of the blind test"
     script:
-        "../scripts/collect_scores.py"
+        "../scripts/run_task.py"
 
 
 rule blind_page:
@@ -264,13 +360,12 @@ rule blind_page:
         "results/blind-test/benchmarks/page.tsv"
     conda:
         "../envs/siq.yaml"
-    threads: 1
     params:
-        code=code("proof_page.py"),
+        **task("score_proof"),
         title="Blind test of the diagnosis",
         settings=None,
         command="snakemake --cores 2 blind_test --config cases=DIR keys=DIR",
     message:
         "writing the report of the blind test"
     script:
-        "../scripts/proof_page.py"
+        "../scripts/run_task.py"

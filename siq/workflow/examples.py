@@ -1,0 +1,274 @@
+"""Studies that ``siq`` writes: the shortest for recordings, one with comments, and examples to try."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from siq.data.inspection import Inspection, inspect_recordings
+from siq.data.recordings import read_recordings
+from siq.errors import InputError
+from siq.numerics.files import whole_file
+from siq.version import DISTRIBUTION
+
+GENERATED = Path(".snakemake", "siq")
+"""Where studies lie that were written for a file of recordings: no result, and of use to nobody else."""
+
+
+def is_study(path: Path) -> bool:
+    """Whether a file is a study, and no recordings."""
+    return path.suffix.lower() in (".yaml", ".yml")
+
+
+def name_for(path: Path) -> str:
+    """A name for the results of a file or folder of recordings: its own, without what no name may have."""
+    resolved = path.resolve()
+    stem = resolved.name if resolved.is_dir() else resolved.stem
+    return re.sub(r"[^A-Za-z0-9_.-]+", "-", stem).strip("-.") or "recordings"
+
+
+def own_path(path: Path, *, start: Path | None = None) -> str:
+    """A path as one writes it in a folder: relative where both lie on one drive."""
+    try:
+        return Path(os.path.relpath(path, start or Path.cwd())).as_posix()
+    except ValueError:  # another drive
+        return path.resolve().as_posix()
+
+
+def write_generated(path: Path, name: str) -> Path:
+    """Write the shortest study for recordings, once they have been read.
+
+    Parameters
+    ----------
+    path
+        A file of recordings, or a folder of files.
+    name
+        Of the study.
+
+    Returns
+    -------
+    pathlib.Path
+        The study.
+
+    Raises
+    ------
+    InputError
+        When the recordings cannot be used.
+    """
+    read_recordings(path)  # before anything starts or is written
+    study = GENERATED / f"{name}.yaml"
+    text = f"name: {_scalar(name)}\nrecordings: {{file: {_scalar(own_path(path, start=study.parent))}}}\n"
+    with whole_file(study) as partial:
+        partial.write_text(text, encoding="utf-8")
+    return study
+
+
+def init_study(path: Path, *, output: Path | None = None, replace: bool = False) -> Path:
+    """Write a study with comments for a file of recordings.
+
+    Parameters
+    ----------
+    path
+        A file of recordings, or a folder of files.
+    output
+        Where to write it; by default named as the recordings, in the folder in which you are.
+    replace
+        Whether a file that is there may be replaced.
+
+    Returns
+    -------
+    pathlib.Path
+        The study.
+
+    Raises
+    ------
+    InputError
+        When the recordings cannot be used, or the study is there already.
+    """
+    if is_study(path):
+        raise InputError(path, "", "this is a study already", f"run it by: siq run {path}")
+    found = inspect_recordings(path)
+    study = Path(f"{name_for(path)}.yaml") if output is None else output
+    if study.exists() and not replace:
+        raise InputError(
+            study, "", "the file is there already", "name another by -o, or replace it by --force"
+        )
+    with whole_file(study) as partial:
+        partial.write_text(commented_study(found, path, study), encoding="utf-8")
+    return study
+
+
+def commented_study(found: Inspection, path: Path, study: Path) -> str:
+    """The text of a study that runs as it is; what is commented out can be used by taking the # away."""
+    states = [state.name for state in found.states]
+    unit = found.recordings.time_unit or "in the unit of t"
+    step = f"{1.5 * found.steps.usual:.3g}" if found.steps is not None else "0.01"
+    units = {state.unit for state in found.states}
+    diffusion = ", ".join("1.0" for _ in states)
+    looked_at = "".join(f"# {line}".rstrip() + "\n" for line in found.text().splitlines())
+    needed = (
+        "\n  # Your states have different units: where no random forces are seen, D has to be given."
+        if len(units) > 1
+        else ""
+    )
+    return f"""\
+# A study: what siq is to answer, from which recordings. Run it by: siq run {own_path(study)}
+# Relative paths start from the folder of this file. What is left out takes its default.
+#
+{looked_at}
+name: {_scalar(name_for(path))}                # names the folder of the results
+title: {_scalar("Landscape of " + name_for(path))}      # what the page is headed
+
+recordings:
+  file: {_scalar(own_path(path, start=study.resolve().parent))}
+  # The columns to use, in this order; by default all of them.
+  # states: [{", ".join(states)}]
+  # Samples further apart than this ({unit}) are no neighbours; by default 1.5 usual steps.
+  # pair_step: {step}
+  # How noise acts on the states: D, one number for each state, or a matrix. By default it is estimated from
+  # the noise in the recordings, or taken as one for each state where they show none.{needed}
+  # diffusion: [{diffusion}]
+
+# More runs, each on recordings drawn anew from yours, show how far the answer depends on the sample.
+# runs: 5
+# seed: 0
+
+# Formulas of a higher degree than what is tried by default, where the page says that none is certified.
+# refinement: {{formula_degree: 6}}
+
+# Only the formula, no wells, barriers and paths:
+# landscape: false
+
+# The published method with two networks, beside ours; needs pip install '{DISTRIBUTION}[networks]'.
+# training: {{}}
+"""
+
+
+def _scalar(text: str) -> str:
+    """A text as YAML writes it: plain where that is safe, otherwise in quotes."""
+    plain = re.fullmatch(r"[A-Za-z./_][\w./ -]*", text, flags=re.ASCII) and text == text.strip()
+    words = {"true", "false", "null", "yes", "no", "on", "off", "y", "n", "~"}
+    return text if plain and text.lower() not in words else json.dumps(text, ensure_ascii=False)
+
+
+DOUBLE_WELL = """\
+# A bead hops between two optical traps at -0.5 um and 0.5 um, and the camera adds an error of 0.01 um to each
+# value. The recordings were simulated, so that the answer is known: dx = (8 x - 32 x**3) dt + noise of
+# strength 0.3 um**2/s, and a barrier of 1 um**2/s in U, which is 3.3 times the noise.
+name: double-well
+title: A bead in two optical traps
+recordings:
+  file: double-well.csv
+"""
+
+SPRING = """\
+# A mass on a spring, as a simulation has it. The recordings beside it are of a spring that hardens, and its
+# stiffness is a little different, too.
+name: spring
+title: A mass on a spring
+time_unit: s
+states:
+  x: {unit: mm, domain: [-2, 2]}
+  v: {unit: mm/s, domain: [-2, 2]}
+parameters:
+  stiffness: {value: 1.05, unit: 1/s**2}
+  damping: {value: 0.2, unit: 1/s}
+equations:
+  x: v
+  v: -stiffness*x - damping*v
+outputs: {x: x, v: v}
+"""
+
+
+def write_example(name: str, folder: Path, *, replace: bool = False) -> tuple[list[Path], str]:
+    """Write an example.
+
+    Parameters
+    ----------
+    name
+        ``double-well`` or ``mismatch``.
+    folder
+        Where to; it is made where it is not there.
+    replace
+        Whether files that are there may be replaced.
+
+    Returns
+    -------
+    files
+        What was written.
+    command
+        What to try with it.
+
+    Raises
+    ------
+    InputError
+        When a file is there already; then none is written.
+    """
+    makers: Mapping[Path, Callable[[], str]]
+    if name == "double-well":
+        study = folder / "double-well.yaml"
+        makers = {folder / "double-well.csv": double_well_recordings, study: lambda: DOUBLE_WELL}
+        command = f"siq run {study}"
+    else:
+        case = folder / "spring"
+        makers = {case / "recordings.csv": spring_recordings, case / "system.yaml": lambda: SPRING}
+        command = f"siq diagnose {case}"
+    for file in makers:
+        if file.exists() and not replace:
+            raise InputError(file, "", "the file is there already", "name another --folder, or give --force")
+    for file, maker in makers.items():
+        with whole_file(file) as partial:
+            partial.write_text(maker(), encoding="utf-8")
+    return list(makers), command
+
+
+def double_well_recordings(recordings: int = 4, samples: int = 20_000, *, seed: int = 1) -> str:
+    """Recordings of a bead in two traps as a CSV file, with the noise of a camera.
+
+    Ten steps of the simulation lead to each sample.
+    """
+    generator, step, within, strength, camera = np.random.default_rng(seed), 0.0025, 10, 0.3, 0.01
+    inner = step / within
+    x = generator.choice([-0.5, 0.5], recordings)
+    recorded = np.empty((samples, recordings))
+    for sample in range(samples):
+        recorded[sample] = x
+        for push in generator.normal(scale=np.sqrt(strength * inner), size=(within, recordings)):
+            x = x + inner * (8 * x - 32 * x**3) + push
+    recorded += generator.normal(scale=camera, size=recorded.shape)
+    t = np.arange(samples) * step
+    return _csv(
+        "recording,t [s],x [um]", [(f"trace-{k + 1}", t, recorded[:, k : k + 1]) for k in range(recordings)]
+    )
+
+
+def spring_recordings(recordings: int = 8, samples: int = 120, *, seed: int = 3) -> str:
+    """Recordings of a spring that hardens as a CSV file, with the noise of a sensor."""
+    generator, step, within = np.random.default_rng(seed), 0.1, 50
+    parts = []
+    for number in range(recordings):
+        x, v = generator.uniform(-1.5, 1.5, 2)
+        rows = np.empty((samples, 2))
+        for sample in range(samples):
+            rows[sample] = (x, v)
+            for _ in range(within):
+                v += step / within * (-x - 0.2 * v - 0.8 * x**3)
+                x += step / within * v
+        rows += generator.normal(scale=0.01, size=rows.shape)
+        parts.append((f"release-{number + 1}", np.arange(samples) * step, rows))
+    return _csv("recording,t [s],x [mm],v [mm/s]", parts)
+
+
+def _csv(header: str, parts: list[tuple[str, np.ndarray, np.ndarray]]) -> str:
+    text = io.StringIO()
+    text.write(header + "\n")
+    for label, t, values in parts:
+        for time, row in zip(t, values, strict=True):
+            text.write(f"{label},{time:.6g}," + ",".join(f"{value:.6f}" for value in row) + "\n")
+    return text.getvalue()

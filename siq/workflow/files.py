@@ -1,0 +1,168 @@
+"""Files of results: how each is read and written, by the name that rules have for it.
+
+What has nothing to say is None, and an empty file. Every file is whole or not there at all.
+
+====================================  ========================================================================
+``recordings``                        trajectories, Parquet
+``field``                             the identified f, `siq.inference.identification.FieldRecord`
+``model``, ``regression``             formulas and certificates by method
+``networks``                          networks of a block of runs, by position
+``quasipotential``                    a landscape; read as plain data
+``card``, ``system``, ``recalibrated``  a system
+``published``, ``reference``          published figures; a reference landscape
+``..._outcome``                       outcomes of steps
+tables                                Parquet, with a CSV beside it
+others                                JSON, text, or a folder of figures and files by name
+====================================  ========================================================================
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from siq.numerics.files import whole_file
+from siq.workflow.outcomes import read_outcomes, write_outcomes
+
+if TYPE_CHECKING:
+    from siq.networks.decomposition import TrainedNetworks
+    from siq.workflow.settings import PipelineSettings
+
+
+@dataclasses.dataclass(frozen=True)
+class _StoredNetworks:
+    """The networks of a block by their position; each is read when it is asked for."""
+
+    path: Path
+
+    def __getitem__(self, position: int) -> TrainedNetworks:
+        from siq.networks.decomposition import load_networks
+
+        return load_networks(self.path, run=position)
+
+
+def read(name: str, path: str | Path) -> Any:
+    """Read a file by its name, None where it is empty.
+
+    Raises
+    ------
+    InputError
+        When the file is not what its name says.
+    """
+    path = Path(path)
+    if path.is_file() and not path.stat().st_size:
+        return None
+    if name == "recordings":
+        from siq.data.recordings import read_recordings
+
+        return read_recordings(path)
+    if name == "field":
+        from siq.inference.identification import read_field
+
+        return read_field(path)
+    if name in ("model", "regression"):
+        from siq.quasipotential.formulas import read_model
+
+        return read_model(path)
+    if name == "networks":
+        return _StoredNetworks(path)
+    if name in ("card", "system", "recalibrated"):
+        from siq.systems.cards import load_system
+
+        return load_system(path)
+    if name == "published":
+        from siq.workflow.published import load_published
+
+        return load_published(path)
+    if name == "reference":
+        from siq.quasipotential.landscape_comparison import read_reference
+
+        return read_reference(path)
+    if name.endswith("_outcome"):
+        return read_outcomes(path)
+    if path.suffix == ".parquet":
+        from siq.workflow.tables import read_table
+
+        return read_table(path)
+    text = path.read_text(encoding="utf-8")
+    return json.loads(text) if path.suffix == ".json" else text
+
+
+def write(name: str, path: str | Path, value: Any, settings: PipelineSettings) -> None:
+    """Write a result by its name.
+
+    Parameters
+    ----------
+    name, path
+        Of the file, or of a folder.
+    value
+        What `read` gives back; of ``quasipotential`` the landscape; of a folder its files.
+    settings
+        Of the task.
+    """
+    import pandas as pd
+
+    path = Path(path)
+    if value is None:
+        path.touch()
+    elif name == "recordings":
+        from siq.data.recordings import write_recordings
+
+        write_recordings(path, value)
+    elif name == "field":
+        from siq.inference.identification import write_field
+
+        write_field(path, value, settings.identification)
+    elif name in ("model", "regression"):
+        from siq.quasipotential.formulas import model_to_data, write_model
+
+        write_model(path, model_to_data(*({str(key): one for key, one in part.items()} for part in value)))
+    elif name == "networks":
+        from siq.networks.decomposition import save_networks
+
+        save_networks(path, list(value))
+    elif name == "quasipotential":
+        from siq.quasipotential.landscape_files import write_landscape
+
+        write_landscape(path, value)
+    elif name == "reference":
+        from siq.quasipotential.landscape_comparison import write_reference
+
+        write_reference(path, value)
+    elif name.endswith("_outcome"):
+        write_outcomes(path, value)
+    elif isinstance(value, pd.DataFrame):
+        from siq.workflow.tables import write_table
+
+        write_table(path, value)
+    elif not path.suffix:
+        _write_folder(path, value)
+    else:
+        with whole_file(path) as partial:
+            if dataclasses.is_dataclass(value) and not isinstance(value, type):
+                from pydantic import TypeAdapter
+
+                partial.write_bytes(TypeAdapter(type(value)).dump_json(value, indent=1))
+            elif isinstance(value, str):
+                partial.write_text(value, encoding="utf-8")
+            else:
+                indent = None if name == "overview" else 1
+                text = json.dumps(value, indent=indent, ensure_ascii=False, allow_nan=False)
+                partial.write_text(text + "\n", encoding="utf-8")
+
+
+def _write_folder(folder: Path, files: Mapping[str, Any]) -> None:
+    """Figures by their names, as SVG and PNG; text and bytes by names of files; what is None is left out."""
+    from siq.report.plots.style import save_figure
+
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, value in files.items():
+        if isinstance(value, str):
+            (folder / name).write_text(value, encoding="utf-8")
+        elif isinstance(value, bytes):
+            (folder / name).write_bytes(value)
+        elif value is not None:
+            save_figure(value, folder / name)

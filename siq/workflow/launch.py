@@ -1,0 +1,587 @@
+"""Start Snakemake for a study, recordings or a folder of cases, and follow it with one line of progress.
+
+A job's message, ``NAME, run 000: drawing trajectories``, is what the line says; events come from the logger
+plugin in ``workflow/plugins``, one line of JSON each.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import queue
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import IO, Any, TextIO
+
+from siq.errors import InputError, MissingExtra, suggestion
+from siq.numerics.files import CARD, case_folders, read_document
+from siq.workflow.answers import Exit, Told, answer_of_page
+from siq.workflow.examples import is_study, name_for, own_path, write_generated
+
+MARK = "\x1e"
+"""Begins a line that is an event, as the logger plugin of the workflow writes them."""
+
+SECONDS = {
+    "diagnosis": 40.0,
+    "escapes": 15.0,
+    "figures": 5.0,
+    "identify": 2.0,
+    "landscape_figures": 2.5,
+    "mismatch_figures": 5.0,
+    "mismatch_landscape": 3.0,
+    "reference": 15.0,
+    "refine": 6.0,
+    "train": 17.0,
+}
+"""What jobs take beside one another, measured on studies of two and three states; others about a second.
+Only their ratios matter once a job has ended: the speed of the machine then follows."""
+
+OF_SNAKEMAKE = "Using workflow specific profile"
+"""What Snakemake prints before it has a logger, of use to nobody here."""
+
+EVERY = 15.0
+"""Seconds between lines where they are kept, as in a log; a choice."""
+
+
+@dataclass
+class Progress:
+    """Where a workflow stands, from its events.
+
+    Attributes
+    ----------
+    clock
+        Seconds of any clock that does not go back.
+    total, done
+        Jobs.
+    running
+        What runs, by number of the job, in the words of its rule.
+    failed
+        The jobs that failed: what they were about, and their logs.
+    errors
+        What Snakemake itself says of a fault.
+    broken
+        Whether a job ended by a fault of ours, with a traceback.
+    planned
+        What is to run, in the words of the rules.
+    """
+
+    clock: Callable[[], float] = time.monotonic
+    total: int = 0
+    done: int = 0
+    running: dict[int, str] = field(default_factory=dict)
+    failed: list[tuple[str, tuple[str, ...]]] = field(default_factory=list)
+    errors: list[str] = field(default_factory=list)
+    broken: bool = False
+    planned: list[str] = field(default_factory=list)
+    _doing: dict[str, str] = field(default_factory=dict)
+    _rules: dict[int, str] = field(default_factory=dict)
+    _words: dict[int, str] = field(default_factory=dict)
+    _latest_words: str = "starting"
+    _work: float = 0.0
+    _worked: float = 0.0
+    _began: float | None = None
+    _latest: float = 0.0
+
+    def take(self, event: Mapping[str, Any]) -> None:
+        """Follow one event."""
+        kind = event.get("event")
+        if kind == "run_info":
+            counts = {name: int(count) for name, count in event["stats"].items()}
+            self.total = counts.pop("total", sum(counts.values()))
+            self._work = sum(count * _seconds(rule) for rule, count in counts.items())
+            self._began = self._latest = self.clock()
+        elif kind == "job_info":
+            job = int(event["jobid"])
+            self._rules[job] = event["rule_name"]
+            self._words[job] = self.running[job] = _in_short(event.get("rule_msg") or event["rule_name"])
+            self.planned.append(self._words[job])
+        elif kind == "doing":
+            self._doing[str(event["of"])] = str(event["text"])
+        elif kind == "job_finished":
+            self._end(int(event["job_id"]))
+        elif kind == "job_error":
+            job = int(event["jobid"])
+            self.running.pop(job, None)
+            self.failed.append((self._words.get(job, str(event["rule_name"])), tuple(event.get("log") or ())))
+        elif kind == "error":
+            self.errors.append(str(event.get("text", "")))
+
+    def _end(self, job: int) -> None:
+        words = self._words.get(job, "")
+        self._doing = {of: text for of, text in self._doing.items() if not words.endswith(f"({of})")}
+        self.running.pop(job, None)
+        self.done += 1
+        self._worked += _seconds(self._rules.get(job, ""))
+        self._latest = self.clock()
+
+    def _within(self, words: str) -> str:
+        """What a running job said last of what it is doing."""
+        said = [text for of, text in self._doing.items() if words.endswith(f"({of})")]
+        return f": {said[-1]}" if said else ""
+
+    def left(self) -> float | None:
+        """Seconds that are left; None before anything began, and where it takes longer than was thought."""
+        if self._began is None or not self._work:
+            return None
+        spent = self._latest - self._began
+        pace = spent / self._worked if self._worked and spent > 0 else 1.0
+        left = (self._work - self._worked) * pace - (self.clock() - self._latest)
+        return None if left < 0 and self.running else max(left, 0.0)
+
+    def line(self) -> str:
+        """Where it stands, in one line."""
+        if not self.total:
+            return "reading and checking your files"
+        words = list(self.running.values())
+        if words:
+            self._latest_words = words[-1] + self._within(words[-1])
+        what = "finishing" if self.done == self.total else self._latest_words
+        more = f" (and {len(words) - 1} more)" if len(words) > 1 else ""
+        left = self.left()
+        time_left = "" if left is None else f", {_duration(left)}"
+        return f"{min(self.done + 1, self.total)} of {self.total}: {what}{more}{time_left}"
+
+
+def _in_short(message: str) -> str:
+    """``bead, run 000: drawing`` as ``drawing (bead)``: what is done comes first, and the line is short."""
+    of, colon, what = message.partition(": ")
+    name = of.removesuffix(", run 000")
+    return f"{what} ({name})" if colon else message
+
+
+def _seconds(rule: str) -> float:
+    return SECONDS.get(rule, 1.0)
+
+
+def _duration(seconds: float) -> str:
+    """About how long, in words."""
+    if seconds < 5:
+        return "a few seconds left"
+    if seconds < 90:
+        return f"about {5 * round(seconds / 5)} s left"
+    if seconds < 5400:
+        return f"about {round(seconds / 60)} min left"
+    return f"about {round(seconds / 3600)} h left"
+
+
+class Screen:
+    """Shows the line: rewritten in place on a terminal, now and then in a log.
+
+    Parameters
+    ----------
+    stream
+        Where to.
+    columns
+        Width of the terminal; None where the stream is none.
+    clock
+        As `Progress.clock`.
+    """
+
+    def __init__(
+        self, stream: TextIO, *, columns: int | None, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._stream, self._columns, self._clock = stream, columns, clock
+        self._shown = ""
+        self._last: float | None = None
+
+    def show(self, line: str) -> None:
+        """Show where it stands."""
+        if self._columns is not None:
+            cut = line if len(line) < self._columns else line[: self._columns - 2] + "…"
+            if cut != self._shown:
+                self._stream.write("\r" + cut.ljust(len(self._shown)))
+                self._shown = cut
+        elif self._last is None or self._clock() - self._last >= EVERY:
+            self._stream.write(line + "\n")
+            self._last = self._clock()
+        self._stream.flush()
+
+    def say(self, line: str) -> None:
+        """Write a line that stays."""
+        self.clear()
+        self._stream.write(line + "\n")
+        self._stream.flush()
+
+    def clear(self) -> None:
+        """Take the rewritten line away."""
+        if self._shown:
+            self._stream.write("\r" + " " * len(self._shown) + "\r")
+            self._shown = ""
+        self._stream.flush()
+
+
+def follow(lines: Iterable[str], screen: Screen, progress: Progress) -> list[str]:
+    """Read what a workflow writes, show where it stands, and pass on what its jobs say.
+
+    The traceback of a job is not passed on: it stands in the job's log, which `faults` names.
+
+    Parameters
+    ----------
+    lines
+        As they come; an empty one only has the time that is left shown anew.
+    screen, progress
+        What is shown, and what is followed.
+
+    Returns
+    -------
+    list of str
+        The lines that were passed on.
+    """
+    passed_on: list[str] = []
+    in_traceback = False
+    for raw in lines:
+        text, mark, event = raw.rstrip("\r\n").partition(MARK)
+        if mark:
+            progress.take(json.loads(event))
+            in_traceback = False
+        if text.startswith("Traceback (most recent call last)"):
+            in_traceback = progress.broken = True
+        elif text.strip() and not in_traceback and not text.startswith(OF_SNAKEMAKE):
+            passed_on.append(text)
+            screen.say(text)
+        screen.show(progress.line())
+    screen.clear()
+    return passed_on
+
+
+def faults(progress: Progress, passed_on: list[str]) -> list[str]:
+    """Sentences on why a workflow stopped, where its jobs did not say so themselves.
+
+    Parameters
+    ----------
+    progress
+        Where it stopped.
+    passed_on
+        What its jobs said.
+    """
+    if passed_on and not progress.broken:
+        return []
+    if progress.failed:
+        what, logs = progress.failed[0]
+        where = f"; the log is {logs[0]}" if logs else ""
+        return [f"This step stopped by a fault that is not yours: {what}{where}. Please report it."]
+    return progress.errors[:1] or ["The workflow did not end; `siq run --verbose` shows what Snakemake says."]
+
+
+def screen_of(stream: TextIO = sys.stderr, *, columns: int = 80) -> Screen:
+    """A screen on a stream, rewritten in place where it is a terminal."""
+    return Screen(stream, columns=columns if stream.isatty() else None)
+
+
+NEEDED = ("snakemake", "filelock", "matplotlib")
+PLUGINS = Path("workflow", "plugins")
+TICK = 1.0  # seconds after which the time left is shown anew
+
+
+def workflow_folder() -> Path:
+    """The folder of the Snakefile: the checkout that this package lies in, or what the wheel brought."""
+    here = Path(__file__).resolve()
+    checkout, shipped = here.parents[2], here.parent / "shipped"
+    in_checkout = (checkout / "Snakefile").is_file() and (checkout / "workflow" / "places.py").is_file()
+    return checkout if in_checkout else shipped
+
+
+def need_workflow() -> None:
+    """Say what to install where the workflow cannot run.
+
+    Raises
+    ------
+    MissingExtra
+        For the first package that is missing.
+    """
+    for package in NEEDED:
+        if importlib.util.find_spec(package) is None:
+            raise MissingExtra("workflow", package)
+
+
+@dataclass(frozen=True)
+class Request:
+    """What Snakemake is asked for.
+
+    Attributes
+    ----------
+    targets
+        Files or rules.
+    study
+        A study to be given by ``--configfile``.
+    settings
+        Keys of the configuration, as ``--config`` takes them.
+    cores
+        A number, or ``all``.
+    verbose
+        Whether Snakemake speaks for itself.
+    dry_run
+        Whether it only says what would run.
+    further
+        Options that are passed on.
+    """
+
+    targets: tuple[str, ...] = ()
+    study: Path | None = None
+    settings: tuple[str, ...] = ()
+    cores: str = "all"
+    verbose: bool = False
+    dry_run: bool = False
+    further: tuple[str, ...] = ()
+
+    def command(self) -> list[str]:
+        """The command line; what it has to make stands behind ``--``, where no option can take it."""
+        base = workflow_folder()
+        # -P: a folder `workflow` of yours, where you work, is not mistaken for ours.
+        words = [sys.executable, "-P", "-m", "snakemake", "--snakefile", str(base / "Snakefile")]
+        words += ["--directory", str(Path.cwd()), "--cores", self.cores]
+        words += ["--workflow-profile", str(base / "profiles" / "default")]
+        if not self.verbose:
+            words += ["--logger", "siq"]
+        if self.dry_run:
+            words += ["--dry-run"]
+        configuration = base / "config" / "config.yaml"
+        words += ["--configfile", str(configuration), *([str(self.study.resolve())] if self.study else [])]
+        if self.settings:
+            words += ["--config", *self.settings]
+        return [*words, *self.further, "--", *self.targets]
+
+
+FOLLOWED = "SIQ_FOLLOWED"
+"""Environment variable that tells jobs that what they say of their progress is read."""
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a workflow ended.
+
+    Attributes
+    ----------
+    code
+        Snakemake's own exit code.
+    said
+        The lines that were shown on the way.
+    steps
+        How many there were to do.
+    planned
+        What they were about, in words.
+    interrupted
+        Whether it was stopped from the keyboard.
+    """
+
+    code: int
+    said: tuple[str, ...] = ()
+    steps: int = 0
+    planned: tuple[str, ...] = ()
+    interrupted: bool = False
+
+
+def run_workflow(request: Request) -> Ended:
+    """Run the workflow in the folder in which you work, with one line of progress on standard error.
+
+    Raises
+    ------
+    MissingExtra
+        Where it is not installed.
+    """
+    need_workflow()
+    process = subprocess.Popen(
+        request.command(),
+        env=_environment() | ({} if request.verbose else {FOLLOWED: "1"}),
+        stdout=None if request.verbose else subprocess.PIPE,
+        stderr=None if request.verbose else subprocess.STDOUT,
+        text=None if request.verbose else True,
+        encoding=None if request.verbose else "utf-8",
+        errors=None if request.verbose else "replace",
+    )
+    progress, said = Progress(), []
+    try:
+        if process.stdout is not None:
+            screen = screen_of(columns=shutil.get_terminal_size().columns)
+            said = follow(_lines(process.stdout), screen, progress)
+        code = process.wait()
+    except KeyboardInterrupt:  # Snakemake has been told, too, and lets no half of a file stand
+        _wait_once_more(process)
+        print(file=sys.stderr)
+        return Ended(process.returncode, interrupted=True)
+    if code and not request.verbose:
+        said += (more := faults(progress, said))
+        for line in more:
+            print(line, file=sys.stderr)
+    return Ended(code, tuple(said), progress.total, tuple(progress.planned))
+
+
+def _environment() -> dict[str, str]:
+    """What Snakemake is started with: our logger, and in a checkout our sources."""
+    base = workflow_folder()
+    paths = [str(base / PLUGINS)]
+    if (base / "siq").is_dir():
+        paths.append(str(base))
+    paths += [path for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
+    return os.environ | {"PYTHONPATH": os.pathsep.join(paths), "PYTHONIOENCODING": "utf-8"}
+
+
+def _lines(stream: IO[str]) -> Iterator[str]:
+    """The lines of a stream as they come, and an empty one each tick in between."""
+    waiting: queue.Queue[str | None] = queue.Queue()
+
+    def read() -> None:
+        for line in stream:
+            waiting.put(line)
+        waiting.put(None)
+
+    threading.Thread(target=read, daemon=True).start()
+    while True:
+        try:
+            line = waiting.get(timeout=TICK)
+        except queue.Empty:
+            yield ""
+            continue
+        if line is None:
+            return
+        yield line
+
+
+def _wait_once_more(process: subprocess.Popen[str] | subprocess.Popen[bytes], patience: float = 20.0) -> None:
+    """Let an interrupted workflow clean up; end it when it is interrupted again, or takes too long."""
+    try:
+        process.wait(timeout=patience)
+    except (KeyboardInterrupt, subprocess.TimeoutExpired):
+        process.kill()
+        process.wait()
+
+
+def known_studies() -> Sequence[str]:
+    """The names of the studies that come with the workflow."""
+    return sorted(path.stem for path in (workflow_folder() / "config" / "studies").glob("*.yaml"))
+
+
+RESULTS = Path("results")
+
+
+def run_study(given: str, asked: Request) -> Exit:
+    """Answer a study, recordings without a study, or a study that comes with the workflow.
+
+    Parameters
+    ----------
+    given
+        Path of a study (YAML) or of recordings (a file, or a folder of files), or the name of a study in
+        ``config/studies``.
+    asked
+        How to run it; what to make is added.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be used.
+    MissingExtra
+        When the workflow is not installed.
+    """
+    need_workflow()
+    path = Path(given).expanduser()
+    settings: tuple[str, ...] = ()
+    study: Path | None = None
+    if not path.exists() and given in known_studies():
+        name = given
+    elif not path.exists():
+        raise _not_there(given)
+    elif (path / CARD).is_file():
+        raise InputError(
+            given, "", f"this is a case of a simulation and its recordings, since it has {CARD}",
+            f"compare them by: siq diagnose {given}",
+        )  # fmt: skip
+    elif is_study(path):
+        from siq.workflow.study import (
+            load_study,  # here, so that `siq --help` and a fault of the line are quick
+        )
+
+        _refuse_card(path)
+        name, study = load_study(path).name, path
+    else:
+        name = name_for(path)
+        study, settings = write_generated(path, name), (f"origin={own_path(path)}",)
+    page = RESULTS / name / "report.html"
+    request = replace(asked, targets=(page.as_posix(),), study=study, settings=settings)
+    return _told(run_workflow(request), request, [page])
+
+
+def diagnose_cases(folder: str, asked: Request) -> Exit:
+    """Compare simulations with recordings: every case of a folder, or the one that the folder is.
+
+    Parameters
+    ----------
+    folder
+        With ``system.yaml`` and recordings, or with folders that have them.
+    asked
+        How to run it; what to make is added.
+
+    Raises
+    ------
+    InputError
+        When there is no such folder.
+    MissingExtra
+        When the workflow is not installed.
+    """
+    need_workflow()
+    place = Path(folder).expanduser()
+    if place.name == CARD and place.is_file():
+        place = place.parent
+    if not place.is_dir():
+        raise _not_there(folder)
+    pages = [RESULTS / "mismatch" / name / "report.html" for name in case_folders(place)]
+    request = replace(asked, targets=("diagnose",), settings=(f"cases={place.as_posix()}",))
+    return _told(run_workflow(request), request, pages)
+
+
+def _refuse_card(path: Path) -> None:
+    data = read_document(path).data
+    if "equations" in data:
+        raise InputError(
+            path, "", "this is the card of a system, not a study",
+            f"write a study beside it, of two lines: 'name: {data.get('name', 'my-study')}' and"
+            f" 'system: {path.name}'",
+        )  # fmt: skip
+
+
+def _not_there(given: str) -> InputError:
+    """A wrong path, with where it was looked for and what is there of a similar name."""
+    place = Path(given).expanduser().absolute()
+    beside = [entry.name for entry in place.parent.iterdir()] if place.parent.is_dir() else []
+    otherwise = suggestion(given, known_studies(), otherwise="correct the path")
+    remedy = suggestion(place.name, beside, otherwise=otherwise)
+    if not place.parent.is_dir():
+        return InputError(given, "", f"there is no folder {place.parent}", remedy)
+    return InputError(given, "", f"there is no file or folder of that name in {place.parent}", remedy)
+
+
+def _told(ended: Ended, request: Request, pages: Sequence[Path]) -> Exit:
+    """Say how it ended, and name the pages."""
+    if ended.interrupted:
+        print("Stopped. Give the same command again to go on from here.", file=sys.stderr)
+        return Exit.INTERRUPTED
+    if ended.code not in (0, Exit.NO_ANSWER):
+        return Exit.FAULT
+    if request.dry_run:
+        for words in ended.planned:
+            print(words)
+        if not request.verbose:
+            print(
+                f"{ended.steps} steps would run." if ended.steps else "Nothing would run: all is up to date."
+            )
+        return Exit.ANSWERED
+    told = [answer_of_page(page) for page in pages if page.is_file()]
+    if not ended.steps and not request.verbose:
+        print("Nothing has changed since the last time; this is the answer that you have.", file=sys.stderr)
+    for one in told:
+        _say(one, ended.said)
+    return max((one.code for one in told), default=Exit.FAULT)
+
+
+def _say(one: Told, said: Sequence[str]) -> None:
+    for line in one.lines:
+        if line not in said:
+            print(line)
+    if (page := f"The page to read: {one.page}") not in said:
+        print(page)

@@ -1,0 +1,296 @@
+"""The tasks that draw and write what people read of a study; the drawing itself is `siq.report`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from siq.workflow.steps import _models, _trained, published_mesh
+from siq.workflow.tasks import Given, task
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from siq.quasipotential.landscape import Landscape
+    from siq.workflow.settings import PipelineSettings
+    from siq.workflow.study import Study
+
+PACKAGES = ("numpy", "snakemake")
+OF_NETWORKS = ("torch", "pysindy")
+
+
+def _versions(*programs: str) -> dict[str, str]:
+    import siq
+
+    return {"siq": siq.__version__} | {name: version(name) for name in programs}
+
+
+def _files(folders: Iterable[str], suffix: str) -> dict[str, bytes]:
+    """Drawn figures by name."""
+    found = [path for folder in folders for path in sorted(Path(folder).glob(f"*{suffix}"))]
+    return {path.stem: path.read_bytes() for path in found}
+
+
+def _first_stored(given: Given) -> tuple[int, Landscape] | None:
+    """The first run with a U over all wells."""
+    from siq.workflow.comparison_steps import first_stored
+
+    landscapes = given.files.get("quasipotential") or ()
+    return first_stored(given.files["field"][: len(landscapes)], landscapes)
+
+
+def _study(given: Given) -> Study:
+    from siq.workflow.study import Study
+
+    return Study.model_validate(given.options["study"])
+
+
+def _tables(given: Given) -> dict[str, pd.DataFrame]:
+    """Every table of the contract that there is."""
+    from siq.workflow.tables import COLUMNS
+
+    return {name: getattr(given, name) for name in COLUMNS if given.path(name) is not None}
+
+
+def _published(given: Given) -> Any:
+    return {} if given.published is None else given.published.figures
+
+
+@task(
+    "coefficients", "rrmse", "training", "prediction", "record", "record_density", "model", "recordings",
+    "networks", "train_outcome", "field", "quasipotential", "overview", "card", "published",
+    options=("seed", "space", "sampling", "simulation", "regression", "card", "exact"),
+)  # fmt: skip
+def figures(given: Given, settings: PipelineSettings) -> Any:
+    """The figures of a study."""
+    from dataclasses import replace
+
+    from siq.quasipotential.landscape_files import read_landscape
+    from siq.report import figures as report
+    from siq.report.page import interactive_view
+    from siq.report.summary import summarise
+    from siq.workflow.collection_steps import shown_formula
+    from siq.workflow.outcomes import Method
+    from siq.workflow.recordings_step import read_states
+    from siq.workflow.scoring import exact_answer
+
+    source, models = given.files, _models(given)
+    tables = {name: getattr(given, name) for name in report.DRAWN_TABLES}
+    chosen = shown_formula(tables["rrmse"], models)
+    of_landscape = chosen.run is None or chosen.method == Method.REGRESSION
+    shown = report.representative_run(chosen, models, _first_stored(given) if of_landscape else None)
+    run, card = shown.number, given.path("card")
+    shown = replace(
+        shown,
+        recordings=read_states(source["recordings"][run], source["field"][run]),
+        networks=_trained(given, run).networks,
+        exact=None if card is None else exact_answer(card),
+    )
+    own = settings.of(report.FiguresSettings)
+    drawn: dict[str, Any] = dict(report.study_figures(own, tables, shown, given.card, _published(given)))
+    overview = given.overview
+    first = run if overview is None else overview["run"]
+    record, recorded = given.field[first], given.recordings[first]
+    folder = Path(given.outputs["drawn"])
+    if record is not None and recorded is not None:
+        dynamics = record.found.dynamics
+        stored = read_landscape(source["overview"], dynamics=dynamics)
+        states = read_states(source["recordings"][first], source["field"][first]) or recorded
+        refined = models.formulas(first).get(Method.REFINED)
+        summary = summarise(stored, states, dynamics=dynamics, formula=refined)
+        drawn |= report.leading_figures(summary, dynamics, states)
+        if dynamics.dimension > 2:
+            drawn["interactive.html"] = interactive_view(summary)
+    if settings.simulation is None and recorded is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        drawn |= report.inspection_drawn(recorded, folder=folder)
+    return {"drawn": drawn}
+
+
+@task(
+    "reference", "escape", "degrees", "field", "quasipotential", "model", "recordings", "networks",
+    "train_outcome", "published", "mesh",
+    options=("space", "landscape"),
+)  # fmt: skip
+def landscape_figures(given: Given, settings: PipelineSettings) -> Any:
+    """The figures of a landscape."""
+    import pandas as pd
+
+    from siq.report import figures as report
+
+    found, formulas, networks = _first_stored(given), None, None
+    if found is not None:
+        formulas, networks = given.model[found[0]][0], _trained(given, found[0]).networks
+    drawn = report.landscape_figures(
+        settings.of(report.LandscapeFiguresSettings),
+        degrees=given.degrees,
+        escape=pd.DataFrame() if given.escape is None else given.escape,
+        landscape=None if found is None else found[1],
+        reference=given.reference,
+        networks=networks,
+        formulas=formulas,
+        published=None if given.published is None else given.published.figures,
+        mesh=None if given.published is None else published_mesh(given),
+    )
+    return {"drawn": drawn}
+
+
+@task(
+    "rrmse", "model", "field", "quasipotential", "card", "published",
+    options=("seed", "space", "invariant", "card"),
+)  # fmt: skip
+def invariant(given: Given, settings: PipelineSettings) -> Any:
+    """The invariant distribution of the formula that is shown, or of the landscape where none holds."""
+    from siq.report.plots import plot_invariant_distribution
+    from siq.workflow import invariant_step
+
+    shown = _what_it_follows_from(given) if settings.invariant and given.card is not None else None
+    own = settings.of(invariant_step.InvariantSettings)
+    found = invariant_step.run(own, given.card, shown, _published(given))
+    drawn = {}
+    if found.densities:
+        names = settings.space.names or ()
+        units = [settings.space.unit(name) for name in names]
+        drawn["invariant"] = plot_invariant_distribution(found.densities, states=names, units=units)
+    return {"table": found.table, "shares": found.shares, "drawn": drawn}
+
+
+def _what_it_follows_from(given: Given) -> Any:
+    """See `siq.workflow.invariant_step.run`; equations have one landscape, and nothing else."""
+    from siq.quasipotential.landscape_files import read_landscape
+    from siq.workflow.collection_steps import shown_formula
+    from siq.workflow.invariant_step import FormulaShown, LandscapeShown
+    from siq.workflow.outcomes import Method
+
+    if not given.path("model"):
+        stored = read_landscape(given.files["quasipotential"], dynamics=given.card)
+        return None if stored is None else LandscapeShown(0, stored)
+    models = _models(given)
+    shown = shown_formula(given.rrmse, models)
+    if shown.run is None or shown.method == Method.REGRESSION:
+        complete = _first_stored(given)
+        if complete is not None:
+            return LandscapeShown(*complete)
+    if shown.run is None:
+        return None
+    return FormulaShown(shown.run, shown.method, models.formulas(shown.run)[shown.method])
+
+
+@task(
+    "summary", "rrmse", "certificates", "coefficients", "outcomes", "record", "timings", "model", "invariant",
+    "well_shares", "overview", "field", "drawn", "drawn_landscape", "drawn_density", "landscape",
+    "landscape_errors", "escape", "beside_equations", "card", "published",
+    options=("study", "command", "card", "exact"),
+)  # fmt: skip
+def page(given: Given, settings: PipelineSettings) -> Any:
+    """The page of a study of trajectories."""
+    from markupsafe import Markup
+
+    from siq.report.figures import read_inspection, read_seen
+    from siq.report.page import render_report
+    from siq.report.study_page import StudyResults, answer_data, study_page
+    from siq.report.summary import summarise
+    from siq.workflow.collection_steps import shown_formula
+    from siq.workflow.scoring import exact_answer
+
+    source, study = given.files, _study(given)
+    tables, models, card = _tables(given), _models(given), given.path("card")
+    shown = shown_formula(tables["rrmse"], models)
+    shown = shown if shown.run is not None else models.first_wells()
+    overview = given.overview
+    run = shown.run if shown.run is not None else (overview or {}).get("run", 0)
+    view = Path(source["drawn"]) / "interactive.html"
+    folders = [source["drawn"], *source["drawn_landscape"], source["drawn_density"]]
+    images, vectors = _files(folders, ".png"), _files(folders, ".svg")
+    results = StudyResults(
+        tables,
+        Path(source["summary"]).parent,
+        landscape=None if overview is None else summarise(overview, record=tables["record"]),
+        models=models,
+        shown=shown,
+        exact=None if card is None else exact_answer(card),
+        images=images,
+        vectors=vectors,
+        record=given.field[run],
+        inspection=read_inspection(source["drawn"]),
+        seen=read_seen(source["drawn"]),
+        interactive=Markup(view.read_text(encoding="utf-8")) if view.is_file() else None,
+    )
+    programs = PACKAGES if study.training is None else (*PACKAGES, *OF_NETWORKS)
+    content = study_page(study, results, command=given.options["command"], versions=_versions(*programs))
+    gathered = {f"{name}.png": one for name, one in images.items()}
+    gathered |= {f"{name}.svg": one for name, one in vectors.items()}
+    answer = answer_data(content, study, results)
+    return {"html": render_report(content), "answer": answer, "figures": gathered}
+
+
+@task(
+    "card", "quasipotential", "landscape", "degrees", "certificates", "outcomes", "sweep", "branches",
+    "bifurcations", "bifurcation_curves", "invariant", "well_shares", "density",
+    options=("study", "command", "card"),
+)  # fmt: skip
+def equations_page(given: Given, settings: PipelineSettings) -> Any:
+    """The figures and the page of a study of equations."""
+    import numpy as np
+
+    from siq.quasipotential.landscape_files import read_landscape
+    from siq.report.figures import equations_figures
+    from siq.report.page import interactive_view, render_report
+    from siq.report.plots import save_figure
+    from siq.report.study_page import StudyResults, answer_data, study_page
+    from siq.report.summary import summarise
+
+    study, system, tables = _study(given), given.card, _tables(given)
+    stored = read_landscape(given.files["quasipotential"], dynamics=system)
+    summary = None if stored is None else summarise(stored, np.zeros((0, system.dimension)))
+    certificate = None if stored is None else stored.certificate
+    folder = Path(given.outputs["figures"])
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, figure in equations_figures(system, summary, tables, study).items():
+        if figure is not None:
+            save_figure(figure, folder / name)
+    density = given.path("density")
+    gathered = {} if density is None else {path.name: path.read_bytes() for path in Path(density).iterdir()}
+    folders = [str(folder), *([] if density is None else [density])]
+    results = StudyResults(
+        tables,
+        Path(given.files["landscape"]).parent,
+        landscape=summary,
+        system=system,
+        certificate=None if certificate is None else certificate.as_data(),
+        images=_files(folders, ".png"),
+        vectors=_files(folders, ".svg"),
+        interactive=None if summary is None or system.dimension < 3 else interactive_view(summary),
+    )
+    command, versions = given.options["command"], _versions(*PACKAGES)
+    content = study_page(study, results, command=command, versions=versions)
+    answer = answer_data(content, study, results)
+    return {"html": render_report(content), "answer": answer, "figures": gathered}
+
+
+@task("summaries", "reports", "published", "card", "contents", "parameters", "contradictions")
+def reproduction(given: Given, settings: PipelineSettings) -> Any:
+    """Everything in the paper on one page, with ours beside it."""
+    import yaml
+    from pydantic import TypeAdapter
+
+    from siq.workflow.reproduction import load_contents, load_parameters
+    from workflow.reproduction import ReproductionSettings
+    from workflow.reproduction.page import Paper, Results, render_reproduction, reproduction_page
+
+    source = given.files
+    told = TypeAdapter(dict[str, ReproductionSettings]).validate_python(given.options["studies"])
+    rows = zip(given.options["names"], source["summaries"], given.published, given.card, strict=True)
+    studies = {
+        name: Results(name, Path(summary).parents[1], told[name], published.figures, system)
+        for name, summary, published, system in rows
+    }
+    paper = Paper(
+        load_contents(source["contents"]).places,
+        load_parameters(source["parameters"]),
+        yaml.safe_load(Path(source["contradictions"]).read_text(encoding="utf-8")),
+    )
+    content, table = reproduction_page(paper, studies, told, command="snakemake --cores 2 reproduce")
+    return {"html": render_reproduction(content), "csv": table.to_csv(index=False)}

@@ -1,0 +1,157 @@
+# Figures, and the pages that people read; recordings to try things with.
+
+
+rule figures:
+    input:
+        coefficients="results/{study}/tables/coefficients.parquet",
+        rrmse="results/{study}/tables/rrmse.parquet",
+        training="results/{study}/tables/training.parquet",
+        prediction="results/{study}/tables/prediction.parquet",
+        record="results/{study}/tables/record.parquet",
+        record_density="results/{study}/tables/record_density.parquet",
+        model=all_runs("results/{study}/runs/{run}/model.json"),
+        recordings=all_runs("results/{study}/runs/{run}/recordings.parquet"),
+        networks=networks_of_runs("networks.npz"),
+        train_outcome=networks_of_runs("train.json"),
+        quasipotential=of_landscapes("results/{study}/runs/{run}/quasipotential.json"),
+        field=all_runs("results/{study}/runs/{run}/vector_field.json"),
+        overview="results/{study}/overview.json",
+        card=card_if_any,
+        published=published_if_any,
+    output:
+        drawn=directory("results/{study}/drawn/study"),
+    log:
+        "results/{study}/logs/figures.log",
+    benchmark:
+        "results/{study}/benchmarks/figures.tsv"
+    conda:
+        "../envs/siq.yaml"
+    params:
+        **task("figures"),
+    message:
+        "{wildcards.study}: drawing the figures"
+    script:
+        "../scripts/run_task.py"
+
+
+rule page:
+    input:
+        summary="results/{study}/tables/summary.parquet",
+        rrmse="results/{study}/tables/rrmse.parquet",
+        certificates="results/{study}/tables/certificates.parquet",
+        coefficients="results/{study}/tables/coefficients.parquet",
+        outcomes="results/{study}/tables/outcomes.parquet",
+        record="results/{study}/tables/record.parquet",
+        timings="results/{study}/tables/timings.parquet",
+        model=all_runs("results/{study}/runs/{run}/model.json"),
+        invariant="results/{study}/tables/invariant.parquet",
+        well_shares="results/{study}/tables/well_shares.parquet",
+        overview="results/{study}/overview.json",
+        field=all_runs("results/{study}/runs/{run}/vector_field.json"),
+        drawn="results/{study}/drawn/study",
+        drawn_landscape=with_landscape("results/{study}/drawn/landscape"),
+        drawn_density="results/{study}/drawn/invariant",
+        landscape="results/{study}/tables/landscape.parquet",
+        landscape_errors=landscape_table("landscape_errors"),
+        escape=landscape_table("escape"),
+        beside_equations=with_equations(
+            "results/{study}/tables/beside_equations.parquet"
+        ),
+        card=card_if_any,
+        published=published_if_any,
+    output:
+        html=report(
+            "results/{study}/report.html",
+            caption="../report/report.rst",
+            category="{study}",
+            subcategory=ANSWER,
+            labels={"shows": "The page: everything in one file", "kind": "page"},
+        ),
+        figures=report(
+            directory("results/{study}/figures"),
+            patterns=["{name}.svg"],
+            caption="../report/figure.rst",
+            category="{study}",
+            subcategory=figure_part,
+            labels=figure_labels,
+        ),
+        answer="results/{study}/answer.json",
+    log:
+        "results/{study}/logs/page.log",
+    benchmark:
+        "results/{study}/benchmarks/page.tsv"
+    conda:
+        "../envs/siq.yaml"
+    params:
+        **task("page"),
+    message:
+        "{wildcards.study}: writing the page"
+    script:
+        "../scripts/run_task.py"
+
+
+rule reproduction:
+    input:
+        summaries=expand("results/{study}/tables/summary.parquet", study=REPRODUCED),
+        reports=expand("results/{study}/report.html", study=REPRODUCED),
+        published=of_reproduced("published"),
+        card=of_reproduced("card"),
+        contents=str(config_path("published", "contents.yaml")),
+        parameters=str(config_path("published", "parameters.yaml")),
+        contradictions=str(config_path("published", "contradictions.yaml")),
+    output:
+        html="results/reproduction.html",
+        csv="results/reproduction.csv",
+    log:
+        "results/logs/reproduction.log",
+    benchmark:
+        "results/benchmarks/reproduction.tsv"
+    conda:
+        "../envs/siq.yaml"
+    params:
+        **task("reproduction"),
+        names=REPRODUCED,
+        studies=reproduced_settings,
+    message:
+        "writing the page of the reproduction"
+    script:
+        "../scripts/run_task.py"
+
+
+rule example_recordings:
+    input:
+        card=ancient(str(config_path("systems", "archetype3d.yaml"))),
+    output:
+        recordings="results/examples/archetype3d.parquet",
+    log:
+        "results/examples/logs/archetype3d.log",
+    benchmark:
+        "results/examples/benchmarks/archetype3d.tsv"
+    conda:
+        "../envs/siq.yaml"
+    params:
+        **task("example_recordings"),
+        seed=0,
+        run=0,
+        simulation={"trajectories": 400, "pairs": 50},
+    message:
+        "simulating the example recordings"
+    script:
+        "../scripts/run_task.py"
+
+
+rule example_hopping:
+    output:
+        text="results/examples/double-well.csv",
+    log:
+        "results/examples/logs/double-well.log",
+    benchmark:
+        "results/examples/benchmarks/double-well.tsv"
+    conda:
+        "../envs/siq.yaml"
+    params:
+        **task("example_hopping"),
+    message:
+        "simulating hopping recordings of a noisy camera"
+    script:
+        "../scripts/run_task.py"

@@ -1,0 +1,189 @@
+# The science in its order: draw trajectories, identify f, train two networks, regress and refine formulas of V, score
+# every run, collect all of them. A rule says which files its task reads and makes; the tasks are in siq/workflow/steps.py.
+
+
+rule draw:
+    # One rule for both entrances: whatever follows cannot tell them apart.
+    input:
+        source=data_source,
+        files=files_in_folder,
+    output:
+        recordings="results/{study}/runs/{run}/recordings.parquet",
+        draw_outcome="results/{study}/runs/{run}/draw.json",
+    log:
+        "results/{study}/logs/{run}/draw.log",
+    benchmark:
+        "results/{study}/benchmarks/{run}/draw.tsv"
+    conda:
+        "../envs/siq.yaml"
+    params:
+        **task("draw"),
+    message:
+        "{wildcards.study}, run {wildcards.run}: drawing trajectories"
+    script:
+        "../scripts/run_task.py"
+
+
+rule identify:
+    input:
+        recordings="results/{study}/runs/{run}/recordings.parquet",
+    output:
+        field="results/{study}/runs/{run}/vector_field.json",
+        identify_outcome="results/{study}/runs/{run}/identify.json",
+    log:
+        "results/{study}/logs/{run}/identify.log",
+    benchmark:
+        "results/{study}/benchmarks/{run}/identify.tsv"
+    conda:
+        "../envs/siq.yaml"
+    params:
+        **task("identify"),
+    message:
+        "{wildcards.study}, run {wildcards.run}: identifying the vector field"
+    script:
+        "../scripts/run_task.py"
+
+
+rule train:
+    input:
+        recordings=of_every_run("recordings.parquet"),
+        field=of_every_run("vector_field.json"),
+    output:
+        networks="results/{study}/training/{block}/networks.npz",
+        history="results/{study}/training/{block}/history.parquet",
+        train_outcome="results/{study}/training/{block}/train.json",
+    log:
+        "results/{study}/logs/{block}/train.log",
+    benchmark:
+        "results/{study}/benchmarks/{block}/train.tsv"
+    conda:
+        "../envs/siq.yaml"
+    params:
+        **task("train"),
+    message:
+        "{wildcards.study}, runs {wildcards.block}: training the networks"
+    script:
+        "../scripts/run_task.py"
+
+
+rule regress:
+    input:
+        recordings="results/{study}/runs/{run}/recordings.parquet",
+        networks=of_block("networks.npz"),
+        train_outcome=of_block("train.json"),
+    output:
+        regression="results/{study}/runs/{run}/regression.json",
+        regress_outcome="results/{study}/runs/{run}/regress.json",
+    log:
+        "results/{study}/logs/{run}/regress.log",
+    benchmark:
+        "results/{study}/benchmarks/{run}/regress.tsv"
+    conda:
+        "../envs/siq.yaml"
+    params:
+        **task("regress"),
+    message:
+        "{wildcards.study}, run {wildcards.run}: regressing formulas"
+    script:
+        "../scripts/run_task.py"
+
+
+rule refine:
+    input:
+        recordings="results/{study}/runs/{run}/recordings.parquet",
+        field="results/{study}/runs/{run}/vector_field.json",
+        identify_outcome="results/{study}/runs/{run}/identify.json",
+        networks=of_block("networks.npz"),
+        train_outcome=of_block("train.json"),
+        regression=regression_of_run,
+    output:
+        model="results/{study}/runs/{run}/model.json",
+        refine_outcome="results/{study}/runs/{run}/refine.json",
+        record="results/{study}/runs/{run}/record.parquet",
+        record_density="results/{study}/runs/{run}/record_density.parquet",
+    log:
+        "results/{study}/logs/{run}/refine.log",
+    benchmark:
+        "results/{study}/benchmarks/{run}/refine.tsv"
+    conda:
+        "../envs/siq.yaml"
+    params:
+        **task("refine"),
+    message:
+        "{wildcards.study}, run {wildcards.run}: refining and certifying the formulas"
+    script:
+        "../scripts/run_task.py"
+
+
+rule score:
+    input:
+        model="results/{study}/runs/{run}/model.json",
+        train_outcome=of_block("train.json"),
+        networks=of_block("networks.npz"),
+        card=card_if_any,
+    output:
+        coefficients="results/{study}/runs/{run}/coefficients.parquet",
+        rrmse="results/{study}/runs/{run}/rrmse.parquet",
+        prediction="results/{study}/runs/{run}/prediction.parquet",
+        certificates="results/{study}/runs/{run}/certificates.parquet",
+        score_outcome="results/{study}/runs/{run}/score.json",
+    log:
+        "results/{study}/logs/{run}/score.log",
+    benchmark:
+        "results/{study}/benchmarks/{run}/score.tsv"
+    conda:
+        "../envs/siq.yaml"
+    params:
+        **task("score"),
+    message:
+        "{wildcards.study}, run {wildcards.run}: scoring"
+    script:
+        "../scripts/run_task.py"
+
+
+rule collect:
+    input:
+        coefficients=all_runs("results/{study}/runs/{run}/coefficients.parquet"),
+        rrmse=all_runs("results/{study}/runs/{run}/rrmse.parquet"),
+        prediction=all_runs("results/{study}/runs/{run}/prediction.parquet"),
+        certificates=all_runs("results/{study}/runs/{run}/certificates.parquet"),
+        record=all_runs("results/{study}/runs/{run}/record.parquet"),
+        record_density=all_runs("results/{study}/runs/{run}/record_density.parquet"),
+        landscape=of_landscapes("results/{study}/runs/{run}/landscape.parquet"),
+        degrees=of_landscapes("results/{study}/runs/{run}/degrees.parquet"),
+        training=all_blocks("results/{study}/training/{block}/history.parquet"),
+        outcomes=all_outcomes,
+        published=published_if_any,
+    output:
+        coefficients="results/{study}/tables/coefficients.parquet",
+        rrmse="results/{study}/tables/rrmse.parquet",
+        prediction="results/{study}/tables/prediction.parquet",
+        certificates="results/{study}/tables/certificates.parquet",
+        record="results/{study}/tables/record.parquet",
+        record_density="results/{study}/tables/record_density.parquet",
+        landscape="results/{study}/tables/landscape.parquet",
+        degrees="results/{study}/tables/degrees.parquet",
+        training="results/{study}/tables/training.parquet",
+        outcomes="results/{study}/tables/outcomes.parquet",
+        timings="results/{study}/tables/timings.parquet",
+        summary="results/{study}/tables/summary.parquet",
+        csv=report(
+            "results/{study}/tables/summary.csv",
+            caption="../report/summary.rst",
+            category="{study}",
+            subcategory=EVIDENCE,
+            labels={"shows": "All quantities over the runs", "kind": "table"},
+        ),
+    log:
+        "results/{study}/logs/collect.log",
+    benchmark:
+        "results/{study}/benchmarks/collect.tsv"
+    conda:
+        "../envs/siq.yaml"
+    params:
+        **task("collect"),
+        benchmarks="results/{study}/benchmarks",
+    message:
+        "{wildcards.study}: collecting the tables of all runs"
+    script:
+        "../scripts/run_task.py"
