@@ -45,7 +45,7 @@ from siq.quasipotential.certificate_tests import (
     stated_error,
 )
 from siq.quasipotential.hamilton_jacobi import LibraryBasis
-from siq.quasipotential.refinement import RefinementOptions, formula_library, local_wells, refine
+from siq.quasipotential.refinement import RefinementOptions, local_wells, refine
 from siq.systems.phase_portrait import PhasePortrait
 from siq.systems.simulation import SimulationOptions, simulate_snapshots
 from siq.workflow import training_step
@@ -83,18 +83,17 @@ def about_attractors(
 ) -> list[Candidate] | None:
     """V about every attractor by one route; None where it found none."""
     options = RefinementOptions(routes=("local",) if network is None else ("network",))
-    library = formula_library(found, options)
     if network is None:
         wells, _ = local_wells(found, portrait, options=options)
     else:
         refined = refine(
-            found, portrait, library=library, formula=None, network=network, points=portrait.points,
+            found, portrait, formula=None, network=network, points=portrait.points,
             options=options,
         )  # fmt: skip
         wells = refined.network_wells
-        if refined.potential is not None:
-            basis = LibraryBasis(refined.library, np.flatnonzero(refined.potential))
-            own = refined.potential[basis.chosen]
+        if refined.formula is not None:
+            basis = LibraryBasis(refined.library, np.flatnonzero(refined.formula.potential))
+            own = refined.formula.potential[basis.chosen]
             return [
                 Candidate(
                     lambda x: basis.values(x) @ own, lambda x: basis.gradients(x) @ own,

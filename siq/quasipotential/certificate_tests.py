@@ -194,21 +194,15 @@ class Candidate:
         V, ∇V and ∇²V: points ``(n, d)`` to ``(n,)``, ``(n, d)`` and ``(n, d, d)``.
     circulatory
         g, points to ``(n, d)``; None where g is f + D∇V by definition, and identity is no test.
-    points
-        Held-out states where it claims to hold, shape ``(n, d)``.
-    attractors
-        Those within.
+    points, pairs
+        Held-out states where it claims to hold, shape ``(n, d)``, and consecutive samples of which the first
+        does; None where no motion was recorded.
+    attractors, references
+        Those within, and V by characteristics about them.
     relative_error
         Relative standard error of V on the points, from the uncertainty of f.
-    pairs
-        Consecutive held-out samples, the first of which lies where it claims to hold; None where no motion
-        was recorded.
-    references
-        V by characteristics about its attractors.
-    level
-        V up to which it claims to hold.
-    claimed
-        Share of the states of its region at which it claims to hold.
+    level, claimed
+        V up to which it claims to hold, and at which share of the states of its region it does.
     tested_on
         The points, in words.
     """
@@ -365,15 +359,9 @@ def stated_error(candidate: Candidate, found: AnyField, *, seed: int = 0) -> flo
 def check_error(own: float, from_field: float, options: CertificateOptions) -> Verdict:
     """Whether the error that has to be stated is small enough to state.
 
-    Parameters
-    ----------
-    own
-        Relative, that V's own residual leaves open: a formula that is off by more is no solution.
-    from_field
-        What the uncertainty of f adds. It is no fault of the formula and is stated, whatever its size, as
-        long as it is known; from `LARGEST_FROM_FIELD` on its first order says nothing any more.
-    options
-        The limit of the first.
+    A formula is no solution if the relative error that its own residual leaves open is larger than the limit.
+    What the uncertainty of f adds is no fault of the formula and is stated, whatever its size, as long as it
+    is known; from `LARGEST_FROM_FIELD` on its first order says nothing any more.
     """
     passed = bool(own <= options.error and from_field <= LARGEST_FROM_FIELD)
     reason = "" if passed else "the error of V that its residual leaves open is too large"
@@ -406,28 +394,11 @@ def check_agreement(first: Function, wells: Sequence[Well], *, limit: float) -> 
 def check_characteristics(
     candidate: Candidate, found: AnyField, options: CertificateOptions, *, error: float, seed: int = 0
 ) -> tuple[Verdict, float]:
-    """Whether V is the one that characteristics carry, within the error that its certificate states.
+    """Whether V is the one that characteristics carry, within the error that its own residual leaves open.
 
-    Parameters
-    ----------
-    candidate
-        V, with the references about every attractor for which it claims to hold.
-    found
-        f and D.
-    options
-        The largest error that may be stated.
-    error
-        The relative error of V that the candidate's own residual leaves open, over its region.
-    seed
-        Draws points on which the error is estimated.
-
-    Returns
-    -------
-    verdict
-        Largest relative L2 difference about any attractor, and what the errors of both explain.
-    error
-        The error to be stated: where V differs by more than the region's, at least that which its residual
-        leaves open about this attractor.
+    The verdict has the largest relative L2 difference about any attractor, and what the errors of both
+    explain. Also returned is the error to be stated: where V differs by more than that of its region, at
+    least that which its residual leaves open about this attractor.
     """
     if not candidate.references or len(candidate.references) < len(candidate.attractors):
         reason = "characteristics were not followed from every attractor, or there is none"
@@ -479,13 +450,8 @@ def check_prediction(
     held_out_ratio
         Mean square of the held-out residuals over that of the others.
     limits
-        Of the three.
-
-    Returns
-    -------
-    Verdict
-        Its figure is the median error; or how much larger the mean square is, as a share; or, where the mean
-        of the residuals refuses, how many powers of ten its probability lies below 1.
+        Of the three. The figure of the verdict is the median error; or how much larger the mean square is, as
+        a share; or how many powers of ten the probability of the mean lies below 1, where that refuses.
     """
     if noise_fault is not None:
         return Verdict.refused(noise_fault, limits.prediction)
@@ -517,28 +483,16 @@ RISES = "V does not fall along the recordings"
 def check_descent(
     candidate: Candidate, found: IdentifiedField, options: CertificateOptions, *, error: float = 0.0
 ) -> Verdict:
-    """Whether V falls along recordings that no fit saw.
+    """Whether V falls along recordings that no fit saw; `error` is the relative one of V that is stated.
 
-    Parameters
-    ----------
-    candidate
-        V, the points on which it may lie nowhere below the attractors, and the pairs.
-    found
-        Says whether recordings carry noise, and how much.
-    options
-        `descent`, the share of pairs that may rise, without noise; `false_alarms` with it.
-    error
-        Relative error of V that its certificate states.
-
-    Notes
-    -----
     Without noise a pair rises where ``V(x_h) - V(x_0)`` is more than the residuals of f over such a pair, and
-    rounding, explain. With noise the mean of ``∇V(X)·ΔX/h`` at the left point (Itô) is ``-∇V·D∇V``, as g is
-    orthogonal to ∇V; the standard error of its mean over a bin in V is known, as increments are independent
-    given the state from which they start. Largest of the bins' deviations, in standard errors, and the limit
-    that all of them keep by chance except with probability `false_alarms`. Two things are allowed for: of a V
-    with the relative error e the term ``∇V·D∇V`` is off by 2e; and over a pair of length h the drift
-    differs from f by ``(h/2) Lf`` with ``Lf = Jf + ½ Σ:∇²f``, Σ being the noise per unit of time.
+    rounding, explain; a share of them may. With noise the mean of ``∇V(X)·ΔX/h`` at the left point (Itô) is
+    ``-∇V·D∇V``, as g is orthogonal to ∇V; the standard error of its mean over a bin in V is known, as
+    increments are independent given the state from which they start. The figure is the largest of the bins'
+    deviations, in standard errors, and its limit one that all of them keep by chance except with probability
+    `false_alarms`. Two things are allowed for: of a V with the relative error e the term ``∇V·D∇V`` is off by
+    2e; and over a pair of length h the drift differs from f by ``(h/2) Lf`` with ``Lf = Jf + ½ Σ:∇²f``, Σ
+    being the noise per unit of time.
     """
     pairs = candidate.pairs
     assert pairs is not None

@@ -175,21 +175,14 @@ class Fan:
     ----------
     attractor, hessian, level
         A, shape ``(d,)``; M, shape ``(d, d)``; and the value of V up to which curves were followed.
-    points
-        Shape ``(n, d)``, in the states' units: all points of all curves, sorted by curve and along it.
-    momenta
-        Shape ``(n, d)``: p = ∇V there. The quasipotential U = 2V has the gradient 2p.
-    values
-        Shape ``(n,)``: V, not U.
-    hessians
-        Shape ``(n, d, d)``: ∇²V there. It diverges towards a caustic.
+    points, momenta, values, hessians
+        x, p = ∇V, V (not U) and ∇²V at all points of all curves, sorted by curve and along it: shapes
+        ``(n, d)``, ``(n, d)``, ``(n,)`` and ``(n, d, d)``. ∇²V diverges towards a caustic.
     curve
         Shape ``(n,)``: index of the point's curve.
-    directions
-        Shape ``(c, d)``: the unit vectors from which the c curves start, in the metric in which M is the unit
-        matrix.
-    ends
-        Shape ``(c,)``: an `End` for every curve.
+    directions, ends
+        The unit vectors from which the c curves start, in the metric in which M is the unit matrix, shape
+        ``(c, d)``; and an `End` for every curve.
     caustic_points, caustic_values, caustic_curves
         Shape ``(k, d)``, ``(k,)`` and ``(k,)``: where curves first meet a caustic, and V there.
     """

@@ -157,14 +157,7 @@ def formula_library(found: IdentifiedField, options: RefinementOptions) -> Candi
 
     No polynomial V has a higher degree than f has, and one: of ``∇V·(f + D∇V) = 0`` the highest powers would
     be those of ``∇V·D∇V``, which cannot vanish where D is regular. Where V is no polynomial, a quartic is the
-    least that has two wells; so this is the default.
-
-    Parameters
-    ----------
-    found
-        The identified f.
-    options
-        Its degree and functions, where the study says them.
+    least that has two wells; so this is the default, unless the options name a degree and functions.
     """
     degree = options.formula_degree
     if degree is None:
@@ -177,7 +170,6 @@ def refine(
     found: IdentifiedField,
     portrait: PhasePortrait,
     *,
-    library: CandidateLibrary,
     formula: np.ndarray | None,
     network: Function | None,
     points: np.ndarray,
@@ -188,14 +180,11 @@ def refine(
 
     Parameters
     ----------
-    found
-        The identified f.
-    portrait
-        Attractors, saddles and basins of f.
-    library
-        The functions that f, V and g may use. It must hold all of f's.
+    found, portrait
+        The identified f, with its attractors, saddles and basins.
     formula
-        The regression's coefficients of V over the library, shape ``(q,)``: the start of the network route.
+        The regression's coefficients of V over the `formula_library`, shape ``(q,)``: the start of the
+        network route.
     network
         V_θ, points ``(n, d)`` to values ``(n,)``: its second start, where the formula leads nowhere.
     points
@@ -207,6 +196,7 @@ def refine(
     """
     notes: list[str] = []
     routes = options.with_routes(networks=network is not None).routes or ()
+    library = formula_library(found, options)
     found = _over_library(found, library)
     wells: tuple[Well, ...] = ()
     if "local" in routes:
@@ -442,19 +432,10 @@ class RefinementContext:
 
 
 def _every_well_held_out(portrait: PhasePortrait, pairs: SnapshotPairs, mask: np.ndarray) -> np.ndarray:
-    """Held-out recordings, more of them where those that there are never come into some well.
+    """Held-out recordings as a mask, more of them where those that there are never come into some well.
 
     Recordings under noise may stay in one well for good, and the test of motion in another would have nothing
     to go by. They are chosen by where they are, not by where they go: the fit of V knows no increments.
-
-    Parameters
-    ----------
-    portrait
-        Attractors with their basins.
-    pairs
-        Of all recordings.
-    mask
-        Which recordings are held out, shape ``(r,)``.
     """
     mask = mask.copy()
     some = pairs.take(np.arange(0, len(pairs.h), max(len(pairs.h) // MOST_PAIRS, 1)))
@@ -475,8 +456,8 @@ def _refined_by_routes(
     """V as the routes make it of their starts, with its certificate."""
     compared = options.routes is not None and len(options.routes) == 2
     refined = refine(
-        context.found, context.portrait, library=formula_library(context.found, options), formula=formula,
-        network=network, points=context.points, options=options, seed=context.number,
+        context.found, context.portrait, formula=formula, network=network, points=context.points,
+        options=options, seed=context.number,
     )  # fmt: skip
     formulas = _refined_decomposition(refined, context.points)
     both = refined.wells and refined.network_wells

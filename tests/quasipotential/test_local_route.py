@@ -319,16 +319,16 @@ def test_refinement_keeps_the_best_degree_of_a_well() -> None:
     known = maier_stein(3)
     found = exact_field(known, 3)
     refined = refine(
-        found, portrait_of(known), library=found.library, formula=None, network=None,
+        found, portrait_of(known), formula=None, network=None,
         points=uniform_points(known, 300),
         options=RefinementOptions(routes=("local",), degrees=(4, 6, 8)),
     )  # fmt: skip
-    assert refined.potential is None
+    assert refined.formula is None
     for well in refined.wells:
         assert [trial.degree for trial in well.trials] == [4, 6, 8]
         assert well.trials[best_trial(well.trials)].degree == well.degree
     with_one = refine(
-        found, portrait_of(known), library=found.library, formula=None, network=None,
+        found, portrait_of(known), formula=None, network=None,
         points=uniform_points(known, 300),
         options=RefinementOptions(routes=("local",), degrees=(6,)),
     )  # fmt: skip
