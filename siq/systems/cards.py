@@ -11,10 +11,11 @@ from __future__ import annotations
 import keyword
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import sympy
+import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from siq.errors import InputError
@@ -37,6 +38,8 @@ Name = Annotated[str, AfterValidator(check_name)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Formula = str | Number
 DiffusionEntry = Literal["identity"] | list[Formula] | list[list[Formula]]
+
+LINE_WIDTH = 110
 
 
 class _CardPart(BaseModel):
@@ -176,11 +179,6 @@ class SystemCard(_CardPart):
         return self
 
 
-def domain_of(card: SystemCard) -> np.ndarray:
-    """The domain of each state, shape ``(d, 2)``; NaN for a state of which the card does not say it."""
-    return np.array([entry.domain or (np.nan, np.nan) for entry in card.states.values()], dtype=float)
-
-
 def diffusion_rows(diffusion: DiffusionEntry, dimension: int) -> list[list[Formula]]:
     """D as rows of numbers and formulas.
 
@@ -292,7 +290,7 @@ def build_system(document: Document, card: SystemCard) -> Dynamics:
         states=tuple(card.states),
         units=tuple(entry.unit for entry in card.states.values()),
         diffusion=diffusion,
-        domain=domain_of(card),
+        domain=np.array([one.domain or (np.nan, np.nan) for one in card.states.values()], dtype=float),
         inputs=tuple(Input(name, entry.unit, entry.interpolation) for name, entry in card.inputs.items()),
         parameters=tuple(
             Parameter(name, entry.value, entry.unit, entry.fixed) for name, entry in card.parameters.items()
@@ -336,3 +334,52 @@ def _parser(document: Document, card: SystemCard) -> Callable[[tuple[str, ...], 
             raise InputError(document.file, document.place(keys), error.fault, error.remedy) from None
 
     return parse
+
+
+def card_of(dynamics: Dynamics) -> str:
+    """Write a dynamics as a system card.
+
+    Parameters
+    ----------
+    dynamics
+        Its parameters' values are those of the card; a domain that nobody knows is left out.
+
+    Returns
+    -------
+    str
+        YAML.
+    """
+    name = dynamics.name or "system"
+    data: dict[str, Any] = {
+        "name": name,
+        "title": "" if dynamics.title == name else dynamics.title,
+        "time_unit": dynamics.time_unit,
+        "states": {
+            state: {"unit": unit}
+            | ({"domain": [float(limit) for limit in limits]} if limits[0] < limits[1] else {})
+            for state, unit, limits in zip(dynamics.states, dynamics.units, dynamics.limits, strict=True)
+        },
+    }
+    if dynamics.inputs:
+        data["inputs"] = {
+            entry.name: {"unit": entry.unit, "interpolation": entry.interpolation}
+            for entry in dynamics.inputs
+        }
+    if dynamics.parameters:
+        data["parameters"] = {
+            entry.name: {"value": float(entry.value), "unit": entry.unit}
+            | ({"fixed": True} if entry.fixed else {})
+            for entry in dynamics.parameters
+        }
+    data["equations"] = {
+        state: str(formula) for state, formula in zip(dynamics.states, dynamics.equations, strict=True)
+    }
+    data["outputs"] = {output: str(formula) for output, formula in dynamics.outputs}
+    rows = dynamics.diffusion.rows  # of which a diagonal, or 1, is written as that
+    places = range(len(rows))
+    diagonal = [rows[i][i] for i in places]
+    if any(rows[i][j] not in (0.0, "0") for i in places for j in places if i != j):
+        data["diffusion"] = rows
+    else:
+        data["diffusion"] = "identity" if all(entry == 1.0 for entry in diagonal) else diagonal
+    return yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=LINE_WIDTH)

@@ -22,9 +22,14 @@ R. Graham, T. Tél, Phys. Rev. A 31 (1985) 1109: V in the limit of weak noise, l
 attractors. S. Bittanti, P. Colaneri, Periodic Systems, Springer 2009, chapter 4: the periodic equation of
 Lyapunov.
 
-Stable cycles are where trajectories end that come to rest nowhere. In two states unstable cycles are where
-they come from: the same, backwards in time. In more states a cycle that parts two basins attracts along
-their boundary, and is found by tracking that (`siq.systems.basins`).
+Notes
+-----
+Stable cycles are sought where trajectories end that come to rest nowhere. These are followed from return to
+return through a section, the plane across f at their start; from a close return Newton's method seeks the
+periodic orbit. Chaos has periodic orbits too, but unstable ones; small differences grow in it from return to
+return, at the rate of the largest Lyapunov exponent. In two states unstable cycles are where trajectories
+come from. In more states a cycle that separates two basins attracts along their boundary, which is tracked
+(`siq.systems.basins`).
 """
 
 from __future__ import annotations
@@ -47,11 +52,11 @@ from siq.systems.equilibria import Equilibrium, classify, spread_evenly
 
 PARTS = 256  # of the period: splines through as many points are exact to about 1e-8
 NEWTON_STEPS = 20
-CLOSED = 1e-9  # of the scale: by so much an orbit may fail to close, with integrals to 1e-11
+CLOSURE_TOLERANCE = 1e-9  # of the scale: by so much an orbit may fail to close, with integrals to 1e-11
 LONGEST_STEP = 0.1  # of the scale, of one step of Newton's method
-NEUTRAL = 1e-6  # of 1: closer to it a multiplier is not told from 1 by these integrals
-MOST_ROUNDS = 100  # numerical: of the power iteration for unstable directions
-SETTLED = 1e-9  # numerical: its accuracy, of integrals to 1e-11
+NEUTRAL_MULTIPLIER_MARGIN = 1e-6  # of 1: closer to it a multiplier is not told from 1 by these integrals
+MAX_POWER_ITERATIONS = 100  # numerical: of the power iteration for unstable directions
+POWER_ITERATION_TOLERANCE = 1e-9  # numerical: its accuracy, of integrals to 1e-11
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -80,12 +85,12 @@ class Cycle:
     @property
     def unstable(self) -> int:
         """Number of unstable directions."""
-        return int((np.abs(self.multipliers) > 1 + NEUTRAL).sum())
+        return int((np.abs(self.multipliers) > 1 + NEUTRAL_MULTIPLIER_MARGIN).sum())
 
     @property
     def stable(self) -> bool:
         """Whether what is near ends on it."""
-        return bool((np.abs(self.multipliers) < 1 - NEUTRAL).all())
+        return bool((np.abs(self.multipliers) < 1 - NEUTRAL_MULTIPLIER_MARGIN).all())
 
     @property
     def kind(self) -> str:
@@ -133,52 +138,35 @@ def closed_orbit(dynamics: Dynamics, guess: np.ndarray, period: float, *, scale:
     """
     x, time = guess.copy(), period
     n, d = x.shape
+    rows = np.arange(n * d).reshape(n, d)  # of the Jacobian: unknowns are all states, and the period
     for _ in range(NEWTON_STEPS):
         ends, flows, _ = _parts(dynamics, x, time / n, scale)
         gap = (ends - np.roll(x, -1, axis=0)) / scale
         along = dynamics.drift(guess[:1])[0] / scale
         phase = along @ ((x[0] - guess[0]) / scale)
-        closed = max(np.abs(gap).max(), abs(phase) / np.linalg.norm(along)) < CLOSED
-        step = _newton_step(
-            flows * scale / scale[:, None], dynamics.drift(ends) / scale / n, along, gap, phase
-        )
+        closed = max(np.abs(gap).max(), abs(phase) / np.linalg.norm(along)) < CLOSURE_TOLERANCE
+        entries = [
+            (np.repeat(rows.ravel(), d), np.repeat(rows, d, axis=0), flows * scale / scale[:, None]),
+            (rows, np.roll(rows, -1, axis=0), -np.ones((n, d))),
+            (rows, np.full((n, d), n * d), dynamics.drift(ends) / scale / n),
+            (np.full(d, n * d), np.arange(d), along),
+        ]
+        row, column, value = (np.concatenate([np.ravel(one[k]) for one in entries]) for k in range(3))
+        matrix = scipy.sparse.csc_matrix((value, (row, column)), shape=(n * d + 1,) * 2)
+        step = spsolve(matrix, -np.append(gap, phase))
         step *= min(1.0, LONGEST_STEP / max(float(np.abs(step[:-1]).max()), np.finfo(float).tiny))
         x, time = x + step[:-1].reshape(n, d) * scale, time + float(step[-1])
         if closed:  # and one step further, as an error across the orbit shows in the gap only in part
-            return _classified(dynamics, x, time, scale)
-        if not (np.isfinite(x).all() and 0.2 * period < time < 5 * period):
             break
-    raise NumericalFailure("Newton's method came to no periodic orbit")
-
-
-def _newton_step(
-    flows: np.ndarray, drift: np.ndarray, along: np.ndarray, gap: np.ndarray, phase: float
-) -> np.ndarray:
-    """Changes of all states, one after another, and of the period."""
-    n, d = drift.shape
-    rows = np.arange(n * d).reshape(n, d)
-    after = np.roll(rows, -1, axis=0)
-    entries = [
-        (
-            np.broadcast_to(rows[:, :, None], flows.shape),
-            np.broadcast_to(rows[:, None, :], flows.shape),
-            flows,
-        ),
-        (rows, after, -np.ones((n, d))),
-        (rows, np.full((n, d), n * d), drift),
-        (np.full(d, n * d), np.arange(d), along),
-    ]
-    row, column, value = (np.concatenate([np.ravel(one[k]) for one in entries]) for k in range(3))
-    matrix = scipy.sparse.csc_matrix((value, (row, column)), shape=(n * d + 1,) * 2)
-    return np.asarray(spsolve(matrix, -np.append(gap, phase)))
-
-
-def _classified(dynamics: Dynamics, x: np.ndarray, time: float, scale: np.ndarray) -> Cycle:
+        if not (np.isfinite(x).all() and 0.2 * period < time < 5 * period):
+            raise NumericalFailure("Newton's method came to no periodic orbit")
+    else:
+        raise NumericalFailure("Newton's method came to no periodic orbit")
     flow = dynamics.drift(x) / scale
-    if not np.linalg.norm(flow, axis=1).min() * time > CLOSED**0.5:
+    if not np.linalg.norm(flow, axis=1).min() * time > CLOSURE_TOLERANCE**0.5:
         raise NumericalFailure("the orbit has shrunk to an equilibrium")
-    _, flows, _ = _parts(dynamics, x, time / len(x), scale)
-    product = np.eye(x.shape[1] - 1)
+    _, flows, _ = _parts(dynamics, x, time / n, scale)
+    product = np.eye(d - 1)
     for one in _reduced(_across(flow), flows * scale / scale[:, None]):
         product = one @ product
     multipliers = np.linalg.eigvals(product)
@@ -250,7 +238,7 @@ def _reduced(rows: np.ndarray, flows: np.ndarray) -> np.ndarray:
 def _unstable_rows(across: np.ndarray, flows: np.ndarray, count: int) -> np.ndarray:
     """Rows that see unstable displacements alone, shape ``(n, count, d)``: backwards others fade."""
     last = across[0, :count]
-    for _ in range(MOST_ROUNDS):
+    for _ in range(MAX_POWER_ITERATIONS):
         rows, current = np.empty((len(flows), count, across.shape[2])), last
         for k in range(len(flows) - 1, -1, -1):
             moved = current @ flows[k] @ across[k].T
@@ -258,7 +246,7 @@ def _unstable_rows(across: np.ndarray, flows: np.ndarray, count: int) -> np.ndar
             rows[k] = current
         turned = np.linalg.norm(current.T @ current - last.T @ last)
         last = current
-        if turned < SETTLED:
+        if turned < POWER_ITERATION_TOLERANCE:
             return rows
     raise NumericalFailure("the unstable directions of the cycle cannot be told apart from the others")
 
@@ -300,16 +288,16 @@ def _parts(
     return end[:, :d], end[:, d : d + d * d].reshape(n, d, d), end[:, d + d * d :].reshape(n, d, d)
 
 
-TRIES = 12  # trajectories of a domain that are asked for their cycle: there are rarely more cycles than a few
-BACKWARDS = 256  # states of the domain that are followed backwards
-SAME = 1e-3  # of the domain: closer cycles are one
-MOST_PAIRS = 6  # of attractors, between which a boundary is tracked in three states and more
-ROUNDS = 40  # of tracking a boundary
-QUIET_ROUNDS = 4  # before a cycle is looked for on it
-RETURNED = 0.05  # of the domain: a state on the boundary that has come back, as a guess for Newton's method
+MAX_TRIED_TRAJECTORIES = 12  # asked for their cycle: there are rarely more cycles than a few
+BACKWARD_STARTS = 256  # states of the domain that are followed backwards
+CYCLE_MERGE_TOLERANCE = 1e-3  # of the domain: closer cycles are one
+MAX_PAIRS = 6  # of attractors, between which a boundary is tracked in three states and more
+TRACKING_ROUNDS = 40  # of tracking a boundary
+ROUNDS_BEFORE_SEARCH = 4  # before a cycle is looked for on it
+RETURN_RADIUS = 0.05  # of the domain: a state on the boundary that has come back, as a guess
 
 
-def cycles_reached(
+def stable_cycles(
     dynamics: Dynamics, descents: Descents, *, first: int, box: np.ndarray, rate: float
 ) -> tuple[tuple[Cycle, ...], Descents]:
     """Stable cycles on which descents end, and the descents with the numbers of these.
@@ -329,7 +317,8 @@ def cycles_reached(
     """
     ends, last, asked = descents.ends.copy(), descents.paths[:, -1], np.zeros(len(descents.ends), dtype=bool)
     cycles: list[Cycle] = []
-    for _ in range(TRIES):
+    width = np.ptp(box, axis=1)
+    for _ in range(MAX_TRIED_TRAJECTORIES):
         left = np.flatnonzero((ends < 0) & ~descents.escaped)
         if asked[left].all():
             break
@@ -338,39 +327,35 @@ def cycles_reached(
         found = recurrence_of(dynamics, last[one][None], box=box, rate=rate)
         if found.place is None:
             continue
+        around = solve_ivp(
+            lambda _, y: dynamics.drift((y * width)[None])[0] / width, (0.0, found.period),
+            found.place / width, method="DOP853", rtol=1e-9, atol=1e-11,
+            t_eval=np.linspace(0, found.period, PARTS, endpoint=False),
+        )  # fmt: skip
+        if not around.success:
+            continue
         try:
-            index = _place_among(cycles, _orbit(dynamics, found.place, found.period, box), box)
+            cycle = closed_orbit(dynamics, around.y.T * width, found.period, scale=width)
         except NumericalFailure:
             continue
+        index = _place_among(cycles, cycle, box)
         near = settled_on(last[left], cycles, box=box)
         ends[left[near >= 0]] = first + near[near >= 0]
         ends[one] = first + index
     return tuple(cycles), replace(descents, ends=ends)
 
 
-def _orbit(dynamics: Dynamics, place: np.ndarray, period: float, box: np.ndarray) -> Cycle:
-    width = np.ptp(box, axis=1)
-    times = np.linspace(0, period, PARTS, endpoint=False)
-    way = solve_ivp(
-        lambda _, y: dynamics.drift((y * width)[None])[0] / width, (0.0, period), place / width,
-        method="DOP853", rtol=1e-9, atol=1e-11, t_eval=times,
-    )  # fmt: skip
-    if not way.success:
-        raise NumericalFailure("f cannot be followed around the cycle")
-    return closed_orbit(dynamics, way.y.T * width, period, scale=width)
-
-
 def _place_among(cycles: list[Cycle], new: Cycle, box: np.ndarray) -> int:
     """The place of a cycle among those that are known; it is added where it is not known yet."""
     width = np.ptp(box, axis=1)
     for index, one in enumerate(cycles):
-        if one.distances(new.points[:1], scale=width)[0] < SAME:
+        if one.distances(new.points[:1], scale=width)[0] < CYCLE_MERGE_TOLERANCE:
             return index
     cycles.append(new)
     return len(cycles) - 1
 
 
-def cycles_left(
+def unstable_cycles_of_plane(
     dynamics: Dynamics, equilibria: Sequence[Equilibrium], *, box: np.ndarray, generator: np.random.Generator
 ) -> tuple[Cycle, ...]:
     """Cycles of two states that are left on both sides: stable ones of the same equations backwards in time.
@@ -388,20 +373,20 @@ def cycles_left(
     """
     backwards = Dynamics.of(dynamics.symbols, [-one for one in dynamics.formulas])
     sources = [classify(backwards, one.position) for one in equilibria if one.kind == "repeller"]
-    starts = spread_evenly(box, BACKWARDS, generator=generator)
+    starts = spread_evenly(box, BACKWARD_STARTS, generator=generator)
     width = np.ptp(box, axis=1)
     rate = float(np.median(np.linalg.norm(dynamics.drift(starts) / width, axis=1)))
     try:
         with np.errstate(all="ignore"):
             ways = follow(backwards, starts, sources, box=box)
-            found, _ = cycles_reached(backwards, ways, first=len(sources), box=box, rate=rate)
+            found, _ = stable_cycles(backwards, ways, first=len(sources), box=box, rate=rate)
     except NumericalFailure:
         return ()
     inside = [one for one in found if ((one.points > box[:, 0]) & (one.points < box[:, 1])).all()]
     return tuple(closed_orbit(dynamics, one.points[::-1], one.period, scale=width) for one in inside)
 
 
-def cycles_between(
+def separatrix_cycles(
     dynamics: Dynamics,
     attractors: Sequence[Equilibrium],
     cycles: Sequence[Cycle],
@@ -429,7 +414,7 @@ def cycles_between(
     places = [*(one.position for one in attractors), *(one.position for one in cycles)]
     pairs = [pair for pair in itertools.combinations(range(len(places)), 2) if max(pair) >= len(attractors)]
     found: list[Cycle] = []
-    for one, two in pairs[:MOST_PAIRS]:
+    for one, two in pairs[:MAX_PAIRS]:
         cycle = _edge_cycle(dynamics, one, (places[one], places[two]), ends, box, generator)
         if cycle is not None:
             _place_among(found, cycle, box)
@@ -448,7 +433,7 @@ def _edge_cycle(
     width = np.ptp(box, axis=1)
     pair = bisected(*places, one, ends, width=width, generator=generator)
     times, states = [0.0], [pair.mean(axis=0)]
-    for number in range(ROUNDS):
+    for number in range(TRACKING_ROUNDS):
         tracked = apart_of(dynamics, pair, width)
         if tracked is None:
             return None
@@ -456,7 +441,7 @@ def _edge_cycle(
         times += (times[-1] + passed).tolist()
         states += list(along)
         pair = bisected(pair[0], pair[1], one, ends, width=width)
-        if number >= QUIET_ROUNDS:
+        if number >= ROUNDS_BEFORE_SEARCH:
             cycle = _closed(dynamics, np.array(times), np.array(states), box)
             if cycle is not None and cycle.unstable == 1:
                 return cycle
@@ -467,14 +452,14 @@ def _closed(dynamics: Dynamics, times: np.ndarray, states: np.ndarray, box: np.n
     """A periodic orbit next to the last return of a trajectory; None where there is none."""
     width = np.ptp(box, axis=1)
     away = np.linalg.norm((states - states[-1]) / width, axis=1)
-    gone = np.flatnonzero(away > 2 * RETURNED)
+    gone = np.flatnonzero(away > 2 * RETURN_RADIUS)
     if not len(gone):
         return None
-    before = np.flatnonzero(away[: gone[-1]] < RETURNED)
+    before = np.flatnonzero(away[: gone[-1]] < RETURN_RADIUS)
     if not len(before):
         return None
     last = before[-1]  # of the latest visit, the closest state
-    visit = last - np.flatnonzero(away[last::-1] > RETURNED)[:1].sum() + 1
+    visit = last - np.flatnonzero(away[last::-1] > RETURN_RADIUS)[:1].sum() + 1
     closest = visit + int(np.argmin(away[visit : last + 1]))
     begin, period = times[closest], float(times[-1] - times[closest])
     at = begin + np.linspace(0, period, PARTS, endpoint=False)
@@ -486,18 +471,22 @@ def _closed(dynamics: Dynamics, times: np.ndarray, states: np.ndarray, box: np.n
 
 
 RETURNS = 40  # through the section, within which chaos has to have lost what was known at the start
-LOOKED = (4, 12, RETURNS)  # returns after which a cycle is sought: most are told long before chaos can be
+SEARCHED_RETURNS = (
+    4,
+    12,
+    RETURNS,
+)  # after which a cycle is sought: most are found long before chaos can be
 CLOSE_RETURN_RATIO = 2.0  # to the closest return: one as close may be earlier, and the period shorter
 RETURN_TOLERANCE = 1e-6  # of the box: returns as close are at one place; chaos tears them a box apart
-STARTS = 3  # trajectories that are followed until one returns
-WAITED = 50.0  # crossings of the box, in which there has to be a return
-MOST_EVALUATIONS = 1_000_000  # of f, in all: some ten times what the equations of Lorenz and Rössler need
-FAR = 1.5  # of the box from its middle: what comes so far has escaped, as in `follow`
-LONGEST = 12  # returns of one period: longer cycles than the doubled ones of doubled ones are not looked for
+MAX_STARTS = 3  # trajectories that are followed until one returns
+LONGEST_RETURN = 50.0  # crossings of the box, in which there has to be a return
+MAX_EVALUATIONS = 1_000_000  # of f: some ten times what the equations of Lorenz and Rössler need
+ESCAPE_DISTANCE = 1.5  # of the box from its middle: what comes so far has escaped, as in `follow`
+MAX_RETURNS_OF_PERIOD = 12  # of longer cycles only those of twice doubled periods are looked for
 RECURRENCE_NEWTON_STEPS = 12
-LOST = 2.0  # times the first gap: from there Newton's method no longer leads to what is close by
+DIVERGENCE_RATIO = 2.0  # to the first gap: from there Newton's method no longer leads close by
 RETURN_CLOSURE_TOLERANCE = 1e-8  # of the box: by which an orbit may fail to close, with integrals to 1e-10
-RESTING = 1e-4  # of the rate: a trajectory so slow at its end is coming to rest
+RESTING_SPEED = 1e-4  # of the rate: a trajectory so slow at its end is coming to rest
 
 Kind = Literal["cycle", "chaos", "aperiodic", "none"]
 
@@ -539,10 +528,6 @@ class Recurrence:
         return "within the time for which they were followed they neither rest nor return"
 
 
-class _TooLongError(Exception):
-    """f was evaluated so often that the trajectory is given up."""
-
-
 def recurrence_of(dynamics: Dynamics, starts: np.ndarray, *, box: np.ndarray, rate: float) -> Recurrence:
     """What becomes of the first of some trajectories that returns.
 
@@ -557,13 +542,20 @@ def recurrence_of(dynamics: Dynamics, starts: np.ndarray, *, box: np.ndarray, ra
     rate
         At which f crosses it, per unit of time. What is far slower is coming to rest.
     """
-    chosen = np.linspace(0, len(starts) - 1, min(STARTS, len(starts))).astype(int)
+    chosen = np.linspace(0, len(starts) - 1, min(MAX_STARTS, len(starts))).astype(int)
     found = Recurrence("none")
     for start in starts[chosen]:
-        found = _Motion(dynamics, start, box, rate).recurrence()
+        try:
+            found = _Motion(dynamics, start, box, rate).recurrence()
+        except _TooLongError:
+            found = Recurrence("none")
         if found.kind != "none":
             break
     return found
+
+
+class _TooLongError(Exception):
+    """f was evaluated so often that the trajectory is given up: it may be too stiff to be followed so."""
 
 
 class _Motion:
@@ -580,28 +572,21 @@ class _Motion:
     def drift(self, y: np.ndarray) -> np.ndarray:
         return np.asarray(self.dynamics.drift((y * self.width)[None])[0] / self.width)
 
-    def count(self) -> None:
-        """Give up what takes too long: f may be too stiff to be followed so."""
+    def linearised(self, z: np.ndarray) -> np.ndarray:
+        """Time derivative of a state and of some tangents, one after another."""
         self.evaluations += 1
-        if self.evaluations > MOST_EVALUATIONS:
+        if self.evaluations > MAX_EVALUATIONS:
             raise _TooLongError
-
-    def jacobian(self, y: np.ndarray) -> np.ndarray:
-        jacobian = self.dynamics.jacobian((y * self.width)[None])[0]
-        return np.asarray(jacobian * self.width / self.width[:, None])
+        d = self.dimension
+        jacobian = self.dynamics.jacobian((z[:d] * self.width)[None])[0] * self.width / self.width[:, None]
+        return np.concatenate([self.drift(z[:d]), (jacobian @ z[d:].reshape(d, -1)).ravel()])
 
     def recurrence(self) -> Recurrence:
         """From return to return, until there are enough of them."""
-        if not self.speed > RESTING * self.rate:
+        if not self.speed > RESTING_SPEED * self.rate:
             return Recurrence("none")
-        try:
-            return self._followed()
-        except _TooLongError:
-            return Recurrence("none")
-
-    def _followed(self) -> Recurrence:
-        draw = np.random.default_rng(0)  # any direction grows as the fastest does
-        state, tangent = self.start, draw.standard_normal(self.dimension)
+        # Any direction grows as the fastest does.
+        state, tangent = self.start, np.random.default_rng(0).standard_normal(self.dimension)
         tangent /= np.linalg.norm(tangent)
         growth, times, places = [], [], []
         for _ in range(RETURNS):
@@ -614,8 +599,15 @@ class _Motion:
             growth.append(np.log(size))
             times.append(time)
             places.append(state)
-            if len(places) in LOOKED and (found := self._cycle(places, np.cumsum(times))) is not None:
-                return Recurrence("cycle", found[1], place=found[0] * self.width)
+            if len(places) in SEARCHED_RETURNS:
+                # Backwards from the last place, where a trajectory is closest to the cycle on which it ends.
+                past = places[-2 : -2 - MAX_RETURNS_OF_PERIOD : -1]
+                away = np.array([np.linalg.norm(place - state) for place in past])
+                close = away <= max(CLOSE_RETURN_RATIO * away.min(), RETURN_TOLERANCE)
+                passed = np.cumsum(times)
+                period = float(passed[-1] - passed[-2 - int(np.flatnonzero(close)[0])])
+                if (found := self._stable_orbit(state, period)) is not None:
+                    return Recurrence("cycle", found[1], place=found[0] * self.width)
         if not places:
             return Recurrence("none")
         exponent = float(np.sum(growth) / np.sum(times))
@@ -627,15 +619,11 @@ class _Motion:
         """State, tangent and time at the next return through the section; None where there is none."""
         d = self.dimension
 
-        def rates(_: float, z: np.ndarray) -> np.ndarray:
-            self.count()
-            return np.concatenate([self.drift(z[:d]), self.jacobian(z[:d]) @ z[d:]])
-
         def returns(_: float, z: np.ndarray) -> float:
             return float(self.across @ (z[:d] - self.start))
 
         def escapes(_: float, z: np.ndarray) -> float:
-            return float(FAR - np.abs(z[:d] - self.middle).max())
+            return float(ESCAPE_DISTANCE - np.abs(z[:d] - self.middle).max())
 
         returns.terminal, returns.direction = True, 1.0  # type: ignore[attr-defined]
         escapes.terminal = True  # type: ignore[attr-defined]
@@ -643,36 +631,36 @@ class _Motion:
         away = RETURN_CLOSURE_TOLERANCE / self.speed
         begin = np.concatenate([state + away * self.drift(state), tangent])
         way = solve_ivp(
-            rates, (0.0, WAITED / self.rate), begin, method="DOP853", rtol=1e-8, atol=1e-10,
-            events=[returns, escapes],
+            lambda _, z: self.linearised(z), (0.0, LONGEST_RETURN / self.rate), begin, method="DOP853",
+            rtol=1e-8, atol=1e-10, events=[returns, escapes],
         )  # fmt: skip
         if not len(way.t_events[0]):
             return None
         end = way.y_events[0][0]
         return end[:d], end[d:], float(way.t_events[0][0]) + away
 
-    def _cycle(self, places: Sequence[np.ndarray], times: np.ndarray) -> tuple[np.ndarray, float] | None:
+    def _stable_orbit(self, base: np.ndarray, period: float) -> tuple[np.ndarray, float] | None:
         """A state and the period of a stable periodic orbit close by, None where there is none."""
-        # Backwards from the last place, where a trajectory is closest to the cycle on which it ends.
-        away = np.array([np.linalg.norm(place - places[-1]) for place in places[-2 : -2 - LONGEST : -1]])
-        first = int(np.flatnonzero(away <= max(CLOSE_RETURN_RATIO * away.min(), RETURN_TOLERANCE))[0])
-        return self._closed(places[-1], float(times[-1] - times[-2 - first]))
-
-    def _closed(self, base: np.ndarray, period: float) -> tuple[np.ndarray, float] | None:
         d, x, longest, widest = self.dimension, base, 2 * period, np.inf
         across = self.drift(base)
         for _ in range(RECURRENCE_NEWTON_STEPS):
-            flowed = self._flowed(x, period)
-            if flowed is None:
+            begin = np.concatenate([x, np.eye(d).ravel()])
+            way = solve_ivp(
+                lambda _, z: self.linearised(z), (0.0, period), begin, method="DOP853", rtol=1e-10, atol=1e-12
+            )
+            if not way.success or not np.isfinite(way.y[:, -1]).all():
                 return None
-            end, monodromy = flowed
+            end, monodromy = way.y[:d, -1], way.y[d:, -1].reshape(d, d)
             gap = end - x
             away = float(np.abs(gap).max())
             if away < RETURN_CLOSURE_TOLERANCE:
-                return (x, period) if self._stable(monodromy) else None
+                # All multipliers but the one of the motion along the orbit lie within the unit circle.
+                multipliers = np.linalg.eigvals(monodromy)
+                others = np.delete(multipliers, np.argmin(np.abs(multipliers - 1)))
+                return (x, period) if (np.abs(others) < 1 - NEUTRAL_MULTIPLIER_MARGIN).all() else None
             if away > widest:
                 return None
-            widest = min(widest, LOST * away)
+            widest = min(widest, DIVERGENCE_RATIO * away)
             matrix = np.zeros((d + 1, d + 1))
             matrix[:d, :d], matrix[:d, d], matrix[d, :d] = monodromy - np.eye(d), self.drift(end), across
             step = np.linalg.lstsq(matrix, -np.append(gap, across @ (x - base)), rcond=None)[0]
@@ -681,22 +669,3 @@ class _Motion:
             if not 0 < period < longest:
                 return None
         return None
-
-    def _flowed(self, x: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray] | None:
-        d = self.dimension
-
-        def rates(_: float, z: np.ndarray) -> np.ndarray:
-            self.count()
-            return np.concatenate([self.drift(z[:d]), (self.jacobian(z[:d]) @ z[d:].reshape(d, d)).ravel()])
-
-        begin = np.concatenate([x, np.eye(d).ravel()])
-        way = solve_ivp(rates, (0.0, period), begin, method="DOP853", rtol=1e-10, atol=1e-12)
-        if not way.success or not np.isfinite(way.y[:, -1]).all():
-            return None
-        return way.y[:d, -1], way.y[d:, -1].reshape(d, d)
-
-    def _stable(self, monodromy: np.ndarray) -> bool:
-        """Whether all multipliers but the one of the motion along the orbit lie within the unit circle."""
-        multipliers = np.linalg.eigvals(monodromy)
-        others = np.delete(multipliers, np.argmin(np.abs(multipliers - 1)))
-        return bool((np.abs(others) < 1 - NEUTRAL).all())

@@ -1,15 +1,12 @@
 """Dynamics: drift, noise, inputs and outputs of a system as one object.
 
-Where parameters are fitted they stay symbols, and inputs, their delays and the time are arguments. Compare
-`siq.systems.dynamics.Dynamics.drift`, in which the parameters' values are inserted.
-
 ``dx = f(x, u, t; θ) dt + √ε σ(x) dW`` with ``D = σσᵀ`` (Itô), of which ``y = h(x, u, t; θ)`` is measured. A
 card describes it, identification returns it with the covariance of its parameters, a diagnosis changes it;
 simulation, landscape and references take it.
 
 Two ways lead to numbers. Without inputs, `Dynamics.drift` and its derivatives take points as rows, with the
 parameters' values inserted. Where parameters are fitted and inputs drive the system, `Dynamics.functions`
-takes components, signals and the values of the parameters (`siq.systems.dynamics`).
+takes components, signals (inputs, their delays, the time) and the values of the parameters.
 """
 
 from __future__ import annotations
@@ -17,18 +14,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import sympy
-import yaml
 
 from siq.systems.diffusion import Diffusion
 from siq.systems.formulas import Tape, compile_formulas, compile_values, delay, exact_number, tape_of
 
 TIME = sympy.Symbol("t", real=True)
 Compiled = Callable[..., Sequence[np.ndarray | float]]
-SMOOTHER = 30.0  # widths of a jump over which its derivative is spread
+JUMP_WIDTHS = 30.0  # widths of a jump over which its derivative is spread
 
 
 def symbol(name: str) -> sympy.Symbol:
@@ -73,7 +68,9 @@ class ParametricFunctions:
         self._equations, self._measured = written[: dynamics.dimension], written[dynamics.dimension :]
         # A jump's derivative is a spike. Spread over more than a step it is seen in full by every rule of
         # integration, and carries deviations across the jump as they are carried in the mean.
-        self._smooth = [evaluable(formula, dynamics, wider=SMOOTHER) for formula in dynamics.equations]
+        self._smooth = [
+            evaluable(formula, dynamics, wider=JUMP_WIDTHS) for formula in dynamics.equations
+        ]
         self._states = [symbol(name) for name in dynamics.states]
         self._free = [symbol(dynamics.parameters[place].name) for place in dynamics.free]
         self._shapes = (dynamics.dimension, len(self._measured), len(self._free))
@@ -90,29 +87,37 @@ class ParametricFunctions:
     def _slopes(self) -> Compiled:
         return compile_values(
             [each.diff(state) for each in self._smooth for state in self._states]
-            + [by_parameter(each, one, self._delays) for each in self._equations for one in self._free],
+            + [self._by_parameter(each, one) for each in self._equations for one in self._free],
             self._arguments,
         )
 
     @cached_property
     def _output_slopes(self) -> Compiled:
         return compile_values(
-            [without_teeth(each).diff(state) for each in self._measured for state in self._states]
-            + [by_parameter(each, one, self._delays) for each in self._measured for one in self._free],
+            [_without_teeth(each).diff(state) for each in self._measured for state in self._states]
+            + [self._by_parameter(each, one) for each in self._measured for one in self._free],
             self._arguments,
         )
 
+    def _by_parameter(self, formula: sympy.Expr, parameter: sympy.Symbol) -> sympy.Expr:
+        """Derivative of an evaluable formula by a parameter, which may stand in a delay as well."""
+        result = formula.diff(parameter)
+        for k, each in enumerate(self._delays):
+            # u(t - τ) depends on τ through the slope of u, backwards.
+            result -= formula.diff(_delayed(k)) * _slope(k) * each.args[1].diff(parameter)
+        return result
+
     @cached_property
     def tape(self) -> Tape | None:
-        """F as a tape in the same arguments; None where it has a function that no tape knows."""
+        """f as a tape in the same arguments; None where it has a function that no tape knows."""
         return tape_of(self._equations, self._arguments)
 
     def rates(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> np.ndarray:
-        """F at states ``(d, n)``, for parameters' values ``(p,)``: shape ``(d, n)``."""
+        """f at states ``(d, n)``, for parameters' values ``(p,)``: shape ``(d, n)``."""
         return _stacked(self._rates, self._shapes[0], x, signals, values)
 
     def outputs(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> np.ndarray:
-        """H at states ``(d, n)``: shape ``(m, n)``."""
+        """h at states ``(d, n)``: shape ``(m, n)``."""
         return _stacked(self._outputs, self._shapes[1], x, signals, values)
 
     def slopes(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -128,12 +133,6 @@ class ParametricFunctions:
         d, m, p = self._shapes
         flat = _stacked(self._output_slopes, m * d + m * p, x, signals, values)
         return flat[: m * d].reshape(m, d, x.shape[1]), flat[m * d :].reshape(m, p, x.shape[1])
-
-
-def delays_of(formulas: Sequence[sympy.Expr]) -> tuple[sympy.Expr, ...]:
-    """The delayed inputs in formulas, each once, in an order that does not change."""
-    found = {each for formula in formulas for each in formula.atoms(delay)}
-    return tuple(sorted(found, key=str))
 
 
 def arguments_of(dynamics: Dynamics) -> list[sympy.Symbol]:
@@ -154,7 +153,7 @@ def evaluable(formula: sympy.Expr, dynamics: Dynamics, *, wider: float = 1.0) ->
     return formula.xreplace(spread).xreplace({each: _delayed(k) for k, each in enumerate(dynamics.delays)})
 
 
-def without_teeth(formula: sympy.Expr) -> sympy.Expr:
+def _without_teeth(formula: sympy.Expr) -> sympy.Expr:
     """A formula whose sawtooth ``atan(tan(z))``, as of rounding, is taken for its mean, zero.
 
     A reading that is rounded stands still and jumps: its slope is nothing almost everywhere, and says nothing
@@ -164,15 +163,6 @@ def without_teeth(formula: sympy.Expr) -> sympy.Expr:
         lambda each: isinstance(each, sympy.atan) and isinstance(each.args[0], sympy.tan),
         lambda each: sympy.Integer(0),
     )
-
-
-def by_parameter(formula: sympy.Expr, parameter: sympy.Symbol, delays: Sequence[sympy.Expr]) -> sympy.Expr:
-    """Derivative of an evaluable formula by a parameter, which may stand in a delay as well."""
-    result = formula.diff(parameter)
-    for k, each in enumerate(delays):
-        # u(t - τ) depends on τ through the slope of u, backwards.
-        result -= formula.diff(_delayed(k)) * _slope(k) * each.args[1].diff(parameter)
-    return result
 
 
 def _delayed(place: int) -> sympy.Symbol:
@@ -196,66 +186,6 @@ def _stacked(
         for place, value in enumerate(function(*arguments)):
             result[place] = value
     return result
-
-
-UNNAMED = "system"
-WIDTH = 110  # of a line of the card
-
-
-def card_of(dynamics: Dynamics) -> str:
-    """Write a dynamics as a system card.
-
-    Parameters
-    ----------
-    dynamics
-        Its parameters' values are those of the card; a domain that nobody knows is left out.
-
-    Returns
-    -------
-    str
-        YAML.
-    """
-    name = dynamics.name or UNNAMED
-    data: dict[str, Any] = {
-        "name": name,
-        "title": "" if dynamics.title == name else dynamics.title,
-        "time_unit": dynamics.time_unit,
-        "states": {
-            state: {"unit": unit} | _domain(limits)
-            for state, unit, limits in zip(dynamics.states, dynamics.units, dynamics.limits, strict=True)
-        },
-    }
-    if dynamics.inputs:
-        data["inputs"] = {
-            entry.name: {"unit": entry.unit, "interpolation": entry.interpolation}
-            for entry in dynamics.inputs
-        }
-    if dynamics.parameters:
-        data["parameters"] = {
-            entry.name: {"value": float(entry.value), "unit": entry.unit}
-            | ({"fixed": True} if entry.fixed else {})
-            for entry in dynamics.parameters
-        }
-    data["equations"] = {
-        state: str(formula) for state, formula in zip(dynamics.states, dynamics.equations, strict=True)
-    }
-    data["outputs"] = {output: str(formula) for output, formula in dynamics.outputs}
-    data["diffusion"] = _diffusion(dynamics.diffusion)
-    return yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=WIDTH)
-
-
-def _domain(limits: np.ndarray) -> dict[str, list[float]]:
-    return {"domain": [float(limit) for limit in limits]} if limits[0] < limits[1] else {}
-
-
-def _diffusion(diffusion: Diffusion) -> str | list[str | float] | list[list[str | float]]:
-    """``identity``, the diagonal, or the whole matrix."""
-    rows = diffusion.rows
-    places = range(len(rows))
-    if any(rows[i][j] not in (0.0, "0") for i in places for j in places if i != j):
-        return rows
-    diagonal = [rows[i][i] for i in places]
-    return "identity" if all(entry == 1.0 for entry in diagonal) else diagonal
 
 
 @dataclass(frozen=True)
@@ -511,6 +441,8 @@ class Dynamics:
 
     def to_card(self) -> str:
         """The text of a system card that is read back as the same dynamics."""
+        from siq.systems.cards import card_of  # which knows of dynamics
+
         return card_of(self)
 
     # Values and derivatives without inputs, parameters inserted: points come as rows.
@@ -527,7 +459,7 @@ class Dynamics:
         return tuple(equation.xreplace(inserted) if inserted else equation for equation in self.equations)
 
     def drift(self, x: np.ndarray) -> np.ndarray:
-        """F at points: ``(n, d)`` to ``(n, d)``."""
+        """f at points: ``(n, d)`` to ``(n, d)``."""
         return self.drift_of_components(_components(x)).T
 
     def jacobian(self, x: np.ndarray) -> np.ndarray:
@@ -563,7 +495,7 @@ class Dynamics:
 
     @cached_property
     def drift_of_components(self) -> Callable[[np.ndarray], np.ndarray]:
-        """F of components ``(d, ...)``, for loops over many states at once: contiguous in memory.
+        """f of components ``(d, ...)``, for loops over many states at once: contiguous in memory.
 
         Raises
         ------
@@ -610,13 +542,14 @@ class Dynamics:
 
     @cached_property
     def functions(self) -> ParametricFunctions:
-        """F, h and their derivatives as functions of states, signals and parameters."""
+        """f, h and their derivatives as functions of states, signals and parameters."""
         return ParametricFunctions(self)
 
     @cached_property
     def delays(self) -> tuple[sympy.Expr, ...]:
         """The delayed inputs in its formulas, each once, in an order that does not change."""
-        return delays_of([*self.equations, *(formula for _, formula in self.outputs)])
+        formulas = [*self.equations, *(formula for _, formula in self.outputs)]
+        return tuple(sorted({each for formula in formulas for each in formula.atoms(delay)}, key=str))
 
     @cached_property
     def _lags(self) -> Callable[..., Sequence[np.ndarray | float]]:

@@ -23,7 +23,14 @@ from scipy.spatial import cKDTree
 from siq.errors import NumericalFailure
 from siq.numerics.least_squares import representative_subset
 from siq.systems.basins import Basin, Descents, Focus, basin_of, edge_saddle, follow, neighbours
-from siq.systems.cycles import Cycle, Recurrence, cycles_between, cycles_left, cycles_reached, recurrence_of
+from siq.systems.cycles import (
+    Cycle,
+    Recurrence,
+    recurrence_of,
+    separatrix_cycles,
+    stable_cycles,
+    unstable_cycles_of_plane,
+)
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import (
     Equilibrium,
@@ -236,11 +243,11 @@ def domain_portrait(dynamics: Dynamics, *, seed: int = 0) -> PhasePortrait:
     stable = [one for one in search.equilibria if one.kind == "attractor"]
     descents = _left(dynamics, follow(dynamics, points, stable, box=box), box=box, rate=rate)
     attractors, descents = reached_attractors(stable, descents)
-    cycles, descents = cycles_reached(dynamics, descents, first=len(attractors), box=box, rate=rate)
+    cycles, descents = stable_cycles(dynamics, descents, first=len(attractors), box=box, rate=rate)
     if d == 2:
-        parting = cycles_left(dynamics, search.equilibria, box=box, generator=generator)
+        parting = unstable_cycles_of_plane(dynamics, search.equilibria, box=box, generator=generator)
     elif cycles:
-        parting = cycles_between(dynamics, attractors, cycles, box=box, generator=generator)
+        parting = separatrix_cycles(dynamics, attractors, cycles, box=box, generator=generator)
     else:
         parting = ()
     around = saddles_beside(dynamics, search.equilibria, attractors, box=box, cycles=cycles)

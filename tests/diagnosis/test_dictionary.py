@@ -23,7 +23,7 @@ from siq.diagnosis.mechanisms import (
 from siq.diagnosis.screening import screen_all
 from siq.diagnosis.study import SearchOptions
 from siq.inference.recalibration import recalibrate
-from siq.systems.dynamics import Dynamics, without_teeth
+from siq.systems.dynamics import Dynamics, _without_teeth
 
 OSCILLATOR = {
     "time_unit": "s",
@@ -242,8 +242,8 @@ def test_a_sawtooth_rounds_and_its_slope_is_that_of_what_it_rounds() -> None:
     rounded = y - q / sympy.pi * sympy.atan(sympy.tan(sympy.pi * y / q))
     at = np.linspace(-2.03, 2.11, 50)
     np.testing.assert_allclose(sympy.lambdify((y, q), rounded)(at, 0.3), 0.3 * np.rint(at / 0.3), atol=1e-12)
-    assert without_teeth(rounded).diff(y) == 1
-    assert without_teeth(sympy.atan(y)) == sympy.atan(y)
+    assert _without_teeth(rounded).diff(y) == 1
+    assert _without_teeth(sympy.atan(y)) == sympy.atan(y)
 
 
 def test_the_time_of_a_course_is_that_in_which_it_changes() -> None:
