@@ -68,9 +68,7 @@ class ParametricFunctions:
         self._equations, self._measured = written[: dynamics.dimension], written[dynamics.dimension :]
         # A jump's derivative is a spike. Spread over more than a step it is seen in full by every rule of
         # integration, and carries deviations across the jump as they are carried in the mean.
-        self._smooth = [
-            evaluable(formula, dynamics, wider=JUMP_WIDTHS) for formula in dynamics.equations
-        ]
+        self._smooth = [evaluable(formula, dynamics, wider=JUMP_WIDTHS) for formula in dynamics.equations]
         self._states = [symbol(name) for name in dynamics.states]
         self._free = [symbol(dynamics.parameters[place].name) for place in dynamics.free]
         self._shapes = (dynamics.dimension, len(self._measured), len(self._free))
