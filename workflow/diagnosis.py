@@ -90,7 +90,8 @@ def _consequences(given: Given) -> Any:
 )  # fmt: skip
 def mismatch_figures(given: Given, settings: PipelineSettings) -> Any:
     """The fit, what is missing and where, the candidates, and escape times."""
-    from siq.report.diagnosis_sections import final_simulation
+    from siq.diagnosis.statement import Statement
+    from siq.report.diagnosis_page import final_simulation
     from siq.report.plots import diagnosis as plots
 
     verdict, before, curves = given.verdict, given.card, given.curves
@@ -101,7 +102,11 @@ def mismatch_figures(given: Given, settings: PipelineSettings) -> Any:
     variances = dict(zip(sensors["name"], sensors["variance"], strict=True))
     drawn = {
         "before_after": plots.plot_before_after(
-            given.held_out, after=final_simulation(verdict), noise=variances, units=units, time_unit=time_unit
+            given.held_out,
+            after=final_simulation(Statement.from_data(verdict)),
+            noise=variances,
+            units=units,
+            time_unit=time_unit,
         ),
         "held_out": plots.plot_held_out(given.held_out, units=units, time_unit=time_unit),
         "curves": None,
@@ -184,16 +189,16 @@ def mismatch_page(given: Given, settings: PipelineSettings) -> Any:
     import pandas as pd
 
     from siq.diagnosis.dictionary import dictionary_of
+    from siq.diagnosis.statement import Statement
     from siq.diagnosis.study import MismatchStudy, load_mismatch_study
-    from siq.report.diagnosis_page import mismatch_answer
+    from siq.report.diagnosis_page import Findings, mismatch_answer
     from siq.report.diagnosis_page import mismatch_page as rendered
-    from siq.report.diagnosis_sections import Findings
 
     file, title = given.path("study"), given.options["title"]
     study = load_mismatch_study(file) if file else MismatchStudy()
     drawn = sorted(Path(given.files["figures"]).glob("*.svg"))
     findings = Findings(
-        verdict=given.verdict,
+        statement=Statement.from_data(given.verdict),
         before=given.card,
         after=given.system,
         dictionary=dictionary_of(without=study.without, further=study.mechanisms, file="the study"),
@@ -208,7 +213,7 @@ def mismatch_page(given: Given, settings: PipelineSettings) -> Any:
     )
     found = f"# the simulation with what was found, a system card like any other: {given.files['system']}"
     html = rendered(findings, title=title, commands=[given.options["command"], found])
-    return {"html": html, "answer": mismatch_answer(findings.verdict, title=title)}
+    return {"html": html, "answer": mismatch_answer(findings.statement, title=title)}
 
 
 @task("card", "recordings", "study", "recalibrated", "system", "noise")

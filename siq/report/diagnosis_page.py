@@ -1,159 +1,122 @@
-"""The page of a diagnosis, and its report as text or for a notebook."""
+"""The page of a diagnosis, its report as text or for a notebook, and its answer for a terminal.
+
+All three read `siq.diagnosis.statement.Statement`; sentences stand in `templates/diagnosis_page.j2`,
+`diagnosis_report.j2` and `diagnosis.j2`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from html import escape
 from typing import Any
 
-from siq.diagnosis.statement import METRIC, Estimate, StatedFunction, StatedMechanism, Statement
-from siq.numerics.text import p_text, value_text
-from siq.report.diagnosis_sections import (
-    Findings,
-    answer,
-    badge,
-    final_simulation,
-    numbers,
-    picture,
-    sections,
-)
-from siq.report.diagnosis_text import location_sentence, words_of
-from siq.report.page import ReportContent, render_report
+import numpy as np
+import pandas as pd
+import sympy
+from markupsafe import Markup
+from markupsafe import escape as markup_escape
+
+from siq.diagnosis.dictionary import Mechanism
+from siq.diagnosis.statement import METRIC, StatedFunction, StatedMechanism, Statement
+from siq.diagnosis.study import MismatchVerdict
+from siq.numerics.text import p_text, unit_text, value_text
+from siq.report.diagnosis_text import location_sentence, sentence_of, words_of
+from siq.report.formatting import environment, formula_mathml, texts
+from siq.report.page import FormulaRow, ReportFigure, compose, render_report
 from siq.report.remarks import sentence
-from siq.systems.dynamics import Dynamics
+from siq.systems.dynamics import Dynamics, symbol
+from siq.systems.formulas import FormulaError, parse_formula
+
+DIGITS = 3
+LARGEST_LOG_ODDS = math.log(1e6)  # beyond which odds are not told
 
 
-def mismatch_page(findings: Findings, *, title: str, commands: Sequence[str]) -> str:
-    """Write the page as HTML: the recording that differs most, the verdict, the number, and the rest."""
-    content = ReportContent(
-        title=title,
-        answer=answer(findings),
-        badge=badge(findings),
-        figure=picture(findings),
-        figure_first=True,
-        table=numbers(findings),
-        sections=sections(findings, commands=commands),
-    )
-    return render_report(content)
+@dataclass(frozen=True)
+class Findings:
+    """What the page is made from.
 
-
-DIGITS = 4
-Section = tuple[str, list[str]]
-
-
-def diagnosis_text(statement: Statement, system: Dynamics) -> str:
-    """The report as text.
-
-    Parameters
+    Attributes
     ----------
     statement
-        What the diagnosis states.
-    system
-        The simulation that was diagnosed, for units.
+        The content of ``verdict.json``.
+    before, after
+        The simulation of the card, and the one that the verdict ends with.
+    dictionary
+        The mechanisms that could be named.
+    candidates
+        Columns ``label shapes gain stage beside``.
+    figures
+        SVG files by the names of their captions, as far as there was something to draw.
+    wells, escape, notes
+        See `workflow.consequences.Consequences`.
+    scores
+        Columns ``simulation score output rms unit published``, of public benchmarks only.
+    held_out
+        Columns ``output measured before recalibrated augmented scored``, one row per sample.
+    folder
+        Where the whole tables are.
     """
-    return "\n".join(
-        line
-        for heading, lines in _sections(statement, system)
-        for line in (f"[[{heading}]]", *(f"    {each}" for each in lines))
-    )
+
+    statement: Statement
+    before: Dynamics
+    after: Dynamics
+    dictionary: Sequence[Mechanism]
+    candidates: pd.DataFrame
+    figures: Mapping[str, bytes]
+    wells: pd.DataFrame = field(default_factory=pd.DataFrame)
+    escape: pd.DataFrame = field(default_factory=pd.DataFrame)
+    notes: Sequence[str] = ()
+    scores: pd.DataFrame = field(default_factory=pd.DataFrame)
+    held_out: pd.DataFrame = field(default_factory=pd.DataFrame)
+    folder: str = "tables"
+
+    @property
+    def kind(self) -> str:
+        """The verdict in two words, random forces being a kind of their own."""
+        return "random forces" if self.statement.random_forces else str(self.statement.verdict)
+
+    @property
+    def final(self) -> str:
+        """Which of the three simulations the verdict ends with."""
+        return final_simulation(self.statement)
+
+    @property
+    def named(self) -> list[StatedMechanism]:
+        """What was named, or what describes a mismatch that has no name."""
+        description = self.statement.description
+        return [*self.statement.mechanisms, *(description.by if description else ())]
+
+    def entry(self, name: str) -> Mechanism | None:
+        """A mechanism of the dictionary by its name."""
+        return next((entry for entry in self.dictionary if entry.name == name), None)
+
+    def figure(self, name: str, caption: str) -> ReportFigure | None:
+        """A figure with its caption, None where there was nothing to draw."""
+        image = self.figures.get(name)
+        return None if image is None else ReportFigure(caption, caption, image, "svg")
+
+    def picture(self, name: str) -> list[ReportFigure]:
+        """A figure of a section; none where there was nothing to draw."""
+        found = self.figure(name, texts("captions")["diagnosis"][name])
+        return [] if found is None else [found]
 
 
-def diagnosis_html(statement: Statement, system: Dynamics) -> str:
-    """The same as HTML, a heading and a list for each section."""
-    parts = []
-    for heading, lines in _sections(statement, system):
-        rows = "".join(f"<li>{escape(each.strip())}</li>" for each in lines)
-        parts.append(f"<h4>{escape(heading)}</h4><ul>{rows}</ul>")
-    return f"<div>{''.join(parts)}</div>"
+def final_simulation(statement: Statement) -> str:
+    """Which simulation a verdict ends with: ``before``, ``recalibrated`` or ``augmented``."""
+    if statement.verdict == MismatchVerdict.NO_MISMATCH:
+        return "before"
+    missing = statement.verdict == MismatchVerdict.MISSING_PHYSICS and not statement.random_forces
+    return "augmented" if statement.described or missing else "recalibrated"
 
 
-def _sections(statement: Statement, system: Dynamics) -> list[Section]:
-    """Every section that has something to say."""
-    closest = () if statement.description is None else statement.description.by
-    found = [
-        (f"Verdict: {statement.verdict}", [statement.sentence, *map(sentence, statement.remarks)]),
-        ("Mechanisms", [line for each in statement.mechanisms for line in _mechanism(each)]),
-        ("What comes closest", [line for each in closest for line in _mechanism(each)]),
-        ("A model of it", [line for each in statement.described for line in _mechanism(each)]),
-        ("How sure it is", [line for lines in words_of(statement).values() for line in lines]),
-        ("Location", _location(statement)),
-        ("Parameters", _parameters(statement, system)),
-        (f"Error ({METRIC})", _errors(statement)),
-        ("Could not be judged", [f"{each.label}: {each.reason}" for each in statement.not_fitted]),
-        ("At most (95 %)", _excluded(statement)),
-    ]
-    return [(heading, lines) for heading, lines in found if lines]
-
-
-def with_error(entry: Estimate) -> str:
-    """A value with its error and unit, and the error in per cent."""
-    text = value_text(entry.estimate, entry.standard_error, unit=entry.unit)
-    if not entry.standard_error or not entry.estimate:
-        return text
-    return f"{text} ({100 * entry.standard_error / abs(entry.estimate):.2g} %)"
-
-
-def _mechanism(mechanism: StatedMechanism | StatedFunction) -> list[str]:
-    lines = [mechanism.label]
-    lines += [f"  {name}: {formula}" for name, formula in mechanism.terms.items()]
-    lines += [f"  {name} = {with_error(entry)}" for name, entry in mechanism.parameters.items()]
-    evidence = mechanism.evidence
-    if evidence.delta_chi2 is not None and evidence.delta_bic is not None:
-        lines.append(
-            f"  gain in χ² {evidence.delta_chi2:.0f}, ΔBIC {evidence.delta_bic:.0f},"
-            f" p = {_p(evidence.p_white)} (independent errors), {_p(evidence.p_cluster)} (errors of a"
-            " recording together)"
-        )
-    return lines
-
-
-def _p(value: float | None) -> str:
-    return "unknown" if value is None else p_text(value)
-
-
-def _location(statement: Statement) -> list[str]:
-    place = statement.location
-    if place is None:
-        return []
-    some = 0 < len(place.recordings) < place.recordings_total
-    return [location_sentence(place), *([f"recordings: {', '.join(place.recordings)}"] if some else [])]
-
-
-def _parameters(statement: Statement, system: Dynamics) -> list[str]:
-    units = {entry.name: entry.unit for entry in system.parameters}
-    return [
-        f"{name} = {with_error(Estimate(each.after, each.standard_error, units.get(name, '1')))}"
-        f"  (on the card: {each.before:.{DIGITS}g})"
-        for name, each in (statement.recalibration or {}).items()
-    ]
-
-
-def _errors(statement: Statement) -> list[str]:
-    errors = statement.errors
-    shown = {
-        "as it is": errors.before,
-        "recalibrated": errors.recalibrated,
-        "with what was found": errors.augmented,
-        "noise alone": errors.noise_floor,
-    }
-    if all(value is None for value in shown.values()):
-        return []
-    return [f"{name}: {'ran away' if value is None else f'{value:.3g}'}" for name, value in shown.items()]
-
-
-def _excluded(statement: Statement) -> list[str]:
-    return [
-        f"{label}: {bound.parameter} = {value_text(bound.upper_bound_95, unit=bound.unit, digits=2)}"
-        for label, bound in (statement.excluded or {}).items()
-    ]
-
-
-def mismatch_answer(verdict: Mapping[str, Any], *, title: str) -> dict[str, Any]:
+def mismatch_answer(statement: Statement, *, title: str) -> dict[str, Any]:
     """The content of ``answer.json``: the sentence that the page opens with, and the number beside it.
 
     Parameters
     ----------
-    verdict
+    statement
         The content of ``verdict.json``.
     title
         What the page is headed.
@@ -166,13 +129,366 @@ def mismatch_answer(verdict: Mapping[str, Any], *, title: str) -> dict[str, Any]
         ends with) and ``held_out_noise``. The errors are root mean squares on recordings held out, as a share
         of the spread of what was measured; null where a simulation ran away.
     """
-    fit = verdict["fit"]
+    errors = statement.errors
     return {
         "title": title,
-        "sentence": verdict["sentence"],
-        "verdict": verdict["verdict"],
-        "compared": fit["noise_floor"] is not None,
-        "held_out_before": fit["before"],
-        "held_out_after": fit[final_simulation(verdict)],
-        "held_out_noise": fit["noise_floor"],
+        "sentence": sentence_of(statement),
+        "verdict": str(statement.verdict),
+        "compared": errors.noise_floor is not None,
+        "held_out_before": errors.before,
+        "held_out_after": getattr(errors, final_simulation(statement)),
+        "held_out_noise": errors.noise_floor,
     }
+
+
+def _sentences(statement: Statement) -> dict[str, Any]:
+    """What page and report say in sentences."""
+    place = statement.location
+    words = words_of(statement)
+    return {
+        "st": statement,
+        "sentence": sentence_of(statement),
+        "remarks": [sentence(remark) for remark in statement.remarks],
+        "location": "" if place is None else location_sentence(place),
+        "evidence_lines": [*words["explained"], *words["left"], *words["alternatives"]],
+    }
+
+
+def diagnosis_text(statement: Statement, system: Dynamics) -> str:
+    """The report as text.
+
+    Parameters
+    ----------
+    statement
+        What the diagnosis states.
+    system
+        The simulation that was diagnosed, for units.
+    """
+    units = {entry.name: entry.unit for entry in system.parameters}
+    words = _sentences(statement) | {"units": units, "metric": METRIC}
+    words["evidence_lines"] = [line for lines in words_of(statement).values() for line in lines]
+    text = environment().get_template("diagnosis_report.j2").render(words)
+    return "\n".join(line for line in text.splitlines() if line.strip())
+
+
+def diagnosis_html(statement: Statement, system: Dynamics) -> str:
+    """The report as HTML, a heading and a list for each section."""
+    parts: list[str] = []
+    for line in map(str.strip, diagnosis_text(statement, system).splitlines()):
+        if line.startswith("[["):
+            heading = escape(line.removeprefix("[[").removesuffix("]]"))
+            parts.append(f"{'</ul>' if parts else ''}<h4>{heading}</h4><ul>")
+        else:
+            parts.append(f"<li>{escape(line)}</li>")
+    return f"<div>{''.join(parts)}</ul></div>"
+
+
+def mismatch_page(findings: Findings, *, title: str, commands: Sequence[str]) -> str:
+    """Write the page as HTML: the recording that differs most, the verdict, the number, and the rest."""
+    from siq.report.plots.diagnosis import largest_difference  # matplotlib
+
+    statement, before = findings.statement, findings.before
+    units = dict(zip(before.states, before.units, strict=True))
+    of_outputs = {name: units.get(str(formula), "1") for name, formula in before.outputs}
+    largest = None
+    if not findings.held_out.empty:
+        largest = largest_difference(findings.held_out, after=findings.final)
+
+    def off(error: float) -> str:
+        assert largest is not None  # the template asked
+        unit = of_outputs.get(largest.output, "1")
+        return f"is off by {value_text(error, unit=unit, digits=2)}" if np.isfinite(error) else "runs away"
+
+    known = [(each, entry) for each in findings.named if (entry := findings.entry(each.name)) is not None]
+    less = {each.name: {one.name for one in each.rivals if one.standing == "less"} for each, _ in known}
+    alike = [
+        (each.name, [name for name in entry.look_alikes if name in less[each.name]]) for each, entry in known
+    ]
+    named = [(each, entry) for each, entry in known if each in statement.mechanisms]
+    content = compose(
+        "diagnosis_page.j2",
+        title=title,
+        **_sentences(statement),
+        d=findings,
+        commands=commands,
+        largest=largest,
+        off=off,
+        mechanism_sentences=[
+            (each.name, entry.sentence) for each, entry in named if findings.kind != "random forces"
+        ],
+        errors=_errors_table(findings, of_outputs),
+        formulas=_formulas(findings),
+        mechanism_parameters=_parameters_of(findings.named, of=True),
+        references=list(
+            dict.fromkeys((each.name, entry.reference) for each, entry in known if entry.reference)
+        ),
+        described_formulas=[row for each in statement.described for row in _rows_of(each, findings)],
+        described_tables=[
+            (each, _curve(each) if each.curve is not None else _parameters_of([each]))
+            for each in statement.described
+        ],
+        look_alikes=[(name, names) for name, names in alike if names],
+        evidence=_evidence(findings.named),
+        explanations=_explanations(statement),
+        wells=_wells(findings.wells),
+        escape=_escape_times(findings.escape),
+        bounds=_bounds(statement),
+        parameters=_own_parameters(statement, before),
+        candidates=_candidates(findings),
+    )
+    return render_report(content)
+
+
+def _percent(share: float) -> str:
+    return f"{value_text(100 * share, digits=3)} %"
+
+
+def _errors_table(findings: Findings, units: Mapping[str, str]) -> pd.DataFrame | None:
+    """The error on held-out recordings: in their own units, in per cent of their spread, and beside noise."""
+    errors, statement, words = findings.statement.errors, findings.statement, texts("tables")["simulations"]
+    floor = errors.noise_floor
+    if floor is None:
+        return None
+    shown = ["before", "recalibrated", "augmented"]
+    if not (findings.named or statement.described) or findings.kind == "random forces":
+        shown.remove("augmented")
+    if errors.before == errors.recalibrated:  # no parameter was free, or none changed
+        shown.remove("recalibrated")
+    rows = []
+
+    def row(words: str, error: float | None, **own: str) -> dict[str, str]:
+        times = "" if error is None or not floor > 0 else value_text(error / floor, digits=2)
+        spread = "ran away" if error is None else _percent(error)
+        return {"simulation": words, **own, "of the spread": spread, "times noise": times}
+
+    table = findings.held_out
+    scored = table[table["scored"].astype(bool)] if len(table) else table
+    for name in shown:
+        own = {}
+        for output, samples in scored.groupby("output", sort=False) if len(scored) else ():
+            unit = unit_text(units.get(str(output), "1"))
+            off = (samples[name] - samples["measured"])[samples["measured"].notna()].to_numpy(float)
+            known = len(off) and np.isfinite(off).all()
+            text = value_text(float(np.sqrt(np.mean(off**2))), digits=3) if known else "ran away"
+            own[f"{output} ({unit})" if unit else str(output)] = text
+        said = name
+        if name == "augmented" and findings.kind == "unexplained":
+            said = "described" if statement.described else "closest"
+        if name == "augmented" and errors.named is not None:
+            rows.append(row(words["named"], errors.named))
+            said = "rest"
+        rows.append(row(words[said], getattr(errors, name), **own))
+    rows.append({"simulation": words["noise"], "of the spread": _percent(floor), "times noise": "1"})
+    return pd.DataFrame(rows).fillna("")
+
+
+def _formulas(findings: Findings) -> list[FormulaRow]:
+    """Formulas of what was named or comes closest; with what is named, the whole new equations."""
+    rows = [row for each in findings.named for row in _rows_of(each, findings)]
+    if rows and findings.kind == "missing physics":
+        rows += [
+            FormulaRow(_rate_of(name), _typeset(formula))
+            for name, formula in zip(findings.after.states, findings.after.equations, strict=True)
+        ]
+    return rows
+
+
+def _rows_of(part: StatedMechanism | StatedFunction, findings: Findings) -> list[FormulaRow]:
+    """The formulas of a mechanism or of what has no name, and what each is."""
+    entry, words, rows = findings.entry(part.name), texts("tables")["smooth"], []
+    kind = part.kind if isinstance(part, StatedFunction) else ""
+    for name, formula in part.terms.items():
+        rows.append(
+            FormulaRow(
+                part.label,
+                words[kind] if kind in words else typeset(formula, findings.after, part.parameters),
+                _meaning(name, entry, findings),
+                whole=formula if kind in words else None,
+            )
+        )
+    return rows
+
+
+def _meaning(name: str, entry: Mechanism | None, findings: Findings) -> str:
+    """What a formula of a mechanism is; see `siq.diagnosis.mechanisms.MechanismCandidate.changes`."""
+    words, forms = texts("tables")["formula_of"], () if entry is None else entry.forms
+    measured = name in [output for output, _ in findings.before.outputs]
+    if measured and any(form.outputs for form in forms):
+        return str(words["measured"]).format(name)
+    if name not in findings.before.states:
+        return str(words["new"]).format(name)
+    return str(words["replaced" if any(form.replace for form in forms) else "added"]).format(name)
+
+
+def typeset(text: str, model: Dynamics, further: Iterable[str] = ()) -> Markup | str:
+    """A formula of the verdict, typeset; as text where it cannot be read as one.
+
+    Parameters
+    ----------
+    text
+        The formula.
+    model
+        Whose names it may use.
+    further
+        Names that the model does not have, such as parameters of what is only described.
+    """
+    names = {**model.names, **{name: symbol(name) for name in further}}
+    try:
+        formula = parse_formula(text, names, inputs=tuple(entry.name for entry in model.inputs))
+    except FormulaError:
+        return text
+    return _typeset(formula)
+
+
+def _typeset(formula: sympy.Expr) -> Markup | str:
+    """A formula, typeset; as text where it has a function that is not known."""
+    try:
+        return formula_mathml(formula, decimals=DIGITS)
+    except (AttributeError, NotImplementedError, TypeError, ValueError):
+        return str(formula)
+
+
+def _rate_of(name: str) -> Markup:
+    """The left side of an equation: dx/dt, typeset."""
+    inner = formula_mathml(sympy.Symbol(name, real=True))
+    inside = inner[inner.index(">") + 1 : inner.rindex("<")]
+    spoken = markup_escape(f"d{name}/dt")
+    return Markup(
+        '<math aria-label="{}"><mfrac><mrow><mi>d</mi>{}</mrow><mrow><mi>d</mi><mi>t</mi></mrow></mfrac>'
+        "<mo>=</mo></math>"
+    ).format(spoken, Markup(inside))
+
+
+def _parameters_of(
+    parts: Sequence[StatedMechanism | StatedFunction], *, of: bool = False
+) -> pd.DataFrame | None:
+    """Parameters with errors and units; with `of`, what each is of."""
+    rows = [
+        ({"of": part.label} if of else {})
+        | {"parameter": name, "value": value_text(one.estimate, one.standard_error, unit=one.unit)}
+        for part in parts
+        for name, one in part.parameters.items()
+    ]
+    return pd.DataFrame(rows) if rows else None
+
+
+def _curve(part: StatedFunction) -> pd.DataFrame:
+    curve = part.curve
+    assert curve is not None
+    return pd.DataFrame(
+        {
+            curve.coordinate: [value_text(at, digits=3) for at in curve.at],
+            "value": list(map(value_text, curve.value, curve.standard_error)),
+        }
+    )
+
+
+def _evidence(parts: Sequence[StatedMechanism]) -> pd.DataFrame:
+    return pd.DataFrame(
+        [
+            {
+                "mechanism": part.label,
+                "gain in χ²": round(evidence.delta_chi2),
+                "ΔBIC": round(evidence.delta_bic or 0),
+                "odds of the name": odds_text(evidence.log_odds),
+                "p, independent errors": p_text(evidence.p_white or 0),
+                "p, errors of a recording together": p_text(evidence.p_cluster or 0),
+            }
+            for part in parts
+            if (evidence := part.evidence).delta_chi2 is not None
+        ]
+    )
+
+
+def odds_text(log_odds: float | None) -> str:
+    """Odds such as ``340 to 1``; empty where they are not known."""
+    if log_odds is None:
+        return ""
+    if abs(log_odds) > LARGEST_LOG_ODDS:
+        return "beyond 10⁶ to 1" if log_odds > 0 else "beyond 1 to 10⁶"
+    odds = math.exp(abs(log_odds))
+    digits = max(len(str(int(odds))) - 2, 0)
+    text = f"{round(odds, -digits):.0f}" if odds >= 10 else f"{odds:.1f}"
+    return f"{text} to 1" if log_odds >= 0 else f"1 to {text}"
+
+
+def _explanations(statement: Statement) -> pd.DataFrame | None:
+    compared = (MismatchVerdict.MISSING_PHYSICS, MismatchVerdict.UNEXPLAINED)
+    if len(statement.explanations) < 2 or statement.verdict not in compared:
+        return None
+    return pd.DataFrame(
+        [
+            {"explanation": each.what, "log-evidence": round(each.log_evidence, 1)}
+            for each in statement.explanations
+        ]
+    )
+
+
+def _wells(wells: pd.DataFrame) -> pd.DataFrame | None:
+    if wells.empty:
+        return None
+    words = texts("tables")["simulations"]
+    return wells.replace({"": None}).replace({"simulation": words}).dropna(axis=1, how="all")
+
+
+def _escape_times(escape: pd.DataFrame) -> pd.DataFrame | None:
+    """Mean escape times, a column for each simulation, and by which factor they differ."""
+    if escape.empty:
+        return None
+    pivot = escape.pivot_table(
+        index=["transition", "intensity"], columns="simulation", values="time", sort=False
+    ).reset_index()
+    names = [name for name in pivot.columns if name not in ("transition", "intensity")]
+    if len(names) == 2:
+        pivot["changed by a factor"] = pivot[names[1]] / pivot[names[0]]
+    pivot.columns.name = None
+    words = texts("tables")["simulations"]
+    return pivot.rename(columns={**words, "transition": "way out", "intensity": "ε"})
+
+
+def _bounds(statement: Statement) -> pd.DataFrame | None:
+    rows = [
+        {
+            "mechanism": label,
+            "parameter": bound.parameter,
+            "at most (95 %)": value_text(bound.upper_bound_95, unit=bound.unit, digits=2),
+        }
+        for label, bound in statement.excluded.items()
+    ]
+    return pd.DataFrame(rows) if rows else None
+
+
+def _own_parameters(statement: Statement, before: Dynamics) -> pd.DataFrame | None:
+    """The simulation's own parameters, on the card and fitted."""
+    units = {entry.name: entry.unit for entry in before.parameters}
+    rows = [
+        {
+            "parameter": name,
+            "on the card": value_text(one.before, unit=units.get(name, "1"), digits=4),
+            "fitted": value_text(one.after, one.standard_error, unit=units.get(name, "1")),
+            "change, in standard errors": (one.after - one.before) / one.standard_error
+            if one.standard_error
+            else math.nan,
+        }
+        for name, one in statement.recalibration.items()
+    ]
+    return pd.DataFrame(rows) if rows else None
+
+
+def _candidates(findings: Findings) -> pd.DataFrame | None:
+    """What was tried by what it explains, what was found first."""
+    table, words = findings.candidates, texts("tables")["stages"]
+    best = table[table["gain"] >= 1] if len(table) else table
+    if not len(best):
+        return None
+    best = best.loc[best.groupby(["label", "stage"], sort=False)["gain"].idxmax()]
+    best = best.assign(
+        first=best["stage"] != "found", what=best["stage"].map(words), gain=best["gain"].round().astype(int)
+    )
+    best = best.sort_values(["first", "gain"], ascending=[True, False], kind="stable")
+    if not findings.named:
+        best["what"] = words["estimate"]
+    shown = best[["label", "what", "gain", "beside", "shapes"]].rename(
+        columns={"label": "mechanism", "what": "how it compares", "gain": "gain in χ²", "beside": "on top of"}
+    )
+    return shown.fillna("").reset_index(drop=True)

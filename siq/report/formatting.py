@@ -155,6 +155,7 @@ def environment() -> Environment:
         "lower_first": lambda text: text[:1].lower() + text[1:],
         "count_word": lambda count: COUNTS[count] if count < len(COUNTS) else str(count),
         "term": term_text,
+        "one_line": lambda text: " ".join(in_paragraphs(text)),
         "time": lambda mean, unit: time_text(mean, _named(unit)),
         "counted": counted_text,
         "predicted": predicted_text,

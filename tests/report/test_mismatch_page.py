@@ -10,11 +10,13 @@ import numpy as np
 import pandas as pd
 import pytest
 import sympy
+from pydantic import TypeAdapter
 
 from siq.diagnosis.dictionary import dictionary_of
+from siq.diagnosis.statement import Statement
 from siq.diagnosis.verdict import statement_of_failure
-from siq.report.diagnosis_page import mismatch_page
-from siq.report.diagnosis_sections import CAPTIONS, Findings
+from siq.report.diagnosis_page import Findings, mismatch_answer, mismatch_page
+from siq.report.formatting import texts
 from siq.report.plots.diagnosis import (
     largest_difference,
     limits_of,
@@ -49,7 +51,6 @@ outputs: {{x: x}}
 """
 VERDICT = {
     "verdict": "missing physics",
-    "sentence": "The simulation lacks cubic stiffness. In the equation of v, along x from -2 to 2.",
     "mechanisms": [
         {
             "name": "cubic stiffness",
@@ -77,19 +78,16 @@ VERDICT = {
         "time": None,
         "recordings": ["r01", "r02"],
         "recordings_total": 3,
-        "sentence": "In the equation of v, along x from -2 to 2, in every recording.",
     },
     "recalibration": {"k": {"before": 1.0, "after": 1.1, "standard_error": 0.02}},
-    "fit": {
-        "metric": "normalised rms, held-out recordings",
+    "errors": {
         "before": None,
         "recalibrated": 0.3,
         "augmented": 0.05,
         "noise_floor": 0.05,
+        "squares": {"recalibrated": (0.09,) * 8, "augmented": (0.0025,) * 8},
     },
     "excluded": {},
-    "remarks": ["A <b>reservation</b>."],
-    "words": {"alternatives": ["These recordings cannot tell cubic stiffness from quintic stiffness."]},
 }  # fmt: skip
 
 
@@ -116,14 +114,17 @@ def candidates() -> pd.DataFrame:
 
 
 def findings(models, **changes) -> Findings:
-    verdict = VERDICT | changes.pop("verdict", {})
+    said = changes.pop("verdict", {})
+    statement = (
+        said if isinstance(said, Statement) else TypeAdapter(Statement).validate_python(VERDICT | said)
+    )
     return Findings(
-        verdict=verdict,
+        statement=statement,
         before=models[0],
         after=models[1],
         dictionary=dictionary_of(without=(), further=(), file=""),
         candidates=candidates(),
-        figures=dict.fromkeys(CAPTIONS, b"<svg/>"),
+        figures=dict.fromkeys(texts("captions")["diagnosis"], b"<svg/>"),
         **changes,
     )
 
@@ -161,7 +162,6 @@ def test_page_says_what_where_how_sure_and_what_else(models):
         "make it",
     ):
         assert part in page
-    assert "<b>reservation</b>" not in page
     assert page.count("<math") == 5  # the term, and both equations with their left sides
 
 
@@ -177,7 +177,14 @@ def test_page_is_self_contained_and_well_formed(models):
 
 @pytest.mark.parametrize("verdict", ["no mismatch", "parameter shift"])
 def test_page_without_a_mechanism_tells_what_is_excluded(models, verdict):
-    excluded = {"dry friction in v": {"upper_bound_95": 0.5, "unit": "mm/s**2", "parameter": "c_1"}}
+    excluded = {
+        "dry friction in v": {
+            "upper_bound_95": 0.5,
+            "unit": "mm/s**2",
+            "parameter": "c_1",
+            "label": "dry friction in v",
+        }
+    }
     page = page_of(
         models, verdict={"verdict": verdict, "mechanisms": [], "location": None, "excluded": excluded}
     )
@@ -192,11 +199,10 @@ def test_page_of_an_unexplained_mismatch_describes_it(models):
         "p_residuals_random": 1e-9,
         "random_forces_admitted": True,
     }
-    words = {"explained": ["Cubic stiffness explains 70 %."], "left": ["What is left is not noise."]}
-    said = {"verdict": "unexplained", "mechanisms": [], "description": description, "words": words}
+    said = {"verdict": "unexplained", "mechanisms": [], "description": description}
     page = page_of(models, verdict=said)
     assert "What comes closest, as a formula" in page
-    assert "Cubic stiffness explains 70 %." in page and "What is left is not noise." in page
+    assert "Cubic stiffness in v explains 99 %" in page and "What is left is not noise" in page
 
 
 def test_formula_that_cannot_be_read_is_shown_as_text(models):
@@ -300,7 +306,6 @@ def test_the_model_of_what_has_no_name_is_on_the_page_and_drawn_with_its_band(mo
     }  # fmt: skip
     said = {
         "verdict": "unexplained", "mechanisms": [], "description": description, "described": [DESCRIBED],
-        "words": {},
     }  # fmt: skip
     shown = findings(models, verdict=said)
     assert shown.final == "augmented"
@@ -385,7 +390,7 @@ def test_there_is_no_figure_without_data(figure):
 
 
 def test_a_simulation_that_cannot_be_fitted_has_a_page(models):
-    said = findings(models, verdict=statement_of_failure("the simulation runs away").as_data())
+    said = findings(models, verdict=statement_of_failure("the simulation runs away"))
     page = mismatch_page(replace(said, candidates=candidates()[:0]), title="t", commands=())
     assert "no fit of it to them has a result" in page and "The simulation runs away." in page
 
@@ -443,3 +448,40 @@ def test_systems_without_a_landscape_are_told(models, change, part):
 @pytest.mark.parametrize(("noise", "part"), [([1.0, 1.0], "acts on x"), ([0.0, 1.0], "does not reach every")])
 def test_noise_without_a_landscape_is_told(models, noise, part):
     assert part in obstacle([each.with_diffusion(Diffusion(np.diag(noise))) for each in models])
+
+
+SQUARES = {"before": (0.25,) * 8, "recalibrated": (0.01,) * 8, "augmented": (4e-4,) * 8}
+FIT = {"before": 0.5, "recalibrated": 0.1, "augmented": 0.02, "noise_floor": 0.01, "squares": SQUARES}
+
+
+@pytest.mark.parametrize(
+    ("verdict", "named", "described", "after"),
+    [
+        ("missing physics", ["cubic stiffness"], [], 0.02),
+        ("missing physics", ["process noise"], [], 0.1),
+        ("parameter shift", [], [], 0.1),
+        ("unexplained", [], [], 0.1),
+        ("unexplained", [], [DESCRIBED], 0.02),
+        ("no mismatch", [], [], 0.5),
+    ],
+)
+def test_the_error_after_is_that_of_the_simulation_that_the_verdict_ends_with(
+    verdict, named, described, after
+):
+    statement = TypeAdapter(Statement).validate_python(
+        VERDICT | {
+            "verdict": verdict, "errors": FIT, "described": described,
+            "mechanisms": [VERDICT["mechanisms"][0] | {"name": name} for name in named],
+        }
+    )  # fmt: skip
+    answer = mismatch_answer(statement, title="A spring")
+    assert answer.pop("sentence")
+    assert answer == {
+        "title": "A spring", "verdict": verdict, "compared": True,
+        "held_out_before": 0.5, "held_out_after": after, "held_out_noise": 0.01,
+    }  # fmt: skip
+
+
+def test_a_simulation_that_cannot_be_compared_says_so():
+    answer = mismatch_answer(statement_of_failure("it runs away"), title="t")
+    assert answer["compared"] is False and answer["held_out_before"] is None
