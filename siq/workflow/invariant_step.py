@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass as plain_dataclass
+from dataclasses import replace
 from typing import Annotated, Any
 
 import numpy as np
@@ -14,23 +15,20 @@ from pydantic.dataclasses import dataclass
 
 from siq.errors import NumericalFailure
 from siq.numerics.randomness import Purpose, generator
-from siq.quasipotential.formulas import SymbolicDecomposition
-from siq.quasipotential.invariant_density import (
+from siq.quasipotential.cell_density import (
     CELLS,
-    ComparedDensity,
-    compare_with_samples,
     known_density,
     lowest_possible,
-    marginal_density,
-    marginal_of,
-    normalisation_bessel,
-    normalisation_quadrature,
     sample_potential,
     shares_by_rates,
-    simulated_shares,
-    starting_states,
-    total_variation,
     walk,
+)
+from siq.quasipotential.formulas import SymbolicDecomposition
+from siq.quasipotential.invariant_density import (
+    StationaryDensity,
+    marginal_density,
+    normalisation_bessel,
+    normalisation_quadrature,
 )
 from siq.quasipotential.landscape import Landscape
 from siq.systems.dynamics import Dynamics
@@ -63,7 +61,7 @@ class Invariant:
 
     table: pd.DataFrame
     shares: pd.DataFrame
-    densities: list[ComparedDensity]
+    densities: list[StationaryDensity]
 
 
 @plain_dataclass(frozen=True)
@@ -125,7 +123,7 @@ class _Rows:
     """What the tables and the figure have for all ε."""
 
     rows: list[dict[str, Any]]
-    densities: list[ComparedDensity]
+    densities: list[StationaryDensity]
     shares: list[dict[str, Any]]
 
 
@@ -163,7 +161,7 @@ def _of_formula(
         except NumericalFailure as error:
             logger.warning("intensity %g: %s", intensity, error)
             continue
-        compared = total_variation(density, samples)
+        compared = density.compare(samples)
         rows.append(
             {
                 "run": shown.run,
@@ -178,7 +176,7 @@ def _of_formula(
                 "published": figure.mean if figure else np.nan,
             }
         )
-        densities.append(ComparedDensity(density, quadrature, compared))
+        densities.append(replace(density, normalisation=quadrature, comparison=compared))
         rows += _of_published(published, system, samples, intensity)
     return _Rows(rows, densities, [])
 
@@ -211,12 +209,12 @@ def _of_landscape(
             logger.warning("intensity %g: %s", intensity, error)
             continue
         draw = generator(seed, Purpose.INVARIANT, str(intensity))
-        start = starting_states(density, fine, WALKERS, generator=draw)
+        start = density.starting_states(WALKERS, generator=draw)
         samples = walk(
             system, start, intensity=intensity, burn_in=STEPS // 5, steps=STEPS,
             thin=STEPS // KEPT, generator=draw,
         )  # fmt: skip
-        compared = compare_with_samples(density, fine, samples)
+        compared = density.compare(samples)
         rows.append(
             {
                 "run": shown.run,
@@ -229,11 +227,9 @@ def _of_landscape(
                 "simulated_unknown": compared.outside,
             }
         )
-        densities.append(
-            ComparedDensity(marginal_of(density, fine), density.normalisation, compared, density.unknown)
-        )
+        densities.append(replace(density.marginal(), comparison=compared))
         rows += _of_published(published, system, samples, intensity)
-        simulated = simulated_shares(fine, start, samples)
+        simulated, changed = fine.simulated_shares(start, samples)
         by_rates = shares_by_rates(laws, count, intensity=intensity)
         shares += [
             {
@@ -242,8 +238,8 @@ def _of_landscape(
                 "well": f"A{index + 1}",
                 "share": density.shares[index],
                 "by_rates": by_rates[index],
-                "simulated": simulated.simulated[index],
-                "changed": simulated.changed[index],
+                "simulated": simulated[index],
+                "changed": changed[index],
             }
             for index in range(count)
         ]
@@ -259,7 +255,7 @@ def _of_published(
         return []
     known: dict[str, Any] = {"intensity": intensity, "box": system.box}
     try:
-        compared = total_variation(marginal_density(formula, system.symbols, **known), samples)
+        compared = marginal_density(formula, system.symbols, **known).compare(samples)
         quadrature = normalisation_quadrature(formula, system.symbols, **known)
     except NumericalFailure as error:
         logger.warning("published formula, intensity %g: %s", intensity, error)

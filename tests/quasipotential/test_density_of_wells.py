@@ -14,16 +14,12 @@ from known_systems import double_well, potential_gradient, potential_values
 from known_wells import matched, stationary
 
 from siq.errors import NumericalFailure
-from siq.quasipotential.invariant_density import (
+from siq.quasipotential.cell_density import (
     SampledPotential,
-    compare_with_samples,
     known_density,
     lowest_possible,
-    marginal_of,
     sample_potential,
     shares_by_rates,
-    simulated_shares,
-    starting_states,
     walk,
 )
 from siq.report.figures import project_landscape
@@ -100,11 +96,11 @@ def test_the_bound_falls_with_the_noise(sampled) -> None:
 
 def test_outside_the_known_region_the_marginal_is_not_known(sampled) -> None:
     fine = sampled[0]
-    marginal = marginal_of(known_density(*sampled, intensity=0.1), fine)
+    marginal = known_density(*sampled, intensity=0.1).marginal()
     np.testing.assert_array_equal(np.isnan(marginal.values), ~fine.known.T)
     assert np.nansum(marginal.values) * fine.widths.prod() == pytest.approx(1)
     np.testing.assert_allclose(marginal.x1, fine.axes[0])
-    other = marginal_of(known_density(*sampled, intensity=0.1), fine, plane=(1, 0))
+    other = known_density(*sampled, intensity=0.1).marginal(plane=(1, 0))
     np.testing.assert_array_equal(other.values, marginal.values.T)
 
 
@@ -127,7 +123,7 @@ def test_three_states_are_integrated_and_projected() -> None:
     gaussian = (0.25 * np.pi) ** 1.5 / np.sqrt(2 * 0.75)
     assert density.normalisation < gaussian < density.normalisation / (1 - density.unknown)
     assert density.normalisation == pytest.approx(gaussian, rel=1e-3)
-    marginal = marginal_of(density, fine, plane=(0, 2))
+    marginal = density.marginal(plane=(0, 2))
     first, second = np.meshgrid(marginal.x1, marginal.x2)
     expected = np.exp(-(first**2 + second**2 + first * second) / 0.25) / (0.25 * np.pi / np.sqrt(0.75))
     np.testing.assert_allclose(np.nan_to_num(marginal.values), expected, atol=2e-3 * expected.max())
@@ -216,32 +212,32 @@ def test_what_cannot_be_done_is_told(sampled) -> None:
 def test_walkers_start_as_the_density_says_and_stay_so(sampled) -> None:
     density, fine = known_density(*sampled, intensity=0.15), sampled[0]
     draw = np.random.default_rng(0)
-    start = starting_states(density, fine, 2000, generator=draw)
-    first = simulated_shares(fine, start, start[:, None])
-    np.testing.assert_allclose(first.simulated, density.shares, atol=2 / 2000)
+    start = density.starting_states(2000, generator=draw)
+    first = fine.simulated_shares(start, start[:, None])
+    np.testing.assert_allclose(first[0], density.shares, atol=2 / 2000)
     samples = walk(
         KNOWN.dynamics, start, intensity=0.15, burn_in=200, steps=2000, thin=100,
         generator=draw,
     )  # fmt: skip
-    compared = compare_with_samples(density, fine, samples, bins=20)
+    compared = density.compare(samples, bins=20)
     assert compared.total_variation < 1.6 * compared.sampling_floor < 0.06
     # What lies where U is not known is left out of the comparison, and bounded.
     assert 0 < compared.outside < density.unknown
-    later = simulated_shares(fine, start, samples)
-    np.testing.assert_allclose(later.simulated, density.shares, atol=0.03)
-    assert (later.changed > 0.02).all()
+    later = fine.simulated_shares(start, samples)
+    np.testing.assert_allclose(later[0], density.shares, atol=0.03)
+    assert (later[1] > 0.02).all()
     wrong = known_density(*sampled, intensity=0.2)
-    assert compare_with_samples(wrong, fine, samples, bins=20).total_variation > 2 * compared.total_variation
+    assert wrong.compare(samples, bins=20).total_variation > 2 * compared.total_variation
 
 
 def test_walkers_stay_in_their_wells_at_small_noise(sampled) -> None:
     density, fine = known_density(*sampled, intensity=0.02), sampled[0]
-    start = starting_states(density, fine, 300, generator=np.random.default_rng(1))
+    start = density.starting_states(300, generator=np.random.default_rng(1))
     samples = walk(
         KNOWN.dynamics, start, intensity=0.02, burn_in=0, steps=300, thin=100,
         generator=np.random.default_rng(2),
     )  # fmt: skip
-    assert np.nanmax(simulated_shares(fine, start, samples).changed) == 0
+    assert np.nanmax(fine.simulated_shares(start, samples)[1]) == 0
 
 
 def test_without_a_step_bias_the_variance_of_a_turning_system_is_that_of_its_noise() -> None:

@@ -14,7 +14,6 @@ from siq.quasipotential.invariant_density import (
     marginal_density,
     normalisation_bessel,
     normalisation_quadrature,
-    total_variation,
 )
 from siq.systems.dynamics import Dynamics
 from siq.systems.simulation import simulate_stationary
@@ -158,18 +157,18 @@ def test_a_plane_of_other_states_is_refused() -> None:
 def test_independent_samples_differ_by_the_sampling_floor_and_others_by_more() -> None:
     density = marginal_density(X**2 + Y**2, (X, Y), intensity=0.5, box=np.array([[-3.0, 3.0]] * 2))
     samples = generator(0).normal(scale=0.5, size=(2, 40, 2000))
-    same = total_variation(density, samples)
+    same = density.compare(samples)
     assert same.total_variation == pytest.approx(same.sampling_floor, rel=0.1)
     assert same.outside == 0
     assert same.histogram.sum() * np.prod([same.x1_edges[1] - same.x1_edges[0]] * 2) == pytest.approx(1)
-    assert total_variation(density, samples + 0.1).total_variation > 4 * same.sampling_floor
-    aside = total_variation(density, np.where(np.arange(2000) < 500, 7.0, samples))
+    assert density.compare(samples + 0.1).total_variation > 4 * same.sampling_floor
+    aside = density.compare(np.where(np.arange(2000) < 500, 7.0, samples))
     assert aside.outside == pytest.approx(0.25)
     assert aside.total_variation == pytest.approx(0.25, abs=same.sampling_floor)
     # Copies of one sample tell no more than the sample itself.
-    copied = total_variation(density, np.repeat(samples[:, :1], 40, axis=1))
+    copied = density.compare(np.repeat(samples[:, :1], 40, axis=1))
     assert copied.sampling_floor > 4 * same.sampling_floor
-    assert np.isnan(total_variation(density, samples[:, :, :1]).sampling_floor)
+    assert np.isnan(density.compare(samples[:, :, :1]).sampling_floor)
 
 
 def test_a_long_simulation_of_the_archetype_has_the_invariant_distribution(archetype: Dynamics) -> None:
@@ -189,10 +188,8 @@ def test_a_long_simulation_of_the_archetype_has_the_invariant_distribution(arche
         generator=generator(0),
     )
     compared, wrong = (
-        total_variation(
-            marginal_density(exact.quasipotential, exact.symbols, intensity=intensity, box=archetype.box),
-            samples,
-            bins=20,
+        marginal_density(exact.quasipotential, exact.symbols, intensity=intensity, box=archetype.box).compare(
+            samples, bins=20
         )
         for intensity in (0.2, 0.25)
     )

@@ -14,17 +14,8 @@ from known_systems import KnownSystem, double_well, exact_field, portrait_of, po
 from scipy.integrate import solve_ivp
 
 from siq.data.recordings import Recordings
-from siq.quasipotential.invariant_density import (
-    compare_with_samples,
-    known_density,
-    lowest_possible,
-    marginal_density,
-    marginal_of,
-    normalisation_quadrature,
-    sample_potential,
-    starting_states,
-    total_variation,
-)
+from siq.quasipotential.cell_density import known_density, lowest_possible, sample_potential
+from siq.quasipotential.invariant_density import marginal_density, normalisation_quadrature
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.landscape_assembly import find_landscape
 from siq.quasipotential.landscape_comparison import reference_landscape
@@ -169,15 +160,15 @@ def test_the_density_of_one_state_is_exact_from_either_formula() -> None:
     total = normalisation_quadrature(exact, (X,), intensity=noise, box=known.domain)
     assert density.normalisation == pytest.approx(total, rel=1e-3)
     assert density.unknown < 2e-3
-    one, other = marginal_of(density, fine), marginal_density(exact, (X,), intensity=noise, box=known.domain)
+    one, other = density.marginal(), marginal_density(exact, (X,), intensity=noise, box=known.domain)
     assert one.plane == other.plane == (0,) and one.values.shape == (1, 4000)
     at = np.isfinite(one.values[0])
     np.testing.assert_allclose(one.values[0][at], np.interp(one.x1, other.x1, other.values[0])[at], atol=5e-3)
     # Draws from the density itself differ from it by no more than draws do.
     draw = np.random.default_rng(0)
-    start = starting_states(density, fine, 20_000, generator=draw)
-    compared = compare_with_samples(density, fine, start[:, None, :])
-    again = total_variation(other, start[:, None, :])
+    start = density.starting_states(20_000, generator=draw)
+    compared = density.compare(start[:, None, :])
+    again = other.compare(start[:, None, :])
     assert compared.total_variation < 0.02 and again.total_variation < 0.02
     assert compared.histogram.shape == again.histogram.shape == (1, 40)
     assert (compared.histogram[0] * np.diff(compared.x1_edges)).sum() == pytest.approx(1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 
 import matplotlib.text
 import numpy as np
@@ -10,14 +11,8 @@ import pytest
 from known_systems import double_well, exact_field, portrait_of
 from matplotlib.figure import Figure
 
-from siq.quasipotential.invariant_density import (
-    ComparedDensity,
-    known_density,
-    lowest_possible,
-    marginal_of,
-    sample_potential,
-    total_variation,
-)
+from siq.quasipotential.cell_density import known_density, lowest_possible, sample_potential
+from siq.quasipotential.invariant_density import StationaryDensity
 from siq.quasipotential.landscape import Landscape, LandscapeOptions
 from siq.quasipotential.landscape_assembly import find_landscape
 from siq.quasipotential.landscape_comparison import reference_landscape
@@ -73,15 +68,10 @@ def test_the_density_is_a_curve_over_a_histogram() -> None:
     assert potential is not None
     fine, coarse = (sample_potential(potential, KNOWN.domain, cells=cells) for cells in (400, 200))
     found = known_density(fine, coarse, lowest_possible(coarse, KNOWN.dynamics), intensity=0.1)
-    density = marginal_of(found, fine)
-    whole = ComparedDensity(density, found.normalisation, None, found.unknown)
+    whole = found.marginal()
     samples = np.random.default_rng(0).normal(-1, 0.1, (1, 4, 200))
-    smooth = ComparedDensity(
-        density.__class__((0,), 0.1, density.x1, density.x2, np.exp(-(density.x1[None] ** 2))),
-        comparison=total_variation(
-            density.__class__((0,), 0.1, density.x1, density.x2, np.exp(-(density.x1[None] ** 2))), samples
-        ),
-    )
+    smooth = StationaryDensity((0,), 0.1, whole.x1, whole.x2, np.exp(-(whole.x1[None] ** 2)))
+    smooth = replace(smooth, comparison=smooth.compare(samples))
     figure = plot_invariant_distribution([whole, smooth], states=["x"], units=["mV"])
     assert len(figure.axes) == 2
     text = words(figure)

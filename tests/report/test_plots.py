@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
-from siq.quasipotential.invariant_density import ComparedDensity, DensityComparison, MarginalDensity
+from siq.quasipotential.invariant_density import DensityComparison, StationaryDensity
 from siq.report.plots import (
     ComponentFields,
     Dataset,
@@ -199,13 +199,12 @@ def test_training_has_a_line_for_every_run_and_the_median() -> None:
     assert plot_training(table[:0]) is None
 
 
-def invariant_panel(intensity: float, *, simulated: bool = True) -> ComparedDensity:
+def invariant_panel(intensity: float, *, simulated: bool = True) -> StationaryDensity:
     x, y = np.linspace(-2, 2, 41), np.linspace(-1.5, 1.5, 31)
     values = np.exp(-((x[None, :] ** 2 - 1) ** 2 + y[:, None] ** 2) / intensity)
-    density = MarginalDensity(plane=(0, 2), intensity=intensity, x1=x, x2=y, values=values)
     edges = [np.linspace(axis[0], axis[-1], 9) for axis in (x, y)]
     comparison = DensityComparison(0.0312, 0.028, 0.0, *edges, histogram=np.ones((8, 8)))
-    return ComparedDensity(density, 0.5236, comparison if simulated else None)
+    return StationaryDensity((0, 2), intensity, x, y, values, 0.5236, comparison if simulated else None)
 
 
 def test_the_invariant_distribution_has_a_row_for_each_intensity() -> None:
@@ -217,7 +216,7 @@ def test_the_invariant_distribution_has_a_row_for_each_intensity() -> None:
         assert label in text
     assert "0.031\n(sampling alone: 0.028)" in text and "not simulated" not in text
     lines = figure.axes[1].collections[1].levels
-    assert lines == pytest.approx(np.nanmax(panels[0].density.values) * np.array([0.1, 0.5, 0.9]))
+    assert lines == pytest.approx(np.nanmax(panels[0].values) * np.array([0.1, 0.5, 0.9]))
 
 
 def test_without_a_simulation_there_is_one_panel() -> None:
@@ -231,10 +230,8 @@ def test_without_a_simulation_there_is_one_panel() -> None:
 
 def test_where_the_density_is_not_known_the_plane_is_hatched() -> None:
     panel = invariant_panel(1e-9)
-    hidden = np.where(panel.density.x1[None, :] > 0.5, np.nan, panel.density.values)
-    partly = ComparedDensity(
-        replace(panel.density, values=hidden), panel.normalisation, panel.comparison, unknown=0.0321
-    )
+    hidden = np.where(panel.x1[None, :] > 0.5, np.nan, panel.values)
+    partly = replace(panel, values=hidden, unknown=0.0321)
     figure = plot_invariant_distribution([partly], states="xyz", units=("1", "1", "1"))
     assert [len(axes.patches) for axes in figure.axes[:2]] == [1, 1]
     assert figure.axes[0].get_xlim()[1] < 1

@@ -25,7 +25,7 @@ from siq.report.plots.style import (
 )
 
 if TYPE_CHECKING:  # to draw a density takes none of what it takes to compute one
-    from siq.quasipotential.invariant_density import ComparedDensity, MarginalDensity
+    from siq.quasipotential.invariant_density import StationaryDensity
 
 COLOUR_MAP = "viridis"
 LEVELS = 13  # filled, from zero to the peak
@@ -36,7 +36,7 @@ LINES = (0.1, 0.5, 0.9)  # shares of the peak at which the density's lines lie o
 
 @drawn_in_style
 def plot_invariant_distribution(
-    panels: Sequence[ComparedDensity], *, states: Sequence[str], units: Sequence[str]
+    panels: Sequence[StationaryDensity], *, states: Sequence[str], units: Sequence[str]
 ) -> Figure | None:
     """Draw the invariant density on a plane of two states, one ε after the other.
 
@@ -58,7 +58,7 @@ def plot_invariant_distribution(
     """
     if not panels:
         return None
-    if len(panels[0].density.plane) == 1:
+    if len(panels[0].plane) == 1:
         return plot_invariant_curves(panels, state=states[0], unit=units[0])
     simulated = any(panel.comparison is not None for panel in panels)
     columns = 2 if simulated or len(panels) > 1 else 1
@@ -67,7 +67,7 @@ def plot_invariant_distribution(
     all_axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     letters = iter(ascii_lowercase)
     for place, panel in enumerate(panels):
-        colours, (first, second) = _colours(panel.density), panel.density.plane
+        colours, (first, second) = _colours(panel), panel.plane
         row, column = (place, 0) if simulated else divmod(place, columns)
         drawn = [all_axes[row, column]]
         drawn[0].set_title(f"({next(letters, '')}) {_draw_density(drawn[0], panel, colours)}", loc="left")
@@ -85,11 +85,11 @@ def plot_invariant_distribution(
             ScalarMappable(**colours), ax=drawn, location="bottom", aspect=30, pad=0.02,
             label=f"density {_density_unit(units[first], units[second])}".strip(),
         )  # fmt: skip
-        levels = _levels(panel.density)[:: (LEVELS - 1) // 4]
+        levels = _levels(panel)[:: (LEVELS - 1) // 4]
         bar.set_ticks(levels.tolist())
         bar.minorticks_off()
         bar.ax.set_xticklabels([f"{level:.2g}".replace("e+0", "e") for level in levels])
-    _limit(all_axes[0, 0], [panel.density for panel in panels])
+    _limit(all_axes[0, 0], panels)
     for axes in all_axes.ravel():
         if not axes.has_data():
             axes.remove()
@@ -101,16 +101,16 @@ def plot_invariant_distribution(
     return figure
 
 
-def _levels(density: MarginalDensity) -> np.ndarray:
+def _levels(density: StationaryDensity) -> np.ndarray:
     # They lie closer at the bottom, where the way from one well to the other is.
     return float(np.nanmax(density.values)) * np.linspace(0, 1, LEVELS) ** 1.5
 
 
-def _colours(density: MarginalDensity) -> dict[str, Any]:
+def _colours(density: StationaryDensity) -> dict[str, Any]:
     return {"cmap": COLOUR_MAP, "norm": BoundaryNorm(_levels(density), 256, extend="max")}
 
 
-def _limit(axes: Axes, densities: Sequence[MarginalDensity]) -> None:
+def _limit(axes: Axes, densities: Sequence[StationaryDensity]) -> None:
     """Leave out most of the plane in which no density is known."""
     known = [np.isfinite(one.values) for one in densities]
     if all(mask.all() for mask in known):
@@ -121,7 +121,7 @@ def _limit(axes: Axes, densities: Sequence[MarginalDensity]) -> None:
         limit(low - MARGIN * (high - low), high + MARGIN * (high - low))
 
 
-def _draw_unknown(axes: Axes, density: MarginalDensity) -> None:
+def _draw_unknown(axes: Axes, density: StationaryDensity) -> None:
     if not np.isfinite(density.values).all():
         axes.add_patch(Rectangle((0, 0), 1, 1, transform=axes.transAxes, zorder=0, **UNKNOWN))
 
@@ -135,24 +135,23 @@ def _density_unit(first: str, second: str) -> str:
     )
 
 
-def _draw_density(axes: Axes, panel: ComparedDensity, colours: dict[str, Any]) -> str:
-    density = panel.density
+def _draw_density(axes: Axes, density: StationaryDensity, colours: dict[str, Any]) -> str:
     _draw_unknown(axes, density)
     axes.contourf(
         density.x1, density.x2, density.values, levels=_levels(density), extend="max", **colours
     )  # fmt: skip
     title = r"$\varepsilon$ = " + magnitude_label(density.intensity)
-    if panel.normalisation is not None:
+    if density.normalisation is not None:
         # The hatched region needs a line of its own, and so Z gets one too.
-        title += ", " if panel.unknown is None else "\n"
-        title += "$Z$ = " + magnitude_label(panel.normalisation, digits=4)
-    if panel.unknown is not None:
-        title += f"\nhatched: at most {100 * panel.unknown:.2g} %"
+        title += ", " if density.unknown is None else "\n"
+        title += "$Z$ = " + magnitude_label(density.normalisation, digits=4)
+    if density.unknown is not None:
+        title += f"\nhatched: at most {100 * density.unknown:.2g} %"
     return title
 
 
-def _draw_histogram(axes: Axes, panel: ComparedDensity, colours: dict[str, Any]) -> str:
-    comparison, density = panel.comparison, panel.density
+def _draw_histogram(axes: Axes, density: StationaryDensity, colours: dict[str, Any]) -> str:
+    comparison = density.comparison
     assert comparison is not None
     _draw_unknown(axes, density)
     empty = np.isnan(density.values).any() & (comparison.histogram == 0)

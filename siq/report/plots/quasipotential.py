@@ -38,7 +38,7 @@ from siq.report.plots.style import (
 from siq.report.summary import BLOCK_OF_POINTS, LandscapeSummary, chosen_states, summarise
 
 if TYPE_CHECKING:  # to draw takes none of what it takes to compute
-    from siq.quasipotential.invariant_density import ComparedDensity
+    from siq.quasipotential.invariant_density import StationaryDensity
     from siq.report.plots.recordings import Dataset
 
 BINS = 60  # of histograms of recorded states
@@ -110,7 +110,7 @@ def plot_error_curves(
 
 
 @drawn_in_style
-def plot_invariant_curves(panels: Sequence[ComparedDensity], *, state: str, unit: str) -> Figure:
+def plot_invariant_curves(panels: Sequence[StationaryDensity], *, state: str, unit: str) -> Figure:
     """Draw the invariant density of one state, with a long simulation's histogram: a panel for each ε."""
     rows = -(-len(panels) // 2)
     figure = Figure(figsize=(PAGE_WIDTH, 3.1 * rows + 0.4))
@@ -118,16 +118,16 @@ def plot_invariant_curves(panels: Sequence[ComparedDensity], *, state: str, unit
     for axes in every[len(panels) :]:
         axes.remove()
     for place, (axes, panel) in enumerate(zip(every[: len(panels)], panels, strict=True)):
-        density, comparison = panel.density, panel.comparison
+        comparison = panel.comparison
         if comparison is not None:
             axes.stairs(comparison.histogram[0], comparison.x1_edges, color=ORANGE, fill=True, alpha=0.5)
-        axes.plot(density.x1, density.values[0], color=BLUE, linewidth=1.2)
-        _draw_unknown(axes, density.x1, density.values[0])
+        axes.plot(panel.x1, panel.values[0], color=BLUE, linewidth=1.2)
+        _draw_unknown(axes, panel.x1, panel.values[0])
         axes.set_ylim(bottom=0)
         axes.set_xlabel(
-            scaled_label(axes.xaxis, f"${name_label(state)}$", unit, float(np.abs(density.x1).max()))
+            scaled_label(axes.xaxis, f"${name_label(state)}$", unit, float(np.abs(panel.x1).max()))
         )
-        title = f"({ascii_lowercase[place % 26]}) " + r"$\varepsilon$ = " + magnitude_label(density.intensity)
+        title = f"({ascii_lowercase[place % 26]}) " + r"$\varepsilon$ = " + magnitude_label(panel.intensity)
         if panel.normalisation is not None:
             title += "\n$Z$ = " + magnitude_label(panel.normalisation, digits=4)
         if panel.unknown is not None:
