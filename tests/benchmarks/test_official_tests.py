@@ -6,13 +6,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from siq.data.public_recordings import Benchmark, OfficialTest, PublishedError
 from siq.data.recordings import Recordings
 from siq.inference.measurements import Measurements, measurements
 from siq.systems.cards import load_system
 from siq.systems.dynamics import Dynamics
 from workflow.reproduction.official_scores import official_tables, scored_run
 from workflow.reproduction.official_tests import official_page, official_rows
+from workflow.reproduction.public_recordings import Benchmark, OfficialTest, PublishedError
 
 CARD = """\
 name: decay

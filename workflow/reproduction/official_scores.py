@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from siq.data.public_recordings import Benchmark
 from siq.inference.kalman_filter import Noise
 from siq.inference.measurements import Measurements
 from siq.inference.trajectories import free_run
 from siq.systems.dynamics import Dynamics
+from workflow.reproduction.public_recordings import Benchmark
 
 EXACT = 1e-3  # relative change of an error by halving the steps of the integration, below which they are fine
 FINEST = 64  # Runge-Kutta steps between samples
