@@ -25,9 +25,8 @@ import numba
 import numpy as np
 import sympy
 
+from siq.data.preparation import in_stretches, without_slow_drift
 from siq.data.recordings import Recordings
-from siq.data.selection import in_stretches
-from siq.data.two_states import without_slow_drift
 from siq.inference.identification import FieldRecord, IdentificationOptions
 from siq.inference.kalman_filter import Grid, linearise, whiten
 from siq.inference.maximum_likelihood import fit_by_filter

@@ -1,12 +1,11 @@
-"""Formats of recordings: tables of text and their dialects, Parquet, HDF5, MATLAB.
+"""Files of recordings as columns: text tables and their dialects, Parquet, HDF5, MATLAB, NumPy.
+
+All formats become the same thing: headings, known before anything large is read, and columns of cells, read
+on request. What headings mean is the matter of `siq.data.layout`, what cells mean that of `siq.data.tables`.
 
 Laboratories write CSV in many ways: a German Excel separates by semicolons and writes decimal commas, a
 logger puts comments above the table, ``numpy.savetxt`` the headings behind ``#``, other programs the units
-into a second line. What was recognised is said, so that a wrong guess is seen.
-
-Parquet, CSV, HDF5, MATLAB and NumPy files are told apart by suffix and all become the same thing: headings,
-known before anything large is read, and columns of cells, read on request. What the headings mean is the
-matter of `siq.data.layout`, what the cells mean that of `siq.data.cells`.
+into a second line. What was recognised stands in the notes, so that a wrong guess is seen.
 
 Files are data. Nothing is unpickled, and MATLAB objects and structs are refused before they are read.
 """
@@ -17,232 +16,32 @@ import codecs
 import csv
 import json
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from siq.data.cells import Column
-from siq.data.columns import equally_long, is_label, is_unit, read_heading
+from siq.data.layout import is_label, is_unit, read_heading
 from siq.errors import InputError
 from siq.numerics.files import missing_file
-
-LOOKED_AT = 200  # lines of the table from which its separator and decimal mark are recognised
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf(inity)?)", re.IGNORECASE)
-_DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
-_GROUPED = re.compile(r"[+-]?\d{1,3}(\.\d{3})+,\d+")
-_SEPARATORS = {";": "semicolons", "\t": "tabs", ",": "commas", "|": "vertical bars", " ": "spaces"}
-_MARKS = ("#", "%", "//")  # with which a line of comment begins
-
-
-@dataclass(frozen=True)
-class TextTable:
-    """A table of text, with its headings apart from its rows.
-
-    Attributes
-    ----------
-    headings, units
-        Of each column; a unit is None where no second line of headings says one.
-    body
-        The rows, in UTF-8.
-    separator, decimal_mark
-        How cells are separated, and how decimals are.
-    notes
-        What was recognised that is not usual.
-    """
-
-    headings: tuple[str, ...]
-    units: tuple[str | None, ...]
-    body: bytes
-    separator: str
-    decimal_mark: str
-    notes: tuple[str, ...]
-
-
-def read_text_table(file: str, content: bytes) -> TextTable:
-    """Recognise how a table is written.
-
-    Parameters
-    ----------
-    file
-        For messages.
-    content
-        Of the file.
-
-    Raises
-    ------
-    InputError
-        When it is no text, has no headings, or can be read in two ways.
-    """
-    content, notes = _in_utf8(file, content)
-    begin, comments, separator = _skip_comments(content)
-    sample = content[begin : begin + 200_000].decode("utf-8", errors="ignore").splitlines()[:LOOKED_AT]
-    lines = [line for line in sample if line.strip() and not line.lstrip().startswith(_MARKS)]
-    if not lines:
-        raise InputError(file, "", "the table has no headings and no rows", "write the recordings again")
-    separator = separator or _separator(lines)
-    split = _splitter(separator)
-    cells = split(lines[0])
-    if all(_is_number(cell) for cell in cells):
-        above = split(comments[-1]) if comments else []
-        if len(above) != len(cells):
-            example = ",".join(["t", *"xyzuvw"][: len(cells)])
-            raise InputError(
-                file,
-                "line 1" if begin == 0 else "",
-                "the first line holds numbers where the headings should stand",
-                f"add a first line that names the columns, such as {example}",
-            )
-        headings, rows = above, lines
-    else:
-        headings, rows = cells, lines[1:]
-        begin = _after_line(content, begin)
-    units: list[str | None] = [None] * len(headings)
-    if rows and (found := _line_of_units(split(rows[0]), len(headings))) is not None:
-        units, rows = found, rows[1:]
-        begin = _after_line(content, begin)
-        notes.append("the second line of headings was read as the units")
-    mark = _decimal_mark(file, [split(row) for row in rows], len(headings), separator)
-    if separator != ",":
-        notes.append(f"the columns are separated by {_SEPARATORS[separator]}" + (
-            ", and decimals by a comma" if mark == "," else ""
-        ))  # fmt: skip
-    body = _without_comments(content[begin:])
-    if separator == " ":
-        body = b"\n".join(b"\t".join(line.split()) for line in body.splitlines())
-    return TextTable(
-        tuple(headings), tuple(units), body, "\t" if separator == " " else separator, mark, tuple(notes)
-    )
-
-
-def _in_utf8(file: str, content: bytes) -> tuple[bytes, list[str]]:
-    for mark, encoding in ((codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16")):
-        if content.startswith(mark):
-            try:
-                return content.decode(encoding).encode(), ["the text is UTF-16"]
-            except UnicodeDecodeError:
-                break
-    content = content.removeprefix(codecs.BOM_UTF8)
-    if b"\0" in content[:100_000]:
-        raise InputError(file, "", "the file is no text", "save the table as CSV in UTF-8")
-    try:
-        content.decode()
-    except UnicodeDecodeError:
-        # What Windows writes in western Europe; five bytes have no meaning there.
-        try:
-            return content.decode("cp1252").encode(), ["the text is not UTF-8 and was read as Windows-1252"]
-        except UnicodeDecodeError:
-            raise InputError(file, "", "the text is not UTF-8", "save it as CSV in UTF-8") from None
-    return content, []
-
-
-def _skip_comments(content: bytes) -> tuple[int, list[str], str | None]:
-    """Where the table begins, the comments above it, and the separator, where a line ``sep=;`` says it."""
-    begin, comments, separator = 0, [], None
-    while begin < len(content):
-        end = _after_line(content, begin)
-        line = content[begin:end].decode("utf-8", errors="ignore").strip()
-        mark = next((each for each in _MARKS if line.startswith(each)), None)
-        if match := re.fullmatch(r'"?sep=(.)"?', line):
-            separator = match[1]
-        elif mark is not None:
-            comments.append(line.lstrip(mark).strip())
-        elif line.strip(',;\t "|'):
-            break
-        begin = end
-    return begin, comments, separator
-
-
-def _after_line(content: bytes, begin: int) -> int:
-    ends = [end for end in (content.find(b"\n", begin), content.find(b"\r", begin)) if end >= 0]
-    if not ends:
-        return len(content)
-    end = min(ends)
-    return end + (2 if content[end : end + 2] == b"\r\n" else 1)
-
-
-def _without_comments(body: bytes) -> bytes:
-    if not any(b"\n" + mark.encode() in body or body.startswith(mark.encode()) for mark in _MARKS):
-        return body
-    marks = tuple(mark.encode() for mark in _MARKS)
-    return b"\n".join(line for line in body.splitlines() if not line.startswith(marks))
-
-
-def _separator(lines: list[str]) -> str:
-    """The separator that the headings and the rows share."""
-    heading = re.sub(r'"[^"]*"', "", lines[0])
-    for separator in (";", "\t", ",", "|"):
-        if separator in heading and (separator != "," or not any(";" in line for line in lines[1:2])):
-            return separator
-    row = lines[1] if len(lines) > 1 else lines[0]
-    if any(separator in row for separator in ";\t,|") or len(row.split()) == 1:
-        return next((separator for separator in ";\t,|" if separator in row), ",")
-    return " "
-
-
-def _splitter(separator: str) -> Callable[[str], list[str]]:
-    def split(line: str) -> list[str]:
-        if separator == " ":
-            # "t (s)" is one heading, not two.
-            joined = re.sub(r"\s+(?=[\[(])", "\0", line.strip())
-            return [cell.replace("\0", " ") for cell in joined.split()]
-        return [cell.strip() for cell in next(csv.reader([line], delimiter=separator), [])]
-
-    return split
-
-
-def _is_number(cell: str) -> bool:
-    return bool(_NUMBER.fullmatch(cell) or _DECIMAL_COMMA.fullmatch(cell))
-
-
-def _line_of_units(cells: list[str], width: int) -> list[str | None] | None:
-    """Units from the second line of headings, if that is what it is: no number, and a unit at least."""
-    units: list[str | None] = []
-    for cell in cells:
-        inner = cell.strip("[]() ")
-        if cell and not is_unit(inner):
-            return None
-        units.append(inner if inner not in ("", "-") else None)
-    if len(cells) != width or not any(units) or any(_is_number(cell) for cell in cells):
-        return None
-    return units
-
-
-def _decimal_mark(file: str, rows: list[list[str]], width: int, separator: str) -> str:
-    if separator == ",":
-        if rows and all(len(row) > width for row in rows) and all(len(row) == len(rows[0]) for row in rows):
-            fault = f"the headings name {width} columns and the rows have {len(rows[0])} cells"
-            remedy = "write decimal points, or separate the columns by semicolons if decimals have commas"
-            raise InputError(file, "", fault, remedy)
-        return "."
-    cells = [cell for row in rows for cell in row]
-    if any(_GROUPED.fullmatch(cell) for cell in cells):
-        cell = next(cell for cell in cells if _GROUPED.fullmatch(cell))
-        raise InputError(
-            file,
-            "",
-            f"'{cell}' has both a point and a comma",
-            "write numbers without marks between thousands",
-        )
-    commas = next((cell for cell in cells if _DECIMAL_COMMA.fullmatch(cell)), None)
-    points = next((cell for cell in cells if "." in cell and _NUMBER.fullmatch(cell)), None)
-    if commas is not None and points is not None:
-        raise InputError(
-            file, "", f"decimals are written with commas ('{commas}') and with points ('{points}')",
-            "write all numbers in the same way",
-        )  # fmt: skip
-    return "." if commas is None else ","
-
 
 if TYPE_CHECKING:
     import pandas as pd
 
-# Each reader imports the library of its format itself: most jobs read Parquet only.
+Column: TypeAlias = "pa.Array | pa.ChunkedArray"
+
+SAMPLED_LINES = 200  # of a table, from which its separator and decimal mark are recognised
+SPREADSHEETS = (".xlsx", ".xls", ".xlsm", ".xlsb", ".ods")
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf(inity)?)", re.IGNORECASE)
+_DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
+_GROUPED = re.compile(r"[+-]?\d{1,3}(\.\d{3})+,\d+")
+_SEPARATORS = {";": "semicolons", "\t": "tabs", ",": "commas", "|": "vertical bars", " ": "spaces"}
+_COMMENTS = ("#", "%", "//")
 
 
 @dataclass(frozen=True)
@@ -277,8 +76,8 @@ def open_columns(path: str | Path) -> ColumnFile:
     Parameters
     ----------
     path
-        A file with one of the suffixes of `READERS`. HDF5 holds one dataset per
-        column at the root, or a single compound dataset; a MATLAB file holds one vector per column.
+        A file with one of the suffixes of `READERS`. HDF5 holds one dataset per column at the root, or a
+        single compound dataset; a MATLAB file holds one vector per column.
 
     Raises
     ------
@@ -287,28 +86,25 @@ def open_columns(path: str | Path) -> ColumnFile:
         for columns that are no vectors of numbers or text, or that differ in length.
     """
     file, suffix = str(path), Path(path).suffix.lower()
-    if not Path(path).exists() and (suffix in READERS or not suffix):
+    exists, reader = Path(path).exists(), READERS.get(suffix)
+    if not exists and (reader or not suffix):
         raise missing_file(file, [Path(path)])
     begin = b""
     try:
-        if suffix in READERS or Path(path).exists():
+        if exists:
             with Path(path).open("rb") as stream:
                 begin = stream.read(8)
     except OSError as error:
-        raise InputError(
-            file, "", f"it cannot be read ({error.strerror})", "check the name and permissions"
-        ) from None
-    if not begin and suffix in READERS:
+        reason = f"it cannot be read ({error.strerror})"
+        raise InputError(file, "", reason, "check the name and permissions") from None
+    if not begin and reader:
         raise InputError(file, "", "the file is empty", "write the recordings again")
     if (suffix in SPREADSHEETS or begin.startswith(b"PK\x03\x04")) and suffix != ".npz":
-        raise InputError(
-            file, "", "it is a spreadsheet", "save the sheet as CSV (in Excel: Save As, CSV UTF-8)"
-        )
-    reader = READERS.get(suffix)
+        remedy = "save the sheet as CSV (in Excel: Save As, CSV UTF-8)"
+        raise InputError(file, "", "it is a spreadsheet", remedy)
     if reader is None:
-        raise InputError(
-            file, "", f"the suffix '{Path(path).suffix}' is unknown", f"use one of {', '.join(READERS)}"
-        )
+        fault = f"the suffix '{Path(path).suffix}' is unknown"
+        raise InputError(file, "", fault, f"use one of {', '.join(READERS)}")
     return reader(file)
 
 
@@ -322,9 +118,8 @@ def frame_columns(file: str, frame: pd.DataFrame) -> ColumnFile:
     frame
         Columns may have a unit behind their name, or in ``frame.attrs["units"]``.
     """
-    headings = [str(heading) for heading in frame.columns]
+    headings = tuple(str(heading) for heading in frame.columns)
     known = frame.attrs.get("units", {})
-    units = [known.get(read_heading(heading).title) for heading in headings]
 
     def load(positions: Sequence[int]) -> list[Column]:
         columns = []
@@ -336,15 +131,7 @@ def frame_columns(file: str, frame: pd.DataFrame) -> ColumnFile:
                 raise InputError(file, f"column {headings[position]}", fault, "make it numbers") from None
         return columns
 
-    return _column_file(headings, load, units)
-
-
-def _column_file(
-    headings: Sequence[str],
-    load: Callable[[Sequence[int]], list[Column]],
-    units: Sequence[str | None] | None = None,
-) -> ColumnFile:
-    return ColumnFile(tuple(headings), tuple(units or [None] * len(headings)), load)
+    return ColumnFile(headings, tuple(known.get(read_heading(one).title) for one in headings), load)
 
 
 @contextmanager
@@ -356,9 +143,186 @@ def _reading(file: str, kind: str) -> Iterator[None]:
         raise
     except Exception as error:
         reason = str(error).split("\n")[0].rstrip(".") or type(error).__name__
-        raise InputError(
-            file, "", f"it cannot be read as {kind} ({reason})", "check its suffix, or write it again"
-        ) from None
+        fault = f"it cannot be read as {kind} ({reason})"
+        raise InputError(file, "", fault, "check its suffix, or write it again") from None
+
+
+def _open_text(file: str) -> ColumnFile:
+    """Recognise how a table of text is written: encoding, comments, headings, units, separator, decimals."""
+    content, notes = _in_utf8(file, Path(file).read_bytes())
+    begin, comments, separator = 0, [], ""
+    while begin < len(content):
+        end = _after_line(content, begin)
+        line = content[begin:end].decode("utf-8", errors="ignore").strip()
+        mark = next((each for each in _COMMENTS if line.startswith(each)), None)
+        if match := re.fullmatch(r'"?sep=(.)"?', line):
+            separator = match[1]
+        elif mark is not None:
+            comments.append(line.lstrip(mark).strip())
+        elif line.strip(',;\t "|'):
+            break
+        begin = end
+    sample = content[begin : begin + 200_000].decode("utf-8", errors="ignore").splitlines()[:SAMPLED_LINES]
+    lines = [line for line in sample if line.strip() and not line.lstrip().startswith(_COMMENTS)]
+    if not lines:
+        raise InputError(file, "", "the table has no headings and no rows", "write the recordings again")
+    separator = separator or _separator(lines)
+    headings, rows = _split(lines[0], separator), [_split(line, separator) for line in lines[1:]]
+    if all(_is_number(cell) for cell in headings):
+        above = _split(comments[-1], separator) if comments else []
+        if len(above) != len(headings):
+            example = ",".join(["t", *"xyzuvw"][: len(headings)])
+            fault = "the first line holds numbers where the headings should stand"
+            remedy = f"add a first line that names the columns, such as {example}"
+            raise InputError(file, "line 1" if begin == 0 else "", fault, remedy)
+        headings, rows = above, [headings, *rows]
+    else:
+        begin = _after_line(content, begin)
+    units: list[str | None] = [None] * len(headings)
+    if rows and (found := _line_of_units(rows[0], len(headings))) is not None:
+        units, rows, begin = found, rows[1:], _after_line(content, begin)
+        notes.append("the second line of headings was read as the units")
+    decimal_mark = _decimal_mark(file, rows, len(headings), separator)
+    if separator != ",":
+        decimals = ", and decimals by a comma" if decimal_mark == "," else ""
+        notes.append(f"the columns are separated by {_SEPARATORS[separator]}{decimals}")
+    body, marks = content[begin:], tuple(mark.encode() for mark in _COMMENTS)
+    if any(b"\n" + mark in body or body.startswith(mark) for mark in marks):
+        body = b"\n".join(line for line in body.splitlines() if not line.startswith(marks))
+    if separator == " ":
+        body, separator = b"\n".join(b"\t".join(line.split()) for line in body.splitlines()), "\t"
+    labels = [place for place, heading in enumerate(headings) if is_label(read_heading(heading).title)]
+    names = [str(position) for position in range(len(headings))]
+
+    def load(positions: Sequence[int]) -> list[Column]:
+        numbers = {str(position) for position in positions if position not in labels}
+        try:
+            cells = _read_cells(file, body, names, separator, decimal_mark, numbers)
+        except pa.ArrowInvalid:  # text among the numbers, or a line of another length: find out where
+            cells = _read_cells(file, body, names, separator, decimal_mark, set())
+        return [cells.column(str(position)) for position in positions]
+
+    return ColumnFile(tuple(headings), tuple(units), load, notes=tuple(notes))
+
+
+def _in_utf8(file: str, content: bytes) -> tuple[bytes, list[str]]:
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        try:
+            return content.decode("utf-16").encode(), ["the text is UTF-16"]
+        except UnicodeDecodeError:
+            pass
+    content = content.removeprefix(codecs.BOM_UTF8)
+    if b"\0" in content[:100_000]:
+        raise InputError(file, "", "the file is no text", "save the table as CSV in UTF-8")
+    try:
+        content.decode()
+    except UnicodeDecodeError:
+        # What Windows writes in western Europe; five bytes have no meaning there.
+        try:
+            return content.decode("cp1252").encode(), ["the text is not UTF-8 and was read as Windows-1252"]
+        except UnicodeDecodeError:
+            raise InputError(file, "", "the text is not UTF-8", "save it as CSV in UTF-8") from None
+    return content, []
+
+
+def _after_line(content: bytes, begin: int) -> int:
+    match = re.compile(rb"\r\n|\n|\r").search(content, begin)
+    return match.end() if match else len(content)
+
+
+def _separator(lines: list[str]) -> str:
+    """The separator that the headings and the rows share."""
+    heading = re.sub(r'"[^"]*"', "", lines[0])
+    for separator in (";", "\t", ",", "|"):
+        if separator in heading and (separator != "," or not any(";" in line for line in lines[1:2])):
+            return separator
+    row = lines[1] if len(lines) > 1 else lines[0]
+    if any(separator in row for separator in ";\t,|") or len(row.split()) == 1:
+        return next((separator for separator in ";\t,|" if separator in row), ",")
+    return " "
+
+
+def _split(line: str, separator: str) -> list[str]:
+    if separator == " ":
+        # "t (s)" is one heading, not two.
+        joined = re.sub(r"\s+(?=[\[(])", "\0", line.strip())
+        return [cell.replace("\0", " ") for cell in joined.split()]
+    return [cell.strip() for cell in next(csv.reader([line], delimiter=separator), [])]
+
+
+def _is_number(cell: str) -> bool:
+    return bool(_NUMBER.fullmatch(cell) or _DECIMAL_COMMA.fullmatch(cell))
+
+
+def _line_of_units(cells: list[str], width: int) -> list[str | None] | None:
+    """Units from the second line of headings, if that is what it is: no number, and a unit at least."""
+    inner = [cell.strip("[]() ") for cell in cells]
+    if any(cell and not is_unit(text) for cell, text in zip(cells, inner, strict=True)):
+        return None
+    units = [text if text not in ("", "-") else None for text in inner]
+    return units if len(cells) == width and any(units) and not any(map(_is_number, cells)) else None
+
+
+def _decimal_mark(file: str, rows: list[list[str]], width: int, separator: str) -> str:
+    if separator == ",":
+        if rows and len(rows[0]) > width and all(len(row) == len(rows[0]) for row in rows):
+            fault = f"the headings name {width} columns and the rows have {len(rows[0])} cells"
+            remedy = "write decimal points, or separate the columns by semicolons if decimals have commas"
+            raise InputError(file, "", fault, remedy)
+        return "."
+    cells = [cell for row in rows for cell in row]
+    grouped = next((cell for cell in cells if _GROUPED.fullmatch(cell)), None)
+    if grouped is not None:
+        fault = f"'{grouped}' has both a point and a comma"
+        raise InputError(file, "", fault, "write numbers without marks between thousands")
+    commas = next((cell for cell in cells if _DECIMAL_COMMA.fullmatch(cell)), None)
+    points = next((cell for cell in cells if "." in cell and _NUMBER.fullmatch(cell)), None)
+    if commas is not None and points is not None:
+        fault = f"decimals are written with commas ('{commas}') and with points ('{points}')"
+        raise InputError(file, "", fault, "write all numbers in the same way")
+    return "." if commas is None else ","
+
+
+def _read_cells(
+    file: str, body: bytes, names: list[str], separator: str, decimal_mark: str, numbers: set[str]
+) -> pa.Table:
+    """Read the columns named `numbers` (by position, as text) as numbers, all others as text."""
+    from pyarrow import csv as arrow_csv
+
+    if not body.strip():
+        return pa.table({name: pa.array([], pa.string()) for name in names})
+    ragged: list[arrow_csv.InvalidRow] = []
+
+    def keep_first(row: arrow_csv.InvalidRow) -> str:
+        ragged.append(row)
+        return "error"
+
+    # Rows are counted only when one thread reads.
+    reading = arrow_csv.ReadOptions(column_names=names, use_threads=bool(numbers))
+    parsing = arrow_csv.ParseOptions(delimiter=separator, invalid_row_handler=None if numbers else keep_first)
+    converting = arrow_csv.ConvertOptions(
+        column_types={name: pa.float64() if name in numbers else pa.string() for name in names},
+        decimal_point=decimal_mark,
+        strings_can_be_null=True,
+        quoted_strings_can_be_null=True,
+    )
+    if numbers:
+        return arrow_csv.read_csv(pa.BufferReader(body), reading, parsing, converting)
+    with _reading(file, "CSV"):
+        try:
+            cells = arrow_csv.read_csv(pa.BufferReader(body), reading, parsing, converting)
+        except pa.ArrowInvalid:
+            if not ragged:
+                raise
+            fault = f"it has {ragged[0].actual_columns} cells while the header has {len(names)}"
+            remedy = "give every row one cell per column, and quote cells that hold a comma"
+            raise InputError(file, f"row {ragged[0].number}", fault, remedy) from None
+    if decimal_mark == ",":  # "1.5 mm" in the place of "1,5 mm"
+        comma = r"^(\s*[+-]?[0-9]*),([0-9])"
+        return pa.table(
+            {name: pc.replace_substring_regex(cells[name], comma, r"\1.\2") for name in cells.column_names}
+        )
+    return cells
 
 
 def _open_parquet(file: str) -> ColumnFile:
@@ -372,82 +336,10 @@ def _open_parquet(file: str) -> ColumnFile:
             table = handle.read(columns=[schema.names[position] for position in positions])
         return [table.column(schema.names[position]) for position in positions]
 
-    def kept(what: bytes) -> tuple[str | None, ...]:
-        return tuple(_text((field.metadata or {}).get(what)) for field in schema)
-
+    kept = [field.metadata or {} for field in schema]
+    units, titles = (tuple(_text(each.get(key)) for each in kept) for key in (b"unit", b"heading"))
     notes = json.loads((schema.metadata or {}).get(b"notes", b"[]"))
-    return ColumnFile(tuple(schema.names), kept(b"unit"), load, kept(b"heading"), tuple(map(str, notes)))
-
-
-def _open_text(file: str) -> ColumnFile:
-    table = read_text_table(file, Path(file).read_bytes())
-    labels = [place for place, heading in enumerate(table.headings) if is_label(read_heading(heading).title)]
-
-    def load(positions: Sequence[int]) -> list[Column]:
-        numbers = {str(position) for position in positions if position not in labels}
-        try:
-            cells = _read_cells(file, table, numbers)
-        except pa.ArrowInvalid:  # text among the numbers, or a line of another length: find out where
-            cells = _read_cells(file, table, set())
-        return [cells.column(str(position)) for position in positions]
-
-    return ColumnFile(table.headings, table.units, load, notes=table.notes)
-
-
-def _read_cells(file: str, table: TextTable, numbers: set[str]) -> pa.Table:
-    """Read the columns named `numbers` (by position, as text) as numbers, all others as text."""
-    from pyarrow import csv as arrow_csv
-
-    width = len(table.headings)
-    names = [str(position) for position in range(width)]
-    ragged = []
-
-    def keep_first(row: arrow_csv.InvalidRow) -> str:
-        ragged.append(row)
-        return "error"
-
-    options = {
-        "read_options": arrow_csv.ReadOptions(
-            column_names=names,
-            use_threads=bool(numbers),  # rows are counted only when one thread reads
-        ),
-        "parse_options": arrow_csv.ParseOptions(
-            delimiter=table.separator, invalid_row_handler=None if numbers else keep_first
-        ),
-        "convert_options": arrow_csv.ConvertOptions(
-            column_types={name: pa.float64() if name in numbers else pa.string() for name in names},
-            decimal_point=table.decimal_mark,
-            strings_can_be_null=True,
-            quoted_strings_can_be_null=True,
-        ),
-    }
-    if not table.body.strip():
-        return pa.table({name: pa.array([], pa.string()) for name in names})
-    source = pa.BufferReader(table.body)
-    if numbers:
-        return arrow_csv.read_csv(source, **options)
-    with _reading(file, "CSV"):
-        try:
-            cells = arrow_csv.read_csv(source, **options)
-        except pa.ArrowInvalid:
-            if not ragged:
-                raise
-        else:
-            return _with_decimal_points(cells) if table.decimal_mark == "," else cells
-    raise InputError(
-        file,
-        f"row {ragged[0].number}",
-        f"it has {ragged[0].actual_columns} cells while the header has {width}",
-        "give every row one cell per column, and quote cells that hold a comma",
-    )
-
-
-def _with_decimal_points(cells: pa.Table) -> pa.Table:
-    """The same text with ``1.5 mm`` in the place of ``1,5 mm``."""
-    comma = r"^(\s*[+-]?[0-9]*),([0-9])"
-    return pa.table(
-        {name: pc.replace_substring_regex(cells[name], comma, r"\1.\2") for name in cells.column_names}
-    )
+    return ColumnFile(tuple(schema.names), units, load, titles, tuple(map(str, notes)))
 
 
 def _open_hdf5(file: str) -> ColumnFile:
@@ -470,7 +362,7 @@ def _open_hdf5(file: str) -> ColumnFile:
         with _reading(file, "HDF5"), h5py.File(file, "r") as handle:
             if compound is not None:
                 rows = handle[compound][()]
-                return equally_long(file, {name: _column(file, name, rows[name]) for name in wanted})
+                return _vectors(file, {name: rows[name] for name in wanted})
             columns = {}
             for name in wanted:
                 dataset = handle[name]
@@ -482,10 +374,10 @@ def _open_hdf5(file: str) -> ColumnFile:
                 elif _text(dataset.attrs.get("MATLAB_class")) == "char":  # stored as characters × rows
                     values = np.ascontiguousarray(values.T, dtype="=u4")
                     values = values.view(f"=U{values.shape[-1]}")
-                columns[name] = _column(file, name, values)
-        return equally_long(file, columns)
+                columns[name] = values
+        return _vectors(file, columns)
 
-    return _column_file(names, load, units)
+    return ColumnFile(tuple(names), tuple(units), load)
 
 
 def _open_matlab(file: str) -> ColumnFile:
@@ -505,9 +397,9 @@ def _open_matlab(file: str) -> ColumnFile:
                 raise _no_vector(file, name, f"a MATLAB {kinds[name]}")
         with _reading(file, "MATLAB"):
             variables = loadmat(file, variable_names=wanted)
-            return equally_long(file, {name: _column(file, name, variables[name]) for name in wanted})
+            return _vectors(file, {name: variables[name] for name in wanted})
 
-    return _column_file(names, load)
+    return ColumnFile(names, (None,) * len(names), load)
 
 
 def _open_numpy(file: str) -> ColumnFile:
@@ -516,20 +408,16 @@ def _open_numpy(file: str) -> ColumnFile:
         fields = kept.dtype.names if isinstance(kept, np.ndarray) else tuple(kept.files)
         columns = {name: kept[name] for name in fields or ()}
     if not columns:
-        raise InputError(
-            file, "", "it is one array without names for its columns",
-            "write numpy.savez(file, t=..., x=...), or a table with headings",
-        )  # fmt: skip
+        remedy = "write numpy.savez(file, t=..., x=...), or a table with headings"
+        raise InputError(file, "", "it is one array without names for its columns", remedy)
     names = tuple(columns)
 
     def load(positions: Sequence[int]) -> list[Column]:
-        wanted = [names[position] for position in positions]
-        return equally_long(file, {name: _column(file, name, columns[name]) for name in wanted})
+        return _vectors(file, {names[position]: columns[names[position]] for position in positions})
 
-    return _column_file(names, load)
+    return ColumnFile(names, (None,) * len(names), load)
 
 
-SPREADSHEETS = (".xlsx", ".xls", ".xlsm", ".xlsb", ".ods")
 READERS: dict[str, Callable[[str], ColumnFile]] = {
     ".parquet": _open_parquet,
     ".csv": _open_text,
@@ -545,31 +433,40 @@ READERS: dict[str, Callable[[str], ColumnFile]] = {
 """How the columns of a file are read, by the suffix of its name."""
 
 
-def _column(file: str, name: str, values: np.ndarray) -> Column:
+def _vectors(file: str, arrays: Mapping[str, np.ndarray]) -> list[Column]:
+    """Arrays, by the names of their columns, as vectors of one length."""
+    columns = [_vector(file, name, values) for name, values in arrays.items()]
+    for name, column in zip(arrays, columns, strict=True):
+        if len(column) != len(columns[0]):
+            fault = f"it has {len(column)} rows while column {next(iter(arrays))} has {len(columns[0])}"
+            remedy = "give all columns one value per sample, or name the columns to read"
+            raise InputError(file, f"column {name}", fault, remedy)
+    return columns
+
+
+def _vector(file: str, name: str, values: np.ndarray) -> Column:
     values = np.asarray(values)
     if values.ndim != 1:
         if values.ndim and values.size != max(values.shape):
             raise _no_vector(file, name, f"of shape {' × '.join(map(str, values.shape))}")
         values = values.ravel()
-    if values.dtype.kind == "f":
+    kind = values.dtype.kind
+    if kind == "f":
         return pa.array(values.astype(np.float64, copy=False))  # native byte order and precision
-    if values.dtype.kind in "iub":
+    if kind in "iub":
         return pa.array(values.astype(values.dtype.newbyteorder("="), copy=False))
-    if values.dtype.kind == "S" or (
-        values.dtype.kind == "O" and all(isinstance(each, bytes) for each in values[:1])
-    ):
+    if kind == "S" or (kind == "O" and all(isinstance(each, bytes) for each in values[:1])):
         return pa.array(values.tolist(), type=pa.binary()).cast(pa.string())
-    if values.dtype.kind == "U":
+    if kind == "U":
         return pa.array(values.tolist(), type=pa.string())
-    kind = "complex numbers" if values.dtype.kind == "c" else "cells, structs or references"
-    raise _no_vector(file, name, f"an array of {kind}")
+    held = "complex numbers" if kind == "c" else "cells, structs or references"
+    raise _no_vector(file, name, f"an array of {held}")
 
 
 def _no_vector(file: str, name: str, found: str) -> InputError:
     text = ", or labels as one text per row" if name == "recording" else ""
-    return InputError(
-        file, f"column {name}", f"it is {found}, not one vector", f"store one vector of numbers{text}"
-    )
+    remedy = f"store one vector of numbers{text}"
+    return InputError(file, f"column {name}", f"it is {found}, not one vector", remedy)
 
 
 def _text(value: object) -> str | None:

@@ -1,24 +1,154 @@
-"""Which column is the time, which says the recording, and which are states?
+"""Headings of recordings: names and units of columns, and which of them is the time, a label or a state.
 
-``recording`` and ``t`` are the plain names. Where they are missing, a column of another name for the same
-thing takes their place, and that is said; a table that names no recordings is one.
+``x [mm]``, ``x (mm)``, ``x / mm`` and ``x in mm`` all are x in millimetres; ``t_s`` is the time in seconds.
+Names stand in formulas: ``bead x`` becomes ``bead_x`` there, and keeps its heading beside it.
+
+``recording`` and ``t`` are the plain names of the label and the time. Where they are missing, a column of
+another name for the same thing takes their place, and a note says so; a table that names no recordings is
+one.
 """
 
 from __future__ import annotations
 
+import keyword
+import re
+import unicodedata
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 
-from siq.data.columns import TIME_UNITS, Heading, is_index, is_label, is_time, read_heading, usable_name
-from siq.data.formats import ColumnFile
 from siq.errors import InputError, suggestion
 
+if TYPE_CHECKING:
+    from siq.data.formats import ColumnFile
 
-@dataclass(frozen=True)
-class Layout:
+
+def _words(text: str) -> frozenset[str]:
+    return frozenset(text.split())
+
+
+RESERVED = _words("sin cos tan exp log sqrt tanh atan Abs sign Max Min pi recording t delay")
+"""What no state may be called, since formulas have another meaning for it (`siq.systems.cards`)."""
+
+TIME_NAMES = _words(
+    "t time times zeit temps tiempo tempo timestamp timestamps datetime date elapsed elapsedtime clock"
+    " clocktime uhrzeit seconds"
+)
+LABEL_NAMES = _words(
+    "recording recordings record run runs trial trials id rec experiment measurement series trajectory traj"
+    " track trackid runid recordingid trialid recid trajectoryid replicate repetition rep file filename sweep"
+    " ringdown label particle particleid messung versuch aufnahme"
+)
+INDEX_NAMES = _words("index idx row rowid rownumber unnamed")
+TIME_UNITS = _words(
+    "ns us µs μs ms s sec secs second seconds min minute minutes h hr hrs hour hours d day days yr year years"
+)
+
+# Symbols of units, longest first; those after a prefix may also stand alone.
+_PREFIX = "(?:da|[YZEPTGMkhdcmuµμnpfazy])?"
+_PREFIXED = "mol|Ohm|ohm|rad|bar|cal|cd|Hz|Pa|Wb|lm|lx|sr|Da|eV|px|Ω|m|s|g|A|K|N|J|W|V|C|F|H|T|S|L|l|M|B"
+_ALONE = (
+    r"counts?|cts|pixels?|px|adu|ADU|a\.?u\.?|arb\.? ?u(?:nits?)?\.?|n\.?u\.?|atm|Torr|mmHg|rpm|ppm|ppb|dB"
+    r"|deg|degrees?|radians?|°[CF]?|%|‰|1|-|min|minutes?|hours?|hrs?|h|days?|d|years?|yr|sec(?:ond)?s?|volts?"
+    r"|meters?|metres?|k_?B ?T|kT|Å|u|LSB|lsb|bits?"
+)
+_POWER = r"(?:(?:\^|\*\*)?\{?[-−+]?\d+(?:[./]\d+)?\}?|[⁺⁻]?[⁰¹²³⁴⁵⁶⁷⁸⁹]+)?"
+_FACTOR = rf"(?:(?:{_ALONE}|{_PREFIX}(?:{_PREFIXED})){_POWER})"
+_UNIT = re.compile(rf"\(?{_FACTOR}(?:\s*(?:[·*⋅×/]|\s)\s*\(?{_FACTOR}\)?)*\)?")
+
+
+class Heading(NamedTuple):
+    """A heading, taken apart: what people call the column, and its unit where it says one."""
+
+    title: str
+    unit: str | None
+
+
+def is_unit(text: str) -> bool:
+    """Whether text reads as a unit: ``mm``, ``µm/s``, ``kg m^-3``, ``arb. units``.
+
+    Examples
+    --------
+    >>> [is_unit(text) for text in ("mm", "µm²/s", "raw", "left", "a.u.")]
+    [True, True, False, False, True]
+    """
+    return _UNIT.fullmatch(text.strip()) is not None
+
+
+def read_heading(heading: str) -> Heading:
+    """Take a heading apart.
+
+    Examples
+    --------
+    >>> read_heading("bead x (µm)"), read_heading("x(t)"), read_heading("time_ms")
+    (Heading(title='bead x', unit='µm'), Heading(title='x', unit=None), Heading(title='time', unit='ms'))
+    """
+    text = heading.strip()
+    if match := re.fullmatch(r"(.*?)\s*\[\s*(.*?)\s*\]", text):
+        return Heading(_without_time(match[1]), match[2] or None)
+    if match := re.fullmatch(r"(.*?\S)\s*\(\s*(.*?)\s*\)", text):
+        if is_unit(match[2]):
+            return Heading(_without_time(match[1]), match[2])
+        return Heading(_without_time(text), None)
+    for pattern in (r"(.*?\S)\s+/\s*(\S.*)", r"(.*?\S)\s+in\s+(\S.*)", r"(.*?\S)\s*,\s*(\S.*)"):
+        if (match := re.fullmatch(pattern, text)) and is_unit(match[2]):
+            return Heading(match[1], match[2])
+    if (
+        (match := re.fullmatch(r"(.+?)[\s_./]+([^\s_./]+)", text))
+        and match[2] in TIME_UNITS
+        and is_time(match[1])
+    ):
+        return Heading(match[1], match[2])
+    return Heading(text, None)
+
+
+def _without_time(title: str) -> str:
+    """``x`` of ``x(t)``."""
+    return re.sub(r"\s*\(\s*t\s*\)$", "", title)
+
+
+def usable_name(title: str) -> str:
+    """A name that formulas can use, as close to the title as can be.
+
+    Examples
+    --------
+    >>> [usable_name(title) for title in ("bead x", "lambda", "2nd mode", "x")]
+    ['bead_x', 'lambda_', 'x_2nd_mode', 'x']
+    """
+    name = re.sub(r"\W+", "_", unicodedata.normalize("NFKC", title)).strip("_")
+    if name and not name[0].isalpha() and not name.isidentifier():
+        name = f"x_{name}"
+    if not name:
+        return "x_"
+    return f"{name}_" if keyword.iskeyword(name) or name in RESERVED else name
+
+
+def is_time(title: str) -> bool:
+    """Whether a column of this title is the time."""
+    return _plain(title) in TIME_NAMES
+
+
+def is_label(title: str) -> bool:
+    """Whether a column of this title says which recording a row belongs to."""
+    return _plain(title) in LABEL_NAMES
+
+
+def is_index(title: str) -> bool:
+    """Whether a column of this title may count the rows, as tables that pandas wrote do."""
+    return (
+        title == ""
+        or _plain(re.sub(r"[\d.:\s]+$", "", title)) in INDEX_NAMES
+        or title.startswith("__index_level_")
+    )
+
+
+def _plain(title: str) -> str:
+    return re.sub(r"[\W_]+", "", title).casefold()
+
+
+class Layout(NamedTuple):
     """The columns of a table by what they mean.
 
     Attributes
@@ -68,34 +198,46 @@ def layout_of(file: str, source: ColumnFile, columns: Sequence[str] | None) -> L
     if columns is not None and (len(set(columns)) < len(columns) or {"recording", "t"} & set(columns)):
         raise ValueError(f"the columns {list(columns)} are not distinct measured columns")
     parts = [read_heading(heading) for heading in source.headings]
-    kept = source.titles or (None,) * len(parts)
-    titles = [title or part.title for title, part in zip(kept, parts, strict=True)]
     plain = [part.title for part in parts]
-    _refuse_twice(file, plain, source)
+    titles = [title or name for title, name in zip(source.titles or (None,) * len(parts), plain, strict=True)]
+    for name in plain:
+        if name and plain.count(name) > 1:
+            raise InputError(
+                file, f"column {name}", "the column stands twice", "rename or remove one of them"
+            )
     notes = list(source.notes)
-    taken = set() if columns is None else {place for place, part in enumerate(parts) if part.title in columns}
-    free = [place for place in range(len(parts)) if place not in taken]
-    dropped = _row_numbers(source, plain, free, notes)
+    free = [place for place in range(len(parts)) if columns is None or plain[place] not in columns]
+    dropped = set()
+    for place in free:  # columns that only count the rows, as pandas writes them, and empty ones at the end
+        values = _numbers(source, place) if is_index(plain[place]) else None
+        if values is None:
+            continue
+        if np.isnan(values).all():
+            dropped.add(place)
+        elif _counts_rows(values):
+            dropped.add(place)
+            called = f"'{source.headings[place]}'" if plain[place] else f"{place + 1}, which has no name,"
+            notes.append(f"the column {called} counts the rows and was left out")
     free = [place for place in free if place not in dropped]
     time = _time_column(file, source.headings, parts, free, notes)
     free.remove(time)
     recording = _label_column(source, plain, free, notes)
-    if recording is not None and recording in free:
-        free.remove(recording)
     if columns is None:
-        others = [place for place in free if _second_time(source, parts[place], place)]
+        others = [place for place in free if place != recording and _is_second_time(source, parts, place)]
         for place in others:
             notes.append(f"the column '{source.headings[place]}' looks like a second time and was left out")
-        states = [place for place in free if place not in others]
-        names = _distinct([usable_name(plain[place]) for place in states])
+        states = [place for place in free if place not in (recording, *others)]
+        names: list[str] = []
         for place in states:
             if not plain[place]:
-                raise InputError(
-                    file, f"column {place + 1}", "the column has no name", "name it, or remove the column"
-                )
-        for place, name in zip(states, names, strict=True):
-            if name != plain[place]:
-                notes.append(f"'{titles[place]}' is called {name} in formulas")
+                remedy = "name it, or remove the column"
+                raise InputError(file, f"column {place + 1}", "the column has no name", remedy)
+            name, count = usable_name(plain[place]), 1
+            while (candidate := name if count == 1 else f"{name}_{count}") in names:
+                count += 1
+            names.append(candidate)
+            if candidate != plain[place]:
+                notes.append(f"'{titles[place]}' is called {candidate} in formulas")
     else:
         known = [place for place in range(len(parts)) if place not in (time, recording, *dropped)]
         states = [_wanted(file, name, plain, known, notes) for name in columns]
@@ -105,49 +247,15 @@ def layout_of(file: str, source: ColumnFile, columns: Sequence[str] | None) -> L
     units = tuple(
         {"name": part.unit, "metadata": unit} for part, unit in zip(parts, source.units, strict=True)
     )
-    return Layout(
-        recording,
-        time,
-        tuple(states),
-        tuple(names),
-        tuple(titles[place] for place in states),
-        units,
-        tuple(notes),
-    )
+    shown = tuple(titles[place] for place in states)
+    return Layout(recording, time, tuple(states), tuple(names), shown, units, tuple(notes))
 
 
-def _refuse_twice(file: str, plain: list[str], source: ColumnFile) -> None:
-    for name in plain:
-        if name and plain.count(name) > 1:
-            raise InputError(
-                file, f"column {name}", "the column stands twice", "rename or remove one of them"
-            )
-
-
-def _row_numbers(source: ColumnFile, plain: list[str], free: list[int], notes: list[str]) -> set[int]:
-    """Columns that only count the rows, as pandas writes them, and empty ones at the end of all lines."""
-    dropped = set()
-    for place in free:
-        if not is_index(plain[place]):
-            continue
-        values = _numbers(source, place)
-        if values is None:
-            continue
-        if np.isnan(values).all():
-            dropped.add(place)
-        elif _counts(values):
-            dropped.add(place)
-            called = f"'{source.headings[place]}'" if plain[place] else f"{place + 1}, which has no name,"
-            notes.append(f"the column {called} counts the rows and was left out")
-    return dropped
-
-
-def _counts(values: np.ndarray) -> bool:
-    """Whether values are 0, 1, 2, … from any start, or that of a table whose rows were taken or mixed."""
-    whole = bool((np.isfinite(values) & (values == np.round(values))).all())
-    return (whole and len(np.unique(values)) == len(values)) or bool(
-        whole and (np.diff(values) == 1).mean() > 0.5
-    )
+def _counts_rows(values: np.ndarray) -> bool:
+    """Whether values are 0, 1, 2, … from any start, or those of a table whose rows were taken or mixed."""
+    if not (np.isfinite(values) & (values == np.round(values))).all():
+        return False
+    return len(np.unique(values)) == len(values) or bool((np.diff(values) == 1).mean() > 0.5)
 
 
 def _numbers(source: ColumnFile, place: int) -> np.ndarray | None:
@@ -161,12 +269,14 @@ def _numbers(source: ColumnFile, place: int) -> np.ndarray | None:
 
 
 def _may_be_time(part: Heading) -> bool:
-    return part.unit is None or part.unit.casefold() in {unit.casefold() for unit in TIME_UNITS}
+    return is_time(part.title) and (
+        part.unit is None or part.unit.casefold() in {unit.casefold() for unit in TIME_UNITS}
+    )
 
 
-def _second_time(source: ColumnFile, part: Heading, place: int) -> bool:
+def _is_second_time(source: ColumnFile, parts: list[Heading], place: int) -> bool:
     """Whether a column is another clock: called so, and ever increasing but where recordings begin."""
-    if not is_time(part.title) or not _may_be_time(part) or part.title == "T":
+    if not _may_be_time(parts[place]) or parts[place].title == "T":
         return False
     values = _numbers(source, place)
     return values is None or bool((np.diff(values) > 0).mean() > 0.5)
@@ -175,10 +285,10 @@ def _second_time(source: ColumnFile, part: Heading, place: int) -> bool:
 def _time_column(
     file: str, headings: Sequence[str], parts: list[Heading], free: list[int], notes: list[str]
 ) -> int:
-    found = [place for place in free if parts[place].title == "t"]
-    if found:
-        return found[0]
-    found = [place for place in free if is_time(parts[place].title) and _may_be_time(parts[place])]
+    for place in free:
+        if parts[place].title == "t":
+            return place
+    found = [place for place in free if _may_be_time(parts[place])]
     if len(found) > 1:
         # "T" is a temperature rather than a time.
         found = [place for place in found if parts[place].title != "T"]
@@ -193,9 +303,9 @@ def _time_column(
 
 
 def _label_column(source: ColumnFile, plain: list[str], free: list[int], notes: list[str]) -> int | None:
-    exact = [place for place in range(len(plain)) if plain[place] == "recording"]
-    if exact:
-        return exact[0]
+    """The column of labels, None where there is none; one that counts the rows is taken out of `free`."""
+    if "recording" in plain:
+        return plain.index("recording")
     for place in free:
         if not is_label(plain[place]):
             continue
@@ -211,25 +321,11 @@ def _label_column(source: ColumnFile, plain: list[str], free: list[int], notes: 
     return None
 
 
-def _distinct(names: list[str]) -> list[str]:
-    """Names, those that came out alike told apart by numbers: ``x_a``, ``x_a_2``."""
-    given: list[str] = []
-    for name in names:
-        candidate, count = name, 1
-        while candidate in given:
-            count += 1
-            candidate = f"{name}_{count}"
-        given.append(candidate)
-    return given
-
-
 def _wanted(file: str, name: str, plain: list[str], known: list[int], notes: list[str]) -> int:
     """The column that is meant by a name: called so, or nearly so, if there is but one."""
-    for matches in (
-        [place for place in known if plain[place] == name],
-        [place for place in known if usable_name(plain[place]) == name],
-        [place for place in known if usable_name(plain[place]).casefold() == name.casefold()],
-    ):
+    for called in (str, usable_name, lambda title: usable_name(title).casefold()):
+        sought = name.casefold() if called not in (str, usable_name) else name
+        matches = [place for place in known if called(plain[place]) == sought]
         if len(matches) == 1:
             if plain[matches[0]] != name:
                 notes.append(f"'{plain[matches[0]]}' is called {name} in formulas")

@@ -1,8 +1,8 @@
-"""Recordings: trajectories as measured, in one long table.
+"""Recordings: trajectories as measured, in one long table, and the pairs of neighbouring samples.
 
-A table has the columns ``recording`` (a label), ``t`` (the time) and one column per measured quantity.
-Here such a table is read and checked, written, and cut into snapshot pairs. Whatever cannot be
-used is refused with its row and column; rows are counted from 1 without the header.
+A table has the columns ``recording`` (a label), ``t`` (the time) and one column per measured quantity. It is
+read and checked, written, resampled by whole recordings, and cut into snapshot pairs. Whatever cannot be used
+is refused with its row and column; rows are counted from 1 without the header.
 """
 
 from __future__ import annotations
@@ -15,13 +15,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from siq.data.columns import check_times, sources
+from siq.errors import InputError, NumericalFailure
 from siq.numerics.files import whole_file
 
 if TYPE_CHECKING:
     import pandas as pd
 
+TABLE = "the table"  # what messages call what is in no file
 LONGEST_STEP = 1.5  # of the median step: a missing sample makes two of it, jitter rarely a half more
+HELD_OUT_SHARE = 0.2
+SINGLE_RECORDING_REMEDY = (
+    "record how the system settles from many starting points, or one long record in which noise makes it hop;"
+    " if these are positions of something that has inertia, set 'identification.hidden_velocities'"
+)
 
 
 @dataclass(frozen=True)
@@ -107,7 +113,7 @@ class Recordings:
 
         levels = [name for name in frame.index.names if name in ("recording", "t")]
         source = frame_columns(TABLE, frame.reset_index(level=levels) if levels else frame)
-        read = cls(**checked_table(TABLE, source, columns, units)._asdict())
+        read = checked_table(TABLE, source, columns, units)
         given = units or {}
         return replace(
             read,
@@ -183,9 +189,6 @@ class Recordings:
         )  # fmt: skip
 
 
-TABLE = "the table"  # what messages call what is in no file
-
-
 @dataclass(frozen=True)
 class SnapshotPairs:
     """States a short time apart, each pair with its own step. See `snapshot_pairs`.
@@ -246,7 +249,7 @@ def read_recordings(
     """
     from siq.data.tables import read_tables  # which imports pyarrow
 
-    return Recordings(**read_tables(path, columns=columns, units=units, gaps=gaps)._asdict())
+    return read_tables(path, columns=columns, units=units, gaps=gaps)
 
 
 def recordings_of(source: str | Path | Recordings | pd.DataFrame) -> Recordings:
@@ -339,5 +342,149 @@ def snapshot_pairs(recordings: Recordings, *, pair_step: float | None = None) ->
         x0=recordings.values[:-1][keep],
         xh=recordings.values[1:][keep],
         h=gap[keep],
-        recording=sources(recordings.labels)[recording[:-1][keep]],
+        recording=parent_recordings(recordings.labels)[recording[:-1][keep]],
     )
+
+
+def check_times(
+    file: str, t: np.ndarray, recording: np.ndarray, labels: tuple[str, ...], rows: np.ndarray
+) -> None:
+    """Refuse times that do not increase within every recording.
+
+    Parameters
+    ----------
+    file
+        The file, for messages.
+    t, recording
+        Shape ``(n,)``: the time and the recording of each row; the rows of a recording stand together.
+    labels
+        The label of each recording.
+    rows
+        Shape ``(n,)``: where each row stands in the file, counted from 0.
+
+    Raises
+    ------
+    InputError
+        For the first row of the file whose time is repeated or earlier, or when no recording has two rows.
+    """
+    same = recording[1:] == recording[:-1]
+    if not same.any():
+        remedy = "give the rows of one recording the same label"
+        raise InputError(file, "", "no recording has two samples", remedy)
+    wrong = np.flatnonzero(same & (t[1:] <= t[:-1]))
+    if wrong.size == 0:
+        return
+    earlier = wrong[np.argmin(rows[wrong + 1])]
+    label, before, now = labels[recording[earlier]], float(t[earlier]), float(t[earlier + 1])
+    if now == before:
+        fault = f"the time {now} of recording '{label}' is repeated (row {rows[earlier] + 1} has it too)"
+        remedy = "keep one of the two rows, or label them as two recordings"
+    else:
+        fault = f"the times of recording '{label}' are unsorted ({now} comes after {before})"
+        remedy = "sort its rows by t, or begin a new label where a new recording begins"
+    raise InputError(file, f"row {rows[earlier + 1] + 1}, column t", fault, remedy)
+
+
+def select_recordings(recordings: Recordings, indices: Sequence[int] | np.ndarray) -> Recordings:
+    """Take whole recordings, in the order given.
+
+    Parameters
+    ----------
+    recordings
+        The trajectories.
+    indices
+        Indices into ``recordings.labels``, not of rows. One that stands twice gives copies, told apart by
+        their labels: ``r07``, ``r07#2``.
+
+    Raises
+    ------
+    ValueError
+        When `indices` is empty, is a mask, or points outside the recordings.
+    """
+    chosen = np.asarray(indices)
+    count = len(recordings.labels)
+    if chosen.ndim != 1 or chosen.dtype.kind not in "iu" or chosen.size == 0:
+        raise ValueError("recordings are selected by a list of at least one index")
+    if chosen.min() < 0 or chosen.max() >= count:
+        raise ValueError(f"a selected recording is not one of 0 ... {count - 1}")
+    taken = set(recordings.labels)  # a label of the file may itself look like that of a copy
+    copies: dict[int, int] = {}
+    labels = []
+    for index in chosen.tolist():
+        label, copy = recordings.labels[index], copies.get(index, 0) + 1
+        while copy > 1 and f"{label}#{copy}" in taken:
+            copy += 1
+        copies[index] = copy
+        labels.append(label if copy == 1 else f"{label}#{copy}")
+        taken.add(labels[-1])
+    bounds = np.searchsorted(recordings.recording, np.arange(count + 1))
+    lengths = np.diff(bounds)[chosen]
+    begins = np.cumsum(lengths) - lengths
+    rows = np.arange(lengths.sum()) + np.repeat(bounds[chosen] - begins, lengths)
+    return replace(
+        recordings,
+        labels=tuple(labels),
+        recording=np.repeat(np.arange(len(chosen)), lengths),
+        t=recordings.t[rows],
+        values=recordings.values[rows],
+    )
+
+
+def resample_recordings(recordings: Recordings, *, generator: np.random.Generator) -> Recordings:
+    """Draw as many recordings as there are, with replacement: one bootstrap sample.
+
+    Whole recordings are drawn, not rows, since the samples of one recording are not independent.
+
+    Parameters
+    ----------
+    recordings
+        The trajectories.
+    generator
+        Where the draw comes from; the only source of chance.
+    """
+    count = len(recordings.labels)
+    return select_recordings(recordings, generator.integers(count, size=count))
+
+
+def parent_recordings(labels: tuple[str, ...]) -> np.ndarray:
+    """Index of the recording that each is, or is a copy of: ``r07#2`` is a copy where there is an ``r07``.
+
+    Parameters
+    ----------
+    labels
+        The labels of all recordings, k of them.
+
+    Returns
+    -------
+    numpy.ndarray
+        Shape ``(k,)``, indices into `labels`.
+    """
+    position = {label: index for index, label in enumerate(labels)}
+    parents = []
+    for label in labels:
+        original, _, copy = label.rpartition("#")
+        parents.append(position[original if copy.isdigit() and original in position else label])
+    return np.array(parents, dtype=np.int64)
+
+
+def held_out_recordings(
+    recordings: Recordings, *, generator: np.random.Generator, share: float = HELD_OUT_SHARE
+) -> np.ndarray:
+    """A random part of the recordings, as a mask over ``recordings.labels``.
+
+    Copies of a resampled recording stay together: none is held out while another is fitted.
+
+    Raises
+    ------
+    NumericalFailure
+        When all recordings are copies of one, so that none can be held out.
+    """
+    groups = parent_recordings(recordings.labels)
+    names = np.unique(groups)
+    if len(names) < 2:
+        raise NumericalFailure(
+            "there is only one recording, and it shows no random forces or is too short to be divided, so"
+            f" that none can be held out; {SINGLE_RECORDING_REMEDY}"
+        )
+    count = min(max(round(share * len(names)), 1), len(names) - 1)
+    return np.isin(groups, generator.permutation(names)[:count])

@@ -1,4 +1,4 @@
-"""Stationarity: relaxation times and slow drift of a record.
+"""Stationarity: stretches of a record, relaxation and correlation times, slow drift.
 
 Three times of a record differ by orders of magnitude, and each has its use:
 
@@ -13,20 +13,22 @@ Three times of a record differ by orders of magnitude, and each has its use:
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
 from siq.data.recordings import LONGEST_STEP, Recordings
 
-FEWEST = 48  # samples of the shortest stretch looked at
-SETTLED = 1.3  # in stretches twice as long a walk's correlation lasts twice as long, a relaxation's as long
-LEAST = 0.5  # of a sample: shorter correlations are not told from none
-WHITE = 0.05  # of the variance: a correlation of neighbours below is none
+SHORTEST_STRETCH = 48  # samples of the shortest stretch looked at
+SETTLED_GROWTH = 1.3  # with twice the length a walk's correlation lasts twice as long, a relaxation's as long
+SHORTEST_TIME = 0.5  # of a sample: shorter correlations are not told from none
+WHITE_CORRELATION = 0.05  # of the variance: a correlation of neighbours below is none
+STEP_TOLERANCE = 0.01  # of a step: stretches end where a step differs by more
 MOST_STRETCHES = 4000  # looked at
-SLOWEST = 8  # half periods of the background in a record: what returns more often is part of the system
-RARE = 1e-3  # probability with which a record without a background is said to have one
+MOST_HALF_PERIODS = 8  # of the background in a record: what returns more often is part of the system
+FALSE_DRIFT_RATE = 1e-3  # probability with which a record without a background is said to have one
 
 
 @dataclass(frozen=True)
@@ -77,17 +79,12 @@ def runs_of(recordings: Recordings, *, longest: float | None = None) -> list[sli
     return [slice(int(a), int(b)) for a, b in pairwise(bounds) if b > a]
 
 
-def stretches_of_all(runs: list[slice], length: int) -> np.ndarray:
-    """First rows of all stretches of that many samples; a run that is shorter gives none."""
-    return np.concatenate(
+def stretches_of(runs: list[slice], length: int, *, most: int | None = None) -> np.ndarray:
+    """First rows of stretches of so many samples in a run, one behind the other; about `most` of them."""
+    found = np.concatenate(
         [np.zeros(0, dtype=int), *(np.arange(run.start, run.stop - length + 1, length) for run in runs)]
     )
-
-
-def stretches_of(runs: list[slice], length: int) -> np.ndarray:
-    """First rows of stretches of that many samples in a run, one behind the other; a part of many."""
-    found = stretches_of_all(runs, length)
-    return found[:: max(len(found) // MOST_STRETCHES, 1)]
+    return found if most is None else found[:: max(len(found) // most, 1)]
 
 
 def relaxation_samples(values: np.ndarray, runs: list[slice]) -> float | None:
@@ -100,11 +97,11 @@ def relaxation_samples(values: np.ndarray, runs: list[slice]) -> float | None:
     runs
         See `runs_of`.
     """
-    length, longest = FEWEST, max((run.stop - run.start for run in runs), default=0)
+    length, longest = SHORTEST_STRETCH, max((run.stop - run.start for run in runs), default=0)
     times = []
     while length <= longest:
-        if (time := _correlated(values, stretches_of(runs, length), length)) is not None:
-            times.append(max(time, LEAST))
+        if (time := _correlated(values, stretches_of(runs, length, most=MOST_STRETCHES), length)) is not None:
+            times.append(max(time, SHORTEST_TIME))
         length *= 2
     if len(times) < 2:
         return None
@@ -112,7 +109,7 @@ def relaxation_samples(values: np.ndarray, runs: list[slice]) -> float | None:
     # Longer stretches hold hops and a slow background, and their correlation grows once more.
     growth = np.array(times[1:]) / times[:-1]
     turns = np.append(False, (growth[1:-1] < growth[:-2]) & (growth[1:-1] < growth[2:]))
-    settled = np.flatnonzero((growth[: len(turns)] <= SETTLED) | turns)
+    settled = np.flatnonzero((growth[: len(turns)] <= SETTLED_GROWTH) | turns)
     place = int(settled[0]) if len(settled) else int(np.argmin(growth))
     return max(times[place + 1], 1.0)
 
@@ -130,7 +127,7 @@ def _correlated(values: np.ndarray, begins: np.ndarray, length: int) -> float | 
     power = np.mean(np.abs(np.fft.rfft(parts, n=width, axis=1)) ** 2, axis=0)
     correlation = np.fft.irfft(power, n=width)[: length // 2] / np.arange(length, length - length // 2, -1)
     # Noise of the sensor falls into lag 0 alone: what is left of it at lag 1 is what relaxes.
-    if correlation[1] <= WHITE * correlation[0]:
+    if correlation[1] <= WHITE_CORRELATION * correlation[0]:
         return 0.0
     below = np.flatnonzero(correlation < correlation[1] / np.e)
     if not len(below):
@@ -140,18 +137,12 @@ def _correlated(values: np.ndarray, begins: np.ndarray, length: int) -> float | 
     return float(last - 2 + share)
 
 
-def correlation_times(recordings: Recordings) -> np.ndarray:
-    """``∫ ρ(s) ds`` of each state over positive lags, in the unit of time: shape ``(d,)``.
+def correlated_samples(values: np.ndarray, runs: list[slice]) -> float:
+    """The correlation time ``Σ ρ_k`` over lags, in samples, half of lag 0 included: at least a half.
 
     The sum runs over pairs of neighbouring lags as long as their sum is positive and falls (Geyer's initial
     monotone sequence). Recordings share their mean; gaps between samples are passed over.
     """
-    runs, step = runs_of(recordings), usual_step(recordings)
-    return np.array([step * correlated_samples(column, runs) for column in recordings.values.T])
-
-
-def correlated_samples(values: np.ndarray, runs: list[slice]) -> float:
-    """``Σ ρ_k`` over lags, in samples, half of lag 0 included: at least a half."""
     longest = max(run.stop - run.start for run in runs)
     width = 1 << int(2 * longest - 1).bit_length()
     centred = values - values.mean()
@@ -194,7 +185,7 @@ def background_of(recordings: Recordings, values: np.ndarray) -> Background:
     if spread <= 0:
         return nothing
     counts = np.bincount(recordings.recording)
-    for half_periods in range(1, SLOWEST + 1):
+    for half_periods in range(1, MOST_HALF_PERIODS + 1):
         fitted = _slow(recordings, values, half_periods)
         rest = values - fitted
         independent = len(values) / (2 * correlated_samples(rest, runs))
@@ -203,7 +194,7 @@ def background_of(recordings: Recordings, values: np.ndarray) -> Background:
             break
         gain = independent * np.log(spread / max(float(np.var(rest)), 1e-300))
         # Twice the gain in the logarithm of the likelihood, less what chance gives it with this probability.
-        surplus = gain - used * np.log(independent) - 2 * np.log(1 / RARE)
+        surplus = gain - used * np.log(independent) - 2 * np.log(1 / FALSE_DRIFT_RATE)
         if surplus > best:
             best, found = surplus, Background(fitted - fitted.mean(), half_periods)
     return found
@@ -225,15 +216,72 @@ def _slow(recordings: Recordings, values: np.ndarray, half_periods: int) -> np.n
     return fitted
 
 
-def without_background(recordings: Recordings, state: int, background: Background) -> Recordings:
-    """The recordings with a state's slow drift taken off, which a note says."""
-    if not background.half_periods:
-        return recordings
-    values = recordings.values.copy()
-    values[:, state] -= background.values
-    unit = recordings.units[state]
-    note = (
-        f"the background of '{recordings.titles[state]}' drifts slowly, over a range of"
-        f" {background.range:.3g}{f' {unit}' if unit else ''}; it was taken off"
-    )
-    return replace(recordings, values=values, notes=(*recordings.notes, note))
+class Stretches(NamedTuple):
+    """Steps between neighbouring samples, numbered by the stretch of even steps that they belong to.
+
+    Attributes
+    ----------
+    number
+        Shape ``(n - 1,)`` for n samples: the stretch of the step from sample k to sample k + 1, -1 where it
+        belongs to none.
+    step
+        The usual time between neighbouring samples, in the unit of time; 0 where there are none.
+    """
+
+    number: np.ndarray
+    step: float
+
+    def within(self, lag: int) -> np.ndarray:
+        """The first of `lag` + 1 steps that belong to one stretch, as indices of steps."""
+        return np.flatnonzero(same_stretch(self.number, lag))
+
+
+def same_stretch(number: np.ndarray, lag: int) -> np.ndarray:
+    """Which steps have one `lag` steps later in their stretch; shape ``(n - lag,)`` for n steps."""
+    earlier = number[: max(len(number) - lag, 0)]
+    return np.asarray((earlier >= 0) & (earlier == number[lag:]))
+
+
+def even_stretches(recordings: Recordings) -> Stretches:
+    """Cut recordings into stretches of even steps."""
+    gap = np.diff(recordings.t)
+    inside = np.diff(recordings.recording) == 0
+    if not inside.any():
+        return Stretches(np.full(len(gap), -1), 0.0)
+    usual = usual_step(recordings)
+    # Times such as 0.1·k, or seconds since 1970, carry rounding errors into their differences.
+    even = inside & (np.abs(gap - usual) <= STEP_TOLERANCE * usual + 4 * np.spacing(np.abs(recordings.t[1:])))
+    return Stretches(np.where(even, np.cumsum(~even), -1), usual)
+
+
+def lagged_covariances(rest: np.ndarray, number: np.ndarray, most: int) -> np.ndarray:
+    """Covariances of what is left of steps with what is left of later ones.
+
+    Parameters
+    ----------
+    rest
+        Shape ``(n, d)``: what is left of each step, with mean zero.
+    number
+        Shape ``(n,)``: the stretch of each step, -1 for none. Steps of a stretch follow each other.
+    most
+        The longest lag.
+
+    Returns
+    -------
+    numpy.ndarray
+        Shape ``(most + 1, d, d)``: ``C[k, i, j]`` is the mean of ``rest[m, i] rest[m + k, j]``; zero where no
+        two steps are so far apart.
+    """
+    d = rest.shape[1]
+    covariances = np.zeros((most + 1, d, d))
+    for lag in range(min(most, len(rest) - 1) + 1):
+        both = same_stretch(number, lag)
+        if both.any():
+            covariances[lag] = (rest[: len(both)] * both[:, None]).T @ rest[lag:] / both.sum()
+    return covariances
+
+
+def long_run_covariance(covariances: np.ndarray, lag: int) -> np.ndarray:
+    """``C_0 + Σ_k (C_k + C_kᵀ)`` up to a lag: what sums of many steps have, per step; shape ``(d, d)``."""
+    later = covariances[1 : lag + 1].sum(axis=0)
+    return np.asarray(covariances[0] + later + later.T)

@@ -1,182 +1,58 @@
-"""Tables of recordings, from cells to checked numbers.
+"""Tables of recordings: from cells of text or numbers to checked trajectories.
 
-Rows without any value are dropped, and those at either end of a recording in which a value is missing. A
-missing value between others is refused, since leaving it out makes a gap that its owner should know of. Rows
-in no order are sorted by time, but never two recordings into one another: where the time starts over, a new
-one begins.
+Cells become numbers, labels, units and times; dates and times of day become seconds since the first of the
+file. The first cell that cannot be used is refused with its row and column; rows are counted from 1.
+
+Rows without any value are dropped, and those at either end of a recording in which a value is missing. Of a
+missing value between others the row is left out where such rows are few, since its time tells the gap, across
+which nothing is learned. Rows in no order are sorted by time, but never two recordings into one another:
+where the time starts over, a new one begins.
 """
 
 from __future__ import annotations
 
+import re
+import unicodedata
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.compute as pc
 
-from siq.data.cells import CellFault, agree_on_unit, parse_labels, parse_numbers, seconds_of_clock
-from siq.data.columns import check_times
-from siq.data.formats import ColumnFile, open_columns
+from siq.data.formats import Column, ColumnFile, open_columns
 from siq.data.layout import layout_of
+from siq.data.recordings import Recordings, check_times
 from siq.errors import InputError
 from siq.numerics.files import files_of
 
-RESTART = 0.1  # of the time that a recording took: where it starts over, it does so near its beginning
-SHUFFLED = (
-    1 / 3
-)  # of the steps lead back in time: recordings of three samples, one after another, have as many
+# Text that holds a number, and what may follow as its unit: "1.2mm", "5 %", but "3 1/s" only after a space.
+_NUMBER = r"(?:[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?|[+-]?(?i:nan|infinity|inf))"
+_UNIT = r"(?:\s*[^\W\d_]|\s*[%°‰]|\s+1/)[^,;]*"
+_ISO_DATE = re.compile(r"\d{4}-\d{2}-\d{2}([T ]\d{2}:\d{2}(:\d{2}([.,]\d+)?)?\s*(Z|[+-]\d{2}:?\d{2})?)?")
+_TIME_OF_DAY = re.compile(r"\d{1,3}:\d{2}(:\d{2}([.,]\d+)?)?")
+_GERMAN_DATE = re.compile(r"\d{1,2}\.\d{1,2}\.\d{4}( \d{1,2}:\d{2}(:\d{2}([.,]\d+)?)?)?")
+_SLASHED_DATE = re.compile(r"\d{1,4}/\d{1,2}/\d{1,4}.*")
+_NUMERIC = (
+    pa.types.is_floating, pa.types.is_integer, pa.types.is_boolean, pa.types.is_decimal, pa.types.is_null,
+)  # fmt: skip
+RESTART_SHARE = 0.1  # of the time that a recording took: where it starts over, it does so near its beginning
+# Of the steps lead back in time where rows are shuffled: recordings of three samples, one after another, have
+# as many.
+SHUFFLED_SHARE = 1 / 3
+
+Fault = tuple[int, InputError]
+"""The row, counted from 1, of the first cell of a column that cannot be used, and what is wrong there."""
 
 
-@dataclass(frozen=True)
-class Rows:
-    """Which rows are kept, in which order, of which recording.
-
-    Attributes
-    ----------
-    order
-        Shape ``(n,)``: indices of rows; those of a recording stand together.
-    recording
-        Shape ``(n,)``: the recording of each.
-    labels
-        Of the recordings.
-    notes
-        What was done.
-    """
+class _Rows(NamedTuple):
+    """Which rows are kept, in which order (those of a recording stand together), and of which recording."""
 
     order: np.ndarray
     recording: np.ndarray
     labels: tuple[str, ...]
-    notes: tuple[str, ...] = ()
-
-
-def trim(rows: Rows, numbers: np.ndarray) -> Rows:
-    """Drop rows at the ends of recordings in which a number is missing, where two others are left.
-
-    Parameters
-    ----------
-    rows
-        As they stand.
-    numbers
-        Shape ``(k, n)``: the time and the measured columns, by the rows of the file.
-    """
-    whole = ~np.isnan(numbers[:, rows.order]).any(axis=0)
-    if whole.all():
-        return rows
-    place = np.arange(len(whole))
-    count = len(rows.labels)
-    first, last = np.full(count, len(whole)), np.full(count, -1)
-    np.minimum.at(first, rows.recording[whole], place[whole])
-    np.maximum.at(last, rows.recording[whole], place[whole])
-    inner = np.bincount(rows.recording[whole], minlength=count) >= 2
-    keep = (place >= first[rows.recording]) & (place <= last[rows.recording]) | ~inner[rows.recording]
-    dropped = int((~keep).sum())
-    if dropped == 0:
-        return rows
-    at = len(np.unique(rows.recording[~keep]))
-    note = (
-        f"{_rows(dropped)} with missing values at the beginning or the end of"
-        f" {_recordings(at)} {'was' if dropped == 1 else 'were'} left out"
-    )
-    return Rows(rows.order[keep], rows.recording[keep], rows.labels, (*rows.notes, note))
-
-
-def put_in_order(rows: Rows, numbers: np.ndarray, *, labelled: bool) -> Rows:
-    """Drop rows that stand twice, sort rows in no order, begin a recording where the time starts over.
-
-    Parameters
-    ----------
-    rows
-        As they stand.
-    numbers
-        Shape ``(k, n)``: the time and the measured columns, by the rows of the file.
-    labelled
-        Whether the table says where its recordings begin.
-    """
-    t = numbers[0]
-    bounds = np.searchsorted(rows.recording, np.arange(len(rows.labels) + 1))
-    steps = np.diff(t[rows.order])
-    inside = rows.recording[1:] == rows.recording[:-1]
-    if not (inside & (steps <= 0)).any():
-        return rows
-    parts, labels, notes = [], [], {"sorted": 0, "twice": 0, "begun": 0}
-    for index, label in enumerate(rows.labels):
-        own = rows.order[bounds[index] : bounds[index + 1]]
-        pieces = [own]
-        back = int((np.diff(t[own]) < 0).sum())
-        if back >= 3 and back > SHUFFLED * (len(own) - 1):
-            order = own[np.argsort(t[own], kind="stable")]
-            if (np.diff(t[_once(order, numbers)]) > 0).all():
-                notes["sorted"] += 1
-                pieces = [order]
-        elif back and not labelled:
-            pieces = _restarts(own, t)
-            notes["begun"] += len(pieces) - 1
-        for number, piece in enumerate(pieces):
-            once = _once(piece, numbers)
-            notes["twice"] += len(piece) - len(once)
-            parts.append(once)
-            labels.append(label if len(pieces) == 1 else f"{label}/{number}" if label != "0" else str(number))
-    said = []
-    if notes["sorted"]:
-        said.append(f"the rows of {_recordings(notes['sorted'])} stood in no order and were sorted by time")
-    if notes["begun"]:
-        said.append(f"the time starts over {_times(notes['begun'])}, and each time a new recording begins")
-    if notes["twice"]:
-        said.append(
-            f"{_rows(notes['twice'])} stood twice and {'was' if notes['twice'] == 1 else 'were'} taken once"
-        )
-    return Rows(
-        np.concatenate(parts),
-        np.repeat(np.arange(len(parts)), [len(part) for part in parts]),
-        tuple(labels),
-        (*rows.notes, *said),
-    )
-
-
-def _once(rows: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-    """The rows without those that are, to the last number, like the row before."""
-    own = numbers[:, rows]
-    same = (own[:, 1:] == own[:, :-1]).all(axis=0)
-    return rows[np.append(True, ~same)]
-
-
-def _restarts(rows: np.ndarray, t: np.ndarray) -> list[np.ndarray]:
-    """The rows, cut wherever the time returns to near its beginning; whole where it goes back elsewhere."""
-    time = t[rows]
-    cuts = np.flatnonzero(np.diff(time) < 0) + 1
-    begin = 0
-    for cut in cuts.tolist():
-        if time[cut] > time[begin] + RESTART * (time[cut - 1] - time[begin]):
-            return [rows]
-        begin = cut
-    return np.split(rows, cuts)
-
-
-def _rows(count: int) -> str:
-    return "one row" if count == 1 else f"{count} rows"
-
-
-def _recordings(count: int) -> str:
-    return "one recording" if count == 1 else f"{count} recordings"
-
-
-def _times(count: int) -> str:
-    return "once" if count == 1 else f"{count} times"
-
-
-class CheckedTable(NamedTuple):
-    """What `siq.data.recordings.Recordings` is made of, by the same names."""
-
-    names: tuple[str, ...]
-    units: tuple[str | None, ...]
-    labels: tuple[str, ...]
-    recording: np.ndarray
-    t: np.ndarray
-    values: np.ndarray
-    time_unit: str | None
-    headings: tuple[str, ...]
-    notes: tuple[str, ...]
 
 
 def read_tables(
@@ -185,7 +61,7 @@ def read_tables(
     columns: Sequence[str] | None,
     units: Mapping[str, str] | None,
     gaps: bool = True,
-) -> CheckedTable:
+) -> Recordings:
     """Read a file of recordings, or a folder that holds one file per recording.
 
     See `siq.data.recordings.read_recordings`.
@@ -204,7 +80,7 @@ def checked_table(
     units: Mapping[str, str] | None,
     *,
     gaps: bool = True,
-) -> CheckedTable:
+) -> Recordings:
     """Check a table that has been opened.
 
     Parameters
@@ -224,38 +100,48 @@ def checked_table(
     layout = layout_of(file, source, columns)
     used = [layout.time, *layout.states]
     cells = source.load([*([] if layout.recording is None else [layout.recording]), *used])
-    labels_of_rows = cells.pop(0) if layout.recording is not None else None
+    labels = cells.pop(0) if layout.recording is not None else None
     if len(cells[0]) == 0:
         raise InputError(file, "", "the table has no rows", "write at least two samples of one recording")
-    called = [source.headings[place].strip() if place == layout.time else layout.titles[index - 1]
-              for index, place in enumerate(used)]  # fmt: skip
-    names = ["t", *layout.names]
+    called = [source.headings[layout.time].strip(), *layout.titles]
     numbers = np.empty((len(used), len(cells[0])))
     found_units: list[str | None] = []
-    faults: list[CellFault] = []
+    faults: list[Fault] = []
     notes = list(layout.notes)
-    for index, (name, place) in enumerate(zip(names, used, strict=True)):
-        clock = seconds_of_clock(file, called[index], cells[index]) if name == "t" else None
+    for index, (name, place) in enumerate(zip(("t", *layout.names), used, strict=True)):
+        clock = _seconds_of_clock(file, called[0], cells[0]) if index == 0 else None
         cell_unit: str | None = "s"
         if clock is not None:
             numbers[index] = clock[0]
             notes.append(f"the times were turned into seconds since the first, {clock[1]}")
         else:
-            shown = name if name == "t" else called[index]
-            numbers[index], cell_unit, fault = parse_numbers(file, shown, cells[index])
+            shown = "t" if index == 0 else called[index]
+            numbers[index], cell_unit, fault = _parse_numbers(file, shown, cells[index])
             faults += [fault] if fault else []
         stated = {**layout.units[place], "cells": cell_unit}
-        found_units.append(agree_on_unit(file, called[index], stated, (units or {}).get(name)))
-    rows, fault = _grouped(file, labels_of_rows, numbers)
-    faults += [fault] if fault else []
-    _refuse(file, faults)
-    rows = trim(rows, numbers)
+        found_units.append(_agreed_unit(file, called[index], stated, (units or {}).get(name)))
+    # Rows without a label and without any number are padding.
+    blank = np.isnan(numbers).all(axis=0)
+    if labels is None:
+        order = np.flatnonzero(~blank)
+        rows = _Rows(order, np.zeros(len(order), dtype=np.int64), ("0",))
+    else:
+        recording, names, fault = _parse_labels(file, labels, blank)
+        faults += [fault] if fault else []
+        order = np.flatnonzero(recording >= 0)
+        order = order[np.argsort(recording[order], kind="stable")]
+        rows = _Rows(order, recording[order], names)
+    if dropped := numbers.shape[1] - len(rows.order):
+        notes.append(f"{dropped} empty row{'s were' if dropped > 1 else ' was'} left out")
+    if faults:
+        raise min(faults, key=lambda each: each[0])[1]
+    rows = _trimmed(rows, numbers, notes)
     if gaps:
-        rows = _without_gaps(rows, numbers)
-    _refuse_missing(file, numbers, rows, ["t", *called[1:]])
-    rows = put_in_order(rows, numbers, labelled=layout.recording is not None)
+        rows = _without_gaps(rows, numbers, notes)
+    _refuse_missing(file, numbers, rows, ["t", *layout.titles])
+    rows = _in_order(rows, numbers, layout.recording is not None, notes)
     check_times(file, numbers[0][rows.order], rows.recording, rows.labels, rows.order)
-    return CheckedTable(
+    return Recordings(
         names=layout.names,
         units=tuple(found_units[1:]),
         labels=rows.labels,
@@ -264,123 +150,326 @@ def checked_table(
         values=np.ascontiguousarray(numbers[1:, rows.order].T),
         time_unit=found_units[0],
         headings=() if layout.titles == layout.names else layout.titles,
-        notes=(*notes, *rows.notes),
+        notes=tuple(notes),
     )
 
 
-def _grouped(file: str, labels: object, numbers: np.ndarray) -> tuple[Rows, CellFault | None]:
-    """The rows by recording; those without a label and without any number are padding and left out."""
-    blank = np.isnan(numbers).all(axis=0)
-    notes: tuple[str, ...] = ()
-    if labels is None:
-        order = np.flatnonzero(~blank)
-        rows = Rows(order, np.zeros(len(order), dtype=np.int64), ("0",))
-        fault = None
+def _parse_numbers(file: str, name: str, cells: Column) -> tuple[np.ndarray, str | None, Fault | None]:
+    """Numbers of a column, NaN where nothing stands, the unit that all cells carry, and the first fault.
+
+    A fault is a cell that is infinite, no number, or in another unit than the first row. A column that as a
+    whole holds something other than numbers, such as dates, is refused at once.
+    """
+    if pa.types.is_dictionary(cells.type):
+        cells = cells.cast(cells.type.value_type)
+    unit, fault = "", None
+    if _is_text(cells.type):
+        cells, unit, fault = _split_units(file, name, cells)
+    elif not any(is_kind(cells.type) for is_kind in _NUMERIC):
+        remedy = "write it as numbers in one unit"
+        raise InputError(file, f"column {name}", f"it holds {cells.type}, not numbers", remedy)
+    try:
+        values = cells.cast(pa.float64()).to_numpy(zero_copy_only=False)
+    except pa.ArrowInvalid:
+        remedy = "subtract a constant, such as the time of the first sample"
+        raise InputError(file, f"column {name}", "its integers are too large to be exact", remedy) from None
+    infinite = np.isinf(values)
+    row = int(np.argmax(infinite)) + 1
+    if infinite.any() and (fault is None or row < fault[0]):
+        remedy = "remove the row or write a finite number"
+        fault = row, InputError(file, f"row {row}, column {name}", "the value is infinite", remedy)
+    return values, unit or None, fault
+
+
+def _split_units(file: str, name: str, cells: Column) -> tuple[Column, str, Fault | None]:
+    """Split cells of text into numbers (null where there is none) and the one unit that follows them."""
+    cells = pc.utf8_trim_whitespace(cells.cast(pa.string()))
+    cells = pc.if_else(pc.equal(cells, ""), None, cells)
+    # The first cell says which unit to expect; only a cell that differs is looked at more closely.
+    unit = _unit_of(next(iter(cells.drop_null().slice(0, 1).to_pylist()), "")) or ""
+    ending = (r"\s+" if unit[:1].isdigit() else r"\s*") + re.escape(unit) if unit else ""
+    good = pc.fill_null(pc.match_substring_regex(cells, f"^{_NUMBER}{ending}$"), False)
+    numbers = pc.replace_substring_regex(pc.if_else(good, cells, None), f"{ending}$", "")
+    bad = pc.and_not(pc.is_valid(cells), good).to_numpy(zero_copy_only=False)
+    if not bad.any():
+        return numbers, unit, None
+    row = int(np.argmax(bad))
+    found = _unit_of(cells[row].as_py())
+    if found is None:
+        fault = f"'{cells[row].as_py()}' is no number"
+        remedy = "write a number with a decimal point, or remove the row"
+        if not good.to_numpy(zero_copy_only=False).any():
+            remedy = "if the column is no state, name the states in the study, or remove the column"
     else:
-        recording, names, fault = parse_labels(file, labels, blank=blank)
-        order = np.flatnonzero(recording >= 0)
-        order = order[np.argsort(recording[order], kind="stable")]
-        rows = Rows(order, recording[order], names)
-    dropped = numbers.shape[1] - len(rows.order)
-    if dropped:
-        notes = (f"{dropped} empty row{'s were' if dropped > 1 else ' was'} left out",)
-    return Rows(rows.order, rows.recording, rows.labels, notes), fault
+        fault = f"mixed units, {found or 'no unit'} after rows in {unit or 'no unit'}"
+        remedy = "convert the whole column to one unit"
+    return numbers, unit, (row + 1, InputError(file, f"row {row + 1}, column {name}", fault, remedy))
 
 
-def _refuse(file: str, faults: Sequence[CellFault]) -> None:
-    if faults:
-        first = min(faults, key=lambda each: each.row)
-        raise InputError(file, f"row {first.row}, column {first.column}", first.fault, first.remedy)
+def _unit_of(cell: str) -> str | None:
+    """Find the unit in a cell of text: empty where there is none, None where the cell holds no number."""
+    match = re.fullmatch(f"{_NUMBER}({_UNIT})?", cell)
+    return (match[1] or "").strip() if match else None
 
 
-def _without_gaps(rows: Rows, numbers: np.ndarray) -> Rows:
-    """Leave out rows in which a measured value is missing, where they are the few.
+def _is_text(kind: pa.DataType) -> bool:
+    return pa.types.is_string(kind) or pa.types.is_large_string(kind) or pa.types.is_string_view(kind)
 
-    Their times tell the gap, across which nothing is learned. Where most are missing, the columns were hardly
-    meant to be one state, and they are refused.
+
+def _parse_labels(
+    file: str, cells: Column, blank: np.ndarray
+) -> tuple[np.ndarray, tuple[str, ...], Fault | None]:
+    """Give every label of the column ``recording`` a number, in order of first appearance.
+
+    A blank row, in which nothing else stands either, needs no label and gets -1. Labels are text without
+    outer spaces; 3 and 3.0 both become ``"3"``.
+    """
+    if isinstance(cells, pa.ChunkedArray):
+        cells = cells.combine_chunks()
+    if pa.types.is_nested(cells.type):
+        remedy = "write one text or whole number per row"
+        raise InputError(file, "column recording", f"it holds {cells.type}, not labels", remedy)
+    if not pa.types.is_dictionary(cells.type):
+        cells = cells.dictionary_encode()
+    # All work on text is done once per label, not once per row.
+    texts = cells.dictionary
+    if not _is_text(texts.type):
+        texts = pa.array([_label(value) for value in texts.to_pylist()], type=pa.string())
+    texts = pc.fill_null(pc.utf8_trim_whitespace(texts.cast(pa.string())), "").dictionary_encode()
+    merged = np.append(texts.indices.to_numpy(), -1)
+    codes = merged[cells.indices.cast(pa.int64()).fill_null(len(merged) - 1).to_numpy()]
+    missing = (codes == -1) | (codes == texts.dictionary.index("").as_py())
+    if (missing & ~blank).any():
+        row = int(np.argmax(missing & ~blank)) + 1
+        remedy = "write the label of the row's recording"
+        fault = InputError(file, f"row {row}, column recording", "the label is missing", remedy)
+        return codes, (), (row, fault)
+    present = pa.array(codes, mask=missing).dictionary_encode()  # again, now in order of first appearance
+    labels = tuple(texts.dictionary.take(present.dictionary).to_pylist())
+    return present.indices.fill_null(-1).to_numpy().astype(np.int64), labels, None
+
+
+def _label(value: object) -> str:
+    if value is None or value != value:  # NaN, as missing numbers are written
+        return ""
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
+    return value.decode("utf-8", errors="replace") if isinstance(value, bytes) else str(value)
+
+
+def _agreed_unit(file: str, name: str, stated: Mapping[str, str | None], expected: str | None) -> str | None:
+    """The unit of a column, on which every place that states one must agree, and with what is expected."""
+
+    def plain(unit: str) -> str:
+        # The micro sign and the Greek letter look the same, as do m/s² and m/s2 to a reader.
+        return unicodedata.normalize("NFKC", unit).replace(" ", "")
+
+    places = [(place, unit) for place, unit in stated.items() if unit is not None]
+    for place, unit in places[1:]:
+        if plain(unit) != plain(places[0][1]):
+            fault = f"mixed units, {places[0][1]} in the {places[0][0]} but {unit} in the {place}"
+            remedy = "state one unit, the one in which the numbers are"
+            raise InputError(file, f"column {name}", fault, remedy)
+    unit = places[0][1] if places else None
+    if unit is not None and expected is not None and plain(unit) != plain(expected):
+        fault = f"the unit is {unit} where the system card has {expected}"
+        remedy = f"convert the column to {expected}, or correct the unit in the card"
+        raise InputError(file, f"column {name}", fault, remedy)
+    return unit
+
+
+def _seconds_of_clock(file: str, name: str, cells: Column) -> tuple[np.ndarray, str] | None:
+    """Seconds since the first time of a column of dates or times of day, and that time as it was written.
+
+    None where the column holds neither. A date that can be read in two ways is refused.
+    """
+    if pa.types.is_dictionary(cells.type):
+        cells = cells.cast(cells.type.value_type)
+    kind, first = cells.type, ""
+    if pa.types.is_string(kind) or pa.types.is_large_string(kind):
+        text = cells.to_pandas().str.strip().replace("", None)
+        first = next(iter(text.dropna()), "")
+        if _SLASHED_DATE.fullmatch(first):
+            fault = f"the date '{first}' can be read in two ways"
+            remedy = "write dates as 2024-12-31 12:00:00, or the time as seconds"
+            raise InputError(file, f"column {name}", fault, remedy)
+        points = text.str.replace(",", ".")
+        try:
+            if _ISO_DATE.fullmatch(first):
+                values = pd.to_datetime(points, format="ISO8601", utc=True)
+            elif _GERMAN_DATE.fullmatch(first):
+                values = pd.to_datetime(points, dayfirst=True, format="mixed")
+            elif _TIME_OF_DAY.fullmatch(first):
+                values = pd.to_timedelta(points.where(points.str.count(":") != 1, points + ":00"))
+            else:
+                return None
+        except (ValueError, TypeError):
+            fault = f"not all of its cells are dates or times such as '{first}'"
+            remedy = "write every time in the same way, or as seconds"
+            raise InputError(file, f"column {name}", fault, remedy) from None
+    elif pa.types.is_time(kind):
+        values = pd.to_timedelta(cells.to_pandas().astype(str))
+    elif pa.types.is_date(kind):
+        values = pd.to_datetime(cells.to_pandas())
+    elif pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
+        values = cells.to_pandas()
+    else:
+        return None
+    present = values.dropna()
+    if len(present) == 0:
+        return None
+    start = present.iloc[0]
+    return ((values - start) / pd.Timedelta(seconds=1)).to_numpy(dtype=float), first or str(start)
+
+
+def _trimmed(rows: _Rows, numbers: np.ndarray, notes: list[str]) -> _Rows:
+    """Without rows at the ends of recordings in which a number is missing, where two others are left."""
+    whole = ~np.isnan(numbers[:, rows.order]).any(axis=0)
+    place, count = np.arange(len(whole)), len(rows.labels)
+    first, last = np.full(count, len(whole)), np.full(count, -1)
+    np.minimum.at(first, rows.recording[whole], place[whole])
+    np.maximum.at(last, rows.recording[whole], place[whole])
+    inner = np.bincount(rows.recording[whole], minlength=count) >= 2
+    keep = (place >= first[rows.recording]) & (place <= last[rows.recording]) | ~inner[rows.recording]
+    dropped = int((~keep).sum())
+    if dropped == 0:
+        return rows
+    at = len(np.unique(rows.recording[~keep]))
+    notes.append(
+        f"{_count(dropped, 'row')} with missing values at the beginning or the end of"
+        f" {_count(at, 'recording')} {'was' if dropped == 1 else 'were'} left out"
+    )
+    return _Rows(rows.order[keep], rows.recording[keep], rows.labels)
+
+
+def _without_gaps(rows: _Rows, numbers: np.ndarray, notes: list[str]) -> _Rows:
+    """Without rows in which a measured value is missing, where they are the few.
+
+    Where most are missing, the columns were hardly meant to be one state, and they are refused.
     """
     missing = np.isnan(numbers[1:, rows.order]).any(axis=0) & ~np.isnan(numbers[0, rows.order])
     count = int(missing.sum())
     if not count or 2 * count > len(missing):
         return rows
-    said = (
-        "1 row in which a value is missing was"
-        if count == 1
-        else f"{count} rows in which a value is missing were"
+    many = count > 1
+    notes.append(
+        f"{count} row{'s' if many else ''} in which a value is missing {'were' if many else 'was'} left out;"
+        f" nothing is learned across the gap{'s' if many else ''}"
     )
-    note = f"{said} left out; nothing is learned across the gap{'' if count == 1 else 's'}"
-    kept = ~missing
-    present, recording = np.unique(rows.recording[kept], return_inverse=True)
-    labels = tuple(rows.labels[place] for place in present)
-    return Rows(rows.order[kept], recording, labels, (*rows.notes, note))
+    present, recording = np.unique(rows.recording[~missing], return_inverse=True)
+    return _Rows(rows.order[~missing], recording, tuple(rows.labels[place] for place in present))
 
 
-def _refuse_missing(file: str, numbers: np.ndarray, rows: Rows, called: Sequence[str]) -> None:
-    missing = np.isnan(numbers[:, rows.order])
-    if not missing.any():
+def _refuse_missing(file: str, numbers: np.ndarray, rows: _Rows, called: Sequence[str]) -> None:
+    wrong = np.flatnonzero(np.isnan(numbers[:, rows.order]).any(axis=0))
+    if not len(wrong):
         return
-    wrong = np.flatnonzero(missing.any(axis=0))
     row = int(rows.order[wrong].min())
-    column = int(np.argmax(np.isnan(numbers[:, row])))
+    column = called[int(np.argmax(np.isnan(numbers[:, row])))]
     if len(wrong) == len(rows.order) and len(wrong) > 2:
-        raise InputError(
-            file, "", "no row has a value in every column",
-            "interpolate all columns to the same times, or name the states in the study",
-        )  # fmt: skip
-    others = f", as in {len(wrong) - 1} more row{'s' if len(wrong) > 2 else ''}" if len(wrong) > 1 else ""
-    remedy = (
-        "remove the row or write a finite number"
-        if not others
-        else "remove these rows or write finite numbers"
-    )
-    raise InputError(
-        file,
-        f"row {row + 1}, column {called[column]}",
-        f"the value is missing (empty or NaN){others}",
-        remedy,
-    )
+        remedy = "interpolate all columns to the same times, or name the states in the study"
+        raise InputError(file, "", "no row has a value in every column", remedy)
+    others, remedy = "", "remove the row or write a finite number"
+    if len(wrong) > 1:
+        others = f", as in {len(wrong) - 1} more row{'s' if len(wrong) > 2 else ''}"
+        remedy = "remove these rows or write finite numbers"
+    fault = f"the value is missing (empty or NaN){others}"
+    raise InputError(file, f"row {row + 1}, column {column}", fault, remedy)
 
 
-def _joined(files: Sequence[Path], tables: Sequence[CheckedTable], folder: str) -> CheckedTable:
+def _in_order(rows: _Rows, numbers: np.ndarray, labelled: bool, notes: list[str]) -> _Rows:
+    """Without rows that stand twice, sorted where in no order; a recording begins where the time starts over.
+
+    `labelled` says that the table itself tells where its recordings begin.
+    """
+    t = numbers[0]
+    inside = rows.recording[1:] == rows.recording[:-1]
+    if not (inside & (np.diff(t[rows.order]) <= 0)).any():
+        return rows
+    bounds = np.searchsorted(rows.recording, np.arange(len(rows.labels) + 1))
+    parts, labels, was_sorted, twice, begun = [], [], 0, 0, 0
+    for index, label in enumerate(rows.labels):
+        own = rows.order[bounds[index] : bounds[index + 1]]
+        pieces = [own]
+        back = np.flatnonzero(np.diff(t[own]) < 0) + 1
+        if len(back) >= 3 and len(back) > SHUFFLED_SHARE * (len(own) - 1):
+            order = own[np.argsort(t[own], kind="stable")]
+            if (np.diff(t[_once(order, numbers)]) > 0).all():
+                was_sorted += 1
+                pieces = [order]
+        elif len(back) and not labelled:
+            # Cut where the time returns to near its beginning; not at all where it goes back elsewhere.
+            begins = own[np.append(0, back[:-1])]
+            took = t[own[back - 1]] - t[begins]
+            if (t[own[back]] <= t[begins] + RESTART_SHARE * took).all():
+                pieces = np.split(own, back)
+                begun += len(back)
+        for number, piece in enumerate(pieces):
+            once = _once(piece, numbers)
+            twice += len(piece) - len(once)
+            parts.append(once)
+            labels.append(label if len(pieces) == 1 else f"{label}/{number}" if label != "0" else str(number))
+    if was_sorted:
+        notes.append(
+            f"the rows of {_count(was_sorted, 'recording')} stood in no order and were sorted by time"
+        )
+    if begun:
+        times = "once" if begun == 1 else f"{begun} times"
+        notes.append(f"the time starts over {times}, and each time a new recording begins")
+    if twice:
+        were = "was" if twice == 1 else "were"
+        notes.append(f"{_count(twice, 'row')} stood twice and {were} taken once")
+    lengths = [len(part) for part in parts]
+    return _Rows(np.concatenate(parts), np.repeat(np.arange(len(parts)), lengths), tuple(labels))
+
+
+def _once(rows: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+    """The rows without those that are, to the last number, like the row before."""
+    own = numbers[:, rows]
+    return rows[np.append(True, ~(own[:, 1:] == own[:, :-1]).all(axis=0))]
+
+
+def _count(number: int, noun: str) -> str:
+    return f"one {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def _joined(files: Sequence[Path], tables: Sequence[Recordings], folder: str) -> Recordings:
     """Tables of one folder as one; the name of a file is that of its recording."""
-    first = tables[0]
-    places = [[0] * 0 for _ in tables]
+    first, names = tables[0], [file.name for file in files]
+    stems = [file.stem for file in files]
     labels: list[str] = []
-    for file, table, order in zip(files, tables, places, strict=True):
-        if set(table.names) != set(first.names):
-            odd = sorted(set(table.names) ^ set(first.names))
-            raise InputError(
-                str(file), "", f"its columns are {', '.join(table.names)}, and those of {files[0].name} are"
-                f" {', '.join(first.names)}",
-                f"give {', '.join(odd)} to all files or to none, or name the states in the study",
-            )  # fmt: skip
-        order += [table.names.index(name) for name in first.names]
-        stem = file.stem
-        if [other.stem for other in files].count(stem) > 1:
-            stem = file.name
+    for file, table in zip(files, tables, strict=True):
+        if odd := sorted(set(table.names) ^ set(first.names)):
+            fault = f"its columns are {', '.join(table.names)}, and those of {names[0]} are"
+            remedy = f"give {', '.join(odd)} to all files or to none, or name the states in the study"
+            raise InputError(str(file), "", f"{fault} {', '.join(first.names)}", remedy)
+        stem = file.name if stems.count(file.stem) > 1 else file.stem
         labels += [stem] if len(table.labels) == 1 else [f"{stem}/{label}" for label in table.labels]
-    names = [file.name for file in files]
-    units = []
-    for index, name in enumerate(first.names):
-        stated = [table.units[order[index]] for table, order in zip(tables, places, strict=True)]
-        units.append(agree_on_unit(folder, name, dict(zip(names, stated, strict=True)), None))
-    stated = [table.time_unit for table in tables]
-    time_unit = agree_on_unit(folder, "t", dict(zip(names, stated, strict=True)), None)
-    counts = np.cumsum([0, *(len(table.labels) for table in tables)])
-    notes = [f"the folder holds {len(files)} files, one recording each" if len(labels) == len(files)
-             else f"the folder holds {len(files)} files with {len(labels)} recordings"]  # fmt: skip
+    orders = [[table.names.index(name) for name in first.names] for table in tables]
+
+    def agreed(name: str, stated: Sequence[str | None]) -> str | None:
+        return _agreed_unit(folder, name, dict(zip(names, stated, strict=True)), None)
+
+    units = tuple(
+        agreed(name, [table.units[order[index]] for table, order in zip(tables, orders, strict=True)])
+        for index, name in enumerate(first.names)
+    )
+    time_unit = agreed("t", [table.time_unit for table in tables])
+    starts = np.cumsum([0, *(len(table.labels) for table in tables)])
+    held = "one recording each" if len(labels) == len(files) else f"with {len(labels)} recordings"
+    notes = [f"the folder holds {len(files)} files{',' if len(labels) == len(files) else ''} {held}"]
     for note in dict.fromkeys(note for table in tables for note in table.notes):
         having = sum(note in table.notes for table in tables)
         notes.append(note if having == len(tables) else f"in {having} of {len(tables)} files {note}")
-    return CheckedTable(
+    return Recordings(
         names=first.names,
-        units=tuple(units),
+        units=units,
         labels=tuple(labels),
         recording=np.concatenate(
-            [table.recording + start for table, start in zip(tables, counts, strict=False)]
+            [table.recording + start for table, start in zip(tables, starts, strict=False)]
         ),
         t=np.concatenate([table.t for table in tables]),
-        values=np.concatenate([table.values[:, order] for table, order in zip(tables, places, strict=True)]),
+        values=np.concatenate([table.values[:, order] for table, order in zip(tables, orders, strict=True)]),
         time_unit=time_unit,
         headings=first.headings,
         notes=tuple(notes),

@@ -1,36 +1,25 @@
-"""Two-state statistics of a record: levels, hops, residence times.
+"""Two states of a record: whether it supports two, their levels, hops and residence times.
 
-A hidden Markov model of two normal distributions finds the levels, and what both have in common is the
-background; each in turn.
+Nothing is identified here: this is what the numbers say before any f is known, and it holds where none is
+found or certified.
+
+*Levels.* A hidden Markov model of two normal distributions finds the levels, and what both have in common is
+the background (`siq.data.stationarity.background_of`); each in turn.
 
 *Hops* are counted with two thresholds, the levels of the two states: a visit begins where the record reaches
-the level of a state, and lasts until it reaches the level of the other one. The mean dwell time is the time
-of all visits, those that the record cuts at its ends included, over the number of visits whose end was seen:
-the best estimate for exponential times, with a relative error of ``1/√n``.
+the level of a state, and lasts until it reaches the level of the other one. The mean residence time is the
+time of all visits, those that the record cuts at its ends included, over the number of visits whose end was
+seen: the best estimate for exponential times, with a relative error of ``1/√n``.
 
-Two tests. *The first one* regresses increments over a lag on polynomials of the state in stretches of forty
-local relaxation times, each with a level of its own, which takes with it whatever drifts slowly. With the
-polynomial of the state, ``E[x(t + 2l) - x(t + l) | x(t)] = l·f(x(t))``, every difference f(b) - f(a) with
-a < b would be negative if a single state attracted; the sensor's noise in x(t) is not that of the increment.
-The largest of them in standard errors counts, with Scheffé's bound for having looked at all pairs.
-
-*The second one* asks for a valley of the histogram, deeper than in surrogates of the record with the same
-spectrum and random phases, which are what a linear system could have shown; of both, every such stretch is
-taken less a straight line.
-
-Nothing is identified here: this is what the numbers say before any formula does.
-
-*Two states.* A histogram with two peaks is no evidence: a slow background makes one of a single state. Two
-states have a place between them *from which the record is pushed away to both sides*: that is the first test.
-Where hops are faster than that shows, as in counts of events, there is a second one, a valley of the
-histogram that no linear system shows (`siq.data.two_states` has both). Few hops do not pass it, and
-records that stay where they are neither; and where a single state attracts beyond doubt by the first test, it
-is not asked. Two states are supported if one of the tests says so, and a hop was seen.
-
-*Hops* are counted from one of their levels (`siq.data.two_states`) to the other (`siq.data.two_states`).
-
-This holds where no f is found, or none is certified: it is counted, and rests on no model but that of two
-levels (`siq.data.two_states`).
+*Two tests.* A histogram with two peaks is no evidence: a slow background makes one of a single state. Two
+states have a place between them from which the record is pushed away to both sides. The first test regresses
+increments over a lag on polynomials of the state in stretches of forty local relaxation times, each with a
+level of its own, which takes with it whatever drifts slowly. With the polynomial of the state,
+``E[x(t + 2l) - x(t + l) | x(t)] = l·f(x(t))``, every difference f(b) - f(a) with a < b would be negative if a
+single state attracted. The largest of them in standard errors counts, with Scheffé's bound for having looked
+at all pairs. The second test asks for a valley of the histogram, deeper than in surrogates of the record with
+the same spectrum and random phases, which are what a linear system could have shown; it is not asked where
+the first one is beyond doubt. Two states are supported if one of the tests says so, and a hop was seen.
 """
 
 from __future__ import annotations
@@ -42,35 +31,38 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy import stats
 
-from siq.data.correlation import noise_floors
 from siq.data.recordings import Recordings
 from siq.data.stationarity import (
+    MOST_STRETCHES,
     Background,
     background_of,
     relaxation_samples,
     runs_of,
     stretches_of,
-    stretches_of_all,
     usual_step,
-    without_background,
 )
 from siq.numerics.integration import machine_code
 from siq.numerics.text import range_text, unit_text, value_text
 
-WINDOW = 0.5  # of the local relaxation time, over which samples are averaged for the hidden Markov model
-SWEEPS = 200  # of its estimation, at most
+if TYPE_CHECKING:
+    import pandas as pd
+
+AVERAGING_TIME = (
+    0.5  # of the local relaxation time, over which samples are averaged for the hidden Markov model
+)
+MOST_ITERATIONS = 200  # of its estimation, at most
 
 
 def two_levels(
     recordings: Recordings, values: np.ndarray, runs: list[slice], relaxation: float
 ) -> tuple[Background, tuple[float, float], tuple[float, float]]:
     """Two levels over a common background: each in turn, until neither changes."""
-    width = max(int(WINDOW * relaxation), 1)
+    width = max(int(AVERAGING_TIME * relaxation), 1)
     background = Background(np.zeros(len(values)), 0)
     levels, spreads = (0.0, 0.0), (0.0, 0.0)
     for _ in range(5):
         flat = values - background.values
-        begins = stretches_of_all(runs, width)
+        begins = stretches_of(runs, width)
         means = flat[begins[:, None] + np.arange(width)].mean(axis=1)
         first = np.append(True, np.diff(begins) != width)
         centre, spread, weights = _two_normals(means, first)
@@ -101,7 +93,7 @@ def _two_normals(series: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, ...
     smallest = 1e-3 * max(float(series.std()), 1e-300)  # a level of a single repeated value has no spread
     before = -np.inf
     weights = np.full((len(series), 2), 0.5)
-    for _ in range(SWEEPS):
+    for _ in range(MOST_ITERATIONS):
         logs = -0.5 * ((series[:, None] - centre) / spread) ** 2 - np.log(spread)
         highest = logs.max(axis=1, keepdims=True)
         weights, pairs, likelihood = _forward_backward(np.exp(logs - highest), transition, first)
@@ -241,15 +233,18 @@ def dwell_counts(
 
 
 SURROGATES = 999  # for each state that is looked at: fewer could not be rare enough for all of them
-ENOUGH = 20  # as deep as the record: the probability is then known to a fifth
+ENOUGH_DEEPER = 20  # as deep as the record: the probability is then known to a fifth
 MOST_POINTS = 8192  # of a series that surrogates are made of
 BINS = 40  # of a histogram with a valley
 DEGREE = 5  # of f in the test: two attractors that differ in depth and width need more than a cubic
-STRETCH = 40  # local relaxation times: shorter ones bias f towards one state, longer ones let drifts in
-FEWEST, SHORTEST = 6, 10  # stretches, at least, for which they may be as short as ten relaxation times
-LAG = 0.1  # of the local relaxation time: over it a state hardly changes what pushes it
-PLACES = 25  # at which f is compared with itself, between the quantiles
-INNER = 0.02  # the quantile from which on f is known well enough
+STRETCH_TIMES = 40  # local relaxation times: shorter ones bias f towards one state, longer ones let drifts in
+FEWEST_STRETCHES, SHORTEST_TIMES = (
+    6,
+    10,
+)  # stretches, at least, for which they may be as short as ten relaxation times
+LAG_SHARE = 0.1  # of the local relaxation time: over it a state hardly changes what pushes it
+PLACES_COMPARED = 25  # at which f is compared with itself, between the quantiles
+INNER_QUANTILE = 0.02  # the quantile from which on f is known well enough
 
 
 def pushed_apart(values: np.ndarray, runs: list[slice], relaxation: float) -> tuple[float, float] | None:
@@ -270,11 +265,15 @@ def pushed_apart(values: np.ndarray, runs: list[slice], relaxation: float) -> tu
         The largest ``(f(b) - f(a)) / error`` with a < b, and its probability by Scheffé's bound; None where
         there are too few stretches.
     """
-    lag = max(int(LAG * relaxation), 1)
-    longest = sum(run.stop - run.start for run in runs) / (lag * FEWEST) - 2
-    rows = int(min(np.ceil(STRETCH * relaxation / lag), longest))
-    begins = stretches_of(runs, (rows + 2) * lag) if rows * lag >= SHORTEST * relaxation else np.zeros(0)
-    if len(begins) < FEWEST - 2:  # gaps cost some
+    lag = max(int(LAG_SHARE * relaxation), 1)
+    longest = sum(run.stop - run.start for run in runs) / (lag * FEWEST_STRETCHES) - 2
+    rows = int(min(np.ceil(STRETCH_TIMES * relaxation / lag), longest))
+    begins = (
+        stretches_of(runs, (rows + 2) * lag, most=MOST_STRETCHES)
+        if rows * lag >= SHORTEST_TIMES * relaxation
+        else np.zeros(0)
+    )
+    if len(begins) < FEWEST_STRETCHES - 2:  # gaps cost some
         return None
     low, high = np.quantile(values, [0.001, 0.999])
     if not high > low:
@@ -298,10 +297,16 @@ def pushed_apart(values: np.ndarray, runs: list[slice], relaxation: float) -> tu
     covariance = inverse * float(rest @ rest) / freedom
     if len(begins) >= 4 * DEGREE:
         robust = inverse @ (scores.T @ scores) @ inverse * len(begins) / (len(begins) - 1)
-        covariance = _larger(covariance, robust)
-    places = np.linspace(np.quantile(now, INNER), np.quantile(now, 1 - INNER), PLACES)
+        # Not smaller than either in any direction in which they differ.
+        root = np.linalg.cholesky(covariance)
+        whitening = np.linalg.inv(root)
+        values_of, vectors = np.linalg.eigh(whitening @ robust @ whitening.T)
+        covariance = (root @ vectors * np.maximum(values_of, 1.0)) @ (root @ vectors).T
+    places = np.linspace(
+        np.quantile(now, INNER_QUANTILE), np.quantile(now, 1 - INNER_QUANTILE), PLACES_COMPARED
+    )
     at_places = np.polynomial.legendre.legvander(places, DEGREE)[:, 1:]
-    first, second = np.triu_indices(PLACES, k=1)
+    first, second = np.triu_indices(PLACES_COMPARED, k=1)
     contrasts = at_places[second] - at_places[first]
     errors = np.sqrt(np.einsum("ij,jk,ik->i", contrasts, covariance, contrasts))
     largest = float(np.max(contrasts @ coefficients / errors))
@@ -325,7 +330,7 @@ def valley_between(
     generator
         Where the phases of the surrogates come from; None makes none.
     surrogates
-        How many, unless `ENOUGH` of them are as deep before: then it is no rare thing (Besag and Clifford,
+        How many, unless `ENOUGH_DEEPER` of them are as deep before: then it is not rare (Besag, Clifford,
         Biometrika 78 (1991) 301).
 
     Returns
@@ -334,7 +339,12 @@ def valley_between(
         The share of the samples, and its probability among surrogates with random phases.
     """
     every = max(int(relaxation / 4), -(-len(values) // MOST_POINTS), 1)
-    levelled = _less_lines(values, runs, max(int(STRETCH * relaxation), 2))
+    levelled = values.copy()
+    for run in runs:  # less a straight line in every stretch, the last of a run longer
+        count = max((run.stop - run.start) // max(int(STRETCH_TIMES * relaxation), 2), 1)
+        for rows in np.array_split(np.arange(run.start, run.stop), count):
+            line = np.vander(np.linspace(-1, 1, len(rows)), 2)
+            levelled[rows] -= line @ np.linalg.lstsq(line, values[rows], rcond=None)[0]
     parts = [levelled[run][::every] for run in runs if run.stop - run.start >= 4 * every]
     if not parts:
         return 0.0, 1.0
@@ -350,20 +360,9 @@ def valley_between(
             turned[0] = spectrum[0]
             drawn.append(np.fft.irfft(turned, n=size))
         deeper += _valley(np.concatenate(drawn)) >= seen
-        if deeper == ENOUGH:
+        if deeper == ENOUGH_DEEPER:
             return seen, deeper / (number + 1)
     return seen, (1 + deeper) / (1 + surrogates)
-
-
-def _less_lines(values: np.ndarray, runs: list[slice], length: int) -> np.ndarray:
-    """The series less a straight line in every stretch of that many samples, the last of a run longer."""
-    rest = values.copy()
-    for run in runs:
-        count = max((run.stop - run.start) // length, 1)
-        for part in np.array_split(np.arange(run.start, run.stop), count):
-            line = np.vander(np.linspace(-1, 1, len(part)), 2)
-            rest[part] -= line @ np.linalg.lstsq(line, values[part], rcond=None)[0]
-    return rest
 
 
 def _valley(series: np.ndarray) -> float:
@@ -376,18 +375,11 @@ def _valley(series: np.ndarray) -> float:
     return float(np.minimum(left, right).max())
 
 
-def _larger(one: np.ndarray, two: np.ndarray) -> np.ndarray:
-    """A covariance that is not smaller than either in any direction in which they differ."""
-    root = np.linalg.cholesky(one)
-    inverse = np.linalg.inv(root)
-    values, vectors = np.linalg.eigh(inverse @ two @ inverse.T)
-    turned = root @ vectors
-    return (turned * np.maximum(values, 1.0)) @ turned.T
-
-
-LEVEL = 0.01  # probability with which a single state is taken for two
-DECIDED = 1e-5  # probability for the first test from which on the second one is not asked
-PULLED = -3.0  # standard errors: where f falls so clearly from every place to every other, one state attracts
+SIGNIFICANCE = 0.01  # probability with which a single state is taken for two
+DECISIVE_P = 1e-5  # probability for the first test from which on the second one is not asked
+PULLED_TOGETHER = (
+    -3.0
+)  # standard errors: where f falls so clearly from every place to every other, one state attracts
 
 
 @dataclass(frozen=True)
@@ -438,7 +430,7 @@ class Switching:
     @property
     def supported(self) -> bool:
         """Whether the record supports two states: it is pushed apart, and was seen to hop at least once."""
-        return self.probability < LEVEL and self.hops > 0
+        return self.probability < SIGNIFICANCE and self.hops > 0
 
 
 def switching(recordings: Recordings, *, generator: np.random.Generator | None = None) -> Switching | None:
@@ -476,7 +468,7 @@ def switching(recordings: Recordings, *, generator: np.random.Generator | None =
         if relaxation is None:  # too short, or a column that runs on like a clock
             continue
         pushed = pushed_apart(column, runs, relaxation) or (float("nan"), 1.0)
-        if pushed[0] < PULLED or pushed[1] < DECIDED:
+        if pushed[0] < PULLED_TOGETHER or pushed[1] < DECISIVE_P:
             valley = (valley_between(column, runs, relaxation, generator=None)[0], 1.0)
         else:
             number = SURROGATES * recordings.values.shape[1]
@@ -502,30 +494,6 @@ def switching(recordings: Recordings, *, generator: np.random.Generator | None =
         depth,
         min(2 * probability * len(tests), 1.0),
     )
-
-
-def without_slow_drift(recordings: Recordings) -> Recordings:
-    """A single long recording less what drifts slowly in it, which a note says for each state.
-
-    Of a record that supports two states the drift is what both levels have in common; of any other, what slow
-    cosines explain. Several recordings come back as they are: how they begin may be a part of what they show.
-    So does one without random forces, in which nothing but the system itself moves.
-    """
-    floors = noise_floors(recordings) if len(recordings.labels) == 1 else None
-    if floors is None or any(floor.process == 0 for floor in floors):
-        return recordings
-    found = switching(recordings)
-    flat = recordings
-    for state, values in enumerate(recordings.values.T):
-        if found is not None and found.supported and state == found.state:
-            flat = without_background(flat, state, found.background)
-        else:
-            flat = without_background(flat, state, background_of(recordings, values))
-    return flat
-
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 
 @dataclass(frozen=True, eq=False)
@@ -590,7 +558,12 @@ class RecordStates:
             return ""
         low, high = (value_text(level, unit=self.unit or "", digits=3) for level in self.levels)
         time = unit_text(self.time_unit) or "time units"
-        means = " and ".join(map(_mean_text, self.counts))
+        means = " and ".join(
+            f"{value_text(one.mean, digits=3)} ({range_text(*one.limits)})"
+            if one.visits
+            else f"more than {value_text(one.limits[0], digits=2)}"
+            for one in self.counts
+        )
         return (
             f"The recordings hop between two states of {self.state}, at {low} and {high}: {self.transitions}"
             f" transition{'s were' if self.transitions > 1 else ' was'} seen, from level to level, and the"
@@ -598,29 +571,17 @@ class RecordStates:
         )
 
     def as_data(self) -> dict[str, Any]:
-        """As plain data."""
-        return {
-            "state": self.state,
-            "unit": self.unit,
-            "time_unit": self.time_unit,
-            "supported": self.supported,
-            "probability": self.probability,
-            "levels": list(self.levels),
-            "counts": [{"visits": one.visits, "time": one.time} for one in self.counts],
-            "edges": self.edges.tolist(),
-            "density": self.density.tolist(),
-        }
+        """As plain data, which `from_data` reads back."""
+        counts = [vars(one) for one in self.counts]
+        arrays = {"edges": self.edges.tolist(), "density": self.density.tolist()}
+        return {**vars(self), "levels": list(self.levels), "counts": counts, **arrays}
 
     @classmethod
     def from_data(cls, data: Mapping[str, Any]) -> RecordStates:
         """What `as_data` gave."""
-        low, high = data["levels"]
-        first, second = (DwellCount(int(one["visits"]), float(one["time"])) for one in data["counts"])
-        return cls(
-            data["state"], data["unit"], data["time_unit"], bool(data["supported"]),
-            float(data["probability"]), (float(low), float(high)), (first, second),
-            np.array(data["edges"], dtype=float), np.array(data["density"], dtype=float),
-        )  # fmt: skip
+        first, second = (DwellCount(**one) for one in data["counts"])
+        arrays = {name: np.array(data[name], dtype=float) for name in ("edges", "density")}
+        return cls(**{**data, "levels": tuple(data["levels"]), "counts": (first, second), **arrays})
 
 
 def states_of_record(recordings: Recordings, found: Switching | None) -> RecordStates | None:
@@ -636,10 +597,3 @@ def states_of_record(recordings: Recordings, found: Switching | None) -> RecordS
         recordings.titles[found.state], recordings.units[found.state], recordings.time_unit,
         found.supported, found.probability, found.levels, found.counts, edges, density,
     )  # fmt: skip
-
-
-def _mean_text(one: DwellCount) -> str:
-    low, high = one.limits
-    if not one.visits:
-        return f"more than {value_text(low, digits=2)}"
-    return f"{value_text(one.mean, digits=3)} ({range_text(low, high)})"

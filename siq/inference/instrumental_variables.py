@@ -21,10 +21,9 @@ import numpy as np
 import scipy.linalg
 import scipy.special
 
-from siq.data.columns import sources
-from siq.data.correlation import MarkovLag, even_stretches, lagged_covariances, long_run_covariance
-from siq.data.recordings import Recordings, SnapshotPairs
-from siq.data.selection import select_recordings
+from siq.data.correlation import MarkovLag
+from siq.data.recordings import Recordings, SnapshotPairs, parent_recordings, select_recordings
+from siq.data.stationarity import even_stretches, lagged_covariances, long_run_covariance
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import IdentifiedField, flow_map
 from siq.inference.flow_regression import FlowRegression, copies, positive
@@ -84,7 +83,7 @@ def lagged_pairs(recordings: Recordings, lag: int) -> LaggedPairs:
         )
     now = at + lag
     x, t = recordings.values, recordings.t
-    recording = sources(recordings.labels)[recordings.recording[now]]
+    recording = parent_recordings(recordings.labels)[recordings.recording[now]]
     pairs = SnapshotPairs(x[now], x[now + 1], t[now + 1] - t[now], recording)
     return LaggedPairs(x[at], pairs, stretches.number[now], lag)
 
@@ -117,7 +116,9 @@ def coarse_pairs(recordings: Recordings, lag: int, *, lost: float) -> SnapshotPa
     at = at[(np.arange(len(at)) - begins[which]) % lag == 0]
     x, t = recordings.values, recordings.t
     h = np.maximum(t[at + lag] - t[at] - lost, 0.5 * stretches.step)
-    return SnapshotPairs(x[at], x[at + lag], h, sources(recordings.labels)[recordings.recording[at]])
+    return SnapshotPairs(
+        x[at], x[at + lag], h, parent_recordings(recordings.labels)[recordings.recording[at]]
+    )
 
 
 def lost_time(found: IdentifiedField, given: LaggedPairs) -> float:

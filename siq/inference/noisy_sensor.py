@@ -22,8 +22,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.special
 
-from siq.data.columns import decimals_of, quantum, rounding_error, sources
-from siq.data.recordings import Recordings, SnapshotPairs
+from siq.data.correlation import decimals_of, resolution_step, rounding_error
+from siq.data.recordings import Recordings, SnapshotPairs, parent_recordings
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import NOISE_FREE, FlowMap, IdentifiedField
 from siq.inference.flow_regression import positive, with_formula
@@ -81,7 +81,7 @@ class FilteredTerms:
         goal = white.innovations + white.columns @ (whole.model.values - _last_change(whole, white))
         # Whitened values stand one behind the other, all outputs of a sample together.
         outputs = data.outputs.shape[1]
-        blocks = blocks_of(sources(data.labels)[data.recording])
+        blocks = blocks_of(parent_recordings(data.labels)[data.recording])
         parts = triangles(white.columns, goal, np.repeat(blocks, outputs))
         triangle = np.asarray(np.linalg.qr(np.concatenate(parts), mode="r"))
         return cls(view, data, parts, Equation(triangle[:, :-1], triangle[:, -1], 1.0, critical))
@@ -517,7 +517,7 @@ COARSE = 0.05  # of the rms step of a state: rounding to less than that stops no
 
 def rounding_errors(recordings: Recordings) -> np.ndarray:
     """Standard deviation of what rounding did to each state, 0 where none is recognised: shape ``(d,)``."""
-    steps = [quantum(values) for values in recordings.values.T]
+    steps = [resolution_step(values) for values in recordings.values.T]
     return np.array([0.0 if step is None else rounding_error(step) for step in steps])
 
 
@@ -578,7 +578,7 @@ def rounding_text(recordings: Recordings, *, coarse: bool = False) -> str | None
     """
     alike: dict[tuple[float, str | None], list[str]] = {}
     for name, unit, values in zip(recordings.titles, recordings.units, recordings.values.T, strict=True):
-        step = quantum(values)
+        step = resolution_step(values)
         if step is None:
             continue
         if coarse and rounding_error(step) < COARSE * np.sqrt(np.mean(np.diff(values) ** 2)):

@@ -198,6 +198,18 @@ def range_text(low: float, high: float, *, unit: str = "") -> str:
     return _with_unit(f"{_two_digits(low)} to {_two_digits(high)}", unit)
 
 
+def span_text(span: tuple[float, float, float]) -> str:
+    """Write the least, the usual and the greatest of something; one number where all are alike.
+
+    Examples
+    --------
+    >>> span_text((1.0, 2.5, 12000.0))
+    '1 to 12,000 (usually 2.5)'
+    """
+    low, usual, high = (f"{value:,.0f}" if value >= 1000 else f"{value:.4g}" for value in span)
+    return low if low == high else f"{low} to {high} (usually {usual})"
+
+
 def _two_digits(value: float) -> str:
     power = _exponent(abs(value), 2) if value else 0
     if SMALLEST_PLAIN <= power <= LARGEST_PLAIN:

@@ -50,10 +50,18 @@ import numpy as np
 from scipy import sparse, stats
 from scipy.sparse.linalg import splu
 
+from siq.data.preparation import joined
 from siq.data.recordings import Recordings
-from siq.data.selection import joined
 from siq.data.stationarity import correlated_samples, runs_of, usual_step
-from siq.data.two_states import BINS, LEVEL, DwellCount, Switching, continued_visits, dwell_counts, switching
+from siq.data.two_states import (
+    BINS,
+    SIGNIFICANCE,
+    DwellCount,
+    Switching,
+    continued_visits,
+    dwell_counts,
+    switching,
+)
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import IdentifiedField, field_dynamics
 from siq.numerics.randomness import normal_draws
@@ -658,7 +666,7 @@ class RecordTest:
             Probability with which chance alone refuses what is right.
         """
         if self.unseen is not None:
-            rarity, limit = -float(np.log10(self.unseen.probability)), -float(np.log10(LEVEL))
+            rarity, limit = -float(np.log10(self.unseen.probability)), -float(np.log10(SIGNIFICANCE))
             return Verdict(rarity, limit, False, self.missing or "")
         found = [one.probability for one in self.visits] + [one.probability for one in self.densities]
         if self.missing is not None or not found:

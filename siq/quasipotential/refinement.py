@@ -26,8 +26,7 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as pydantic_dataclass
 
-from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
-from siq.data.selection import held_out_recordings
+from siq.data.recordings import Recordings, SnapshotPairs, held_out_recordings, snapshot_pairs
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import IdentifiedField
 from siq.inference.identification import FieldRecord

@@ -18,8 +18,8 @@ from matplotlib.figure import Figure
 from pydantic.dataclasses import dataclass
 
 from siq.data.inspection import inspection_of
+from siq.data.preparation import joined
 from siq.data.recordings import Recordings, snapshot_pairs
-from siq.data.selection import joined
 from siq.data.two_states import RecordStates
 from siq.inference.residuals import predict
 from siq.networks.decomposition import TrainedNetworks

@@ -198,7 +198,7 @@ def _cores(text: str) -> str:
 
 
 def _inspect(options: argparse.Namespace) -> Exit:
-    from siq.data.inspection import inspect_recordings
+    from siq.data.inspection import inspect as inspect_recordings
 
     for file in options.recordings:
         print(inspect_recordings(file).text())

@@ -11,8 +11,14 @@ import numpy as np
 from pydantic.dataclasses import dataclass
 
 from siq.data.correlation import MarkovLag, markov_lag
-from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
-from siq.data.selection import held_out_recordings, joined, select_recordings
+from siq.data.preparation import joined
+from siq.data.recordings import (
+    Recordings,
+    SnapshotPairs,
+    held_out_recordings,
+    select_recordings,
+    snapshot_pairs,
+)
 from siq.errors import NumericalFailure
 from siq.inference.diffusion_model import constant_noise_probability, with_random_forces
 from siq.inference.field_estimate import (

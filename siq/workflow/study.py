@@ -14,7 +14,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from siq.data.columns import read_heading, usable_name
+from siq.data.layout import read_heading, usable_name
 from siq.errors import InputError, suggestion
 from siq.inference.identification import IdentificationOptions
 from siq.inference.library import candidate_library

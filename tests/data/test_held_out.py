@@ -3,8 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from siq.data.recordings import Recordings
-from siq.data.selection import held_out_recordings, resample_recordings, select_recordings
+from siq.data.recordings import Recordings, held_out_recordings, resample_recordings, select_recordings
 from siq.errors import NumericalFailure
 
 

@@ -7,14 +7,12 @@ from remembering import STEP, double_wells, trap
 from siq.data.correlation import (
     MarkovLag,
     coloured_displacement,
-    even_stretches,
     exposure_displacement,
     increment_covariances,
-    lagged_covariances,
-    long_run_covariance,
     markov_lag,
 )
 from siq.data.recordings import Recordings
+from siq.data.stationarity import even_stretches, lagged_covariances, long_run_covariance
 
 
 def recorded(values: np.ndarray, step: float = STEP) -> Recordings:

@@ -12,8 +12,14 @@ import pytest
 from pyarrow import parquet
 from scipy.io import savemat
 
-from siq.data.recordings import Recordings, read_recordings, snapshot_pairs, write_recordings
-from siq.data.selection import resample_recordings, select_recordings
+from siq.data.recordings import (
+    Recordings,
+    read_recordings,
+    resample_recordings,
+    select_recordings,
+    snapshot_pairs,
+    write_recordings,
+)
 from siq.errors import InputError
 
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from siq.data.recordings import Recordings
-from siq.data.selection import in_stretches, joined, resample_recordings, select_recordings
+from siq.data.preparation import in_stretches, joined
+from siq.data.recordings import Recordings, resample_recordings, select_recordings
 from siq.data.stationarity import runs_of
 
 

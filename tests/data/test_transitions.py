@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from siq.data.preparation import in_stretches, without_slow_drift
 from siq.data.recordings import Recordings
-from siq.data.selection import in_stretches
-from siq.data.stationarity import background_of, correlation_times, relaxation_samples, runs_of
-from siq.data.two_states import DwellCount, counted_visits, dwell_counts, switching, without_slow_drift
+from siq.data.stationarity import background_of, correlated_samples, relaxation_samples, runs_of, usual_step
+from siq.data.two_states import DwellCount, counted_visits, dwell_counts, switching
 
 STEP, COUNT = 0.05, 20_000
 TIME = STEP * np.arange(COUNT)
@@ -103,7 +103,8 @@ def test_an_exponential_correlation_is_found(scale: float) -> None:
     recordings = recorded(*(scale * one_state(seed) for seed in range(4)))
     relaxation = relaxation_samples(recordings.values[:, 0], runs_of(recordings))
     assert relaxation is not None and 0.6 < relaxation * STEP < 1.3
-    assert correlation_times(recordings)[0] == pytest.approx(1.0, rel=0.15)
+    time = usual_step(recordings) * correlated_samples(recordings.values[:, 0], runs_of(recordings))
+    assert time == pytest.approx(1.0, rel=0.15)
 
 
 def test_only_a_background_that_is_there_is_found() -> None:

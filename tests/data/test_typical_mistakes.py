@@ -11,19 +11,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from siq.data.columns import (
-    RESERVED,
-    decimals_of,
-    is_unit,
-    quantum,
-    read_heading,
-    rounding_error,
-    usable_name,
-)
-from siq.data.correlation import noise_floors
-from siq.data.inspection import checked_for_learning, inspect_recordings, read_pairs
+from siq.data.correlation import decimals_of, noise_floors, resolution_step, rounding_error
+from siq.data.inspection import inspect as inspect_recordings
+from siq.data.layout import RESERVED, is_unit, read_heading, usable_name
+from siq.data.preparation import FEWEST_STRETCHES, checked_for_learning, in_stretches, read_pairs
 from siq.data.recordings import Recordings, read_recordings, write_recordings
-from siq.data.selection import STRETCHES, in_stretches
 from siq.errors import InputError
 from siq.systems.cards import check_name
 from siq.systems.formulas import CONSTANTS, FUNCTIONS
@@ -308,16 +300,16 @@ def test_units_are_told_from_words() -> None:
 @pytest.mark.parametrize("decimals", [0, 1, 3, 6])
 def test_rounding_is_recognised_and_what_was_not_rounded_is_not(decimals: int) -> None:
     values = np.random.default_rng(decimals).normal(size=3000) * 10.0 ** (1 - decimals) * 20
-    step = quantum(values.round(decimals))
+    step = resolution_step(values.round(decimals))
     assert step is not None and decimals_of(step) == decimals
     assert np.std(values.round(decimals) - values) == pytest.approx(rounding_error(step), rel=0.05)
-    assert quantum(values) is None
-    assert quantum(np.zeros(100)) is None
+    assert resolution_step(values) is None
+    assert resolution_step(np.zeros(100)) is None
 
 
 def test_the_step_of_a_digitiser_is_recognised() -> None:
     counts = np.random.default_rng(0).integers(-500, 500, 20_000)
-    step = quantum(0.3 + counts * 0.0048828125 / 3)
+    step = resolution_step(0.3 + counts * 0.0048828125 / 3)
     assert step == pytest.approx(0.0048828125 / 3, rel=1e-6)
 
 
@@ -364,7 +356,7 @@ def test_one_relaxation_is_refused_before_anything_runs_and_one_hopping_record_i
     write_recordings(tmp_path / "hopping.parquet", hopping)
     read, _ = read_pairs(tmp_path / "hopping.parquet", states=None, units=None, pair_step=None)
     cut = in_stretches(read)
-    assert len(cut.labels) >= STRETCHES and f"cut into {len(cut.labels)} stretches" in cut.notes[-1]
+    assert len(cut.labels) >= FEWEST_STRETCHES and f"cut into {len(cut.labels)} stretches" in cut.notes[-1]
     np.testing.assert_array_equal(cut.values, read.values)
     assert in_stretches(cut) is cut
     settling = read_recordings(path)

@@ -16,8 +16,7 @@ from known_systems import (
     uniform_points,
 )
 
-from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
-from siq.data.selection import select_recordings
+from siq.data.recordings import Recordings, SnapshotPairs, select_recordings, snapshot_pairs
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import FlowMap, IdentifiedField
 from siq.inference.flow_regression import copies, refit, residuals

@@ -10,8 +10,7 @@ from remembering import STEP as TIME
 from remembering import double_wells
 
 from siq.data.correlation import markov_lag
-from siq.data.recordings import Recordings, snapshot_pairs
-from siq.data.selection import select_recordings
+from siq.data.recordings import Recordings, select_recordings, snapshot_pairs
 from siq.inference.identification import IdentificationOptions, identify_vector_field
 from siq.inference.instrumental_variables import possible_exposures
 from siq.inference.kalman_filter import Noise

@@ -8,8 +8,7 @@ import pytest
 import sympy
 from known_systems import KnownSystem, archetype, as_system, double_well, maier_stein
 
-from siq.data.recordings import Recordings, snapshot_pairs
-from siq.data.selection import select_recordings
+from siq.data.recordings import Recordings, select_recordings, snapshot_pairs
 from siq.inference.field_estimate import IdentifiedField
 from siq.inference.identification import IdentificationOptions, field_library, identify_vector_field
 from siq.inference.residuals import NoiseDiagnosis, mean_residual_probability, residual_noise

@@ -10,8 +10,7 @@ import pytest
 import torch
 from known_settings import PAPER
 
-from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
-from siq.data.selection import resample_recordings
+from siq.data.recordings import Recordings, SnapshotPairs, resample_recordings, snapshot_pairs
 from siq.errors import InputError, NumericalFailure
 from siq.networks.decomposition import TrainingOptions, load_networks, pack, save_networks
 from siq.networks.networks import Components, at_rest, dynamics_loss, orthogonality_loss

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from siq.data.preparation import in_stretches
 from siq.data.recordings import Recordings
-from siq.data.selection import in_stretches
 from siq.data.two_states import LEVEL, continued_visits, dwell_counts
 from siq.inference.field_estimate import FlowMap, IdentifiedField
 from siq.inference.identification import IdentificationOptions, field_library

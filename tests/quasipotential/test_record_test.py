@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from siq.data.recordings import Recordings
-from siq.data.selection import held_out_recordings
+from siq.data.recordings import Recordings, held_out_recordings
 from siq.data.two_states import DwellCount
 from siq.inference.identification import FieldRecord
 from siq.quasipotential.certificate_tests import Verdict

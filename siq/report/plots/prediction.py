@@ -16,8 +16,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator
 
-from siq.data.correlation import lagged_covariances, long_run_covariance, markov_lag
+from siq.data.correlation import markov_lag
 from siq.data.recordings import Recordings, snapshot_pairs
+from siq.data.stationarity import lagged_covariances, long_run_covariance
 from siq.inference.field_estimate import NOISE_FREE
 from siq.inference.instrumental_variables import lagged_pairs
 from siq.numerics.integration import runge_kutta_step

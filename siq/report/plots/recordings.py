@@ -151,7 +151,7 @@ def _draw_visits(axes: Axes, found: Inspection) -> None:
         axes.figure.colorbar(mesh, ax=axes, label=r"$\log_{10}$ of the samples")
         axes.set_xlabel(labels[0])
         axes.set_ylabel(labels[1])
-    axes.set_title(f"visited: {100 * found.coverage.share:.0f} % of the range", loc="left")
+    axes.set_title(f"visited: {100 * found.coverage:.0f} % of the range", loc="left")
 
 
 def _draw_memory(axes: Axes, found: Inspection) -> None:

@@ -1,0 +1,244 @@
+"""Preparation of recordings: what is refused, left out, cut or taken off before anything is learned.
+
+A single long recording is cut into stretches, of which some can be held out or drawn again, and less what
+drifts slowly in it. Columns that never change are no states. Each step leaves a note.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from siq.data.correlation import noise_floors
+from siq.data.recordings import (
+    SINGLE_RECORDING_REMEDY,
+    Recordings,
+    SnapshotPairs,
+    read_recordings,
+    snapshot_pairs,
+)
+from siq.data.stationarity import background_of, correlated_samples, runs_of
+from siq.data.two_states import switching
+from siq.errors import InputError
+
+FULL_TURNS = {2 * np.pi: "2π", 360.0: "360"}  # of an angle, in radians and in degrees
+WRAPPED_SHARE = 0.9  # of a turn: a jump by so much, in a column that stays within one, is no motion
+FEWEST_STRETCHES = 10  # of a single recording, at least, two of which are held out
+MOST_STRETCHES = 40  # more make no error better known
+STRETCH_LENGTH = 10  # correlation times: what is left of its first sample at its end is then nothing
+_STRETCH_LABEL = re.compile(r"(?P<label>.*) \((?P<number>\d+) of (?P<of>\d+)\)")
+SINGLE_RECORDING = (
+    "there is one recording, and it shows no random forces: it leads into one stable state and tells nothing"
+    " of others, nor of barriers"
+)
+
+
+def read_pairs(
+    path: str | Path,
+    *,
+    states: Sequence[str] | None,
+    units: Mapping[str, str] | None,
+    pair_step: float | None,
+    hidden_velocities: bool = False,
+) -> tuple[Recordings, SnapshotPairs]:
+    """Read recordings that something is to be learned from, and their pairs.
+
+    Parameters
+    ----------
+    path, states, units
+        See `read_recordings`.
+    pair_step
+        See `snapshot_pairs`.
+    hidden_velocities
+        See `checked_for_learning`.
+
+    Raises
+    ------
+    InputError
+        As `read_recordings` and `checked_for_learning` do, and when no two samples are
+        close enough to be a pair.
+    """
+    recordings = read_recordings(path, columns=states, units=units)
+    recordings = checked_for_learning(
+        recordings, file=str(path), chosen=states is not None, hidden_velocities=hidden_velocities
+    )
+    try:
+        pairs = snapshot_pairs(recordings, pair_step=pair_step)
+    except ValueError as error:
+        raise InputError(path, "", str(error), "raise recordings.pair_step in the study") from None
+    without = len(recordings.labels) - len(np.unique(pairs.recording))
+    single = int((np.bincount(recordings.recording) == 1).sum())
+    if without > single:
+        note = (
+            f"{without - single} of {len(recordings.labels)} recordings have longer steps than the others and"
+            " give no pairs; recordings.pair_step in the study says how long a step may be"
+        )
+        recordings = replace(recordings, notes=(*recordings.notes, note))
+    return recordings, pairs
+
+
+def checked_for_learning(
+    recordings: Recordings, *, file: str, chosen: bool, hidden_velocities: bool = False
+) -> Recordings:
+    """Refuse what nothing can be learned from; leave out columns that never change.
+
+    Parameters
+    ----------
+    recordings
+        As read.
+    file
+        For messages.
+    chosen
+        Whether somebody named the states: then none is left out.
+    hidden_velocities
+        Whether they are positions: these are smooth, however strong the random forces on velocities are.
+
+    Raises
+    ------
+    InputError
+        For a single recording without noise, and for a state that never changes.
+    """
+    still = np.ptp(recordings.values, axis=0) == 0
+    if still.any():
+        first = int(np.argmax(still))
+        if still.all() or chosen:
+            fault = f"it is {recordings.values[0, first]:g} in every row, and what never changes is no state"
+            remedy = "leave it out of the states" if chosen else "record how the system moves"
+            raise InputError(file, f"column {recordings.titles[first]}", fault, remedy)
+        kept = np.flatnonzero(~still)
+        notes = [
+            f"the column '{recordings.titles[place]}' is {recordings.values[0, place]:g} in every row and was"
+            " left out"
+            for place in np.flatnonzero(still)
+        ]
+        recordings = replace(
+            recordings,
+            names=tuple(recordings.names[place] for place in kept),
+            units=tuple(recordings.units[place] for place in kept),
+            headings=tuple(recordings.headings[place] for place in kept) if recordings.headings else (),
+            values=np.ascontiguousarray(recordings.values[:, kept]),
+            notes=(*recordings.notes, *notes),
+        )
+    if len(recordings.labels) == 1 and not hidden_velocities:
+        floors = noise_floors(recordings)
+        if floors is not None and all(floor.process == 0 for floor in floors):
+            raise InputError(file, "", SINGLE_RECORDING, SINGLE_RECORDING_REMEDY)
+    return replace(recordings, notes=(*recordings.notes, *unusual(recordings)))
+
+
+def unusual(recordings: Recordings) -> list[str]:
+    """What is unusual, and may be wrong."""
+    said = []
+    single = int((np.bincount(recordings.recording) == 1).sum())
+    if single:
+        said.append(
+            "one recording has a single sample, which tells nothing"
+            if single == 1
+            else f"{single} recordings have a single sample each, which tells nothing"
+        )
+    inside = recordings.recording[1:] == recordings.recording[:-1]
+    for title, values in zip(recordings.titles, recordings.values.T, strict=True):
+        jumps = np.abs(np.diff(values)[inside])
+        for turn, text in FULL_TURNS.items():
+            count = int((jumps > WRAPPED_SHARE * turn).sum())
+            between = ((jumps > 0.5 * turn) & (jumps < WRAPPED_SHARE * turn)).any()
+            if count and not between and np.ptp(values) <= turn * (1 + 1e-6):
+                times = "once" if count == 1 else f"{count} times"
+                said.append(
+                    f"'{title}' jumps by {text} {times}, as an angle does that wraps around: unwrap it first,"
+                    " or record its sine and cosine"
+                )
+    return said
+
+
+def in_stretches(recordings: Recordings, *, hidden_velocities: bool = False) -> Recordings:
+    """Cut a recording that is the only one into stretches, of which some can be held out, or drawn again.
+
+    Stretches are ten correlation times long, hops included, where this makes between ten and forty of them.
+    Several recordings come back as they are, and so does one of too few pairs, or without
+    random forces: a system that settles once is not seen again in another stretch.
+
+    Parameters
+    ----------
+    recordings
+        Trajectories.
+    hidden_velocities
+        Whether they are positions: these are smooth, however strong the random forces on velocities are, and
+        whether there are any is found together with f.
+    """
+    count = len(recordings.t)
+    if len(recordings.labels) > 1 or count < 2 * FEWEST_STRETCHES:
+        return recordings
+    floors = noise_floors(recordings)
+    if floors is not None and all(floor.process == 0 for floor in floors) and not hidden_velocities:
+        return recordings
+    runs = runs_of(recordings)
+    longest = max(correlated_samples(column, runs) for column in recordings.values.T)
+    cut = int(np.clip(count / (STRETCH_LENGTH * longest), FEWEST_STRETCHES, min(MOST_STRETCHES, count // 2)))
+    label = recordings.labels[0]
+    note = f"there is one recording; it was cut into {cut} stretches, so that some can be held out"
+    return replace(
+        recordings,
+        labels=tuple(f"{label} ({number} of {cut})" for number in range(1, cut + 1)),
+        recording=np.arange(count) * cut // count,
+        notes=(*recordings.notes, note),
+    )
+
+
+def joined(recordings: Recordings) -> Recordings:
+    """Put together again what `in_stretches` has cut, where one stretch follows the other.
+
+    What takes long, such as a hop or a memory, is not seen in a stretch: how long a record remembers, and how
+    it hops, is asked of the record as a whole. Rows stay as they are.
+    """
+    numbers = [_STRETCH_LABEL.fullmatch(label) for label in recordings.labels]
+    follows = [False] + [
+        one is not None
+        and other is not None
+        and (one["label"], one["of"], int(one["number"]) + 1)
+        == (other["label"], other["of"], int(other["number"]))
+        for one, other in pairwise(numbers)
+    ]
+    if not any(follows):
+        return recordings
+    labels = tuple(
+        label if number is None else number["label"]
+        for label, number, later in zip(recordings.labels, numbers, follows, strict=True)
+        if not later
+    )
+    if len(set(labels)) < len(labels):  # of recordings drawn again, some may follow, and others not
+        labels = tuple(label for label, later in zip(recordings.labels, follows, strict=True) if not later)
+    whole = np.cumsum(~np.array(follows)) - 1
+    return replace(recordings, labels=labels, recording=whole[recordings.recording])
+
+
+def without_slow_drift(recordings: Recordings) -> Recordings:
+    """A single long recording less what drifts slowly in it, which a note says for each state.
+
+    Of a record that supports two states the drift is what both levels have in common; of any other, what slow
+    cosines explain. Several recordings come back as they are: how they begin may be a part of what they show.
+    So does one without random forces, in which nothing but the system itself moves.
+    """
+    floors = noise_floors(recordings) if len(recordings.labels) == 1 else None
+    if floors is None or any(floor.process == 0 for floor in floors):
+        return recordings
+    found = switching(recordings)
+    flat, notes = recordings.values.copy(), list(recordings.notes)
+    for state, values in enumerate(recordings.values.T):
+        background = background_of(recordings, values)
+        if found is not None and found.supported and state == found.state:
+            background = found.background
+        if not background.half_periods:
+            continue
+        flat[:, state] -= background.values
+        unit = f" {recordings.units[state]}" if recordings.units[state] else ""
+        notes.append(
+            f"the background of '{recordings.titles[state]}' drifts slowly, over a range of"
+            f" {background.range:.3g}{unit}; it was taken off"
+        )
+    return replace(recordings, values=flat, notes=tuple(notes))
