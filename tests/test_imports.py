@@ -37,7 +37,6 @@ ORDER = (
 UPWARDS: frozenset[tuple[str, str]] = frozenset(
     {
         ("siq.data.inspection", "siq.report.plots.recordings"),
-        ("siq.data.inspection", "siq.report.remarks"),
         ("siq.diagnosis.diagnosis", "siq.report.diagnosis_page"),
         ("siq.diagnosis.statement", "siq.report.diagnosis_text"),
         ("siq.quasipotential.landscape", "siq.report.landscape"),

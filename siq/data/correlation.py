@@ -132,7 +132,7 @@ class _Residuals(NamedTuple):
     inverse: np.ndarray  # (q, q): of the mean of φ(x(t-L)) φ(x(t))ᵀ
 
     @property
-    def count(self) -> int:
+    def size(self) -> int:
         return int((self.number >= 0).sum())
 
     def correlations(self, most: int) -> tuple[np.ndarray, np.ndarray]:
@@ -141,7 +141,7 @@ class _Residuals(NamedTuple):
         values = own[1:] / np.where(own[0] > 0, own[0], 1.0)
         # Bartlett: correlations at shorter lags make all others uncertain.
         spread = 1 + 2 * np.cumsum(np.vstack([np.zeros_like(values[:1]), values[:-1] ** 2]), axis=0)
-        return values, np.sqrt(spread * self.kurtosis(most) / self.count)
+        return values, np.sqrt(spread * self.kurtosis(most) / self.size)
 
     def kurtosis(self, lag: int) -> np.ndarray:
         """Mean of r²(t) r²(t+lag) over that of r² squared: 1 where the strength is the same everywhere."""
@@ -190,8 +190,8 @@ class _Increments(NamedTuple):
         values, errors = seen.correlations(lags[-1])
         for place, one in enumerate(lags):
             count = len(seen.rest) - one
-            carried = seen.rest[:count].T @ self.functions[one:] / seen.count @ seen.inverse
-            further = (carried**2).sum(axis=1) * run / seen.count / size**2
+            carried = seen.rest[:count].T @ self.functions[one:] / seen.size @ seen.inverse
+            further = (carried**2).sum(axis=1) * run / seen.size / size**2
             error = np.sqrt(errors[one - 1] ** 2 + further)
             limit = STANDARD_ERRORS if place == 0 else STANDARD_ERRORS_LATER
             if (np.abs(values[one - 1]) > limit * error).any():
@@ -258,7 +258,7 @@ def markov_lag(recordings: Recordings) -> MarkovLag:
     own = np.einsum("kii->ki", lagged_covariances(seen.rest, seen.number, most))
     marked = np.flatnonzero(_significant(*seen.correlations(FIRST_LAGS)))
     kurtosis = seen.kurtosis(lag + 1)
-    fits = [_fitted_shape(own[:, place], seen.count / kurtosis[place], seen=lag) for place in marked]
+    fits = [_fitted_shape(own[:, place], seen.size / kurtosis[place], seen=lag) for place in marked]
     longest = max(fits, key=lambda fit: fit.memory, default=None)
     if longest is None or longest.shape == "white":
         return told("white", 0, seen, most)

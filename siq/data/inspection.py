@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -24,10 +24,17 @@ from siq.data.correlation import (
     resolution_step,
     rounding_error,
 )
-from siq.data.preparation import SINGLE_RECORDING, SINGLE_RECORDING_REMEDY, unusual
-from siq.data.recordings import LONGEST_STEP, Recordings, read_recordings, recordings_of
+from siq.data.preparation import SINGLE_RECORDING, unusual
+from siq.data.recordings import (
+    LONGEST_STEP,
+    SINGLE_RECORDING_REMEDY,
+    Recordings,
+    read_recordings,
+    recordings_of,
+)
 from siq.data.two_states import RecordStates, Switching, states_of_record, switching
 from siq.remarks import Remark
+from siq.report.remarks import sentence
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -156,8 +163,6 @@ class Inspection:
 
     def lines(self) -> list[str]:
         """`remarks` as sentences."""
-        from siq.report.remarks import sentence
-
         return [sentence(remark) for remark in self.remarks()]
 
     def plot(self) -> Figure:
@@ -168,6 +173,7 @@ class Inspection:
 
     def _contents(self) -> list[Remark]:
         recordings, time_unit = self.recordings, self.recordings.time_unit
+        values: dict[str, Any]
         held = {"recordings": len(recordings.labels), "samples": self.samples, "durations": self.durations}
         found = [Remark("data.recordings", held | {"unit": time_unit})]
         if self.steps is not None:
@@ -193,6 +199,7 @@ class Inspection:
 
     def _findings(self) -> list[Remark]:
         memory, titles, unit = self.memory, self.recordings.titles, self.recordings.time_unit
+        values: dict[str, Any]
         strongest, state = 0.0, ""
         if len(memory.correlations):
             row, place = np.unravel_index(np.argmax(np.abs(memory.correlations)), memory.correlations.shape)
@@ -228,6 +235,7 @@ class Inspection:
         return [Remark("data.note", {"text": note}) for note in self.notes]
 
     def _prospects(self) -> list[Remark]:
+        values: dict[str, Any]
         recordings, memory = self.recordings, self.memory
         noises = [state.noise for state in self.states if state.noise is not None]
         # Correlated forces fill the windows of the first look as a smooth motion does.
@@ -238,7 +246,7 @@ class Inspection:
             values = {"fault": SINGLE_RECORDING, "remedy": SINGLE_RECORDING_REMEDY}
             found = [Remark("data.single_recording", values)]
         else:
-            found = [Remark("data.no_noise" if noises else "data.noise_unknown")]
+            found = [Remark("data.no_noise") if noises else Remark("data.noise_unknown")]
         units = sorted({unit for unit in recordings.units if unit})
         if not forced and len(units) > 1:
             found.append(Remark("data.different_units", {"units": units}))

@@ -241,4 +241,6 @@ def without_slow_drift(recordings: Recordings) -> Recordings:
             f"the background of '{recordings.titles[state]}' drifts slowly, over a range of"
             f" {background.range:.3g}{unit}; it was taken off"
         )
+    if len(notes) == len(recordings.notes):
+        return recordings
     return replace(recordings, values=flat, notes=tuple(notes))

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from siq.errors import InputError, NumericalFailure
+from siq.errors import NumericalFailure
 from siq.numerics.files import whole_file
 
 if TYPE_CHECKING:
@@ -113,7 +113,7 @@ class Recordings:
 
         levels = [name for name in frame.index.names if name in ("recording", "t")]
         source = frame_columns(TABLE, frame.reset_index(level=levels) if levels else frame)
-        read = checked_table(TABLE, source, columns, units)
+        read = cls(**checked_table(TABLE, source, columns, units)._asdict())
         given = units or {}
         return replace(
             read,
@@ -161,6 +161,8 @@ class Recordings:
         >>> Recordings.from_arrays(t, decays, names=["x"]).labels
         ('0', '1', '2')
         """
+        from siq.data.tables import check_times  # which imports pyarrow
+
         one = isinstance(values, np.ndarray) and values.ndim == 2
         parts = [np.asarray(each, dtype=float) for each in ([values] if one else values)]
         common = np.ndim(t[0]) == 0
@@ -249,7 +251,7 @@ def read_recordings(
     """
     from siq.data.tables import read_tables  # which imports pyarrow
 
-    return read_tables(path, columns=columns, units=units, gaps=gaps)
+    return Recordings(**read_tables(path, columns=columns, units=units, gaps=gaps)._asdict())
 
 
 def recordings_of(source: str | Path | Recordings | pd.DataFrame) -> Recordings:
@@ -344,45 +346,6 @@ def snapshot_pairs(recordings: Recordings, *, pair_step: float | None = None) ->
         h=gap[keep],
         recording=parent_recordings(recordings.labels)[recording[:-1][keep]],
     )
-
-
-def check_times(
-    file: str, t: np.ndarray, recording: np.ndarray, labels: tuple[str, ...], rows: np.ndarray
-) -> None:
-    """Refuse times that do not increase within every recording.
-
-    Parameters
-    ----------
-    file
-        The file, for messages.
-    t, recording
-        Shape ``(n,)``: the time and the recording of each row; the rows of a recording stand together.
-    labels
-        The label of each recording.
-    rows
-        Shape ``(n,)``: where each row stands in the file, counted from 0.
-
-    Raises
-    ------
-    InputError
-        For the first row of the file whose time is repeated or earlier, or when no recording has two rows.
-    """
-    same = recording[1:] == recording[:-1]
-    if not same.any():
-        remedy = "give the rows of one recording the same label"
-        raise InputError(file, "", "no recording has two samples", remedy)
-    wrong = np.flatnonzero(same & (t[1:] <= t[:-1]))
-    if wrong.size == 0:
-        return
-    earlier = wrong[np.argmin(rows[wrong + 1])]
-    label, before, now = labels[recording[earlier]], float(t[earlier]), float(t[earlier + 1])
-    if now == before:
-        fault = f"the time {now} of recording '{label}' is repeated (row {rows[earlier] + 1} has it too)"
-        remedy = "keep one of the two rows, or label them as two recordings"
-    else:
-        fault = f"the times of recording '{label}' are unsorted ({now} comes after {before})"
-        remedy = "sort its rows by t, or begin a new label where a new recording begins"
-    raise InputError(file, f"row {rows[earlier + 1] + 1}, column t", fault, remedy)
 
 
 def select_recordings(recordings: Recordings, indices: Sequence[int] | np.ndarray) -> Recordings:

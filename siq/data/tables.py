@@ -24,7 +24,6 @@ import pyarrow.compute as pc
 
 from siq.data.formats import Column, ColumnFile, open_columns
 from siq.data.layout import layout_of
-from siq.data.recordings import Recordings, check_times
 from siq.errors import InputError
 from siq.numerics.files import files_of
 
@@ -55,13 +54,27 @@ class _Rows(NamedTuple):
     labels: tuple[str, ...]
 
 
+class CheckedTable(NamedTuple):
+    """What `siq.data.recordings.Recordings` is made of, by the same names."""
+
+    names: tuple[str, ...]
+    units: tuple[str | None, ...]
+    labels: tuple[str, ...]
+    recording: np.ndarray
+    t: np.ndarray
+    values: np.ndarray
+    time_unit: str | None
+    headings: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
 def read_tables(
     path: str | Path,
     *,
     columns: Sequence[str] | None,
     units: Mapping[str, str] | None,
     gaps: bool = True,
-) -> Recordings:
+) -> CheckedTable:
     """Read a file of recordings, or a folder that holds one file per recording.
 
     See `siq.data.recordings.read_recordings`.
@@ -80,7 +93,7 @@ def checked_table(
     units: Mapping[str, str] | None,
     *,
     gaps: bool = True,
-) -> Recordings:
+) -> CheckedTable:
     """Check a table that has been opened.
 
     Parameters
@@ -121,7 +134,7 @@ def checked_table(
         stated = {**layout.units[place], "cells": cell_unit}
         found_units.append(_agreed_unit(file, called[index], stated, (units or {}).get(name)))
     # Rows without a label and without any number are padding.
-    blank = np.isnan(numbers).all(axis=0)
+    blank = np.asarray(np.isnan(numbers).all(axis=0))
     if labels is None:
         order = np.flatnonzero(~blank)
         rows = _Rows(order, np.zeros(len(order), dtype=np.int64), ("0",))
@@ -141,7 +154,7 @@ def checked_table(
     _refuse_missing(file, numbers, rows, ["t", *layout.titles])
     rows = _in_order(rows, numbers, layout.recording is not None, notes)
     check_times(file, numbers[0][rows.order], rows.recording, rows.labels, rows.order)
-    return Recordings(
+    return CheckedTable(
         names=layout.names,
         units=tuple(found_units[1:]),
         labels=rows.labels,
@@ -162,7 +175,8 @@ def _parse_numbers(file: str, name: str, cells: Column) -> tuple[np.ndarray, str
     """
     if pa.types.is_dictionary(cells.type):
         cells = cells.cast(cells.type.value_type)
-    unit, fault = "", None
+    unit: str | None = None
+    fault: Fault | None = None
     if _is_text(cells.type):
         cells, unit, fault = _split_units(file, name, cells)
     elif not any(is_kind(cells.type) for is_kind in _NUMERIC):
@@ -270,12 +284,12 @@ def _agreed_unit(file: str, name: str, stated: Mapping[str, str | None], expecte
             fault = f"mixed units, {places[0][1]} in the {places[0][0]} but {unit} in the {place}"
             remedy = "state one unit, the one in which the numbers are"
             raise InputError(file, f"column {name}", fault, remedy)
-    unit = places[0][1] if places else None
-    if unit is not None and expected is not None and plain(unit) != plain(expected):
-        fault = f"the unit is {unit} where the system card has {expected}"
+    agreed = places[0][1] if places else None
+    if agreed is not None and expected is not None and plain(agreed) != plain(expected):
+        fault = f"the unit is {agreed} where the system card has {expected}"
         remedy = f"convert the column to {expected}, or correct the unit in the card"
         raise InputError(file, f"column {name}", fault, remedy)
-    return unit
+    return agreed
 
 
 def _seconds_of_clock(file: str, name: str, cells: Column) -> tuple[np.ndarray, str] | None:
@@ -433,7 +447,46 @@ def _count(number: int, noun: str) -> str:
     return f"one {noun}" if number == 1 else f"{number} {noun}s"
 
 
-def _joined(files: Sequence[Path], tables: Sequence[Recordings], folder: str) -> Recordings:
+def check_times(
+    file: str, t: np.ndarray, recording: np.ndarray, labels: tuple[str, ...], rows: np.ndarray
+) -> None:
+    """Refuse times that do not increase within every recording.
+
+    Parameters
+    ----------
+    file
+        The file, for messages.
+    t, recording
+        Shape ``(n,)``: the time and the recording of each row; the rows of a recording stand together.
+    labels
+        The label of each recording.
+    rows
+        Shape ``(n,)``: where each row stands in the file, counted from 0.
+
+    Raises
+    ------
+    InputError
+        For the first row of the file whose time is repeated or earlier, or when no recording has two rows.
+    """
+    same = recording[1:] == recording[:-1]
+    if not same.any():
+        remedy = "give the rows of one recording the same label"
+        raise InputError(file, "", "no recording has two samples", remedy)
+    wrong = np.flatnonzero(same & (t[1:] <= t[:-1]))
+    if wrong.size == 0:
+        return
+    earlier = wrong[np.argmin(rows[wrong + 1])]
+    label, before, now = labels[recording[earlier]], float(t[earlier]), float(t[earlier + 1])
+    if now == before:
+        fault = f"the time {now} of recording '{label}' is repeated (row {rows[earlier] + 1} has it too)"
+        remedy = "keep one of the two rows, or label them as two recordings"
+    else:
+        fault = f"the times of recording '{label}' are unsorted ({now} comes after {before})"
+        remedy = "sort its rows by t, or begin a new label where a new recording begins"
+    raise InputError(file, f"row {rows[earlier + 1] + 1}, column t", fault, remedy)
+
+
+def _joined(files: Sequence[Path], tables: Sequence[CheckedTable], folder: str) -> CheckedTable:
     """Tables of one folder as one; the name of a file is that of its recording."""
     first, names = tables[0], [file.name for file in files]
     stems = [file.stem for file in files]
@@ -461,7 +514,7 @@ def _joined(files: Sequence[Path], tables: Sequence[Recordings], folder: str) ->
     for note in dict.fromkeys(note for table in tables for note in table.notes):
         having = sum(note in table.notes for table in tables)
         notes.append(note if having == len(tables) else f"in {having} of {len(tables)} files {note}")
-    return Recordings(
+    return CheckedTable(
         names=first.names,
         units=units,
         labels=tuple(labels),
