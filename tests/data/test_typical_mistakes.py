@@ -411,5 +411,8 @@ def test_an_inspection_says_what_is_there(tmp_path: Path) -> None:
     hopping = noisy(0.02, 0.1)
     write_recordings(tmp_path / "b.parquet", hopping)
     found = inspect_recordings(tmp_path / "b.parquet")
-    assert "Random forces are seen" in found.prospects[0] and "noise of the sensor" in found.prospects[1]
-    assert "unit the time is" in found.prospects[2]
+    codes = [remark.code for remark in found.remarks()]
+    assert codes[-3:] == ["data.noise_seen", "data.sensor_noise", "data.no_time_unit"]
+    lines = found.lines()
+    assert "Random forces are seen" in lines[-3] and "noise of the sensor" in lines[-2]
+    assert "unit the time is" in lines[-1]
