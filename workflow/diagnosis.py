@@ -24,7 +24,7 @@ COMPARED = {"missing physics": ("recalibrated", "augmented"), "parameter shift":
 @task("file")
 def benchmark_recordings(given: Given, settings: PipelineSettings) -> Any:
     """The recordings of a public benchmark, from its file as downloaded."""
-    from siq.data.public_recordings import BENCHMARKS
+    from workflow.reproduction.public_recordings import BENCHMARKS
 
     return {"recordings": BENCHMARKS[given.wildcards["benchmark"]].read(given.files["file"])}
 
@@ -219,9 +219,9 @@ def mismatch_page(given: Given, settings: PipelineSettings) -> Any:
 @task("card", "recordings", "study", "recalibrated", "system", "noise")
 def official_tests(given: Given, settings: PipelineSettings) -> Any:
     """How far simulations of a public benchmark are off in its official tests, in its own units."""
-    from siq.data.public_recordings import BENCHMARKS
     from siq.diagnosis.study import read_case
     from workflow.reproduction.official_scores import official_tables
+    from workflow.reproduction.public_recordings import BENCHMARKS
 
     case = read_case(given.files["card"], given.files["recordings"], given.path("study"))
     noise = given.noise
@@ -240,9 +240,9 @@ def official_summary(given: Given, settings: PipelineSettings) -> Any:
     """The official tests of all benchmarks: one table, and a figure of each."""
     import pandas as pd
 
-    from siq.data.public_recordings import BENCHMARKS
     from workflow.reproduction.official_tests import official_page, official_rows
     from workflow.reproduction.plots import plot_official_tests
+    from workflow.reproduction.public_recordings import BENCHMARKS
 
     names, drawn = given.options["benchmarks"], {}
     for name, runs, system in zip(names, given.runs, given.system, strict=True):

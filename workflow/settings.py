@@ -11,7 +11,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from siq.data.inspection import read_pairs
+from siq.data.preparation import read_pairs
 from siq.errors import InputError, suggestion
 from siq.numerics.files import Document, read_document, validate
 from siq.systems.cards import check_name, load_exact

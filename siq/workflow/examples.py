@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from siq.data.inspection import Inspection, inspect_recordings
+from siq.data.inspection import Inspection
+from siq.data.inspection import inspect as inspect_recordings
 from siq.data.recordings import read_recordings
 from siq.errors import InputError
 from siq.numerics.files import whole_file

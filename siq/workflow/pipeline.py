@@ -13,9 +13,8 @@ from typing import Any
 import pandas as pd
 
 from siq.data.inspection import seen_states
+from siq.data.preparation import in_stretches, joined, without_slow_drift
 from siq.data.recordings import Recordings, recordings_of
-from siq.data.selection import in_stretches, joined
-from siq.data.two_states import without_slow_drift
 from siq.quasipotential.landscape import Landscape, NoLandscape
 from siq.systems.dynamics import Dynamics
 from siq.workflow import identification_step, landscape_step, refinement_step, regression_step, steps

@@ -7,10 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from siq.data.inspection import read_pairs
-from siq.data.recordings import Recordings
-from siq.data.selection import in_stretches, resample_recordings
-from siq.data.two_states import without_slow_drift
+from siq.data.preparation import in_stretches, read_pairs, without_slow_drift
+from siq.data.recordings import Recordings, resample_recordings
 from siq.errors import NumericalFailure
 from siq.inference.noisy_sensor import of_all_states
 from siq.numerics.randomness import Purpose, generator

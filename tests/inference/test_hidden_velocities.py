@@ -13,8 +13,8 @@ import scipy.integrate
 from particles import TEMPERATURE, particle
 
 from siq.data.correlation import noise_floors
+from siq.data.preparation import FEWEST_STRETCHES
 from siq.data.recordings import Recordings, write_recordings
-from siq.data.selection import STRETCHES
 from siq.errors import InputError, NumericalFailure
 from siq.inference.field_estimate import DiffusionSource
 from siq.inference.hidden_velocities import HiddenMotion, identify_hidden_motion
@@ -160,7 +160,7 @@ def test_one_record_of_smooth_positions_is_enough(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="positions of something that has inertia, set 'identification"):
         recordings_step.source_of(path, alone)
     drawn = recordings_step.run(hidden, recordings_step.source_of(path, hidden), number=0).recordings
-    assert drawn is not None and len(drawn.labels) >= STRETCHES
+    assert drawn is not None and len(drawn.labels) >= FEWEST_STRETCHES
     done = identification_step.run(SETTINGS.of(identification_step.IdentifySettings), drawn, number=0)
     assert done.record is not None and done.record.prediction["passed"]
     field = done.record.found

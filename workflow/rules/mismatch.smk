@@ -1,5 +1,5 @@
 # What physics a simulation lacks: the studies of config/mismatch/, and folders of cases (--config cases=DIR).
-from siq.data.public_recordings import BENCHMARKS
+from workflow.reproduction.public_recordings import BENCHMARKS
 from workflow.cases import Cases
 
 MISMATCH_TABLES = ["curves", "candidates", "held_out", "forces", "noise"]
