@@ -493,9 +493,10 @@ def _joined(files: Sequence[Path], tables: Sequence[CheckedTable], folder: str) 
     labels: list[str] = []
     for file, table in zip(files, tables, strict=True):
         if odd := sorted(set(table.names) ^ set(first.names)):
-            fault = f"its columns are {', '.join(table.names)}, and those of {names[0]} are"
+            ours, others = ", ".join(table.names), ", ".join(first.names)
+            fault = f"its columns are {ours}, and those of {names[0]} are {others}"
             remedy = f"give {', '.join(odd)} to all files or to none, or name the states in the study"
-            raise InputError(str(file), "", f"{fault} {', '.join(first.names)}", remedy)
+            raise InputError(str(file), "", fault, remedy)
         stem = file.name if stems.count(file.stem) > 1 else file.stem
         labels += [stem] if len(table.labels) == 1 else [f"{stem}/{label}" for label in table.labels]
     orders = [[table.names.index(name) for name in first.names] for table in tables]
