@@ -324,105 +324,82 @@ def _fit_orthogonal(
     stay so. ∇V·g is asked to vanish at points; more of them than coefficients make it vanish identically.
     None where the iteration finds no decomposition that is orthogonal to rounding.
     """
-    library = found.library
-    family = _Family(found, potential != 0, circulatory != 0, points)
-    theta = np.concatenate([potential[family.of_potential], circulatory.T[family.of_circulatory]])
+    library, noise = found.library, found.diffusion
+    q, d = library.size, library.dimension
+    # The family f = -D∇V + g is linear in θ = (coefficients of V, of g).
+    of_potential, of_circulatory = potential != 0, circulatory.T != 0
+    terms, places = np.flatnonzero(of_potential), np.argwhere(of_circulatory)
+    count = len(terms)
+    whole = np.zeros((d, q, count + len(places)))
+    whole[:, :, :count] = -library.downhill(noise)[:, :, terms]
+    for column, (i, k) in enumerate(places):
+        whole[i, k, count + column] = 1.0
+    components, functions = found.support.T
+    listed = np.zeros((d, q), dtype=bool)
+    listed[components, functions] = True
+    values = library.evaluate(points)
+    speed = np.sqrt(noise.squared_speed(points, found.dynamics.drift(points)))
+    usual = np.sqrt((speed**2).mean())
+    # What one unit of each term adds to f, relative to f.
+    sizes = np.sqrt(np.outer(np.diag(noise.precision), (values**2).mean(axis=0))) / usual
+    absent = (sizes[:, :, None] * whole)[~listed]
+    absent = absent[np.abs(absent).any(axis=1)]
+    gradients = np.einsum("nk,kij->nij", values, library.derivatives[:, :, terms])
+    circulation = np.zeros((len(points), d, len(places)))
+    for column, (i, k) in enumerate(places):
+        circulation[:, i, column] = values[:, k]
+    slopes = np.sqrt(noise.contract(points, gradients.transpose(0, 2, 1)))
+    scale = np.concatenate([np.sqrt((slopes**2).mean(axis=0)) / usual, sizes[of_circulatory]])
+    scale = np.where(scale > 0, scale, 1.0)
+    weight = 1 / np.maximum(speed, 1e-3 * speed.max()) / usual / np.sqrt(len(points))
+
+    def constraints(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Weighted ∇V·g at the points and the terms that f does not have, with their derivatives."""
+        gradient, turning = gradients @ theta[:count], circulation @ theta[count:]
+        slope = np.concatenate(
+            [
+                weight[:, None] * np.einsum("nd,ndj->nj", turning, gradients),
+                weight[:, None] * np.einsum("nd,ndj->nj", gradient, circulation),
+            ],
+            axis=1,
+        )
+        product = weight * (gradient * turning).sum(axis=1)
+        return np.concatenate([product, absent @ theta]), np.concatenate([slope, absent])
+
+    theta = np.concatenate([potential[of_potential], circulatory.T[of_circulatory]])
     whiten = scipy.linalg.solve_triangular(
         np.linalg.cholesky(found.covariance), np.eye(len(found.support)), lower=True
     )
     # Coefficients in units of what each of them does to f, so that the units of the states do not matter.
-    design = whiten @ family.observed / family.scale
+    design = whiten @ whole[components, functions] / scale
     tangent = np.zeros((len(theta), 0))
     rank = 0
     for _ in range(STEPS):
-        violation, slope = family.constraints(theta)
-        left, singular, right = np.linalg.svd(slope / family.scale, full_matrices=True)
+        violation, slope = constraints(theta)
+        left, singular, right = np.linalg.svd(slope / scale, full_matrices=True)
         rank = int((singular > RANK * singular[0]).sum()) if len(singular) else 0
         restore = -right[:rank].T @ ((left[:, :rank].T @ violation) / singular[:rank])
         tangent = right[rank:].T
-        wanted = whiten @ found.values - design @ (theta * family.scale + restore)
+        wanted = whiten @ found.values - design @ (theta * scale + restore)
         step = restore.copy()
         if tangent.shape[1]:
             step += tangent @ np.linalg.lstsq(design @ tangent, wanted, rcond=None)[0]
-        theta = theta + step / family.scale
-        if np.linalg.norm(step) <= 1e-13 * np.linalg.norm(theta * family.scale):
+        theta = theta + step / scale
+        if np.linalg.norm(step) <= 1e-13 * np.linalg.norm(theta * scale):
             break
-    violation, _slope = family.constraints(theta)
+    violation, _slope = constraints(theta)
     if not np.isfinite(theta).all() or np.abs(violation).max() > 1e-8:
         return None
-    inverse = tangent @ np.linalg.pinv(design @ tangent) / family.scale[:, None]
+    inverse = tangent @ np.linalg.pinv(design @ tangent) / scale[:, None]
     covariance = inverse @ inverse.T
-    distance = whiten @ found.values - design @ (theta * family.scale)
-    q, d = library.size, library.dimension
-    count = int(family.of_potential.sum())
+    distance = whiten @ found.values - design @ (theta * scale)
     fitted_potential, fitted = np.zeros(q), np.zeros((d, q))
-    fitted_potential[family.of_potential] = theta[:count]
-    fitted[family.of_circulatory] = theta[count:]
+    fitted_potential[of_potential] = theta[:count]
+    fitted[of_circulatory] = theta[count:]
     potential_covariance, errors = np.zeros((q, q)), np.zeros((d, q))
-    terms = np.flatnonzero(family.of_potential)
     potential_covariance[np.ix_(terms, terms)] = covariance[:count, :count]
-    errors[family.of_circulatory] = np.sqrt(np.maximum(np.diag(covariance)[count:], 0))
+    errors[of_circulatory] = np.sqrt(np.maximum(np.diag(covariance)[count:], 0))
     return RegionFormula(
         fitted_potential, fitted.T, potential_covariance, errors.T, joint=True,
         freedom=len(found.values) - tangent.shape[1], chi_square=float(distance @ distance),
     )  # fmt: skip
-
-
-class _Family:
-    """Fields f = -D∇V + g over given terms, linear in θ = (coefficients of V, of g), and ∇V·g."""
-
-    def __init__(
-        self,
-        found: IdentifiedField,
-        of_potential: np.ndarray,
-        of_circulatory: np.ndarray,
-        points: np.ndarray,
-    ) -> None:
-        library: CandidateLibrary = found.library
-        q, d = library.size, library.dimension
-        self.of_potential, self.of_circulatory = of_potential, of_circulatory.T
-        terms = np.flatnonzero(of_potential)
-        places = np.argwhere(self.of_circulatory)
-        downhill = library.downhill(found.diffusion)[:, :, terms]
-        whole = np.zeros((d, q, len(terms) + len(places)))
-        whole[:, :, : len(terms)] = -downhill
-        for column, (i, k) in enumerate(places):
-            whole[i, k, len(terms) + column] = 1.0
-        listed = np.zeros((d, q), dtype=bool)
-        listed[found.support[:, 0], found.support[:, 1]] = True
-        self.observed = whole[found.support[:, 0], found.support[:, 1]]
-        values = library.evaluate(points)
-        noise = found.diffusion
-        speed = np.sqrt(noise.squared_speed(points, found.dynamics.drift(points)))
-        usual = np.sqrt((speed**2).mean())
-        # What one unit of each term adds to f, relative to f.
-        sizes = np.sqrt(np.outer(np.diag(noise.precision), (values**2).mean(axis=0))) / usual
-        self.absent = (sizes[:, :, None] * whole)[~listed]
-        self.absent = self.absent[np.abs(self.absent).any(axis=1)]
-        self.gradients = np.einsum("nk,kij->nij", values, library.derivatives[:, :, terms])
-        self.circulation = np.zeros((len(points), d, len(places)))
-        for column, (i, k) in enumerate(places):
-            self.circulation[:, i, column] = values[:, k]
-        slopes = np.sqrt(noise.contract(points, self.gradients.transpose(0, 2, 1)))
-        scale = np.concatenate([np.sqrt((slopes**2).mean(axis=0)) / usual, sizes[self.of_circulatory]])
-        self.scale = np.where(scale > 0, scale, 1.0)
-        self.weight = 1 / np.maximum(speed, 1e-3 * speed.max()) / usual / np.sqrt(len(points))
-
-    def constraints(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Weighted ∇V·g at the points and the terms that f does not have, with their derivatives."""
-        count = self.gradients.shape[2]
-        gradient = self.gradients @ theta[:count]
-        circulation = self.circulation @ theta[count:]
-        weight = self.weight[:, None]
-        slope = np.concatenate(
-            [
-                weight * np.einsum("nd,ndj->nj", circulation, self.gradients),
-                weight * np.einsum("nd,ndj->nj", gradient, self.circulation),
-            ],
-            axis=1,
-        )
-        product = self.weight * (gradient * circulation).sum(axis=1)
-        return (
-            np.concatenate([product, self.absent @ theta]),
-            np.concatenate([slope, self.absent]),
-        )

@@ -52,7 +52,7 @@ from siq.quasipotential.certificate_tests import (
     Function,
     Reference,
     Verdict,
-    sublevel_points,
+    check_agreement,
 )
 from siq.quasipotential.formulas import (
     SymbolicDecomposition,
@@ -638,7 +638,7 @@ class TrainingCheck:
         result = refine_globally(start, self.library, self.found, points[below], sparse=False)
         basis = potential_basis(self.library)
         own = result.coefficients[basis.chosen]
-        worst = max(_relative_difference(lambda x: basis.values(x) @ own, well) for well in self.wells)
+        worst = check_agreement(lambda x: basis.values(x) @ own, self.wells, limit=0.0).value
         logger.info("check of one formula: residual %.1e, difference %.1e", result.residual, worst)
         return result.residual < self.options.residual / 10 and worst < self.options.difference
 
@@ -651,16 +651,9 @@ class TrainingCheck:
                 )  # fmt: skip
             except NumericalFailure:
                 return False
-            difference = _relative_difference(well.values, local)
+            difference = check_agreement(well.values, [local], limit=0.0).value
             logger.info("check of a well: residual %.1e, difference %.1e", well.residual, difference)
             allowed = self.options.difference + 2 * (local.residual + well.residual)
             if well.residual > self.options.residual or difference > allowed:
                 return False
         return True
-
-
-def _relative_difference(values: Function, well: Well) -> float:
-    """Relative difference of V by another route from that of a well, within it."""
-    x = sublevel_points(well)
-    other = values(x) - values(well.attractor[None])
-    return float(np.linalg.norm(other - well.values(x)) / np.linalg.norm(well.values(x)))
