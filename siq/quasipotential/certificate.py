@@ -36,13 +36,9 @@ from siq.quasipotential.certificate_tests import (
     Reference,
     Verdict,
     check_agreement,
-    check_branch,
-    check_characteristics,
-    check_descent,
+    check_candidate,
     check_error,
     check_existence,
-    check_hamilton_jacobi,
-    check_identity,
     stated_error,
     sublevel_points,
 )
@@ -198,18 +194,7 @@ def certify(
             verdicts["hamilton_jacobi"] = [Verdict.refused(reason, options.hamilton_jacobi)]
             error = own_error = np.inf
             continue
-        its = stated_error(candidate, found, seed=seed)
-        # Characteristics follow the same f: what f's uncertainty adds explains no difference from them.
-        followed, its = check_characteristics(candidate, found, options, error=its, seed=seed)
-        made = {
-            "hamilton_jacobi": check_hamilton_jacobi(candidate, found, options),
-            "branch": check_branch(candidate, found, options, seed=seed),
-        }
-        if candidate.pairs is not None and not isinstance(found, GivenField):
-            made["descent"] = check_descent(candidate, found, options, error=its)
-        made["characteristics"] = followed
-        if candidate.circulatory is not None:
-            made["identity"] = check_identity(candidate, found, options)
+        made, its = check_candidate(candidate, found, options, seed=seed)
         for name, verdict in made.items():
             verdicts.setdefault(name, []).append(verdict)
         uncertain = STATED * candidate.relative_error

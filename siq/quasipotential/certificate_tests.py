@@ -221,7 +221,7 @@ class Candidate:
     tested_on: str = ""
 
 
-def check_identity(candidate: Candidate, found: AnyField, options: CertificateOptions) -> Verdict:
+def _check_identity(candidate: Candidate, found: AnyField, options: CertificateOptions) -> Verdict:
     """Whether the stored V and g make up the f that was identified without them."""
     assert candidate.circulatory is not None
     x, noise = candidate.points, found.diffusion
@@ -272,7 +272,7 @@ def _relative_error_of_drift(found: AnyField, points: np.ndarray, measure: Diffu
     return float(np.sqrt(total / measure.squared_speed(points, found.dynamics.drift(points)).mean()))
 
 
-def check_branch(
+def _check_branch(
     candidate: Candidate, found: AnyField, options: CertificateOptions, *, seed: int = 0
 ) -> Verdict:
     """Whether V has the right curvature at every attractor: the test that exposes exact false solutions."""
@@ -391,7 +391,7 @@ def check_agreement(first: Function, wells: Sequence[Well], *, limit: float) -> 
     return Verdict.of(worst, limit, f"the two routes disagree most at {where}")
 
 
-def check_characteristics(
+def _check_characteristics(
     candidate: Candidate, found: AnyField, options: CertificateOptions, *, error: float, seed: int = 0
 ) -> tuple[Verdict, float]:
     """Whether V is the one that characteristics carry, within the error that its own residual leaves open.
@@ -427,6 +427,25 @@ def check_characteristics(
             Verdict.of(value, limit, f"V is not what characteristics give, most of all at {place}")
         )
     return Verdict.worst(verdicts), error
+
+
+def check_candidate(
+    candidate: Candidate, found: AnyField, options: CertificateOptions, *, seed: int = 0
+) -> tuple[dict[str, Verdict], float]:
+    """The tests that apply to a candidate, by name, and the error of V that has to be stated after them."""
+    # Characteristics follow the same f: what f's uncertainty adds explains no difference from them.
+    error = stated_error(candidate, found, seed=seed)
+    followed, error = _check_characteristics(candidate, found, options, error=error, seed=seed)
+    tests = {
+        "hamilton_jacobi": check_hamilton_jacobi(candidate, found, options),
+        "branch": _check_branch(candidate, found, options, seed=seed),
+    }
+    if candidate.pairs is not None and not isinstance(found, GivenField):
+        tests["descent"] = _check_descent(candidate, found, options, error=error)
+    tests["characteristics"] = followed
+    if candidate.circulatory is not None:
+        tests["identity"] = _check_identity(candidate, found, options)
+    return tests, error
 
 
 def check_prediction(
@@ -480,7 +499,7 @@ FLAT = "V does not vary on the held-out points"
 RISES = "V does not fall along the recordings"
 
 
-def check_descent(
+def _check_descent(
     candidate: Candidate, found: IdentifiedField, options: CertificateOptions, *, error: float = 0.0
 ) -> Verdict:
     """Whether V falls along recordings that no fit saw; `error` is the relative one of V that is stated.

@@ -185,7 +185,7 @@ def term_coefficients(expression: sympy.Expr) -> dict[str, float]:
     return {str(term): value for term, value in linear_combination(expression).items()}
 
 
-def expression_to_data(expression: sympy.Expr, symbols: Sequence[sympy.Symbol]) -> dict[str, Any]:
+def _expression_to_data(expression: sympy.Expr, symbols: Sequence[sympy.Symbol]) -> dict[str, Any]:
     """A formula as plain data: a polynomial by its coefficients, anything else by its text."""
     # "is polynomial" must not simplify: 1/x*x**2 is what the library said it is.
     if expression.is_polynomial(*symbols):
@@ -200,7 +200,7 @@ def expression_to_data(expression: sympy.Expr, symbols: Sequence[sympy.Symbol]) 
     return {"formula": str(expression)}
 
 
-def expression_from_data(data: Mapping[str, Any], symbols: Sequence[sympy.Symbol]) -> sympy.Expr:
+def _expression_from_data(data: Mapping[str, Any], symbols: Sequence[sympy.Symbol]) -> sympy.Expr:
     """The formula that `expression_to_data` wrote; text goes through the whitelist of formulas."""
     if "formula" in data:
         return parse_formula(data["formula"], {symbol.name: symbol for symbol in symbols})
@@ -228,9 +228,9 @@ def model_to_data(
 def _decomposition_to_data(one: SymbolicDecomposition) -> dict[str, Any]:
     symbols = one.symbols
     data: dict[str, Any] = {
-        "V": None if one.potential is None else expression_to_data(one.potential, symbols),
-        "g": [expression_to_data(component, symbols) for component in one.circulatory],
-        "f": [expression_to_data(component, symbols) for component in one.vector_field],
+        "V": None if one.potential is None else _expression_to_data(one.potential, symbols),
+        "g": [_expression_to_data(component, symbols) for component in one.circulatory],
+        "f": [_expression_to_data(component, symbols) for component in one.vector_field],
     }
     if one.wells:
         data["wells"] = [
@@ -274,7 +274,7 @@ def _wells_from_data(method: Mapping[str, Any], symbols: tuple[sympy.Symbol, ...
     if not method.get("wells"):
         return ()
     d = len(symbols)
-    equations = [expression_from_data(part, symbols) for part in method["f"]]
+    equations = [_expression_from_data(part, symbols) for part in method["f"]]
     diffusion = Diffusion.of_rows(symbols, method.get("D", np.eye(d).tolist()))
     dynamics = Dynamics.of(symbols, equations, diffusion=diffusion)
     return tuple(
@@ -310,9 +310,9 @@ def read_model(path: str | Path) -> tuple[dict[str, SymbolicDecomposition], dict
         decompositions = {
             method: SymbolicDecomposition(
                 symbols=symbols,
-                potential=None if one["V"] is None else expression_from_data(one["V"], symbols),
-                circulatory=tuple(expression_from_data(part, symbols) for part in one["g"]),
-                vector_field=tuple(expression_from_data(part, symbols) for part in one["f"]),
+                potential=None if one["V"] is None else _expression_from_data(one["V"], symbols),
+                circulatory=tuple(_expression_from_data(part, symbols) for part in one["g"]),
+                vector_field=tuple(_expression_from_data(part, symbols) for part in one["f"]),
                 wells=_wells_from_data(one, symbols),
                 standard_errors=one.get("standard_errors", {}),
             )

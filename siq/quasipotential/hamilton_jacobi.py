@@ -291,7 +291,7 @@ def relative_residuals(equation: HamiltonJacobi, coefficients: np.ndarray) -> np
 
 
 @dataclass(frozen=True)
-class Solution:
+class _Solution:
     """Coefficients where Gauss–Newton ended, and whether its last step was too small to matter.
 
     The residual is the root mean square of the weighted one, divided by that of ∇V: the mean of
@@ -326,7 +326,7 @@ def gauss_newton(
     free: np.ndarray | None = None,
     steps: int = 60,
     tolerance: float = 1e-13,
-) -> Solution:
+) -> _Solution:
     """Minimise the sum of squares of the residual, relative to the size of ∇V.
 
     The residual alone would draw a bad start to V = 0, which solves the equation, too.
@@ -378,7 +378,7 @@ def gauss_newton(
         if not improved or change <= tolerance * reached or gain < 1e-7:
             converged = True
             break
-    return Solution(coefficients, _relative_residual(equation, coefficients), converged)
+    return _Solution(coefficients, _relative_residual(equation, coefficients), converged)
 
 
 def _least_squares(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:

@@ -151,7 +151,7 @@ class Refined:
     formula: RegionFormula | None = None
 
 
-def formula_library(found: IdentifiedField, options: RefinementOptions) -> CandidateLibrary:
+def _formula_library(found: IdentifiedField, options: RefinementOptions) -> CandidateLibrary:
     """The functions in which one formula of V is sought for the whole region.
 
     No polynomial V has a higher degree than f has, and one: of ``∇V·(f + D∇V) = 0`` the highest powers would
@@ -195,7 +195,7 @@ def refine(
     """
     notes: list[str] = []
     routes = options.with_routes(networks=network is not None).routes or ()
-    library = formula_library(found, options)
+    library = _formula_library(found, options)
     found = _over_library(found, library)
     wells: tuple[Well, ...] = ()
     if "local" in routes:
@@ -507,7 +507,7 @@ def refine_and_certify(context: RefinementContext, regressed: SymbolicDecomposit
     formula = None
     if regressed is not None and regressed.potential is not None:
         named = term_coefficients(regressed.potential)
-        library = formula_library(context.found, context.options)
+        library = _formula_library(context.found, context.options)
         formula = np.array([named.get(name, 0.0) for name in library.names])
     network = None if context.networks is None else _potential_of(context.networks)
     refined, formulas, certificate = _refined_by_routes(context, context.options, network, formula)

@@ -93,8 +93,8 @@ class RefinedRun:
         return {
             "model": (self.formulas, self.certificates),
             "refine_outcome": [self.outcome],
-            "record": visit_rows(number, self.record, attractors),
-            "record_density": density_rows(number, self.record, attractors, self.states),
+            "record": _visit_rows(number, self.record, attractors),
+            "record_density": _density_rows(number, self.record, attractors, self.states),
         }
 
     @property
@@ -160,7 +160,7 @@ def run(settings: RefineSettings, given: RunToRefine) -> RefinedRun:
     return RefinedRun(formulas, certificates, outcome, refinement, portrait, states)
 
 
-def visit_rows(run: int, found: RecordTest | None, attractors: Sequence[np.ndarray]) -> pd.DataFrame:
+def _visit_rows(run: int, found: RecordTest | None, attractors: Sequence[np.ndarray]) -> pd.DataFrame:
     """One row for each well; none where there is no test."""
     rows = []
     for one in () if found is None else found.visits:
@@ -186,7 +186,7 @@ def visit_rows(run: int, found: RecordTest | None, attractors: Sequence[np.ndarr
     return as_table("record", rows)
 
 
-def density_rows(
+def _density_rows(
     run: int, found: RecordTest | None, attractors: Sequence[np.ndarray], states: Sequence[str]
 ) -> pd.DataFrame:
     """One row for each bin of each histogram."""

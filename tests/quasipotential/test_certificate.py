@@ -52,9 +52,9 @@ from siq.quasipotential.certificate_tests import (
     PredictionLimits,
     Reference,
     Verdict,
+    _check_branch,
+    _check_characteristics,
     check_agreement,
-    check_branch,
-    check_characteristics,
     check_hamilton_jacobi,
     check_prediction,
     stated_error,
@@ -391,8 +391,8 @@ def test_every_other_invariant_subspace_is_refused(dimension: int, rotation: flo
         own = coefficients[1:]
         candidate = replace(in_basis(basis, own, points, portrait), references=references_of(known))
         equation = check_hamilton_jacobi(candidate, found, CertificateOptions())
-        branch = check_branch(candidate, found, CertificateOptions())
-        followed, _ = check_characteristics(candidate, found, CertificateOptions(), error=1e-6)
+        branch = _check_branch(candidate, found, CertificateOptions())
+        followed, _ = _check_characteristics(candidate, found, CertificateOptions(), error=1e-6)
         if np.allclose(hessian, true, rtol=1e-6, atol=1e-8):
             accepted += 1
             assert equation.passed

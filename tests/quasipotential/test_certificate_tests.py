@@ -35,10 +35,10 @@ from siq.quasipotential.certificate_tests import (
     CertificateOptions,
     Reference,
     Verdict,
+    _check_characteristics,
+    _check_descent,
     _lost_shares,
     _residual_integral,
-    check_characteristics,
-    check_descent,
     check_existence,
 )
 from siq.systems.dynamics import Dynamics
@@ -96,7 +96,7 @@ def test_v_has_to_be_theirs_within_the_error_that_is_stated(factor: float, passe
     # What is stated is 0.02 or, where V is off by more, what its own residual tells; that may be 0.15.
     options = replace(OPTIONS, error=0.02)
     candidate = candidate_of(known, reference_of_name("Maier-Stein"), factor=factor)
-    verdict, error = check_characteristics(candidate, exact_field(known, 3), options, error=0.02)
+    verdict, error = _check_characteristics(candidate, exact_field(known, 3), options, error=0.02)
     assert verdict.passed is passes and error >= 0.02
     assert verdict.value == pytest.approx(abs(factor - 1), abs=1e-5)
     assert ("most of all at" in verdict.reason) is not passes
@@ -105,7 +105,7 @@ def test_v_has_to_be_theirs_within_the_error_that_is_stated(factor: float, passe
 def test_an_error_that_a_region_hides_is_stated() -> None:
     known = maier_stein(1)
     candidate = candidate_of(known, reference_of_name("Maier-Stein"), factor=1.01)
-    verdict, error = check_characteristics(candidate, exact_field(known, 3), OPTIONS, error=1e-6)
+    verdict, error = _check_characteristics(candidate, exact_field(known, 3), OPTIONS, error=1e-6)
     assert verdict.passed
     assert error >= 0.01
 
@@ -115,7 +115,7 @@ def test_a_formula_answers_up_to_the_level_that_it_claims() -> None:
     low = reference_of_name("Maier-Stein").below(0.1)[1]
     assert len(low) and low.max() <= SHARE * 0.1
     candidate = candidate_of(known, reference_of_name("Maier-Stein"), level=1e-9)
-    verdict, _ = check_characteristics(candidate, exact_field(known, 3), OPTIONS, error=1e-6)
+    verdict, _ = _check_characteristics(candidate, exact_field(known, 3), OPTIONS, error=1e-6)
     assert not verdict.passed and "the level is too low" in verdict.reason
 
 
@@ -125,7 +125,9 @@ def test_what_is_too_stiff_is_told() -> None:
     stiff = replace(known.dynamics, equations=(known.dynamics.equations[0], -20_000 * (y - x / 2)))
     found = _follow_well(stiff, portrait_of(known, 300, share=0.6), 0)
     assert "characteristics" in found.fault and "from the attractor [-" in found.fault
-    verdict, _ = check_characteristics(candidate_of(known, found), exact_field(known, 3), OPTIONS, error=1e-6)
+    verdict, _ = _check_characteristics(
+        candidate_of(known, found), exact_field(known, 3), OPTIONS, error=1e-6
+    )
     assert not verdict.passed and verdict.reason == found.fault
 
 
@@ -141,7 +143,7 @@ def test_nothing_is_certified_without_them() -> None:
 
 def test_an_attractor_that_none_left_is_refused() -> None:
     known = maier_stein(1)
-    verdict, error = check_characteristics(candidate_of(known), exact_field(known, 3), OPTIONS, error=1e-6)
+    verdict, error = _check_characteristics(candidate_of(known), exact_field(known, 3), OPTIONS, error=1e-6)
     assert not verdict.passed and error == 1e-6
 
 
@@ -180,14 +182,14 @@ def pairs_of(
 @pytest.mark.parametrize("build", [lambda: archetype(2), lambda: maier_stein(1)])
 def test_without_noise_the_true_v_falls_along_every_pair(build: Callable[[], KnownSystem]) -> None:
     known = build()
-    verdict = check_descent(with_pairs(known, pairs_of(known)), exact_field(known, 3), OPTIONS)
+    verdict = _check_descent(with_pairs(known, pairs_of(known)), exact_field(known, 3), OPTIONS)
     assert verdict.passed and verdict.value == 0
 
 
 def test_it_is_the_recorded_motion_that_counts_and_not_the_identified_f() -> None:
     known = maier_stein(1)
     # f is the right one, and ∇V·f < 0 everywhere; the recordings go the other way.
-    verdict = check_descent(with_pairs(known, pairs_of(known, sign=-1.0)), exact_field(known, 3), OPTIONS)
+    verdict = _check_descent(with_pairs(known, pairs_of(known, sign=-1.0)), exact_field(known, 3), OPTIONS)
     assert not verdict.passed and verdict.value > 0.9
     assert verdict.reason == "V does not fall along the recordings"
 
@@ -198,7 +200,7 @@ def test_a_share_of_the_pairs_may_rise() -> None:
     xh = np.where((np.arange(len(down.h)) % 50 == 0)[:, None], up.xh, down.xh)
     mixed = SnapshotPairs(down.x0, xh, down.h, down.recording)
     for limit, passes in [(0.05, True), (0.01, False)]:
-        verdict = check_descent(
+        verdict = _check_descent(
             with_pairs(known, mixed), exact_field(known, 3), CertificateOptions(descent=limit)
         )
         assert verdict.value == pytest.approx(0.02, abs=2e-3)
@@ -211,7 +213,7 @@ def test_a_share_of_the_pairs_may_rise() -> None:
 def test_with_noise_v_falls_in_the_mean_as_fast_as_it_has_to(factor: float, passes: bool) -> None:
     known = maier_stein(1)
     found = exact_field(known, 3, relative_error=np.sqrt(NOISE))
-    verdict = check_descent(
+    verdict = _check_descent(
         with_pairs(known, pairs_of(known, noise=NOISE), factor), found, OPTIONS, error=1e-3
     )
     assert verdict.passed is passes, (verdict.value, verdict.limit)
@@ -222,12 +224,12 @@ def test_longer_steps_change_the_mean_by_as_much_as_is_allowed_for() -> None:
     known = maier_stein(1)
     found = exact_field(known, 3, relative_error=np.sqrt(NOISE))
     pairs = pairs_of(known, h=0.1, noise=NOISE, count=10_000)
-    assert check_descent(with_pairs(known, pairs), found, OPTIONS).passed
+    assert _check_descent(with_pairs(known, pairs), found, OPTIONS).passed
 
 
 def test_too_few_pairs_are_no_test() -> None:
     known = maier_stein(1)
-    verdict = check_descent(with_pairs(known, pairs_of(known, count=20)), exact_field(known, 3), OPTIONS)
+    verdict = _check_descent(with_pairs(known, pairs_of(known, count=20)), exact_field(known, 3), OPTIONS)
     assert not verdict.passed and "only 20 pairs" in verdict.reason
 
 

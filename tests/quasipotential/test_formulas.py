@@ -14,11 +14,11 @@ from siq.errors import InputError, NumericalFailure
 from siq.inference.library import candidate_library
 from siq.quasipotential.formulas import (
     SymbolicDecomposition,
+    _expression_from_data,
+    _expression_to_data,
     _minimum,
     decomposition_from_coefficients,
     exact_decomposition,
-    expression_from_data,
-    expression_to_data,
     model_to_data,
     read_model,
     term_coefficients,
@@ -228,14 +228,14 @@ def test_anything_can_evaluate_a_polynomial_without_this_library(tmp_path: Path)
 
 def test_center_and_scale_are_obeyed_when_reading() -> None:
     data = {"center": [1.0, 0.0], "scale": [2.0, 1.0], "exponents": [[2, 1]], "coefficients": [3.0]}
-    formula = expression_from_data(data, (x, y))
+    formula = _expression_from_data(data, (x, y))
     assert float(formula.subs({x: 4.0, y: 5.0})) == pytest.approx(3 * 1.5**2 * 5)
 
 
 def test_a_formula_that_is_no_polynomial_travels_as_text() -> None:
-    data = expression_to_data(sympy.sqrt(x**2 + 1) - y, (x, y))
+    data = _expression_to_data(sympy.sqrt(x**2 + 1) - y, (x, y))
     assert set(data) == {"formula"}
-    assert expression_from_data(data, (x, y)) == sympy.sqrt(x**2 + 1) - y
+    assert _expression_from_data(data, (x, y)) == sympy.sqrt(x**2 + 1) - y
 
 
 @pytest.mark.parametrize(

@@ -80,7 +80,7 @@ def test_the_wells_carry_the_certificate_where_one_formula_is_refused(
     one = RegionFormula(np.ones(1), np.ones((1, 1)), np.eye(1), np.ones((1, 1)), joint=True)
     found = Refined(SimpleNamespace(noise_free=True), None, 0.01, (well,), formula=one)  # type: ignore[arg-type]
     monkeypatch.setattr(refinement, "refine", lambda *_, **__: found)
-    monkeypatch.setattr(refinement, "formula_library", lambda *_: None)
+    monkeypatch.setattr(refinement, "_formula_library", lambda *_: None)
     monkeypatch.setattr(
         refinement, "_refined_decomposition", lambda one, _: SimpleNamespace(potential=one.formula)
     )
