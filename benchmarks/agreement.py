@@ -48,8 +48,8 @@ from siq.quasipotential.hamilton_jacobi import LibraryBasis
 from siq.quasipotential.refinement import RefinementOptions, local_wells, refine
 from siq.systems.phase_portrait import PhasePortrait
 from siq.systems.simulation import SimulationOptions, simulate_snapshots
-from siq.workflow import training_step
-from siq.workflow.settings import PipelineSettings, Sampling, StateSpace
+from siq.workflow import training
+from siq.workflow.study import PipelineSettings, Sampling, StateSpace
 
 SYSTEMS = {
     "Maier–Stein, β = 1": (maier_stein(1), 3),
@@ -74,8 +74,8 @@ def networks_of(known: KnownSystem, steps: int) -> list[TrainedNetworks]:
     for number in range(TRAININGS):
         draw = np.random.default_rng([steps, number])
         recordings = simulate_snapshots(as_system(known), options=SIMULATION, generator=draw)
-        runs[number] = training_step.RunToTrain(recordings, None)
-    return list(training_step.run(settings, runs, device="cpu").networks.values())
+        runs[number] = training.RunToTrain(recordings, None)
+    return list(training.train_block(settings, runs, device="cpu").networks.values())
 
 
 def about_attractors(

@@ -29,10 +29,9 @@ from siq.networks.decomposition import TrainingOptions
 from siq.systems.cards import load_exact, load_system
 from siq.systems.formulas import compile_formulas
 from siq.systems.simulation import complete, simulate_snapshots
-from siq.workflow.outcomes import Method
 from siq.workflow.pipeline import Analysis, PipelineSettings, analyse
-from siq.workflow.settings import Sampling, StateSpace
-from siq.workflow.study import SimulationEntry
+from siq.workflow.study import Sampling, SimulationEntry, StateSpace
+from siq.workflow.tables import Method
 
 ROOT = Path(__file__).parents[1]
 CARDS = ("archetype3d", "resonator", "maier-stein")

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from siq.validation.reference_systems import reference_systems, reference_table
     from siq.workflow.pipeline import PipelineSettings
     from siq.workflow.study import Study, load_study
-    from siq.workflow.sweep_step import Sweep, sweep
+    from siq.workflow.sweep import Sweep, sweep
     from siq.workflow.tipping import probability_of_tipping
 
     __version__: str
@@ -108,7 +108,7 @@ _MODULES = {
     "RegressionOptions": "siq.networks.regression",
     "SimulationOptions": "siq.systems.simulation",
     "Study": "siq.workflow.study",
-    "Sweep": "siq.workflow.sweep_step",
+    "Sweep": "siq.workflow.sweep",
     "SymbolicDecomposition": "siq.quasipotential.formulas",
     "TrainingOptions": "siq.networks.decomposition",
     "candidate_library": "siq.inference.library",
@@ -133,7 +133,7 @@ _MODULES = {
     "snapshot_pairs": "siq.data.recordings",
     "solve_case": "siq.diagnosis.diagnosis",
     "sparse_decomposition": "siq.networks.regression",
-    "sweep": "siq.workflow.sweep_step",
+    "sweep": "siq.workflow.sweep",
     "train": "siq.networks.training",
     "write_recordings": "siq.data.recordings",
 }

@@ -43,7 +43,7 @@ UPWARDS: frozenset[tuple[str, str]] = frozenset(
         ("siq.quasipotential.landscape", "siq.report.plots.quasipotential"),
         ("siq.quasipotential.landscape", "siq.workflow.pipeline"),
         ("siq.workflow.files", "siq.report.plots.style"),
-        ("siq.workflow.sweep_step", "siq.report.plots.sweep"),
+        ("siq.workflow.sweep", "siq.report.plots.sweep"),
     }
 )
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from siq.systems.cards import load_system
-from siq.workflow import recordings_step
+from siq.workflow import results
 from siq.workflow.pipeline import Analysis, analyse
-from siq.workflow.settings import settings_of
-from siq.workflow.study import load_study, system_path
+from siq.workflow.study import load_study, settings_of, system_path
 
 SYSTEMS = Path(__file__).parents[1] / "config" / "systems"
 
@@ -23,6 +22,6 @@ def analysed(data: str, folder: Path) -> Analysis:
     settings = settings_of(study, system)
     source = card if study.recordings is None else study.recordings.file
     assert source is not None
-    drawn = recordings_step.run(settings, recordings_step.source_of(source, settings), number=0)
+    drawn = results.draw_run(settings, results.source_of(source, settings), number=0)
     assert drawn.recordings is not None
     return analyse(drawn.recordings, settings)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from siq.systems.dynamics import Dynamics
-    from siq.workflow.settings import PipelineSettings
+    from siq.workflow.study import PipelineSettings
 
 LOGGER = logging.getLogger(__name__)
 COMPARED = {"missing physics": ("recalibrated", "augmented"), "parameter shift": ("before", "recalibrated")}

@@ -14,8 +14,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from siq.quasipotential.landscape import Landscape
-    from siq.workflow.settings import PipelineSettings
-    from siq.workflow.study import Study
+    from siq.workflow.study import PipelineSettings, Study
 
 PACKAGES = ("numpy", "snakemake")
 OF_NETWORKS = ("torch", "pysindy")
@@ -35,7 +34,7 @@ def _files(folders: Iterable[str], suffix: str) -> dict[str, bytes]:
 
 def _first_stored(given: Given) -> tuple[int, Landscape] | None:
     """The first run with a U over all wells."""
-    from siq.workflow.comparison_steps import first_stored
+    from siq.workflow.comparison import first_stored
 
     landscapes = given.files.get("quasipotential") or ()
     return first_stored(given.files["field"][: len(landscapes)], landscapes)
@@ -71,10 +70,9 @@ def figures(given: Given, settings: PipelineSettings) -> Any:
     from siq.report import figures as report
     from siq.report.page import interactive_view
     from siq.report.summary import summarise
-    from siq.workflow.collection_steps import shown_formula
-    from siq.workflow.outcomes import Method
-    from siq.workflow.recordings_step import read_states
-    from siq.workflow.scoring import exact_answer
+    from siq.workflow.results import read_states
+    from siq.workflow.scoring import exact_answer, shown_formula
+    from siq.workflow.tables import Method
 
     source, models = given.files, _models(given)
     tables = {name: getattr(given, name) for name in report.DRAWN_TABLES}
@@ -144,11 +142,11 @@ def landscape_figures(given: Given, settings: PipelineSettings) -> Any:
 def invariant(given: Given, settings: PipelineSettings) -> Any:
     """The invariant distribution of the formula that is shown, or of the landscape where none holds."""
     from siq.report.plots import plot_invariant_distribution
-    from siq.workflow import invariant_step
+    from siq.workflow import comparison
 
     shown = _what_it_follows_from(given) if settings.invariant and given.card is not None else None
-    own = settings.of(invariant_step.InvariantSettings)
-    found = invariant_step.run(own, given.card, shown, _published(given))
+    own = settings.of(comparison.InvariantSettings)
+    found = comparison.compare_invariant(own, given.card, shown, _published(given))
     drawn = {}
     if found.densities:
         names = settings.space.names or ()
@@ -158,11 +156,11 @@ def invariant(given: Given, settings: PipelineSettings) -> Any:
 
 
 def _what_it_follows_from(given: Given) -> Any:
-    """See `siq.workflow.invariant_step.run`; equations have one landscape, and nothing else."""
+    """See `siq.workflow.comparison.compare_invariant`; equations have one landscape, and nothing else."""
     from siq.quasipotential.landscape_files import read_landscape
-    from siq.workflow.collection_steps import shown_formula
-    from siq.workflow.invariant_step import FormulaShown, LandscapeShown
-    from siq.workflow.outcomes import Method
+    from siq.workflow.comparison import FormulaShown, LandscapeShown
+    from siq.workflow.scoring import shown_formula
+    from siq.workflow.tables import Method
 
     if not given.path("model"):
         stored = read_landscape(given.files["quasipotential"], dynamics=given.card)
@@ -192,8 +190,7 @@ def page(given: Given, settings: PipelineSettings) -> Any:
     from siq.report.page import render_report
     from siq.report.study_page import StudyResults, answer_data, study_page
     from siq.report.summary import summarise
-    from siq.workflow.collection_steps import shown_formula
-    from siq.workflow.scoring import exact_answer
+    from siq.workflow.scoring import exact_answer, shown_formula
 
     source, study = given.files, _study(given)
     tables, models, card = _tables(given), _models(given), given.path("card")
@@ -276,9 +273,9 @@ def reproduction(given: Given, settings: PipelineSettings) -> Any:
     import yaml
     from pydantic import TypeAdapter
 
-    from siq.workflow.reproduction import load_contents, load_parameters
     from workflow.reproduction import ReproductionSettings
     from workflow.reproduction.page import Paper, Results, render_reproduction, reproduction_page
+    from workflow.reproduction.publication import load_contents, load_parameters
 
     source = given.files
     told = TypeAdapter(dict[str, ReproductionSettings]).validate_python(given.options["studies"])

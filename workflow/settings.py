@@ -18,8 +18,16 @@ from siq.systems.cards import check_name, load_exact
 from siq.systems.dynamics import Dynamics
 from siq.version import DISTRIBUTION
 from siq.workflow.published import load_published
-from siq.workflow.settings import PipelineSettings, card_content, card_content_beside, settings_of
-from siq.workflow.study import Study, check_states, completed, load_study_system
+from siq.workflow.study import (
+    PipelineSettings,
+    Study,
+    card_content,
+    card_content_beside,
+    check_states,
+    completed,
+    load_study_system,
+    settings_of,
+)
 from workflow.places import BASE, config_path, names_in, needed_file, published_figures, system_card
 
 WORKFLOW_KEYS = ("statistics", "device", "runs_per_training", "mismatch", "cases", "keys", "proof", "origin")

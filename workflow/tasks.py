@@ -18,7 +18,7 @@ from typing import Any
 
 from siq.errors import InputError
 from siq.workflow import steps
-from siq.workflow.tasks import TASKS, Given, results
+from siq.workflow.tasks import TASKS, Given, outputs_of
 from workflow import diagnosis, pages
 from workflow.proof import tasks as proof
 
@@ -80,7 +80,7 @@ class Job:
     def __call__(self) -> None:
         """Run the task and write its results."""
         from siq.workflow.files import write
-        from siq.workflow.settings import PipelineSettings
+        from siq.workflow.study import PipelineSettings
 
         options = dict(self.params.get("options") or {})
         known = {each.name for each in fields(PipelineSettings)}
@@ -91,7 +91,7 @@ class Job:
             wildcards=self.wildcards, outputs=self.output, device=self.device, threads=self.threads,
             tell=_teller(self.wildcards.get("case", "")),
         )  # fmt: skip
-        made = results(TASKS[self.task].run(given, settings))
+        made = outputs_of(TASKS[self.task].run(given, settings))
         for name, path in self.output.items():
             if name in made:
                 write(name, path, made[name], settings)

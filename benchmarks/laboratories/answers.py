@@ -14,7 +14,7 @@ from benchmarks.laboratories.truths import Truth
 from siq.data.recordings import Recordings
 from siq.quasipotential.landscape import Landscape
 from siq.workflow.pipeline import Analysis, PipelineSettings, analyse
-from siq.workflow.settings import StateSpace
+from siq.workflow.study import StateSpace
 
 SAME_PLACE = 0.25  # of the way from an attractor to its saddle: where an attractor found is this one
 TRUE_BRANCH = 3.0  # a curvature of V that is wrong by this factor is that of another solution (a choice)

@@ -35,7 +35,7 @@ from siq.inference.observation import View, settled, unbroken
 from siq.quasipotential.certificate_tests import PredictionLimits
 from siq.systems.diffusion import Diffusion
 from siq.workflow.identification_step import IdentifySettings, run
-from siq.workflow.settings import Sampling, StateSpace
+from siq.workflow.study import Sampling, StateSpace
 
 STRONG = 5.0  # standard errors of the weakest true term of a record that counts
 WANTED = 0.93

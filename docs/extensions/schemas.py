@@ -158,7 +158,7 @@ class CommandLine(SphinxDirective):
     """What `siq --help` and the help of each subcommand say, where the library has a command."""
 
     def run(self) -> list[nodes.Node]:
-        """Ask the parser of `siq.cli` itself."""
+        """Ask the parser of the command itself."""
         try:
             parser = importlib.import_module("siq.workflow.command").parser()
         except ImportError:

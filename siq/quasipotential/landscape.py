@@ -497,7 +497,7 @@ class Landscape:
         equations
             From `from_equations`, of the same states. U is in the unit of D, which has to be the same, but
             for the errors of one that was estimated: tell the recordings that of the equations
-            (`siq.workflow.settings.StateSpace`), or read ΔU/ε of both.
+            (`siq.workflow.study.StateSpace`), or read ΔU/ε of both.
         noise
             ε for which mean times are compared; left out, none are.
 

@@ -50,11 +50,10 @@ from siq.report.summary import LandscapeSummary, energy_unit
 from siq.systems.dynamics import Dynamics
 from siq.systems.formulas import compile_formulas
 from siq.systems.simulation import SimulationOptions, simulate_snapshots
-from siq.workflow.collection_steps import ModelFiles, Shown
-from siq.workflow.outcomes import METHODS, Method
 from siq.workflow.published import PublishedFigure, published_formula
-from siq.workflow.settings import STRICT, Sampling, StateSpace
-from siq.workflow.study import Study, SweepOptions
+from siq.workflow.scoring import ModelFiles, Shown
+from siq.workflow.study import STRICT, Sampling, StateSpace, Study, SweepOptions
+from siq.workflow.tables import METHODS, Method
 
 
 def project(
@@ -388,7 +387,7 @@ def representative_run(
     Parameters
     ----------
     shown
-        The formula that is shown, see `siq.workflow.collection_steps.shown_formula`.
+        The formula that is shown, see `siq.workflow.scoring.shown_formula`.
     models
         The formulas of all runs.
     complete

@@ -21,7 +21,7 @@ from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.rates import NoiseStrength, mean_exit_time
 from siq.report.formatting import counted_text, paragraphs, percent_text, predicted_text, texts, time_text
 from siq.report.summary import LandscapeSummary, VisitSummary, settled, summarise, well_name
-from siq.workflow.outcomes import Method
+from siq.workflow.tables import Method
 
 MOST_COLUMNS = 4  # wells that are columns of a table; more are rows
 

@@ -57,10 +57,9 @@ from siq.report.page import FormulaRow, ReportContent, ReportFigure, compose
 from siq.report.summary import LandscapeSummary, well_name
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
-from siq.workflow.collection_steps import ModelFiles, Shown
-from siq.workflow.outcomes import Method, Outcome, Status, Step, why_no_landscape
-from siq.workflow.settings import STRICT
-from siq.workflow.study import Study, SweepOptions
+from siq.workflow.scoring import ModelFiles, Shown
+from siq.workflow.study import STRICT, Study, SweepOptions
+from siq.workflow.tables import Method, Outcome, Status, Step, why_no_landscape
 
 NEGLIGIBLE_TERM = 1e-3  # of the depth: a term that adds less everywhere is left to the whole formula
 ROUNDED_CONSTANT = 1e-9  # of the depth: a constant of U far below it is what rounding left of zero

@@ -25,11 +25,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from siq.numerics.files import whole_file
-from siq.workflow.outcomes import read_outcomes, write_outcomes
+from siq.workflow.tables import read_outcomes, write_outcomes
 
 if TYPE_CHECKING:
     from siq.networks.decomposition import TrainedNetworks
-    from siq.workflow.settings import PipelineSettings
+    from siq.workflow.study import PipelineSettings
 
 
 @dataclasses.dataclass(frozen=True)

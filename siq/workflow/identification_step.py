@@ -78,8 +78,8 @@ from siq.inference.residuals import (
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.certificate_tests import PredictionLimits, Verdict, check_prediction
 from siq.systems.diffusion import Diffusion
-from siq.workflow.outcomes import Outcome, Status, Step
-from siq.workflow.settings import STRICT, Sampling, StateSpace
+from siq.workflow.study import STRICT, Sampling, StateSpace
+from siq.workflow.tables import Outcome, Status, Step
 
 SUSPECT = -1.0  # standard errors of the correlation of neighbouring residuals
 FROM_ABOVE = 0.1  # of what means move by: a search finds its way down to no sensor noise, but not up from it

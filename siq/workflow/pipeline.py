@@ -17,11 +17,11 @@ from siq.data.preparation import in_stretches, joined, without_slow_drift
 from siq.data.recordings import Recordings, recordings_of
 from siq.quasipotential.landscape import Landscape, NoLandscape
 from siq.systems.dynamics import Dynamics
-from siq.workflow import identification_step, landscape_step, refinement_step, regression_step, steps
-from siq.workflow.outcomes import Outcome, why_no_landscape
-from siq.workflow.settings import PipelineSettings
-from siq.workflow.tasks import Given, results
-from siq.workflow.training_step import TrainedRun, trained_run
+from siq.workflow import identification_step, results, steps
+from siq.workflow.study import PipelineSettings
+from siq.workflow.tables import Outcome, why_no_landscape
+from siq.workflow.tasks import Given, outputs_of
+from siq.workflow.training import TrainedRun, trained_run
 
 __all__ = ["Analysis", "PipelineSettings", "analyse", "landscape_from_recordings"]
 
@@ -44,9 +44,9 @@ class Analysis:
 
     identified: identification_step.Identified
     trained: TrainedRun
-    regressed: regression_step.Regressed | None
-    refined: refinement_step.RefinedRun
-    landscape: landscape_step.FoundLandscape | None
+    regressed: results.Regressed | None
+    refined: results.RefinedRun
+    landscape: results.FoundLandscape | None
 
     @property
     def outcomes(self) -> tuple[Outcome, ...]:
@@ -93,7 +93,7 @@ def analyse(
         block = one is steps.train  # whose runs train side by side; here there is one
         values = {name: [value] for name, value in made.items()} if block else dict(made)
         found = one(Given(values=values, number=number, device=device), settings)
-        made.update(results(found))
+        made.update(outputs_of(found))
         return found
 
     identified = run(steps.identify)

@@ -1,22 +1,47 @@
-"""Scores: how close the formulas come to exact answers, where these are known.
+"""Scores: how close formulas come to exact answers, and all runs of a study as tables.
 
 Nothing here feeds back into a method. A run without formulas has no coefficients and no error; it stays in
-the tables with missing values.
+the tables with missing values, and where no exact answer is known the coefficients stand without one.
+`shown_formula` chooses the run that figures and pages show.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from dataclasses import dataclass as plain_dataclass
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from siq.quasipotential.formulas import SymbolicDecomposition, exact_decomposition, term_coefficients
+from siq.data.recordings import Recordings
+from siq.inference.identification import FieldRecord
+from siq.inference.library import candidate_library
+from siq.inference.residuals import prediction_errors
+from siq.networks.decomposition import TrainedNetworks, shuffled
+from siq.numerics.randomness import Purpose, generator
+from siq.quasipotential.formulas import (
+    SymbolicDecomposition,
+    exact_decomposition,
+    read_model,
+    term_coefficients,
+)
+from siq.quasipotential.landscape_files import landscape_data
+from siq.quasipotential.wells import Well
 from siq.systems.cards import load_exact, load_system
+from siq.systems.dynamics import Dynamics
 from siq.systems.formulas import compile_formulas
+from siq.systems.simulation import SimulationOptions, simulate_snapshots
+from siq.workflow import results
 from siq.workflow.published import PublishedFigure
-from siq.workflow.tables import as_table
+from siq.workflow.results import LandscapeSettings
+from siq.workflow.study import PipelineSettings
+from siq.workflow.tables import METHODS, Method, Outcome, Status, Step, as_table, concatenate
+from siq.workflow.training import TrainedRun
 
 GRID_POINTS = 1_000_000  # the paper's grid has 100 points along each of three axes
 
@@ -175,3 +200,309 @@ def summary_row(
         "published_standard_deviation": figure.standard_deviation if figure else np.nan,
         "source": figure.source if figure else "",
     }
+
+
+COARSE = 50_000  # points of the grid on which the randomised network is scored
+UNSEEN = 1000  # trajectories that no run learns from (paper, section 3.1)
+
+
+@plain_dataclass(frozen=True)
+class RunToScore:
+    """What is scored, and by what.
+
+    Attributes
+    ----------
+    formulas, certificates
+        Of the run, by method.
+    trained
+        Its networks.
+    system
+        Its card, None where there is none.
+    exact
+        The exact decomposition, None where the card does not know it.
+    """
+
+    formulas: Mapping[str, SymbolicDecomposition]
+    certificates: Mapping[str, Mapping[str, Any]]
+    trained: TrainedRun
+    system: Dynamics | None = None
+    exact: SymbolicDecomposition | None = None
+
+
+@plain_dataclass(frozen=True)
+class Scored:
+    """The tables of a run, see `siq.workflow.tables.COLUMNS`, and the outcome."""
+
+    coefficients: pd.DataFrame
+    rrmse: pd.DataFrame
+    prediction: pd.DataFrame
+    certificates: pd.DataFrame
+    outcome: Outcome
+
+    def files(self) -> dict[str, Any]:
+        """By the names of the rule."""
+        names = ("coefficients", "rrmse", "prediction", "certificates")
+        return {name: getattr(self, name) for name in names} | {"score_outcome": [self.outcome]}
+
+
+def score_run(settings: PipelineSettings, given: RunToScore) -> Scored:
+    """Scores of one run."""
+    number, system, exact = given.trained.outcome.run, given.system, given.exact
+    options, tables = settings.regression, []
+    errors: dict[str, dict[str, Any]] = {
+        # A method without a formula stays in the table, without an error to boast of.
+        str(method): {"run": number, "method": str(method), "certified": False}
+        for method in Method
+        if method in settings.methods or method in given.certificates
+    }
+    for method, one in given.certificates.items():
+        errors[method] |= {"certified": one["certified"], "stated_error": one["stated_error"]}
+    for method, identified in given.formulas.items():
+        library = candidate_library(
+            [symbol.name for symbol in identified.symbols], degree=options.degree, further=options.functions
+        )
+        table = coefficient_table(number, method, identified, exact, terms=library.names)
+        tables.append(table)
+        errors[method] |= {
+            "rrmse": relative_root_mean_square_error(table),
+            "support_correct": support_is_correct(table),
+        }
+    if exact is not None and system is not None and given.trained.networks is not None:
+        draw = generator(settings.seed, number, Purpose.SHUFFLE)
+        known = _network_errors(given.trained.networks, system.box, exact, draw)
+        for method, row in errors.items():
+            row["network_error"] = known[method]
+    predicted = as_table("prediction", [])
+    if system is not None and settings.simulation is not None and given.formulas:
+        predicted = _predictions(system, given.formulas, number, settings.simulation, settings.seed)
+    return Scored(
+        coefficients=concatenate("coefficients", tables),
+        rrmse=as_table("rrmse", list(errors.values())),
+        prediction=predicted,
+        certificates=_certificate_table(number, given.certificates),
+        outcome=_outcome(number, has_formulas=bool(given.formulas), known=exact is not None),
+    )
+
+
+def _outcome(number: int, *, has_formulas: bool, known: bool) -> Outcome:
+    if not has_formulas:
+        return Outcome(number, Step.SCORE, Status.SKIPPED, "there is no formula to score")
+    if not known:
+        return Outcome(number, Step.SCORE, Status.SKIPPED, "no exact answer is known")
+    return Outcome(number, Step.SCORE)
+
+
+def _network_errors(
+    trained: TrainedNetworks, box: np.ndarray, exact: SymbolicDecomposition, draw: np.random.Generator
+) -> dict[str, float]:
+    """Relative L2 error on a grid over Ω of the U of the trained network, and of a randomised one."""
+    randomised = shuffled(trained, generator=draw)
+
+    def error_of(networks: TrainedNetworks, grid: np.ndarray) -> float:
+        return relative_error(2 * networks.potential_at(grid.T), exact_values(exact, grid))
+
+    error = error_of(trained, domain_grid(box))
+    chance = error_of(randomised, domain_grid(box, points=COARSE))
+    return dict.fromkeys(map(str, METHODS), error) | {str(Method.CONTROL): chance}
+
+
+def _predictions(
+    system: Dynamics,
+    formulas: Mapping[str, SymbolicDecomposition],
+    number: int,
+    simulation: SimulationOptions,
+    seed: int,
+) -> pd.DataFrame:
+    """Errors of long-term prediction of unseen trajectories of the system without noise."""
+    options = replace(simulation, trajectories=UNSEEN, noise_intensity=0.0)
+    unseen = simulate_snapshots(system, options=options, generator=generator(seed, Purpose.UNSEEN))
+    tables = [
+        pd.DataFrame(
+            {
+                "run": number,
+                "method": method,
+                "trajectory": np.arange(UNSEEN),
+                "error": prediction_errors(Dynamics.of(one.symbols, one.vector_field), unseen),
+            }
+        )
+        for method, one in formulas.items()
+    ]
+    return concatenate("prediction", tables)
+
+
+def _certificate_table(number: int, certificates: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
+    """Every test of every formula, with its figure."""
+    rows = [
+        {"run": number, "method": method, "test": test} | verdict
+        for method, one in certificates.items()
+        for test, verdict in one["tests"].items()
+    ]
+    return as_table("certificates", rows)
+
+
+OF_RUNS = (
+    "coefficients", "rrmse", "prediction", "certificates", "record", "record_density", "landscape", "degrees",
+    "training",
+)  # fmt: skip
+"""Tables that every run, or every block of runs, has a part of."""
+
+
+def collect_runs(
+    parts: Mapping[str, Sequence[pd.DataFrame]],
+    outcomes: Sequence[Outcome],
+    published: Mapping[str, PublishedFigure],
+    *,
+    benchmarks: Path,
+) -> dict[str, pd.DataFrame]:
+    """The tables of a study by name.
+
+    Parameters
+    ----------
+    parts
+        The parts of each of the tables `OF_RUNS`.
+    outcomes
+        Of every step of every run.
+    published
+        Figures to be set beside ours.
+    benchmarks
+        Folder of the times that the workflow measured.
+    """
+    tables = {name: concatenate(name, list(parts[name])) for name in OF_RUNS}
+    order = list(Step)
+    entries = sorted(outcomes, key=lambda one: (one.run, order.index(one.step)))
+    tables["outcomes"] = as_table(
+        "outcomes",
+        [
+            {"run": one.run, "step": str(one.step), "status": str(one.status), "reason": one.reason}
+            for one in entries
+        ],
+    )
+    tables["timings"] = timings(benchmarks, {one.run for one in entries}, drawing=str(entries[0].step))
+    tables["summary"] = summary_table(
+        tables["coefficients"], tables["rrmse"], tables["prediction"], published
+    )
+    return tables
+
+
+def timings(folder: Path, runs: Iterable[int], *, drawing: str) -> pd.DataFrame:
+    """Seconds of every step of every run; runs that trained side by side share their time evenly.
+
+    `drawing` is what the outcomes call the step that draws trajectories.
+    """
+    known, rows = set(runs), []
+    for path in sorted(folder.glob("*/*.tsv")):
+        first, _, last = path.parent.name.partition("-")
+        together = [run for run in range(int(first), int(last or first) + 1) if run in known]
+        seconds = float(pd.read_csv(path, sep="\t")["s"].iloc[0])
+        rows += [
+            {
+                "run": run,
+                "step": drawing if path.stem == "draw" else path.stem,
+                "seconds": seconds / len(together),
+            }
+            for run in together
+        ]
+    return as_table("timings", rows).sort_values(["run", "step"], ignore_index=True)
+
+
+@dataclass(frozen=True)
+class ModelFiles:
+    """The `model.json` of every run; formulas are parsed for the runs that are shown alone."""
+
+    paths: tuple[str, ...]
+
+    @cached_property
+    def _methods(self) -> list[dict[str, Any]]:
+        return [json.loads(Path(path).read_text(encoding="utf-8"))["methods"] for path in self.paths]
+
+    def with_formula(self, method: Method) -> list[int]:
+        """The runs with one formula of V for the whole region."""
+        return [run for run, one in enumerate(self._methods) if one.get(method, {}).get("V")]
+
+    def with_any_formula(self, method: Method) -> list[int]:
+        """The runs with a formula of V, be it of the whole region or of single wells."""
+        have = [one.get(method, {}) for one in self._methods]
+        return [run for run, one in enumerate(have) if one.get("V") or one.get("wells")]
+
+    def first_wells(self) -> Shown:
+        """The first run that has a formula about each attractor, where none has a single one."""
+        for run, methods in enumerate(self._methods):
+            for method, one in methods.items():
+                if one.get("wells"):
+                    return Shown(run, Method(method))
+        return Shown(None, METHODS[0])
+
+    def formulas(self, run: int) -> dict[str, SymbolicDecomposition]:
+        """The formulas of a run by method."""
+        return read_model(self.paths[run])[0]
+
+    def certificates(self, run: int) -> dict[str, Any]:
+        """Their certificates."""
+        return read_model(self.paths[run])[1]
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A run, and the method of it whose formula is shown; None where no run has a formula."""
+
+    run: int | None
+    method: Method
+
+
+def shown_formula(rrmse: pd.DataFrame, models: ModelFiles) -> Shown:
+    """The run and the method whose formula is shown: refined where any run has one, otherwise as published.
+
+    Of the runs with such a formula it is the median by error where errors are known, otherwise the first.
+    """
+    for method in reversed(METHODS):
+        with_formula = models.with_formula(method)
+        if with_formula:
+            mine = rrmse[(rrmse["method"] == method) & rrmse["run"].isin(with_formula)]
+            ranked = mine.dropna(subset="rrmse").sort_values("rrmse")
+            if len(ranked):
+                return Shown(int(ranked["run"].iloc[(len(ranked) - 1) // 2]), method)
+            return Shown(with_formula[0], method)
+    return Shown(None, METHODS[0])
+
+
+@plain_dataclass(frozen=True)
+class RunToShow:
+    """A run: its number, its trajectories, its f, and V about its attractors, as far as they are known."""
+
+    number: int
+    recordings: Recordings | None
+    record: FieldRecord | None
+    wells: tuple[Well, ...] = ()
+
+
+def choose(shown: int | None, stored: Sequence[Callable[[], Mapping[str, Any] | None]]) -> int | None:
+    """The run whose stored landscape is shown: that of the formulas, or else the first that has an attractor.
+
+    Parameters
+    ----------
+    shown
+        The run whose formulas are shown, None where there is none.
+    stored
+        Reads `quasipotential.json` of each run; None where it is empty.
+    """
+    order = [*([] if shown is None else [shown]), *range(len(stored))]
+    return next((run for run in order if run < len(stored) and _has_wells(stored[run]())), None)
+
+
+def _has_wells(data: Mapping[str, Any] | None) -> bool:
+    return bool(data) and bool((data or {}).get("wells"))
+
+
+def overview_of_run(settings: LandscapeSettings, given: RunToShow) -> dict[str, Any] | None:
+    """The overview of a run whose landscape nobody asked for; None where it has none."""
+    found = results.landscape_of_run(
+        settings, given.recordings, given.record,
+        number=given.number, wells=given.wells, seek_wells=False,
+    )  # fmt: skip
+    if found.landscape is None or found.record is None or not found.landscape.attractors:
+        return None
+    data = landscape_data(found.landscape)
+    # No formula about a single well was sought, so that none is missed.
+    missed = "quasipotential.no_refined_formula"
+    data["remarks"] = [one for one in data["remarks"] if one["code"] != missed]
+    return {"run": given.number} | data

@@ -15,9 +15,9 @@ from siq.workflow.tasks import Given, task
 
 if TYPE_CHECKING:
     from siq.quasipotential.wells import Well
-    from siq.workflow.collection_steps import ModelFiles
-    from siq.workflow.settings import PipelineSettings
-    from siq.workflow.training_step import TrainedRun
+    from siq.workflow.scoring import ModelFiles
+    from siq.workflow.study import PipelineSettings
+    from siq.workflow.training import TrainedRun
 
 
 # The published method, and ours.
@@ -29,11 +29,11 @@ if TYPE_CHECKING:
 )  # fmt: skip
 def draw(given: Given, settings: PipelineSettings) -> Any:
     """Trajectories of a run: a simulation of the card, or recordings resampled."""
-    from siq.workflow import recordings_step
+    from siq.workflow import results
 
     path = given.path("source")
     assert path is not None
-    return recordings_step.run(settings, recordings_step.source_of(path, settings), number=given.number)
+    return results.draw_run(settings, results.source_of(path, settings), number=given.number)
 
 
 @task("recordings", options=("seed", "space", "sampling", "identification", "certificate"))
@@ -51,18 +51,18 @@ def train(given: Given, settings: PipelineSettings) -> Any:
     import torch
     import torch._dynamo  # the first optimiser loads it: once for all runs
 
-    from siq.workflow import training_step
+    from siq.workflow import training
 
     torch.set_num_threads(given.threads)
     pairs = zip(given.recordings, given.field, strict=True)
     runs = {
-        number: training_step.RunToTrain(recordings, record)
+        number: training.RunToTrain(recordings, record)
         for number, (recordings, record) in enumerate(pairs, start=given.number)
     }
     folder = Path(given.outputs["networks"]).parent if given.outputs else None
     if folder is not None:
-        given.afterwards.append(partial(training_step.clean, folder))
-    return training_step.run(settings, runs, folder=folder, device=given.device)
+        given.afterwards.append(partial(training.clean, folder))
+    return training.train_block(settings, runs, folder=folder, device=given.device)
 
 
 @task("recordings", "networks", "train_outcome", options=("space", "sampling", "regression"))
@@ -70,9 +70,9 @@ def regress(given: Given, settings: PipelineSettings) -> Any:
     """Sparse formulas of V, g and f from the networks, as published."""
     import pysindy  # noqa: F401 (once for all runs: it takes seconds)
 
-    from siq.workflow import regression_step
+    from siq.workflow import results
 
-    return regression_step.run(settings, given.recordings, _trained(given))
+    return results.regress_run(settings, given.recordings, _trained(given))
 
 
 @task(
@@ -81,17 +81,17 @@ def regress(given: Given, settings: PipelineSettings) -> Any:
 )  # fmt: skip
 def refine(given: Given, settings: PipelineSettings) -> Any:
     """V and g refined on the Hamilton–Jacobi equation, and the certificate of every formula."""
-    from siq.workflow import identification_step, refinement_step
-    from siq.workflow.outcomes import Method
+    from siq.workflow import identification_step, results
+    from siq.workflow.tables import Method
 
     regressed = {} if given.regression is None else given.regression[0]
-    run = refinement_step.RunToRefine(
+    run = results.RunToRefine(
         given.recordings,
         identification_step.Identified(given.field, given.identify_outcome[0]),
         _trained(given),
         regressed.get(Method.REGRESSION),
     )
-    return refinement_step.run(settings.of(refinement_step.RefineSettings), run)
+    return results.refine_run(settings.of(results.RefineSettings), run)
 
 
 @task(
@@ -100,14 +100,14 @@ def refine(given: Given, settings: PipelineSettings) -> Any:
 )  # fmt: skip
 def score(given: Given, settings: PipelineSettings) -> Any:
     """How close a run comes to exact answers, where these are known."""
-    from siq.workflow import scoring_step
+    from siq.workflow import scoring
     from siq.workflow.scoring import exact_answer
 
     card = given.path("card")
     exact = None if card is None else exact_answer(card)
     formulas, certificates = given.model
-    run = scoring_step.RunToScore(formulas, certificates, _trained(given), given.card, exact)
-    return scoring_step.run(settings, run)
+    run = scoring.RunToScore(formulas, certificates, _trained(given), given.card, exact)
+    return scoring.score_run(settings, run)
 
 
 @task(
@@ -116,11 +116,11 @@ def score(given: Given, settings: PipelineSettings) -> Any:
 )  # fmt: skip
 def collect(given: Given, settings: PipelineSettings) -> Any:
     """All runs of a study as tables."""
-    from siq.workflow import collection_steps
-    from siq.workflow.outcomes import read_outcomes
+    from siq.workflow import scoring
+    from siq.workflow.tables import read_outcomes
 
-    return collection_steps.run(
-        {name: list(getattr(given, name) or ()) for name in collection_steps.OF_RUNS},
+    return scoring.collect_runs(
+        {name: list(getattr(given, name) or ()) for name in scoring.OF_RUNS},
         [one for path in given.files["outcomes"] for one in read_outcomes(path)],
         {} if given.published is None else given.published.figures,
         benchmarks=Path(given.options["benchmarks"]),
@@ -133,10 +133,10 @@ def collect(given: Given, settings: PipelineSettings) -> Any:
 @task("recordings", "field", "model", options=("seed", "space", "sampling", "refinement", "landscape"))
 def landscape(given: Given, settings: PipelineSettings) -> Any:
     """Equilibria of the identified f, a formula for each well, barriers, paths and times."""
-    from siq.workflow import landscape_step
+    from siq.workflow import results
 
-    own, refined = settings.of(landscape_step.LandscapeSettings), given.refined  # known in memory alone
-    return landscape_step.run(
+    own, refined = settings.of(results.LandscapeSettings), given.refined  # known in memory alone
+    return results.landscape_of_run(
         own, given.recordings, given.field, wells=_wells(given.model), number=given.number,
         certificate=None if refined is None else refined.certificate,
         visits=() if refined is None or refined.record is None else refined.record.visits,
@@ -149,34 +149,34 @@ def landscape(given: Given, settings: PipelineSettings) -> Any:
 )  # fmt: skip
 def overview(given: Given, settings: PipelineSettings) -> Any:
     """The landscape that the page opens with, found for this run alone where the study asks for none."""
-    from siq.workflow import collection_steps
-    from siq.workflow.landscape_step import LandscapeSettings
+    from siq.workflow import scoring
+    from siq.workflow.results import LandscapeSettings
 
     models = _models(given)
-    shown = collection_steps.shown_formula(given.rrmse, models)
+    shown = scoring.shown_formula(given.rrmse, models)
     number = shown.run if shown.run is not None else models.first_wells().run
     found = None
     if given.options["every_run"]:
         stored = given.quasipotential
         readers = [partial(stored.__getitem__, run) for run in range(len(stored))]
-        chosen = collection_steps.choose(number, readers)
+        chosen = scoring.choose(number, readers)
         if chosen is not None:
             found = {"run": chosen} | stored[chosen]
     elif number is not None:
-        run = collection_steps.RunToShow(
+        run = scoring.RunToShow(
             number, given.recordings[number], given.field[number], _wells(given.model[number])
         )
-        found = collection_steps.run_overview(settings.of(LandscapeSettings), run)
+        found = scoring.overview_of_run(settings.of(LandscapeSettings), run)
     return {"overview": found}
 
 
 @task("card", options=("seed", "card"))
 def reference(given: Given, settings: PipelineSettings) -> Any:
     """What methods say of the card's own vector field that share no code with ours."""
-    from siq.workflow import comparison_steps
+    from siq.workflow import comparison
 
-    own = settings.of(comparison_steps.ReferenceSettings)
-    return {"reference": comparison_steps.run(own, given.card)}
+    own = settings.of(comparison.ReferenceSettings)
+    return {"reference": comparison.reference_of_card(own, given.card)}
 
 
 @task(
@@ -185,12 +185,12 @@ def reference(given: Given, settings: PipelineSettings) -> Any:
 )  # fmt: skip
 def landscape_errors(given: Given, settings: PipelineSettings) -> Any:
     """The landscapes of all runs against the references, networks, formulas, and what was published."""
-    from siq.workflow import comparison_steps
+    from siq.workflow import comparison
 
     runs = [
-        comparison_steps.RunToCompare(
+        comparison.RunToCompare(
             number,
-            comparison_steps.read_stored(given.files["field"][number], given.files["quasipotential"][number]),
+            comparison.read_stored(given.files["field"][number], given.files["quasipotential"][number]),
             given.model[number][0],
             _trained(given, number).networks,
         )
@@ -198,28 +198,28 @@ def landscape_errors(given: Given, settings: PipelineSettings) -> Any:
     ]
     published = None
     if given.published is not None:
-        published = comparison_steps.PublishedAnswers(given.published.figures, published_mesh(given))
-    own = settings.of(comparison_steps.LandscapeErrorsSettings)
-    return {"table": comparison_steps.run_landscape_errors(own, given.reference, runs, published)}
+        published = comparison.PublishedAnswers(given.published.figures, published_mesh(given))
+    own = settings.of(comparison.LandscapeErrorsSettings)
+    return {"table": comparison.run_landscape_errors(own, given.reference, runs, published)}
 
 
 @task("quasipotential", "card", options=("seed", "landscape", "card"))
 def beside_equations(given: Given, settings: PipelineSettings) -> Any:
     """The landscape of the card's own equations beside those of the runs: scoring alone."""
-    from siq.workflow import comparison_steps
+    from siq.workflow import comparison
 
-    own = settings.of(comparison_steps.BesideEquationsSettings)
-    table = comparison_steps.run_beside_equations(own, given.card, list(given.quasipotential))
+    own = settings.of(comparison.BesideEquationsSettings)
+    table = comparison.run_beside_equations(own, given.card, list(given.quasipotential))
     return {"table": table}
 
 
 @task("quasipotential", "card", options=("seed", "landscape", "card"))
 def escapes(given: Given, settings: PipelineSettings) -> Any:
     """Simulated escapes beside the law."""
-    from siq.workflow import comparison_steps
+    from siq.workflow import comparison
 
-    own = settings.of(comparison_steps.EscapesSettings)
-    return {"table": comparison_steps.run_escapes(own, given.card, list(given.quasipotential))}
+    own = settings.of(comparison.EscapesSettings)
+    return {"table": comparison.run_escapes(own, given.card, list(given.quasipotential))}
 
 
 # Landscapes of equations.
@@ -229,16 +229,16 @@ def escapes(given: Given, settings: PipelineSettings) -> Any:
 def equations(given: Given, settings: PipelineSettings) -> Any:
     """The landscape of equations."""
     from siq.quasipotential.landscape_assembly import EquationSettings
-    from siq.workflow import equations_step
+    from siq.workflow import results
 
-    return equations_step.run(settings.of(EquationSettings), given.card)
+    return results.landscape_of_equations(settings.of(EquationSettings), given.card)
 
 
 @task("card", options=("seed", "card_but_for_swept"))
 def sweep_point(given: Given, settings: PipelineSettings) -> Any:
     """The landscape at one point of a sweep, in a file of its name: another range makes new values only."""
     from siq.workflow.study import point_values
-    from siq.workflow.sweep_step import point_at
+    from siq.workflow.sweep import point_at
 
     names, values = point_values(given.wildcards["point"])
     card = given.path("card")
@@ -252,7 +252,7 @@ def sweep(given: Given, settings: PipelineSettings) -> Any:
     from pydantic import TypeAdapter
 
     from siq.workflow.study import SweepOptions
-    from siq.workflow.sweep_step import SweptPoint, collected
+    from siq.workflow.sweep import SweptPoint, collected
 
     adapter = TypeAdapter(SweptPoint)
     points = [adapter.validate_json(Path(path).read_bytes()) for path in given.files["points"]]
@@ -288,7 +288,7 @@ def example_hopping(given: Given, settings: PipelineSettings) -> Any:
 
 def _trained(given: Given, run: int | None = None) -> TrainedRun:
     """The networks of a run; of one of several where `run` says which."""
-    from siq.workflow.training_step import trained_run
+    from siq.workflow.training import trained_run
 
     if not given.networks:
         return trained_run(None, None, number=given.number if run is None else run)
@@ -299,13 +299,13 @@ def _trained(given: Given, run: int | None = None) -> TrainedRun:
 
 def _wells(model: Any) -> tuple[Well, ...]:
     """V about the attractors, as refined."""
-    from siq.workflow.outcomes import Method
+    from siq.workflow.tables import Method
 
     return model[0][Method.REFINED].wells if Method.REFINED in model[0] else ()
 
 
 def _models(given: Given) -> ModelFiles:
-    from siq.workflow.collection_steps import ModelFiles
+    from siq.workflow.scoring import ModelFiles
 
     return ModelFiles(tuple(given.files["model"]))
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from siq.workflow.settings import PipelineSettings
+    from siq.workflow.study import PipelineSettings
 
 TASKS: dict[str, Task] = {}
 """Every task by its name, as soon as its module is imported."""
@@ -29,7 +29,7 @@ class Task:
     needs
         Files that it reads, by the names that the rule has for them; some may be absent.
     options
-        Parts of the settings that it depends on, see `siq.workflow.settings.PipelineSettings.parts`.
+        Parts of the settings that it depends on, see `siq.workflow.study.PipelineSettings.parts`.
     run
         The function: of what is given and of settings, its results by the names of the rule's outputs, or an
         object with the method ``files()`` that gives them.
@@ -125,6 +125,6 @@ class Given:
         return self.files.get(name) or None
 
 
-def results(made: Any) -> Mapping[str, Any]:
+def outputs_of(made: Any) -> Mapping[str, Any]:
     """What a task returned, by the names of its outputs."""
     return made if isinstance(made, Mapping) else made.files()

@@ -31,7 +31,7 @@ from scipy.integrate import cumulative_simpson
 from scipy.interpolate import PchipInterpolator
 
 from siq.quasipotential.rates import MIN_BARRIER_OVER_NOISE
-from siq.workflow.sweep_step import ALONE, Sweep
+from siq.workflow.sweep import ALONE, Sweep
 
 WITHIN = 32  # steps of the integral between two times: Simpson's error falls as their fourth power
 
@@ -77,7 +77,7 @@ def probability_of_tipping(
     --------
     >>> import sympy
     >>> from siq.systems.dynamics import Dynamics
-    >>> from siq.workflow.sweep_step import sweep
+    >>> from siq.workflow.sweep import sweep
     >>> h, x = sympy.symbols("h x", real=True)
     >>> cusp = Dynamics.of((x,), (h + x - x**3,), domain=[(-2, 2)], parameters={h: 0.0})
     >>> found = sweep(cusp, "h", np.linspace(0, 0.6, 7))

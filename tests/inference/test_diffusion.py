@@ -23,10 +23,10 @@ from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.landscape_comparison import check_same_noise
 from siq.systems.diffusion import Diffusion
 from siq.systems.simulation import SimulationOptions, simulate_snapshots
-from siq.workflow import identification_step, landscape_step
-from siq.workflow.outcomes import Status
+from siq.workflow import identification_step, results
 from siq.workflow.pipeline import PipelineSettings
-from siq.workflow.settings import Sampling, StateSpace
+from siq.workflow.study import Sampling, StateSpace
+from siq.workflow.tables import Status
 
 pytestmark = pytest.mark.portable
 
@@ -150,7 +150,7 @@ def test_where_d_is_from_is_kept_with_the_field_and_said_of_the_landscape(tmp_pa
     write_field(tmp_path / "vector_field.json", found.record, LINEAR)
     kept = read_field(tmp_path / "vector_field.json")
     assert kept is not None and kept.diffusion_source == DiffusionSource.UNIT
-    settings = PipelineSettings(identification=LINEAR).of(landscape_step.LandscapeSettings)
-    seen = landscape_step.run(settings, recordings, kept, number=0)
+    settings = PipelineSettings(identification=LINEAR).of(results.LandscapeSettings)
+    seen = results.landscape_of_run(settings, recordings, kept, number=0)
     assert seen.landscape is not None and seen.outcome.status == Status.OK
     assert DiffusionSource.UNIT.note in seen.landscape.notes

@@ -26,10 +26,10 @@ from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.rates import _covariance_axes
 from siq.quasipotential.transitions import barrier_uncertainty, ways_out
 from siq.systems.phase_portrait import evenly_spread, phase_portrait
-from siq.workflow import identification_step, recordings_step
-from siq.workflow.outcomes import Status
+from siq.workflow import identification_step, results
 from siq.workflow.pipeline import PipelineSettings
-from siq.workflow.settings import StateSpace
+from siq.workflow.study import StateSpace
+from siq.workflow.tables import Status
 
 FRICTION, SENSOR = 0.3, 0.02
 SETTINGS = PipelineSettings(identification=IdentificationOptions(degree=3, hidden_velocities=True))
@@ -158,8 +158,8 @@ def test_one_record_of_smooth_positions_is_enough(tmp_path: Path) -> None:
         PipelineSettings(identification=IdentificationOptions(hidden_velocities=key)) for key in (False, True)
     )
     with pytest.raises(InputError, match="positions of something that has inertia, set 'identification"):
-        recordings_step.source_of(path, alone)
-    drawn = recordings_step.run(hidden, recordings_step.source_of(path, hidden), number=0).recordings
+        results.source_of(path, alone)
+    drawn = results.draw_run(hidden, results.source_of(path, hidden), number=0).recordings
     assert drawn is not None and len(drawn.labels) >= FEWEST_STRETCHES
     done = identification_step.run(SETTINGS.of(identification_step.IdentifySettings), drawn, number=0)
     assert done.record is not None and done.record.prediction["passed"]

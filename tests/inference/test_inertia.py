@@ -11,8 +11,8 @@ from siq.errors import NumericalFailure
 from siq.inference.hidden_velocities import inertia_test
 from siq.inference.identification import IdentificationOptions
 from siq.workflow import identification_step
-from siq.workflow.outcomes import Status
 from siq.workflow.pipeline import PipelineSettings
+from siq.workflow.tables import Status
 
 
 def overdamped(seed: int, *, step: float, samples: int = 1_000) -> Recordings:

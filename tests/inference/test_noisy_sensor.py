@@ -25,8 +25,8 @@ from siq.inference.observation import View, unbroken
 from siq.systems.diffusion import Diffusion
 from siq.workflow import identification_step
 from siq.workflow.identification_step import means_over_exposures
-from siq.workflow.outcomes import Status
 from siq.workflow.pipeline import PipelineSettings
+from siq.workflow.tables import Status
 
 STEP, FORCES, SENSOR = 0.02, 0.3, 0.1
 

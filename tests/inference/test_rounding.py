@@ -11,8 +11,8 @@ from siq.inference.library import candidate_library
 from siq.inference.noisy_sensor import HARMLESS, decimals_needed, is_rounding, rounding_bias, rounding_errors
 from siq.inference.residuals import residual_noise
 from siq.workflow import identification_step
-from siq.workflow.outcomes import Status
 from siq.workflow.pipeline import PipelineSettings
+from siq.workflow.tables import Status
 
 STEP = 0.02
 

@@ -17,8 +17,8 @@ from siq.report.landscape import comparison_table
 from siq.report.remarks import sentence
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
-from siq.workflow import comparison_steps
-from siq.workflow.comparison_steps import BesideEquationsSettings
+from siq.workflow import comparison
+from siq.workflow.comparison import BesideEquationsSettings
 from siq.workflow.tables import COLUMNS
 
 X, Y = sympy.symbols("x y", real=True)
@@ -119,12 +119,12 @@ def test_the_step_names_the_run_and_says_why_there_is_nothing_to_compare():
     settings = BesideEquationsSettings(seed=0, landscape=LandscapeOptions(noise_intensities=(NOISE,)))
     found = wells()
     data = landscape_data(wells(1.1))
-    table = comparison_steps.run_beside_equations(settings, found.dynamics, [data, None, data])
+    table = comparison.run_beside_equations(settings, found.dynamics, [data, None, data])
     assert list(table.columns) == list(COLUMNS["beside_equations"])
     assert list(table.groupby("run").size()) == [6, 1, 6]
     assert list(table.loc[table["run"] == 1, "note"]) == ["the run has no landscape"]
     nowhere = Dynamics.of((X,), (X,), domain=[(-1, 1)])
-    (row,) = comparison_steps.run_beside_equations(settings, nowhere, [data]).itertuples()
+    (row,) = comparison.run_beside_equations(settings, nowhere, [data]).itertuples()
     assert row.run == -1 and row.note.startswith("the equations have no landscape: ")
 
 
@@ -133,7 +133,7 @@ def test_the_page_says_the_largest_difference():
     found = wells()
     near = landscape_data(wells(1.01))
     far = landscape_data(wells(1.1))
-    several = comparison_steps.run_beside_equations(settings, found.dynamics, [near, far])
+    several = comparison.run_beside_equations(settings, found.dynamics, [near, far])
     shown = comparison_table(several)
     assert len(shown) == 6 and shown["largest difference"].iloc[0] == "21 %"
     alone = comparison_table(several[several["run"] == 0])

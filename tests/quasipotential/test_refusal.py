@@ -16,8 +16,8 @@ from siq.inference.identification import IdentificationOptions
 from siq.quasipotential.landscape import Landscape, NoLandscape
 from siq.report.landscape import answer_lines
 from siq.report.summary import summarise
-from siq.workflow.outcomes import Outcome, Status, Step, why_no_landscape
 from siq.workflow.pipeline import PipelineSettings
+from siq.workflow.tables import Outcome, Status, Step, why_no_landscape
 
 LASTS = 60  # samples, in the mean
 

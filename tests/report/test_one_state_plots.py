@@ -20,7 +20,7 @@ from siq.quasipotential.landscape_files import read_landscape, write_landscape
 from siq.quasipotential.wells import WellOptions
 from siq.report.figures import LandscapeFiguresSettings, landscape_figures, project_landscape
 from siq.report.plots import plot_components, plot_invariant_distribution
-from siq.workflow.settings import StateSpace
+from siq.workflow.study import StateSpace
 from siq.workflow.tables import as_table
 
 KNOWN = double_well(1)

@@ -19,11 +19,9 @@ from siq.report.page import ReportContent, ReportSection, render_report
 from siq.report.study_page import StudyResults, study_page
 from siq.report.summary import summarise
 from siq.systems.dynamics import Dynamics
-from siq.workflow.collection_steps import ModelFiles, shown_formula
-from siq.workflow.outcomes import Method
-from siq.workflow.scoring import coefficient_table, summary_table
+from siq.workflow.scoring import ModelFiles, coefficient_table, shown_formula, summary_table
 from siq.workflow.study import Study
-from siq.workflow.tables import COLUMNS, as_table
+from siq.workflow.tables import COLUMNS, Method, as_table
 
 CAPTIONS = {name: caption["text"] for name, caption in texts("captions")["figures"].items()}
 OF_ONE_STATE = texts("captions")["lead"]["one_state"]

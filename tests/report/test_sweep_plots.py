@@ -12,7 +12,7 @@ from siq.report.plots.sweep import plot_sweep
 from siq.report.study_page import StudyResults, study_page
 from siq.systems.dynamics import Dynamics
 from siq.workflow.study import Study, SweepOptions
-from siq.workflow.sweep_step import Sweep, sweep
+from siq.workflow.sweep import Sweep, sweep
 from siq.workflow.tables import as_table
 
 h, a, x = sympy.symbols("h a x", real=True)

@@ -9,12 +9,11 @@ import pytest
 from siq.quasipotential.formulas import read_model
 from siq.systems.cards import load_system
 from siq.workflow.published import load_published
-from siq.workflow.reproduction import Parameters, Place
-from siq.workflow.settings import settings_of
-from siq.workflow.study import completed, load_study
+from siq.workflow.study import completed, load_study, settings_of
 from siq.workflow.tables import COLUMNS
 from workflow.reproduction import ReproductionSettings
 from workflow.reproduction.page import Paper, Results, render_reproduction, reproduction_page
+from workflow.reproduction.publication import Parameters, Place
 
 pytestmark = pytest.mark.workflow
 

@@ -17,10 +17,10 @@ from siq.networks.regression import RegressionOptions
 from siq.quasipotential.formulas import term_coefficients
 from siq.systems.cards import load_system
 from siq.systems.simulation import SimulationOptions
-from siq.workflow import recordings_step
-from siq.workflow.outcomes import Method
+from siq.workflow import results
 from siq.workflow.pipeline import PipelineSettings, analyse
-from siq.workflow.settings import Sampling, StateSpace
+from siq.workflow.study import Sampling, StateSpace
+from siq.workflow.tables import Method
 
 SEED = 20260102
 RUNS = 50
@@ -85,7 +85,7 @@ def one_run(run: int):
         landscape=None,
     )
     drawing = replace(settings, seed=SEED, sampling=sampling, simulation=SIMULATION)
-    recordings = recordings_step.run(drawing, load_system(CARD), number=run).recordings
+    recordings = results.draw_run(drawing, load_system(CARD), number=run).recordings
     x = snapshot_pairs(recordings, pair_step=sampling.pair_step).x0
     formulas = analyse(recordings, settings, number=run).refined.formulas[Method.REFINED]
     components = formulas.components()

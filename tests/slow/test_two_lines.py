@@ -14,9 +14,9 @@ from two_lines import analysed
 from untuned_systems import SYSTEMS, error_beside_mesh, simulated
 
 from siq.data.recordings import snapshot_pairs
-from siq.workflow.outcomes import Method
 from siq.workflow.pipeline import Analysis, PipelineSettings, analyse
-from siq.workflow.settings import StateSpace
+from siq.workflow.study import StateSpace
+from siq.workflow.tables import Method
 
 pytestmark = pytest.mark.slow
 

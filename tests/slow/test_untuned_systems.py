@@ -17,9 +17,9 @@ from siq.data.recordings import snapshot_pairs
 from siq.inference.identification import IdentificationOptions
 from siq.networks.decomposition import CheckOptions, TrainingOptions
 from siq.networks.regression import RegressionOptions
-from siq.workflow.outcomes import Method
 from siq.workflow.pipeline import Analysis, PipelineSettings, analyse
-from siq.workflow.settings import Sampling, StateSpace
+from siq.workflow.study import Sampling, StateSpace
+from siq.workflow.tables import Method
 
 TRAINING = TrainingOptions(
     steps=8000,

@@ -7,9 +7,8 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from siq.workflow import collection_steps
-from siq.workflow.outcomes import Outcome, Status, Step
-from siq.workflow.tables import COLUMNS
+from siq.workflow import scoring
+from siq.workflow.tables import COLUMNS, Outcome, Status, Step
 
 
 def benchmark(folder: Path, name: str, seconds: float) -> None:
@@ -22,7 +21,7 @@ def test_runs_that_trained_side_by_side_share_their_time(tmp_path: Path) -> None
     benchmark(tmp_path, "000-001/train.tsv", 10.0)
     benchmark(tmp_path, "000/draw.tsv", 1.0)
     benchmark(tmp_path, "001/draw.tsv", 2.0)
-    table = collection_steps.timings(tmp_path, [0, 1], drawing="resample")
+    table = scoring.timings(tmp_path, [0, 1], drawing="resample")
     assert table[["run", "step"]].to_numpy().tolist() == [
         [0, "resample"], [0, "train"], [1, "resample"], [1, "train"]
     ]  # fmt: skip
@@ -36,9 +35,9 @@ def test_outcomes_stand_by_run_in_the_order_of_the_steps(tmp_path: Path) -> None
         Outcome(0, Step.SIMULATE),
         Outcome(1, Step.REFINE, Status.WARNING, "not certified"),
     ]
-    parts: dict[str, list[pd.DataFrame]] = {name: [] for name in collection_steps.OF_RUNS}
-    tables = collection_steps.run(parts, said, {}, benchmarks=tmp_path)
-    assert set(tables) == {*collection_steps.OF_RUNS, "outcomes", "timings", "summary"}
+    parts: dict[str, list[pd.DataFrame]] = {name: [] for name in scoring.OF_RUNS}
+    tables = scoring.collect_runs(parts, said, {}, benchmarks=tmp_path)
+    assert set(tables) == {*scoring.OF_RUNS, "outcomes", "timings", "summary"}
     for name, table in tables.items():
         assert list(table.columns) == list(COLUMNS[name])
     assert tables["outcomes"].to_numpy().tolist() == [

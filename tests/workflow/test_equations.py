@@ -30,7 +30,7 @@ from siq.systems.cards import load_system
 from siq.systems.cycles import hessians_along
 from siq.systems.dynamics import Dynamics
 from siq.validation.mesh import mesh_quasipotential
-from siq.workflow.landscape_step import landscape_rows
+from siq.workflow.results import landscape_rows
 
 X, Y, Z = sympy.symbols("x y z", real=True)
 SYSTEMS = Path(__file__).parents[2] / "config" / "systems"

@@ -14,11 +14,11 @@ from siq.quasipotential.landscape import LandscapeOptions
 from siq.quasipotential.landscape_files import write_landscape
 from siq.systems.cards import load_system
 from siq.systems.dynamics import Dynamics
-from siq.workflow import comparison_steps, invariant_step
-from siq.workflow.comparison_steps import first_stored
-from siq.workflow.outcomes import Method
+from siq.workflow import comparison
+from siq.workflow.comparison import first_stored
 from siq.workflow.pipeline import Analysis
-from siq.workflow.settings import StateSpace
+from siq.workflow.study import StateSpace
+from siq.workflow.tables import Method
 
 CARD = Path(__file__).parents[2] / "config" / "systems" / "maier-stein.yaml"
 INTENSITY = 0.15  # ΔU/ε = 3.3: walkers settle, and change wells, within a short simulation
@@ -43,14 +43,14 @@ def files(found: Analysis, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pa
 @pytest.fixture
 def system(monkeypatch: pytest.MonkeyPatch) -> Dynamics:
     """The card, with simulations that take a second."""
-    monkeypatch.setattr(invariant_step, "WALKERS", 500)
-    monkeypatch.setattr(invariant_step, "STEPS", 4000)
-    monkeypatch.setattr(comparison_steps, "WALKERS", 200)
+    monkeypatch.setattr(comparison, "INVARIANT_STEP_WALKERS", 500)
+    monkeypatch.setattr(comparison, "STEPS", 4000)
+    monkeypatch.setattr(comparison, "WALKERS", 200)
     return load_system(CARD)
 
 
-def asked(*intensities: float) -> invariant_step.InvariantSettings:
-    return invariant_step.InvariantSettings(1, StateSpace(), intensities)
+def asked(*intensities: float) -> comparison.InvariantSettings:
+    return comparison.InvariantSettings(1, StateSpace(), intensities)
 
 
 def test_the_first_landscape_with_heights_is_read_and_gives_the_same_u(
@@ -72,7 +72,7 @@ def test_the_density_of_two_like_wells_is_that_of_a_simulation(
 ) -> None:
     first = first_stored([files[0]], [files[1]])
     assert first is not None
-    got = invariant_step.run(asked(INTENSITY), system, invariant_step.LandscapeShown(*first), {})
+    got = comparison.compare_invariant(asked(INTENSITY), system, comparison.LandscapeShown(*first), {})
     row = got.table.iloc[0]
     assert row["simulated_distance"] < 2 * row["sampling_floor"]
     np.testing.assert_allclose(got.shares["share"], 0.5, atol=1e-3)
@@ -83,8 +83,8 @@ def test_the_density_of_a_formula_is_normalised_and_that_of_a_simulation(
     found: Analysis, system: Dynamics
 ) -> None:
     formulas = found.refined.formulas[Method.REFINED]
-    shown = invariant_step.FormulaShown(0, str(Method.REFINED), formulas)
-    got = invariant_step.run(asked(INTENSITY), system, shown, {})
+    shown = comparison.FormulaShown(0, str(Method.REFINED), formulas)
+    got = comparison.compare_invariant(asked(INTENSITY), system, shown, {})
     assert len(got.table) == 1 and got.shares.empty
     axes = [np.linspace(low, high, 801) for low, high in system.box]
     u = formulas.evaluate(np.stack([x.ravel() for x in np.meshgrid(*axes, indexing="ij")]))[0] * 2
@@ -94,14 +94,14 @@ def test_the_density_of_a_formula_is_normalised_and_that_of_a_simulation(
 
 
 def test_nothing_is_simulated_where_nothing_was_asked(found: Analysis, system: Dynamics) -> None:
-    got = invariant_step.run(asked(), system, None, {})
+    got = comparison.compare_invariant(asked(), system, None, {})
     assert got.table.empty and got.shares.empty and got.densities == []
 
 
 def test_escapes_are_simulated_beside_the_law(files: tuple[Path, Path], system: Dynamics) -> None:
     landscape = json.loads(files[1].read_text(encoding="utf-8"))
-    settings = comparison_steps.EscapesSettings(2, LandscapeOptions(noise_intensities=(INTENSITY,)))
-    table = comparison_steps.run_escapes(settings, system, [None, landscape])
+    settings = comparison.EscapesSettings(2, LandscapeOptions(noise_intensities=(INTENSITY,)))
+    table = comparison.run_escapes(settings, system, [None, landscape])
     assert list(table["transition"]) == ["A1 to A2", "A2 to A1"]
     for way, row in zip(landscape["transitions"], table.to_dict("records"), strict=True):
         law = way["prefactor"] * np.exp(way["barrier"] / INTENSITY)

@@ -12,8 +12,15 @@ import pytest
 from pydantic import TypeAdapter, ValidationError
 
 from siq.systems.dynamics import Dynamics
-from siq.workflow.settings import PipelineSettings, Sampling, StateSpace, card_content, settings_of
-from siq.workflow.study import Study, load_study
+from siq.workflow.study import (
+    PipelineSettings,
+    Sampling,
+    StateSpace,
+    Study,
+    card_content,
+    load_study,
+    settings_of,
+)
 from workflow.tasks import TASKS
 
 Write = Callable[..., Path]

@@ -16,12 +16,11 @@ from siq.networks.regression import RegressionOptions
 from siq.quasipotential.formulas import exact_decomposition, model_to_data
 from siq.quasipotential.refinement import RefinementOptions
 from siq.systems.simulation import SimulationOptions
-from siq.workflow import identification_step, recordings_step, refinement_step, scoring_step, training_step
-from siq.workflow.outcomes import Method, Outcome, Status, Step
+from siq.workflow import identification_step, results, scoring, training
 from siq.workflow.pipeline import Analysis, PipelineSettings, analyse
-from siq.workflow.settings import Sampling, StateSpace
-from siq.workflow.tables import COLUMNS
-from siq.workflow.training_step import TrainedRun, not_trained
+from siq.workflow.study import Sampling, StateSpace
+from siq.workflow.tables import COLUMNS, Method, Outcome, Status, Step
+from siq.workflow.training import TrainedRun, not_trained
 
 KNOWN = double_well(2)
 SYSTEM = as_system(KNOWN)
@@ -42,9 +41,9 @@ BRIEF = replace(
 )
 
 
-def drawn(*, number: int = 0) -> recordings_step.Drawn:
+def drawn(*, number: int = 0) -> results.Drawn:
     settings = replace(SETTINGS, simulation=SIMULATION)
-    return recordings_step.run(settings, SYSTEM, number=number)
+    return results.draw_run(settings, SYSTEM, number=number)
 
 
 @pytest.fixture(scope="module")
@@ -132,7 +131,7 @@ def test_the_regression_does_not_steer_the_refined_formulas(
 
 def test_networks_are_trained_with_the_d_that_the_noise_shows() -> None:
     noisy = replace(SIMULATION, pairs=40, noise_intensity=0.02)
-    found = recordings_step.run(PipelineSettings(seed=3, simulation=noisy), SYSTEM, number=0).recordings
+    found = results.draw_run(PipelineSettings(seed=3, simulation=noisy), SYSTEM, number=0).recordings
     assert found is not None
     settings = PipelineSettings(
         sampling=Sampling(0.01, 0.002), training=replace(BRIEF, matching="explicit", steps=2)
@@ -140,8 +139,8 @@ def test_networks_are_trained_with_the_d_that_the_noise_shows() -> None:
     record = identification_step.run(
         settings.of(identification_step.IdentifySettings), found, number=0
     ).record
-    runs = {0: training_step.RunToTrain(found, record)}
-    networks = training_step.run(settings, runs, device="cpu").networks[0]
+    runs = {0: training.RunToTrain(found, record)}
+    networks = training.train_block(settings, runs, device="cpu").networks[0]
     assert record is not None and networks is not None
     np.testing.assert_allclose(networks.diffusion, record.found.diffusion.matrix, rtol=1e-6)
     shape = KNOWN.diffusion / np.sqrt(np.linalg.det(KNOWN.diffusion))
@@ -153,7 +152,7 @@ def test_a_run_without_trajectories_is_skipped_by_every_step_after() -> None:
     nothing = identification_step.run(settings, None, number=5)
     assert (nothing.outcome.run, nothing.outcome.status) == (5, Status.SKIPPED)
     told = replace(SETTINGS, training=BRIEF)
-    trained = training_step.run(told, {5: training_step.RunToTrain(None, None)})
+    trained = training.train_block(told, {5: training.RunToTrain(None, None)})
     assert not trained.networks
     assert trained.outcomes[0].reason == "the run has no trajectories"
 
@@ -161,7 +160,7 @@ def test_a_run_without_trajectories_is_skipped_by_every_step_after() -> None:
 def test_a_simulation_that_runs_to_infinity_fails_and_says_so() -> None:
     away = replace(SYSTEM, equations=tuple(symbol**3 for symbol in SYSTEM.symbols))
     settings = PipelineSettings(simulation=replace(SIMULATION, interval=2.0))
-    found = recordings_step.run(settings, away, number=2)
+    found = results.draw_run(settings, away, number=2)
     assert found.recordings is None
     assert (found.outcome.step, found.outcome.status) == (Step.SIMULATE, Status.FAILED)
 
@@ -170,7 +169,7 @@ def test_recordings_are_taken_whole_by_the_first_run_and_resampled_by_others(
     recordings: Recordings,
 ) -> None:
     settings = PipelineSettings()
-    first, second = (recordings_step.run(settings, recordings, number=number) for number in (0, 1))
+    first, second = (results.draw_run(settings, recordings, number=number) for number in (0, 1))
     assert first.recordings is recordings and second.recordings is not recordings
     assert first.outcome.step == second.outcome.step == Step.RESAMPLE
 
@@ -184,8 +183,8 @@ def test_why_a_check_could_not_be_prepared_is_the_reason(
     monkeypatch.setattr("siq.quasipotential.refinement.TrainingCheck", refuse)
     options = replace(BRIEF, check=CheckOptions(first=10, every=10, attempts=2))
     settings = replace(SETTINGS, training=options)
-    runs = {0: training_step.RunToTrain(recordings, analysis.identified.record)}
-    said = training_step.run(settings, runs, device="cpu").outcomes[0]
+    runs = {0: training.RunToTrain(recordings, analysis.identified.record)}
+    said = training.train_block(settings, runs, device="cpu").outcomes[0]
     assert said.status == Status.WARNING
     assert said.reason.endswith("could not be prepared: the attractors cannot be told apart")
 
@@ -198,9 +197,9 @@ def test_why_a_training_failed_is_what_refinement_says_first(
 ) -> None:
     failed = TrainedRun(None, Outcome(0, Step.TRAIN, Status.FAILED, "the loss became infinite"))
     options = replace(SETTINGS, refinement=RefinementOptions(routes=routes, degrees=(2,)))
-    found = refinement_step.run(
-        options.of(refinement_step.RefineSettings),
-        refinement_step.RunToRefine(recordings, analysis.identified, failed),
+    found = results.refine_run(
+        options.of(results.RefineSettings),
+        results.RunToRefine(recordings, analysis.identified, failed),
     )
     assert found.outcome.status != Status.OK
     assert found.outcome.reason.startswith("the training gave no networks (the loss became infinite)")
@@ -210,9 +209,9 @@ def test_where_refinement_needs_no_networks_their_failure_is_a_note(
     recordings: Recordings, analysis: Analysis
 ) -> None:
     failed = TrainedRun(None, Outcome(0, Step.TRAIN, Status.FAILED, "the loss became infinite"))
-    found = refinement_step.run(
-        SETTINGS.of(refinement_step.RefineSettings),
-        refinement_step.RunToRefine(recordings, analysis.identified, failed),
+    found = results.refine_run(
+        SETTINGS.of(results.RefineSettings),
+        results.RunToRefine(recordings, analysis.identified, failed),
     )
     assert found.outcome.status == Status.OK
     notes = found.certificates[Method.REFINED]["notes"]
@@ -225,14 +224,14 @@ def test_scores_are_in_the_columns_of_the_contract(analysis: Analysis) -> None:
     formulas = {str(name): one for name, one in analysis.refined.formulas.items()}
     assert KNOWN.potential is not None
     exact = exact_decomposition(SYSTEM, 2 * KNOWN.potential)
-    given = scoring_step.RunToScore(formulas, certificates, not_trained(0), SYSTEM, exact)
-    found = scoring_step.run(settings, given)
+    given = scoring.RunToScore(formulas, certificates, not_trained(0), SYSTEM, exact)
+    found = scoring.score_run(settings, given)
     assert found.outcome == Outcome(0, Step.SCORE)
     for name in ("coefficients", "rrmse", "prediction", "certificates"):
         assert list(getattr(found, name).columns) == list(COLUMNS[name])
     errors = found.rrmse.set_index("method")["rrmse"]
     assert errors["refined"] < 1e-5 and np.isnan(errors["regression"])
-    skipped = scoring_step.run(
-        settings, scoring_step.RunToScore({}, {}, TrainedRun(None, Outcome(0, Step.TRAIN)))
+    skipped = scoring.score_run(
+        settings, scoring.RunToScore({}, {}, TrainedRun(None, Outcome(0, Step.TRAIN)))
     )
     assert skipped.outcome.reason == "there is no formula to score"

@@ -16,14 +16,13 @@ from siq.quasipotential.landscape_comparison import read_reference, write_refere
 from siq.report.figures import LandscapeFiguresSettings, landscape_figures
 from siq.report.study_page import without_landscape
 from siq.systems.dynamics import Dynamics
-from siq.workflow import comparison_steps
-from siq.workflow.comparison_steps import LandscapeErrorsSettings
-from siq.workflow.outcomes import Status, Step
-from siq.workflow.settings import StateSpace
-from siq.workflow.tables import COLUMNS, as_table
+from siq.workflow import comparison
+from siq.workflow.comparison import LandscapeErrorsSettings
+from siq.workflow.study import StateSpace
+from siq.workflow.tables import COLUMNS, Status, Step, as_table
 
 X, Y = sympy.symbols("x y", real=True)
-SETTINGS = comparison_steps.ReferenceSettings(seed=1)
+SETTINGS = comparison.ReferenceSettings(seed=1)
 
 
 def system(formulas: tuple[sympy.Expr, ...], domain: list[list[float]]) -> Dynamics:
@@ -46,11 +45,11 @@ ONE_WELL = system((-X, -2 * Y), [[-1.0, 1.0], [-1.0, 1.0]])
     ],
 )
 def test_without_wells_there_is_a_reason_and_no_rows(card: Dynamics, reason: str, tmp_path: Path) -> None:
-    write_reference(tmp_path / "reference.npz", comparison_steps.run(SETTINGS, card))
+    write_reference(tmp_path / "reference.npz", comparison.reference_of_card(SETTINGS, card))
     found = read_reference(tmp_path / "reference.npz")
     assert reason in found.reason and found.attractors.shape == (0, 2)
     settings = LandscapeErrorsSettings(seed=1, space=StateSpace(), landscape=LandscapeOptions())
-    table = comparison_steps.run_landscape_errors(settings, found, [], None)
+    table = comparison.run_landscape_errors(settings, found, [], None)
     assert list(table.columns) == list(COLUMNS["landscape_errors"]) and table.empty
     drawn = landscape_figures(
         LandscapeFiguresSettings(space=StateSpace(), landscape=LandscapeOptions()),
@@ -61,7 +60,7 @@ def test_without_wells_there_is_a_reason_and_no_rows(card: Dynamics, reason: str
 
 def test_a_reference_that_exists_has_no_reason(tmp_path: Path) -> None:
     wells = system((X - X**3,), [[-1.6, 1.6]])
-    write_reference(tmp_path / "reference.npz", comparison_steps.run(SETTINGS, wells))
+    write_reference(tmp_path / "reference.npz", comparison.reference_of_card(SETTINGS, wells))
     found = read_reference(tmp_path / "reference.npz")
     assert found.reason == "" and len(found.attractors) == 2
 

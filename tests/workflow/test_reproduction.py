@@ -13,7 +13,10 @@ import sympy
 from siq.report.formatting import texts
 from siq.systems.dynamics import Dynamics
 from siq.workflow.published import PublishedFigure, load_published
-from siq.workflow.reproduction import (
+from siq.workflow.scoring import summary_table
+from siq.workflow.study import load_study
+from siq.workflow.tables import as_table
+from workflow.reproduction.publication import (
     attractor_rows,
     gradient_coefficients,
     load_contents,
@@ -22,9 +25,6 @@ from siq.workflow.reproduction import (
     parameter_table,
     shown,
 )
-from siq.workflow.scoring import summary_table
-from siq.workflow.study import load_study
-from siq.workflow.tables import as_table
 
 CONFIG = Path(__file__).parents[2] / "config"
 RULES = Path(__file__).parents[2] / "workflow" / "rules"

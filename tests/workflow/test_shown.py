@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pandas as pd
 
-from siq.workflow.collection_steps import ModelFiles, Shown, shown_formula
-from siq.workflow.outcomes import Method
+from siq.workflow.scoring import ModelFiles, Shown, shown_formula
+from siq.workflow.tables import Method
 
 
 def models(folder: Path, *methods: dict[str, object]) -> ModelFiles:

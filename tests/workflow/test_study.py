@@ -13,10 +13,9 @@ from siq.networks.regression import RegressionOptions
 from siq.quasipotential.landscape import LandscapeOptions
 from siq.systems.dynamics import Dynamics
 from siq.systems.simulation import SimulationEntry, SimulationOptions
-from siq.workflow.outcomes import Method
 from siq.workflow.published import load_published
-from siq.workflow.settings import settings_of
-from siq.workflow.study import load_study, load_study_system
+from siq.workflow.study import load_study, load_study_system, settings_of
+from siq.workflow.tables import Method
 
 Write = Callable[..., Path]
 CONFIG = Path(__file__).parents[2] / "config"

@@ -10,16 +10,8 @@ from siq.quasipotential.landscape import Landscape
 from siq.systems.cards import load_system
 from siq.systems.dynamics import Dynamics
 from siq.workflow.files import write
-from siq.workflow.settings import PipelineSettings
-from siq.workflow.sweep_step import (
-    ALONE,
-    Sweep,
-    SweptPoint,
-    collected,
-    point_at,
-    sweep,
-    with_parameters,
-)
+from siq.workflow.study import PipelineSettings
+from siq.workflow.sweep import ALONE, Sweep, SweptPoint, collected, point_at, sweep, with_parameters
 
 h, a, x, y = sympy.symbols("h a x y", real=True)
 FOLD = 2 / (3 * np.sqrt(3))

@@ -8,7 +8,7 @@ import pytest
 import sympy
 
 from siq.systems.dynamics import Dynamics
-from siq.workflow.sweep_step import ALONE, Sweep, sweep
+from siq.workflow.sweep import ALONE, Sweep, sweep
 from siq.workflow.tables import as_table
 from siq.workflow.tipping import probability_of_tipping
 

@@ -14,8 +14,8 @@ from siq.data.recordings import SnapshotPairs
 from siq.networks.decomposition import CheckOptions, TrainedNetworks, pack
 from siq.networks.training import prepare_data
 from siq.systems.diffusion import Diffusion
-from siq.workflow.outcomes import Status
-from siq.workflow.training_step import Block, Kept, clean
+from siq.workflow.tables import Status
+from siq.workflow.training import Block, Kept, clean
 
 TRAINING = replace(
     PAPER,

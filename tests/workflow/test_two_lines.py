@@ -11,8 +11,8 @@ from two_lines import analysed
 
 from siq.inference.field_estimate import DiffusionSource
 from siq.quasipotential.landscape import Landscape
-from siq.workflow.outcomes import Method
 from siq.workflow.pipeline import Analysis
+from siq.workflow.tables import Method
 
 
 def landscape_of(found: Analysis) -> Landscape:

@@ -55,9 +55,8 @@ def test_comments_docstrings_and_type_checking_do_not_count() -> None:
     assert sorted(versions._imports(versions.ast.parse(code), at_load=True)) == ["a", "c"]
 
 
-def test_a_step_depends_on_no_other_step_that_it_does_not_use() -> None:
-    drawing, training, regressing = map(imported_by, ("draw", "train", "regress"))
-    assert "siq/workflow/identification_step.py" not in drawing | regressing
-    assert "siq/networks/training.py" in training
-    for files in (drawing, training, regressing):
-        assert not any(path.startswith("siq/report/") for path in files)
+def test_no_step_depends_on_pages_and_identification_on_no_networks() -> None:
+    identifying, training = imported_by("identify"), imported_by("train")
+    assert "siq/networks/training.py" in training - identifying
+    for task in ("draw", "identify", "train", "regress", "refine", "score", "landscape"):
+        assert not any(path.startswith("siq/report/") for path in imported_by(task))

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from siq.report.page import ReportContent
-    from siq.workflow.settings import PipelineSettings
+    from siq.workflow.study import PipelineSettings
     from workflow.proof.targets import Target
 
 LOGGER = logging.getLogger(__name__)

@@ -7,7 +7,7 @@ from pydantic.dataclasses import dataclass
 from siq.networks.decomposition import TrainingOptions
 from siq.networks.regression import RegressionOptions
 from siq.systems.simulation import SimulationOptions
-from siq.workflow.settings import STRICT
+from siq.workflow.study import STRICT
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -36,9 +36,8 @@ from siq.networks.training import (
 from siq.numerics.randomness import Purpose, generator, seed_sequence
 from siq.quasipotential.refinement import TrainingCheck
 from siq.systems.diffusion import Diffusion
-from siq.workflow.outcomes import Outcome, Status, Step
-from siq.workflow.settings import PipelineSettings
-from siq.workflow.tables import as_table
+from siq.workflow.study import PipelineSettings
+from siq.workflow.tables import Outcome, Status, Step, as_table
 
 POSITION = "position"
 """In the details of an outcome: where the run stands among the networks of its block."""
@@ -291,7 +290,7 @@ class Checks:
     faults: Mapping[int, str]
 
 
-def run(
+def train_block(
     settings: PipelineSettings,
     runs: Mapping[int, RunToTrain],
     *,

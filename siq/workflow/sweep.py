@@ -14,9 +14,9 @@ know. What folds or begins to oscillate there is a point of a curve, which is fo
 Barriers and prefactors are those of the point; times and shares follow from them for a noise
 (`siq.quasipotential.rates`, `siq.quasipotential.invariant_density`).
 
-Points (`siq.workflow.sweep_step`) become tables here: equilibria are joined to branches by continuation
+Points (`siq.workflow.sweep`) become tables here: equilibria are joined to branches by continuation
 (`siq.systems.continuation`), a well is a stable stretch of a branch, and its times and weights follow for a
-noise (`siq.workflow.sweep_step`).
+noise (`siq.workflow.sweep`).
 """
 
 from __future__ import annotations
@@ -38,11 +38,7 @@ from siq.numerics.files import read_document, validate
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.cell_density import shares_by_rates
 from siq.quasipotential.landscape import NoLandscape
-from siq.quasipotential.landscape_assembly import (
-    EquationSettings,
-    landscape_from_equations,
-    usable_system,
-)
+from siq.quasipotential.landscape_assembly import EquationSettings, landscape_from_equations, usable_system
 from siq.quasipotential.rates import EscapeRate, NoiseStrength, mean_residence_time
 from siq.quasipotential.transitions import Transition
 from siq.systems.cards import ParameterEntry, SystemCard, build_system, load_system
