@@ -341,7 +341,7 @@ def run_beside_equations(
 
 logger = logging.getLogger(__name__)
 
-INVARIANT_STEP_WALKERS = 4000
+DENSITY_WALKERS = 4000
 STEPS = 20_000  # of the simulation, after a fifth of them to settle
 KEPT = 50  # samples of every walker
 ACCURACY = 0.025  # step times the norm of the Jacobian where the walkers are
@@ -432,7 +432,7 @@ def _simulate(system: Dynamics, intensity: float, *, seed: int) -> np.ndarray:
     """Samples of a long simulation of the system itself, walkers side by side, ``(d, times, walkers)``."""
     draw = generator(seed, Purpose.INVARIANT, str(intensity))
     low, high = system.box.T
-    start = draw.uniform(low, high, (INVARIANT_STEP_WALKERS, system.dimension)).T
+    start = draw.uniform(low, high, (DENSITY_WALKERS, system.dimension)).T
     rate = np.linalg.norm(system.jacobian(start[:, :500].T), axis=(1, 2))
     return simulate_stationary(
         system, intensity=intensity, start=start,
@@ -510,7 +510,7 @@ def _of_landscape(
             logger.warning("intensity %g: %s", intensity, error)
             continue
         draw = generator(seed, Purpose.INVARIANT, str(intensity))
-        start = starting_states(density, fine, INVARIANT_STEP_WALKERS, generator=draw)
+        start = density.starting_states(DENSITY_WALKERS, generator=draw)
         samples = walk(
             system, start, intensity=intensity, burn_in=STEPS // 5, steps=STEPS,
             thin=STEPS // KEPT, generator=draw,

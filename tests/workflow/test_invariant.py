@@ -43,7 +43,7 @@ def files(found: Analysis, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pa
 @pytest.fixture
 def system(monkeypatch: pytest.MonkeyPatch) -> Dynamics:
     """The card, with simulations that take a second."""
-    monkeypatch.setattr(comparison, "INVARIANT_STEP_WALKERS", 500)
+    monkeypatch.setattr(comparison, "DENSITY_WALKERS", 500)
     monkeypatch.setattr(comparison, "STEPS", 4000)
     monkeypatch.setattr(comparison, "WALKERS", 200)
     return load_system(CARD)
