@@ -96,8 +96,8 @@ class RefinementOptions(WellOptions):
         ``network``, ``local``, or both, which are then compared with each other. By default both where
         networks are asked for, and otherwise the local one; see `with_routes`.
     formula_degree
-        Highest power of one formula for the whole region; by default what the identified f allows, see
-        `formula_library`.
+        Highest power of one formula for the whole region; by default what the identified f allows: one
+        more than that of f, and at least four.
     functions
         Further functions that such a formula may use, as formulas of the states, beside those of f.
     single_formula
@@ -182,7 +182,7 @@ def refine(
     found, portrait
         The identified f, with its attractors, saddles and basins.
     formula
-        The regression's coefficients of V over the `formula_library`, shape ``(q,)``: the start of the
+        The regression's coefficients of V over the library of the formula, shape ``(q,)``: the start of the
         network route.
     network
         V_θ, points ``(n, d)`` to values ``(n,)``: its second start, where the formula leads nowhere.
@@ -345,20 +345,14 @@ class RefinementContext:
 
     Parameters
     ----------
-    recordings
-        Trajectories.
-    record
-        The identified f.
-    networks
-        The trained networks; None for none.
+    recordings, record, networks
+        Trajectories, the identified f, and the trained networks, None for none.
     number, seed
         Of the run, and of the study.
     pair_step
         Time between the samples of a pair.
-    refinement
-        How V is refined; without named routes those that there are.
-    limits
-        Of the tests of V.
+    refinement, limits
+        How V is refined, without named routes by those that there are; and the limits of its tests.
 
     Attributes
     ----------

@@ -74,8 +74,8 @@ class DegreeTrial:
     residual
         Median relative Hamilton–Jacobi residual on points that took no part in the fit.
     covered
-        Points among them below the lowest level of all degrees at which the formula is believed, as a share
-        of those that the degree which reaches most of them has there.
+        Those of them at which the formula is believed, as a share of those that the degree which reaches most
+        of them has.
     """
 
     degree: int
@@ -90,20 +90,16 @@ class Well(Expansion):
 
     Attributes
     ----------
-    dynamics
-        f and D.
-    attractor
-        Shape ``(d,)``. V is zero there.
+    dynamics, attractor
+        f and D, and where V is zero, shape ``(d,)``.
     basis, coefficients
         The powers about the attractor, and their coefficients, shape ``(m,)``.
-    level
-        V of the lowest saddle, or, where there is none, of the last point that recordings reach.
-    saddle
-        Position of that saddle, None where recordings end before one.
-    residual
-        Relative Hamilton–Jacobi residual on the points of the fit.
-    points
-        Those, shape ``(n, d)``; none where only the formula was kept.
+    level, saddle
+        V of the lowest saddle and its position; of the last point that recordings reach, and None, where they
+        end before one.
+    residual, points
+        Relative Hamilton–Jacobi residual on the points of the fit, and those, shape ``(n, d)``; none where
+        only the formula was kept.
     reach
         V up to which the formula was sought, which may lie beyond the saddle; by default the level.
     tolerance
@@ -232,16 +228,10 @@ class Well(Expansion):
 
 @dataclass(frozen=True, eq=False)
 class Depth:
-    """How deep a well is, as the path of least action to its lowest saddle tells.
+    """How deep a well is, as the path of least action to its lowest saddle, or bounding cycle, tells.
 
-    Attributes
-    ----------
-    saddle
-        That saddle, or the unstable cycle that bounds the well.
-    points
-        Along the path, shape ``(n, d)``.
-    values, slopes
-        V and ∇V there, shape ``(n,)`` and ``(n, d)``.
+    `points`, ``(n, d)``, lie along the path; `values`, ``(n,)``, and `slopes`, ``(n, d)``, are V and ∇V
+    there.
     """
 
     saddle: Equilibrium | Cycle
@@ -322,12 +312,8 @@ def local_well(
 
     Parameters
     ----------
-    dynamics
-        f and D.
-    portrait
-        Attractors, saddles and basins.
-    index
-        Which attractor.
+    dynamics, portrait, index
+        f and D, their attractors, saddles and basins, and which attractor.
     options
         Degrees, reach and tolerance.
     seed
