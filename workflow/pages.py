@@ -86,8 +86,7 @@ def figures(given: Given, settings: PipelineSettings) -> Any:
         networks=_trained(given, run).networks,
         exact=None if card is None else exact_answer(card),
     )
-    own = settings.of(report.FiguresSettings)
-    drawn: dict[str, Any] = dict(report.study_figures(own, tables, shown, given.card, _published(given)))
+    drawn: dict[str, Any] = dict(report.study_figures(settings, tables, shown, given.card, _published(given)))
     overview = given.overview
     first = run if overview is None else overview["run"]
     record, recorded = given.field[first], given.recordings[first]
@@ -122,7 +121,8 @@ def landscape_figures(given: Given, settings: PipelineSettings) -> Any:
     if found is not None:
         formulas, networks = given.model[found[0]][0], _trained(given, found[0]).networks
     drawn = report.landscape_figures(
-        settings.of(report.LandscapeFiguresSettings),
+        settings.space,
+        compare_below=None if settings.landscape is None else settings.landscape.compare_below,
         degrees=given.degrees,
         escape=pd.DataFrame() if given.escape is None else given.escape,
         landscape=None if found is None else found[1],

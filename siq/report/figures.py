@@ -7,15 +7,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass as plain_dataclass
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import sympy
 from matplotlib.figure import Figure
-from pydantic.dataclasses import dataclass
 
 from siq.data.inspection import inspection_of
 from siq.data.preparation import joined
@@ -23,10 +21,10 @@ from siq.data.recordings import Recordings, snapshot_pairs
 from siq.data.two_states import RecordStates
 from siq.inference.residuals import predict
 from siq.networks.decomposition import TrainedNetworks
-from siq.networks.regression import RegressionOptions, highest_used, points_below
+from siq.networks.regression import highest_used, points_below
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.formulas import SymbolicDecomposition
-from siq.quasipotential.landscape import GlobalQuasipotential, Landscape, LandscapeOptions
+from siq.quasipotential.landscape import GlobalQuasipotential, Landscape
 from siq.quasipotential.landscape_comparison import Potential, ReferenceLandscape, overall_level
 from siq.report.formatting import texts
 from siq.report.page import ReportFigure
@@ -49,10 +47,10 @@ from siq.report.plots.sweep import plot_sweep
 from siq.report.summary import LandscapeSummary, energy_unit
 from siq.systems.dynamics import Dynamics
 from siq.systems.formulas import compile_formulas
-from siq.systems.simulation import SimulationOptions, simulate_snapshots
+from siq.systems.simulation import simulate_snapshots
 from siq.workflow.published import PublishedFigure, published_formula
 from siq.workflow.scoring import ModelFiles, Shown
-from siq.workflow.study import STRICT, Sampling, StateSpace, Study, SweepOptions
+from siq.workflow.study import PipelineSettings, StateSpace, Study, SweepOptions
 from siq.workflow.tables import METHODS, Method
 
 
@@ -149,25 +147,6 @@ def project_landscape(
     )
 
 
-@dataclass(frozen=True, config=STRICT)
-class FiguresSettings:
-    """What the figures of a study depend on; `simulation` is None of recordings."""
-
-    seed: int
-    space: StateSpace
-    sampling: Sampling
-    simulation: SimulationOptions | None
-    regression: RegressionOptions
-
-
-@dataclass(frozen=True, config=STRICT)
-class LandscapeFiguresSettings:
-    """What the figures of a landscape depend on."""
-
-    space: StateSpace
-    landscape: LandscapeOptions
-
-
 OF_NETWORKS = ("coefficients_regression", "inclusion_regression", "training")
 """Figures that say nothing where no networks were asked for."""
 
@@ -239,8 +218,9 @@ def figure_of(
 
 
 def landscape_figures(
-    settings: LandscapeFiguresSettings,
+    space: StateSpace,
     *,
+    compare_below: float | None = None,
     degrees: pd.DataFrame,
     escape: pd.DataFrame,
     landscape: Landscape | None = None,
@@ -254,8 +234,10 @@ def landscape_figures(
 
     Parameters
     ----------
-    settings
-        Units, and below which U errors are drawn.
+    space
+        Units.
+    compare_below
+        U below which errors are drawn, by default 1.1 of the highest saddle.
     degrees, escape
         The tables; `escape` is empty where nothing was simulated.
     landscape
@@ -267,7 +249,7 @@ def landscape_figures(
     published, mesh
         Published figures by quantity, and a U that was published on a mesh.
     """
-    time_unit = settings.space.unit("t", unknown="1")
+    time_unit = space.unit("t", unknown="1")
     figures: dict[str, Figure | None] = {
         "degrees": plot_degrees(degrees),
         "escape": plot_escape(escape, time_unit=time_unit),
@@ -276,7 +258,7 @@ def landscape_figures(
         return figures
     names, x, potential = landscape.dynamics.states, reference.points, landscape.global_quasipotential
     assert potential is not None  # U is known over all wells
-    below = settings.landscape.compare_below or overall_level(reference)
+    below = compare_below or overall_level(reference)
     inside = np.nan_to_num(reference.values, nan=np.inf) < below
     ours = {"characteristics": reference.values, "mesh": reference.mesh_values}
     if networks is not None:
@@ -297,7 +279,7 @@ def landscape_figures(
         theirs["local formulas"] = ours["local formulas"]
         constants = ("published mesh", "published formula")
         maps["landscape_published"] = _shifted(theirs, inside, of_any_constant=constants)
-    units = tuple(settings.space.unit(name, unknown="1") for name in names)
+    units = tuple(space.unit(name, unknown="1") for name in names)
     energy = energy_unit(units, time_unit)
     if len(names) == 1:
         return figures | {
@@ -335,7 +317,7 @@ PREDICTED = 6
 GRID = 161  # on which the level of the regression is drawn
 
 
-@plain_dataclass(frozen=True)
+@dataclass(frozen=True)
 class RepresentativeRun:
     """The run whose figures are shown.
 
@@ -405,7 +387,7 @@ def representative_run(
 
 
 def study_figures(
-    settings: FiguresSettings,
+    settings: PipelineSettings,
     tables: Mapping[str, pd.DataFrame],
     shown: RepresentativeRun,
     system: Dynamics | None,
@@ -418,30 +400,29 @@ def study_figures(
         coefficients = tables["coefficients"]
         figures[f"coefficients_{method}"] = plot_coefficient_distributions(coefficients, method=method)
         figures[f"inclusion_{method}"] = plot_inclusion(coefficients, method=method)
-    known = published.get("rrmse")
+    known, error = published.get("rrmse"), published.get("prediction_error")
     band = None
     if known is not None and known.standard_deviation is not None:
         band = (known.mean, known.standard_deviation)
     figures["error_distribution"] = plot_error_distribution(rrmse, published=band)
     figures["training"] = plot_training(tables["training"])
-    figures["dataset"] = _dataset_figure(settings, shown, system)
     figures["components"] = _components_figure(shown, system)
-    error = published.get("prediction_error")
-    figures["record"] = _record_figure(tables, shown, system)
     figures["prediction"] = _prediction_figure(settings, tables["prediction"], shown, system, error)
-    return figures
-
-
-def _record_figure(
-    tables: Mapping[str, pd.DataFrame], shown: RepresentativeRun, system: Dynamics | None
-) -> Figure | None:
-    """The test against the record, of the run that is shown."""
     recordings = shown.recordings
-    if recordings is None:
-        return None
-    one, two = (table[table["run"] == shown.number] for table in (tables["record"], tables["record_density"]))
-    units = dict(zip(recordings.names, _units(recordings, system), strict=True))
-    return plot_record(one, two, units=units, time_unit=recordings.time_unit or "1")
+    if recordings is not None:
+        names, units = recordings.names, _units(recordings, system)
+        data = _dataset(settings, recordings, shown.networks, system)
+        figures["dataset"] = plot_dataset(data, states=names, units=units)
+        record, density = (
+            tables[name][tables[name]["run"] == shown.number] for name in ("record", "record_density")
+        )
+        figures["record"] = plot_record(
+            record,
+            density,
+            units=dict(zip(names, units, strict=True)),
+            time_unit=recordings.time_unit or "1",
+        )
+    return figures
 
 
 def _some(recordings: Recordings) -> np.ndarray:
@@ -499,7 +480,7 @@ def _limits_of(fields: ComponentFields, domain: np.ndarray) -> np.ndarray:
 
 
 def _prediction_figure(
-    settings: FiguresSettings,
+    settings: PipelineSettings,
     errors: pd.DataFrame,
     shown: RepresentativeRun,
     system: Dynamics | None,
@@ -523,23 +504,13 @@ def _prediction_figure(
     )
 
 
-def _dataset_figure(
-    settings: FiguresSettings, shown: RepresentativeRun, system: Dynamics | None
-) -> Figure | None:
-    """The recorded states of a run, and those that its regression sees."""
-    recordings = shown.recordings
-    if recordings is None:
-        return None
-    data = _dataset(settings, recordings, shown.networks, system)
-    return plot_dataset(data, states=recordings.names, units=_units(recordings, system))
-
-
 def _dataset(
-    settings: FiguresSettings,
+    settings: PipelineSettings,
     recordings: Recordings,
     networks: TrainedNetworks | None,
     system: Dynamics | None,
 ) -> Dataset:
+    """The recorded states of a run, and those that its regression sees."""
     chosen = _some(recordings)
     rows = np.isin(recordings.recording, chosen)
     paths = [recordings.values[recordings.recording == index, :2] for index in chosen]

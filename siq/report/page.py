@@ -493,7 +493,11 @@ def interactive_view(landscape: LandscapeSummary) -> Markup | None:
     names = data["names"]
     return Markup(
         environment.get_template("interactive.html.j2").render(
-            text=_text(landscape, shown),
+            held=[
+                f"{landscape.names[k]} = {landscape.lowest_pass[k]:.3g}"
+                for k in range(len(landscape.names))
+                if k not in shown
+            ],
             flat=len(shown) == 2,
             level=round(1000 * share),
             names=names,
@@ -592,18 +596,3 @@ def _lowest_pass(landscape: LandscapeSummary) -> float | None:
     tops = [landscape.wells[way.start].height + way.barrier for way in landscape.ways]
     known = [top for top in tops if np.isfinite(top)]
     return min(known) if known else None
-
-
-def _text(landscape: LandscapeSummary, shown: Sequence[int]) -> str:
-    rest = [place for place in range(len(landscape.names)) if place not in shown]
-    text = (
-        "Circles are stable states, diamonds saddles. The solid line is the most probable way out of a well,"
-    )
-    text += " the dashed line the way on without noise. Where U is not known, nothing is drawn."
-    if len(shown) == 2:
-        return "Drag the first picture to turn it. " + text
-    text = "The first picture is the surface on which U has one value: raise it until the wells join. " + text
-    if rest:
-        held = ", ".join(f"{landscape.names[k]} = {landscape.lowest_pass[k]:.3g}" for k in rest)
-        text += f" The other states are held at the lowest saddle: {held}."
-    return text

@@ -20,7 +20,6 @@ import pandas as pd
 import sympy
 import yaml
 from markupsafe import Markup
-from pydantic.dataclasses import dataclass as pydantic_dataclass
 
 from siq.data.two_states import RecordStates
 from siq.inference.field_estimate import DiffusionSource
@@ -58,7 +57,7 @@ from siq.report.summary import LandscapeSummary, well_name
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.workflow.scoring import ModelFiles, Shown
-from siq.workflow.study import STRICT, Study, SweepOptions
+from siq.workflow.study import Study, SweepOptions
 from siq.workflow.tables import Method, Outcome, Status, Step, why_no_landscape
 
 NEGLIGIBLE_TERM = 1e-3  # of the depth: a term that adds less everywhere is left to the whole formula
@@ -72,13 +71,6 @@ SUMMARY_COLUMNS = (
     "method", "quantity", "exact", "mean", "standard_deviation", "median", "inclusion_frequency", "published",
     "published_standard_deviation", "runs",
 )  # fmt: skip
-
-
-@pydantic_dataclass(frozen=True, config=STRICT)
-class PageSettings:
-    """What the page of a study depends on: the whole study, which it prints."""
-
-    study: Study
 
 
 @dataclass(frozen=True)
@@ -536,43 +528,25 @@ def comparison_notes(table: pd.DataFrame) -> list[tuple[str, list[str]]]:
     ]
 
 
-@dataclass(frozen=True)
-class RunFigures:
+def run_figures(tables: Mapping[str, pd.DataFrame], *, runs: int, method: str) -> dict[str, Any]:
     """What all runs of a study say together of a method, for `templates/runs.j2`.
 
-    Attributes
-    ----------
-    runs, failed, certified, correct
-        How many were asked for, failed, are certified, and have exactly the right terms.
-    stated, errors, networks
-        Errors that certificates state, of the coefficients of U, and of U of the networks.
-    terms, rare
-        Terms of U in most runs with mean and standard deviation, and terms in some runs only.
-    published
-        The published error of the coefficients, NaN where there is none.
-    prediction
-        Error of predictions, mean and median over the runs; None where nothing was predicted.
+    Returns
+    -------
+    dict
+        How many ``runs`` were asked for, ``failed``, are ``certified``, have exactly the right terms
+        (``correct``); the errors that certificates state (``stated``), of the coefficients of U (``errors``)
+        and of U of the ``networks``; ``terms`` of U in most runs with mean and standard deviation, and
+        ``rare`` ones; the ``published`` error of the coefficients, NaN where there is none; mean and median
+        error of predictions (``prediction``), None where nothing was predicted.
     """
-
-    runs: int
-    failed: int
-    certified: int
-    correct: int
-    stated: pd.Series
-    errors: pd.Series
-    networks: pd.Series
-    terms: Sequence[tuple[str, float, float]]
-    rare: Sequence[str]
-    published: float
-    prediction: tuple[float, float] | None
-
-
-def run_figures(tables: Mapping[str, pd.DataFrame], *, runs: int, method: str) -> RunFigures:
-    """Figures over the runs that a study asked for, of one method, from its tables."""
     nothing = pd.Series(dtype=float)
     outcomes, rrmse, summary = tables["outcomes"], tables.get("rrmse"), tables.get("summary")
     if rrmse is None or summary is None:
-        return RunFigures(runs, 0, 0, 0, nothing, nothing, nothing, (), (), np.nan, None)
+        return {
+            "runs": runs, "failed": 0, "certified": 0, "correct": 0, "stated": nothing, "errors": nothing,
+            "networks": nothing, "terms": (), "rare": (), "published": np.nan, "prediction": None,
+        }  # fmt: skip
     mine = rrmse[rrmse["method"] == method]
     summary = summary[summary["method"] == method].set_index("quantity")
     terms = summary[summary.index.str.startswith("U:")]
@@ -580,22 +554,22 @@ def run_figures(tables: Mapping[str, pd.DataFrame], *, runs: int, method: str) -
     rare = terms[(terms["inclusion_frequency"] > 0) & (terms["inclusion_frequency"] < 0.5)]
     predicted = summary[summary.index == "prediction_error"]
     published = summary[summary.index == "rrmse"]["published"]
-    return RunFigures(
-        runs=runs,
-        failed=int(outcomes[outcomes["status"] == Status.FAILED]["run"].nunique()),
-        certified=int(mine["certified"].sum()),
-        correct=int(mine["support_correct"].fillna(False).sum()),
-        stated=mine[mine["certified"].astype(bool)]["stated_error"].dropna(),
-        errors=mine["rrmse"].dropna(),
-        networks=mine["network_error"].dropna(),
-        terms=[
+    return {
+        "runs": runs,
+        "failed": int(outcomes[outcomes["status"] == Status.FAILED]["run"].nunique()),
+        "certified": int(mine["certified"].sum()),
+        "correct": int(mine["support_correct"].fillna(False).sum()),
+        "stated": mine[mine["certified"].astype(bool)]["stated_error"].dropna(),
+        "errors": mine["rrmse"].dropna(),
+        "networks": mine["network_error"].dropna(),
+        "terms": [
             (str(name).removeprefix("U:"), float(row["mean"]), float(row["standard_deviation"]))
             for name, row in often.iterrows()
         ],
-        rare=[str(name).removeprefix("U:") for name in rare.index],
-        published=float(published.iloc[0]) if len(published) else np.nan,
-        prediction=tuple(predicted.iloc[0][["mean", "median"]]) if len(predicted) else None,
-    )
+        "rare": [str(name).removeprefix("U:") for name in rare.index],
+        "published": float(published.iloc[0]) if len(published) else np.nan,
+        "prediction": tuple(predicted.iloc[0][["mean", "median"]]) if len(predicted) else None,
+    }
 
 
 def control_counts(certificates: pd.DataFrame) -> dict[str, int] | None:

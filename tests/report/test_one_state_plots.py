@@ -13,12 +13,12 @@ from matplotlib.figure import Figure
 
 from siq.quasipotential.cell_density import known_density, lowest_possible, sample_potential
 from siq.quasipotential.invariant_density import StationaryDensity
-from siq.quasipotential.landscape import Landscape, LandscapeOptions
+from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.landscape_assembly import find_landscape
 from siq.quasipotential.landscape_comparison import reference_landscape
 from siq.quasipotential.landscape_files import read_landscape, write_landscape
 from siq.quasipotential.wells import WellOptions
-from siq.report.figures import LandscapeFiguresSettings, landscape_figures, project_landscape
+from siq.report.figures import landscape_figures, project_landscape
 from siq.report.plots import plot_components, plot_invariant_distribution
 from siq.workflow.study import StateSpace
 from siq.workflow.tables import as_table
@@ -48,7 +48,7 @@ def figures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Figure | None
     )
     space = StateSpace(names=("x",), units={"x": "mV", "t": "s"})
     return landscape_figures(
-        LandscapeFiguresSettings(space=space, landscape=LandscapeOptions()),
+        space,
         degrees=as_table("degrees", []), escape=as_table("escape", []), landscape=stored, reference=reference,
     )  # fmt: skip
 

@@ -13,7 +13,7 @@ from known_systems import as_system, limit_cycle
 
 from siq.quasipotential.landscape import LandscapeOptions
 from siq.quasipotential.landscape_comparison import read_reference, write_reference
-from siq.report.figures import LandscapeFiguresSettings, landscape_figures
+from siq.report.figures import landscape_figures
 from siq.report.study_page import without_landscape
 from siq.systems.dynamics import Dynamics
 from siq.workflow import comparison
@@ -52,7 +52,7 @@ def test_without_wells_there_is_a_reason_and_no_rows(card: Dynamics, reason: str
     table = comparison.run_landscape_errors(settings, found, [], None)
     assert list(table.columns) == list(COLUMNS["landscape_errors"]) and table.empty
     drawn = landscape_figures(
-        LandscapeFiguresSettings(space=StateSpace(), landscape=LandscapeOptions()),
+        StateSpace(),
         degrees=as_table("degrees", []), escape=as_table("escape", []), reference=found,
     )  # fmt: skip
     assert "landscape_errors" not in drawn
