@@ -301,7 +301,7 @@ def _rows_of(part: StatedMechanism | StatedFunction, findings: Findings) -> list
         rows.append(
             FormulaRow(
                 part.label,
-                words[kind] if kind in words else typeset(formula, findings.after, part.parameters),
+                words[kind] if kind in words else _typeset_text(formula, findings.after, part.parameters),
                 _meaning(name, entry, findings),
                 whole=formula if kind in words else None,
             )
@@ -320,7 +320,7 @@ def _meaning(name: str, entry: Mechanism | None, findings: Findings) -> str:
     return str(words["replaced" if any(form.replace for form in forms) else "added"]).format(name)
 
 
-def typeset(text: str, model: Dynamics, further: Iterable[str] = ()) -> Markup | str:
+def _typeset_text(text: str, model: Dynamics, further: Iterable[str] = ()) -> Markup | str:
     """A formula of the verdict, typeset; as text where it cannot be read as one.
 
     Parameters
@@ -390,7 +390,7 @@ def _evidence(parts: Sequence[StatedMechanism]) -> pd.DataFrame:
                 "mechanism": part.label,
                 "gain in χ²": round(evidence.delta_chi2),
                 "ΔBIC": round(evidence.delta_bic or 0),
-                "odds of the name": odds_text(evidence.log_odds),
+                "odds of the name": _odds_text(evidence.log_odds),
                 "p, independent errors": p_text(evidence.p_white or 0),
                 "p, errors of a recording together": p_text(evidence.p_cluster or 0),
             }
@@ -400,7 +400,7 @@ def _evidence(parts: Sequence[StatedMechanism]) -> pd.DataFrame:
     )
 
 
-def odds_text(log_odds: float | None) -> str:
+def _odds_text(log_odds: float | None) -> str:
     """Odds such as ``340 to 1``; empty where they are not known."""
     if log_odds is None:
         return ""

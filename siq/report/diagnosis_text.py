@@ -44,15 +44,15 @@ def _templates() -> Any:
         "p": p_text,
         "p_equation": p_equation,
         "share": percent,
-        "error": error_text,
+        "error": _error_text,
         "value": lambda entry, digits=4: value_text(
             entry.estimate, entry.standard_error, unit=entry.unit, digits=digits
         ),
         "after": lambda each: value_text(each.after, each.standard_error, unit=each.unit),
-        "before": lambda each: card_value(each.before),
+        "before": lambda each: _card_value(each.before),
         "limit": lambda value: value_text(value, digits=3),
         "unit": unit_text,
-        "changes": changes,
+        "changes": _changes,
     }
     return environment.get_template("diagnosis.j2").module
 
@@ -99,7 +99,7 @@ def sentences_of(statement: Statement) -> dict[str, Any]:
     }
 
 
-def changes(recalibration: Mapping[str, Recalibrated]) -> list[tuple[str, Recalibrated, float]]:
+def _changes(recalibration: Mapping[str, Recalibrated]) -> list[tuple[str, Recalibrated, float]]:
     """Parameters that differ from those on the card, with how many standard errors; the surest first."""
     found = []
     for name, each in recalibration.items():
@@ -109,13 +109,13 @@ def changes(recalibration: Mapping[str, Recalibrated]) -> list[tuple[str, Recali
     return sorted(found, key=lambda each: -each[2])
 
 
-def card_value(value: float) -> str:
+def _card_value(value: float) -> str:
     """A value as a card has it."""
     text = f"{value:.6g}"
     return number_text(value) if "e" in text else text.replace("-", "−")
 
 
-def error_text(value: float | None) -> str:
+def _error_text(value: float | None) -> str:
     """An error as a share of the recordings' spread."""
     if value is None:
         return "unknown"

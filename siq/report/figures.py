@@ -54,7 +54,7 @@ from siq.workflow.study import PipelineSettings, StateSpace, Study, SweepOptions
 from siq.workflow.tables import METHODS, Method
 
 
-def project(
+def _project(
     identified: SymbolicDecomposition,
     *,
     exact: SymbolicDecomposition | None,
@@ -105,7 +105,7 @@ def project(
     )
 
 
-def project_landscape(
+def _project_landscape(
     potential: GlobalQuasipotential,
     *,
     domain: np.ndarray,
@@ -456,14 +456,14 @@ def _component_fields(
     chosen = _some(recordings)
     paths = [recordings.values[recordings.recording == index] for index in chosen]
     if shown.landscape is not None and len(domain) <= 2:
-        whole = project_landscape(shown.landscape, domain=domain, trajectories=())
+        whole = _project_landscape(shown.landscape, domain=domain, trajectories=())
         domain = _limits_of(whole, domain)
-        return project_landscape(shown.landscape, domain=domain, trajectories=paths), domain
+        return _project_landscape(shown.landscape, domain=domain, trajectories=paths), domain
     if shown.formula is None:
         nothing = ComponentFields(x1=np.array([]), x2=np.array([]), trajectories=[p[:, :2] for p in paths])
         return nothing, domain
     lowest = recordings.values[np.argmin(shown.formula.evaluate(recordings.values.T)[0])]
-    return project(shown.formula, exact=shown.exact, domain=domain, at=lowest, trajectories=paths), domain
+    return _project(shown.formula, exact=shown.exact, domain=domain, at=lowest, trajectories=paths), domain
 
 
 def _limits_of(fields: ComponentFields, domain: np.ndarray) -> np.ndarray:
@@ -538,7 +538,7 @@ def _dataset(
     )
 
 
-def sweep_figure(system: Dynamics, options: SweepOptions, tables: Mapping[str, pd.DataFrame]) -> Figure:
+def _sweep_figure(system: Dynamics, options: SweepOptions, tables: Mapping[str, pd.DataFrame]) -> Figure:
     """The figure of a sweep, with the units of the card."""
     units = dict(zip(system.states, system.units, strict=True)) | {"t": system.time_unit}
     units |= {each.name: each.unit for each in system.parameters}
@@ -555,7 +555,7 @@ def equations_figures(
     return {
         "quasipotential": None if summary is None else quasipotential_figure(summary),
         "degrees": plot_degrees(tables["degrees"]) if len(tables["degrees"]) else None,
-        "sweep": None if study.sweep is None else sweep_figure(system, study.sweep, tables),
+        "sweep": None if study.sweep is None else _sweep_figure(system, study.sweep, tables),
     }
 
 

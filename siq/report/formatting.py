@@ -111,12 +111,12 @@ def position_text(well: WellSummary, summary: LandscapeSummary) -> str:
     )
 
 
-def relative_text(share: float) -> str:
+def _relative_text(share: float) -> str:
     """A relative error: ``3.7 %``, ``4.2 × 10⁻⁶``.
 
     Examples
     --------
-    >>> relative_text(0.0371)
+    >>> _relative_text(0.0371)
     '3.7 %'
     """
     if share < 1e-4:
@@ -145,7 +145,7 @@ def environment() -> Environment:
         "value": value_text,
         "number": number_text,
         "share": percent,
-        "relative": relative_text,
+        "relative": _relative_text,
         "percent": percent_text,
         "p": p_text,
         "range": lambda ends, **options: range_text(*ends, **options),

@@ -45,7 +45,7 @@ def answer_lines(
     )
 
 
-def certificate_line(certificate: Mapping[str, Any] | None) -> str:
+def _certificate_line(certificate: Mapping[str, Any] | None) -> str:
     """The certificate in one sentence, for text."""
     (line,) = paragraphs("certificate.j2", certificate=certificate, texts=texts("certificate"))[-1:]
     return line
@@ -73,7 +73,7 @@ def headed(name: str, unit: str) -> str:
     return f"{name} ({shown})" if shown else name
 
 
-def complex_text(value: complex) -> str:
+def _complex_text(value: complex) -> str:
     """A complex number to four digits: ``−1.000 + 2.000 i``."""
     if not value.imag:
         return value_text(value.real)
@@ -110,7 +110,7 @@ def wells_table(summary: LandscapeSummary) -> tuple[pd.DataFrame, pd.DataFrame]:
             )
         cells[headed("period", time_unit)] = "" if cycle is None else value_text(cycle.period, digits=4)
         multipliers = [] if cycle is None else cycle.multipliers.tolist()
-        cells["Floquet multipliers"] = ", ".join(complex_text(one) for one in multipliers)
+        cells["Floquet multipliers"] = ", ".join(_complex_text(one) for one in multipliers)
         deep = math.isfinite(well.depth)
         cells[headed("depth ΔU", summary.energy_unit)] = (
             value_text(well.depth, well.depth_error) if deep else ""
@@ -186,7 +186,7 @@ def cycles_table(summary: LandscapeSummary) -> pd.DataFrame:
         rows.append(
             dict(zip(summary.names, reach, strict=True))
             | {headed("period", summary.time_unit): value_text(one.period, digits=4)}
-            | {"Floquet multipliers": ", ".join(map(complex_text, one.multipliers.tolist()))}
+            | {"Floquet multipliers": ", ".join(map(_complex_text, one.multipliers.tolist()))}
         )
     return pd.DataFrame(rows)
 
@@ -204,7 +204,7 @@ def equilibria_table(summary: LandscapeSummary) -> pd.DataFrame:
             "name": one.label,
             "what": kinds.get(one.kind, one.kind),
             position: _place(summary, one.position),
-            f"rates (1/{time})" if time else "rates": ", ".join(map(complex_text, one.eigenvalues)),
+            f"rates (1/{time})" if time else "rates": ", ".join(map(_complex_text, one.eigenvalues)),
         }
         for one in summary.equilibria
     ]
@@ -332,7 +332,7 @@ def _report(landscape: Landscape) -> tuple[list[str], list[tuple[str, pd.DataFra
     certified = certificate is not None and bool(certificate["certified"])
     answer, *further = answer_lines(summary, seen=landscape.seen, certified=certified)
     written = certificate is not None or any(well is not None for well in landscape.wells)
-    verdict = certificate_line(certificate) if written else "U is not written as a formula."
+    verdict = _certificate_line(certificate) if written else "U is not written as a formula."
     words = texts("tables")
     tables = [(words["wells"], wells_table(summary)[0])] if summary.wells else []
     if landscape.transitions:

@@ -195,7 +195,7 @@ class ReportContent:
     language: str = "en"
 
 
-class PageWriter:
+class _PageWriter:
     """A page that a template fills; see `compose`.
 
     Parameters
@@ -292,7 +292,7 @@ def compose(template: str, *, title: str, interactive: Markup | None = None, **v
     values
         What the template reads.
     """
-    writer = PageWriter(title)
+    writer = _PageWriter(title)
     environment().get_template(template).render(page=writer, **values)
     return replace(writer.content, interactive=interactive)
 
@@ -335,23 +335,23 @@ def render_template(name: str, content: object, *, folder: Path | None = None) -
         lstrip_blocks=True,
     )
     environment.filters |= {
-        "cell": cell_text,
+        "cell": _cell_text,
         "is_number": _is_number_column,
-        "kept_columns": kept_columns,
+        "kept_columns": _kept_columns,
         "data_address": _data_address,
         "figure_download": _figure_download,
         "table_download": _table_download,
-        "file_name": file_name,
+        "file_name": _file_name,
         "page_width": _page_width,
         "wide_for": _wide_for,
-        "short": short_caption,
+        "short": _short_caption,
         "unbroken": lambda text: text.replace(" × 10", "\u00a0×\u00a010"),
         "records": lambda frame: list(frame.itertuples(index=False, name=None)),
     }
     return environment.get_template(name).render(content=content)
 
 
-def kept_columns(frame: pd.DataFrame) -> pd.DataFrame:
+def _kept_columns(frame: pd.DataFrame) -> pd.DataFrame:
     """The table without columns that say nothing: of missing values, or of empty texts."""
     said = [not (frame[name].isna() | (frame[name].astype(str) == "")).all() for name in frame.columns]
     return frame if all(said) or frame.empty else frame.loc[:, said]
@@ -382,13 +382,13 @@ def _table_download(table: Any) -> str:
     return _address("text/csv;charset=utf-8", text.encode("utf-8"))
 
 
-def short_caption(caption: str) -> str:
+def _short_caption(caption: str) -> str:
     """The first sentence, or its first part, for the contents: no more than a line."""
     first = re.split(r"(?<=[a-zà-ÿ)\]])[.:;](?:\s|$)", caption, maxsplit=1)[0].rstrip(".")
     return first if len(first) <= 90 else first[:88].rsplit(" ", 1)[0] + " …"
 
 
-def file_name(caption: str, number: int, *, what: str) -> str:
+def _file_name(caption: str, number: int, *, what: str) -> str:
     """A name for a download: ``table-3-barriers-of-u``."""
     words = re.findall(r"[a-z0-9]+", caption.lower())[:5]
     return "-".join([what, str(number), *words])
@@ -409,17 +409,17 @@ def _wide_for(frame: pd.DataFrame, rows: int) -> str:
     """For which screens a table is about too wide: ``page phone``, ``phone``, or none."""
     width = 0.0
     for name in frame.columns:
-        cells = [_least_width(cell_text(value)) for value in frame[name].head(rows)]
-        width += CELL + CHARACTER * max([longest_word(str(name)), *cells])
+        cells = [_least_width(_cell_text(value)) for value in frame[name].head(rows)]
+        width += CELL + CHARACTER * max([_longest_word(str(name)), *cells])
     return "page phone" if width > PAGE else "phone" if width > PHONE else ""
 
 
 def _least_width(text: str) -> int:
     """Characters on the narrowest line that a cell can be set in: long texts wrap."""
-    return len(text) if len(text) <= SHORT_TEXT else min(LINE, max(longest_word(text), SHORT_TEXT // 2))
+    return len(text) if len(text) <= SHORT_TEXT else min(LINE, max(_longest_word(text), SHORT_TEXT // 2))
 
 
-def longest_word(text: str) -> int:
+def _longest_word(text: str) -> int:
     """Characters of the longest word: headings wrap, figures do not."""
     return max((len(word) for word in text.split()), default=0)
 
@@ -428,7 +428,7 @@ def _is_number_column(column: pd.Series) -> bool:
     return pd.api.types.is_numeric_dtype(column) and not pd.api.types.is_bool_dtype(column)
 
 
-def cell_text(value: object) -> str:
+def _cell_text(value: object) -> str:
     """What stands in a cell."""
     if value is None or value is pd.NA or value is pd.NaT:
         return "—"
@@ -507,12 +507,12 @@ def interactive_view(landscape: LandscapeSummary) -> Markup | None:
             solid=f"U over {', '.join(names[:3])}, in three dimensions; the controls below turn it",
             section="A map of U over two of the states; the controls below choose them",
             data=Markup(_safe(data)),
-            script=Markup(script()),
+            script=Markup(_script()),
         )
     )
 
 
-def script() -> str:
+def _script() -> str:
     """The script of the view."""
     return (files("siq.report") / "templates" / "interactive.js").read_text(encoding="utf-8")
 

@@ -211,12 +211,12 @@ def study_page(
         record=record,
         no_record_test=str((certificate or {}).get("no_record_test") or ""),
         record_table=None if record is None else record_table(record, results.time_unit),
-        run_lines=paragraphs("runs.j2", r=run_figures(results.tables, runs=study.runs, method=str(method))),
-        control=control_counts(certificates),
-        without_landscape=without_landscape(results.tables),
+        run_lines=paragraphs("runs.j2", r=_run_figures(results.tables, runs=study.runs, method=str(method))),
+        control=_control_counts(certificates),
+        without_landscape=_without_landscape(results.tables),
         compared=compared,
         comparison=None if compared is None else comparison_table(compared),
-        compared_notes=[] if compared is None else comparison_notes(compared),
+        compared_notes=[] if compared is None else _comparison_notes(compared),
         tests=None if shown.run is None else tests_table(certificates, shown.run, method),
         landscape_errors=None if errors is None else errors_over_runs(errors),
         escape=None if escape is None else escape.rename(columns=lambda name: name.replace("_", " ")),
@@ -238,10 +238,10 @@ def study_page(
         folder=results.folder,
         bifurcations=None if given is None else _bifurcations(given, study.sweep, table("bifurcations")),
         swept_wells=_swept_wells(table("sweep")),
-        of_runs=method_tables(results.tables, (str(method), str(Method.CONTROL))) if several else None,
+        of_runs=_method_tables(results.tables, (str(method), str(Method.CONTROL))) if several else None,
         published_formulas=_formulas_by(results, Method.REGRESSION) if other else [],
         published_certificate=results.certificates.get(str(Method.REGRESSION)),
-        published_runs=method_tables(results.tables, (str(Method.REGRESSION),))
+        published_runs=_method_tables(results.tables, (str(Method.REGRESSION),))
         if several and other
         else None,
         routes=study.refinement.with_routes(networks=study.training is not None).routes or (),
@@ -329,9 +329,9 @@ def _formulas(results: StudyResults) -> list[FormulaRow]:
         formulas = () if results.landscape is None else results.landscape.formulas
         wells = tuple(well for well in formulas if well is not None)
         found = SymbolicDecomposition(system.symbols, None, (), system.formulas, wells)
-        rows = formula_rows(found, None, places=_places(results.landscape))
+        rows = _formula_rows(found, None, places=_places(results.landscape))
         rows[-1] = replace(rows[-1], note=words["given"])
-        return [*rows, FormulaRow("D", diffusion_mathml(system.diffusion), words["D"]["given"])]
+        return [*rows, FormulaRow("D", _diffusion_mathml(system.diffusion), words["D"]["given"])]
     rows, record = _formulas_by(results, results.shown.method), results.record
     if record is None:
         return rows
@@ -339,10 +339,10 @@ def _formulas(results: StudyResults) -> list[FormulaRow]:
         rows.append(FormulaRow("f", vector_mathml(record.found.dynamics.formulas), words["f"]))
     noise, note = record.found.diffusion, words["D"][record.diffusion_source]
     note = note if noise.constant else f"{note} {words['by_state']}"
-    return [*rows, FormulaRow("D", diffusion_mathml(noise), note)]
+    return [*rows, FormulaRow("D", _diffusion_mathml(noise), note)]
 
 
-def diffusion_mathml(noise: Diffusion) -> Markup:
+def _diffusion_mathml(noise: Diffusion) -> Markup:
     """D, typeset."""
     return matrix_mathml(noise.matrix.tolist() if noise.constant else noise.formulas)
 
@@ -358,12 +358,12 @@ def _formulas_by(results: StudyResults, method: Method) -> list[FormulaRow]:
     if method not in found:
         return []
     barriers = [] if summary is None else [way.barrier for way in summary.ways if np.isfinite(way.barrier)]
-    return formula_rows(
+    return _formula_rows(
         found[method], results.exact, places=_places(summary), depth=max(barriers, default=0.0)
     )
 
 
-def formula_rows(
+def _formula_rows(
     found: SymbolicDecomposition,
     exact: SymbolicDecomposition | None,
     *,
@@ -507,7 +507,7 @@ def _troubled(study: Study, results: StudyResults) -> pd.DataFrame | None:
     return rows.drop(columns="run") if study.runs == 1 else rows
 
 
-def without_landscape(tables: Mapping[str, pd.DataFrame]) -> tuple[str, int, int] | None:
+def _without_landscape(tables: Mapping[str, pd.DataFrame]) -> tuple[str, int, int] | None:
     """Why runs have no landscape whose f was followed, in how many, of how many; None where all have one."""
     landscape, outcomes = tables["landscape"], tables["outcomes"]
     asked = outcomes[
@@ -519,7 +519,7 @@ def without_landscape(tables: Mapping[str, pd.DataFrame]) -> tuple[str, int, int
     return str(without["reason"].iloc[0]), len(without), int(outcomes["run"].nunique())
 
 
-def comparison_notes(table: pd.DataFrame) -> list[tuple[str, list[str]]]:
+def _comparison_notes(table: pd.DataFrame) -> list[tuple[str, list[str]]]:
     """What could not be compared with the equations: each note, and the numbers that it is of."""
     noted = table[table["note"].fillna("") != ""]
     return [
@@ -528,7 +528,7 @@ def comparison_notes(table: pd.DataFrame) -> list[tuple[str, list[str]]]:
     ]
 
 
-def run_figures(tables: Mapping[str, pd.DataFrame], *, runs: int, method: str) -> dict[str, Any]:
+def _run_figures(tables: Mapping[str, pd.DataFrame], *, runs: int, method: str) -> dict[str, Any]:
     """What all runs of a study say together of a method, for `templates/runs.j2`.
 
     Returns
@@ -572,7 +572,7 @@ def run_figures(tables: Mapping[str, pd.DataFrame], *, runs: int, method: str) -
     }
 
 
-def control_counts(certificates: pd.DataFrame) -> dict[str, int] | None:
+def _control_counts(certificates: pd.DataFrame) -> dict[str, int] | None:
     """What became of the control, a network with its weights in random order; None where there is none.
 
     Parameters
@@ -598,7 +598,7 @@ def control_counts(certificates: pd.DataFrame) -> dict[str, int] | None:
     }  # fmt: skip
 
 
-def method_tables(
+def _method_tables(
     tables: Mapping[str, pd.DataFrame], methods: tuple[str, ...]
 ) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame, pd.DataFrame]:
     """Of some methods: figures over the runs, shown and as numbers, tests passed, and errors by run."""

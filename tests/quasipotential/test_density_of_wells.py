@@ -22,7 +22,7 @@ from siq.quasipotential.cell_density import (
     shares_by_rates,
     walk,
 )
-from siq.report.figures import project_landscape
+from siq.report.figures import _project_landscape
 from siq.systems.dynamics import Dynamics
 
 KNOWN, POTENTIAL = matched("double well")
@@ -185,7 +185,7 @@ def test_a_formula_is_not_believed_where_it_is_negative() -> None:
 
 
 def test_the_components_of_the_wells_are_those_of_the_system() -> None:
-    fields = project_landscape(POTENTIAL, domain=BOX, trajectories=(), resolution=41)
+    fields = _project_landscape(POTENTIAL, domain=BOX, trajectories=(), resolution=41)
     x = np.stack(np.meshgrid(fields.x1, fields.x2), axis=-1).reshape(-1, 2)
     seen = np.isfinite(fields.quasipotential).ravel()
     assert 0.1 < seen.mean() < 0.9

@@ -18,7 +18,7 @@ from siq.quasipotential.landscape_assembly import find_landscape
 from siq.quasipotential.landscape_comparison import reference_landscape
 from siq.quasipotential.landscape_files import read_landscape, write_landscape
 from siq.quasipotential.wells import WellOptions
-from siq.report.figures import landscape_figures, project_landscape
+from siq.report.figures import _project_landscape, landscape_figures
 from siq.report.plots import plot_components, plot_invariant_distribution
 from siq.workflow.study import StateSpace
 from siq.workflow.tables import as_table
@@ -82,7 +82,7 @@ def test_the_density_is_a_curve_over_a_histogram() -> None:
 def test_the_components_of_a_landscape_of_one_state_are_curves() -> None:
     potential = landscape().global_quasipotential
     assert potential is not None
-    fields = project_landscape(potential, domain=KNOWN.domain, trajectories=(), resolution=41)
+    fields = _project_landscape(potential, domain=KNOWN.domain, trajectories=(), resolution=41)
     assert fields.quasipotential is not None and fields.quasipotential.shape == (1, 41)
     figure = plot_components(fields, states=["x"], units=["mV"], domain=KNOWN.domain)
     assert figure is not None

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from siq.report.formatting import paragraphs
-from siq.report.study_page import control_counts, run_figures
+from siq.report.study_page import _control_counts, _run_figures
 from siq.workflow.published import PublishedFigure
 from siq.workflow.scoring import summary_table
 from siq.workflow.tables import as_table
@@ -45,7 +45,7 @@ def answer(errors: list[float | None], *, published: bool = True, certified: boo
         as_table("coefficients", rows), rrmse, as_table("prediction", []), PUBLISHED if published else {}
     )
     tables = {"rrmse": rrmse, "outcomes": outcomes, "summary": summary}
-    return " ".join(paragraphs("runs.j2", r=run_figures(tables, runs=len(errors), method="regression")))
+    return " ".join(paragraphs("runs.j2", r=_run_figures(tables, runs=len(errors), method="regression")))
 
 
 def test_it_says_how_many_runs_ended_with_formulas_and_how_many_failed() -> None:
@@ -94,7 +94,7 @@ def test_a_study_without_any_answer_known_claims_no_error() -> None:
     outcomes = as_table("outcomes", [{"run": 0, "step": "train", "status": "ok", "reason": ""}])
     summary = summary_table(as_table("coefficients", []), rrmse, as_table("prediction", []), {})
     tables = {"rrmse": rrmse, "outcomes": outcomes, "summary": summary}
-    assert paragraphs("runs.j2", r=run_figures(tables, runs=1, method="regression")) == []
+    assert paragraphs("runs.j2", r=_run_figures(tables, runs=1, method="regression")) == []
 
 
 def test_one_run_is_not_counted() -> None:
@@ -118,6 +118,6 @@ def test_the_control_is_counted_by_what_became_of_it() -> None:
             for run, test, passed in rows
         ]
     )
-    assert control_counts(table) == {"runs": 3, "refused": 1, "same": 1, "false": 1}
-    assert control_counts(table[table["run"] < 2]) == {"runs": 2, "refused": 1, "same": 1, "false": 0}
-    assert control_counts(table.assign(method="refined")) is None
+    assert _control_counts(table) == {"runs": 3, "refused": 1, "same": 1, "false": 1}
+    assert _control_counts(table[table["run"] < 2]) == {"runs": 2, "refused": 1, "same": 1, "false": 0}
+    assert _control_counts(table.assign(method="refined")) is None

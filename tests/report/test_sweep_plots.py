@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import sympy
 
-from siq.report.figures import sweep_figure
+from siq.report.figures import _sweep_figure
 from siq.report.page import ReportSection
 from siq.report.plots.sweep import plot_sweep
 from siq.report.study_page import StudyResults, study_page
@@ -97,4 +97,4 @@ def test_the_section_says_where_wells_end_and_what_was_not_found(found):
     assert "No landscape at h = -0.5: it was too far." in section.notes
     (shown,) = section.tables
     assert list(shown.frame["what"]) == ["fold"]
-    assert len(sweep_figure(CUSP, options, tables).axes) == 4
+    assert len(_sweep_figure(CUSP, options, tables).axes) == 4

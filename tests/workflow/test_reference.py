@@ -14,7 +14,7 @@ from known_systems import as_system, limit_cycle
 from siq.quasipotential.landscape import LandscapeOptions
 from siq.quasipotential.landscape_comparison import read_reference, write_reference
 from siq.report.figures import landscape_figures
-from siq.report.study_page import without_landscape
+from siq.report.study_page import _without_landscape
 from siq.systems.dynamics import Dynamics
 from siq.workflow import comparison
 from siq.workflow.comparison import LandscapeErrorsSettings
@@ -75,7 +75,7 @@ def test_the_answer_says_that_there_is_no_landscape_and_why() -> None:
         }
     )
     wells = as_table("landscape", [{"run": 1, "kind": "attractor"}])
-    assert without_landscape({"landscape": wells, "outcomes": outcomes}) == ("a cycle", 1, 2)
+    assert _without_landscape({"landscape": wells, "outcomes": outcomes}) == ("a cycle", 1, 2)
     one = {"landscape": wells.iloc[:0], "outcomes": outcomes.iloc[:1]}
-    assert without_landscape(one) == ("a cycle", 1, 1)
-    assert without_landscape({"landscape": wells, "outcomes": outcomes.iloc[1:]}) is None
+    assert _without_landscape(one) == ("a cycle", 1, 1)
+    assert _without_landscape({"landscape": wells, "outcomes": outcomes.iloc[1:]}) is None
