@@ -47,8 +47,7 @@ from siq.systems.equilibria import Equilibrium, hessian_at, spread_evenly, unrea
 from siq.systems.phase_portrait import (
     MOST_SEARCHED,
     PhasePortrait,
-    domain_portrait,
-    high_dimensional_portrait,
+    phase_portrait,
 )
 from siq.systems.simulation import fault_over_domain
 
@@ -153,7 +152,7 @@ def landscape_from_equations(
     system, settings = usable_system(system), settings or EquationSettings()
     many = system.dimension > MOST_SEARCHED
     try:
-        portrait = (high_dimensional_portrait if many else domain_portrait)(system, seed=settings.seed)
+        portrait = phase_portrait(system, seed=settings.seed)
     except NumericalFailure as error:
         raise NoLandscape(str(error), None, system) from None
     fault, points = portrait.fault(), len(portrait.attractors)

@@ -7,15 +7,6 @@ boundary that attracts along it: mostly a saddle with one unstable direction, at
 References
 ----------
 J. D. Skufca, J. A. Yorke, B. Eckhardt, Phys. Rev. Lett. 96 (2006) 174101: edge tracking.
-
-A trajectory is followed from return to return through a section, the plane across f at its start. From a
-close return Newton's method seeks the periodic orbit,
-
-    Φ_T(x) = x,    f(x₀)·(x - x₀) = 0,
-
-whose stability the eigenvalues of ``∂Φ_T/∂x`` decide: one of them is 1, and on a limit cycle all others lie
-within the unit circle. Chaos has periodic orbits too, but unstable ones; what tells it is that small
-differences grow from return to return, at the rate of the largest Lyapunov exponent.
 """
 
 from __future__ import annotations
@@ -39,13 +30,13 @@ if TYPE_CHECKING:
 
 SLOWEST_TIMES = 200.0  # trajectories are followed for so many of the slowest relaxation times, ...
 UNSETTLED_TIMES = 25.0  # ... or times to cross the box where there is no attractor
-MOST_STEPS = 3000
-SPACING = 0.04  # of the recorded box: longest step
-ACCURACY = 1e-7  # of the recorded box: local error of a step
-NEXT_TO = 0.02  # of the domain: a trajectory that has been followed for long is so close to its cycle
-ARRIVED_ON = 1e-3  # of the domain: and one so close to a cycle stays with it
-ASKED = 10  # steps after which trajectories are asked whether they are on a cycle
-ARRIVED = 1e-4  # of the recorded box: trajectories so close to an attractor end there
+MAX_STEPS = 3000
+LONGEST_STEP = 0.04  # of the recorded box: longest step
+STEP_ACCURACY = 1e-7  # of the recorded box: local error of a step
+SETTLED_DISTANCE = 0.02  # of the domain: so close to its cycle is what has been followed for long
+CYCLE_DISTANCE = 1e-3  # of the domain: and one so close to a cycle stays with it
+STEPS_PER_CYCLE_CHECK = 10  # steps after which trajectories are asked whether they are on a cycle
+ATTRACTOR_DISTANCE = 1e-4  # of the recorded box: trajectories so close to an attractor end there
 
 
 @dataclass(frozen=True)
@@ -116,12 +107,12 @@ def follow(
     ends, escaped = np.full(count, -1), np.zeros(count, dtype=bool)
     passed, whose = [starts], [np.arange(count)]
     running = np.arange(count)
-    for number in range(patience * MOST_STEPS):
+    for number in range(patience * MAX_STEPS):
         speed = np.abs(dynamics.drift(x[running]) / width).max(axis=1)
-        step = np.minimum(steps[running], np.minimum(0.5 / slowest, SPACING / np.maximum(speed, 1e-300)))
+        step = np.minimum(steps[running], np.minimum(0.5 / slowest, LONGEST_STEP / np.maximum(speed, 1e-300)))
         with np.errstate(over="ignore", invalid="ignore"):
             moved, error = dormand_prince_step(dynamics.drift, x[running], step)
-            relative = np.abs(error / width).max(axis=1) / ACCURACY
+            relative = np.abs(error / width).max(axis=1) / STEP_ACCURACY
         steps[running] = next_step(step, relative)
         on, moved, step = running[relative <= 1], moved[relative <= 1], step[relative <= 1]
         inside = (np.abs((moved - middle) / width) < 1.5).all(axis=1)
@@ -132,9 +123,9 @@ def follow(
         passed.append(moved)
         whose.append(on)
         for index, one in enumerate(attractors):
-            ends[on[np.abs((moved - one.position) / width).max(axis=1) < ARRIVED]] = index
-        if cycles and number % ASKED == 0:
-            near = settled_on(moved, cycles, box=box, distance=ARRIVED_ON)
+            ends[on[np.abs((moved - one.position) / width).max(axis=1) < ATTRACTOR_DISTANCE]] = index
+        if cycles and number % STEPS_PER_CYCLE_CHECK == 0:
+            near = settled_on(moved, cycles, box=box, distance=CYCLE_DISTANCE)
             ends[on[near >= 0]] = len(attractors) + near[near >= 0]
         running = running[~escaped[running] & (ends[running] < 0) & (times[running] < horizon)]
         if not len(running):
@@ -147,7 +138,7 @@ def follow(
 
 
 def settled_on(
-    x: np.ndarray, cycles: Sequence[Cycle], *, box: np.ndarray, distance: float = NEXT_TO
+    x: np.ndarray, cycles: Sequence[Cycle], *, box: np.ndarray, distance: float = SETTLED_DISTANCE
 ) -> np.ndarray:
     """The first of some cycles next to which each state lies, -1 where there is none: shape ``(n,)``."""
     width = np.ptp(box, axis=1)
@@ -214,17 +205,18 @@ def ends_of(
     return np.where((ways.ends < 0) & ~ways.escaped & (near >= 0), len(attractors) + near, ways.ends)
 
 
-SECTIONS = 16  # of a segment, whose ends are followed side by side
-CLOSE, APART = 1e-7, 1e-3  # of the box: when two states all but agree, and when they have come apart
-ROUNDS = 40
-BENT = 0.05  # of the box, by which the first way leaves the straight line, where symmetry may hold it
-EDGE_TRACKING_MOST_STEPS = 20_000  # of integration, until two states have come apart
-EDGE_TRACKING_ACCURACY = 1e-9  # of the box: local error of a step
+BISECTION_STATES = 16  # of a segment, whose ends are followed side by side
+BISECTED_DISTANCE = 1e-7  # of the box: when two states all but agree, ...
+DIVERGED_DISTANCE = 1e-3  # ... and when they have come apart
+MAX_TRACKING_ROUNDS = 40
+FIRST_WAY_BEND = 0.05  # of the box, by which the first way leaves the straight line: symmetry may hold it
+MAX_TRACKING_STEPS = 20_000  # of integration, until two states have come apart
+TRACKING_ACCURACY = 1e-9  # of the box: local error of a step
 # Of the box: how far beside a root with two unstable directions saddles are sought. Enough in chains of 24
 # and 50 units, coupling 2 and tilt 0.1; with a tilt of 0.03 not always.
-ASIDE = (0.02, 0.05, 0.1)
+SADDLE_OFFSETS = (0.02, 0.05, 0.1)
 LEVENBERG_STEPS = 200
-BESIDE = 0.2  # of the box: so close to the edge a root of f has to be its saddle
+SADDLE_DISTANCE = 0.2  # of the box: so close to the edge a root of f has to be its saddle
 
 
 def edge_saddle(
@@ -257,7 +249,7 @@ def edge_saddle(
 
     start, end = attractors[one].position, attractors[two].position
     pair = bisected(start, end, one, ends, width=width, generator=generator)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_TRACKING_ROUNDS):
         found = _saddle_near(dynamics, pair.mean(axis=0), box, width)
         if found is not None:
             return found
@@ -292,14 +284,18 @@ def bisected(
     generator
         Bends the way between both; without it, it is straight.
     """
-    share = np.linspace(0, 1, SECTIONS + 2)[:, None]
-    bend = np.zeros(len(width)) if generator is None else BENT * width * generator.standard_normal(len(width))
+    share = np.linspace(0, 1, BISECTION_STATES + 2)[:, None]
+    bend = (
+        np.zeros(len(width))
+        if generator is None
+        else FIRST_WAY_BEND * width * generator.standard_normal(len(width))
+    )
     way = low + share * (high - low) + np.sin(np.pi * share) * bend
     while True:
         other = np.flatnonzero(ends(way[1:-1]) != one)
         last = int(other[0]) if len(other) else len(way) - 2
         low, high = way[last], way[last + 1]
-        if (np.abs(high - low) / width).max() <= CLOSE:
+        if (np.abs(high - low) / width).max() <= BISECTED_DISTANCE:
             return np.stack([low, high])
         way = low + share * (high - low)
 
@@ -312,8 +308,20 @@ def _saddle_near(dynamics: Dynamics, x: np.ndarray, box: np.ndarray, width: np.n
     """
 
     def beside(start: np.ndarray) -> Equilibrium | None:
-        for place in _roots_near(dynamics, start, box, width):
-            if (np.abs(place - x) / width).max() < BESIDE:
+        """Where Newton's method comes to, or else Levenberg and Marquardt's, which may not run away."""
+        roots = distinct_roots(dynamics, start[None], box=box, margin=0.0)
+        if not roots:
+            with np.errstate(all="ignore"):  # a step to where f is beyond all numbers is taken back
+                solved = scipy.optimize.root(
+                    lambda share: dynamics.drift((share * width)[None])[0] / width,
+                    start / width,
+                    jac=lambda share: dynamics.jacobian((share * width)[None])[0] * width / width[:, None],
+                    method="lm",
+                    options={"xtol": 1e-12, "ftol": 1e-12, "maxiter": LEVENBERG_STEPS},
+                )
+            roots = distinct_roots(dynamics, (solved.x * width)[None], box=box, margin=0.0)
+        for place in roots:
+            if (np.abs(place - x) / width).max() < SADDLE_DISTANCE:
                 return classify(dynamics, place)
         return None
 
@@ -324,27 +332,11 @@ def _saddle_near(dynamics: Dynamics, x: np.ndarray, box: np.ndarray, width: np.n
     weakest = np.argmin(np.where(values.real > 0, values.real, np.inf))
     along = vectors[:, weakest].real
     along *= width / np.abs(along).max()
-    for size, sign in itertools.product(ASIDE, (1, -1)):
+    for size, sign in itertools.product(SADDLE_OFFSETS, (1, -1)):
         other = beside(one.position + sign * size * along)
         if other is not None and other.kind == "saddle" and other.unstable == 1:
             return other
     return None
-
-
-def _roots_near(dynamics: Dynamics, x: np.ndarray, box: np.ndarray, width: np.ndarray) -> list[np.ndarray]:
-    """Where Newton's method comes from a state, or else Levenberg and Marquardt's, which may not run away."""
-    found = distinct_roots(dynamics, x[None], box=box, margin=0.0)
-    if found:
-        return found
-    with np.errstate(all="ignore"):  # a step may lead to where f is beyond all numbers, and is taken back
-        solved = scipy.optimize.root(
-            lambda share: dynamics.drift((share * width)[None])[0] / width,
-            x / width,
-            jac=lambda share: dynamics.jacobian((share * width)[None])[0] * width / width[:, None],
-            method="lm",
-            options={"xtol": 1e-12, "ftol": 1e-12, "maxiter": LEVENBERG_STEPS},
-        )
-    return distinct_roots(dynamics, (solved.x * width)[None], box=box, margin=0.0)
 
 
 def apart_of(
@@ -361,30 +353,22 @@ def apart_of(
     speed = float(np.abs(dynamics.drift(pair) / width).max())
     step, now = 1e-3 / max(speed, 1e-300), 0.0
     times, middles = [], []
-    for _ in range(EDGE_TRACKING_MOST_STEPS):
+    for _ in range(MAX_TRACKING_STEPS):
         with np.errstate(over="ignore", invalid="ignore"):  # a step that is too long is taken again
             moved, error = dormand_prince_step(dynamics.drift, pair, np.full(2, step))
-        relative = np.abs(error / width).max(axis=1) / EDGE_TRACKING_ACCURACY
+        relative = np.abs(error / width).max(axis=1) / TRACKING_ACCURACY
         if relative.max() <= 1:
             pair, now = moved, now + step
             times.append(now)
             middles.append(pair.mean(axis=0))
-            if (np.abs(pair[1] - pair[0]) / width).max() > APART:
+            if (np.abs(pair[1] - pair[0]) / width).max() > DIVERGED_DISTANCE:
                 return pair, np.array(times), np.array(middles)
         step = float(next_step(np.full(2, step), relative).min())
     return None
 
 
-NEAREST = 600  # descents that start close to the attractor, where recordings leave directions out
-POINTS = 6000  # chosen in a basin, about: as many as a fit of V takes
-
-
-@dataclass(frozen=True)
-class Focus:
-    """Further starts about an attractor: how many, and up to which level of ``½ (x - A)·M (x - A)``."""
-
-    count: int
-    level: float
+STARTS_NEAR_ATTRACTOR = 600  # descents from close to it, where recordings leave directions out
+BASIN_POINTS = 6000  # chosen in a basin, about: as many as a fit of V takes
 
 
 @dataclass(frozen=True)
@@ -440,7 +424,7 @@ def basin_of(
     *,
     box: np.ndarray,
     generator: np.random.Generator,
-    focus: Focus | None = None,
+    near: tuple[int, float] | None = None,
 ) -> Basin:
     """The points from which f leads to an attractor.
 
@@ -456,8 +440,8 @@ def basin_of(
         Shape ``(d, 2)``: the recorded region.
     generator
         Draws further starts close to the attractor.
-    focus
-        How many of these, and how far; by default as recordings need it.
+    near
+        How many of these, and up to which level of ``½ (x - A)·M (x - A)``; by default as recordings need it.
     """
     center, d = attractors[index].position, len(box)
     width = box[:, 1] - box[:, 0]
@@ -466,11 +450,11 @@ def basin_of(
     # but one, and more starts close by would only make light of those far out.
     hessian = hessian_at(dynamics, center)
     offsets = recorded[:, 0] - center
-    if focus is None:
+    if near is None:
         reach = np.quantile(np.einsum("ni,ij,nj->n", offsets, hessian, offsets), 0.3)
-        count = NEAREST if d > 1 else 0
+        count = STARTS_NEAR_ATTRACTOR if d > 1 else 0
     else:
-        reach, count = 2 * focus.level, focus.count
+        reach, count = 2 * near[1], near[0]
         # A well may be small in its domain.
         width = np.minimum(width, 2 * np.sqrt(reach * np.diag(np.linalg.inv(hessian))))
     directions = generator.standard_normal((count, d))
@@ -478,9 +462,9 @@ def basin_of(
     radii = np.sqrt(reach) * generator.uniform(0.02, 1.0, (count, 1))
     starts = center + (radii * directions) @ np.linalg.inv(np.linalg.cholesky(hessian))
     starts = starts[((starts > box[:, 0]) & (starts < box[:, 1])).all(axis=1)]
-    near = follow(dynamics, starts, attractors, box=box)
-    states = np.concatenate([recorded, near.paths[near.ends == index]])
-    spread = None if focus is None else len(recorded)
+    close = follow(dynamics, starts, attractors, box=box)
+    states = np.concatenate([recorded, close.paths[close.ends == index]])
+    spread = None if near is None else len(recorded)
     return Basin(states, _chosen(states, center, width, generator), spread)
 
 
@@ -524,5 +508,5 @@ def _chosen(
     d = states.shape[2]
     flat = (states.reshape(-1, d) - center) / width
     warped = flat / np.sqrt(np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-6))
-    rows = representative_subset(warped, distance=0.6 * POINTS ** (-1 / d), generator=generator)
+    rows = representative_subset(warped, distance=0.6 * BASIN_POINTS ** (-1 / d), generator=generator)
     return np.stack(np.divmod(rows, states.shape[1]), axis=1)

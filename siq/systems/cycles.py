@@ -471,11 +471,7 @@ def _closed(dynamics: Dynamics, times: np.ndarray, states: np.ndarray, box: np.n
 
 
 RETURNS = 40  # through the section, within which chaos has to have lost what was known at the start
-SEARCHED_RETURNS = (
-    4,
-    12,
-    RETURNS,
-)  # after which a cycle is sought: most are found long before chaos can be
+SEARCHED_RETURNS = (4, 12, RETURNS)  # after which a cycle is sought: most are found long before chaos can
 CLOSE_RETURN_RATIO = 2.0  # to the closest return: one as close may be earlier, and the period shorter
 RETURN_TOLERANCE = 1e-6  # of the box: returns as close are at one place; chaos tears them a box apart
 MAX_STARTS = 3  # trajectories that are followed until one returns

@@ -37,8 +37,8 @@ from siq.systems.dynamics import Dynamics
 EquilibriumKind = Literal["attractor", "saddle", "repeller", "degenerate"]
 
 NEWTON_STEPS = 60
-MARGIN = 0.05  # of the recorded box, by which an equilibrium may lie outside
-SAME = 1e-6  # of the recorded box: closer equilibria are one
+BOX_MARGIN = 0.05  # of the recorded box, by which an equilibrium may lie outside
+EQUILIBRIUM_MERGE_TOLERANCE = 1e-6  # of the recorded box: closer equilibria are one
 MARGINAL = 1e-6  # of the fastest rate: multiple roots are only found to the root of rounding
 UNREACHED = 1e-12  # numerical, of the largest eigenvalue of W in units of its diagonal: rounding
 
@@ -85,7 +85,7 @@ def find_equilibria(dynamics: Dynamics, points: np.ndarray) -> list[Equilibrium]
         By their position along the first state. Only roots of f that are isolated are found.
     """
     box = np.stack([points.min(axis=0), points.max(axis=0)], axis=1)
-    found = distinct_roots(dynamics, points, box=box, margin=MARGIN)
+    found = distinct_roots(dynamics, points, box=box, margin=BOX_MARGIN)
     return classified(dynamics, found, box=box, rate=rate_of(dynamics, points))
 
 
@@ -135,7 +135,7 @@ def distinct_roots(
     # Zero but for what is left of Newton's last step reads better as zero.
     x = np.where(np.abs(x) < np.finfo(float).eps * width, 0.0, x)
     for candidate in x[inside & converged]:
-        if all(np.abs((candidate - other) / width).max() > SAME for other in found):
+        if all(np.abs((candidate - other) / width).max() > EQUILIBRIUM_MERGE_TOLERANCE for other in found):
             found.append(candidate)
     return found[len(known) :]
 
@@ -155,21 +155,15 @@ def _newton(
         normal = np.einsum("nji,njk->nik", jacobian, jacobian) + 1e-14 * size**2 * np.eye(x.shape[1])
         step = -np.linalg.solve(normal, np.einsum("nji,nj->ni", jacobian, value)[..., None])[..., 0]
         if known:
-            step *= _deflation((x[:, None] - np.array(known)) / width, step)
+            # With m f in the place of f, Newton's step s becomes s/(1 - s·∇m/m).
+            offset = (x[:, None] - np.array(known)) / width
+            square = np.maximum((offset**2).sum(axis=2), 1e-24)
+            slope = (-2 * offset / (square * (square + 1))[:, :, None]).sum(axis=1)
+            step *= (1 / (1 - (slope * step).sum(axis=1) + 1e-12))[:, None]
         longest = np.abs(step).max(axis=1, keepdims=True)
         x = x + width * step * np.minimum(1.0, 0.2 / np.maximum(longest, 1e-300))
         x = x[np.isfinite(x).all(axis=1) & (np.abs((x - low) / width - 0.5) < 2.0).all(axis=1)]
     return x
-
-
-def _deflation(offset: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Factor of Newton's step, ``(n, 1)``, that deflation makes, from offsets to known roots ``(n, k, d)``.
-
-    With ``m f`` in the place of f, Newton's step s becomes ``s/(1 - s·∇m/m)``.
-    """
-    square = np.maximum((offset**2).sum(axis=2), 1e-24)
-    slope = (-2 * offset / (square * (square + 1))[:, :, None]).sum(axis=1)
-    return np.asarray(1 / (1 - (slope * step).sum(axis=1) + 1e-12))[:, None]
 
 
 def classified(
@@ -321,31 +315,15 @@ def measure_at(dynamics: Dynamics, attractor: np.ndarray) -> Diffusion:
     return Diffusion(relaxation * np.linalg.inv(hessian_at(dynamics, attractor)))
 
 
-FIRST = 128  # starts of the first round, times the number of states
-ROUNDS = 5  # of search, each with twice as many starts, ...
-QUIET = 2  # ... until as many in a row found nothing new
-DEFLATED = 256  # starts of each round with deflation
-MOST_DEFLATIONS = 8
-EDGE = 1e-6  # of the domain, by which a root on its boundary may be off: a double one is found to 1e-8
-BOUNDARY = 4096  # points on the boundary, for its degree
-TURN = 2.0  # radian: f that turns by more from one of them to the next is not followed
-NEAR_EDGE = 1e-3  # of the domain: so close to the boundary a root leaves the degree undefined
-
-
-@dataclass(frozen=True)
-class FoundEquilibria:
-    """Equilibria of a domain.
-
-    Attributes
-    ----------
-    equilibria
-        By their position along the first state.
-    notes
-        What speaks against their being all, in words.
-    """
-
-    equilibria: tuple[Equilibrium, ...]
-    notes: tuple[str, ...] = ()
+FIRST_STARTS = 128  # starts of the first round, times the number of states
+MAX_ROUNDS = 5  # of search, each with twice as many starts, ...
+QUIET_ROUNDS = 2  # ... until as many in a row found nothing new
+DEFLATION_STARTS = 256  # starts of each round with deflation
+MAX_DEFLATIONS = 8
+BOUNDARY_TOLERANCE = 1e-6  # of the domain, by which a root on its boundary may be off: double ones are
+BOUNDARY_POINTS = 4096  # points on the boundary, for its degree
+LARGEST_TURN = 2.0  # radian: f that turns by more from one of them to the next is not followed
+BOUNDARY_DISTANCE = 1e-3  # of the domain: so close to the boundary a root leaves the degree undefined
 
 
 def spread_evenly(box: np.ndarray, count: int, *, generator: np.random.Generator) -> np.ndarray:
@@ -355,7 +333,9 @@ def spread_evenly(box: np.ndarray, count: int, *, generator: np.random.Generator
     return np.asarray(box[:, 0] + share * (box[:, 1] - box[:, 0]))
 
 
-def all_equilibria(dynamics: Dynamics, *, generator: np.random.Generator) -> FoundEquilibria:
+def all_equilibria(
+    dynamics: Dynamics, *, generator: np.random.Generator
+) -> tuple[tuple[Equilibrium, ...], tuple[str, ...]]:
     """Equilibria in the domain of a system.
 
     Parameters
@@ -364,33 +344,44 @@ def all_equilibria(dynamics: Dynamics, *, generator: np.random.Generator) -> Fou
         f, with its domain.
     generator
         Scrambles the sequences of starts.
+
+    Returns
+    -------
+    tuple
+        The equilibria, by their position along the first state; and what speaks against their being all, in
+        words.
     """
     box, d = dynamics.box, dynamics.dimension
+    width = np.ptp(box, axis=1)
     found: list[np.ndarray] = []
-    quiet, count, starts = 0, FIRST * d, np.zeros((0, d))
-    for _ in range(ROUNDS):
+    quiet, count, starts = 0, FIRST_STARTS * d, np.zeros((0, d))
+    for _ in range(MAX_ROUNDS):
         starts = spread_evenly(box, count, generator=generator)
-        new = _new(found, distinct_roots(dynamics, starts, box=box, margin=EDGE), box)
+        new = [
+            one
+            for one in distinct_roots(dynamics, starts, box=box, margin=BOUNDARY_TOLERANCE)
+            if all(np.abs((one - other) / width).max() > BOUNDARY_TOLERANCE for other in found)
+        ]
         found, quiet, count = [*found, *new], 0 if new else quiet + 1, 2 * count
-        if quiet == QUIET:
+        if quiet == QUIET_ROUNDS:
             break
-    for _ in range(MOST_DEFLATIONS if found else 0):
-        some = spread_evenly(box, DEFLATED, generator=generator)
-        new = distinct_roots(dynamics, some, box=box, margin=EDGE, known=found)
+    for _ in range(MAX_DEFLATIONS if found else 0):
+        some = spread_evenly(box, DEFLATION_STARTS, generator=generator)
+        new = distinct_roots(dynamics, some, box=box, margin=BOUNDARY_TOLERANCE, known=found)
         if not new:
             break
         found += new
-    width = np.ptp(box, axis=1)
     rate = float(np.median(np.linalg.norm(dynamics.drift(starts) / width, axis=1)))
     equilibria = tuple(classified(dynamics, found, box=box, rate=rate))
     degree = boundary_degree(dynamics, equilibria)
-    if degree is None or degree == _indices(dynamics, equilibria):
-        return FoundEquilibria(equilibria)
+    indices = [np.sign(np.linalg.det(dynamics.jacobian(one.position[None])[0])) for one in equilibria]
+    if degree is None or degree == int(sum(indices)):
+        return equilibria, ()
     note = (
         "an equilibrium of the domain was missed: the directions of f along the boundary of the domain turn"
         f" {degree} times, which the {len(equilibria)} that were found do not explain"
     )
-    return FoundEquilibria(equilibria, (note,))
+    return equilibria, (note,)
 
 
 def boundary_degree(dynamics: Dynamics, equilibria: tuple[Equilibrium, ...]) -> int | None:
@@ -402,14 +393,15 @@ def boundary_degree(dynamics: Dynamics, equilibria: tuple[Equilibrium, ...]) -> 
     width = np.ptp(box, axis=1)
     places = [one.position for one in equilibria]
     near = any(
-        (np.minimum(place - box[:, 0], box[:, 1] - place) / width < NEAR_EDGE).any() for place in places
+        (np.minimum(place - box[:, 0], box[:, 1] - place) / width < BOUNDARY_DISTANCE).any()
+        for place in places
     )
     if d > 2 or near or any(one.kind == "degenerate" for one in equilibria):
         return None
     if d == 1:
         low, high = np.sign(dynamics.drift(box.T)[:, 0])
         return round(float(high - low) / 2)
-    share = np.linspace(0, 1, BOUNDARY // 4, endpoint=False)
+    share = np.linspace(0, 1, BOUNDARY_POINTS // 4, endpoint=False)
     zero, one = np.zeros_like(share), np.ones_like(share)
     along = [(share, zero), (one, share), (1 - share, one), (zero, 1 - share)]
     around = np.concatenate([np.stack(side, axis=1) for side in along])
@@ -417,17 +409,6 @@ def boundary_degree(dynamics: Dynamics, equilibria: tuple[Equilibrium, ...]) -> 
     angle = np.arctan2(flow[:, 1], flow[:, 0])
     turn = np.diff(np.append(angle, angle[0]))
     turn -= 2 * np.pi * np.round(turn / (2 * np.pi))
-    if not np.abs(turn).max() < TURN:  # also where f is not finite
+    if not np.abs(turn).max() < LARGEST_TURN:  # also where f is not finite
         return None
     return int(np.round(turn.sum() / (2 * np.pi)))
-
-
-def _indices(dynamics: Dynamics, equilibria: tuple[Equilibrium, ...]) -> int:
-    """Sum of ``sign det J``."""
-    jacobians = [dynamics.jacobian(one.position[None])[0] for one in equilibria]
-    return int(sum(np.sign(np.linalg.det(one)) for one in jacobians))
-
-
-def _new(known: list[np.ndarray], found: list[np.ndarray], box: np.ndarray) -> list[np.ndarray]:
-    width = np.ptp(box, axis=1)
-    return [one for one in found if all(np.abs((one - other) / width).max() > EDGE for other in known)]

@@ -1,18 +1,16 @@
-"""Formulas of people: text, checked against a whitelist, to sympy, numpy and machine code.
+"""Formulas of people: text, checked against a whitelist, to sympy, numpy, machine code and other languages.
 
-A formula is data. The text is parsed by Python's own parser into a syntax tree, of which only numbers,
-declared names, ``+ - * / **`` and named functions are accepted; the sympy expression is then built node
-by node. Nothing is ever evaluated as code.
+A formula is data. Its text is parsed into a syntax tree, of which only numbers, declared names, the operators
+``+ - * / **`` and named functions are accepted; the sympy expression is then built node by node. Nothing is
+ever evaluated as code, as sympy's own parser does.
 
-A trajectory is a long chain of small steps. Numpy needs microseconds for each operation of each step, and to
-compile every formula of every candidate would take seconds. A tape is made in no time, and one compiled loop
-runs all tapes (`siq.inference.trajectories`).
+Expressions are evaluated as numpy functions (`compile_formulas`, `compile_values`). A trajectory is a long
+chain of small steps, for which numpy is slow, and to compile every formula of every candidate would take
+seconds: a tape is made in no time, and one compiled loop runs all tapes (`siq.inference.trajectories`).
 
-A polynomial about a center is written in powers of the offsets from it, never multiplied out: expanded, its
-terms would be far larger than their sum. Numbers have as many digits as it takes to read the same double
-back, 17 at most.
-
-Sums of powers are worked out by Horner's rule; see `siq.systems.formulas` for what all exports share.
+For other programs a formula is written as text, LaTeX, and source in numpy, C and Julia. A polynomial about a
+center is written in powers of the offsets from it by Horner's rule, never multiplied out: expanded, its terms
+would be far larger than their sum. Numbers have the digits that it takes to read the same double back.
 """
 
 from __future__ import annotations
@@ -69,9 +67,9 @@ CONSTANTS: Mapping[str, sympy.Expr] = {"pi": sympy.pi}
 LARGEST_EXPONENT = 32  # numerical: several such powers of states of the order of 10 stay doubles
 LARGEST_BASE = 1e9  # numerical: the same for numbers in formulas; (1e9)^32 = 1e288 is still a double
 LARGEST_VALUE = 1e300  # numerical: below the largest double, 1.8e308
-KEPT = 4096  # compiled formulas that are kept: each takes some kilobytes
+MAX_COMPILED = 4096  # compiled formulas that are kept: each takes some kilobytes
 DIGITS = 17  # of decimal digits, that a double is read back exactly
-LONGEST_FORMULA = 20_000  # characters, a guard against files that are no formulas
+MAX_FORMULA_LENGTH = 20_000  # characters, a guard against files that are no formulas
 
 _OPERATORS: Mapping[type[ast.operator], Callable[[sympy.Expr, sympy.Expr], sympy.Expr]] = {
     ast.Add: lambda left, right: left + right,
@@ -122,8 +120,8 @@ def parse_formula(
         above `LARGEST_EXPONENT`, a division by zero, the root of a negative number.
     """
     text = str(text)
-    if len(text) > LONGEST_FORMULA:
-        raise FormulaError(f"the formula has {len(text)} characters", f"keep it below {LONGEST_FORMULA}")
+    if len(text) > MAX_FORMULA_LENGTH:
+        raise FormulaError(f"the formula has {len(text)} characters", f"keep it below {MAX_FORMULA_LENGTH}")
     try:
         tree = ast.parse(text.strip(), mode="eval")
         expression = _build(tree.body, names, inputs)
@@ -150,7 +148,10 @@ def _build(node: ast.expr, names: Mapping[str, sympy.Expr], inputs: Collection[s
                 raise FormulaError("a number is too large", "write a finite number")
             return sympy.Float(value, DIGITS)
         case ast.Name(id=name):
-            return _look_up(name, names)
+            if name in names or name in CONSTANTS:
+                return names[name] if name in names else CONSTANTS[name]
+            remedy = suggestion(name, names, otherwise="declare it, or correct the spelling")
+            raise FormulaError(f"the name '{name}' is not declared", remedy)
         case ast.UnaryOp(op=ast.USub(), operand=operand):
             return -build(operand)
         case ast.UnaryOp(op=ast.UAdd(), operand=operand):
@@ -162,22 +163,17 @@ def _build(node: ast.expr, names: Mapping[str, sympy.Expr], inputs: Collection[s
         case ast.BinOp(op=ast.BitXor()):
             raise FormulaError("'^' is not an operator", "write '**' for powers")
         case ast.Call(func=ast.Name(id="delay"), args=arguments, keywords=[]) if inputs:
-            return _delay([build(argument) for argument in arguments], inputs)
+            built = [build(argument) for argument in arguments]
+            if len(built) != 2 or str(built[0]) not in inputs:
+                remedy = f"write delay(u, tau) with one of {', '.join(inputs)} as u"
+                raise FormulaError("'delay' needs an input and a time", remedy)
+            return delay(*built)
         case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]):
             return _call(name, [build(argument) for argument in arguments])
     raise FormulaError(
         f"'{_short(ast.unparse(node))}' is not allowed in a formula",
         f"use numbers, declared names, + - * / ** and the functions {', '.join(FUNCTIONS)}",
     )
-
-
-def _look_up(name: str, names: Mapping[str, sympy.Expr]) -> sympy.Expr:
-    if name in names:
-        return names[name]
-    if name in CONSTANTS:
-        return CONSTANTS[name]
-    remedy = suggestion(name, names, otherwise="declare it, or correct the spelling")
-    raise FormulaError(f"the name '{name}' is not declared", remedy)
 
 
 def _power(base: sympy.Expr, exponent: sympy.Expr) -> sympy.Expr:
@@ -207,14 +203,6 @@ def _call(name: str, arguments: Sequence[sympy.Expr]) -> sympy.Expr:
         if value.imag != 0 or not np.isfinite(value.real) or abs(value.real) > LARGEST_VALUE:
             raise FormulaError(f"'{name}' of a number is not a real number of usable size", "correct it")
     return FUNCTIONS[name](*arguments)
-
-
-def _delay(arguments: Sequence[sympy.Expr], inputs: Collection[str]) -> sympy.Expr:
-    if len(arguments) != 2 or str(arguments[0]) not in inputs:
-        raise FormulaError(
-            "'delay' needs an input and a time", f"write delay(u, tau) with one of {', '.join(inputs)} as u"
-        )
-    return delay(*arguments)
 
 
 def compile_formulas(
@@ -273,11 +261,11 @@ def compile_values(
     return _compiled(tuple(expressions), tuple(variables), common)
 
 
-@functools.lru_cache(maxsize=KEPT)
+@functools.lru_cache(maxsize=MAX_COMPILED)
 def _compiled(
     expressions: tuple[sympy.Expr, ...], variables: tuple[sympy.Symbol, ...], common: bool
 ) -> Callable[..., Sequence[np.ndarray | float]]:
-    """The same, once for the same formulas: a diagnosis asks for those of a hundred mechanisms ten times."""
+    """`compile_values`, once for the same formulas: a diagnosis asks for many of them often."""
     return sympy.lambdify(
         list(variables),
         list(expressions),
@@ -335,7 +323,7 @@ def _short(text: str) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-class Operation(IntEnum):
+class _Operation(IntEnum):
     """What a step of a tape does with one register, or two."""
 
     ADD = 0
@@ -358,21 +346,21 @@ class Operation(IntEnum):
 
 
 _FUNCTIONS = {
-    sympy.sin: Operation.SIN,
-    sympy.cos: Operation.COS,
-    sympy.tan: Operation.TAN,
-    sympy.exp: Operation.EXP,
-    sympy.log: Operation.LOG,
-    sympy.tanh: Operation.TANH,
-    sympy.atan: Operation.ATAN,
-    sympy.Abs: Operation.ABS,
-    sympy.sign: Operation.SIGN,
+    sympy.sin: _Operation.SIN,
+    sympy.cos: _Operation.COS,
+    sympy.tan: _Operation.TAN,
+    sympy.exp: _Operation.EXP,
+    sympy.log: _Operation.LOG,
+    sympy.tanh: _Operation.TANH,
+    sympy.atan: _Operation.ATAN,
+    sympy.Abs: _Operation.ABS,
+    sympy.sign: _Operation.SIGN,
 }
 _CHAINS = {
-    sympy.Add: Operation.ADD,
-    sympy.Mul: Operation.MULTIPLY,
-    sympy.Max: Operation.MAX,
-    sympy.Min: Operation.MIN,
+    sympy.Add: _Operation.ADD,
+    sympy.Mul: _Operation.MULTIPLY,
+    sympy.Max: _Operation.MAX,
+    sympy.Min: _Operation.MIN,
 }
 
 
@@ -383,7 +371,7 @@ class Tape:
     Attributes
     ----------
     operations
-        Shape ``(k, 3)``: an `Operation`, and the registers of its arguments; the second is the exponent
+        Shape ``(k, 3)``: an operation, and the registers of its arguments; the second is the exponent
         itself of a whole power. The result goes to the register ``base + k``.
     registers
         To begin with, shape ``(base + k,)``: arguments, which are to be filled in, then constants.
@@ -404,72 +392,62 @@ def tape_of(formulas: Sequence[sympy.Expr], arguments: Sequence[sympy.Symbol]) -
 
     What occurs twice is worked out once.
     """
-    writer = _Writer(arguments, formulas)
+    formulas = [sympy.sympify(formula) for formula in formulas]
+    constants: dict[sympy.Expr, float] = {}
+    for formula in formulas:
+        for part in sympy.preorder_traversal(formula):
+            if part.is_number and not part.free_symbols:
+                constants.setdefault(part, float(part) if part.is_real else np.nan)
+    known = {each: place for place, each in enumerate((*arguments, *constants))}
+    start = np.concatenate([np.zeros(len(arguments)), list(constants.values())])
+    operations: list[tuple[int, int, int]] = []
+
+    def add(operation: _Operation, one: int, other: int) -> int:
+        operations.append((int(operation), one, other))
+        return len(start) + len(operations) - 1
+
+    def register(formula: sympy.Expr) -> int:
+        """Where the value of a formula is, once the tape has run so far."""
+        if formula not in known:
+            known[formula] = written(formula)
+        return known[formula]
+
+    def written(formula: sympy.Expr) -> int:
+        if formula.func in _CHAINS:
+            place = register(formula.args[0])
+            for other in formula.args[1:]:
+                place = add(_CHAINS[formula.func], place, register(other))
+            return place
+        if formula.func in _FUNCTIONS:
+            return add(_FUNCTIONS[formula.func], register(formula.args[0]), 0)
+        if not isinstance(formula, sympy.Pow):
+            raise NotImplementedError(str(formula.func))
+        base, exponent = formula.args
+        place = register(base)
+        if exponent.is_Integer:
+            if abs(int(exponent)) > 1:
+                place = add(_Operation.WHOLE_POWER, place, abs(int(exponent)))
+        elif abs(exponent) == sympy.S.Half:
+            place = add(_Operation.SQRT, place, 0)
+        else:
+            return add(_Operation.POWER, place, register(exponent))
+        return place if exponent > 0 else add(_Operation.INVERT, place, 0)
+
     try:
-        results = [writer.register(formula) for formula in formulas]
+        results = [register(formula) for formula in formulas]
     except NotImplementedError:
         return None
     return Tape(
-        operations=np.array(writer.operations, dtype=np.int64).reshape(-1, 3),
-        registers=np.concatenate([writer.start, np.zeros(len(writer.operations))]),
-        base=len(writer.start),
+        operations=np.array(operations, dtype=np.int64).reshape(-1, 3),
+        registers=np.concatenate([start, np.zeros(len(operations))]),
+        base=len(start),
         results=np.array(results, dtype=np.int64),
     )
 
 
-class _Writer:
-    """A tape in the making."""
-
-    def __init__(self, arguments: Sequence[sympy.Symbol], formulas: Sequence[sympy.Expr]) -> None:
-        self.operations: list[tuple[int, int, int]] = []
-        self._known: dict[sympy.Expr, int] = {each: place for place, each in enumerate(arguments)}
-        constants: dict[sympy.Expr, float] = {}
-        for formula in formulas:
-            for part in sympy.preorder_traversal(sympy.sympify(formula)):
-                if part.is_number and not part.free_symbols:
-                    constants.setdefault(part, float(part) if part.is_real else np.nan)
-        self._known |= {each: len(arguments) + place for place, each in enumerate(constants)}
-        self.start = np.concatenate([np.zeros(len(arguments)), list(constants.values())])
-
-    def register(self, formula: sympy.Expr) -> int:
-        """Where the value of a formula is, once the tape has run so far."""
-        formula = sympy.sympify(formula)
-        if formula not in self._known:
-            self._known[formula] = self._written(formula)
-        return self._known[formula]
-
-    def _written(self, formula: sympy.Expr) -> int:
-        if formula.func in _CHAINS:
-            operation = _CHAINS[formula.func]
-            place = self.register(formula.args[0])
-            for other in formula.args[1:]:
-                place = self._add(operation, place, self.register(other))
-            return place
-        if formula.func in _FUNCTIONS:
-            return self._add(_FUNCTIONS[formula.func], self.register(formula.args[0]), 0)
-        if isinstance(formula, sympy.Pow):
-            return self._power(*formula.args)
-        raise NotImplementedError(str(formula.func))
-
-    def _power(self, base: sympy.Expr, exponent: sympy.Expr) -> int:
-        place = self.register(base)
-        if exponent.is_Integer:
-            if abs(int(exponent)) > 1:
-                place = self._add(Operation.WHOLE_POWER, place, abs(int(exponent)))
-            return place if exponent > 0 else self._add(Operation.INVERT, place, 0)
-        if abs(exponent) == sympy.S.Half:
-            place = self._add(Operation.SQRT, place, 0)
-            return place if exponent > 0 else self._add(Operation.INVERT, place, 0)
-        return self._add(Operation.POWER, place, self.register(exponent))
-
-    def _add(self, operation: Operation, one: int, other: int) -> int:
-        self.operations.append((int(operation), one, other))
-        return len(self.start) + len(self.operations) - 1
-
-
 LARGEST_INTEGER = 2**31  # of a C int
 
-# Names that a state may have in a card and may not have in a program.
+# _Names that a state may have in a card and may not have in a program.
 _JULIA = frozenset(
     {"abstract", "baremodule", "begin", "catch", "const", "do", "elseif", "end", "export", "false", "finally",
      "function", "global", "import", "let", "local", "macro", "module", "mutable", "primitive", "quote",
@@ -599,7 +577,7 @@ def as_sympy(formula: Formula) -> sympy.Expr:
 
 def as_text(formula: Formula) -> str:
     """The formula as text that `siq.systems.formulas.parse_formula` reads, a line for each definition."""
-    names = Names(formula)
+    names = _Names(formula)
     return "\n".join(
         [f"# {line}" for line in names.header]
         + [f"{offset} = {definition}" for offset, definition in names.definitions(_Text().doprint)]
@@ -635,7 +613,7 @@ def as_latex(formula: Formula, *, digits: int = DIGITS) -> str:
                       r"\end{aligned}"])  # fmt: skip
 
 
-class Names:
+class _Names:
     """What the states and their offsets are called in a program, and the lines that say so."""
 
     def __init__(self, formula: Formula) -> None:
@@ -696,7 +674,7 @@ def _latex(expression: sympy.Expr, digits: int) -> str:
     return str(LatexPrinter({"full_prec": False}).doprint(expression.xreplace(rounded)))
 
 
-class Doubles:
+class _Doubles:
     """Numbers with the digits that it takes to read the same double back."""
 
     def _print_Float(self, expr: sympy.Float) -> str:  # noqa: N802 (sympy's names, here and below)
@@ -706,11 +684,11 @@ class Doubles:
         return repr(float(expr)) if abs(expr) >= LARGEST_INTEGER else str(int(expr))
 
 
-class _Text(Doubles, StrPrinter):
+class _Text(_Doubles, StrPrinter):
     pass
 
 
-LINE = 100  # characters after which source goes on in the next line
+SOURCE_WIDTH = 100  # characters after which source goes on in the next line
 
 
 def numpy_source(formula: Formula, *, gradient: bool = True) -> str:
@@ -723,7 +701,7 @@ def numpy_source(formula: Formula, *, gradient: bool = True) -> str:
     gradient
         Whether ``V_gradient(x, y)`` is written as well: components first, shape ``(d, ...)``.
     """
-    names = Names(formula)
+    names = _Names(formula)
     printer = _NumPy({"fully_qualified_modules": True, "user_functions": {}})
     offsets = [f"    {name} = {text}" for name, text in names.definitions(printer.doprint)]
     value, *slopes = _written(formula, names, printer.doprint)
@@ -751,7 +729,7 @@ def c_source(formula: Formula, *, gradient: bool = True) -> str:
     gradient
         Whether ``void V_gradient(double x, double y, double gradient[2])`` is written as well.
     """
-    names = Names(formula)
+    names = _Names(formula)
     printer = _C()
     offsets = [f"    const double {name} = {text};" for name, text in names.definitions(printer.doprint)]
     value, *slopes = _written(formula, names, printer.doprint)
@@ -780,7 +758,7 @@ def julia_source(formula: Formula, *, gradient: bool = True) -> str:
     gradient
         Whether ``V_gradient(x, y)`` is written as well, which returns a vector.
     """
-    names = Names(formula)
+    names = _Names(formula)
     printer = _Julia()
     offsets = [f"    {name} = {text}" for name, text in names.definitions(printer.doprint)]
     value, *slopes = _written(formula, names, printer.doprint)
@@ -796,21 +774,17 @@ def julia_source(formula: Formula, *, gradient: bool = True) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _written(formula: Formula, names: Names, written: Callable[[sympy.Expr], str]) -> list[str]:
-    """The function and its derivatives, powers by Horner's rule."""
-    return [
-        written(_for_programs(each, formula.symbols).xreplace(names.variables))
-        for each in (formula.expression, *formula.gradient)
-    ]
-
-
-def _for_programs(expression: sympy.Expr, symbols: Sequence[sympy.Symbol]) -> sympy.Expr:
-    """The same with a number in the place of π, and by Horner's rule where it is a sum of powers."""
-    powers = _powers(expression, symbols)
-    if powers is not None:
-        return _horner(powers, symbols)
-    numbers = {each: sympy.Float(each, DIGITS) for each in expression.atoms(sympy.NumberSymbol)}
-    return expression.xreplace(numbers)
+def _written(formula: Formula, names: _Names, written: Callable[[sympy.Expr], str]) -> list[str]:
+    """The function and its derivatives, a sum of powers by Horner's rule, and a number in the place of π."""
+    texts = []
+    for each in (formula.expression, *formula.gradient):
+        powers = _powers(each, formula.symbols)
+        if powers is not None:
+            each = _horner(powers, formula.symbols)
+        else:
+            each = each.xreplace({one: sympy.Float(one, DIGITS) for one in each.atoms(sympy.NumberSymbol)})
+        texts.append(written(each.xreplace(names.variables)))
+    return texts
 
 
 def _powers(
@@ -846,22 +820,22 @@ def _wrapped(source: str, indent: int) -> list[str]:
     """Source in lines of bearable length, each but the last ending with an operator."""
     lines, line = [], " " * indent
     for piece in re.split(r"(?<= [-+*/]) ", source):
-        if line.strip() and len(line) + len(piece) > LINE:
+        if line.strip() and len(line) + len(piece) > SOURCE_WIDTH:
             lines.append(line.rstrip())
             line = " " * indent
         line += piece + " "
     return [*lines, line.rstrip()]
 
 
-class _NumPy(Doubles, NumPyPrinter):
+class _NumPy(_Doubles, NumPyPrinter):
     pass
 
 
-class _C(Doubles, C99CodePrinter):
+class _C(_Doubles, C99CodePrinter):
     pass
 
 
-class _Julia(Doubles, JuliaCodePrinter):
+class _Julia(_Doubles, JuliaCodePrinter):
     def _print_Max(self, expr: sympy.Expr) -> str:  # noqa: N802
         return f"max({', '.join(map(self._print, expr.args))})"
 

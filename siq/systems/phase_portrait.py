@@ -1,14 +1,12 @@
-"""The phase portrait: attractors, saddles and basins, from recordings or over a domain.
+"""The phase portrait: attractors, saddles, cycles and basins, from recorded states or over a domain.
 
-It follows from the identified f and the recorded points alone. Both routes to V start from it, and so does
-the check that ends a training.
+Of an identified f it follows from f and the recorded states. Both routes to V start from it, and so does the
+check that ends a training. Of equations it follows from states that are spread evenly over the domain, with
+more of them about each attractor, as its linearisation tells how far: a well may be small in its domain.
 
-The same `PhasePortrait` as that of recorded states, from states that are spread evenly over the domain. About
-each attractor there are more of them, as its linearisation tells how far: a well may be small in its domain.
-
-In many states no search covers the domain. Attractors are where f leads from states all over it, and saddles
-are found between each two of them by following the edge of their basins (`siq.systems.basins`). What
-follows from paths needs no more; there are no basins in which V could be fitted.
+In many states no search covers the domain. Attractors are then where f leads from states all over it, and
+saddles are found between each two of them by tracking the edge of their basins (`siq.systems.basins`). There
+are no basins in which V could be fitted, and what follows from paths needs none.
 """
 
 from __future__ import annotations
@@ -22,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from siq.errors import NumericalFailure
 from siq.numerics.least_squares import representative_subset
-from siq.systems.basins import Basin, Descents, Focus, basin_of, edge_saddle, follow, neighbours
+from siq.systems.basins import Basin, Descents, basin_of, edge_saddle, follow, neighbours
 from siq.systems.cycles import (
     Cycle,
     Recurrence,
@@ -39,15 +37,35 @@ from siq.systems.equilibria import (
     distinct_roots,
     find_equilibria,
     hessian_at,
-    rate_of,
     spread_evenly,
 )
 
-STARTS = 1500  # recorded points from which f is followed
-NEWTON_STARTS = 400
-UNSETTLED = 0.02  # share of the recorded points: as many may be slow, on the ridge between two wells
+UNSETTLED = 0.02  # share of the states: as many may be slow, on the ridge between two wells
 NEIGHBOUR_SPACINGS = 2.5  # of the spacing of recorded states: further away nothing was recorded
-APART = 0.04  # of each state's range: starts that cover the recorded region evenly
+SPACING = 0.04  # of each state's range: states that cover the recorded region evenly
+# From recorded states.
+RECORDED_STARTS = 1500  # from which f is followed
+NEWTON_STARTS = 400
+# Over a domain.
+MOST_SEARCHED = 8  # states up to which Newton's method searches the whole domain
+DOMAIN_STARTS = 1024  # in one and two states, twice as many for each further one: shares of basins to 1 %
+MAX_DOMAIN_STARTS = 4096
+STARTS_NEAR_ATTRACTOR = 1024
+LEVEL_BEYOND_SADDLE = 4.0  # of the quadratic V at the lowest saddle: V may differ from it by that
+RESTING_SPEED = 1e-3  # of the rate: what is so slow outside the domain does not come back
+DIRECTIONS = 64  # in which the neighbourhood of a degenerate equilibrium is asked where it leads
+NEIGHBOURHOOD = 0.02  # of the domain: so far from it
+MIN_DECIDED_SHARE = 0.5  # of these, that has to have led somewhere: f is slow where it is degenerate
+# In many states.
+INDEPENDENT_STARTS = 64  # independent in each state
+DIAGONAL_STARTS = 33  # with every state at the same share of its range
+EDGES_PER_PAIR = 2  # of attractors, from different first ways
+MAX_PAIRS = 15  # of attractors
+MERGE_TOLERANCE = 1e-6  # of the domain
+SEARCHED = (
+    "in so many states equilibria were not searched for over the whole domain: attractors are those to which"
+    " f leads from {starts} states, and saddles those at which edges between each two of their basins end"
+)
 
 
 @dataclass(frozen=True)
@@ -125,172 +143,149 @@ def evenly_spread(x: np.ndarray, *, generator: np.random.Generator, most: int = 
     width, dimension = np.ptp(x, axis=0), x.shape[1]
     rows = representative_subset(
         x / np.where(width > 0, width, 1.0),
-        distance=max(APART ** max(1.0, 2 / dimension), 0.5 * most ** (-1 / dimension)),
+        distance=max(SPACING ** max(1.0, 2 / dimension), 0.5 * most ** (-1 / dimension)),
         generator=generator,
     )
     return np.sort(generator.choice(rows, most, replace=False)) if len(rows) > most else rows
 
 
-def phase_portrait(dynamics: Dynamics, points: np.ndarray, *, seed: int = 0) -> PhasePortrait:
+def phase_portrait(dynamics: Dynamics, points: np.ndarray | None = None, *, seed: int = 0) -> PhasePortrait:
     """Find the attractors, their saddles, and what leads to them.
 
     Parameters
     ----------
     dynamics
-        f and D.
+        f and D; with the domain where no points are given.
     points
-        Evenly spread recorded states, shape ``(n, d)``; see `evenly_spread`.
+        Evenly spread recorded states, shape ``(n, d)``, see `evenly_spread`; by default states of the domain.
     seed
-        Decides which points stand for the others.
-    """
-    generator = np.random.default_rng(seed)
-    box = np.stack([points.min(axis=0), points.max(axis=0)], axis=1)
-    few = generator.permutation(len(points))
-    equilibria = find_equilibria(dynamics, points[few[:NEWTON_STARTS]])
-    stable = [one for one in equilibria if one.kind == "attractor"]
-    descents = follow(dynamics, points[few[:STARTS]], stable, box=box)
-    attractors, descents = reached_attractors(stable, descents)
-    around = saddles_beside(dynamics, equilibria, attractors, box=box)
-    basins = [
-        basin_of(dynamics, descents, index, attractors, box=box, generator=generator)
-        for index in range(len(attractors))
-    ]
-    return PhasePortrait(
-        points, box, tuple(equilibria), tuple(attractors), around, tuple(basins), descents,
-        recurrence_beyond(dynamics, descents, box=box, rate=rate_of(dynamics, points)),
-    )  # fmt: skip
-
-
-def reached_attractors(
-    stable: Sequence[Equilibrium], descents: Descents
-) -> tuple[list[Equilibrium], Descents]:
-    """Those stable equilibria at which descents end, and the descents with the numbers of these."""
-    reached = [index for index in range(len(stable)) if (descents.ends == index).any()]
-    renumbered = np.full(len(stable) + 1, -1)
-    renumbered[reached] = np.arange(len(reached))
-    return [stable[index] for index in reached], replace(descents, ends=renumbered[descents.ends])
-
-
-def saddles_beside(
-    dynamics: Dynamics,
-    equilibria: Sequence[Equilibrium],
-    attractors: Sequence[Equilibrium],
-    *,
-    box: np.ndarray,
-    cycles: Sequence[Cycle] = (),
-) -> tuple[tuple[Equilibrium, ...], ...]:
-    """For each attractor, and each cycle after these, the saddles next to it."""
-    around: list[list[Equilibrium]] = [[] for _ in (*attractors, *cycles)]
-    for one in equilibria:
-        if one.kind == "saddle":
-            for index in neighbours(dynamics, one, attractors, box=box, cycles=cycles):
-                around[index].append(one)
-    return tuple(tuple(saddles) for saddles in around)
-
-
-def recurrence_beyond(
-    dynamics: Dynamics, descents: Descents, *, box: np.ndarray, rate: float
-) -> Recurrence | None:
-    """Where those descents lead that come to rest nowhere; None where they are few."""
-    unsettled = np.flatnonzero((descents.ends < 0) & ~descents.escaped)
-    if not len(unsettled) > UNSETTLED * len(descents.ends):
-        return None
-    return recurrence_of(dynamics, descents.paths[unsettled, -1], box=box, rate=rate)
-
-
-DOMAIN_PORTRAIT_STARTS = (
-    1024  # in one and two states, and twice as many for each further one; shares of basins to 1 %
-)
-MOST_STARTS = 4096
-NEAR = 1024  # starts about each attractor
-FAR = (
-    4.0  # of the quadratic V at the lowest saddle: V may differ from it by that, and wells are fitted beyond
-)
-AROUND = 64  # directions in which the neighbourhood of a degenerate equilibrium is asked where it leads
-RESTING = 1e-3  # of the rate: what is so slow outside the domain does not come back
-CLOSE = 0.02  # of the domain: so far from it
-DECIDED = 0.5  # share of these directions that has to have led somewhere: f is slow where it is degenerate
-
-
-def domain_portrait(dynamics: Dynamics, *, seed: int = 0) -> PhasePortrait:
-    """Equilibria, basins, and what leads to each attractor, from equations and their domain.
-
-    Parameters
-    ----------
-    dynamics
-        f and D, with the domain.
-    seed
-        Scrambles the states that stand for the domain.
+        Decides which states stand for the others.
 
     Raises
     ------
     ValueError
-        Where no domain is known, or the equations are driven.
+        Without points, where no domain is known, or the equations are driven.
     NumericalFailure
         When f has no value in a part of the domain, or nothing moves.
     """
     generator = np.random.default_rng(seed)
-    box, d = dynamics.box, dynamics.dimension
-    points = spread_evenly(
-        box, min(DOMAIN_PORTRAIT_STARTS * 2 ** max(d - 2, 0), MOST_STARTS), generator=generator
-    )
-    flow = dynamics.drift(points)
-    if not np.isfinite(flow).all():
-        raise NumericalFailure("f has no value in a part of the domain: choose one in which it has")
-    width = np.ptp(box, axis=1)
-    rate = float(np.median(np.linalg.norm(flow / width, axis=1)))
-    search = all_equilibria(dynamics, generator=generator)
-    stable = [one for one in search.equilibria if one.kind == "attractor"]
-    descents = _left(dynamics, follow(dynamics, points, stable, box=box), box=box, rate=rate)
-    attractors, descents = reached_attractors(stable, descents)
-    cycles, descents = stable_cycles(dynamics, descents, first=len(attractors), box=box, rate=rate)
-    if d == 2:
-        parting = unstable_cycles_of_plane(dynamics, search.equilibria, box=box, generator=generator)
-    elif cycles:
-        parting = separatrix_cycles(dynamics, attractors, cycles, box=box, generator=generator)
+    d, recorded = dynamics.dimension, points is not None
+    searched = not recorded and d <= MOST_SEARCHED  # the whole domain
+    if points is not None:
+        box = np.stack([points.min(axis=0), points.max(axis=0)], axis=1)
     else:
-        parting = ()
-    around = saddles_beside(dynamics, search.equilibria, attractors, box=box, cycles=cycles)
-    # Over a saddle with several unstable directions no way is lowest.
-    passes = tuple(tuple(one for one in saddles if one.unstable == 1) for saddles in around)
+        box = dynamics.box
+        count = min(DOMAIN_STARTS * 2 ** max(d - 2, 0), MAX_DOMAIN_STARTS)
+        points = spread_evenly(box, count if searched else INDEPENDENT_STARTS, generator=generator)
+    width = np.where(np.ptp(box, axis=1) > 0, np.ptp(box, axis=1), 1.0)
+    if not recorded and not searched:
+        # Of many independent states the mean is always about the same: some have all states high, or low.
+        alike = np.linspace(0, 1, DIAGONAL_STARTS)[:, None] * width + box[:, 0]
+        points = np.concatenate([points, alike])
+    flow = dynamics.drift(points)
+    if searched and not np.isfinite(flow).all():
+        raise NumericalFailure("f has no value in a part of the domain: choose one in which it has")
+    rate = float(np.median(np.linalg.norm(flow / width, axis=1)))
+
+    starts, notes = points, list[str]()
+    if recorded:
+        few = generator.permutation(len(points))
+        equilibria = tuple(find_equilibria(dynamics, points[few[:NEWTON_STARTS]]))
+        starts = points[few[:RECORDED_STARTS]]
+    elif searched:
+        equilibria, missing = all_equilibria(dynamics, generator=generator)
+        notes = [*missing]
+    else:
+        resting = follow(dynamics, points, [], box=box, states=2).paths[:, -1]
+        roots = distinct_roots(dynamics, resting, box=box, margin=MERGE_TOLERANCE)
+        equilibria = tuple(classified(dynamics, roots, box=box, rate=rate))
+
+    stable = [one for one in equilibria if one.kind == "attractor"]
+    descents = follow(dynamics, starts, stable, box=box)
+    if searched:  # what comes to rest outside the domain has left it
+        last = descents.paths[:, -1]
+        resting_there = np.linalg.norm(dynamics.drift(last) / width, axis=1) < RESTING_SPEED * rate
+        outside = ((last < box[:, 0]) | (last > box[:, 1])).any(axis=1) & resting_there
+        descents = replace(descents, escaped=descents.escaped | (outside & (descents.ends < 0)))
+    reached = [index for index in range(len(stable)) if (descents.ends == index).any()]
+    renumbered = np.full(len(stable) + 1, -1)
+    renumbered[reached] = np.arange(len(reached))
+    descents = replace(descents, ends=renumbered[descents.ends])
+    attractors = [stable[index] for index in reached]
+
+    cycles: tuple[Cycle, ...] = ()
+    unstable_cycles: tuple[Cycle, ...] = ()
+    if searched:
+        cycles, descents = stable_cycles(dynamics, descents, first=len(attractors), box=box, rate=rate)
+        if d == 2:
+            unstable_cycles = unstable_cycles_of_plane(dynamics, equilibria, box=box, generator=generator)
+        elif cycles:
+            unstable_cycles = separatrix_cycles(dynamics, attractors, cycles, box=box, generator=generator)
+    elif not recorded:
+        saddles, further = _edge_saddles(dynamics, attractors, box, generator)
+        equilibria = (*attractors, *saddles)
+        notes = [SEARCHED.format(starts=len(points)), *further]
+    around: list[list[Equilibrium]] = [[] for _ in (*attractors, *cycles)]
+    for one in equilibria:
+        # Over a saddle of a domain with several unstable directions no way is lowest.
+        if one.kind == "saddle":
+            for index in neighbours(dynamics, one, attractors, box=box, cycles=cycles):
+                if one.unstable == 1 or not searched:
+                    around[index].append(one)
+
     basins: list[Basin] = []
-    for index, one in enumerate(attractors):
-        starts = descents.paths[descents.ends == index][:, 0]
-        focus = Focus(NEAR if d > 1 else 0, _level(dynamics, one, passes[index], starts))
+    for index, one in enumerate(attractors if recorded or searched else ()):
+        near = None
+        if searched:
+            # Up to a level of ½ (x - A)·M (x - A); without a saddle, half of the basin.
+            tops = np.array([each.position for each in around[index]])
+            places = tops if len(tops) else descents.paths[descents.ends == index][:, 0]
+            offset = places - one.position
+            heights = 0.5 * np.einsum("ni,ij,nj->n", offset, hessian_at(dynamics, one.position), offset)
+            level = LEVEL_BEYOND_SADDLE * float(heights.min()) if len(tops) else float(np.median(heights))
+            near = (STARTS_NEAR_ATTRACTOR if d > 1 else 0, level)
         basins.append(
-            basin_of(dynamics, descents, index, attractors, box=box, generator=generator, focus=focus)
+            basin_of(dynamics, descents, index, attractors, box=box, generator=generator, near=near)
         )
-    harmless, notes = _harmless(dynamics, search.equilibria, attractors, box, generator)
-    unseen = [one.position for one in stable if all(one is not other for other in attractors)]
-    notes += [
-        f"fewer than one in {len(points)} states of the domain lead to the stable equilibrium"
-        f" {place.round(4).tolist()}: it is left out"
-        for place in unseen
-    ]
+    harmless: tuple[Equilibrium, ...] = ()
+    if searched:
+        harmless, further = _harmless(dynamics, equilibria, attractors, box, generator)
+        notes += further
+        notes += [
+            f"fewer than one in {len(points)} states of the domain lead to the stable equilibrium"
+            f" {one.position.round(4).tolist()}: it is left out"
+            for one in stable
+            if all(one is not other for other in attractors)
+        ]
+    recurrence = None
+    unsettled = np.flatnonzero((descents.ends < 0) & ~descents.escaped)
+    if len(unsettled) > UNSETTLED * len(descents.ends):
+        recurrence = recurrence_of(dynamics, descents.paths[unsettled, -1], box=box, rate=rate)
     return PhasePortrait(
-        points, box, search.equilibria, tuple(attractors), passes, tuple(basins), descents,
-        recurrence_beyond(dynamics, descents, box=box, rate=rate),
-        harmless, (*search.notes, *notes), cycles, parting,
+        points, box, equilibria, tuple(attractors), tuple(map(tuple, around)), tuple(basins), descents,
+        recurrence, harmless, tuple(notes), cycles, unstable_cycles,
     )  # fmt: skip
 
 
-def _left(dynamics: Dynamics, descents: Descents, *, box: np.ndarray, rate: float) -> Descents:
-    """The same, with those that come to rest outside the domain counted among those that left it."""
-    last, width = descents.paths[:, -1], np.ptp(box, axis=1)
-    speed = np.linalg.norm(dynamics.drift(last) / width, axis=1)
-    outside = ((last < box[:, 0]) | (last > box[:, 1])).any(axis=1) & (speed < RESTING * rate)
-    return replace(descents, escaped=descents.escaped | (outside & (descents.ends < 0)))
-
-
-def _level(
-    dynamics: Dynamics, attractor: Equilibrium, saddles: Sequence[Equilibrium], starts: np.ndarray
-) -> float:
-    """Up to which ``½ (x - A)·M (x - A)`` there are further starts; without a saddle, half of the basin."""
-    hessian = hessian_at(dynamics, attractor.position)
-    places = np.array([one.position for one in saddles]) if saddles else starts
-    offset = places - attractor.position
-    heights = 0.5 * np.einsum("ni,ij,nj->n", offset, hessian, offset)
-    return FAR * float(heights.min()) if saddles else float(np.median(heights))
+def _edge_saddles(
+    dynamics: Dynamics, attractors: Sequence[Equilibrium], box: np.ndarray, generator: np.random.Generator
+) -> tuple[list[Equilibrium], list[str]]:
+    """Saddles on the edges between each two basins, and what is not known."""
+    width = np.ptp(box, axis=1)
+    saddles: list[Equilibrium] = []
+    pairs = list(itertools.combinations(range(len(attractors)), 2))
+    for (one, two), _ in itertools.product(pairs[:MAX_PAIRS], range(EDGES_PER_PAIR)):
+        top = edge_saddle(dynamics, one, two, attractors, box=box, generator=generator)
+        if top is not None and all(
+            np.abs((top.position - other.position) / width).max() > MERGE_TOLERANCE for other in saddles
+        ):
+            saddles.append(top)
+    notes = []
+    if len(attractors) > 1 and not saddles:
+        notes.append("edges between the basins were followed, and led to no saddle: there are no barriers")
+    if len(pairs) > MAX_PAIRS:
+        notes.append(f"saddles were sought between {MAX_PAIRS} of {len(pairs)} pairs of attractors")
+    return saddles, notes
 
 
 def _harmless(
@@ -305,16 +300,16 @@ def _harmless(
     for one in equilibria:
         if one.kind != "degenerate" or not attractors:
             continue
-        directions = generator.standard_normal((AROUND, len(box)))
+        directions = generator.standard_normal((DIRECTIONS, len(box)))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        starts = one.position + CLOSE * width * directions
+        starts = one.position + NEIGHBOURHOOD * width * directions
         starts = starts[((starts > box[:, 0]) & (starts < box[:, 1])).all(axis=1)]
         if not len(starts):
             continue
         ways = follow(dynamics, starts, attractors, box=box)
-        creeping = (np.abs((ways.paths[:, -1] - one.position) / width) < 2 * CLOSE).all(axis=1)
+        creeping = (np.abs((ways.paths[:, -1] - one.position) / width) < 2 * NEIGHBOURHOOD).all(axis=1)
         ends = ways.ends[(ways.ends >= 0) | ~creeping]
-        if len(ends) > DECIDED * len(starts) and ends[0] >= 0 and (ends == ends[0]).all():
+        if len(ends) > MIN_DECIDED_SHARE * len(starts) and ends[0] >= 0 and (ends == ends[0]).all():
             found.append(one)
             notes.append(
                 f"the equilibrium {one.position.round(4).tolist()} is neither stable nor unstable to first"
@@ -322,59 +317,6 @@ def _harmless(
                 f" {attractors[ends[0]].position.round(4).tolist()}, and it takes no part in the landscape"
             )
     return tuple(found), notes
-
-
-MOST_SEARCHED = 8  # states up to which Newton's method searches the whole domain
-MANY_STATES_STARTS = 64  # independent in each state
-ALIKE = 33  # with every state at the same share of its range
-TRACKED = 2  # edges for each two attractors, from different first ways
-MOST_PAIRS = 15  # of attractors
-SAME = 1e-6  # of the domain
-SEARCHED = (
-    "in so many states equilibria were not searched for over the whole domain: attractors are those to which"
-    " f leads from {starts} states, and saddles those at which edges between each two of their basins end"
-)
-
-
-def high_dimensional_portrait(dynamics: Dynamics, *, seed: int = 0) -> PhasePortrait:
-    """Attractors, and the saddles between them.
-
-    Parameters
-    ----------
-    dynamics
-        f and D, with the domain.
-    seed
-        Of the states that are followed, and of the first ways between attractors.
-    """
-    generator = np.random.default_rng(seed)
-    box = dynamics.box
-    width = np.ptp(box, axis=1)
-    # Of many independent states the mean is always about the same: some starts have all states high, or low.
-    alike = np.linspace(0, 1, ALIKE)[:, None] * width + box[:, 0]
-    points = np.concatenate([spread_evenly(box, MANY_STATES_STARTS, generator=generator), alike])
-    rate = float(np.median(np.linalg.norm(dynamics.drift(points) / width, axis=1)))
-    resting = follow(dynamics, points, [], box=box, states=2).paths[:, -1]
-    found = classified(dynamics, distinct_roots(dynamics, resting, box=box, margin=SAME), box=box, rate=rate)
-    stable = [one for one in found if one.kind == "attractor"]
-    attractors, descents = reached_attractors(stable, follow(dynamics, points, stable, box=box))
-    saddles: list[Equilibrium] = []
-    pairs = list(itertools.combinations(range(len(attractors)), 2))
-    for (one, two), _ in itertools.product(pairs[:MOST_PAIRS], range(TRACKED)):
-        top = edge_saddle(dynamics, one, two, attractors, box=box, generator=generator)
-        if top is not None and all(
-            np.abs((top.position - other.position) / width).max() > SAME for other in saddles
-        ):
-            saddles.append(top)
-    notes = [SEARCHED.format(starts=len(points))]
-    if len(attractors) > 1 and not saddles:
-        notes.append("edges between the basins were followed, and led to no saddle: there are no barriers")
-    if len(pairs) > MOST_PAIRS:
-        notes.append(f"saddles were sought between {MOST_PAIRS} of {len(pairs)} pairs of attractors")
-    return PhasePortrait(
-        points, box, (*attractors, *saddles), tuple(attractors),
-        saddles_beside(dynamics, saddles, attractors, box=box), (), descents,
-        recurrence_beyond(dynamics, descents, box=box, rate=rate), (), tuple(notes),
-    )  # fmt: skip
 
 
 class RecordedRegion:

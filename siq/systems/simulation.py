@@ -106,18 +106,13 @@ def noise_source(
     ValueError
         When ε or Δt is negative.
     """
-    factor = noise_factor(intensity=intensity, step=step)
+    if intensity < 0 or step < 0:
+        raise ValueError(f"the noise intensity ({intensity}) and the step ({step}) must not be negative")
+    factor = float(np.sqrt(intensity * step))
     if diffusion.constant:
         whole = factor * diffusion.root
         return lambda x: np.asarray(whole @ generator.standard_normal(x.shape))
     return lambda x: factor * diffusion.kicks(x, generator.standard_normal(x.shape))
-
-
-def noise_factor(*, intensity: float, step: float) -> float:
-    """``sqrt(ε Δt)``: the size of the noise over one step where D = 1; raises as `noise_source`."""
-    if intensity < 0 or step < 0:
-        raise ValueError(f"the noise intensity ({intensity}) and the step ({step}) must not be negative")
-    return float(np.sqrt(intensity * step))
 
 
 def simulate_snapshots(

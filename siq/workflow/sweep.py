@@ -189,7 +189,7 @@ def _resting(system: Dynamics, seed: int) -> tuple[tuple[float, ...], ...]:
         return ()
     try:
         draw = generator(seed, Purpose.LANDSCAPE)
-        found = all_equilibria(system, generator=draw).equilibria
+        found, _ = all_equilibria(system, generator=draw)
     except (NumericalFailure, np.linalg.LinAlgError):
         return ()
     return tuple(tuple(map(float, one.position)) for one in found)

@@ -14,7 +14,7 @@ from siq.quasipotential.paths import MinimumActionPath, minimum_action_path
 from siq.systems.cycles import Cycle, closed_orbit, hessians_along
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import hessian_at
-from siq.systems.phase_portrait import domain_portrait
+from siq.systems.phase_portrait import phase_portrait
 from siq.validation.mesh import mesh_quasipotential_of_cycle
 
 x, y, z = (sympy.Symbol(name, real=True) for name in "xyz")
@@ -125,7 +125,7 @@ def test_a_point_and_a_cycle_make_a_landscape(axis: bool) -> None:
 def test_u_about_the_cycle_of_van_der_pol_is_that_of_the_mesh() -> None:
     """The mesh shares neither equations nor code with paths; its error is about 0.3 % here."""
     system = Dynamics.of((x, y), (y, (1 - x**2) * y - x), domain=[(-3, 3), (-4, 4)])
-    (cycle,) = domain_portrait(system).cycles
+    (cycle,) = phase_portrait(system).cycles
     points, hessians = finer(cycle.points), finer(hessians_along(system, cycle))
     box = np.array([[-3.5, 3.5], [-4.5, 4.5]])
     mesh = mesh_quasipotential_of_cycle(
@@ -154,7 +154,7 @@ def test_an_oscillation_beside_rest_has_the_barriers_of_characteristics_and_of_t
     """Liénard's equation with an unstable cycle within a stable one: here phases differ."""
     friction = sympy.Rational(1, 4) - x**2 + sympy.Rational(2, 5) * x**4
     system = Dynamics.of((x, y), (y - x * friction, -x), domain=[(-2, 2)] * 2)
-    portrait = domain_portrait(system)
+    portrait = phase_portrait(system)
     (cycle,), (parting,) = portrait.cycles, portrait.parting
     inwards = minimum_action_path(system, portrait.attractors[0].position, parting)
     assert inwards.action == pytest.approx(lowest_crossing(system, parting), rel=1e-4)
