@@ -1,10 +1,15 @@
-"""diagnosis"""
+"""The diagnosis of a simulation, and the tables that its figures are drawn from.
+
+A mechanism may explain the recordings that it was found in, and nothing else: it stands in for something that
+goes on differently elsewhere. Where the simulation with it predicts recordings held out worse than without
+it, by more than appears by chance, it keeps no name.
+"""
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,7 +25,7 @@ from siq.diagnosis.search import Search
 from siq.diagnosis.smooth_functions import MECHANISM
 from siq.diagnosis.statement import Location, StatedMechanism, Statement
 from siq.diagnosis.study import Comparison, MismatchStudy, MismatchVerdict, comparison_of
-from siq.diagnosis.unnamed_models import Material, Model, models_of_the_nameless
+from siq.diagnosis.unnamed_models import Material, models_of_the_nameless
 from siq.diagnosis.verdict import statement_of
 from siq.errors import InputError, NumericalFailure
 from siq.inference.budget import Budget
@@ -34,50 +39,12 @@ if TYPE_CHECKING:
 LOGGER = logging.getLogger(__name__)
 
 
-def misleads(found: Investigation, shown: HeldOutRuns) -> bool:
-    """Whether the mechanisms that are named make predictions of recordings held out worse.
-
-    Parameters
-    ----------
-    found
-        What was found.
-    shown
-        Its free runs of the recordings held out; tests of somebody else may not be among them, since they
-        decide nothing.
-    """
-    named = found.verdict is MismatchVerdict.MISSING_PHYSICS and not found.process_noise
-    return named and shown.errors.change("without", "augmented") == "worse"
-
-
-def anything_else(found: Investigation, models: Sequence[Model], case: Comparison) -> bool:
-    """Whether anything but mechanisms that recordings held out refute speaks of a mismatch.
-
-    Random forces that are needed do, and so does structure that the recalibrated simulation leaves, or a
-    function without a name that is certain by the odds that a name takes.
-
-    Parameters
-    ----------
-    found
-        What was found.
-    models
-        Of what has no name, the likeliest first.
-    case
-        The recordings and the settings.
-    """
-    recalibrated = found.search.recalibrated
-    if recalibrated.has_process_noise:
-        return True
-    functions = [each for each in models if all(part.kind != MECHANISM for part in each.parts)]
-    if any(each.log_evidence >= case.settings.search.least_log_odds for each in functions):
-        return True
-    return what_is_left(found.model, case.learn, recalibrated, recalibrated, found.roles).structured
-
-
 def withdrawn(found: Investigation, case: Comparison, budget: Budget) -> Investigation:
     """An investigation without its names, and with models of what has none.
 
     Where nothing else speaks of a mismatch there is none: evidence that recordings held out refute is no
-    evidence.
+    evidence. Process noise that is needed speaks of one, and so does structure that the recalibrated
+    simulation leaves, or a function without a name that is certain by the odds that a name takes.
 
     Parameters
     ----------
@@ -89,17 +56,24 @@ def withdrawn(found: Investigation, case: Comparison, budget: Budget) -> Investi
         Charged for the models; those that it does not reach are left out.
     """
     names = [each.best.candidate.label for each in found.search.found]
-    LOGGER.info("%s: not named, since held-out recordings are foreseen worse", names)
-    settings = case.settings
+    LOGGER.info("%s: not named, since held-out recordings are predicted worse", names)
+    options, recalibrated = case.settings.search, found.search.recalibrated
     material = Material(
-        case.learn, found.roles, settings.degree, settings.search.blocks, len(found.candidates), budget
+        case.learn, found.roles, case.settings.degree, options.blocks, len(found.candidates), budget
     )
     models = models_of_the_nameless(found.search, material)
-    if not anything_else(found, models, case):
-        recalibrated = found.search.recalibrated
+    certain = any(
+        each.log_evidence >= options.least_log_odds and all(part.kind != MECHANISM for part in each.parts)
+        for each in models
+    )
+    if not (
+        recalibrated.has_process_noise
+        or certain
+        or what_is_left(found.model, case.learn, recalibrated, recalibrated, found.roles).structured
+    ):
         return replace(
             found,
-            verdict=quiet_verdict(found.p_shift, settings.search),
+            verdict=quiet_verdict(found.p_shift, options),
             search=replace(found.search, found=(), fit=recalibrated),
             naming=None,
             remarks=(*found.remarks, Remark("diagnosis.refuted", {"names": " and ".join(names)})),
@@ -259,7 +233,9 @@ def solve_case(
         found = investigate(case.system, case.learn, case.dictionary, case.settings, budget=budget)
         certain = case.settings.search.least_log_odds
         shown = held_out_runs(found, case.learn, case.kept, certain=certain, tests=case.settings.tests)
-        if not case.settings.tests and misleads(found, shown):
+        named = found.verdict.names and not found.process_noise
+        # Tests of somebody else may be among the recordings held out, and decide nothing.
+        if named and not case.settings.tests and shown.errors.change("without", "augmented") == "worse":
             found = withdrawn(found, case, budget)
             shown = held_out_runs(found, case.learn, case.kept, certain=certain)
         statement = statement_of(found, case.learn, shown)
@@ -270,7 +246,7 @@ def solve_case(
     final, model = found.final, found.final.model
     if shown.described_fit is not None and shown.adopted:
         final, model = shown.described_fit, shown.model
-    elif found.verdict is MismatchVerdict.MISSING_PHYSICS:
+    elif found.verdict.names:
         model = shown.model
     process = final.noise.process if found.process_noise else None
     recalibrated = found.search.recalibrated
@@ -323,7 +299,7 @@ def tables_of(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:
             "p_value": curve.p_value,
             "stage": stage,
         }
-        for stage, structure in (("before", found.before), ("after", found.after))
+        for stage, structure in (("before", found.remainder.before), ("after", found.remainder.after))
         for curve in structure.curves
         for at, value, error in zip(curve.direction.knots, curve.values, curve.standard_errors, strict=True)
     ]

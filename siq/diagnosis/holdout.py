@@ -1,10 +1,20 @@
-"""holdout"""
+"""Errors of free runs on held-out recordings, cross-validation, and the adoption of a model.
+
+Two simulations of the same recordings are off by the same noise. Whether one is better is therefore asked of
+pairs: of the ratio of their errors, whose own error is known from leaving out one block of samples at a time
+(the jackknife). Errors of a simulation last; blocks are long, and few.
+
+In cross-validation every part of the recordings to learn from is left out in turn: whole recordings, or
+stretches of a single one. All parameters are fitted to the others, so that what is left out had no part in
+them. Of several models of what has no name that one becomes part of the new card which is likeliest and
+predicts recordings better than they are predicted without it.
+"""
 
 from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -21,11 +31,18 @@ from siq.inference.recalibration import fit_with_process_noise_as_needed
 from siq.inference.trajectories import FreeRun, UsualStates, free_run, squared_errors
 
 LOGGER = logging.getLogger(__name__)
+Change = Literal["better", "same", "worse", "unknown"]
+Run = Literal["before", "recalibrated", "augmented", "named", "without"]
+CONFIDENCE_95 = 1.96  # standard errors within which 95 % lie
+BLOCKS = 12  # as many as tell an error of a ratio; fewer leave more samples that belong together in one
+CHANGE_BY_CHANCE = 0.05  # probability of a gain, or a loss, where there is none
+FOLDS = 4  # of which one is left out at a time: a quarter, as is held out by default
+MIN_STRETCH_SAMPLES = 16  # of a stretch that an initial state and an error can be told from
 
 
 @dataclass(frozen=True)
-class RunsAlike:
-    """What all of them have in common.
+class SimulationProtocol:
+    """How simulations of recordings are run, so that their errors can be compared.
 
     Attributes
     ----------
@@ -55,13 +72,6 @@ class RunsAlike:
 def mean_error(squares: np.ndarray | None) -> float:
     """The mean of squared errors, infinite where a simulation ran away."""
     return float("inf") if squares is None else float(squares.mean())
-
-
-Change = Literal["better", "same", "worse", "unknown"]
-Run = Literal["before", "recalibrated", "augmented", "named", "without"]
-CONFIDENCE_95 = 1.96  # standard errors within which 95 % lie
-BLOCKS = 12  # as many as tell an error of a ratio; fewer leave more samples that belong together in one
-CHANGE_BY_CHANCE = 0.05  # probability of a gain, or a loss, where there is none
 
 
 @dataclass(frozen=True)
@@ -189,20 +199,16 @@ def in_blocks(squares: np.ndarray) -> tuple[float, ...]:
     return tuple(float(each.mean()) for each in np.array_split(squares, max(min(BLOCKS, len(squares)), 1)))
 
 
-FOLDS = 4  # of which one is left out at a time: a quarter, as is held out by default
-MIN_STRETCH_SAMPLES = 16  # samples of a stretch that an initial state and an error can be told from
-
-
 @dataclass(frozen=True)
-class LeftOut:
-    """What is left out, the rest, and the rows of the rest in all of it."""
+class Fold:
+    """A part that is left out, the rest, and the rows of the rest in all of the recordings."""
 
     out: Measurements
     rest: Measurements
     rows: np.ndarray
 
 
-def parts_left_out(learned: Measurements) -> Iterator[LeftOut]:
+def cross_validation_folds(learned: Measurements) -> Iterator[Fold]:
     """The recordings divided into parts, each left out once.
 
     Of recordings, so many at equal distances are a part; a single one is cut into stretches, of which the
@@ -218,16 +224,34 @@ def parts_left_out(learned: Measurements) -> Iterator[LeftOut]:
         edges = np.linspace(0, len(learned.t), parts + 1).round().astype(int)
         pieces, owner = list(itertools.pairwise(edges)), np.zeros(parts, dtype=int)
         groups = [np.array([part]) for part in range(parts)]
+
+    def stretches(chosen: Sequence[tuple[int, int]], of: Iterable[int]) -> tuple[Measurements, np.ndarray]:
+        """Stretches of rows as recordings of their own, and their rows; the inputs stay whole."""
+        rows, of = np.concatenate([np.arange(begin, end) for begin, end in chosen]), list(of)
+        return replace(
+            learned,
+            labels=tuple(
+                f"{learned.labels[place]}, rows {a} to {b}" for place, (a, b) in zip(of, chosen, strict=True)
+            ),
+            first=np.concatenate([[0], np.cumsum([end - begin for begin, end in chosen])]),
+            t=learned.t[rows],
+            outputs=learned.outputs[rows],
+            courses=tuple(learned.courses[place] for place in of) if learned.courses else learned.courses,
+        ), rows
+
     for group in groups:
         others = np.setdiff1d(np.arange(len(pieces)), group)
-        chosen = [pieces[place] for place in group]
         kept = [pieces[place] for place in others]
+        owners = owner[others]
         if count == 1:  # what was not cut stays one recording
-            kept = _joined(kept)
-            others = np.zeros(len(kept), dtype=int)
-        rest, rows = _stretches(learned, kept, owner[others] if count > 1 else others)
-        out, _ = _stretches(learned, chosen, owner[group])
-        yield LeftOut(out, rest, rows)
+            joined: list[tuple[int, int]] = []
+            for begin, end in kept:
+                if joined and joined[-1][1] == begin:
+                    joined[-1] = (joined[-1][0], end)
+                else:
+                    joined.append((begin, end))
+            kept, owners = joined, np.zeros(len(joined), dtype=int)
+        yield Fold(stretches([pieces[place] for place in group], owner[group])[0], *stretches(kept, owners))
 
 
 def errors_left_out(
@@ -244,7 +268,8 @@ def errors_left_out(
     noise
         See `siq.inference.trajectories.free_run`.
     candidates
-        The mechanisms in it, of which some amplitudes cannot be negative.
+        The mechanisms in it, of which some amplitudes cannot be negative. What the rest would have of a sign
+        that cannot be is not there: the part left out may be the only one that tells of it.
 
     Returns
     -------
@@ -253,68 +278,29 @@ def errors_left_out(
         away.
     """
     positive = {name for each in candidates for name in each.positive.intersection(each.amplitudes)}
-    runs = RunsAlike(noise, fit.substeps)
+    runs = SimulationProtocol(noise, fit.substeps)
     squares = []
-    for part in parts_left_out(learned):
+    for fold in cross_validation_folds(learned):
+        model, wrong = fit.model, {""}
         try:
-            again = _made_again(fit, part, positive)
-            own = runs.errors(again, part.out)
+            while wrong:
+                again = fit_with_process_noise_as_needed(model, fold.rest, replace(fit, x=fit.x[fold.rows]))
+                wrong = {p.name for p in again.model.parameters if p.name in positive and p.value < 0}
+                if wrong:
+                    LOGGER.info("without rows of one part, %s would be negative", ", ".join(sorted(wrong)))
+                    absent = (
+                        replace(each, value=0.0, fixed=True) if each.name in wrong else each
+                        for each in model.parameters
+                    )
+                    model = replace(model, parameters=tuple(absent))
+            own = runs.errors(again, fold.out)
         except NumericalFailure:
             return None
-        # One that does not quite settle, as where a reading is cut off, is judged by what it foresees.
+        # One that does not quite settle, as where a reading is cut off, is judged by what it predicts.
         if own is None or again.fault:
             return None
         squares.append(own)
     return np.concatenate(squares)
-
-
-def _made_again(fit: Fit, part: LeftOut, positive: Collection[str]) -> Fit:
-    """A fit to the rest alone. What the rest would have of a sign that cannot be is not there.
-
-    The part left out may be the only one that tells of it: of vessels that overflow once, say.
-    """
-    model = fit.model
-    while True:
-        again = fit_with_process_noise_as_needed(model, part.rest, replace(fit, x=fit.x[part.rows]))
-        wrong = [each.name for each in again.model.parameters if each.name in positive and each.value < 0]
-        if not wrong:
-            return again
-        LOGGER.info("without rows of one part, %s would be negative", ", ".join(wrong))
-        model = replace(
-            model,
-            parameters=tuple(
-                replace(each, value=0.0, fixed=True) if each.name in wrong else each
-                for each in model.parameters
-            ),
-        )
-
-
-def _joined(stretches: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Stretches of rows, those that follow each other as one."""
-    whole: list[tuple[int, int]] = []
-    for begin, end in stretches:
-        if whole and whole[-1][1] == begin:
-            whole[-1] = (whole[-1][0], end)
-        else:
-            whole.append((begin, end))
-    return whole
-
-
-def _stretches(
-    data: Measurements, stretches: list[tuple[int, int]], owner: np.ndarray
-) -> tuple[Measurements, np.ndarray]:
-    """Stretches of rows as recordings of their own, and their rows; the inputs stay whole."""
-    rows = np.concatenate([np.arange(begin, end) for begin, end in stretches])
-    return replace(
-        data,
-        labels=tuple(
-            f"{data.labels[place]}, rows {a} to {b}" for place, (a, b) in zip(owner, stretches, strict=True)
-        ),
-        first=np.concatenate([[0], np.cumsum([end - begin for begin, end in stretches])]),
-        t=data.t[rows],
-        outputs=data.outputs[rows],
-        courses=tuple(data.courses[place] for place in owner) if data.courses else data.courses,
-    ), rows
 
 
 def adopted_by_held_out(
@@ -322,7 +308,7 @@ def adopted_by_held_out(
     without: Sequence[Fit],
     data: Measurements,
     *,
-    runs: RunsAlike,
+    runs: SimulationProtocol,
     certain: float,
 ) -> int | None:
     """The place of the model that is adopted, judged by recordings held out; None where none helps.
@@ -358,7 +344,7 @@ def adopted_by_held_out(
     if likeliest is None:
         return None
     sizes = [mean_error(each) for each in errors]
-    return simplest_of(sizes, [model.coordinates for model, _ in choices], likeliest)
+    return _simplest_of(sizes, [model.coordinates for model, _ in choices], likeliest)
 
 
 def adopted_by_left_out(
@@ -400,19 +386,10 @@ def adopted_by_left_out(
     return best if first_better(alone, [errors[best]], [0.0]) == 0 else None
 
 
-def simplest_of(errors: Sequence[float], coordinates: Sequence[int], likeliest: int) -> int:
-    """The place of the model of fewest coordinates that foresees no worse than the likeliest one.
+def _simplest_of(errors: Sequence[float], coordinates: Sequence[int], likeliest: int) -> int:
+    """The place of the model of fewest coordinates that predicts no worse than the likeliest one.
 
     Errors of a sensor's clock, for one, grow with the motion, and look like functions of more than there is.
-
-    Parameters
-    ----------
-    errors
-        Of each model, on recordings held out.
-    coordinates
-        How many each depends on.
-    likeliest
-        The place of the one to begin with.
     """
     known = [place for place, error in enumerate(errors) if error <= errors[likeliest]]
     return min(known, key=lambda place: (coordinates[place], place != likeliest, place))

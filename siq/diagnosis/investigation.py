@@ -1,4 +1,4 @@
-"""investigation"""
+"""The investigation of a case, from its recalibration to what it lacks, and its runs of held-out recordings."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ import scipy.stats
 
 from siq.diagnosis.dictionary import Mechanism, Roles, roles_of
 from siq.diagnosis.evidence import UntriedMechanism
-from siq.diagnosis.holdout import HeldOutErrors, RunsAlike, adopted_by_held_out, adopted_by_left_out
+from siq.diagnosis.holdout import HeldOutErrors, SimulationProtocol, adopted_by_held_out, adopted_by_left_out
 from siq.diagnosis.mechanisms import MechanismCandidate, candidates_of, generic_candidates
 from siq.diagnosis.naming import NamingDecision, decide_naming
 from siq.diagnosis.residual_structure import (
     RANDOM_RESIDUALS,
     STRUCTURED,
     Remainder,
-    Structure,
     explained_by_rounding,
     unsteadiness,
     what_is_left,
@@ -35,13 +34,209 @@ from siq.remarks import Remark
 from siq.systems.dynamics import Dynamics
 
 
+@dataclass(frozen=True)
+class Investigation:
+    """What was found out about a simulation and recordings of the system, with all fits that it rests on.
+
+    Attributes
+    ----------
+    verdict
+        One of four.
+    model
+        The simulation as its author believes it.
+    roles
+        Of its states.
+    search
+        Recalibration, mechanisms found, and the final fit.
+    least_squares
+        The recalibration whose trajectories follow the equations exactly.
+    exact
+        The final simulation fitted so, where a remainder that is no noise was admitted as process noise.
+    remainder
+        What the recalibrated simulation does not explain, what the final fit leaves, and the share of the
+        excess that mechanisms explain.
+    p_shift
+        p-value of the test that the parameters of the card are the true ones.
+    remarks
+        Reservations.
+    candidates
+        All mechanisms that were considered.
+    naming
+        What was asked of mechanisms before they could be named; None where none was found.
+    models
+        Of what has no name, be it all that is missing or what names leave, the likeliest first.
+    account
+        The work that it took, and whether something was left undone.
+    withdrawn
+        Whether a name was given, and mislead on recordings held out (`siq.diagnosis.diagnosis`).
+    """
+
+    verdict: MismatchVerdict
+    model: Dynamics
+    roles: Roles
+    search: Search
+    least_squares: Fit
+    exact: Fit | None
+    remainder: Remainder
+    p_shift: float
+    remarks: tuple[Remark, ...]
+    candidates: tuple[MechanismCandidate, ...]
+    naming: NamingDecision | None = None
+    models: tuple[Model, ...] = ()
+    account: Account = UNLIMITED
+    withdrawn: bool = False
+
+    @property
+    def process_noise(self) -> bool:
+        """Whether process noise is all that is missing."""
+        return self.verdict.names and not self.search.found
+
+    @property
+    def too_faint(self) -> bool:
+        """Whether what was found explains enough, and is not named since a function is nearly as likely."""
+        unexplained = self.verdict is MismatchVerdict.UNEXPLAINED and not self.withdrawn
+        return unexplained and self.naming is not None and self.naming.convincing
+
+    @property
+    def final(self) -> Fit:
+        """The fit that the verdict stands on: with mechanisms only where they are physics."""
+        return self.search.fit if self.verdict.names else self.search.recalibrated
+
+
 def quiet_verdict(p_shift: float, options: SearchOptions) -> MismatchVerdict:
     """The verdict where nothing is missing, by the probability that the card's parameters are right."""
     shifted = p_shift < options.false_alarms
     return MismatchVerdict.PARAMETER_SHIFT if shifted else MismatchVerdict.NO_MISMATCH
 
 
-def shift_probability(model: Dynamics, recalibrated: Fit) -> float:
+def investigate(
+    model: Dynamics,
+    data: Measurements,
+    dictionary: Sequence[Mechanism],
+    study: MismatchStudy,
+    *,
+    file: str = "the dictionary",
+    seed: int = 0,
+    budget: Budget | None = None,
+) -> Investigation:
+    """Say whether, where and in which way a simulation differs from recordings.
+
+    Parameters
+    ----------
+    model
+        The simulation, as its card says.
+    data
+        The recordings to learn from; those held out stay out.
+    dictionary
+        The mechanisms that may be named.
+    study
+        What counts as found, and whether monomials do.
+    file
+        Where the dictionary's entries come from, for messages.
+    seed
+        Of the effects without a name that mechanisms are held against.
+    budget
+        Charged for the work; what it does not reach is left undone, and the answer is that of the rest.
+
+    Raises
+    ------
+    NumericalFailure
+        When not even the recalibrated simulation with process noise can be fitted.
+    """
+    options = study.search
+    model = with_expectations(model)
+    roles = roles_of(model)
+    candidates = candidates_of(model, roles, dictionary, file=file)
+    if study.generic if study.generic is not None else not roles.physical:
+        monomials = generic_candidates(model, roles, degree=study.degree, named=candidates)
+        candidates += [each for each in monomials if each.coordinate != "constant"]
+    budget = budget or Budget()
+    budget.says("fitting the simulation's own parameters")
+    with budget.exempt():
+        recalibrated, least_squares = recalibrate(model, data, budget=budget)
+    found = search(model, data, recalibrated, candidates, options=options, budget=budget)
+    recalibrated = found.recalibrated  # from where a mechanism led it, if that is better
+    if not (recalibrated.has_process_noise or recalibrated.log_likelihood < least_squares.log_likelihood):
+        least_squares = recalibrated
+    # What is left with each mechanism that was found. One whose remainder has no finite size, such as one
+    # that makes the simulation run away without process noise, is taken back, with those after it.
+    by_each: list[Remainder] = []
+    for place, each in enumerate(found.found):
+        try:
+            by_each.append(what_is_left(model, data, recalibrated, each.best.fit, roles))
+        except NumericalFailure as error:
+            fit = found.found[place - 1].best.fit if place else recalibrated
+            untried = (*found.untried, UntriedMechanism(each.best.candidate, str(error)))
+            found = replace(found, found=found.found[:place], fit=fit, untried=untried)
+            break
+    left = by_each[-1] if by_each else what_is_left(model, data, recalibrated, recalibrated, roles)
+    exact: Fit | None = None
+    naming: NamingDecision | None = None
+    models: tuple[Model, ...] = ()
+    verdict, remarks = MismatchVerdict.NO_MISMATCH, tuple[Remark, ...]()
+    material = Material(data, roles, study.degree, options.blocks, len(candidates), budget)
+    tried = bool(found.found)
+    if tried:
+        naming = decide_naming(
+            found, by_each, model, material, candidates,
+            options=options, generator=np.random.default_rng(seed),
+        )  # fmt: skip
+        models, exact, remarks = naming.models, naming.exact, naming.remarks
+        found, left = naming.search, naming.remainder
+        verdict = MismatchVerdict.MISSING_PHYSICS if naming.named else MismatchVerdict.UNEXPLAINED
+    rounded = None
+    doubtful = not tried and (found.fit.has_process_noise or left.structured)
+    if doubtful or verdict is MismatchVerdict.UNEXPLAINED:
+        budget.says("asking whether the sensors' steps explain it")
+        with budget.exempt():
+            # What a mechanism has found already has to be gone more clearly.
+            least = RANDOM_RESIDUALS if tried else STRUCTURED
+            rounded = explained_by_rounding(model, data, least_squares, roles, least=least, budget=budget)
+    if rounded is not None:
+        found = replace(found, recalibrated=rounded.fit, found=(), fit=rounded.fit)
+        left, least_squares, naming, models, exact = rounded.left, rounded.fit, None, (), None
+        remarks = (Remark("diagnosis.quantised", {"outputs": ", ".join(rounded.outputs)}),)
+    p_shift = _shift_probability(model, found.recalibrated)
+    if rounded is not None or not (tried or doubtful):
+        verdict = quiet_verdict(p_shift, options)
+    elif not tried and found.fit.has_process_noise:
+        # Process noise explains any recordings. It is named where nothing else is likelier, neither a
+        # function instead of it nor one beside what is left of it: noise does not know where a system is, so
+        # that no function of the states takes a part of it over.
+        verdict = MismatchVerdict.UNEXPLAINED
+        steady = unsteadiness(found.fit, data) < 2 * options.least_log_odds
+        remarks = () if steady else (Remark("diagnosis.noise_follows_motion"),)
+        knows_noise = any(form.noise for mechanism in dictionary for form in mechanism.forms)
+        if knows_noise and steady and not left.doubtful:
+            models = models_of_the_nameless(found, material)
+            if not models or models[0].log_evidence < options.least_log_odds:
+                verdict, models = MismatchVerdict.MISSING_PHYSICS, ()
+    elif not tried:
+        verdict = MismatchVerdict.UNEXPLAINED
+    if verdict is MismatchVerdict.UNEXPLAINED and not (models or found.found):
+        models = models_of_the_nameless(found, material)
+    budget.says("working out how well parameters are known")
+    with budget.exempt():
+        covariance = covariance_with_unknown_forces(found.fit, data, budget=budget)
+    found = replace(found, fit=replace(found.fit, covariance=covariance))
+    return Investigation(
+        verdict=verdict,
+        model=model,
+        roles=roles,
+        search=found,
+        least_squares=least_squares,
+        exact=exact,
+        remainder=left,
+        p_shift=p_shift,
+        remarks=remarks,
+        candidates=tuple(candidates),
+        naming=naming,
+        models=models,
+        account=budget.account(),
+    )
+
+
+def _shift_probability(model: Dynamics, recalibrated: Fit) -> float:
     """p-value of the test that the card's parameters are the true ones, given the recalibrated ones."""
     free = np.array(model.free, dtype=int)
     if not len(free):
@@ -97,7 +292,7 @@ def held_out_runs(
     certain: float,
     tests: Collection[str] = (),
 ) -> HeldOutRuns:
-    """Show the fit on recordings that had no part in anything.
+    """Run the simulations freely on recordings that had no part in anything.
 
     Of several models of what has no name one may be adopted (`siq.diagnosis.holdout`): it makes the
     prediction better than that of the mechanisms with a name, where there are any, or else of the simulation.
@@ -119,7 +314,7 @@ def held_out_runs(
     """
     search = investigation.search
     noise, substeps = search.recalibrated.noise, max(search.fit.substeps, search.recalibrated.substeps)
-    runs = RunsAlike(noise, substeps)
+    runs = SimulationProtocol(noise, substeps)
 
     def best_of(*fits: Fit | None) -> Fit:
         return runs.nearest([each for each in fits if each is not None], learned)
@@ -129,9 +324,9 @@ def held_out_runs(
     recalibrated = search.recalibrated
     if recalibrated.has_process_noise and np.isfinite(investigation.least_squares.sum_of_squares):
         recalibrated = best_of(investigation.least_squares, recalibrated, card)
-    plain = best_of(investigation.augmented_least_squares, search.fit)
+    plain = best_of(investigation.exact, search.fit)
     choices = [(model, best_of(model.fit, model.exact)) for model in investigation.models]
-    named = investigation.verdict is MismatchVerdict.MISSING_PHYSICS
+    named = investigation.verdict.names
     judges = [place for place, label in enumerate(data.labels) if label not in tests]
     adopted = None
     if choices and judges:
@@ -151,7 +346,10 @@ def held_out_runs(
         "augmented": squared_errors(data.outputs, run),
         "named": runs.errors(plain, data) if named and adopted is not None else None,
     }
-    floor = noise_floor_of((search.fit, fit), data, before.scored)
+    # What a fit leaves may be more than noise; the one that leaves least is nearest to it.
+    spread = np.nanvar(data.outputs[before.scored], axis=0)
+    least = np.minimum(search.fit.noise.measurement, fit.noise.measurement)
+    floor = float(np.sqrt(np.mean(least / np.where(spread > 0, spread, 1.0))))
     return HeldOutRuns(
         before=before,
         recalibrated=refitted,
@@ -163,276 +361,3 @@ def held_out_runs(
         described_fit=fit if described is not None else None,
         adopted=adopted is not None,
     )
-
-
-def noise_floor_of(fits: Sequence[Fit], data: Measurements, scored: np.ndarray) -> float:
-    """The error that noise alone would leave, as a share of the recordings' spread.
-
-    What a fit leaves may be more than noise; the one that leaves least is nearest to it.
-
-    Parameters
-    ----------
-    fits
-        Of several simulations, each with its estimate of the measurement noise.
-    data
-        The recordings held out.
-    scored
-        Rows that count, shape ``(n,)``.
-    """
-    spread = np.nanvar(data.outputs[scored], axis=0)
-    least = np.minimum.reduce([each.noise.measurement for each in fits])
-    return float(np.sqrt(np.mean(least / np.where(spread > 0, spread, 1.0))))
-
-
-@dataclass(frozen=True)
-class Investigation:
-    """What was found out about a simulation and recordings of the system, with all fits that it rests on.
-
-    Attributes
-    ----------
-    verdict
-        One of four.
-    model
-        The simulation as its author believes it.
-    roles
-        Of its states.
-    search
-        Recalibration, mechanisms found, and the final fit.
-    least_squares
-        The recalibration whose trajectories follow the equations exactly.
-    augmented_least_squares
-        The same of the final simulation, where a remainder that is no noise was admitted as random forces.
-    before
-        Structure of what the recalibrated simulation does not explain, random forces included.
-    after
-        Structure that the final fit leaves.
-    process_noise
-        Whether random forces are part of the verdict.
-    p_shift
-        p-value of the test that the parameters of the card are the true ones.
-    share
-        Of the excess that the mechanisms explain.
-    remarks
-        Reservations.
-    candidates
-        All mechanisms that were considered.
-    naming
-        What was asked of mechanisms before they could be named; None where none was found.
-    models
-        Of what has no name, be it all that is missing or what names leave, the likeliest first.
-    account
-        The work that it took, and whether something was left undone.
-    withdrawn
-        Whether a name was given, and mislead on recordings held out (`siq.diagnosis.diagnosis`).
-    """
-
-    verdict: MismatchVerdict
-    model: Dynamics
-    roles: Roles
-    search: Search
-    least_squares: Fit
-    augmented_least_squares: Fit | None
-    before: Structure
-    after: Structure
-    process_noise: bool
-    p_shift: float
-    share: float
-    remarks: tuple[Remark, ...]
-    candidates: tuple[MechanismCandidate, ...]
-    naming: NamingDecision | None = None
-    models: tuple[Model, ...] = ()
-    account: Account = UNLIMITED
-    withdrawn: bool = False
-
-    @property
-    def too_faint(self) -> bool:
-        """Whether what was found explains enough, and is not named since a function is nearly as likely."""
-        return (
-            self.verdict is MismatchVerdict.UNEXPLAINED
-            and not self.withdrawn
-            and self.naming is not None
-            and self.naming.convincing
-        )
-
-    @property
-    def final(self) -> Fit:
-        """The fit that the verdict stands on: with mechanisms only where they are physics."""
-        return (
-            self.search.fit if self.verdict is MismatchVerdict.MISSING_PHYSICS else self.search.recalibrated
-        )
-
-
-def investigate(
-    model: Dynamics,
-    data: Measurements,
-    dictionary: Sequence[Mechanism],
-    study: MismatchStudy,
-    *,
-    file: str = "the dictionary",
-    seed: int = 0,
-    budget: Budget | None = None,
-) -> Investigation:
-    """Say whether, where and in which way a simulation differs from recordings.
-
-    Parameters
-    ----------
-    model
-        The simulation, as its card says.
-    data
-        The recordings to learn from; those held out stay out.
-    dictionary
-        The mechanisms that may be named.
-    study
-        What counts as found, and whether monomials do.
-    file
-        Where the dictionary's entries come from, for messages.
-    seed
-        Of the effects without a name that mechanisms are held against.
-    budget
-        Charged for the work; what it does not reach is left undone, and the answer is that of the rest.
-
-    Raises
-    ------
-    NumericalFailure
-        When not even the recalibrated simulation with process noise can be fitted.
-    """
-    options = study.search
-    model = with_expectations(model)
-    roles = roles_of(model)
-    candidates = considered(model, roles, dictionary, study, file=file)
-    budget = budget or Budget()
-    budget.says("fitting the simulation's own parameters")
-    with budget.exempt():
-        recalibrated, least_squares = recalibrate(model, data, budget=budget)
-    found = search(model, data, recalibrated, candidates, options=options, budget=budget)
-    recalibrated = found.recalibrated  # from where a mechanism led it, if that is better
-    if not (recalibrated.has_process_noise or recalibrated.log_likelihood < least_squares.log_likelihood):
-        least_squares = recalibrated
-    found, by_each = remainders(model, data, found, roles)
-    left = by_each[-1]
-    exact: Fit | None = None
-    naming: NamingDecision | None = None
-    models: tuple[Model, ...] = ()
-    verdict, remarks = MismatchVerdict.NO_MISMATCH, tuple[Remark, ...]()
-    material = Material(data, roles, study.degree, options.blocks, len(candidates), budget)
-    tried = bool(found.found)
-    if tried:
-        naming = decide_naming(
-            found, by_each, model, material, candidates,
-            options=options, generator=np.random.default_rng(seed),
-        )  # fmt: skip
-        models, exact, remarks = naming.models, naming.exact, naming.remarks
-        found, left = naming.search, naming.remainder
-        verdict = MismatchVerdict.MISSING_PHYSICS if naming.named else MismatchVerdict.UNEXPLAINED
-    rounded = None
-    doubtful = not tried and (found.fit.has_process_noise or left.structured)
-    if doubtful or verdict is MismatchVerdict.UNEXPLAINED:
-        budget.says("asking whether the sensors' steps explain it")
-        with budget.exempt():
-            # What a mechanism has found already has to be gone more clearly.
-            least = RANDOM_RESIDUALS if tried else STRUCTURED
-            rounded = explained_by_rounding(model, data, least_squares, roles, least=least, budget=budget)
-    if rounded is not None:
-        found = replace(found, recalibrated=rounded.fit, found=(), fit=rounded.fit)
-        left, least_squares, naming, models, exact = rounded.left, rounded.fit, None, (), None
-        remarks = (Remark("diagnosis.quantised", {"outputs": ", ".join(rounded.outputs)}),)
-    p_shift = shift_probability(model, found.recalibrated)
-    if rounded is not None or not (tried or doubtful):
-        verdict = quiet_verdict(p_shift, options)
-    elif not tried and found.fit.has_process_noise:
-        verdict, models, remarks = driven(found, left, material, dictionary, options)
-    elif not tried:
-        verdict = MismatchVerdict.UNEXPLAINED
-    if verdict is MismatchVerdict.UNEXPLAINED and not (models or found.found):
-        models = models_of_the_nameless(found, material)
-    budget.says("working out how well parameters are known")
-    with budget.exempt():
-        covariance = covariance_with_unknown_forces(found.fit, data, budget=budget)
-    found = replace(found, fit=replace(found.fit, covariance=covariance))
-    return Investigation(
-        verdict=verdict,
-        model=model,
-        roles=roles,
-        search=found,
-        least_squares=least_squares,
-        augmented_least_squares=exact,
-        before=left.before,
-        after=left.after,
-        process_noise=verdict is MismatchVerdict.MISSING_PHYSICS and not found.found,
-        p_shift=p_shift,
-        share=left.share,
-        remarks=remarks,
-        candidates=tuple(candidates),
-        naming=naming,
-        models=models,
-        account=budget.account(),
-    )
-
-
-def driven(
-    found: Search,
-    left: Remainder,
-    material: Material,
-    dictionary: Sequence[Mechanism],
-    options: SearchOptions,
-) -> tuple[MismatchVerdict, tuple[Model, ...], tuple[Remark, ...]]:
-    """The verdict where random forces are needed and no mechanism was found, with models and remarks.
-
-    Random forces explain any recordings. They are named where nothing else is likelier, neither a function
-    instead of them nor one beside what is left of them: noise does not know where a system is, so that no
-    function of the states takes a part of it over.
-
-    Parameters
-    ----------
-    found, left
-        The search, and what its fit leaves.
-    material, options
-        What functions without a name are fitted with, and what a name takes.
-    dictionary
-        Random forces are named only where an entry of it knows them.
-    """
-    steady = unsteadiness(found.fit, material.data) < 2 * options.least_log_odds
-    remarks = () if steady else (Remark("diagnosis.noise_follows_motion"),)
-    knows_noise = any(form.noise for mechanism in dictionary for form in mechanism.forms)
-    if not (knows_noise and steady) or left.doubtful:
-        return MismatchVerdict.UNEXPLAINED, (), remarks
-    models = models_of_the_nameless(found, material)
-    if not models or models[0].log_evidence < options.least_log_odds:
-        return MismatchVerdict.MISSING_PHYSICS, (), remarks
-    return MismatchVerdict.UNEXPLAINED, models, remarks
-
-
-def remainders(
-    model: Dynamics, data: Measurements, search: Search, roles: Roles
-) -> tuple[Search, list[Remainder]]:
-    """What is left with each mechanism that was found, or of the recalibrated simulation where there is none.
-
-    A mechanism whose remainder has no finite size, such as one that makes the simulation run away without
-    random forces, is taken back, with those after it.
-
-    Raises
-    ------
-    NumericalFailure
-        When that of the recalibrated simulation has none, either.
-    """
-    left: list[Remainder] = []
-    for place, found in enumerate(search.found):
-        try:
-            left.append(what_is_left(model, data, search.recalibrated, found.best.fit, roles))
-        except NumericalFailure as error:
-            fit = search.found[place - 1].best.fit if place else search.recalibrated
-            untried = (*search.untried, UntriedMechanism(found.best.candidate, str(error)))
-            search = replace(search, found=search.found[:place], fit=fit, untried=untried)
-            break
-    return search, left or [what_is_left(model, data, search.recalibrated, search.recalibrated, roles)]
-
-
-def considered(
-    model: Dynamics, roles: Roles, dictionary: Sequence[Mechanism], study: MismatchStudy, *, file: str
-) -> list[MechanismCandidate]:
-    """The candidates of the dictionary, and monomials where the study or the lack of roles allows them."""
-    candidates = candidates_of(model, roles, dictionary, file=file)
-    if study.generic if study.generic is not None else not roles.physical:
-        monomials = generic_candidates(model, roles, degree=study.degree, named=candidates)
-        candidates += [each for each in monomials if each.coordinate != "constant"]
-    return candidates

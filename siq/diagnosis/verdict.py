@@ -93,9 +93,9 @@ def statement_of(investigation: Investigation, data: Measurements, shown: HeldOu
         verdict=verdict,
         mechanisms=found if verdict.names else (),
         description=Description(
-            share_described=investigation.share if found else 0.0,
+            share_described=investigation.remainder.share if found else 0.0,
             by=found,
-            p_residuals_random=investigation.after.p_value,
+            p_residuals_random=investigation.remainder.after.p_value,
             random_forces_admitted=search.fit.has_process_noise,
             too_faint=investigation.too_faint,
             p_alike=None if investigation.naming is None else investigation.naming.p_alike,
@@ -226,7 +226,7 @@ def _found_mechanisms(investigation: Investigation, card: Fit | None) -> tuple[S
                     if name in known
                 },
                 evidence=Evidence(trial.delta_chi2, trial.delta_bic, trial.p_white, trial.p_cluster, odds),
-                share_of_excess=investigation.share,
+                share_of_excess=investigation.remainder.share,
                 indistinguishable_from=tuple(sorted(alike)) if investigation.verdict.names else None,
                 equations=candidate.equations,
                 beside=tuple(labels[:place]),
@@ -328,7 +328,7 @@ def locate(investigation: Investigation, data: Measurements, described: Model | 
     described
         The model of it that is part of the new card; by default the likeliest one, if there is any.
     """
-    curves, search = investigation.before.curves, investigation.search
+    curves, search = investigation.remainder.before.curves, investigation.search
     candidate, outputs = None, tuple[str, ...]()
     if investigation.verdict.names and search.found:
         candidate = search.found[0].best.candidate
@@ -340,7 +340,7 @@ def locate(investigation: Investigation, data: Measurements, described: Model | 
             measured = set(candidate.model.output_names)
             outputs = tuple(name for name, _ in candidate.changes if name in measured)
     elif curves:
-        equations, coordinate = most_telling(investigation.before, investigation.roles)
+        equations, coordinate = most_telling(investigation.remainder.before, investigation.roles)
     else:
         equations, coordinate = (), "unknown"
     curve = next(
@@ -365,7 +365,7 @@ def locate(investigation: Investigation, data: Measurements, described: Model | 
     for each in curves:
         for name in each.direction.equations:
             gains[name] = max(gains.get(name, 0.0), each.gain)
-    total = max(investigation.before.total - investigation.before.freedom, 1e-300)
+    total = max(investigation.remainder.before.total - investigation.remainder.before.freedom, 1e-300)
     # Recordings whose residuals, process noise not admitted, exceed noise by a fair share of the excess.
     recalibrated = search.recalibrated
     still = Noise(search.fit.noise.measurement, np.zeros(recalibrated.model.dimension))

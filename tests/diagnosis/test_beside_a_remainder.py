@@ -12,7 +12,7 @@ import pytest
 from siq.data.recordings import Recordings
 from siq.diagnosis import naming
 from siq.diagnosis.evidence import correlation_time_of
-from siq.diagnosis.holdout import errors_left_out, first_better, parts_left_out
+from siq.diagnosis.holdout import cross_validation_folds, errors_left_out, first_better
 from siq.diagnosis.naming import MissingEffect, residual_model_comparison
 from siq.diagnosis.unnamed_models import Material, Model, runs_freely
 from siq.inference.kalman_filter import Whitened
@@ -168,7 +168,7 @@ def decays(count: int, samples: int, *, rate: float = 1.0) -> Measurements:
 def test_every_row_is_left_out_once_and_never_fitted_then(count: int, samples: int, parts: int) -> None:
     data = decays(count, samples)
     seen = []
-    every = list(parts_left_out(data))
+    every = list(cross_validation_folds(data))
     for part in every:
         np.testing.assert_array_equal(part.rest.outputs, data.outputs[part.rows])
         assert len(part.out.t) + len(part.rest.t) == len(data.t)
@@ -192,7 +192,7 @@ def test_what_is_left_out_is_foreseen_up_to_noise_and_parameters_are_fitted_to_t
     assert squares is not None and len(squares) > 150
     right = np.sqrt(squares.mean())
     # A fifth of each tells where it begins.
-    spread = np.array([part.out.outputs[12:].std() for part in parts_left_out(data)])
+    spread = np.array([part.out.outputs[12:].std() for part in cross_validation_folds(data)])
     assert right == pytest.approx(np.sqrt(np.mean((0.01 / spread) ** 2)), rel=0.3)
     # From wrong parameters it ends the same, since they are fitted again, but where they may not be.
     off = replace(fit, model=fit.model.with_values(np.array([1.3])))

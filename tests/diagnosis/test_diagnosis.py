@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from siq.diagnosis import holdout, investigation, search
-from siq.diagnosis.diagnosis import Diagnosis, anything_else, solve_case, withdrawn
+from siq.diagnosis.diagnosis import Diagnosis, solve_case, withdrawn
 from siq.diagnosis.dictionary import standard_dictionary
 from siq.diagnosis.evidence import TriedMechanism
 from siq.diagnosis.investigation import held_out_runs
@@ -476,4 +476,5 @@ def test_where_nothing_speaks_of_a_mismatch_but_a_refuted_name_there_is_none(tmp
     fit = found.search.recalibrated
     forced = replace(fit, noise=replace(fit.noise, process=np.array([0.0, 1e-3])))
     search = replace(found.search, recalibrated=forced)
-    assert anything_else(replace(refuted, search=search), (), diagnosis.case)
+    forced_one = withdrawn(replace(refuted, search=search), diagnosis.case, Budget())
+    assert str(forced_one.verdict) == "unexplained" and forced_one.withdrawn

@@ -15,6 +15,7 @@ import pytest
 import sympy
 import yaml
 from scipy.integrate import solve_ivp
+from siq.report.plots.proof import plot_foreign_proof
 
 from siq.diagnosis.study import Comparison, measurements_of, read_case
 from siq.systems.cards import load_system
