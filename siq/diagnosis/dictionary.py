@@ -222,17 +222,11 @@ class Dictionary(BaseModel):
 def standard_dictionary() -> tuple[Mechanism, ...]:
     """The mechanisms that come with the library."""
     with as_file(files("siq.diagnosis") / "mechanisms.yaml") as path:
-        return read_dictionary(path)
+        return _read_dictionary(path)
 
 
-def read_dictionary(path: str | Path) -> tuple[Mechanism, ...]:
-    """Read a file ``mechanisms: [...]``.
-
-    Raises
-    ------
-    InputError
-        With the line of the first entry that cannot be used.
-    """
+def _read_dictionary(path: str | Path) -> tuple[Mechanism, ...]:
+    """Read a file ``mechanisms: [...]``."""
     document = read_document(path)
     return validate(document, Dictionary).mechanisms
 

@@ -139,7 +139,7 @@ def correlation_time_left(fits: Sequence[Fit], data: Measurements) -> float:
     return correlation_time_of(left, white.recording, outputs=len(closest.model.outputs))
 
 
-def correlation_time(series: np.ndarray) -> float:
+def _correlation_time(series: np.ndarray) -> float:
     """Integral correlation time in samples: one and twice the autocorrelations up to the first negative."""
     power = float(series @ series)
     total = 1.0
@@ -180,7 +180,7 @@ def correlation_time_of(left: np.ndarray, recording: np.ndarray, *, outputs: int
     return total
 
 
-def blocks_of(recording: np.ndarray, left: np.ndarray, *, least: int) -> np.ndarray:
+def _blocks_of(recording: np.ndarray, left: np.ndarray, *, least: int) -> np.ndarray:
     """The block of each residual, numbered from 0, where recordings are cut into at least so many."""
     recordings = np.unique(recording)
     block = np.empty(len(recording), dtype=int)
@@ -189,7 +189,7 @@ def blocks_of(recording: np.ndarray, left: np.ndarray, *, least: int) -> np.ndar
         rows = np.flatnonzero(recording == place)
         parts = max(
             -(-least // len(recordings)),
-            int(len(rows) / (BLOCK_CORRELATION_TIMES * correlation_time(left[rows]))),
+            int(len(rows) / (BLOCK_CORRELATION_TIMES * _correlation_time(left[rows]))),
         )
         block[rows] = begun + (np.arange(len(rows)) * parts) // len(rows)
         begun += parts
@@ -202,7 +202,7 @@ def probability_by_chance(
     """Probability of a mechanism by chance, where errors of a recording are autocorrelated.
 
     Among many recordings each counts as one (`clustered_probability`). Of a few, blocks are too few to know a
-    covariance from them; how long errors are correlated is known all the same (`correlated_probability`).
+    covariance from them; how long errors are correlated is known all the same (`_correlated_probability`).
 
     Parameters
     ----------
@@ -216,10 +216,10 @@ def probability_by_chance(
     if len(data.labels) >= blocks // 2 or fit.has_process_noise or before.has_process_noise:
         return clustered_probability(fit, data, candidate, blocks=blocks)
     gained = 2 * (fit.log_likelihood - before.log_likelihood)
-    return correlated_probability(fit, data, candidate, gained=gained)
+    return _correlated_probability(fit, data, candidate, gained=gained)
 
 
-def correlated_probability(
+def _correlated_probability(
     fit: Fit, data: Measurements, candidate: MechanismCandidate, *, gained: float
 ) -> float:
     """Probability by chance of a gain in twice the log-likelihood, where errors are autocorrelated.
@@ -229,7 +229,7 @@ def correlated_probability(
     """
     white, _, left = residuals(fit, data)
     weights = np.bincount(white.recording)
-    times = [correlation_time(left[white.recording == place]) for place in range(len(weights))]
+    times = [_correlation_time(left[white.recording == place]) for place in range(len(weights))]
     together = float(np.average(times, weights=weights))
     places = [each.frequencies or len(each.at) for each in candidate.searches]
     alone = float(scipy.stats.chi2.sf(max(gained, 0.0) / together, max(len(candidate.new), 1)))
@@ -252,7 +252,7 @@ def clustered_probability(
     values = fit.model.values[[fit.model.free[place] for place in tested]] + change[tested]
     owner = white.recording
     if len(data.labels) < blocks // 2:
-        owner = blocks_of(owner, left, least=blocks)
+        owner = _blocks_of(owner, left, least=blocks)
     others = np.setdiff1d(np.arange(white.columns.shape[1]), tested)
     nuisance = np.linalg.qr(white.columns[:, others])[0] if len(others) else np.zeros((len(left), 0))
     columns = white.columns[:, tested] - nuisance @ (nuisance.T @ white.columns[:, tested])
@@ -291,26 +291,10 @@ def smooth_prior(knots: np.ndarray, length: float) -> np.ndarray:
     return np.exp(-0.5 * (distance / length) ** 2) + PRIOR_JITTER * np.eye(len(knots))
 
 
-def log_evidence(
+def _log_evidence(
     gram: np.ndarray, overlap: np.ndarray, prior: np.ndarray, *, total: float, freedom: float
 ) -> float:
-    """Log-likelihood of columns with normal coefficients, over that without them.
-
-    Parameters
-    ----------
-    gram, overlap
-        Of the columns with each other and with the target, in units of noise; shapes ``(k, k)`` and ``(k,)``.
-    prior
-        Covariance of the coefficients, shape ``(k, k)``.
-    total, freedom
-        Sum of squares of the target, and its degrees of freedom. The scale of the noise is at its best, so
-        that a target much larger than noise does not make small differences count.
-
-    Returns
-    -------
-    float
-        -½ log det(1 + K G) - ½ν log(1 - q/total), with q = bᵀ K (1 + G K)⁻¹ b.
-    """
+    """Log-likelihood of columns with normal coefficients, over that without them."""
     unit = np.eye(len(gram))
     inner = unit + gram @ prior
     sign, determinant = np.linalg.slogdet(inner)
@@ -322,8 +306,8 @@ def log_evidence(
 def averaged_evidence(
     gram: np.ndarray, overlap: np.ndarray, priors: Sequence[np.ndarray], total: float, freedom: float
 ) -> float:
-    """Logarithm of the mean evidence over priors; see `log_evidence`."""
-    values = [log_evidence(gram, overlap, prior, total=total, freedom=freedom) for prior in priors]
+    """Logarithm of the mean evidence over priors; see `_log_evidence`."""
+    values = [_log_evidence(gram, overlap, prior, total=total, freedom=freedom) for prior in priors]
     return float(scipy.special.logsumexp(values) - np.log(len(values)))
 
 
@@ -337,7 +321,7 @@ def evidences_by_size(
     gram, overlap
         Of the columns with each other and with the target, in units of noise; shapes ``(k, k)`` and ``(k,)``.
     total, freedom
-        Sum of squares of the target, and its degrees of freedom; see `log_evidence`.
+        Sum of squares of the target, and its degrees of freedom; see `_log_evidence`.
 
     Returns
     -------

@@ -66,10 +66,10 @@ class SimulationProtocol:
 
     def nearest(self, fits: list[Fit], data: Measurements) -> Fit:
         """The fit that runs nearest to recordings; the first of those that are as near, or run away."""
-        return fits[0] if len(fits) == 1 else min(fits, key=lambda fit: mean_error(self.errors(fit, data)))
+        return fits[0] if len(fits) == 1 else min(fits, key=lambda fit: _mean_error(self.errors(fit, data)))
 
 
-def mean_error(squares: np.ndarray | None) -> float:
+def _mean_error(squares: np.ndarray | None) -> float:
     """The mean of squared errors, infinite where a simulation ran away."""
     return float("inf") if squares is None else float(squares.mean())
 
@@ -200,7 +200,7 @@ def in_blocks(squares: np.ndarray) -> tuple[float, ...]:
 
 
 @dataclass(frozen=True)
-class Fold:
+class _Fold:
     """A part that is left out, the rest, and the rows of the rest in all of the recordings."""
 
     out: Measurements
@@ -208,7 +208,7 @@ class Fold:
     rows: np.ndarray
 
 
-def cross_validation_folds(learned: Measurements) -> Iterator[Fold]:
+def _cross_validation_folds(learned: Measurements) -> Iterator[_Fold]:
     """The recordings divided into parts, each left out once.
 
     Of recordings, so many at equal distances are a part; a single one is cut into stretches, of which the
@@ -251,7 +251,7 @@ def cross_validation_folds(learned: Measurements) -> Iterator[Fold]:
                 else:
                     joined.append((begin, end))
             kept, owners = joined, np.zeros(len(joined), dtype=int)
-        yield Fold(stretches([pieces[place] for place in group], owner[group])[0], *stretches(kept, owners))
+        yield _Fold(stretches([pieces[place] for place in group], owner[group])[0], *stretches(kept, owners))
 
 
 def errors_left_out(
@@ -280,7 +280,7 @@ def errors_left_out(
     positive = {name for each in candidates for name in each.positive.intersection(each.amplitudes)}
     runs = SimulationProtocol(noise, fit.substeps)
     squares = []
-    for fold in cross_validation_folds(learned):
+    for fold in _cross_validation_folds(learned):
         model, wrong = fit.model, {""}
         try:
             while wrong:
@@ -335,15 +335,15 @@ def adopted_by_held_out(
     errors = [runs.errors(fit, data) for _, fit in choices]
     # A card whose values are right foresees well, and tells nothing of a function whose fit had to find
     # them, too. Beside random forces a free run is off by these, and a little may be chance.
-    fitted_alone, lowest = mean_error(alone[-1]), mean_error(least)
+    fitted_alone, lowest = _mean_error(alone[-1]), _mean_error(least)
     limits = [
         0.0 if model.log_evidence < certain else lowest if model.fit.has_process_noise else fitted_alone
         for model, _ in choices
     ]
-    likeliest = first_better(least, errors, limits)
+    likeliest = _first_better(least, errors, limits)
     if likeliest is None:
         return None
-    sizes = [mean_error(each) for each in errors]
+    sizes = [_mean_error(each) for each in errors]
     return _simplest_of(sizes, [model.coordinates for model, _ in choices], likeliest)
 
 
@@ -380,10 +380,10 @@ def adopted_by_left_out(
         )
         for model, fit in choices
     ]
-    sizes = [mean_error(each) for each in errors]
+    sizes = [_mean_error(each) for each in errors]
     LOGGER.info("parts left out: mean squared errors %s with models of what has no name", sizes)
     best = int(np.argmin(sizes))
-    return best if first_better(alone, [errors[best]], [0.0]) == 0 else None
+    return best if _first_better(alone, [errors[best]], [0.0]) == 0 else None
 
 
 def _simplest_of(errors: Sequence[float], coordinates: Sequence[int], likeliest: int) -> int:
@@ -395,21 +395,10 @@ def _simplest_of(errors: Sequence[float], coordinates: Sequence[int], likeliest:
     return min(known, key=lambda place: (coordinates[place], place != likeliest, place))
 
 
-def first_better(
+def _first_better(
     without: np.ndarray | None, models: Iterable[np.ndarray | None], limits: Iterable[float]
 ) -> int | None:
-    """The place of the first of several models that foresees better than without it; None where none does.
-
-    Parameters
-    ----------
-    without
-        Squared errors without any of the models, shape ``(values,)``; None where it ran away.
-    models
-        Those of each model, the likeliest first.
-    limits
-        Mean squared errors below which a model need only be no worse than without it, by more than appears
-        by chance; zero for one that has to be better by more than that.
-    """
+    """The place of the first of several models that foresees better than without it; None where none does."""
     before = None if without is None else in_blocks(without)
     for place, (squares, limit) in enumerate(zip(models, limits, strict=True)):
         if squares is None:

@@ -1,4 +1,4 @@
-"""The investigation of a case, from its recalibration to what it lacks, and its runs of held-out recordings."""
+"""The investigation of a case, from its recalibration to what it lacks, and its runs of held-out data."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ def places_of(search: Shape, data: Measurements, model: Dynamics, x: np.ndarray)
             found = lattice_step(values)
         else:
             side = 1.0 if search.top_of is not None else -1.0
-            top = plateau(side * values, data.recording, noise=float(np.sqrt(data.roughness[place])))
+            top = _plateau(side * values, data.recording, noise=float(np.sqrt(data.roughness[place])))
             found = None if top is None else side * top
         return np.zeros(0) if found is None else np.array([found])
     text = search.scale_of or search.inverse_scale_of or search.quantiles_of or search.time_of
@@ -89,18 +89,8 @@ def lattice_step(values: np.ndarray) -> float | None:
     return step if np.abs(levels - numbers * step).max() < LATTICE_TOLERANCE * step else None
 
 
-def plateau(values: np.ndarray, recording: np.ndarray, *, noise: float) -> float | None:
-    """Where recorded values end, if they stay there for a while; None where they only turn.
-
-    Parameters
-    ----------
-    values
-        What a sensor recorded, shape ``(n,)``.
-    recording
-        The place of each value's recording; it never decreases. Shape ``(n,)``.
-    noise
-        Standard deviation of the sensor's noise: what lies within two of it on either side is at the end.
-    """
+def _plateau(values: np.ndarray, recording: np.ndarray, *, noise: float) -> float | None:
+    """Where recorded values end, if they stay there for a while; None where they only turn."""
     ends = values >= np.nanmax(values) - 4 * noise
     same = recording[2:] == recording[:-2]
     stays = ends[2:] & ends[1:-1] & ends[:-2] & same  # a parabola has two points of one height, not three
@@ -180,7 +170,7 @@ def build_candidate(
     """Build a mechanism into a model, for one assignment of names to roles; None where it changes nothing."""
     fresh: dict[str, str] = {}
     for name in (*form.parameters, *form.states):
-        fresh[name] = fresh_name(name, model, set(fresh.values()))
+        fresh[name] = _fresh_name(name, model, set(fresh.values()))
     names = _vocabulary(model, form, assignment, fresh)
     equations = dict(zip(model.states, model.equations, strict=True))
     outputs = dict(model.outputs)
@@ -216,7 +206,7 @@ def build_candidate(
     shapes = {name: entry.shape for name, entry in form.parameters.items() if entry.shape is not None}
     return MechanismCandidate(
         name=mechanism.name,
-        label=label_of(mechanism.name, form.variant, model, augmented),
+        label=_label_of(mechanism.name, form.variant, model, augmented),
         model=augmented,
         amplitudes=tuple(fresh[name] for name in form.parameters if name not in shapes),
         shapes=tuple(fresh[name] for name in shapes),
@@ -238,7 +228,7 @@ def build_candidate(
     )
 
 
-def fresh_name(name: str, model: Dynamics, taken: set[str] | None = None) -> str:
+def _fresh_name(name: str, model: Dynamics, taken: set[str] | None = None) -> str:
     """A name as in the dictionary, numbered so that it collides with none of the card."""
     used = set(model.names) | (taken or set())
     return next(f"{name}_{k}" for k in itertools.count(1) if f"{name}_{k}" not in used)
@@ -281,8 +271,8 @@ def _vocabulary(
     for role in (role for role, kind in form.roles.items() if kind == "output"):
         names[role] = dict(model.outputs)[assignment[role]]
         if {f"{role}_rate", f"{role}_curvature"} & wanted:
-            names[f"{role}_rate"] = rate_of(names[role], model)
-            names[f"{role}_curvature"] = rate_of(names[f"{role}_rate"], model)
+            names[f"{role}_rate"] = _rate_of(names[role], model)
+            names[f"{role}_curvature"] = _rate_of(names[f"{role}_rate"], model)
     states = [role for role, kind in form.roles.items() if kind not in ("input", "parameter", "output")]
     for one in states:
         names[f"{one}_rate"] = equations[assignment[one]]
@@ -302,7 +292,7 @@ def _words(form: Form) -> set[str]:
     return set(re.findall(r"[A-Za-z_]\w*", " ".join(map(str, texts))))
 
 
-def rate_of(formula: sympy.Expr, model: Dynamics) -> sympy.Expr:
+def _rate_of(formula: sympy.Expr, model: Dynamics) -> sympy.Expr:
     """Time derivative of a formula of states along the equations, inputs being held."""
     along = zip(model.states, model.equations, strict=True)
     return formula.diff(TIME) + sum(formula.diff(symbol(name)) * equation for name, equation in along)
@@ -338,7 +328,7 @@ def _units(model: Dynamics, assignment: Mapping[str, str]) -> dict[str, str]:
     return {role: known.get(name, "1") for role, name in assignment.items()} | {"T": model.time_unit}
 
 
-def label_of(name: str, variant: str, model: Dynamics, augmented: Dynamics) -> str:
+def _label_of(name: str, variant: str, model: Dynamics, augmented: Dynamics) -> str:
     """A mechanism's name, with its variant, and where it changes a simulation."""
     places = [
         state
@@ -362,19 +352,12 @@ INDEPENDENCE_TOLERANCE = (
 )
 
 
-def beyond_parameters(
+def _beyond_parameters(
     model: Dynamics, candidates: Sequence[MechanismCandidate]
 ) -> list[MechanismCandidate | None]:
     """Candidates less what the simulation's own parameters can do; None for those of which nothing is left.
 
     Of several amplitudes those are taken out that the parameters, together with those before, stand for.
-
-    Parameters
-    ----------
-    model
-        The simulation.
-    candidates
-        The simulation with a mechanism built in, each.
     """
     count = 2 * (len(model.free) + 6)
     x, signals = trial_points(model, count, either_sign=True)
@@ -392,7 +375,7 @@ def beyond_parameters(
         if not any(new):
             result.append(None)
         else:
-            result.append(without_amplitudes(each, model, needless) if needless else each)
+            result.append(_without_amplitudes(each, model, needless) if needless else each)
     return result
 
 
@@ -479,19 +462,12 @@ def _typical(shape: Shape, model: Dynamics, x: np.ndarray, signals: Signals) -> 
     return at * size if shape.scale_of is not None else at / size
 
 
-def without_amplitudes(
+def _without_amplitudes(
     candidate: MechanismCandidate, model: Dynamics, names: Collection[str]
 ) -> MechanismCandidate:
     """A candidate less some of its amplitudes, which a simulation's own parameters stand for.
 
     What is left adds to these, so that it may have either sign.
-
-    Parameters
-    ----------
-    candidate, model
-        The mechanism, and the simulation that it is built into.
-    names
-        Of the amplitudes, not all of them.
     """
     zero = dict.fromkeys(map(symbol, names), 0)
 
@@ -515,7 +491,7 @@ def without_amplitudes(
     changes = ((name, formula.subs(zero)) for name, formula in candidate.changes)
     return replace(
         candidate,
-        label=label_of(candidate.name, candidate.variant, model, reduced),
+        label=_label_of(candidate.name, candidate.variant, model, reduced),
         model=reduced,
         amplitudes=tuple(name for name in candidate.amplitudes if name not in names),
         positive=candidate.positive & set(candidate.shapes),
@@ -558,7 +534,7 @@ def candidates_of(
                     raise InputError(file, mechanism.name, error.fault, error.remedy) from None
                 if candidate is not None:
                     found.append((candidate, ", ".join(assignment.values())))
-    reduced = beyond_parameters(model, [each for each, _ in found])
+    reduced = _beyond_parameters(model, [each for each, _ in found])
     result: list[tuple[MechanismCandidate, str]] = []
     for each, (_, filled) in zip(reduced, found, strict=True):
         if each is not None and not any(_same(each, other) for other, _ in result):
@@ -617,7 +593,7 @@ def generic_candidates(
             if sum(powers) > degree:
                 continue
             monomial = sympy.prod([s**p for s, p in zip(states, powers, strict=True)])
-            new = fresh_name("c", model)
+            new = _fresh_name("c", model)
             units = {f"_{k}": unit for k, unit in enumerate(model.units)}
             per = "*".join(f"_{k}**{power}" for k, power in enumerate(powers) if power)
             unit = unit_of(f"_{place}/_t" + (f"/({per})" if per else ""), {**units, "_t": model.time_unit})
@@ -647,7 +623,7 @@ def generic_candidates(
             )
     have_names = {_added_square(each) for each in named} - {None}
     found = [each for each in found if _added_square(each) not in have_names]
-    return [each for each in beyond_parameters(model, found) if each is not None]
+    return [each for each in _beyond_parameters(model, found) if each is not None]
 
 
 def _added_square(candidate: MechanismCandidate) -> tuple[str, sympy.Expr] | None:

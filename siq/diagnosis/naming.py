@@ -68,7 +68,7 @@ FUNCTIONS_EXTENDED = 2  # functions in the place of the mechanism that get anoth
 EFFECTS_DRAWN = 300  # effects without a name, which tell a probability of 5 % to 1 %
 
 
-class MissingEffect:
+class _MissingEffect:
     """What is missing, as a linear problem: innovations without the mechanism, and what could explain them.
 
     Parameters
@@ -121,7 +121,7 @@ class MissingEffect:
         return evidence_of_function(self.projected(columns), self._target, knots, freedom=self._freedom)
 
 
-def log_odds_of_a_name(
+def _log_odds_of_a_name(
     fit: Fit,
     data: Measurements,
     candidates: Sequence[MechanismCandidate],
@@ -131,29 +131,14 @@ def log_odds_of_a_name(
     considered: Sequence[MechanismCandidate],
     unnamed: float,
 ) -> float:
-    """Logarithm of the odds that what is missing is the mechanism, rather than a function without a name.
-
-    Parameters
-    ----------
-    fit, data
-        The fit with the mechanism in place, and the recordings.
-    candidates
-        The mechanism; where there are several, all of them together against one function.
-    roles, model
-        The simulation as its author believes it, and the roles of its states.
-    considered
-        The mechanisms that could have been named: each name is as likely beforehand, and so is each of its
-        forms and places.
-    unnamed
-        Probability beforehand that what is missing has no name.
-    """
+    """Logarithm of the odds that what is missing is the mechanism, rather than a function without a name."""
     ours, theirs = -np.inf, []
     single = places_in(model, roles, data, fit.x)
     there = {name for each in candidates for name in each.equations}
     products = products_in([each for each in single if there & set(each.targets)], model, data, fit.x)
     for response, some in linearised_with_places(fit, data, (*single, *products)):
         white = whiten(response, data, fit.noise)
-        problem = MissingEffect(white, fit, candidates)
+        problem = _MissingEffect(white, fit, candidates)
         ours = problem.log_evidence_of_mechanisms()
         begin = len(fit.model.free)
         for place in some:
@@ -170,7 +155,7 @@ def log_odds_of_a_name(
     return float(named - nameless)
 
 
-def false_match_rate(
+def _false_match_rate(
     recalibrated: Fit,
     data: Measurements,
     probes: Sequence[Probe],
@@ -181,30 +166,7 @@ def false_match_rate(
     measurement: np.ndarray,
     generator: np.random.Generator,
 ) -> float:
-    """Probability that so many mechanisms explain as large a share of an effect that has no name.
-
-    Parameters
-    ----------
-    recalibrated, data
-        The simulation with nothing added, and the recordings.
-    probes
-        What could have been named.
-    roles
-        Of the simulation's states.
-    share
-        Of the excess that the mechanisms explain.
-    mechanisms
-        How many they are.
-    measurement
-        Variance of the measurement noise, shape ``(m,)``.
-    generator
-        Draws the effects.
-
-    Raises
-    ------
-    NumericalFailure
-        When the simulation, as linearised, runs away.
-    """
+    """Probability that so many mechanisms explain as large a share of an effect that has no name."""
     model, noise = recalibrated.model, Noise(measurement, np.zeros(recalibrated.model.dimension))
     effects = _drawn_effects(recalibrated, data, roles, noise, generator=generator)
     grid = Grid(data, min(recalibrated.substeps, PROBE_SUBSTEPS))
@@ -263,7 +225,7 @@ def _best_shares(effects: np.ndarray, groups: Sequence[np.ndarray], most: int) -
 
 
 @dataclass(frozen=True)
-class ResidualModelComparison:
+class _ResidualModelComparison:
     """How likely a mechanism is beside a function without a name, and what was fitted to know it.
 
     Attributes
@@ -285,7 +247,7 @@ class ResidualModelComparison:
     predicts_better: bool = False
 
 
-def residual_model_comparison(
+def _residual_model_comparison(
     trial: TriedMechanism,
     recalibrated: Fit,
     material: Material,
@@ -293,29 +255,8 @@ def residual_model_comparison(
     considered: Sequence[MechanismCandidate],
     unnamed: float,
     least: float,
-) -> ResidualModelComparison | None:
-    """Hold a mechanism against functions in its place, whatever else is missing being a function for both.
-
-    Parameters
-    ----------
-    trial
-        The mechanism, fitted without anything beside it.
-    recalibrated
-        The simulation without it.
-    material
-        What functions are fitted to.
-    considered
-        The mechanisms that could have been named.
-    unnamed
-        Probability beforehand that what is missing has no name.
-    least
-        Logarithm of the odds that decide.
-
-    Returns
-    -------
-    ResidualModelComparison or None
-        None where process noise stands in for what it leaves, or it has states of its own.
-    """
+) -> _ResidualModelComparison | None:
+    """Hold a mechanism against functions in its place, whatever else is missing being a function for both."""
     if trial.fit.has_process_noise or trial.fit.model.dimension > recalibrated.model.dimension:
         return None
     data = material.data
@@ -361,7 +302,7 @@ def residual_model_comparison(
             blocks.append(None if least_error is None else in_blocks(least_error))
         predicts_better = None not in blocks and change_between(*blocks) == "better"
         LOGGER.info("parts left out are predicted better with it: %s", predicts_better)
-    return ResidualModelComparison(log_odds, tuple(on_top), tuple(instead), predicts_better)
+    return _ResidualModelComparison(log_odds, tuple(on_top), tuple(instead), predicts_better)
 
 
 @dataclass(frozen=True)
@@ -405,7 +346,7 @@ class NamingDecision:
     exact: Fit | None = None
 
 
-def judge_mechanisms(
+def _judge_mechanisms(
     whole: Search,
     left: Sequence[Remainder],
     data: Measurements,
@@ -416,21 +357,7 @@ def judge_mechanisms(
     options: SearchOptions,
     generator: np.random.Generator,
 ) -> NamingDecision:
-    """Judge the mechanisms of a search, as far as they explain by themselves what is missing.
-
-    Parameters
-    ----------
-    whole
-        The search, that found at least one.
-    left
-        What is left with the first, the first two, and so on.
-    data, model, roles, candidates
-        The recordings, the simulation as its author believes it, and what could be named.
-    options
-        Of the search.
-    generator
-        Draws effects without a name.
-    """
+    """Judge the mechanisms of a search, as far as they explain by themselves what is missing."""
 
     def log_odds(number: int, chosen: Sequence[int]) -> float:
         return _log_odds(whole, number, chosen, data, model, roles, candidates, options)
@@ -441,7 +368,7 @@ def judge_mechanisms(
             return True, None
         recalibrated = whole.recalibrated
         try:
-            p_alike = false_match_rate(
+            p_alike = _false_match_rate(
                 recalibrated,
                 data,
                 [probe for each in candidates for probe in probes_of(each, data, model, recalibrated.x)],
@@ -511,16 +438,16 @@ def decide_naming(
         Draws effects without a name.
     """
     data, roles = material.data, material.roles
-    decision = judge_mechanisms(
+    decision = _judge_mechanisms(
         whole, left, data, model, roles, candidates, options=options, generator=generator
     )
-    beside: ResidualModelComparison | None = None
+    beside: _ResidualModelComparison | None = None
     # Only few functions are fitted; along the trajectories of a fit all are compared. Where these speak
     # against the name as clearly as something would have to speak for it, the few prove nothing.
     if not decision.convincing and (
         _log_odds(whole, 1, [0], data, model, roles, candidates, options) > -options.least_log_odds
     ):
-        beside = residual_model_comparison(
+        beside = _residual_model_comparison(
             whole.found[0].best, whole.recalibrated, material,
             considered=candidates, unnamed=options.unnamed, least=options.least_log_odds,
         )  # fmt: skip
@@ -564,7 +491,7 @@ def _log_odds(
     found = [each.best for each in search.found]
     named = [found[place].candidate for place in chosen]
     try:
-        odds = log_odds_of_a_name(
+        odds = _log_odds_of_a_name(
             found[number - 1].fit, data, named, roles, model, considered=candidates, unnamed=options.unnamed
         )
     except NUMERICAL_ERRORS as error:

@@ -25,7 +25,7 @@ LAGS = 12  # of autocorrelations
 
 
 @dataclass(frozen=True)
-class Direction:
+class _Direction:
     """In which equations a function of a coordinate may stand, and along which coordinate.
 
     Attributes
@@ -45,7 +45,7 @@ class Direction:
 
 
 @dataclass(frozen=True)
-class Curve:
+class _Curve:
     """What is missing in an equation along a coordinate, as far as the data tell.
 
     Attributes
@@ -60,7 +60,7 @@ class Curve:
         Probability of as much by chance.
     """
 
-    direction: Direction
+    direction: _Direction
     values: np.ndarray
     standard_errors: np.ndarray
     gain: float
@@ -83,7 +83,7 @@ class Structure:
         Sum of squared innovations and its degrees of freedom, at the measurement noise of the fit.
     """
 
-    curves: tuple[Curve, ...]
+    curves: tuple[_Curve, ...]
     p_curves: float
     p_autocorrelation: float
     total: float
@@ -95,10 +95,10 @@ class Structure:
         return min(1.0, 2 * min(self.p_curves, self.p_autocorrelation))
 
 
-class HatColumns:
+class _HatColumns:
     """Piecewise linear functions of coordinates, as `siq.inference.kalman_filter.linearise` wants them."""
 
-    def __init__(self, model: Dynamics, grid: Grid, directions: tuple[Direction, ...]) -> None:
+    def __init__(self, model: Dynamics, grid: Grid, directions: tuple[_Direction, ...]) -> None:
         self._model, self._grid, self._directions = model, grid, directions
         self.width = sum(len(each.knots) for each in directions)
 
@@ -108,7 +108,7 @@ class HatColumns:
         signals = self._grid.signals(node, ())
         place = 0
         for direction in self._directions:
-            course = coordinate_values(self._model, direction, x, signals.inputs, signals.t)
+            course = _coordinate_values(self._model, direction, x, signals.inputs, signals.t)
             hats = _hats(direction.knots, course)
             columns = slice(place, place + len(direction.knots))
             rows = [self._model.states.index(name) for name in direction.equations]
@@ -128,19 +128,21 @@ class HatColumns:
         return np.zeros((len(self._model.outputs), self.width, x.shape[1]))
 
 
-def directions_of(model: Dynamics, roles: Roles, data: Measurements, x: np.ndarray) -> tuple[Direction, ...]:
+def _directions_of(
+    model: Dynamics, roles: Roles, data: Measurements, x: np.ndarray
+) -> tuple[_Direction, ...]:
     """Every equation that may lack something, with every coordinate."""
     signals = data.signals(data.t, data.recording, delays=())
     pairs = {name for pair in roles.amplitudes for name in pair}
-    found: list[Direction] = []
+    found: list[_Direction] = []
 
     def add(equations: tuple[str, ...], coordinate: str, across: bool = False) -> None:
-        draft = Direction(equations, coordinate, across, np.empty(0))
-        course = coordinate_values(model, draft, x.T, signals.inputs, signals.t)
+        draft = _Direction(equations, coordinate, across, np.empty(0))
+        course = _coordinate_values(model, draft, x.T, signals.inputs, signals.t)
         if np.ptp(course) > 0:
             knots = np.unique(np.quantile(course, np.linspace(0, 1, HAT_KNOTS)))
             if len(knots) > 3:
-                found.append(Direction(equations, coordinate, across, knots))
+                found.append(_Direction(equations, coordinate, across, knots))
 
     for pair in roles.amplitudes:
         add(pair, "amplitude")
@@ -153,8 +155,8 @@ def directions_of(model: Dynamics, roles: Roles, data: Measurements, x: np.ndarr
     return tuple(found)
 
 
-def coordinate_values(
-    model: Dynamics, direction: Direction, x: np.ndarray, inputs: np.ndarray, t: np.ndarray
+def _coordinate_values(
+    model: Dynamics, direction: _Direction, x: np.ndarray, inputs: np.ndarray, t: np.ndarray
 ) -> np.ndarray:
     """The coordinate along trajectories, shape ``(n,)``."""
     if direction.coordinate == "t":
@@ -167,7 +169,7 @@ def coordinate_values(
     return inputs[[entry.name for entry in model.inputs].index(direction.coordinate)]
 
 
-def structure_of(
+def _structure_of(
     model: Dynamics,
     data: Measurements,
     fit: Fit,
@@ -175,25 +177,14 @@ def structure_of(
     *,
     noise: Noise | None = None,
 ) -> Structure:
-    """Describe what a fit leaves.
-
-    Parameters
-    ----------
-    model, data, fit
-        The simulation, the recordings, and the fit of the one to the other.
-    roles
-        Of the simulation's states.
-    noise
-        At which the innovations are taken; by default the fit's, which shows what is not random. Without
-        process noise they show all that the simulation does not explain.
-    """
-    directions = directions_of(model, roles, data, fit.x)
+    """Describe what a fit leaves."""
+    directions = _directions_of(model, roles, data, fit.x)
     grid = Grid(data, min(fit.substeps, RESPONSE_SUBSTEPS))
     noise = fit.noise if noise is None else noise
     parameters = len(fit.model.free)
 
-    def projected_with(some: tuple[Direction, ...]) -> tuple[Whitened, np.ndarray, np.ndarray]:
-        white = whiten(probe_response(model, grid, fit, HatColumns(model, grid, some)), data, noise)
+    def projected_with(some: tuple[_Direction, ...]) -> tuple[Whitened, np.ndarray, np.ndarray]:
+        white = whiten(probe_response(model, grid, fit, _HatColumns(model, grid, some)), data, noise)
         return white, *projected(white, parameters)
 
     white, left, _ = projected_with(())
@@ -213,7 +204,7 @@ def structure_of(
             rank = int((np.linalg.svd(own, compute_uv=False) > 1e-9 * max(np.abs(own).max(), 1e-300)).sum())
             p_value = float(scipy.stats.chi2.sf(max(gain, 0.0) / scale, max(rank, 1)))
             errors = np.sqrt(np.diag(covariance) * scale)
-            curves.append(Curve(direction, values, errors, gain, p_value))
+            curves.append(_Curve(direction, values, errors, gain, p_value))
     curves.sort(key=lambda each: -each.gain)
     best = min((each.p_value for each in curves), default=1.0)
     return Structure(
@@ -300,17 +291,17 @@ def what_is_left(
     roles
         Of the simulation's states.
     """
-    after = structure_of(final.model, data, final, roles)
+    after = _structure_of(final.model, data, final, roles)
     # Random forces that stand for missing physics take measurement noise with them; the final fit's is right.
     still = Noise(final.noise.measurement, np.zeros(model.dimension))
-    before = structure_of(model, data, recalibrated, roles, noise=still)
+    before = _structure_of(model, data, recalibrated, roles, noise=still)
     alone = after
     if final.has_process_noise:
-        alone = structure_of(final.model, data, final, roles, noise=final.noise.without_process())
-    return Remainder(before, after, explained_share(before, alone))
+        alone = _structure_of(final.model, data, final, roles, noise=final.noise.without_process())
+    return Remainder(before, after, _explained_share(before, alone))
 
 
-def explained_share(before: Structure, after: Structure) -> float:
+def _explained_share(before: Structure, after: Structure) -> float:
     """Share of the excess over measurement noise that the final simulation explains, without process noise.
 
     What is left is the excess that remains, or what a function of one coordinate still finds: where a fit
@@ -330,7 +321,7 @@ def something_left(current: Fit, data: Measurements) -> bool:
     if current.has_process_noise:
         return True
     try:
-        return structure_of(model, data, current, roles_of(model)).p_value < RANDOM_RESIDUALS
+        return _structure_of(model, data, current, roles_of(model)).p_value < RANDOM_RESIDUALS
     except NumericalFailure:  # a simulation that runs away lacks something, whatever it is
         return True
 
@@ -340,7 +331,7 @@ NOISE_SETTLED = 0.01  # relative change of the noise, at which they have settled
 
 
 @dataclass(frozen=True)
-class Unrounded:
+class _Unrounded:
     """A simulation that explains recordings but for rounding.
 
     Attributes
@@ -367,7 +358,7 @@ def explained_by_rounding(
     *,
     least: float = STRUCTURED,
     budget: Budget | None = None,
-) -> Unrounded | None:
+) -> _Unrounded | None:
     """The fit to the values that were rounded, if it leaves noise; None where it does not, or nothing rounds.
 
     Parameters
@@ -383,7 +374,7 @@ def explained_by_rounding(
     budget
         Charged for every evaluation.
     """
-    steps = steps_of(data)
+    steps = _steps_of(data)
     # What rounding does under noise half as wide as a step is white (Widrow and Kollár 2008), and fitted.
     coarse = steps > np.sqrt(strict.noise.measurement)
     if not (strict.converged and coarse.any()):
@@ -392,7 +383,7 @@ def explained_by_rounding(
     values = data
     for _ in range(QUANTISATION_ROUNDS):
         before = deviation
-        values, deviation = unrounded(data, simulated(fit, values), steps, before)
+        values, deviation = _unrounded(data, _simulated(fit, values), steps, before)
         fit = fit_by_multiple_shooting(
             fit.model, values, x=fit.x, noise=fit.noise, estimate_process=False, substeps=fit.substeps,
             budget=budget,
@@ -414,42 +405,25 @@ def explained_by_rounding(
     if left.after.p_value < least:
         return None
     names = tuple(name for name, wide in zip(model.output_names, coarse, strict=True) if wide)
-    return Unrounded(replace(strict, model=fit.model, x=fit.x), left, names)
+    return _Unrounded(replace(strict, model=fit.model, x=fit.x), left, names)
 
 
-def steps_of(data: Measurements) -> np.ndarray:
+def _steps_of(data: Measurements) -> np.ndarray:
     """The step on whose multiples the values of each output lie, zero where there is none; shape ``(m,)``."""
     return np.array([lattice_step(column) or 0.0 for column in data.outputs.T])
 
 
-def simulated(fit: Fit, data: Measurements) -> np.ndarray:
+def _simulated(fit: Fit, data: Measurements) -> np.ndarray:
     """What a fit says of the outputs, shape ``(n, m)``."""
     model = fit.model
     signals = Grid(data, fit.substeps).at_samples(model.lags(model.values))
     return model.functions.outputs(np.ascontiguousarray(fit.x.T), signals, model.values).T
 
 
-def unrounded(
+def _unrounded(
     data: Measurements, simulation: np.ndarray, steps: np.ndarray, deviation: np.ndarray
 ) -> tuple[Measurements, np.ndarray]:
-    """Recordings before they were rounded, as far as a simulation tells, and the deviation of their noise.
-
-    Parameters
-    ----------
-    data
-        What was recorded.
-    simulation
-        Outputs without noise, shape ``(n, m)``.
-    steps
-        Of each output, zero where nothing is rounded; shape ``(m,)``.
-    deviation
-        Of the noise of each output before rounding, shape ``(m,)``.
-
-    Returns
-    -------
-    Measurements, numpy.ndarray
-        With the expected values; and the deviation of what they are expected of, shape ``(m,)``.
-    """
+    """Recordings before they were rounded, as far as a simulation tells, and the deviation of their noise."""
     outputs, wide = data.outputs.copy(), deviation.copy()
     for place in np.flatnonzero(steps > 0):
         off = (data.outputs[:, place] - simulation[:, place]) / deviation[place]

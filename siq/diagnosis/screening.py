@@ -235,17 +235,7 @@ class _Compiled:
     def carried(
         self, grid: Grid, signals: np.ndarray, numbers: tuple[float, ...], begin: np.ndarray
     ) -> np.ndarray:
-        """The further states at all samples, shape ``(n, k)``.
-
-        Parameters
-        ----------
-        grid, signals
-            What is known at all nodes, shape ``(3 substeps, s, intervals)``.
-        numbers
-            All parameters.
-        begin
-            Where they begin, shape ``(recordings, k)``.
-        """
+        """The further states at all samples, shape ``(n, k)``."""
         tape = tape_of(self._further, self._memory_arguments)
         if tape is None:
             names = ", ".join(map(str, self._further))
@@ -399,7 +389,7 @@ def projected(white: Whitened, parameters: int) -> tuple[np.ndarray, np.ndarray]
     return left, further
 
 
-def screen(
+def _screen(
     linearisation: Linearisation,
     data: Measurements,
     fit: Fit,
@@ -407,24 +397,7 @@ def screen(
     *,
     positive: Sequence[np.ndarray],
 ) -> list[Screened]:
-    """Screen groups of columns.
-
-    Parameters
-    ----------
-    linearisation
-        With the columns of all groups behind those of the free parameters.
-    data, fit
-        The fit that is to be improved.
-    groups
-        The columns of each group, counted behind the parameters'.
-    positive
-        For each group which amplitudes must not be negative; one that would be is zero.
-
-    Raises
-    ------
-    NumericalFailure
-        When the simulation runs away at every level.
-    """
+    """Screen groups of columns."""
     parameters = len(fit.model.free)
     base = -np.inf
     best = [Screened(-np.inf, 1.0, np.zeros(0), np.zeros(0), finite=False)] * len(groups)
@@ -575,4 +548,4 @@ def _screened(
         np.array([name in probe.candidate.positive for name in probe.candidate.amplitudes] or [True])
         for probe in probes
     ]
-    return list(zip(probes, screen(response, data, current, groups, positive=positive), strict=True))
+    return list(zip(probes, _screen(response, data, current, groups, positive=positive), strict=True))

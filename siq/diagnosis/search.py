@@ -46,7 +46,7 @@ Standing = Literal["same", "needless", "less"]
 
 
 @dataclass(frozen=True)
-class Found:
+class _Found:
     """A mechanism that stood the tests, and what else was fitted in its place.
 
     Attributes
@@ -96,7 +96,7 @@ class Search:
     """
 
     recalibrated: Fit
-    found: tuple[Found, ...]
+    found: tuple[_Found, ...]
     fit: Fit
     screened: tuple[tuple[Probe, Screened], ...]
     untried: tuple[UntriedMechanism, ...] = ()
@@ -104,22 +104,10 @@ class Search:
     fruitless: frozenset[str] = frozenset()
 
 
-def accepted(
+def _accepted(
     trials: Sequence[TriedMechanism], probes: int, chance: float, *, options: SearchOptions
-) -> Found | None:
-    """The best of the trials that stand every test, with what cannot be told from it.
-
-    Parameters
-    ----------
-    trials
-        Candidates, fitted.
-    probes
-        How many were screened: the white test allows for them.
-    chance
-        Probability by which an effect clustered by recording may be one of chance.
-    options
-        Of the search.
-    """
+) -> _Found | None:
+    """The best of the trials that stand every test, with what cannot be told from it."""
     significant = [
         trial
         for trial in trials
@@ -147,7 +135,7 @@ def accepted(
 
     others = [other for other in trials if other is not best]
     equals = [other for other in others if other.delta_chi2 > least]
-    return Found(
+    return _Found(
         best,
         indistinguishable=tuple(other for other in equals if not needless(other)),
         needless=tuple(other for other in equals if needless(other)),
@@ -155,7 +143,7 @@ def accepted(
     )
 
 
-def better_without(
+def _better_without(
     trial: TriedMechanism,
     current: Fit,
     model: Dynamics,
@@ -168,19 +156,6 @@ def better_without(
 
     A mechanism may seem to explain much only because its fit found parameters of the simulation that its own
     fit had missed. Nothing is called missing before the simulation has begun there, too.
-
-    Parameters
-    ----------
-    trial
-        The mechanism.
-    current
-        The fit that it is held against.
-    model, data
-        The simulation without mechanisms, and the recordings.
-    least
-        Twice the difference of log-likelihoods, within which explanations cannot be told apart.
-    budget
-        Charged for the fit; None is the answer where it is spent.
     """
     fit = trial.fit
     known = {each.name: each.value for each in fit.model.parameters}
@@ -195,7 +170,7 @@ def better_without(
     return again if again.converged and gained > max(least, trial.delta_chi2 - least) else None
 
 
-def fit_most_promising(
+def _fit_most_promising(
     data: Measurements,
     current: Fit,
     base_model: Dynamics,
@@ -206,30 +181,7 @@ def fit_most_promising(
     blocks: int,
     budget: Budget | None = None,
 ) -> tuple[list[TriedMechanism], list[UntriedMechanism]]:
-    """Fit the candidates that promise most, each from its best probe.
-
-    Parameters
-    ----------
-    data
-        The recordings.
-    current, base_model
-        The fit that is to be improved, and its model.
-    screened
-        Every probe with what it would gain.
-    most
-        So many candidates at most, but for rivals of the best.
-    least_gain
-        Twice the increase of the log-likelihood that a candidate must promise.
-    blocks
-        For clustered errors; see `siq.diagnosis.evidence.probability_by_chance`.
-    budget
-        Charged for the work; what it does not reach is not fitted.
-
-    Returns
-    -------
-    list of TriedMechanism, list of UntriedMechanism
-        Those whose fit settled, with signs that their mechanism allows; and the others, with the reason.
-    """
+    """Fit the candidates that promise most, each from its best probe."""
     budget = budget or Budget()
     best = best_probes(screened)
     ranked = sorted(best.values(), key=lambda each: -each[1].gain)
@@ -246,7 +198,7 @@ def fit_most_promising(
                 substeps=current.substeps, values=current.model.values,
             )  # fmt: skip
             fit = fit_with_process_noise_as_needed(
-                with_start(probe, result, begin.model), data, begin, level=result.level, x=x, budget=budget
+                _with_start(probe, result, begin.model), data, begin, level=result.level, x=x, budget=budget
             )
             if not fit.converged:
                 raise NumericalFailure(fit.fault or "its fit does not settle")
@@ -331,7 +283,7 @@ def best_probes(
     return best
 
 
-def with_start(probe: Probe, result: Screened, base: Dynamics) -> Dynamics:
+def _with_start(probe: Probe, result: Screened, base: Dynamics) -> Dynamics:
     """The candidate's model with parameters to begin with: those of the base, and no effect yet.
 
     What screening found of the amplitudes is a start only where shapes need one: linearised amplitudes can be
@@ -427,7 +379,7 @@ def _extended(
         screened, unscreened = screen_all(
             base, data, current, remaining, fruitless=progress.fruitless, budget=budget
         )
-        trials, failed = fit_most_promising(
+        trials, failed = _fit_most_promising(
             data, current, base, screened,
             most=options.fitted, least_gain=options.same, blocks=options.blocks,
             budget=budget,
@@ -447,11 +399,11 @@ def _extended(
                 trial.candidate.label, trial.delta_chi2, trial.delta_bic, trial.p_white, trial.p_cluster,
             )  # fmt: skip
         chance = 5 * options.false_alarms / max(len(remaining), 1)
-        stands = accepted(trials, len(screened), chance, options=options)
-        best = accepted(trials, len(screened), 1.0, options=options)
+        stands = _accepted(trials, len(screened), chance, options=options)
+        best = _accepted(trials, len(screened), 1.0, options=options)
         if not (found or begun_anew) and best is not None:
             begun_anew = True
-            better = better_without(best.best, current, model, data, least=options.same, budget=budget)
+            better = _better_without(best.best, current, model, data, least=options.same, budget=budget)
             if better is not None:
                 LOGGER.info("%s led to better parameters, without it", best.best.candidate.label)
                 progress = replace(progress, recalibrated=better, fit=better, fruitless=frozenset())

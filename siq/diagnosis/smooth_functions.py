@@ -79,7 +79,7 @@ MOST_BUMPS = 100  # a guard on the time of a fit
 
 
 @dataclass(frozen=True)
-class Told:
+class _Told:
     """What a fit leaves says of a function's values, at a level of random forces.
 
     Attributes
@@ -100,7 +100,7 @@ class Told:
     """
 
     level: float
-    fine: SmoothFunction
+    fine: _SmoothFunction
     correlated: float
     gram: np.ndarray
     overlap: np.ndarray
@@ -108,9 +108,9 @@ class Told:
     freedom: float
     likelihood: float
 
-    def over(self, correlated: float) -> Told:
+    def over(self, correlated: float) -> _Told:
         """The same where so many samples hang together."""
-        return Told(
+        return _Told(
             self.level, self.fine, correlated, self.gram / correlated, self.overlap / correlated,
             self.total / correlated, self.freedom / correlated, self.likelihood / correlated,
         )  # fmt: skip
@@ -139,7 +139,7 @@ class Smoothness:
 
     shares: tuple[float, ...]
     deviation: float
-    told: Told
+    told: _Told
     noise: float
     log_evidence: float
     considered: int
@@ -167,7 +167,7 @@ def smoothness_of(
     if not alike:
         choices = list(itertools.product(some, repeat=len(ground.words)))
     # What processes of these lengths have for values at the finest bumps, as heights of these.
-    shapes = [fine.heights_of(triangle_of(fine.centres, np.array(each) * ground.ranges)) for each in choices]
+    shapes = [fine.heights_of(_triangle_of(fine.centres, np.array(each) * ground.ranges)) for each in choices]
     alone = -np.inf
     values: list[np.ndarray] = []
     highest, best = -np.inf, None
@@ -191,7 +191,7 @@ def smoothness_of(
     return replace(best, log_evidence=mean - alone)
 
 
-def likeliest_product(asked: Smoothness, ground: Ground, *, times: float = 1.0) -> ProductFunction:
+def likeliest_product(asked: Smoothness, ground: Ground, *, times: float = 1.0) -> _ProductFunction:
     """The likeliest product of two functions, where a function of two coordinates is asked for.
 
     Parameters
@@ -205,7 +205,7 @@ def likeliest_product(asked: Smoothness, ground: Ground, *, times: float = 1.0) 
     """
     told = asked.told
     by_value = told.fine.heights_of(told.fine.heights_of(told.gram).T)
-    return product_of(
+    return _product_of(
         ground,
         tuple(times * share for share in LENGTH_SCALES),
         points=told.fine.centres,
@@ -216,14 +216,14 @@ def likeliest_product(asked: Smoothness, ground: Ground, *, times: float = 1.0) 
     )
 
 
-def _told(fit: Fit, data: Measurements, fine: SmoothFunction, known: Part | None) -> list[Told]:
+def _told(fit: Fit, data: Measurements, fine: _SmoothFunction, known: Part | None) -> list[_Told]:
     """What is told at each level of random forces at which it can be worked out.
 
     Errors are as correlated as the likeliest level leaves them with such a function, at all levels.
     """
     grid = Grid(data, fit.substeps if known else min(fit.substeps, RESPONSE_SUBSTEPS))
     response = probe_response(fit.model, grid, fit, PlaceColumns(fit.model, grid, [fine]))
-    found: list[Told] = []
+    found: list[_Told] = []
     highest, correlated = -np.inf, 1.0
     for level in levels_of(fit):
         try:
@@ -236,7 +236,7 @@ def _told(fit: Fit, data: Measurements, fine: SmoothFunction, known: Part | None
         total, freedom = float(left @ left), white.degrees_of_freedom - parameters
         likelihood = profile_likelihood(total, freedom, white.log_determinant)
         found.append(
-            Told(level, fine, 1.0, columns.T @ columns, columns.T @ left, total, freedom, likelihood)
+            _Told(level, fine, 1.0, columns.T @ columns, columns.T @ left, total, freedom, likelihood)
         )
         basis = orthonormal(columns)
         rest = left - basis @ (basis.T @ left)
@@ -247,7 +247,7 @@ def _told(fit: Fit, data: Measurements, fine: SmoothFunction, known: Part | None
     return [each.over(correlated) for each in found]
 
 
-def _finest(ground: Ground, data: Measurements, model: Dynamics) -> tuple[float, SmoothFunction]:
+def _finest(ground: Ground, data: Measurements, model: Dynamics) -> tuple[float, _SmoothFunction]:
     """The shortest length, as a share of the range, of which the recordings need not too many bumps."""
     room = LARGEST_LINEARISATION // (len(data.t) * (model.dimension + len(model.outputs)))
     most = max(min(MOST_BUMPS, room), 1)
@@ -279,7 +279,7 @@ COVARIANCE_JITTER = 1e-6  # numerical: of the process's variance, added to it at
 
 
 class Smooth(Protocol):
-    """A smooth function with its bumps; see `SmoothFunction`."""
+    """A smooth function with its bumps; see `_SmoothFunction`."""
 
     @property
     def ground(self) -> Ground:
@@ -319,7 +319,7 @@ class Smooth(Protocol):
 
 
 @dataclass(frozen=True)
-class SmoothFunction:
+class _SmoothFunction:
     """A smooth function as a sum of bumps, and what is expected of it.
 
     Attributes
@@ -410,7 +410,7 @@ class SmoothFunction:
     @cached_property
     def triangle(self) -> np.ndarray:
         """Lower triangle L of the process's covariance at the centres over s², shape ``(b, b)``."""
-        return triangle_of(self.centres, self.lengths)
+        return _triangle_of(self.centres, self.lengths)
 
     def heights_of(self, values: np.ndarray) -> np.ndarray:
         """The heights with which it has given values ``(b,)`` at its centres."""
@@ -429,7 +429,7 @@ def smooth_function(
     deviation: float = 1.0,
     weight: float = 1.0,
     most: int | None = None,
-) -> SmoothFunction:
+) -> _SmoothFunction:
     """A smooth function with its bumps where the recordings have been.
 
     Parameters
@@ -439,7 +439,7 @@ def smooth_function(
     shares
         Its lengths, as shares of the coordinates' ranges.
     deviation, weight
-        See `SmoothFunction`.
+        See `_SmoothFunction`.
     most
         So many bumps at most; those left out are nearest to others.
     """
@@ -450,11 +450,11 @@ def smooth_function(
     else:
         apart = BUMP_SPACING * np.sqrt(len(shares))
         scaled = ground.courses / lengths[:, None]
-        centres = ground.courses[:, spread_out(scaled, apart=apart, most=most)].T
-    return SmoothFunction(ground, centres, lengths, deviation, weight)
+        centres = ground.courses[:, _spread_out(scaled, apart=apart, most=most)].T
+    return _SmoothFunction(ground, centres, lengths, deviation, weight)
 
 
-def spread_out(points: np.ndarray, *, apart: float, most: int | None = None) -> np.ndarray:
+def _spread_out(points: np.ndarray, *, apart: float, most: int | None = None) -> np.ndarray:
     """Indices of points ``(c, n)`` that are so far apart, beginning in their middle."""
     away = np.full(points.shape[1], np.inf)
     chosen = [int(np.argmin(((points - np.median(points, axis=1)[:, None]) ** 2).sum(axis=0)))]
@@ -481,7 +481,7 @@ def with_smooth_function(model: Dynamics, function: Smooth) -> MechanismCandidat
     return replace(candidate, model=begun)
 
 
-def triangle_of(points: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+def _triangle_of(points: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     """Lower triangle of the covariance of a process of unit size at points ``(b, c)``, shape ``(b, b)``."""
     likeness = np.exp(-0.5 * _squares(points / lengths, points / lengths))
     return np.linalg.cholesky(likeness + COVARIANCE_JITTER * np.eye(len(points)))
@@ -501,7 +501,7 @@ PRODUCT_TOLERANCE = 1e-4  # of what is left, by which a turn has to be better
 
 
 @dataclass(frozen=True)
-class ProductFunction:
+class _ProductFunction:
     """A product of two smooth functions, as two sums of bumps.
 
     Attributes
@@ -515,8 +515,8 @@ class ProductFunction:
     """
 
     ground: Ground
-    first: SmoothFunction
-    second: SmoothFunction
+    first: _SmoothFunction
+    second: _SmoothFunction
     begin: np.ndarray
 
     @property
@@ -559,7 +559,7 @@ class ProductFunction:
         return np.concatenate([self.first.limits, self.second.limits], axis=1)
 
 
-def product_of(
+def _product_of(
     ground: Ground,
     shares: tuple[float, ...],
     *,
@@ -568,24 +568,8 @@ def product_of(
     overlap: np.ndarray,
     deviation: float,
     weight: float = 1.0,
-) -> ProductFunction:
-    """The likeliest product, whose lengths may be any of several.
-
-    Parameters
-    ----------
-    ground
-        Where it stands.
-    shares
-        Lengths to choose among, as shares of the coordinates' ranges.
-    points
-        Where the recordings tell a function's values, shape ``(z, 2)``.
-    gram, overlap
-        Of what these values do to the innovations, in units of noise, with each other and with the
-        innovations: shapes ``(z, z)`` and ``(z,)``.
-    deviation, weight
-        The size that is expected of the product, and how often that counts against the data
-        (`siq.systems.dynamics.JointExpectation`).
-    """
+) -> _ProductFunction:
+    """The likeliest product, whose lengths may be any of several."""
     grounds = [
         Ground(ground.place, (ground.coordinates[side],), (ground.words[side],), ground.courses[side, None])
         for side in range(2)
@@ -605,7 +589,7 @@ def product_of(
                 for function, values in ((one, f), (other, deviation * g))
             ]
             sized = replace(other, deviation=deviation)
-            highest, best = evidence, ProductFunction(ground, one, sized, np.concatenate(heights))
+            highest, best = evidence, _ProductFunction(ground, one, sized, np.concatenate(heights))
     if best is None:
         raise NumericalFailure("no product of two functions has an evidence that is a number")
     return best

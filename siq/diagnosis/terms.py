@@ -79,18 +79,18 @@ def _compared(fit: Fit, data: Measurements, places: Sequence[Place]) -> list[Lik
     return [replace(each, log_evidence=each.log_evidence - alone) for each in ranked]
 
 
-def few_powers(likely: LikelyPlace, fit: Fit, data: Measurements, *, degree: int) -> tuple[Power, ...]:
-    """The powers that a formula needs: each added as long as it earns its place (Schwarz).
+def few_powers(likely: LikelyPlace, fit: Fit, data: Measurements, *, degree: int) -> tuple[_Power, ...]:
+    """The _powers that a formula needs: each added as long as it earns its place (Schwarz).
 
-    Errors count as correlated as all of the powers leave them (`siq.diagnosis.evidence`).
+    Errors count as correlated as all of the _powers leave them (`siq.diagnosis.evidence`).
     """
-    terms = powers(likely.place, degree=degree)
+    terms = _powers(likely.place, degree=degree)
     probe = Probe(with_formula(fit.model, likely.place, terms), ())
     grid = Grid(data, min(fit.substeps, PROBE_SUBSTEPS))
     columns = ProbeColumns(fit.model, grid, [probe], fit.x, fit.model.values)
     white = whiten(probe_response(fit.model, grid, fit, columns), data, fit.noise.scaled(likely.level))
     left, own = projected(white, len(fit.model.free))
-    count = independent(left, own, white, fit)
+    count = _independent(left, own, white, fit)
     chosen: list[int] = []
     total = float(left @ left)
     while len(chosen) < len(terms):
@@ -110,8 +110,8 @@ def few_powers(likely: LikelyPlace, fit: Fit, data: Measurements, *, degree: int
     return tuple(terms[place] for place in sorted(chosen))
 
 
-def independent(left: np.ndarray, columns: np.ndarray, white: Whitened, fit: Fit) -> float:
-    """How many errors count as independent, if columns are fitted to what is left."""
+def _independent(left: np.ndarray, columns: np.ndarray, white: Whitened, fit: Fit) -> float:
+    """How many errors count as _independent, if columns are fitted to what is left."""
     basis = orthonormal(columns)
     rest = left - basis @ (basis.T @ left)
     correlated = correlation_time_of(rest, white.recording, outputs=len(fit.model.outputs))
@@ -156,7 +156,7 @@ class Place:
 
     def values(self, courses: np.ndarray) -> np.ndarray:
         """What a unit at each knot does along courses ``(1, n)`` of the coordinate, shape ``(k, n)``."""
-        return cardinal_splines(self.knots, courses[0])
+        return _cardinal_splines(self.knots, courses[0])
 
     @property
     def targets(self) -> tuple[str, ...]:
@@ -164,7 +164,7 @@ class Place:
         return tuple(name for name, _ in (*self.equations, *self.outputs))
 
 
-class PlacedFunction(Protocol):
+class _PlacedFunction(Protocol):
     """A function with linear parameters, such as values at knots, in a place; see `Place`."""
 
     @property
@@ -190,7 +190,7 @@ class PlacedFunction(Protocol):
 class PlaceColumns:
     """Functions in many places, as `siq.inference.kalman_filter.linearise` wants them."""
 
-    def __init__(self, model: Dynamics, grid: Grid, places: Sequence[PlacedFunction]) -> None:
+    def __init__(self, model: Dynamics, grid: Grid, places: Sequence[_PlacedFunction]) -> None:
         self._model, self._grid, self._places = model, grid, places
         self.width = sum(each.width for each in places)
         names = (*model.states, *(entry.name for entry in model.inputs), "t")
@@ -229,7 +229,7 @@ class PlaceColumns:
         return result
 
 
-def cardinal_splines(knots: np.ndarray, course: np.ndarray) -> np.ndarray:
+def _cardinal_splines(knots: np.ndarray, course: np.ndarray) -> np.ndarray:
     """Natural cubic splines that are one at one knot and zero at the others, shape ``(k, n)``.
 
     What lies beyond the knots has the value at the last one.
@@ -299,13 +299,13 @@ def products_in(
         )
         for place in places
         if place.equations
-        for name, formula in factors_of(place, model).items()
+        for name, formula in _factors_of(place, model).items()
         if name not in place.words
     ]
     return tuple(_with_knots(found, model, data, x))
 
 
-def factors_of(place: Place, model: Dynamics) -> dict[str, sympy.Expr]:
+def _factors_of(place: Place, model: Dynamics) -> dict[str, sympy.Expr]:
     """What a function may be the coefficient of, by name: in a rotating frame only the amplitude."""
     if len(place.equations) > 1:
         first, second = (symbol(name) for name in place.targets)
@@ -325,7 +325,7 @@ def _with_knots(
     known: dict[sympy.Expr, np.ndarray] = {}
     for each in drafts:
         if each.coordinate not in known:
-            (course,) = courses_of((each.coordinate,), model, data, x)
+            (course,) = _courses_of((each.coordinate,), model, data, x)
             finite = course[np.isfinite(course)]
             known[each.coordinate] = (
                 np.unique(np.quantile(finite, np.linspace(0, 1, SPLINE_KNOTS)))
@@ -336,18 +336,10 @@ def _with_knots(
             yield replace(each, knots=known[each.coordinate])
 
 
-def courses_of(
+def _courses_of(
     coordinates: tuple[sympy.Expr, ...], model: Dynamics, data: Measurements, x: np.ndarray
 ) -> np.ndarray:
-    """What formulas of states, inputs and time are along recordings, shape ``(c, n)``.
-
-    Parameters
-    ----------
-    coordinates
-        The formulas.
-    model, data, x
-        The simulation, the recordings, and the states along them, shape ``(n, d)``.
-    """
+    """What formulas of states, inputs and time are along recordings, shape ``(c, n)``."""
     names = (*model.states, *(entry.name for entry in model.inputs), "t")
     compiled = compile_values(coordinates, [symbol(name) for name in names], common=False)
     signals = data.signals(data.t, data.recording, delays=())
@@ -381,12 +373,12 @@ Kind = Literal["formula", "curve", "surface", "mechanism"]
 FORMULA: Final = "formula"
 
 
-def described_name(place: Place) -> str:
+def _described_name(place: Place) -> str:
     """What a function without a name is called, such as ``a function of x and v``."""
     return f"a function of {' and '.join(place.words)}"
 
 
-def with_formula(model: Dynamics, place: Place, terms: Sequence[Power]) -> MechanismCandidate:
+def with_formula(model: Dynamics, place: Place, terms: Sequence[_Power]) -> MechanismCandidate:
     """The simulation with a sum of terms in a place, whose coefficients are the amplitudes."""
     names = fresh_names("c", len(terms), model)
     formula = sympy.Add(*(symbol(name) * term.formula for name, term in zip(names, terms, strict=True)))
@@ -394,24 +386,24 @@ def with_formula(model: Dynamics, place: Place, terms: Sequence[Power]) -> Mecha
     return built(model, _without_factor(place), formula, names, units)
 
 
-def simplest(place: Place, terms: Sequence[Power]) -> tuple[Place, tuple[Power, ...]]:
+def simplest(place: Place, terms: Sequence[_Power]) -> tuple[Place, tuple[_Power, ...]]:
     """The same terms as a function of the second coordinate alone, where the first is in none of them."""
     if len(place.words) == 1 or any(term.first for term in terms):
         return place, tuple(terms)
     alone = replace(
-        _without_factor(place), coordinate=second_coordinate(place), words=place.words[1:], knots=np.empty(0)
+        _without_factor(place), coordinate=_second_coordinate(place), words=place.words[1:], knots=np.empty(0)
     )
-    return alone, tuple(Power(term.formula, term.second) for term in terms)
+    return alone, tuple(_Power(term.formula, term.second) for term in terms)
 
 
 def _without_factor(place: Place) -> Place:
     """The same place, but that a function is not multiplied by the second coordinate."""
-    factor = second_coordinate(place)
+    factor = _second_coordinate(place)
     return replace(place, equations=tuple((name, each / factor) for name, each in place.equations))
 
 
 @dataclass(frozen=True)
-class Power:
+class _Power:
     """A term of a formula: what it is, and how often either coordinate is a factor of it."""
 
     formula: sympy.Expr
@@ -419,7 +411,7 @@ class Power:
     second: int = 0
 
 
-def powers(place: Place, *, degree: int) -> list[Power]:
+def _powers(place: Place, *, degree: int) -> list[_Power]:
     """Monomials of a place's coordinates up to a degree.
 
     Of a single coordinate there are the odd functions of even degree beside them, such as z∣z∣; a second
@@ -427,16 +419,16 @@ def powers(place: Place, *, degree: int) -> list[Power]:
     """
     z = place.coordinate
     if len(place.words) > 1:
-        factor = second_coordinate(place)
+        factor = _second_coordinate(place)
         return [
-            Power(z**i * factor**j, i, j)
+            _Power(z**i * factor**j, i, j)
             for i, j in itertools.product(range(degree + 1), range(1, degree + 1))
             if i + j <= degree
         ]
-    smooth = [Power(z**power, power) for power in range(degree + 1)]
+    smooth = [_Power(z**power, power) for power in range(degree + 1)]
     if place.words[0] in ("amplitude", "t"):
         return smooth
-    return [*smooth, *(Power(z ** (power - 1) * sympy.Abs(z), power) for power in range(2, degree + 1, 2))]
+    return [*smooth, *(_Power(z ** (power - 1) * sympy.Abs(z), power) for power in range(2, degree + 1, 2))]
 
 
 def fresh_names(stem: str, count: int, model: Dynamics) -> list[str]:
@@ -446,7 +438,7 @@ def fresh_names(stem: str, count: int, model: Dynamics) -> list[str]:
     return list(itertools.islice(free, count))
 
 
-def second_coordinate(place: Place) -> sympy.Expr:
+def _second_coordinate(place: Place) -> sympy.Expr:
     """What the function of the first coordinate is multiplied by: the second, or 1."""
     if len(place.words) == 1:
         return sympy.Integer(1)
@@ -474,11 +466,11 @@ def built(
         ),
         outputs=tuple((name, before + read.get(name, sympy.Integer(0))) for name, before in model.outputs),
     )
-    label = f"{described_name(place)} in {', '.join(place.targets)}"
+    label = f"{_described_name(place)} in {', '.join(place.targets)}"
     if place.outputs:
-        label = f"{described_name(place)} in the measurement of {', '.join(place.targets)}"
+        label = f"{_described_name(place)} in the measurement of {', '.join(place.targets)}"
     return MechanismCandidate(
-        name=described_name(place),
+        name=_described_name(place),
         label=label,
         model=augmented,
         amplitudes=tuple(names),
@@ -541,7 +533,7 @@ class Ground:
 
     def along(self, model: Dynamics, data: Measurements, x: np.ndarray) -> Ground:
         """The same ground where the recordings have been by other states, shape ``(n, d)``."""
-        return replace(self, courses=courses_of(self.coordinates, model, data, x))
+        return replace(self, courses=_courses_of(self.coordinates, model, data, x))
 
 
 def ground_of(place: Place, model: Dynamics, data: Measurements, x: np.ndarray) -> Ground:
@@ -554,7 +546,7 @@ def ground_of(place: Place, model: Dynamics, data: Measurements, x: np.ndarray) 
     model, data, x
         The simulation, the recordings, and the states along them, shape ``(n, d)``.
     """
-    courses = courses_of((place.coordinate,), model, data, x)
+    courses = _courses_of((place.coordinate,), model, data, x)
     return Ground(place, (place.coordinate,), place.words[:1], courses)
 
 
@@ -564,4 +556,4 @@ def ground_of_two(
     """The ground of a function of two states or inputs, in the equation of a state."""
     coordinates = tuple(symbol(name) for name in words)
     place = Place(((target, sympy.Integer(1)),), (), coordinates[0], words, np.empty(0))
-    return Ground(place, coordinates, words, courses_of(coordinates, model, data, x))
+    return Ground(place, coordinates, words, _courses_of(coordinates, model, data, x))

@@ -102,7 +102,7 @@ class Model:
     fit
         Of the simulation with all of it.
     log_evidence
-        Of the whole over that of the simulation without its parts, less the costs of these; see `weighed`.
+        Of the whole over that of the simulation without its parts, less the costs of these; see `_weighed`.
     exact
         The fit whose trajectories follow the equations, if random forces are part of `fit`.
     """
@@ -123,7 +123,7 @@ class Model:
         return sum(part.cost for part in self.parts)
 
 
-def weighed(models: Sequence[Model], alone: Fit, data: Measurements) -> list[Model]:
+def _weighed(models: Sequence[Model], alone: Fit, data: Measurements) -> list[Model]:
     """Models with their evidence over that of a simulation without their parts, the likeliest first.
 
     Errors are as correlated as the model that fits best leaves them (`correlation_time_left`), for all.
@@ -162,7 +162,7 @@ def runs_freely(fit: Fit, alone: Fit, data: Measurements) -> bool:
 LARGEST_PART = 0.25  # of the work left, that a single fit may take: a choice
 
 
-def fitted_part(
+def _fitted_part(
     candidate: MechanismCandidate,
     level: float,
     place: Place | None,
@@ -173,28 +173,7 @@ def fitted_part(
     smooth: Smooth | None = None,
     begin: Fit | None = None,
 ) -> list[Part]:
-    """A function as part of a model, or nothing where it cannot be fitted.
-
-    Parameters
-    ----------
-    candidate
-        The simulation with the function.
-    level
-        Of random forces to begin with, as a multiple of those of the fit.
-    place
-        Where the function stands; None for a memory.
-    fit
-        The simulation without it.
-    cost
-        Logarithm of the number of functions that it was chosen among.
-    material
-        What models are made from.
-    smooth
-        See `Part`.
-    begin
-        Where the fit begins, if it is not the simulation without the function: with states for those that
-        the function brings, if it brings any.
-    """
+    """A function as part of a model, or nothing where it cannot be fitted."""
     kind = FORMULA if smooth is None else smooth.kind
     try:
         material.budget.says(f"a {kind}: {candidate.label}")
@@ -209,13 +188,7 @@ def fitted_part(
 def _fitted_term(
     candidate: MechanismCandidate, level: float, begin: Fit, fit: Fit, material: Material
 ) -> TriedMechanism:
-    """A function, fitted from a fit on, and judged against the fit without it.
-
-    Raises
-    ------
-    NumericalFailure
-        When the fit does not settle.
-    """
+    """A function, fitted from a fit on, and judged against the fit without it."""
     data, budget = material.data, material.budget
     known = {each.name: each.value for each in begin.model.parameters}
     known |= {each.name: each.value for each in candidate.model.parameters if each.name in candidate.new}
@@ -250,7 +223,7 @@ SMOOTH_ROUNDS = 4  # of fits, each along the trajectories of the one before: a c
 LEAST_GAIN = 1.0  # of a logarithm of odds, below which another round is not worth its time
 
 
-def with_a_smooth_function(
+def _with_a_smooth_function(
     before: tuple[Part, ...],
     fit: Fit,
     ground: Ground,
@@ -260,23 +233,7 @@ def with_a_smooth_function(
     like: Model | None = None,
     product: bool = False,
 ) -> list[Model]:
-    """The likeliest model with a smooth function on a ground; none where none can be fitted.
-
-    Parameters
-    ----------
-    before, fit
-        What was added already, and the fit with it.
-    ground
-        Where the function stands.
-    cost
-        Logarithm of the number of functions that it was chosen among.
-    material
-        What models are made from.
-    like
-        A model with a function in its stead that explains a part, if there is one.
-    product
-        Whether it is to be a product of two functions of one coordinate each.
-    """
+    """The likeliest model with a smooth function on a ground; none where none can be fitted."""
     data = material.data
     if not ground.usable:
         return []
@@ -299,7 +256,7 @@ def with_a_smooth_function(
                 LOGGER.info("no function of %s can be worked out: %s", " and ".join(here.words), error)
                 break
             candidate = with_smooth_function(fit.model, function)
-            parts = fitted_part(
+            parts = _fitted_part(
                 candidate, level, ground.place, fit, price, material, smooth=function, begin=current
             )
         if not parts:
@@ -311,7 +268,7 @@ def with_a_smooth_function(
         )  # fmt: skip
         if likeliest is not None:
             new = {
-                each.fit is found.fit: each.log_evidence for each in weighed([likeliest, found], fit, data)
+                each.fit is found.fit: each.log_evidence for each in _weighed([likeliest, found], fit, data)
             }
             if new[True] < new[False] + LEAST_GAIN:
                 break
@@ -338,19 +295,8 @@ def _function(asked: Smoothness, ground: Ground, *, product: bool, times: float)
     return smooth_function(ground, shares, deviation=asked.deviation, weight=asked.told.correlated)
 
 
-def with_surfaces(fit: Fit, models: Sequence[Model], material: Material) -> list[Model]:
-    """Models with a smooth function of two coordinates, where the recordings tell both.
-
-    Parameters
-    ----------
-    fit
-        Of the simulation without functions.
-    models
-        Those with functions of one coordinate, or of one times another, the likeliest first: one of two is
-        asked for where the first ones have theirs, and has to be likelier there.
-    material
-        What models are made from.
-    """
+def _with_surfaces(fit: Fit, models: Sequence[Model], material: Material) -> list[Model]:
+    """Models with a smooth function of two coordinates, where the recordings tell both."""
     material.budget.says("comparing functions of two coordinates")
     data = material.data
     begins = _begins(fit, models, material)
@@ -378,7 +324,7 @@ def with_surfaces(fit: Fit, models: Sequence[Model], material: Material) -> list
     found: list[Model] = []
     for _, ground, like in ranked[:FUNCTIONS_FITTED]:
         for product in (True, False):
-            some = with_a_smooth_function((), fit, ground, price, material, like=like, product=product)
+            some = _with_a_smooth_function((), fit, ground, price, material, like=like, product=product)
             found += some
             if some and not something_left(some[0].fit, data):
                 return found  # nothing is left for a surface, nor for a less likely pair
@@ -442,9 +388,9 @@ def with_a_function(before: tuple[Part, ...], fit: Fit, material: Material) -> l
         id(each): each for each in (*ranked[:FUNCTIONS_FITTED], *itertools.islice(alone, 1))
     }.values():
         ground = ground_of(likely.place, fit.model, data, fit.x)
-        models += with_a_smooth_function(before, fit, ground, cost, material)
+        models += _with_a_smooth_function(before, fit, ground, cost, material)
     given = sum(part.cost for part in before)
-    found = [replace(each, log_evidence=each.log_evidence + given) for each in weighed(models, fit, data)]
+    found = [replace(each, log_evidence=each.log_evidence + given) for each in _weighed(models, fit, data)]
     for each in found:
         last = each.parts[-1]
         LOGGER.info(
@@ -475,7 +421,7 @@ def _formulas(
             for amplitude in candidate.amplitudes
         )
         if monomials not in done:
-            parts = fitted_part(candidate, likely.level, place, fit, cost, material)
+            parts = _fitted_part(candidate, likely.level, place, fit, cost, material)
             models += [Model((*before, each), each.trial.fit) for each in parts]
         done.add(monomials)
     return models
@@ -489,18 +435,11 @@ MEMORY_DAMPINGS = (0.1, 1.0)  # k of what rings, tried and then fitted: over man
 MEMORIES_FITTED = 6  # memories that are fitted, the most promising ones: a choice
 
 
-def memory_suspected(models: Sequence[Model], data: Measurements) -> bool:
+def _memory_suspected(models: Sequence[Model], data: Measurements) -> bool:
     """Whether models leave room for a memory: all but a function of one coordinate that leaves nothing.
 
     The time is no such coordinate, since nothing but the time itself knows it: what seems to depend on it may
     have been brought about before.
-
-    Parameters
-    ----------
-    models
-        Of what has no name, the likeliest first.
-    data
-        The recordings.
     """
     if not models:
         return True
@@ -510,21 +449,11 @@ def memory_suspected(models: Sequence[Model], data: Measurements) -> bool:
     return not told or something_left(best.fit, data)
 
 
-def with_memories(fit: Fit, models: Sequence[Model], material: Material) -> list[Model]:
-    """Models with a hidden state that follows a coordinate late, or that it makes ring.
-
-    Parameters
-    ----------
-    fit
-        Of the simulation without them.
-    models
-        Others: the equations in which these have something come first, should work be scarce.
-    material
-        What models are made from.
-    """
+def _with_memories(fit: Fit, models: Sequence[Model], material: Material) -> list[Model]:
+    """Models with a hidden state that follows a coordinate late, or that it makes ring."""
     likely = {name for each in models for part in each.parts for name in part.trial.candidate.equations}
     candidates = sorted(
-        memories_of(fit.model, material.roles), key=lambda each: not likely & set(each.equations)
+        _memories_of(fit.model, material.roles), key=lambda each: not likely & set(each.equations)
     )
     if not candidates:
         return []
@@ -562,13 +491,13 @@ def _fitted_memory(probe: Probe, result: Screened, fit: Fit, cost: float, materi
         LOGGER.info("%s cannot be fitted: %s", candidate.label, error)
         return []
     begin = replace(fit, x=x)
-    parts = fitted_part(candidate, result.level, None, fit, cost, material, begin=begin)
+    parts = _fitted_part(candidate, result.level, None, fit, cost, material, begin=begin)
     for each in parts:
         LOGGER.info("%s: chi2 better by %.1f", candidate.label, each.trial.delta_chi2)
     return [each for each in parts if admissible(each.trial.fit, candidate)]
 
 
-def memories_of(model: Dynamics, roles: Roles) -> list[MechanismCandidate]:
+def _memories_of(model: Dynamics, roles: Roles) -> list[MechanismCandidate]:
     """A memory of every coordinate in every equation that says more than a definition."""
     what = Mechanism(name="memory", sentence="What is missing follows a coordinate late.", forms=MEMORY_FORMS)
     return [_named(each) for each in candidates_of(model, roles, (what,))]
@@ -668,12 +597,12 @@ def models_of_the_nameless(
     base, data = search.recalibrated, material.data
     models = list(with_a_function((), base, material) if functions is None else functions)
     if search.found and np.isfinite(search.fit.log_likelihood):
-        models.append(Model(parts_of(search, material.considered), search.fit))
-    models = weighed(models, base, data)
+        models.append(Model(_parts_of(search, material.considered), search.fit))
+    models = _weighed(models, base, data)
     if functions is None:
-        models = weighed([*models, *with_surfaces(base, models, material)], base, data)
-        if memory_suspected(models, data):
-            models = weighed([*models, *with_memories(base, models, material)], base, data)
+        models = _weighed([*models, *_with_surfaces(base, models, material)], base, data)
+        if _memory_suspected(models, data):
+            models = _weighed([*models, *_with_memories(base, models, material)], base, data)
     best = models[0] if models else None
     if (
         best is not None
@@ -711,7 +640,7 @@ def models_beside_names(
         return with_a_function(parts, fit, material)
 
     models = list(functions or ())
-    parts = parts_of(whole, material.considered)[len(named.found) :]
+    parts = _parts_of(whole, material.considered)[len(named.found) :]
     fits = [each.best.fit for each in whole.found[len(named.found) :]]
     models += [Model(parts[: place + 1], fit) for place, fit in enumerate(fits)]
     if parts:
@@ -727,7 +656,7 @@ def models_beside_names(
     return likeliest(allowed, base, data)
 
 
-def parts_of(search: Search, considered: int) -> tuple[Part, ...]:
+def _parts_of(search: Search, considered: int) -> tuple[Part, ...]:
     """The mechanisms of a search as parts of a model, each chosen among so many."""
     cost = float(np.log(max(considered, 1)))
     return tuple(Part(each.best, MECHANISM, cost) for each in search.found)
@@ -737,7 +666,7 @@ def likeliest(models: Sequence[Model], alone: Fit, data: Measurements) -> tuple[
     """The few models that are likelier than the simulation without them, the likeliest first."""
     likelier = (
         each
-        for each in weighed(models, alone, data)
+        for each in _weighed(models, alone, data)
         if each.log_evidence > 0 and runs_freely(each.fit, alone, data)
     )
     return tuple(_followed(each, data) for each in itertools.islice(likelier, FUNCTIONS_FITTED))

@@ -81,7 +81,7 @@ def statement_of(investigation: Investigation, data: Measurements, shown: HeldOu
     parts = () if described is None else described.parts
     labels = [each.trial.candidate.label for each in parts]
     final = investigation.final if described_fit is None else described_fit
-    errors = standard_errors(final)
+    errors = _standard_errors(final)
     remarks = list(investigation.remarks)
     if investigation.account.partial:
         untried = sum(each.reason == BUDGET_SPENT for each in search.untried)
@@ -108,7 +108,7 @@ def statement_of(investigation: Investigation, data: Measurements, shown: HeldOu
             for place, part in enumerate(parts)
             if described_fit is not None
         ),
-        location=locate(investigation, data, described) if verdict.mismatch else None,
+        location=_locate(investigation, data, described) if verdict.mismatch else None,
         recalibration={
             entry.name: Recalibrated(
                 entry.value, float(final.model.values[place]), errors[entry.name], entry.unit
@@ -127,7 +127,7 @@ def statement_of(investigation: Investigation, data: Measurements, shown: HeldOu
     )
 
 
-def standard_errors(fit: Fit) -> dict[str, float]:
+def _standard_errors(fit: Fit) -> dict[str, float]:
     """Standard error of every free parameter, by name."""
     names = [fit.model.parameters[place].name for place in fit.model.free]
     return dict(zip(names, map(float, fit.standard_errors), strict=True))
@@ -199,7 +199,7 @@ def _found_mechanisms(investigation: Investigation, card: Fit | None) -> tuple[S
     labels = [each.best.candidate.label for each in search.found]
     log_odds = investigation.naming.log_odds if investigation.naming is not None else ()
     final = search.fit if card is None else card
-    errors, known = standard_errors(final), {entry.name: entry for entry in final.model.parameters}
+    errors, known = _standard_errors(final), {entry.name: entry for entry in final.model.parameters}
     stated = []
     for place, (found, odds) in enumerate(zip(search.found, log_odds, strict=True)):
         trial, candidate = found.best, found.best.candidate
@@ -239,7 +239,7 @@ def _found_mechanisms(investigation: Investigation, card: Fit | None) -> tuple[S
 def _stated_function(part: Part, fit: Fit, beside: tuple[str, ...]) -> StatedFunction:
     """A part of the model of what has no name, with its curve or surface and their standard errors."""
     trial, candidate, place, smooth = part.trial, part.trial.candidate, part.place, part.smooth
-    errors, known = standard_errors(fit), {entry.name: entry for entry in fit.model.parameters}
+    errors, known = _standard_errors(fit), {entry.name: entry for entry in fit.model.parameters}
     free = list(errors)
     changed = [name for name, _ in candidate.changes]
 
@@ -262,7 +262,7 @@ def _stated_function(part: Part, fit: Fit, beside: tuple[str, ...]) -> StatedFun
             factor = dict((*place.equations, *place.outputs))[name]
             columns = []
             for amplitude in candidate.amplitudes:
-                term = in_coordinate(formula.diff(symbol(amplitude)) / factor, place.coordinate)
+                term = _in_coordinate(formula.diff(symbol(amplitude)) / factor, place.coordinate)
                 value = compile_values([term], [COORDINATE], common=False)(knots)[0]
                 columns.append(np.broadcast_to(np.asarray(value, dtype=float), knots.shape))
             weights = np.stack(columns, axis=1)
@@ -303,7 +303,7 @@ def _stated_function(part: Part, fit: Fit, beside: tuple[str, ...]) -> StatedFun
     )
 
 
-def in_coordinate(term: sympy.Expr, coordinate: sympy.Expr) -> sympy.Expr:
+def _in_coordinate(term: sympy.Expr, coordinate: sympy.Expr) -> sympy.Expr:
     """A formula in `COORDINATE`, in the place of the formula that the coordinate is.
 
     The square of ``sqrt(P**2 + Q**2)`` has no root in it, so that what stands under the root is replaced.
@@ -313,20 +313,11 @@ def in_coordinate(term: sympy.Expr, coordinate: sympy.Expr) -> sympy.Expr:
     return term.subs(coordinate, COORDINATE)
 
 
-def locate(investigation: Investigation, data: Measurements, described: Model | None = None) -> Location:
+def _locate(investigation: Investigation, data: Measurements, described: Model | None = None) -> Location:
     """In which equation a mismatch sits, along which coordinate and where, and in which recordings.
 
     What has no name is where the model of it stands. Where nothing describes it, it is sought in all
     equations by what they leave unexplained.
-
-    Parameters
-    ----------
-    investigation
-        What was found.
-    data
-        The recordings that it was found in.
-    described
-        The model of it that is part of the new card; by default the likeliest one, if there is any.
     """
     curves, search = investigation.remainder.before.curves, investigation.search
     candidate, outputs = None, tuple[str, ...]()
@@ -340,7 +331,7 @@ def locate(investigation: Investigation, data: Measurements, described: Model | 
             measured = set(candidate.model.output_names)
             outputs = tuple(name for name, _ in candidate.changes if name in measured)
     elif curves:
-        equations, coordinate = most_telling(investigation.remainder.before, investigation.roles)
+        equations, coordinate = _most_telling(investigation.remainder.before, investigation.roles)
     else:
         equations, coordinate = (), "unknown"
     curve = next(
@@ -388,7 +379,7 @@ def locate(investigation: Investigation, data: Measurements, described: Model | 
     )
 
 
-def most_telling(structure: Structure, roles: Roles) -> tuple[tuple[str, ...], str]:
+def _most_telling(structure: Structure, roles: Roles) -> tuple[tuple[str, ...], str]:
     """The equation in which something is missing, and the coordinate along which it shows best.
 
     Where its own motion tells nearly as much as that of others, it is its own; and where any motion tells

@@ -12,8 +12,8 @@ import pytest
 from siq.data.recordings import Recordings
 from siq.diagnosis import naming
 from siq.diagnosis.evidence import correlation_time_of
-from siq.diagnosis.holdout import cross_validation_folds, errors_left_out, first_better
-from siq.diagnosis.naming import MissingEffect, residual_model_comparison
+from siq.diagnosis.holdout import _cross_validation_folds, _first_better, errors_left_out
+from siq.diagnosis.naming import _MissingEffect, _residual_model_comparison
 from siq.diagnosis.unnamed_models import Material, Model, runs_freely
 from siq.inference.kalman_filter import Whitened
 from siq.inference.measurements import Measurements, measurements
@@ -71,7 +71,7 @@ def test_evidence_counts_errors_that_hang_together_as_one() -> None:
             model=SimpleNamespace(free=(0, 1), parameters=parameters, values=values, outputs=("x",))
         )
         cubic = SimpleNamespace(amplitudes=("c",), shapes=())
-        return MissingEffect(white, fit, [cubic]).log_evidence_of_mechanisms()
+        return _MissingEffect(white, fit, [cubic]).log_evidence_of_mechanisms()
 
     alone, repeated = evidence(1), evidence(10)
     assert alone > 2
@@ -128,7 +128,7 @@ def test_a_name_stands_beside_a_rest_where_no_function_does_as_well_in_its_place
     monkeypatch.setattr(naming, "log_evidence_of", lambda fit, *_, **__: fit.evidence)
     material = SimpleNamespace(data=None)
     considered = [SimpleNamespace(name=name) for name in ("overflow", "overflow", "leak")]
-    found = residual_model_comparison(
+    found = _residual_model_comparison(
         trial_of(own), base, material, considered=considered, unnamed=0.1, least=2.9
     )
     # Each function costs what it was chosen among, and the probability that something has no name.
@@ -146,7 +146,7 @@ def test_what_random_forces_stand_in_for_has_no_model_beside_which_a_name_could_
     material = Material(SimpleNamespace(), SimpleNamespace(), 3, 10, 5)
     for fit in (fit_of(50.0, forces=True), fit_of(50.0, dimension=2)):
         assert (
-            residual_model_comparison(
+            _residual_model_comparison(
                 trial_of(fit), fit_of(0.0), material, considered=(), unnamed=0.1, least=2.9
             )
             is None
@@ -168,7 +168,7 @@ def decays(count: int, samples: int, *, rate: float = 1.0) -> Measurements:
 def test_every_row_is_left_out_once_and_never_fitted_then(count: int, samples: int, parts: int) -> None:
     data = decays(count, samples)
     seen = []
-    every = list(cross_validation_folds(data))
+    every = list(_cross_validation_folds(data))
     for part in every:
         np.testing.assert_array_equal(part.rest.outputs, data.outputs[part.rows])
         assert len(part.out.t) + len(part.rest.t) == len(data.t)
@@ -192,7 +192,7 @@ def test_what_is_left_out_is_foreseen_up_to_noise_and_parameters_are_fitted_to_t
     assert squares is not None and len(squares) > 150
     right = np.sqrt(squares.mean())
     # A fifth of each tells where it begins.
-    spread = np.array([part.out.outputs[12:].std() for part in cross_validation_folds(data)])
+    spread = np.array([part.out.outputs[12:].std() for part in _cross_validation_folds(data)])
     assert right == pytest.approx(np.sqrt(np.mean((0.01 / spread) ** 2)), rel=0.3)
     # From wrong parameters it ends the same, since they are fitted again, but where they may not be.
     off = replace(fit, model=fit.model.with_values(np.array([1.3])))
@@ -254,4 +254,4 @@ def test_the_likeliest_model_that_foresees_better_is_adopted(
 ) -> None:
     draw = np.random.default_rng(1)
     runs = [None if size is None else squares(draw, size) for size in (without, *models)]
-    assert first_better(runs[0], runs[1:], [runs[0].mean() if certain else 0.0] * len(models)) == place
+    assert _first_better(runs[0], runs[1:], [runs[0].mean() if certain else 0.0] * len(models)) == place

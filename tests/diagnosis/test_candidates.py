@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import sympy
 
-from siq.diagnosis.dictionary import dictionary_of, read_dictionary, roles_of, standard_dictionary, unit_of
+from siq.diagnosis.dictionary import _read_dictionary, dictionary_of, roles_of, standard_dictionary, unit_of
 from siq.diagnosis.mechanisms import candidates_of, generic_candidates
 from siq.errors import InputError
 from siq.numerics.files import Document, validate
@@ -199,7 +199,7 @@ def test_entries_that_cannot_be_used_are_refused(text: str, message: str, tmp_pa
     path = tmp_path / "mechanisms.yaml"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=message):
-        read_dictionary(path)
+        _read_dictionary(path)
 
 
 def test_a_formula_outside_the_whitelist_is_refused(oscillator: Dynamics, tmp_path) -> None:
@@ -210,4 +210,4 @@ def test_a_formula_outside_the_whitelist_is_refused(oscillator: Dynamics, tmp_pa
         encoding="utf-8",
     )
     with pytest.raises(InputError, match="evil"):
-        candidates_of(oscillator, roles_of(oscillator), read_dictionary(path), file="mechanisms.yaml")
+        candidates_of(oscillator, roles_of(oscillator), _read_dictionary(path), file="mechanisms.yaml")

@@ -223,7 +223,7 @@ def test_random_forces_are_no_noise_where_a_function_beside_them_is_likelier(
         return (Model((part,), search.recalibrated, 5.0),)
 
     monkeypatch.setattr(investigation, "models_of_the_nameless", models)
-    monkeypatch.setattr(holdout, "first_better", lambda *_: None)
+    monkeypatch.setattr(holdout, "_first_better", lambda *_: None)
     diagnosis = solved(tmp_path, recordings_of(nothing, drive=0.05, count=4), study={"held_out": ["r2"]})
     assert said(diagnosis)["verdict"] == "unexplained" and names(diagnosis) == []
     # It is located where the likeliest function stands.
@@ -297,7 +297,7 @@ def test_what_a_name_leaves_is_described_and_no_sample_of_a_test_chooses_it(
         first = replace(whole, found=whole.found[:1], fit=whole.found[0].best.fit)
         return NamingDecision(first, left[0], (9.0,), 9.0, None, convincing=True, named=True)
 
-    monkeypatch.setattr("siq.diagnosis.naming.judge_mechanisms", the_first_alone)
+    monkeypatch.setattr("siq.diagnosis.naming._judge_mechanisms", the_first_alone)
     table = recordings_of(lambda x, v, t: -2.0 * x**3 - 0.1 * v * np.abs(v), count=6)
     study = {"held_out": ["r2", "r4"], "tests": ["r2", "r4"], "search": {"mechanisms": 2}}
     diagnosis = solved(tmp_path, table, study=study)
@@ -405,14 +405,14 @@ def test_a_mechanism_that_overflows_ends_itself_and_not_the_diagnosis(tmp_path: 
 def test_a_candidate_whose_fit_fails_unforeseen_is_recorded_with_the_reason(
     error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    right = search.with_start
+    right = search._with_start
 
     def failing(probe: Probe, *further: Any) -> Dynamics:
         if probe.candidate.name == "cubic stiffness":
             raise error
         return right(probe, *further)
 
-    monkeypatch.setattr(search, "with_start", failing)
+    monkeypatch.setattr(search, "_with_start", failing)
     kept = {"cubic stiffness", "quintic stiffness"}
     without = [each.name for each in standard_dictionary() if each.name not in kept]
     study = {"held_out": ["r2"], "without": without}

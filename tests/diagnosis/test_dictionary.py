@@ -14,11 +14,11 @@ from homes_of_mechanisms import HOMES, RESIDENTS, model_of, numbers, recorded, s
 from siq.diagnosis.dictionary import Mechanism, Shape, roles_of, standard_dictionary
 from siq.diagnosis.mechanisms import (
     MechanismCandidate,
+    _plateau,
     candidates_of,
     generic_candidates,
     lattice_step,
     places_of,
-    plateau,
 )
 from siq.diagnosis.screening import screen_all
 from siq.diagnosis.study import SearchOptions
@@ -230,11 +230,11 @@ def test_a_sensor_ends_where_recorded_values_stay() -> None:
     wave = np.sin(0.3 * np.arange(200))
     one = np.zeros(200, dtype=int)
     noise = 0.01 * rng.normal(size=200)
-    assert plateau(np.minimum(wave, 0.7) + noise, one, noise=0.01) == pytest.approx(0.7, abs=0.01)
-    assert plateau(-np.maximum(wave, -0.5) + noise, one, noise=0.01) == pytest.approx(0.5, abs=0.01)
-    assert plateau(wave + noise, one, noise=0.01) is None
+    assert _plateau(np.minimum(wave, 0.7) + noise, one, noise=0.01) == pytest.approx(0.7, abs=0.01)
+    assert _plateau(-np.maximum(wave, -0.5) + noise, one, noise=0.01) == pytest.approx(0.5, abs=0.01)
+    assert _plateau(wave + noise, one, noise=0.01) is None
     # Three in a row belong to one recording.
-    assert plateau(np.array([0.0, 1.0, 1.0, 1.0, 0.0]), np.array([0, 0, 0, 1, 1]), noise=1e-3) is None
+    assert _plateau(np.array([0.0, 1.0, 1.0, 1.0, 0.0]), np.array([0, 0, 0, 1, 1]), noise=1e-3) is None
 
 
 def test_a_sawtooth_rounds_and_its_slope_is_that_of_what_it_rounds() -> None:

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import sympy
 
-from siq.diagnosis.evidence import evidence_of_function, log_evidence, orthonormal, smooth_prior
+from siq.diagnosis.evidence import _log_evidence, evidence_of_function, orthonormal, smooth_prior
 from siq.diagnosis.naming import _best_shares
 from siq.diagnosis.study import SearchOptions
-from siq.diagnosis.terms import Place, Power, fresh_names, powers, simplest, with_formula
+from siq.diagnosis.terms import Place, _Power, _powers, fresh_names, simplest, with_formula
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, symbol
 from siq.systems.formulas import compile_values
@@ -35,7 +35,7 @@ def test_the_evidence_is_that_of_a_normal_distribution() -> None:
     expected = -0.5 * np.linalg.slogdet(covariance)[1] - 20 * np.log(
         (target @ np.linalg.solve(covariance, target)) / (target @ target)
     )
-    found = log_evidence(
+    found = _log_evidence(
         columns.T @ columns, columns.T @ target, prior, total=float(target @ target), freedom=40
     )
     assert found == pytest.approx(expected, rel=1e-9)
@@ -100,7 +100,7 @@ def place(*words: str) -> Place:
 def test_coefficients_of_formulas_have_units(words: tuple[str, ...], terms: str, unit: str) -> None:
     where = place(*words)
     wanted = sympy.sympify(terms, {name: symbol(name) for name in ("c_1", "x", "v", "t")})
-    term = next(each for each in powers(where, degree=3) if symbol("c_1") * each.formula == wanted)
+    term = next(each for each in _powers(where, degree=3) if symbol("c_1") * each.formula == wanted)
     candidate = with_formula(OSCILLATOR, where, [term])
     assert candidate.model.equations[1] - OSCILLATOR.equations[1] == wanted
     assert candidate.model.parameters[-1].unit == unit
@@ -109,16 +109,16 @@ def test_coefficients_of_formulas_have_units(words: tuple[str, ...], terms: str,
 
 def test_a_formula_without_its_first_coordinate_is_one_of_the_second() -> None:
     t, w = symbol("t"), symbol("v")
-    alone, terms = simplest(place("t", "v"), [Power(w, 0, 1), Power(w**2, 0, 2)])
+    alone, terms = simplest(place("t", "v"), [_Power(w, 0, 1), _Power(w**2, 0, 2)])
     assert alone.words == ("v",) and alone.coordinate == w and alone.equations == (("v", sympy.Integer(1)),)
     assert [each.first for each in terms] == [1, 2]
-    both, _ = simplest(place("t", "v"), [Power(t * w, 1, 1)])
+    both, _ = simplest(place("t", "v"), [_Power(t * w, 1, 1)])
     assert both.words == ("t", "v")
 
 
 def test_new_names_are_new() -> None:
     assert fresh_names("c", 2, OSCILLATOR) == ["c_1", "c_2"]
-    again = with_formula(OSCILLATOR, place("x"), powers(place("x"), degree=2)[:2]).model
+    again = with_formula(OSCILLATOR, place("x"), _powers(place("x"), degree=2)[:2]).model
     assert fresh_names("c", 1, again) == ["c_3"]
 
 

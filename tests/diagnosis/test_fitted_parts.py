@@ -11,8 +11,8 @@ import sympy
 
 from siq.data.recordings import Recordings
 from siq.diagnosis import unnamed_models
-from siq.diagnosis.terms import Place, Power, with_formula
-from siq.diagnosis.unnamed_models import Material, fitted_part
+from siq.diagnosis.terms import Place, _Power, with_formula
+from siq.diagnosis.unnamed_models import Material, _fitted_part
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements, measurements
 from siq.inference.recalibration import recalibrate
@@ -37,11 +37,11 @@ def test_a_function_whose_fit_leads_away_begins_again(monkeypatch: pytest.Monkey
     _, alone = recalibrate(DECAY, data)
     assert not alone.has_process_noise
     place = Place((("x", sympy.Integer(1)),), (), X, ("x",), np.empty(0))
-    candidate = with_formula(alone.model, place, [Power(X**2, 2)])
+    candidate = with_formula(alone.model, place, [_Power(X**2, 2)])
     material = Material(data, SimpleNamespace(), 3, 10, 5)
 
     def fitted() -> Fit:
-        (part,) = fitted_part(candidate, 1.0, place, alone, 0.0, material)
+        (part,) = _fitted_part(candidate, 1.0, place, alone, 0.0, material)
         return part.trial.fit
 
     right = fitted()

@@ -18,11 +18,11 @@ from siq.diagnosis.search import Search
 from siq.diagnosis.terms import Place
 from siq.diagnosis.unnamed_models import (
     Material,
-    memories_of,
-    memory_suspected,
+    _memories_of,
+    _memory_suspected,
+    _weighed,
+    _with_memories,
     models_of_the_nameless,
-    weighed,
-    with_memories,
 )
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements, measurements
@@ -83,7 +83,7 @@ def test_a_memory_whose_fit_leads_away_begins_again(
         return replace(usual(*given, **options), log_likelihood=-1e3)
 
     monkeypatch.setattr(unnamed_models, "fit_with_process_noise_as_needed", leading_away)
-    found = with_memories(still, [], material(fading))
+    found = _with_memories(still, [], material(fading))
     kept = {each.parts[0].trial.candidate.label: each.fit.log_likelihood for each in found}
     assert kept["a memory of x in x"] > 2000 and kept["a memory of x in x, as a rate"] > -1e3
     # Nothing rings here: how much it is damped no recording tells, and such a fit may lead away once more.
@@ -91,13 +91,13 @@ def test_a_memory_whose_fit_leads_away_begins_again(
 
 
 def test_a_hidden_state_pays_for_its_beginnings(fading: Measurements, alone: Fit) -> None:
-    (model,) = weighed(with_memories(alone, [], material(fading))[:1], alone, fading)
+    (model,) = _weighed(_with_memories(alone, [], material(fading))[:1], alone, fading)
     gained = model.fit.log_likelihood - alone.log_likelihood
     assert model.log_evidence < gained - 0.5 * 6 * np.log(COUNT / 10)
 
 
 def test_every_coordinate_and_equation_has_its_memories() -> None:
-    labels = [each.label for each in memories_of(DECAY, roles_of(DECAY))]
+    labels = [each.label for each in _memories_of(DECAY, roles_of(DECAY))]
     assert labels == ["a memory of x in x", "a memory of x in x, as a rate", "a memory of x in x, that rings"]
 
 
@@ -112,7 +112,7 @@ def test_the_intensity_of_a_rotating_frame_has_its_own_unit() -> None:
         units=("mV", "mV"),
         time_unit="s",
     )
-    found = memories_of(frame, roles_of(frame))
+    found = _memories_of(frame, roles_of(frame))
     (shift, _) = (each for each in found if each.coordinate == "amplitude")
     assert shift.label == "a memory of amplitude in P, Q, across the state"
     assert shift.model.units == ("mV", "mV", "mV**2")
@@ -126,5 +126,5 @@ def test_the_time_is_suspected_of_standing_in_for_what_was(
     monkeypatch.setattr("siq.diagnosis.unnamed_models.something_left", lambda *_: False)
     place = Place((("x", sympy.Integer(1)),), (), X, words, np.empty(0))
     model = SimpleNamespace(parts=(SimpleNamespace(place=place),), fit=None)
-    assert memory_suspected([model], fading) is suspected
-    assert memory_suspected([], fading)
+    assert _memory_suspected([model], fading) is suspected
+    assert _memory_suspected([], fading)

@@ -13,14 +13,14 @@ import sympy
 from siq.data.recordings import Recordings
 from siq.diagnosis import naming
 from siq.diagnosis.dictionary import Roles, Shape
-from siq.diagnosis.evidence import TriedMechanism, blocks_of, correlated_probability, correlation_time
+from siq.diagnosis.evidence import TriedMechanism, _blocks_of, _correlated_probability, _correlation_time
 from siq.diagnosis.mechanisms import once_more
-from siq.diagnosis.naming import NamingDecision, judge_mechanisms
-from siq.diagnosis.residual_structure import Curve, Direction, Remainder, Structure
-from siq.diagnosis.screening import screen
-from siq.diagnosis.search import Found, Search, accepted, better_without
+from siq.diagnosis.naming import NamingDecision, _judge_mechanisms
+from siq.diagnosis.residual_structure import Remainder, Structure, _Curve, _Direction
+from siq.diagnosis.screening import _screen
+from siq.diagnosis.search import Search, _accepted, _better_without, _Found
 from siq.diagnosis.study import SearchOptions
-from siq.diagnosis.verdict import most_telling
+from siq.diagnosis.verdict import _most_telling
 from siq.inference.budget import Budget
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements, measurements
@@ -42,13 +42,13 @@ def autoregressive(memory: float, size: int) -> np.ndarray:
 
 @pytest.mark.parametrize("memory", [0.0, 0.5, 0.9])
 def test_the_correlation_time_of_an_autoregressive_series(memory: float) -> None:
-    found = correlation_time(autoregressive(memory, 40_000))
+    found = _correlation_time(autoregressive(memory, 40_000))
     assert found == pytest.approx((1 + memory) / (1 - memory), rel=0.15)
 
 
 def test_blocks_are_long_compared_with_correlations_and_never_span_recordings() -> None:
     recording = np.repeat([0, 1], [3000, 6000])
-    block = blocks_of(recording, autoregressive(0.9, 9000), least=10)
+    block = _blocks_of(recording, autoregressive(0.9, 9000), least=10)
     count = block.max() + 1
     assert sorted(set(block)) == list(range(count))
     assert 10 < count < 9000 / (3 * 19)
@@ -58,7 +58,7 @@ def test_blocks_are_long_compared_with_correlations_and_never_span_recordings() 
 
 
 def test_there_are_at_least_so_many_blocks() -> None:
-    assert blocks_of(np.zeros(400, dtype=int), autoregressive(0.99, 400), least=10).max() == 9
+    assert _blocks_of(np.zeros(400, dtype=int), autoregressive(0.99, 400), least=10).max() == 9
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +83,7 @@ def test_a_gain_weighs_as_much_as_there_are_independent_errors(decaying: Dynamic
     found = {}
     for memory in (0.0, 0.9):
         fit, data = fit_with_errors(decaying, 0.01 * autoregressive(memory, 2000))
-        found[memory] = correlated_probability(fit, data, candidate, gained=60.0)
+        found[memory] = _correlated_probability(fit, data, candidate, gained=60.0)
     assert found[0.0] == pytest.approx(scipy.stats.chi2.sf(60.0, 1), rel=30)
     assert 1e-3 < found[0.9] < 0.5  # about χ² of 60/19
 
@@ -94,8 +94,8 @@ def test_every_place_at_which_a_shape_was_looked_for_is_a_chance(decaying: Dynam
     often = SimpleNamespace(
         searches=(Shape(frequencies=90), Shape(scale_of="x", at=(1.0, 2.0))), new=("c", "w")
     )
-    alone = correlated_probability(fit, data, once, gained=30.0)
-    assert correlated_probability(fit, data, often, gained=30.0) == pytest.approx(180 * alone)
+    alone = _correlated_probability(fit, data, once, gained=30.0)
+    assert _correlated_probability(fit, data, often, gained=30.0) == pytest.approx(180 * alone)
 
 
 def test_an_amplitude_that_may_not_be_negative_is_zero_and_leaves_the_special_case(
@@ -111,7 +111,7 @@ def test_an_amplitude_that_may_not_be_negative_is_zero_and_leaves_the_special_ca
         measured_response=np.concatenate([known.measured_response, shapes[:, None, :]], axis=2),
         response=np.concatenate([known.response, np.zeros((*known.response.shape[:2], 2))], axis=2),
     )
-    either, first, both = screen(
+    either, first, both = _screen(
         with_shapes, data, fit, [slice(0, 2), slice(0, 1), slice(0, 2)],
         positive=[np.array([True, True]), np.array([True]), np.array([False, False])],
     )  # fmt: skip
@@ -139,7 +139,7 @@ def test_a_mechanism_that_was_found_is_not_found_once_more_in_another_form() -> 
 
 def structure(excess: float, *gains: tuple[str, str, float]) -> Structure:
     curves = [
-        Curve(Direction((equation,), coordinate, False, np.zeros(4)), np.zeros(4), np.ones(4), gain, 0.0)
+        _Curve(_Direction((equation,), coordinate, False, np.zeros(4)), np.zeros(4), np.ones(4), gain, 0.0)
         for equation, coordinate, gain in gains
     ]
     return Structure(tuple(curves), 0.0, 0.0, excess + 100, 100)
@@ -153,10 +153,10 @@ def remainder(share: float, p_curves: float = 1.0) -> Remainder:
 def found_with(number: int) -> Search:
     """A search that found so many mechanisms, one after the other."""
 
-    def found(place: int) -> Found:
+    def found(place: int) -> _Found:
         candidate = SimpleNamespace(name=f"mechanism {place}", label=f"mechanism {place}", number=place)
         fit = SimpleNamespace(number=place, has_process_noise=False, noise=SimpleNamespace(measurement=1.0))
-        return Found(TriedMechanism(candidate, fit, 100.0, -90.0, 0.0, 0.0), ())
+        return _Found(TriedMechanism(candidate, fit, 100.0, -90.0, 0.0, 0.0), ())
 
     each = tuple(found(place) for place in range(1, number + 1))
     return Search(SimpleNamespace(number=0, x=None), each, each[-1].best.fit, ())
@@ -187,16 +187,18 @@ POPULATIONS = Roles(populations=("prey", "predator"), states=("prey", "predator"
     ],
 )
 def test_the_coordinate_that_tells_most(roles: Roles, found: Structure, expected: str) -> None:
-    equations, coordinate = most_telling(found, roles)
+    equations, coordinate = _most_telling(found, roles)
     assert equations == (found.curves[0].direction.equations)
     assert coordinate == expected
 
 
 def test_of_a_rotating_frame_the_motion_is_its_amplitude() -> None:
-    across = Curve(Direction(("P", "Q"), "amplitude", True, np.zeros(4)), np.zeros(4), np.ones(4), 128.0, 0.0)
+    across = _Curve(
+        _Direction(("P", "Q"), "amplitude", True, np.zeros(4)), np.zeros(4), np.ones(4), 128.0, 0.0
+    )
     found = structure(370, ("Q", "t", 150.0))
     found = replace(found, curves=(*found.curves, across))
-    assert most_telling(found, FRAME) == (("P", "Q"), "amplitude")
+    assert _most_telling(found, FRAME) == (("P", "Q"), "amplitude")
 
 
 def judged(
@@ -214,10 +216,10 @@ def judged(
     ) -> float:
         return odds[candidates[0].number - 1] if len(candidates) == 1 else together
 
-    monkeypatch.setattr(naming, "log_odds_of_a_name", of_a_name)
-    monkeypatch.setattr(naming, "false_match_rate", lambda *_, **__: p_alike)
+    monkeypatch.setattr(naming, "_log_odds_of_a_name", of_a_name)
+    monkeypatch.setattr(naming, "_false_match_rate", lambda *_, **__: p_alike)
     data = SimpleNamespace()
-    return judge_mechanisms(
+    return _judge_mechanisms(
         found_with(len(odds)), left, data, SimpleNamespace(), MOTION, (),
         options=SearchOptions(wrong_names=0.05, unnamed=0.2), generator=np.random.default_rng(0),
     )  # fmt: skip
@@ -285,7 +287,7 @@ def test_of_equals_the_one_that_all_recordings_ask_for_where_white_errors_mean_l
         return TriedMechanism(SimpleNamespace(name=name, new=("c",)), fit, gain, 7.0 - gain, 0.0, p_cluster)
 
     trials = [trial("better", 331, 1e-9), trial("steadier", 325, 1e-49), trial("worse", 276, 1e-60)]
-    found = accepted(trials, 50, 1e-4, options=SearchOptions())
+    found = _accepted(trials, 50, 1e-4, options=SearchOptions())
     assert found is not None and found.best.candidate.name == expected
     assert {each.candidate.name for each in found.indistinguishable} == {"better", "steadier"} - {expected}
 
@@ -303,6 +305,6 @@ def test_nothing_is_missing_where_its_fit_only_found_better_parameters(decaying:
     missed = replace(
         right, model=right.model.with_values(np.array([9.0])), log_likelihood=right.log_likelihood - 40
     )
-    found = better_without(trial, missed, decaying, data, least=10.0, budget=Budget())
+    found = _better_without(trial, missed, decaying, data, least=10.0, budget=Budget())
     assert found is not None and found.model.values == pytest.approx(right.model.values, rel=1e-3)
-    assert better_without(trial, right, decaying, data, least=10.0, budget=Budget()) is None
+    assert _better_without(trial, right, decaying, data, least=10.0, budget=Budget()) is None

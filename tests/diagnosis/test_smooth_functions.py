@@ -17,11 +17,11 @@ from siq.diagnosis.evidence import evidences_by_size, log_evidence_of
 from siq.diagnosis.holdout import _simplest_of
 from siq.diagnosis.smooth_functions import (
     LENGTH_SCALES,
-    ProductFunction,
     Smooth,
-    product_of,
+    _product_of,
+    _ProductFunction,
+    _triangle_of,
     smooth_function,
-    triangle_of,
     with_smooth_function,
 )
 from siq.diagnosis.terms import Ground, Place
@@ -46,9 +46,9 @@ def ground(*coordinates: sympy.Symbol, count: int = 400) -> Ground:
     return Ground(place, coordinates, words, courses)
 
 
-def product() -> ProductFunction:
+def product() -> _ProductFunction:
     first, second = (smooth_function(ground(z), (0.25,)) for z in (X, V))
-    return ProductFunction(ground(X, V), first, second, np.ones(first.width + second.width))
+    return _ProductFunction(ground(X, V), first, second, np.ones(first.width + second.width))
 
 
 @pytest.mark.parametrize("function", [smooth_function(ground(X, V), (0.25, 0.5)), product()])
@@ -98,7 +98,7 @@ def test_length_and_size_of_a_function_are_told() -> None:
     fine = smooth_function(where, (1 / 32,))
     for share in np.repeat([1 / 16, 1 / 8, 1 / 4, 1 / 2], 5):
         heights = fine.heights_of(
-            triangle_of(fine.centres, share * where.ranges) @ draw.normal(size=fine.width)
+            _triangle_of(fine.centres, share * where.ranges) @ draw.normal(size=fine.width)
         )
         left = fine.along(heights, where.courses)[0] / noise + draw.normal(size=400)
         told = []
@@ -126,7 +126,7 @@ def test_a_product_is_told_where_both_coordinates_were_never_large_at_a_time() -
 
     told = true(*where.courses) + 0.02 * draw.normal(size=seen.sum())
     weights = np.eye(len(told)) / 0.02**2
-    found = product_of(
+    found = _product_of(
         where, LENGTH_SCALES, points=where.courses.T, gram=weights, overlap=weights @ told, deviation=1.0
     )
     corner = draw.uniform(1.2, 2.8, size=(2, 200))
@@ -165,11 +165,11 @@ def test_what_is_beyond_all_numbers_ends_a_function_and_not_the_case(monkeypatch
     where = SimpleNamespace(usable=True, words=("x",), along=lambda *_: where)
     fit, material = SimpleNamespace(model=MODEL, x=np.zeros((3, 2))), SimpleNamespace(data=None)
     monkeypatch.setattr(unnamed_models, "smoothness_of", singular)
-    assert unnamed_models.with_a_smooth_function((), fit, where, 0.0, material) == []
+    assert unnamed_models._with_a_smooth_function((), fit, where, 0.0, material) == []
     asked = SimpleNamespace(considered=9, told=SimpleNamespace(level=1.0))
     monkeypatch.setattr(unnamed_models, "smoothness_of", lambda *_, **__: asked)
     monkeypatch.setattr(unnamed_models, "likeliest_product", singular)
-    assert unnamed_models.with_a_smooth_function((), fit, where, 0.0, material, product=True) == []
+    assert unnamed_models._with_a_smooth_function((), fit, where, 0.0, material, product=True) == []
 
 
 def test_the_model_of_fewest_coordinates_is_taken_that_foresees_no_worse() -> None:
