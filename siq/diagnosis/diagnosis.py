@@ -289,7 +289,7 @@ def tables_of(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:
     case, found, shown = diagnosis.case, diagnosis.investigation, diagnosis.held_out
     curves = [
         {
-            "equation": ", ".join(curve.direction.equations),
+            "equation": ", ".join(curve.direction.names),
             "coordinate": curve.direction.coordinate,
             "across": curve.direction.across,
             "at": at,

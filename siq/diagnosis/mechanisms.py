@@ -1,11 +1,25 @@
-"""mechanisms"""
+"""Mechanisms built into a simulation, and which of them are no more than a recalibration.
+
+A mechanism is written for roles (`siq.diagnosis.dictionary`); here it becomes models, one for each way of
+filling the roles. Beside the roles its formulas may use what the simulation itself says of them: `v_rate`,
+the equation of the state v; `p_with_q`, the part of the equation of p in which q stands as well; `y_rate` and
+`y_curvature`, the first and second time derivative of the output y, inputs being held. What a mechanism does
+not depend on linearly is looked for about sizes, times and frequencies of the recorded motion; what the
+values themselves show of a sensor, its steps and the ends of its range, is read off them.
+
+Where a simulation has a free damping rate, linear damping is another value of it: no recording can tell the
+two apart, and a mechanism of that kind would only stand in the way of the parameter. To first order a
+mechanism adds the derivatives of f and h by its amplitudes; it is something new where these are linearly
+independent, as functions of states, inputs and time, of the derivatives by the free parameters. Generic
+monomials become candidates of the same kind, for systems whose states have no roles.
+"""
 
 from __future__ import annotations
 
 import itertools
 import re
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -179,10 +193,32 @@ def build_candidate(
     def parse(text: object, **other: sympy.Expr) -> sympy.Expr:
         return parse_formula(str(text), names | other, inputs=delayed)
 
-    changes = list(_built_in(form, assignment, parse, equations, outputs))
+    # Equations and outputs change as the form says; told is what is added, or else the new formula.
+    put = {symbol(assignment[role]): parse(text) for role, text in form.replace.items()}
+    for formulas in (equations, outputs):
+        for name in formulas:
+            formulas[name] = formulas[name].subs(put, simultaneous=True)
+    for role, texts in form.within.items():
+        name = assignment[role]
+        put = {symbol(assignment[other]): parse(text) for other, text in texts.items()}
+        equations[name] = equations[name].subs(put, simultaneous=True)
+    before = dict(zip(model.states, model.equations, strict=True))
+    changes = [(name, formula) for name, formula in equations.items() if formula != before[name]]
+    for role, text in form.terms.items():
+        added = parse(text)
+        equations[assignment[role]] += added
+        changes.append((assignment[role], added))
+    for role, text in form.outputs.items():
+        outputs[assignment[role]] = parse(text, **{role: outputs[assignment[role]]})
+        changes.append((assignment[role], outputs[assignment[role]]))
     if tuple(equations.values()) == model.equations and outputs == dict(model.outputs):
         return None
-    units = _units(model, assignment)
+    known = dict(zip(model.states, model.units, strict=True))
+    known |= {entry.name: entry.unit for entry in model.inputs}
+    known |= {entry.name: entry.unit for entry in model.parameters}
+    for name, formula in model.outputs:
+        known.setdefault(name, known.get(str(formula), "1"))
+    units = {role: known.get(name, "1") for role, name in assignment.items()} | {"T": model.time_unit}
     parameters = tuple(
         Parameter(
             fresh[name],
@@ -221,7 +257,7 @@ def build_candidate(
             for name, before in zip(model.states, model.equations, strict=True)
             if equations[name] != before
         ),
-        coordinate=_in_words(form.coordinate, assignment),
+        coordinate=" ".join(assignment.get(word, word) for word in form.coordinate.split()),
         changes=(*changes, *further),
         generalises=mechanism.generalises,
         variant=form.variant,
@@ -234,40 +270,17 @@ def _fresh_name(name: str, model: Dynamics, taken: set[str] | None = None) -> st
     return next(f"{name}_{k}" for k in itertools.count(1) if f"{name}_{k}" not in used)
 
 
-def _built_in(
-    form: Form,
-    assignment: Mapping[str, str],
-    parse: Callable[..., sympy.Expr],
-    equations: dict[str, sympy.Expr],
-    outputs: dict[str, sympy.Expr],
-) -> Iterator[tuple[str, sympy.Expr]]:
-    """Change equations and outputs as a form says, and tell what is added, or else the new formula."""
-    before = dict(equations)
-    put = {symbol(assignment[role]): parse(text) for role, text in form.replace.items()}
-    for formulas in (equations, outputs):
-        for name in formulas:
-            formulas[name] = formulas[name].subs(put, simultaneous=True)
-    for role, texts in form.within.items():
-        name = assignment[role]
-        put = {symbol(assignment[other]): parse(text) for other, text in texts.items()}
-        equations[name] = equations[name].subs(put, simultaneous=True)
-    yield from ((name, formula) for name, formula in equations.items() if formula != before[name])
-    for role, text in form.terms.items():
-        added = parse(text)
-        equations[assignment[role]] += added
-        yield assignment[role], added
-    for role, text in form.outputs.items():
-        outputs[assignment[role]] = parse(text, **{role: outputs[assignment[role]]})
-        yield assignment[role], outputs[assignment[role]]
-
-
 def _vocabulary(
     model: Dynamics, form: Form, assignment: Mapping[str, str], fresh: Mapping[str, str]
 ) -> dict[str, sympy.Expr]:
     """What every name in a form's formulas stands for."""
     equations = dict(zip(model.states, model.equations, strict=True))
     names: dict[str, sympy.Expr] = {role: symbol(name) for role, name in assignment.items()}
-    wanted = _words(form)  # the others are not worked out: formulas of many terms take their time
+    within = (text for texts in form.within.values() for text in texts.values())
+    states_of = (text for each in form.states.values() for text in (each.equation, each.scale, each.begin))
+    texts = (*form.terms.values(), *form.replace.values(), *form.outputs.values(), *within, *states_of)
+    # The others are not worked out: formulas of many terms take their time.
+    wanted = set(re.findall(r"[A-Za-z_]\w*", " ".join(map(str, texts))))
     for role in (role for role, kind in form.roles.items() if kind == "output"):
         names[role] = dict(model.outputs)[assignment[role]]
         if {f"{role}_rate", f"{role}_curvature"} & wanted:
@@ -282,14 +295,6 @@ def _vocabulary(
                 equations[assignment[one]], assignment[one], assignment[other]
             )
     return names | {name: symbol(new) for name, new in fresh.items()} | {"t": TIME}
-
-
-def _words(form: Form) -> set[str]:
-    """The names that a form's formulas use."""
-    within = (text for texts in form.within.values() for text in texts.values())
-    states = (text for each in form.states.values() for text in (each.equation, each.scale, each.begin))
-    texts = (*form.terms.values(), *form.replace.values(), *form.outputs.values(), *within, *states)
-    return set(re.findall(r"[A-Za-z_]\w*", " ".join(map(str, texts))))
 
 
 def _rate_of(formula: sympy.Expr, model: Dynamics) -> sympy.Expr:
@@ -313,19 +318,6 @@ def _in_names(shape: Shape, names: Mapping[str, sympy.Expr], assignment: Mapping
         if (role := getattr(shape, key)) is not None:
             texts[key] = assignment[role]
     return shape.model_copy(update=texts)
-
-
-def _in_words(coordinate: str, assignment: Mapping[str, str]) -> str:
-    return " ".join(assignment.get(word, word) for word in coordinate.split())
-
-
-def _units(model: Dynamics, assignment: Mapping[str, str]) -> dict[str, str]:
-    known = dict(zip(model.states, model.units, strict=True))
-    known |= {entry.name: entry.unit for entry in model.inputs}
-    known |= {entry.name: entry.unit for entry in model.parameters}
-    for name, formula in model.outputs:
-        known.setdefault(name, known.get(str(formula), "1"))
-    return {role: known.get(name, "1") for role, name in assignment.items()} | {"T": model.time_unit}
 
 
 def _label_of(name: str, variant: str, model: Dynamics, augmented: Dynamics) -> str:
@@ -535,36 +527,22 @@ def candidates_of(
                 if candidate is not None:
                     found.append((candidate, ", ".join(assignment.values())))
     reduced = _beyond_parameters(model, [each for each, _ in found])
-    result: list[tuple[MechanismCandidate, str]] = []
+    # Ways of filling the roles of a mechanism that end in one model are one.
+    models: dict[object, tuple[MechanismCandidate, str]] = {}
     for each, (_, filled) in zip(reduced, found, strict=True):
-        if each is not None and not any(_same(each, other) for other, _ in result):
-            result.append((each, filled))
-    return _told_apart(result)
-
-
-def _same(one: MechanismCandidate, other: MechanismCandidate) -> bool:
-    """Whether two ways of filling the roles of a mechanism end in one model."""
-    return (
-        one.name == other.name
-        and one.model.equations == other.model.equations
-        and one.model.outputs == other.model.outputs
-    )
-
-
-def _told_apart(found: Sequence[tuple[MechanismCandidate, str]]) -> list[MechanismCandidate]:
-    """Labels that occur once, where needed with what fills the roles, and then with what is added.
-
-    Two parameters of one equation may drift, each of two species be satiated, and a coupling have two forms.
-    """
-    by_label = Counter(each.label for each, _ in found)
-    by_roles = Counter((each.label, roles) for each, roles in found)
+        if each is not None:
+            models.setdefault((each.name, each.model.equations, each.model.outputs), (each, filled))
+    # Labels occur once, where needed with what fills the roles, and then with what is added: two parameters
+    # of one equation may drift, each of two species be satiated, and a coupling have two forms.
+    by_label = Counter(each.label for each, _ in models.values())
+    by_roles = Counter((each.label, filled) for each, filled in models.values())
     result = []
-    for each, roles in found:
-        if by_label[each.label] > 1:
+    for each, filled in models.values():
+        label = each.label
+        if by_label[label] > 1:
             added = "; ".join(str(formula) for _, formula in each.changes)
-            known = roles if by_roles[each.label, roles] == 1 else added
-            each = replace(each, label=f"{each.label} ({known})")
-        result.append(each)
+            label = f"{label} ({filled if by_roles[label, filled] == 1 else added})"
+        result.append(replace(each, label=label))
     return result
 
 

@@ -6,10 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.stats
+import sympy
 
 from siq.diagnosis.dictionary import Roles, roles_of
 from siq.diagnosis.mechanisms import lattice_step
-from siq.diagnosis.screening import in_portions, probe_response, projected
+from siq.diagnosis.screening import PROBE_SUBSTEPS, in_portions, probe_response, projected
+from siq.diagnosis.terms import PlaceColumns, coordinates_of, courses_of
 from siq.errors import NumericalFailure
 from siq.inference.budget import Budget
 from siq.inference.kalman_filter import Grid, Noise, Whitened, profile_likelihood, solve, whiten
@@ -17,35 +19,64 @@ from siq.inference.maximum_likelihood import Fit, fit_by_multiple_shooting
 from siq.inference.measurements import Measurements
 from siq.inference.noise import first_noise, likelihood_sums
 from siq.inference.recalibration import FAINT, process_noise_needed
-from siq.systems.dynamics import Dynamics
+from siq.systems.dynamics import Dynamics, symbol
 
 HAT_KNOTS = 9  # of the functions that are tried: a choice
-RESPONSE_SUBSTEPS = 2  # between samples, for the response to these functions
+TINY_AMPLITUDE = sympy.Float(1e-300)  # so that a system at rest has a direction, which is none
 LAGS = 12  # of autocorrelations
 
 
 @dataclass(frozen=True)
-class _Direction:
-    """In which equations a function of a coordinate may stand, and along which coordinate.
+class Direction:
+    """A piecewise linear function of a coordinate in an equation: a `siq.diagnosis.terms.Basis` of hats.
 
     Attributes
     ----------
-    equations
-        Names of the states; two of them for a force along or across the amplitude.
+    names
+        Of the states in whose equations it stands; two of them for a force along or across the amplitude.
     coordinate
         Its name.
+    across
+        Whether it is a force across the amplitude.
     knots
-        Where the piecewise linear function bends, shape ``(k,)``.
+        Where it bends, shape ``(k,)``.
     """
 
-    equations: tuple[str, ...]
+    names: tuple[str, ...]
     coordinate: str
     across: bool
     knots: np.ndarray
+    outputs: tuple[tuple[str, sympy.Expr], ...] = ()
+
+    @property
+    def coordinates(self) -> tuple[sympy.Expr, ...]:
+        """The formula of its coordinate."""
+        if self.coordinate != "amplitude":
+            return (symbol(self.coordinate),)
+        return (sympy.sqrt(sum(symbol(name) ** 2 for name in self.names)),)
+
+    @property
+    def equations(self) -> tuple[tuple[str, sympy.Expr], ...]:
+        """The factor in each equation: 1, or the direction along or across the amplitude."""
+        if len(self.names) == 1:
+            return ((self.names[0], sympy.Integer(1)),)
+        a, b = map(symbol, self.names)
+        size = sympy.sqrt(a**2 + b**2 + TINY_AMPLITUDE)
+        along, other = (b, -a) if self.across else (a, b)
+        return ((self.names[0], along / size), (self.names[1], other / size))
+
+    @property
+    def width(self) -> int:
+        """The number of its values."""
+        return len(self.knots)
+
+    def values(self, courses: np.ndarray) -> np.ndarray:
+        """Hats that are one at one knot and zero at the others, along a course ``(1, n)``: ``(k, n)``."""
+        return np.stack([np.interp(courses[0], self.knots, unit) for unit in np.eye(self.width)])
 
 
 @dataclass(frozen=True)
-class _Curve:
+class Curve:
     """What is missing in an equation along a coordinate, as far as the data tell.
 
     Attributes
@@ -60,7 +91,7 @@ class _Curve:
         Probability of as much by chance.
     """
 
-    direction: _Direction
+    direction: Direction
     values: np.ndarray
     standard_errors: np.ndarray
     gain: float
@@ -83,7 +114,7 @@ class Structure:
         Sum of squared innovations and its degrees of freedom, at the measurement noise of the fit.
     """
 
-    curves: tuple[_Curve, ...]
+    curves: tuple[Curve, ...]
     p_curves: float
     p_autocorrelation: float
     total: float
@@ -95,78 +126,28 @@ class Structure:
         return min(1.0, 2 * min(self.p_curves, self.p_autocorrelation))
 
 
-class _HatColumns:
-    """Piecewise linear functions of coordinates, as `siq.inference.kalman_filter.linearise` wants them."""
-
-    def __init__(self, model: Dynamics, grid: Grid, directions: tuple[_Direction, ...]) -> None:
-        self._model, self._grid, self._directions = model, grid, directions
-        self.width = sum(len(each.knots) for each in directions)
-
-    def rates(self, x: np.ndarray, values: np.ndarray, node: int) -> np.ndarray:
-        """See `siq.inference.kalman_filter.Columns`."""
-        result = np.zeros((self._model.dimension, self.width, x.shape[1]))
-        signals = self._grid.signals(node, ())
-        place = 0
-        for direction in self._directions:
-            course = _coordinate_values(self._model, direction, x, signals.inputs, signals.t)
-            hats = _hats(direction.knots, course)
-            columns = slice(place, place + len(direction.knots))
-            rows = [self._model.states.index(name) for name in direction.equations]
-            if len(rows) == 1:
-                result[rows[0], columns] = hats
-            else:
-                a, b = rows
-                size = np.hypot(x[a], x[b]) + 1e-300
-                first, second = (x[b], -x[a]) if direction.across else (x[a], x[b])
-                result[a, columns] = hats * first / size
-                result[b, columns] = hats * second / size
-            place += len(direction.knots)
-        return result
-
-    def outputs(self, x: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """See `siq.inference.kalman_filter.Columns`."""
-        return np.zeros((len(self._model.outputs), self.width, x.shape[1]))
-
-
-def _directions_of(
-    model: Dynamics, roles: Roles, data: Measurements, x: np.ndarray
-) -> tuple[_Direction, ...]:
+def _directions_of(model: Dynamics, roles: Roles, data: Measurements, x: np.ndarray) -> tuple[Direction, ...]:
     """Every equation that may lack something, with every coordinate."""
-    signals = data.signals(data.t, data.recording, delays=())
     pairs = {name for pair in roles.amplitudes for name in pair}
-    found: list[_Direction] = []
-
-    def add(equations: tuple[str, ...], coordinate: str, across: bool = False) -> None:
-        draft = _Direction(equations, coordinate, across, np.empty(0))
-        course = _coordinate_values(model, draft, x.T, signals.inputs, signals.t)
+    drafts = [
+        Direction(pair, "amplitude", across, np.empty(0))
+        for pair in roles.amplitudes
+        for across in (False, True)
+    ]
+    drafts += [
+        Direction((name,), coordinate, False, np.empty(0))
+        for name in roles.states
+        for coordinate in coordinates_of(model)
+        if not (name in pairs and coordinate in pairs)
+    ]
+    found = []
+    for draft in drafts:
+        (course,) = courses_of(draft.coordinates, model, data, x)
         if np.ptp(course) > 0:
             knots = np.unique(np.quantile(course, np.linspace(0, 1, HAT_KNOTS)))
             if len(knots) > 3:
-                found.append(_Direction(equations, coordinate, across, knots))
-
-    for pair in roles.amplitudes:
-        add(pair, "amplitude")
-        add(pair, "amplitude", across=True)
-    for name in roles.states:
-        coordinates = [*model.states, *(entry.name for entry in model.inputs), "t"]
-        for coordinate in coordinates:
-            if not (name in pairs and coordinate in pairs):
-                add((name,), coordinate)
+                found.append(replace(draft, knots=knots))
     return tuple(found)
-
-
-def _coordinate_values(
-    model: Dynamics, direction: _Direction, x: np.ndarray, inputs: np.ndarray, t: np.ndarray
-) -> np.ndarray:
-    """The coordinate along trajectories, shape ``(n,)``."""
-    if direction.coordinate == "t":
-        return t
-    if direction.coordinate == "amplitude":
-        a, b = (model.states.index(name) for name in direction.equations)
-        return np.hypot(x[a], x[b])
-    if direction.coordinate in model.states:
-        return x[model.states.index(direction.coordinate)]
-    return inputs[[entry.name for entry in model.inputs].index(direction.coordinate)]
 
 
 def _structure_of(
@@ -179,12 +160,12 @@ def _structure_of(
 ) -> Structure:
     """Describe what a fit leaves."""
     directions = _directions_of(model, roles, data, fit.x)
-    grid = Grid(data, min(fit.substeps, RESPONSE_SUBSTEPS))
+    grid = Grid(data, min(fit.substeps, PROBE_SUBSTEPS))
     noise = fit.noise if noise is None else noise
     parameters = len(fit.model.free)
 
-    def projected_with(some: tuple[_Direction, ...]) -> tuple[Whitened, np.ndarray, np.ndarray]:
-        white = whiten(probe_response(model, grid, fit, _HatColumns(model, grid, some)), data, noise)
+    def projected_with(some: tuple[Direction, ...]) -> tuple[Whitened, np.ndarray, np.ndarray]:
+        white = whiten(probe_response(model, grid, fit, PlaceColumns(model, grid, some)), data, noise)
         return white, *projected(white, parameters)
 
     white, left, _ = projected_with(())
@@ -204,7 +185,7 @@ def _structure_of(
             rank = int((np.linalg.svd(own, compute_uv=False) > 1e-9 * max(np.abs(own).max(), 1e-300)).sum())
             p_value = float(scipy.stats.chi2.sf(max(gain, 0.0) / scale, max(rank, 1)))
             errors = np.sqrt(np.diag(covariance) * scale)
-            curves.append(_Curve(direction, values, errors, gain, p_value))
+            curves.append(Curve(direction, values, errors, gain, p_value))
     curves.sort(key=lambda each: -each.gain)
     best = min((each.p_value for each in curves), default=1.0)
     return Structure(
@@ -214,14 +195,6 @@ def _structure_of(
         total=total,
         freedom=freedom,
     )
-
-
-def _hats(knots: np.ndarray, course: np.ndarray) -> np.ndarray:
-    """Piecewise linear functions that are one at one knot and zero at the others, shape ``(k, n)``."""
-    result = np.empty((len(knots), len(course)))
-    for place in range(len(knots)):
-        result[place] = np.interp(course, knots, np.eye(len(knots))[place])
-    return result
 
 
 def _autocorrelation(left: np.ndarray, recording: np.ndarray, known: np.ndarray, outputs: int) -> float:

@@ -1,4 +1,10 @@
-"""screening"""
+"""Screening: how much a little of each mechanism would improve the fit.
+
+A mechanism that is absent from a simulation enters, to first order, by the derivative of f by its amplitudes.
+Along the trajectories of one fit everything is linear, so that the likelihood with a probe, its amplitude and
+all parameters at their best, is a matter of least squares. It is worked out for several levels of process
+noise: where physics is missing the fit had to admit such noise, and the right probe makes it needless.
+"""
 
 from __future__ import annotations
 
@@ -439,7 +445,13 @@ def _admissible(
     kept = np.ones(len(overlap), dtype=bool)
     amplitudes, errors, after = np.zeros(len(overlap)), np.zeros(len(overlap)), total
     while kept.any():
-        solved, covariance = _small_solve(gram[np.ix_(kept, kept)], overlap[kept])
+        part = gram[np.ix_(kept, kept)]
+        scale = np.sqrt(np.diag(part))
+        scale = np.where(scale > 0, scale, np.inf)
+        values, vectors = np.linalg.eigh(part / np.outer(scale, scale))
+        told = values > 1e-10 * max(values[-1], 1e-300)
+        covariance = (vectors[:, told] / values[told]) @ vectors[:, told].T / np.outer(scale, scale)
+        solved = covariance @ overlap[kept]
         after = max(total - float(solved @ overlap[kept]), 1e-12 * total)
         spread = np.sqrt(np.diag(covariance) * after / max(freedom - len(solved), 1))
         amplitudes[kept], errors[kept] = solved, spread
@@ -450,15 +462,6 @@ def _admissible(
         kept[worst] = False
         amplitudes[worst] = errors[worst] = 0.0
     return amplitudes, errors, after if kept.any() else total
-
-
-def _small_solve(gram: np.ndarray, overlap: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    scale = np.sqrt(np.diag(gram))
-    scale = np.where(scale > 0, scale, np.inf)
-    values, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
-    kept = values > 1e-10 * max(values[-1], 1e-300)
-    inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T / np.outer(scale, scale)
-    return inverse @ overlap, inverse
 
 
 PROBE_SUBSTEPS = 2  # what a little of a mechanism does need not be known to many digits
@@ -510,11 +513,19 @@ def screen_all(
     screened: list[tuple[Probe, Screened]] = []
     for portion in in_portions([probe.width for probe in probes], model, data):
         some = probes[portion]
-        columns = sum(probe.width for probe in some)
         try:
             budget.says(f"screening {len(candidates)} candidates")
-            budget.charge(grid.substeps * evaluation(model, data, columns=columns))
-            screened += _screened(model, data, current, grid, some)
+            budget.charge(grid.substeps * evaluation(model, data, columns=sum(probe.width for probe in some)))
+            columns = ProbeColumns(model, grid, some, current.x, current.model.values)
+            response = probe_response(model, grid, current, columns)
+            ends = np.cumsum([probe.width for probe in some])
+            groups = [slice(end - probe.width, end) for probe, end in zip(some, ends, strict=True)]
+            positive = [
+                np.array([name in each.candidate.positive for name in each.candidate.amplitudes] or [True])
+                for each in some
+            ]
+            results = _screen(response, data, current, groups, positive=positive)
+            screened += zip(some, results, strict=True)
         except BudgetSpent:
             break
         except NUMERICAL_ERRORS as error:
@@ -535,17 +546,3 @@ def screen_all(
             why = OVERFLOWS if candidate.label in seen else BUDGET_SPENT
             untried.setdefault(candidate.label, UntriedMechanism(candidate, why))
     return screened, [each for label, each in untried.items() if label not in finite]
-
-
-def _screened(
-    model: Dynamics, data: Measurements, current: Fit, grid: Grid, probes: Sequence[Probe]
-) -> list[tuple[Probe, Screened]]:
-    columns = ProbeColumns(model, grid, probes, current.x, current.model.values)
-    response = probe_response(model, grid, current, columns)
-    ends = np.cumsum([probe.width for probe in probes])
-    groups = [slice(end - probe.width, end) for probe, end in zip(probes, ends, strict=True)]
-    positive = [
-        np.array([name in probe.candidate.positive for name in probe.candidate.amplitudes] or [True])
-        for probe in probes
-    ]
-    return list(zip(probes, _screen(response, data, current, groups, positive=positive), strict=True))

@@ -1,4 +1,11 @@
-"""terms"""
+"""Terms: unknown functions in an equation, where they may stand and of what.
+
+A function of one coordinate - a state, an input, time, the amplitude of a rotating frame - may be missing
+in an equation or in what is measured, alone or as the coefficient of another coordinate. At every place it is
+offered as a natural cubic spline, of which the data are asked for the values at the knots; the places are
+compared by the evidence of a smooth function (`siq.diagnosis.evidence`). At the likeliest a formula of a few
+powers becomes part of the simulation.
+"""
 
 from __future__ import annotations
 
@@ -14,16 +21,253 @@ import sympy
 from siq.diagnosis.dictionary import Roles, unit_of, units_of
 from siq.diagnosis.evidence import correlation_time_of, evidence_of_function, orthonormal
 from siq.diagnosis.mechanisms import MechanismCandidate
-from siq.diagnosis.residual_structure import RESPONSE_SUBSTEPS
 from siq.diagnosis.screening import PROBE_SUBSTEPS, Probe, ProbeColumns, levels_of, probe_response, projected
 from siq.errors import NumericalFailure
-from siq.inference.kalman_filter import Grid, Linearisation, Whitened, profile_likelihood, whiten
+from siq.inference.kalman_filter import Grid, Linearisation, profile_likelihood, whiten
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
 from siq.systems.dynamics import Dynamics, Parameter, Signals, symbol
 from siq.systems.formulas import compile_values, exact_number
 
+Kind = Literal["formula", "curve", "surface", "mechanism"]
+FORMULA: Final = "formula"
 FUNCTIONS_FITTED = 3  # places in which functions are fitted, the most likely ones: a choice
+SPLINE_KNOTS = 17  # enough for the shortest length of `siq.diagnosis.evidence.SMOOTH_LENGTHS`, two for each
+LARGEST_LINEARISATION = 40_000_000  # numbers held at a time, which is a third of a gigabyte
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a function may stand, and of what.
+
+    Attributes
+    ----------
+    equations, outputs
+        What the function is multiplied by, in each equation, or each output, in which it stands.
+    coordinate
+        What it is a function of.
+    words
+        The coordinates in words of the system, the one that it is a function of first.
+    knots
+        Of the spline: quantiles of the coordinate, shape ``(k,)``.
+    """
+
+    equations: tuple[tuple[str, sympy.Expr], ...]
+    outputs: tuple[tuple[str, sympy.Expr], ...]
+    coordinate: sympy.Expr
+    words: tuple[str, ...]
+    knots: np.ndarray
+
+    @property
+    def coordinates(self) -> tuple[sympy.Expr, ...]:
+        """What it is a function of: a single coordinate."""
+        return (self.coordinate,)
+
+    @property
+    def width(self) -> int:
+        """The number of its values."""
+        return len(self.knots)
+
+    def values(self, courses: np.ndarray) -> np.ndarray:
+        """Natural cubic splines that are one at one knot and zero at the others, shape ``(k, n)``.
+
+        What lies beyond the knots has the value at the last one.
+        """
+        course = np.clip(courses[0], self.knots[0], self.knots[-1])
+        unit = np.eye(len(self.knots))
+        return scipy.interpolate.make_interp_spline(self.knots, unit, bc_type="natural")(course).T
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """Names of the states or outputs that it changes."""
+        return tuple(name for name, _ in (*self.equations, *self.outputs))
+
+
+class Basis(Protocol):
+    """A function with linear parameters, such as values at knots, with its place; see `Place`."""
+
+    @property
+    def equations(self) -> tuple[tuple[str, sympy.Expr], ...]:
+        """What it is multiplied by in each equation."""
+
+    @property
+    def outputs(self) -> tuple[tuple[str, sympy.Expr], ...]:
+        """What it is multiplied by in each output."""
+
+    @property
+    def coordinates(self) -> tuple[sympy.Expr, ...]:
+        """What it is a function of."""
+
+    @property
+    def width(self) -> int:
+        """The number of its parameters."""
+
+    def values(self, courses: np.ndarray) -> np.ndarray:
+        """What a unit of each does along courses ``(c, n)`` of the coordinates, shape ``(width, n)``."""
+
+
+class PlaceColumns:
+    """Functions in many places, as `siq.inference.kalman_filter.linearise` wants them."""
+
+    def __init__(self, model: Dynamics, grid: Grid, places: Sequence[Basis]) -> None:
+        self._model, self._grid, self._places = model, grid, places
+        self.width = sum(each.width for each in places)
+        names = (*model.states, *(entry.name for entry in model.inputs), "t")
+        arguments = [symbol(name) for name in names]
+        self._compiled = [
+            compile_values(
+                [*each.coordinates, *(factor for _, factor in (*each.equations, *each.outputs))],
+                arguments,
+                common=False,
+            )
+            for each in places
+        ]
+
+    def rates(self, x: np.ndarray, values: np.ndarray, node: int) -> np.ndarray:
+        """See `siq.inference.kalman_filter.Columns`."""
+        return self._filled(x, self._grid.signals(node, ()), measured=False)
+
+    def outputs(self, x: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """See `siq.inference.kalman_filter.Columns`."""
+        return self._filled(x, self._grid.at_samples(()), measured=True)
+
+    def _filled(self, x: np.ndarray, signals: Signals, *, measured: bool) -> np.ndarray:
+        names = list(self._model.output_names if measured else self._model.states)
+        result = np.zeros((len(names), self.width, x.shape[1]))
+        begin = 0
+        for place, compiled in zip(self._places, self._compiled, strict=True):
+            end = begin + place.width
+            targets = place.outputs if measured else place.equations
+            if targets:
+                known = compiled(*x, *signals.inputs, signals.t)
+                courses = [np.broadcast_to(each, x.shape[1]) for each in known[: len(place.coordinates)]]
+                values = place.values(np.stack(courses))
+                for (name, _), factor in zip(targets, known[len(place.coordinates) :], strict=True):
+                    result[names.index(name), begin:end] = values * factor
+            begin = end
+        return result
+
+
+def places_in(model: Dynamics, roles: Roles, data: Measurements, x: np.ndarray) -> tuple[Place, ...]:
+    """Functions of one coordinate, in every equation that says more than a definition, and in every output.
+
+    In a rotating frame they are also those of amplitude and time, along the state and across it.
+
+    Parameters
+    ----------
+    model, roles
+        The simulation, and the roles of its states.
+    data, x
+        The recordings and the states along them, shape ``(n, d)``: knots are quantiles of these.
+    """
+    found: list[Place] = []
+    one = sympy.Integer(1)
+    coordinates = coordinates_of(model)
+    framed = {name for pair in roles.amplitudes for name in pair}
+    for first, second in roles.amplitudes:
+        a, b = symbol(first), symbol(second)
+        along, across = ((first, a), (second, b)), ((first, b), (second, -a))
+        found += [
+            Place(equations, (), formula, (word,), np.empty(0))
+            for word, formula in (("amplitude", sympy.sqrt(a**2 + b**2)), ("t", symbol("t")))
+            for equations in (along, across)
+        ]
+    for name in roles.states:
+        found += [
+            Place(((name, one),), (), formula, (word,), np.empty(0))
+            for word, formula in coordinates.items()
+            if not (name in framed and word in framed)
+        ]
+    values = {symbol(each.name): exact_number(each.value) for each in model.parameters}
+    for name, written in model.outputs:
+        formula = written.xreplace(values)  # an offset of the sensor is where the fit has it
+        own = str(formula) if formula.is_Symbol else name
+        found += [
+            Place((), ((name, one),), formula, (own,), np.empty(0)),
+            Place((), ((name, one),), symbol("t"), ("t",), np.empty(0)),
+        ]
+    return tuple(_with_knots(found, model, data, x))
+
+
+def products_in(
+    places: Sequence[Place], model: Dynamics, data: Measurements, x: np.ndarray
+) -> tuple[Place, ...]:
+    """The same functions as coefficients of each other coordinate but time, in the same equations.
+
+    Parameters
+    ----------
+    places
+        Functions of one coordinate.
+    model, data, x
+        See `places_in`.
+    """
+    found = []
+    for place in places:
+        factors = {name: formula for name, formula in coordinates_of(model).items() if name != "t"}
+        if len(place.equations) > 1:  # in a rotating frame only the amplitude
+            first, second = (symbol(name) for name in place.targets)
+            factors = {"amplitude": sympy.sqrt(first**2 + second**2)}
+        for name, formula in factors.items():
+            if place.equations and name not in place.words:
+                equations = tuple((target, factor * formula) for target, factor in place.equations)
+                found.append(replace(place, equations=equations, words=(*place.words, name)))
+    return tuple(_with_knots(found, model, data, x))
+
+
+def coordinates_of(model: Dynamics) -> dict[str, sympy.Expr]:
+    """States, inputs and the time, by name."""
+    return {name: symbol(name) for name in (*model.states, *(each.name for each in model.inputs), "t")}
+
+
+def _with_knots(
+    drafts: Sequence[Place], model: Dynamics, data: Measurements, x: np.ndarray
+) -> Iterator[Place]:
+    """Places with their knots, but for those whose coordinate takes too few values for a function."""
+    known: dict[sympy.Expr, np.ndarray] = {}
+    for each in drafts:
+        if each.coordinate not in known:
+            (course,) = courses_of((each.coordinate,), model, data, x)
+            finite = course[np.isfinite(course)]
+            known[each.coordinate] = (
+                np.unique(np.quantile(finite, np.linspace(0, 1, SPLINE_KNOTS)))
+                if len(finite)
+                else np.empty(0)
+            )
+        if len(known[each.coordinate]) > 3:
+            yield replace(each, knots=known[each.coordinate])
+
+
+def courses_of(
+    coordinates: tuple[sympy.Expr, ...], model: Dynamics, data: Measurements, x: np.ndarray
+) -> np.ndarray:
+    """What formulas of states, inputs and time are along recordings, shape ``(c, n)``."""
+    names = (*model.states, *(entry.name for entry in model.inputs), "t")
+    compiled = compile_values(coordinates, [symbol(name) for name in names], common=False)
+    signals = data.signals(data.t, data.recording, delays=())
+    values = compiled(*x.T[: model.dimension], *signals.inputs, signals.t)
+    return np.stack([np.broadcast_to(each, data.t.shape) for each in values])
+
+
+def linearised_with_places(
+    fit: Fit, data: Measurements, places: Sequence[Place]
+) -> Iterator[tuple[Linearisation, Sequence[Place]]]:
+    """The linearisation of a fit with the columns of places behind those of its parameters, in portions.
+
+    Parameters
+    ----------
+    fit, data
+        The fit along whose trajectories everything is linear, and what it was made for.
+    places
+        The functions.
+    """
+    model = fit.model
+    own = len(model.free)
+    room = LARGEST_LINEARISATION // (len(data.t) * (model.dimension + len(model.outputs))) - own
+    at_once = max(room // SPLINE_KNOTS, 1)
+    grid = Grid(data, min(fit.substeps, PROBE_SUBSTEPS))
+    for begin in range(0, len(places), at_once):
+        some = places[begin : begin + at_once]
+        yield probe_response(model, grid, fit, PlaceColumns(model, grid, some)), some
 
 
 @dataclass(frozen=True)
@@ -80,9 +324,9 @@ def _compared(fit: Fit, data: Measurements, places: Sequence[Place]) -> list[Lik
 
 
 def few_powers(likely: LikelyPlace, fit: Fit, data: Measurements, *, degree: int) -> tuple[_Power, ...]:
-    """The _powers that a formula needs: each added as long as it earns its place (Schwarz).
+    """The powers that a formula needs: each added as long as it earns its place (Schwarz).
 
-    Errors count as correlated as all of the _powers leave them (`siq.diagnosis.evidence`).
+    Errors count as correlated as all of the powers leave them (`siq.diagnosis.evidence`).
     """
     terms = _powers(likely.place, degree=degree)
     probe = Probe(with_formula(fit.model, likely.place, terms), ())
@@ -90,7 +334,10 @@ def few_powers(likely: LikelyPlace, fit: Fit, data: Measurements, *, degree: int
     columns = ProbeColumns(fit.model, grid, [probe], fit.x, fit.model.values)
     white = whiten(probe_response(fit.model, grid, fit, columns), data, fit.noise.scaled(likely.level))
     left, own = projected(white, len(fit.model.free))
-    count = _independent(left, own, white, fit)
+    basis = orthonormal(own)
+    rest = left - basis @ (basis.T @ left)
+    correlated = correlation_time_of(rest, white.recording, outputs=len(fit.model.outputs))
+    count = max(float(white.known.sum()) / correlated, 2.0)  # errors that count as independent
     chosen: list[int] = []
     total = float(left @ left)
     while len(chosen) < len(terms):
@@ -108,274 +355,6 @@ def few_powers(likely: LikelyPlace, fit: Fit, data: Measurements, *, degree: int
         chosen.append(best)
         total = sums[best]
     return tuple(terms[place] for place in sorted(chosen))
-
-
-def _independent(left: np.ndarray, columns: np.ndarray, white: Whitened, fit: Fit) -> float:
-    """How many errors count as _independent, if columns are fitted to what is left."""
-    basis = orthonormal(columns)
-    rest = left - basis @ (basis.T @ left)
-    correlated = correlation_time_of(rest, white.recording, outputs=len(fit.model.outputs))
-    return max(float(white.known.sum()) / correlated, 2.0)
-
-
-SPLINE_KNOTS = 17  # enough for the shortest length of `siq.diagnosis.evidence.SMOOTH_LENGTHS`, two for each
-LARGEST_LINEARISATION = 40_000_000  # of a linearisation held at a time, which is a third of a gigabyte
-
-
-@dataclass(frozen=True)
-class Place:
-    """Where a function may stand, and of what.
-
-    Attributes
-    ----------
-    equations, outputs
-        What the function is multiplied by, in each equation, or each output, in which it stands.
-    coordinate
-        What it is a function of.
-    words
-        The coordinates in words of the system, the one that it is a function of first.
-    knots
-        Of the spline: quantiles of the coordinate, shape ``(k,)``.
-    """
-
-    equations: tuple[tuple[str, sympy.Expr], ...]
-    outputs: tuple[tuple[str, sympy.Expr], ...]
-    coordinate: sympy.Expr
-    words: tuple[str, ...]
-    knots: np.ndarray
-
-    @property
-    def coordinates(self) -> tuple[sympy.Expr, ...]:
-        """What it is a function of: a single coordinate."""
-        return (self.coordinate,)
-
-    @property
-    def width(self) -> int:
-        """The number of its values."""
-        return len(self.knots)
-
-    def values(self, courses: np.ndarray) -> np.ndarray:
-        """What a unit at each knot does along courses ``(1, n)`` of the coordinate, shape ``(k, n)``."""
-        return _cardinal_splines(self.knots, courses[0])
-
-    @property
-    def targets(self) -> tuple[str, ...]:
-        """Names of the states or outputs that it changes."""
-        return tuple(name for name, _ in (*self.equations, *self.outputs))
-
-
-class _PlacedFunction(Protocol):
-    """A function with linear parameters, such as values at knots, in a place; see `Place`."""
-
-    @property
-    def equations(self) -> tuple[tuple[str, sympy.Expr], ...]:
-        """What it is multiplied by in each equation."""
-
-    @property
-    def outputs(self) -> tuple[tuple[str, sympy.Expr], ...]:
-        """What it is multiplied by in each output."""
-
-    @property
-    def coordinates(self) -> tuple[sympy.Expr, ...]:
-        """What it is a function of."""
-
-    @property
-    def width(self) -> int:
-        """The number of its parameters."""
-
-    def values(self, courses: np.ndarray) -> np.ndarray:
-        """What a unit of each does along courses ``(c, n)`` of the coordinates, shape ``(width, n)``."""
-
-
-class PlaceColumns:
-    """Functions in many places, as `siq.inference.kalman_filter.linearise` wants them."""
-
-    def __init__(self, model: Dynamics, grid: Grid, places: Sequence[_PlacedFunction]) -> None:
-        self._model, self._grid, self._places = model, grid, places
-        self.width = sum(each.width for each in places)
-        names = (*model.states, *(entry.name for entry in model.inputs), "t")
-        arguments = [symbol(name) for name in names]
-        self._compiled = [
-            compile_values(
-                [*each.coordinates, *(factor for _, factor in (*each.equations, *each.outputs))],
-                arguments,
-                common=False,
-            )
-            for each in places
-        ]
-
-    def rates(self, x: np.ndarray, values: np.ndarray, node: int) -> np.ndarray:
-        """See `siq.inference.kalman_filter.Columns`."""
-        return self._filled(x, self._grid.signals(node, ()), measured=False)
-
-    def outputs(self, x: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """See `siq.inference.kalman_filter.Columns`."""
-        return self._filled(x, self._grid.at_samples(()), measured=True)
-
-    def _filled(self, x: np.ndarray, signals: Signals, *, measured: bool) -> np.ndarray:
-        names = list(self._model.output_names if measured else self._model.states)
-        result = np.zeros((len(names), self.width, x.shape[1]))
-        begin = 0
-        for place, compiled in zip(self._places, self._compiled, strict=True):
-            end = begin + place.width
-            targets = place.outputs if measured else place.equations
-            if targets:
-                known = compiled(*x, *signals.inputs, signals.t)
-                courses = [np.broadcast_to(each, x.shape[1]) for each in known[: len(place.coordinates)]]
-                values = place.values(np.stack(courses))
-                for (name, _), factor in zip(targets, known[len(place.coordinates) :], strict=True):
-                    result[names.index(name), begin:end] = values * factor
-            begin = end
-        return result
-
-
-def _cardinal_splines(knots: np.ndarray, course: np.ndarray) -> np.ndarray:
-    """Natural cubic splines that are one at one knot and zero at the others, shape ``(k, n)``.
-
-    What lies beyond the knots has the value at the last one.
-    """
-    course = np.clip(course, knots[0], knots[-1])
-    return scipy.interpolate.make_interp_spline(knots, np.eye(len(knots)), bc_type="natural")(course).T
-
-
-def places_in(model: Dynamics, roles: Roles, data: Measurements, x: np.ndarray) -> tuple[Place, ...]:
-    """Functions of one coordinate, in every equation that says more than a definition, and in every output.
-
-    In a rotating frame they are also those of amplitude and time, along the state and across it.
-
-    Parameters
-    ----------
-    model, roles
-        The simulation, and the roles of its states.
-    data, x
-        The recordings and the states along them, shape ``(n, d)``: knots are quantiles of these.
-    """
-    found: list[Place] = []
-    one = sympy.Integer(1)
-    coordinates = coordinates_of(model)
-    framed = {name for pair in roles.amplitudes for name in pair}
-    for first, second in roles.amplitudes:
-        a, b = symbol(first), symbol(second)
-        along, across = ((first, a), (second, b)), ((first, b), (second, -a))
-        found += [
-            Place(equations, (), formula, (word,), np.empty(0))
-            for word, formula in (("amplitude", sympy.sqrt(a**2 + b**2)), ("t", symbol("t")))
-            for equations in (along, across)
-        ]
-    for name in roles.states:
-        found += [
-            Place(((name, one),), (), formula, (word,), np.empty(0))
-            for word, formula in coordinates.items()
-            if not (name in framed and word in framed)
-        ]
-    values = {symbol(each.name): exact_number(each.value) for each in model.parameters}
-    for name, written in model.outputs:
-        formula = written.xreplace(values)  # an offset of the sensor is where the fit has it
-        own = str(formula) if formula.is_Symbol else name
-        found += [
-            Place((), ((name, one),), formula, (own,), np.empty(0)),
-            Place((), ((name, one),), symbol("t"), ("t",), np.empty(0)),
-        ]
-    return tuple(_with_knots(found, model, data, x))
-
-
-def products_in(
-    places: Sequence[Place], model: Dynamics, data: Measurements, x: np.ndarray
-) -> tuple[Place, ...]:
-    """The same functions as coefficients of each other coordinate but time, in the same equations.
-
-    Parameters
-    ----------
-    places
-        Functions of one coordinate.
-    model, data, x
-        See `places_in`.
-    """
-    found = [
-        replace(
-            place,
-            equations=tuple((target, factor * formula) for target, factor in place.equations),
-            words=(*place.words, name),
-        )
-        for place in places
-        if place.equations
-        for name, formula in _factors_of(place, model).items()
-        if name not in place.words
-    ]
-    return tuple(_with_knots(found, model, data, x))
-
-
-def _factors_of(place: Place, model: Dynamics) -> dict[str, sympy.Expr]:
-    """What a function may be the coefficient of, by name: in a rotating frame only the amplitude."""
-    if len(place.equations) > 1:
-        first, second = (symbol(name) for name in place.targets)
-        return {"amplitude": sympy.sqrt(first**2 + second**2)}
-    return {name: formula for name, formula in coordinates_of(model).items() if name != "t"}
-
-
-def coordinates_of(model: Dynamics) -> dict[str, sympy.Expr]:
-    """States, inputs and the time, by name."""
-    return {name: symbol(name) for name in (*model.states, *(each.name for each in model.inputs), "t")}
-
-
-def _with_knots(
-    drafts: Sequence[Place], model: Dynamics, data: Measurements, x: np.ndarray
-) -> Iterator[Place]:
-    """Places with their knots, but for those whose coordinate takes too few values for a function."""
-    known: dict[sympy.Expr, np.ndarray] = {}
-    for each in drafts:
-        if each.coordinate not in known:
-            (course,) = _courses_of((each.coordinate,), model, data, x)
-            finite = course[np.isfinite(course)]
-            known[each.coordinate] = (
-                np.unique(np.quantile(finite, np.linspace(0, 1, SPLINE_KNOTS)))
-                if len(finite)
-                else np.empty(0)
-            )
-        if len(known[each.coordinate]) > 3:
-            yield replace(each, knots=known[each.coordinate])
-
-
-def _courses_of(
-    coordinates: tuple[sympy.Expr, ...], model: Dynamics, data: Measurements, x: np.ndarray
-) -> np.ndarray:
-    """What formulas of states, inputs and time are along recordings, shape ``(c, n)``."""
-    names = (*model.states, *(entry.name for entry in model.inputs), "t")
-    compiled = compile_values(coordinates, [symbol(name) for name in names], common=False)
-    signals = data.signals(data.t, data.recording, delays=())
-    values = compiled(*x.T[: model.dimension], *signals.inputs, signals.t)
-    return np.stack([np.broadcast_to(each, data.t.shape) for each in values])
-
-
-def linearised_with_places(
-    fit: Fit, data: Measurements, places: Sequence[Place]
-) -> Iterator[tuple[Linearisation, Sequence[Place]]]:
-    """The linearisation of a fit with the columns of places behind those of its parameters, in portions.
-
-    Parameters
-    ----------
-    fit, data
-        The fit along whose trajectories everything is linear, and what it was made for.
-    places
-        The functions.
-    """
-    model = fit.model
-    own = len(model.free)
-    room = LARGEST_LINEARISATION // (len(data.t) * (model.dimension + len(model.outputs))) - own
-    at_once = max(room // SPLINE_KNOTS, 1)
-    grid = Grid(data, min(fit.substeps, RESPONSE_SUBSTEPS))
-    for begin in range(0, len(places), at_once):
-        some = places[begin : begin + at_once]
-        yield probe_response(model, grid, fit, PlaceColumns(model, grid, some)), some
-
-
-Kind = Literal["formula", "curve", "surface", "mechanism"]
-FORMULA: Final = "formula"
-
-
-def _described_name(place: Place) -> str:
-    """What a function without a name is called, such as ``a function of x and v``."""
-    return f"a function of {' and '.join(place.words)}"
 
 
 def with_formula(model: Dynamics, place: Place, terms: Sequence[_Power]) -> MechanismCandidate:
@@ -466,12 +445,11 @@ def built(
         ),
         outputs=tuple((name, before + read.get(name, sympy.Integer(0))) for name, before in model.outputs),
     )
-    label = f"{_described_name(place)} in {', '.join(place.targets)}"
-    if place.outputs:
-        label = f"{_described_name(place)} in the measurement of {', '.join(place.targets)}"
+    name = f"a function of {' and '.join(place.words)}"
+    where = f"{'the measurement of ' if place.outputs else ''}{', '.join(place.targets)}"
     return MechanismCandidate(
-        name=_described_name(place),
-        label=label,
+        name=name,
+        label=f"{name} in {where}",
         model=augmented,
         amplitudes=tuple(names),
         shapes=(),
@@ -501,8 +479,8 @@ def unit_in(place: Place, model: Dynamics, first: int, second: int) -> str:
 
 
 @dataclass(frozen=True)
-class Ground:
-    """Where a smooth function may stand, and where the recordings have been there.
+class FunctionSite:
+    """A place where a smooth function may stand, and where the recordings have been there.
 
     Attributes
     ----------
@@ -521,6 +499,17 @@ class Ground:
     words: tuple[str, ...]
     courses: np.ndarray
 
+    @classmethod
+    def of(
+        cls, place: Place, words: tuple[str, ...], model: Dynamics, data: Measurements, x: np.ndarray
+    ) -> FunctionSite:
+        """The site of a function of one coordinate of a place, or of two states or inputs.
+
+        A word of the place that is not among these is a factor of the function.
+        """
+        coordinates = (place.coordinate,) if len(words) == 1 else tuple(map(symbol, words))
+        return cls(place, coordinates, words, courses_of(coordinates, model, data, x))
+
     @property
     def ranges(self) -> np.ndarray:
         """Of each coordinate, shape ``(c,)``."""
@@ -531,29 +520,6 @@ class Ground:
         """Whether every coordinate takes several values, all of them finite."""
         return bool(np.isfinite(self.courses).all() and (self.ranges > 0).all())
 
-    def along(self, model: Dynamics, data: Measurements, x: np.ndarray) -> Ground:
-        """The same ground where the recordings have been by other states, shape ``(n, d)``."""
-        return replace(self, courses=_courses_of(self.coordinates, model, data, x))
-
-
-def ground_of(place: Place, model: Dynamics, data: Measurements, x: np.ndarray) -> Ground:
-    """The ground of a function of one coordinate, in a place.
-
-    Parameters
-    ----------
-    place
-        The coordinate's second word, if it has one, is a factor of the function.
-    model, data, x
-        The simulation, the recordings, and the states along them, shape ``(n, d)``.
-    """
-    courses = _courses_of((place.coordinate,), model, data, x)
-    return Ground(place, (place.coordinate,), place.words[:1], courses)
-
-
-def ground_of_two(
-    target: str, words: tuple[str, str], model: Dynamics, data: Measurements, x: np.ndarray
-) -> Ground:
-    """The ground of a function of two states or inputs, in the equation of a state."""
-    coordinates = tuple(symbol(name) for name in words)
-    place = Place(((target, sympy.Integer(1)),), (), coordinates[0], words, np.empty(0))
-    return Ground(place, coordinates, words, _courses_of(coordinates, model, data, x))
+    def along(self, model: Dynamics, data: Measurements, x: np.ndarray) -> FunctionSite:
+        """The site with the courses of other states, shape ``(n, d)``."""
+        return replace(self, courses=courses_of(self.coordinates, model, data, x))

@@ -1,10 +1,23 @@
-"""unnamed_models"""
+"""Models of effects that have no name: smooth functions, formulas, products and memories, fitted and judged.
+
+What explains the recordings best as a whole describes them, be it a function or a mechanism that was found
+and is not certain enough for its name. At the likeliest places (`siq.diagnosis.terms`) a formula of a few
+powers and a smooth curve are fitted in earnest. What a fit leaves says how smooth a function is, along the
+trajectories of that fit; those with the function are better, and say it better, so that it is asked for
+again. Functions of two coordinates are fitted where they are likelier than the likeliest of one, and where a
+function leaves something there may be another. What mechanisms with a name leave is described on top of them.
+
+A body that warms up, a store that fills, a prey that takes time to become a predator depend on a hidden state
+that follows a coordinate late, ``z' = (x - z)/τ``, or that it makes ring, ``τ² z'' + kτ z' + z = x``. A
+function of what is measured now can only imitate such a memory, mostly as one of the time. A memory describes
+what is missing where it is likelier than any function.
+"""
 
 from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -13,7 +26,6 @@ import sympy
 from siq.diagnosis.dictionary import Form, FurtherState, Mechanism, MechanismParameter, Role, Roles, Shape
 from siq.diagnosis.evidence import (
     NUMERICAL_ERRORS,
-    TriedMechanism,
     admissible,
     correlation_time_left,
     judged,
@@ -21,7 +33,7 @@ from siq.diagnosis.evidence import (
 )
 from siq.diagnosis.mechanisms import MechanismCandidate, candidates_of
 from siq.diagnosis.residual_structure import something_left
-from siq.diagnosis.screening import Probe, Screened, screen_all, with_further_states
+from siq.diagnosis.screening import screen_all, with_further_states
 from siq.diagnosis.search import Search, best_probes
 from siq.diagnosis.smooth_functions import (
     MECHANISM,
@@ -36,13 +48,11 @@ from siq.diagnosis.smooth_functions import (
 from siq.diagnosis.terms import (
     FORMULA,
     FUNCTIONS_FITTED,
-    Ground,
+    FunctionSite,
     LikelyPlace,
     Place,
     coordinates_of,
     few_powers,
-    ground_of,
-    ground_of_two,
     likely_places,
     simplest,
     with_formula,
@@ -61,6 +71,16 @@ from siq.inference.trajectories import UsualStates, fit_trajectories, free_run, 
 from siq.systems.dynamics import Dynamics, symbol
 
 LOGGER = logging.getLogger(__name__)
+LARGEST_PART = 0.25  # of the work left, that a single fit may take: a choice
+SMOOTH_ROUNDS = 4  # of fits, each along the trajectories of the one before: a choice
+LEAST_GAIN = 1.0  # of a logarithm of odds, below which another round is not worth its time
+DESCRIBED_MOST = 2  # functions that are put on top of each other: more are no description
+# Times τ that are tried, in units of the time in which the coordinate changes; the best of them is then
+# fitted. A much shorter memory cannot be told from none, nor a much longer one from a constant of each
+# recording.
+MEMORY_TIMES = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
+MEMORY_DAMPINGS = (0.1, 1.0)  # k of what rings, tried and then fitted: over many turns, and over hardly one
+MEMORIES_FITTED = 6  # the most promising ones: a choice
 
 
 @dataclass(frozen=True)
@@ -159,9 +179,6 @@ def runs_freely(fit: Fit, alone: Fit, data: Measurements) -> bool:
     return one is not None and (other is None or one < other)
 
 
-LARGEST_PART = 0.25  # of the work left, that a single fit may take: a choice
-
-
 def _fitted_part(
     candidate: MechanismCandidate,
     level: float,
@@ -175,58 +192,64 @@ def _fitted_part(
 ) -> list[Part]:
     """A function as part of a model, or nothing where it cannot be fitted."""
     kind = FORMULA if smooth is None else smooth.kind
+    data, budget = material.data, material.budget
+
     try:
-        material.budget.says(f"a {kind}: {candidate.label}")
-        with material.budget.part(LARGEST_PART):
-            trial = _fitted_term(candidate, level, begin or fit, fit, material)
+        budget.says(f"a {kind}: {candidate.label}")
+        with budget.part(LARGEST_PART):
+            begun = fit if begin is None else begin
+            known = {each.name: each.value for each in begun.model.parameters}
+            new = candidate.new
+            known |= {each.name: each.value for each in candidate.model.parameters if each.name in new}
+            values = np.array([known.get(each.name, 0.0) for each in candidate.model.parameters])
+            if not begun.has_process_noise:  # a function that was nearly right may lead no further
+                begun = replace(begun, noise=replace(begun.noise, process=fit.noise.process))
+            trial = fit_with_process_noise_as_needed(
+                candidate.model.with_values(values), data, begun, level=level, budget=budget
+            )
+            # A function may be steeper than the simulation, whose steps are then too long to follow it.
+            needed = substeps_needed(trial.model, data, trial.model.values, trial.x, tolerance=SUBSTEP_ERROR)
+            if trial.converged and needed > trial.substeps:
+                finer = replace(trial, substeps=needed)
+                trial = fit_with_process_noise_as_needed(trial.model, data, finer, budget=budget)
+            if (
+                not (trial.has_process_noise or fit.has_process_noise)
+                and trial.log_likelihood < fit.log_likelihood
+            ):
+                # Nothing added is as likely as that: steps of all samples at once have led away.
+                damped = fit_trajectories(
+                    candidate.model.with_values(values),
+                    data,
+                    begin=begun.x[data.first[:-1]],
+                    noise=begun.noise.of_states(candidate.model.dimension),
+                    substeps=trial.substeps,
+                    budget=budget,
+                )
+                trial = better_of(trial, damped)
+            if not trial.converged:
+                raise NumericalFailure(trial.fault or "its fit does not settle")
+            fitted = judged(trial, fit, data, candidate, blocks=material.blocks)
     except (*NUMERICAL_ERRORS, BudgetSpent) as error:
         LOGGER.info("%s as a %s cannot be fitted: %s", candidate.label, kind, error)
         return []
-    return [Part(trial, kind, cost, place, smooth)]
+    return [Part(fitted, kind, cost, place, smooth)]
 
 
-def _fitted_term(
-    candidate: MechanismCandidate, level: float, begin: Fit, fit: Fit, material: Material
-) -> TriedMechanism:
-    """A function, fitted from a fit on, and judged against the fit without it."""
-    data, budget = material.data, material.budget
-    known = {each.name: each.value for each in begin.model.parameters}
-    known |= {each.name: each.value for each in candidate.model.parameters if each.name in candidate.new}
-    values = np.array([known.get(each.name, 0.0) for each in candidate.model.parameters])
-    if not begin.has_process_noise:  # a function that was nearly right may not be followed by another
-        begin = replace(begin, noise=replace(begin.noise, process=fit.noise.process))
-    trial = fit_with_process_noise_as_needed(
-        candidate.model.with_values(values), data, begin, level=level, budget=budget
-    )
-    # A function may be steeper than the simulation, whose steps are then too long to follow it.
-    needed = substeps_needed(trial.model, data, trial.model.values, trial.x, tolerance=SUBSTEP_ERROR)
-    if trial.converged and needed > trial.substeps:
-        finer = replace(trial, substeps=needed)
-        trial = fit_with_process_noise_as_needed(trial.model, data, finer, budget=budget)
-    if not (trial.has_process_noise or fit.has_process_noise) and trial.log_likelihood < fit.log_likelihood:
-        # Nothing added is as likely as the fit without it: steps of all samples at once have led away.
-        damped = fit_trajectories(
-            candidate.model.with_values(values),
-            data,
-            begin=begin.x[data.first[:-1]],
-            noise=begin.noise.of_states(candidate.model.dimension),
-            substeps=trial.substeps,
-            budget=budget,
-        )
-        trial = better_of(trial, damped)
-    if not trial.converged:
-        raise NumericalFailure(trial.fault or "its fit does not settle")
-    return judged(trial, fit, data, candidate, blocks=material.blocks)
-
-
-SMOOTH_ROUNDS = 4  # of fits, each along the trajectories of the one before: a choice
-LEAST_GAIN = 1.0  # of a logarithm of odds, below which another round is not worth its time
+def _asked(
+    fit: Fit, data: Measurements, ground: FunctionSite, *, known: Part | None, alike: bool = False
+) -> Smoothness | None:
+    """See `smoothness_of`; what is beyond all numbers ends a function, not a case."""
+    try:
+        return smoothness_of(fit, data, ground, known=known, alike=alike)
+    except NUMERICAL_ERRORS as error:
+        LOGGER.info("no function of %s can be worked out: %s", " and ".join(ground.words), error)
+        return None
 
 
 def _with_a_smooth_function(
     before: tuple[Part, ...],
     fit: Fit,
-    ground: Ground,
+    ground: FunctionSite,
     cost: float,
     material: Material,
     *,
@@ -251,7 +274,15 @@ def _with_a_smooth_function(
             if parts:
                 break
             try:
-                function = _function(asked, here, product=product, times=times)
+                if product:
+                    function: Smooth = likeliest_product(asked, here, times=times)
+                else:
+                    function = smooth_function(
+                        here,
+                        tuple(times * share for share in asked.shares),
+                        deviation=asked.deviation,
+                        weight=asked.told.correlated,
+                    )
             except NUMERICAL_ERRORS as error:
                 LOGGER.info("no function of %s can be worked out: %s", " and ".join(here.words), error)
                 break
@@ -276,43 +307,41 @@ def _with_a_smooth_function(
     return [] if likeliest is None else [likeliest]
 
 
-def _asked(
-    fit: Fit, data: Measurements, ground: Ground, *, known: Part | None, alike: bool = False
-) -> Smoothness | None:
-    """See `smoothness_of`; what is beyond all numbers ends a function, not a case."""
-    try:
-        return smoothness_of(fit, data, ground, known=known, alike=alike)
-    except NUMERICAL_ERRORS as error:
-        LOGGER.info("no function of %s can be worked out: %s", " and ".join(ground.words), error)
-        return None
-
-
-def _function(asked: Smoothness, ground: Ground, *, product: bool, times: float) -> Smooth:
-    """The function that is asked for, its lengths multiplied."""
-    if product:
-        return likeliest_product(asked, ground, times=times)
-    shares = tuple(times * share for share in asked.shares)
-    return smooth_function(ground, shares, deviation=asked.deviation, weight=asked.told.correlated)
-
-
 def _with_surfaces(fit: Fit, models: Sequence[Model], material: Material) -> list[Model]:
     """Models with a smooth function of two coordinates, where the recordings tell both."""
     material.budget.says("comparing functions of two coordinates")
     data = material.data
-    begins = _begins(fit, models, material)
-    asked: list[tuple[float, Ground, Model | None]] = []
+    # Where functions of one coordinate are, or would be; not in a rotating frame, nor in a sensor.
+    single = [each for each in models if len(each.parts) == 1]
+    begins: list[tuple[Place, Model | None]] = []
+    for each in single[:FUNCTIONS_FITTED]:
+        if (place := each.parts[0].place) is not None:
+            begins.append((place, each))
+    if not single:  # one of two may tell so little of either coordinate alone
+        try:
+            likely = likely_places(fit, data, material.roles)
+        except NUMERICAL_ERRORS as error:
+            LOGGER.info("no function can be screened: %s", error)
+            likely = []
+        begins = [(each.place, None) for each in likely[:FUNCTIONS_FITTED]]
+    names = [name for name in coordinates_of(fit.model) if name != "t"]
+    asked: list[tuple[float, FunctionSite, Model | None]] = []
     done = set()
     for place, like in begins:
+        if len(place.equations) != 1:
+            continue
         current, known = (fit, None) if like is None else (like.fit, like.parts[-1])
         alone = 0.0
         if known is not None:
-            one = _asked(current, data, ground_of(place, current.model, data, current.x), known=known)
+            ground = FunctionSite.of(place, place.words[:1], current.model, data, current.x)
+            one = _asked(current, data, ground, known=known)
             alone = -np.inf if one is None else one.log_evidence
-        for words in _pairs(fit.model, place):
-            if (place.targets, words) in done:
+        for words in itertools.combinations(names, 2):  # a coordinate of the place, and any other
+            if not set(words) & set(place.words) or (place.targets, words) in done:
                 continue
             done.add((place.targets, words))
-            ground = ground_of_two(place.targets[0], words, current.model, data, current.x)
+            site = Place(((place.targets[0], sympy.Integer(1)),), (), symbol(words[0]), words, np.empty(0))
+            ground = FunctionSite.of(site, words, current.model, data, current.x)
             if not ground.usable:
                 continue
             both = _asked(current, data, ground, known=known, alike=True)
@@ -329,31 +358,6 @@ def _with_surfaces(fit: Fit, models: Sequence[Model], material: Material) -> lis
             if some and not something_left(some[0].fit, data):
                 return found  # nothing is left for a surface, nor for a less likely pair
     return found
-
-
-def _begins(fit: Fit, models: Sequence[Model], material: Material) -> list[tuple[Place, Model | None]]:
-    """Where functions of two coordinates are asked for, and the models that have one of one there.
-
-    Where there are none, one of two may tell so little of either coordinate alone.
-    """
-    single = [each for each in models if len(each.parts) == 1]
-    known = [(each.parts[0].place, each) for each in single[:FUNCTIONS_FITTED]]
-    found: list[tuple[Place, Model | None]] = [(place, each) for place, each in known if place is not None]
-    if not single:
-        try:
-            likely = likely_places(fit, material.data, material.roles)
-        except NUMERICAL_ERRORS as error:
-            LOGGER.info("no function can be screened: %s", error)
-            return []
-        found = [(each.place, None) for each in likely[:FUNCTIONS_FITTED]]
-    # Not in a rotating frame, nor in a sensor.
-    return [(place, model) for place, model in found if len(place.equations) == 1]
-
-
-def _pairs(model: Dynamics, place: Place) -> Iterator[tuple[str, str]]:
-    """A coordinate of a place, and any other state or input."""
-    names = [name for name in coordinates_of(model) if name != "t"]
-    return (each for each in itertools.combinations(names, 2) if set(each) & set(place.words))
 
 
 def with_a_function(before: tuple[Part, ...], fit: Fit, material: Material) -> list[Model]:
@@ -387,7 +391,7 @@ def with_a_function(before: tuple[Part, ...], fit: Fit, material: Material) -> l
     for likely in {
         id(each): each for each in (*ranked[:FUNCTIONS_FITTED], *itertools.islice(alone, 1))
     }.values():
-        ground = ground_of(likely.place, fit.model, data, fit.x)
+        ground = FunctionSite.of(likely.place, likely.place.words[:1], fit.model, data, fit.x)
         models += _with_a_smooth_function(before, fit, ground, cost, material)
     given = sum(part.cost for part in before)
     found = [replace(each, log_evidence=each.log_evidence + given) for each in _weighed(models, fit, data)]
@@ -427,14 +431,6 @@ def _formulas(
     return models
 
 
-# Times τ that are tried, in units of the time in which the coordinate changes; the best of them is then
-# fitted. A much shorter memory cannot be told from none, nor a much longer one from a constant of each
-# recording.
-MEMORY_TIMES = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
-MEMORY_DAMPINGS = (0.1, 1.0)  # k of what rings, tried and then fitted: over many turns, and over hardly one
-MEMORIES_FITTED = 6  # memories that are fitted, the most promising ones: a choice
-
-
 def _memory_suspected(models: Sequence[Model], data: Measurements) -> bool:
     """Whether models leave room for a memory: all but a function of one coordinate that leaves nothing.
 
@@ -471,46 +467,36 @@ def _with_memories(fit: Fit, models: Sequence[Model], material: Material) -> lis
     for probe, result in ranked[:MEMORIES_FITTED]:
         if result.gain < 2 * cost:
             break
-        found += [
-            Model((part,), part.trial.fit) for part in _fitted_memory(probe, result, fit, cost, material)
-        ]
+        # Fitted from no effect on, with the τ that promises most.
+        candidate, model = probe.candidate, probe.candidate.model
+        known = dict(probe.shapes)
+        values = [known.get(each.name, each.value) for each in model.parameters]
+        candidate = replace(candidate, model=model.with_values(np.array(values)))
+        try:
+            x = with_further_states(
+                probe, fit.model, material.data, fit.x, substeps=fit.substeps, values=fit.model.values
+            )
+        except NUMERICAL_ERRORS as error:
+            LOGGER.info("%s cannot be fitted: %s", candidate.label, error)
+            continue
+        begin = replace(fit, x=x)
+        for part in _fitted_part(candidate, result.level, None, fit, cost, material, begin=begin):
+            LOGGER.info("%s: chi2 better by %.1f", candidate.label, part.trial.delta_chi2)
+            if admissible(part.trial.fit, candidate):
+                found.append(Model((part,), part.trial.fit))
     return found
-
-
-def _fitted_memory(probe: Probe, result: Screened, fit: Fit, cost: float, material: Material) -> list[Part]:
-    """A memory fitted from no effect on, with the τ that promises most."""
-    candidate, model = probe.candidate, probe.candidate.model
-    known = dict(probe.shapes)
-    values = [known.get(each.name, each.value) for each in model.parameters]
-    candidate = replace(candidate, model=model.with_values(np.array(values)))
-    try:
-        x = with_further_states(
-            probe, fit.model, material.data, fit.x, substeps=fit.substeps, values=fit.model.values
-        )
-    except NUMERICAL_ERRORS as error:
-        LOGGER.info("%s cannot be fitted: %s", candidate.label, error)
-        return []
-    begin = replace(fit, x=x)
-    parts = _fitted_part(candidate, result.level, None, fit, cost, material, begin=begin)
-    for each in parts:
-        LOGGER.info("%s: chi2 better by %.1f", candidate.label, each.trial.delta_chi2)
-    return [each for each in parts if admissible(each.trial.fit, candidate)]
 
 
 def _memories_of(model: Dynamics, roles: Roles) -> list[MechanismCandidate]:
     """A memory of every coordinate in every equation that says more than a definition."""
     what = Mechanism(name="memory", sentence="What is missing follows a coordinate late.", forms=MEMORY_FORMS)
-    return [_named(each) for each in candidates_of(model, roles, (what,))]
-
-
-def _named(candidate: MechanismCandidate) -> MechanismCandidate:
-    name = f"a memory of {candidate.coordinate}"
-    variant = f", {candidate.variant}" if candidate.variant else ""
-    return replace(candidate, name=name, label=f"{name} in {', '.join(candidate.equations)}{variant}")
-
-
-def _late(of: str) -> Shape:
-    return Shape(time_of=of, at=MEMORY_TIMES)
+    found = []
+    for each in candidates_of(model, roles, (what,)):
+        name = f"a memory of {each.coordinate}"
+        variant = f", {each.variant}" if each.variant else ""
+        label = f"{name} in {', '.join(each.equations)}{variant}"
+        found.append(replace(each, name=name, label=label))
+    return found
 
 
 def _memory_form(
@@ -530,7 +516,7 @@ def _memory_form(
         terms=terms,
         parameters={
             "c": MechanismParameter(unit=unit),
-            "tau": MechanismParameter(sign="positive", unit="T", shape=_late(of)),
+            "tau": MechanismParameter(sign="positive", unit="T", shape=Shape(time_of=of, at=MEMORY_TIMES)),
         },
         coordinate=coordinate or of,
         variant=variant,
@@ -548,7 +534,7 @@ def _forms_of(roles: dict[str, Role], of: str) -> tuple[Form, ...]:
         terms={"q": "c*z"},
         parameters={
             "c": MechanismParameter(unit=f"q/T/{of}"),
-            "tau": MechanismParameter(sign="positive", unit="T", shape=_late(of)),
+            "tau": MechanismParameter(sign="positive", unit="T", shape=Shape(time_of=of, at=MEMORY_TIMES)),
             "k": MechanismParameter(sign="positive", shape=Shape(scale_of="1", at=MEMORY_DAMPINGS)),
         },
         coordinate=of,
@@ -577,7 +563,6 @@ MEMORY_FORMS = (
     _intensity({"p": "c*z*q", "q": "-c*z*p"}, "across the state"),
     _intensity({"p": "c*z*p", "q": "c*z*q"}, "along the state"),
 )
-DESCRIBED_MOST = 2  # functions that are put on top of each other: more are no description
 
 
 def models_of_the_nameless(
@@ -669,13 +654,11 @@ def likeliest(models: Sequence[Model], alone: Fit, data: Measurements) -> tuple[
         for each in _weighed(models, alone, data)
         if each.log_evidence > 0 and runs_freely(each.fit, alone, data)
     )
-    return tuple(_followed(each, data) for each in itertools.islice(likelier, FUNCTIONS_FITTED))
-
-
-def _followed(model: Model, data: Measurements) -> Model:
-    """A model with its estimates of least squares, where random forces are part of its fit."""
-    if not model.fit.has_process_noise:
-        return model
-    still = replace(model.fit, noise=model.fit.noise.without_process())
-    followed = fit_with_and_without_process_noise(model.fit.model, data, still)[1]
-    return replace(model, exact=followed) if followed.converged else model
+    found = []
+    for each in itertools.islice(likelier, FUNCTIONS_FITTED):
+        if each.fit.has_process_noise:  # its estimates of least squares, too
+            still = replace(each.fit, noise=each.fit.noise.without_process())
+            exact = fit_with_and_without_process_noise(each.fit.model, data, still)[1]
+            each = replace(each, exact=exact) if exact.converged else each
+        found.append(each)
+    return tuple(found)

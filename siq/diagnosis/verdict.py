@@ -338,7 +338,7 @@ def _locate(investigation: Investigation, data: Measurements, described: Model |
         (
             each
             for each in curves
-            if each.direction.coordinate == coordinate and set(each.direction.equations) & set(equations)
+            if each.direction.coordinate == coordinate and set(each.direction.names) & set(equations)
         ),
         None,
     )
@@ -354,7 +354,7 @@ def _locate(investigation: Investigation, data: Measurements, described: Model |
     # What any one equation could explain, as a share of the excess over noise.
     gains: dict[str, float] = {}
     for each in curves:
-        for name in each.direction.equations:
+        for name in each.direction.names:
             gains[name] = max(gains.get(name, 0.0), each.gain)
     total = max(investigation.remainder.before.total - investigation.remainder.before.freedom, 1e-300)
     # Recordings whose residuals, process noise not admitted, exceed noise by a fair share of the excess.
@@ -387,16 +387,16 @@ def _most_telling(structure: Structure, roles: Roles) -> tuple[tuple[str, ...], 
     coordinate tells nearly all, a force depends on the course of the motion, position and velocity both.
     """
     best = structure.curves[0]
-    equations, coordinate = best.direction.equations, best.direction.coordinate
+    equations, coordinate = best.direction.names, best.direction.coordinate
     own = next((pair for pair in roles.motions if pair[1] in equations), equations)
     if coordinate in (*own, "amplitude"):
         return equations, coordinate
     motion = {*roles.states, *(name for pair in roles.motions for name in pair), "amplitude"}
     rivals, share = (own, NEARLY_ALL) if coordinate in motion else (motion, MOTION_SHARE)
     for curve in structure.curves:
-        there = set(equations) <= set(curve.direction.equations)
+        there = set(equations) <= set(curve.direction.names)
         if there and curve.direction.coordinate in rivals and curve.gain >= share * best.gain:
-            return curve.direction.equations, curve.direction.coordinate
+            return curve.direction.names, curve.direction.coordinate
     excess = structure.total - structure.freedom
     if len(own) > len(equations) and best.gain < NEARLY_ALL * excess:
         return equations, ", ".join(own)

@@ -140,7 +140,7 @@ def test_a_candidate_that_overflows_ends_itself_and_not_the_case(
     def overflow(*_: object, **__: object) -> None:
         raise NumericalFailure("it runs away")
 
-    monkeypatch.setattr(promises, "_screened", overflow)
+    monkeypatch.setattr(promises, "_screen", overflow)
     found = answered(falling_ball(0.3), tmp_path)
     assert {each.reason for each in found.statement.not_fitted} == {"it runs away"}
     assert not found.statement.partial and np.isfinite(found.statement.errors.recalibrated or 0.0)

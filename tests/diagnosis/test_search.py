@@ -16,7 +16,7 @@ from siq.diagnosis.dictionary import Roles, Shape
 from siq.diagnosis.evidence import TriedMechanism, _blocks_of, _correlated_probability, _correlation_time
 from siq.diagnosis.mechanisms import once_more
 from siq.diagnosis.naming import NamingDecision, _judge_mechanisms
-from siq.diagnosis.residual_structure import Remainder, Structure, _Curve, _Direction
+from siq.diagnosis.residual_structure import Curve, Direction, Remainder, Structure
 from siq.diagnosis.screening import _screen
 from siq.diagnosis.search import Search, _accepted, _better_without, _Found
 from siq.diagnosis.study import SearchOptions
@@ -139,7 +139,7 @@ def test_a_mechanism_that_was_found_is_not_found_once_more_in_another_form() -> 
 
 def structure(excess: float, *gains: tuple[str, str, float]) -> Structure:
     curves = [
-        _Curve(_Direction((equation,), coordinate, False, np.zeros(4)), np.zeros(4), np.ones(4), gain, 0.0)
+        Curve(Direction((equation,), coordinate, False, np.zeros(4)), np.zeros(4), np.ones(4), gain, 0.0)
         for equation, coordinate, gain in gains
     ]
     return Structure(tuple(curves), 0.0, 0.0, excess + 100, 100)
@@ -193,9 +193,7 @@ def test_the_coordinate_that_tells_most(roles: Roles, found: Structure, expected
 
 
 def test_of_a_rotating_frame_the_motion_is_its_amplitude() -> None:
-    across = _Curve(
-        _Direction(("P", "Q"), "amplitude", True, np.zeros(4)), np.zeros(4), np.ones(4), 128.0, 0.0
-    )
+    across = Curve(Direction(("P", "Q"), "amplitude", True, np.zeros(4)), np.zeros(4), np.ones(4), 128.0, 0.0)
     found = structure(370, ("Q", "t", 150.0))
     found = replace(found, curves=(*found.curves, across))
     assert _most_telling(found, FRAME) == (("P", "Q"), "amplitude")

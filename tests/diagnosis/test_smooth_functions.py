@@ -24,7 +24,7 @@ from siq.diagnosis.smooth_functions import (
     smooth_function,
     with_smooth_function,
 )
-from siq.diagnosis.terms import Ground, Place
+from siq.diagnosis.terms import FunctionSite, Place
 from siq.inference.budget import Budget, BudgetSpent
 from siq.inference.kalman_filter import Noise
 from siq.inference.maximum_likelihood import fit_by_multiple_shooting
@@ -38,12 +38,12 @@ ONE = sympy.Integer(1)
 MODEL = Dynamics(("x", "v"), (V, -X), Diffusion.identity(2))
 
 
-def ground(*coordinates: sympy.Symbol, count: int = 400) -> Ground:
+def ground(*coordinates: sympy.Symbol, count: int = 400) -> FunctionSite:
     """Where a function of some coordinates stands, and recordings that have been everywhere."""
     courses = np.random.default_rng(3).uniform(-1, 3, size=(len(coordinates), count))
     words = tuple(map(str, coordinates))
     place = Place((("v", ONE),), (), coordinates[0], words, np.empty(0))
-    return Ground(place, coordinates, words, courses)
+    return FunctionSite(place, coordinates, words, courses)
 
 
 def product() -> _ProductFunction:
@@ -73,7 +73,7 @@ def test_a_formula_says_what_the_function_does(function: Smooth) -> None:
     ("where", "shares", "off"), [(ground(X), (0.25,), 1e-4), (ground(X, V), (0.5, 0.25), 0.05)]
 )
 def test_a_sum_of_bumps_is_the_process_where_the_recordings_have_been(
-    where: Ground, shares: tuple[float, ...], off: float
+    where: FunctionSite, shares: tuple[float, ...], off: float
 ) -> None:
     function = smooth_function(where, shares, deviation=1.7)
     (expected,) = function.expected(tuple(f"b{k}" for k in range(function.width)))
@@ -138,7 +138,7 @@ def test_evidence_of_parameters_expected_together_is_the_marginal_likelihood() -
     """Exact for a linear model with normal errors: log N(y; 0, ΦKΦᵀ + σ²)."""
     t, noise = np.arange(0, 8, 0.1), 0.1**2
     place = Place((), (("y", ONE),), TIME, ("t",), np.empty(0))
-    function = smooth_function(Ground(place, (TIME,), ("t",), t[None]), (0.125,), deviation=0.8)
+    function = smooth_function(FunctionSite(place, (TIME,), ("t",), t[None]), (0.125,), deviation=0.8)
     still = Dynamics(("y",), (sympy.Integer(0),), Diffusion.identity(1))
     along = 0.8 * np.linalg.solve(function.triangle, function.values(t[None]))
     exact = [along.T @ along + noise * np.eye(len(t)), noise * np.eye(len(t))]
