@@ -188,7 +188,7 @@ POPULATIONS = Roles(populations=("prey", "predator"), states=("prey", "predator"
 )
 def test_the_coordinate_that_tells_most(roles: Roles, found: Structure, expected: str) -> None:
     equations, coordinate = _most_telling(found, roles)
-    assert equations == (found.curves[0].direction.equations)
+    assert equations == (found.curves[0].direction.names)
     assert coordinate == expected
 
 
