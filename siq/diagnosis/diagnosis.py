@@ -20,12 +20,12 @@ import pandas as pd
 from siq.diagnosis.evidence import NUMERICAL_ERRORS
 from siq.diagnosis.investigation import HeldOutRuns, Investigation, held_out_runs, investigate, quiet_verdict
 from siq.diagnosis.mechanisms import completed
-from siq.diagnosis.residual_structure import what_is_left
+from siq.diagnosis.residual_structure import remainder_of
 from siq.diagnosis.search import Search
 from siq.diagnosis.smooth_functions import MECHANISM
 from siq.diagnosis.statement import Location, StatedMechanism, Statement
 from siq.diagnosis.study import Comparison, MismatchStudy, MismatchVerdict, comparison_of
-from siq.diagnosis.unnamed_models import Material, models_of_the_nameless
+from siq.diagnosis.unnamed_models import FitContext, fit_unnamed_models
 from siq.diagnosis.verdict import statement_of
 from siq.errors import InputError, NumericalFailure
 from siq.inference.budget import Budget
@@ -58,10 +58,10 @@ def withdrawn(found: Investigation, case: Comparison, budget: Budget) -> Investi
     names = [each.best.candidate.label for each in found.search.found]
     LOGGER.info("%s: not named, since held-out recordings are predicted worse", names)
     options, recalibrated = case.settings.search, found.search.recalibrated
-    material = Material(
+    context = FitContext(
         case.learn, found.roles, case.settings.degree, options.blocks, len(found.candidates), budget
     )
-    models = models_of_the_nameless(found.search, material)
+    models = fit_unnamed_models(found.search, context)
     certain = any(
         each.log_evidence >= options.least_log_odds and all(part.kind != MECHANISM for part in each.parts)
         for each in models
@@ -69,7 +69,7 @@ def withdrawn(found: Investigation, case: Comparison, budget: Budget) -> Investi
     if not (
         recalibrated.has_process_noise
         or certain
-        or what_is_left(found.model, case.learn, recalibrated, recalibrated, found.roles).structured
+        or remainder_of(found.model, case.learn, recalibrated, recalibrated, found.roles).structured
     ):
         return replace(
             found,

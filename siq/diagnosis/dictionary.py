@@ -1,10 +1,15 @@
-"""dictionary"""
+"""The dictionary of mechanisms, and which states, inputs and parameters may take part in each.
+
+Mechanisms are written for roles - a position, a velocity, the two quadratures of a rotating frame, a
+population, a level, a store - and roles are read off equations and units, never off names. A system of mere
+numbers is described by generic monomials only.
+"""
 
 from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -369,9 +374,12 @@ def roles_of(model: Dynamics) -> Roles:
         name for name in alone if name not in levels and _stays_zero(model, model.states.index(name))
     )
     units = dict(zip(model.states, model.units, strict=True))
+    formulas = (*model.equations, *dict(model.outputs).values())
+    sines = {each for formula in formulas for each in formula.atoms(sympy.sin, sympy.cos)}
+    turning = {name for each in sines for name in each.free_symbols}
     return Roles(
         motions=motions,
-        angles=tuple(x for x, _ in motions if units[x] == "rad" or _turns_round(model, x)),
+        angles=tuple(x for x, _ in motions if units[x] == "rad" or symbol(x) in turning),
         amplitudes=amplitudes,
         populations=populations,
         feeding=tuple(
@@ -430,15 +438,6 @@ def trial_points(
         delayed=delayed,
         slopes=np.zeros_like(delayed),
         t=generator.uniform(0.0, 1.0, size=count),
-    )
-
-
-def _turns_round(model: Dynamics, name: str) -> bool:
-    """Whether a state stands within a sine or cosine."""
-    return any(
-        symbol(name) in each.free_symbols
-        for formula in (*model.equations, *dict(model.outputs).values())
-        for each in formula.atoms(sympy.sin, sympy.cos)
     )
 
 
@@ -522,9 +521,11 @@ def assignments(form: Form, model: Dynamics, roles: Roles) -> Iterator[dict[str,
             choices.append([{names[place]: name} for name in _of_kind(kinds[place], model, roles)])
             place += 1
     units = dict(zip(model.states, model.units, strict=True))
+    order = {name: place for place, name in enumerate(model.states)}
     for combination in itertools.product(*choices):
         filled = [name for part in combination for name in part.values()]
-        if len(set(filled)) < len(filled) or (form.symmetric and filled != sorted(filled, key=_order(model))):
+        ordered = sorted(filled, key=lambda name: order.get(name, -1))
+        if len(set(filled)) < len(filled) or (form.symmetric and filled != ordered):
             continue
         found = {units.get(name, "1") for name in filled} if form.one_unit else set()
         if len(found) > 1 or "1" in found:
@@ -548,11 +549,6 @@ def _pairs(kinds: Sequence[str], roles: Roles) -> tuple[tuple[str, str], ...] | 
         case ["upper level", "lower level"]:
             return roles.cascades
     return None
-
-
-def _order(model: Dynamics) -> Callable[[str], int]:
-    places = {name: place for place, name in enumerate(model.states)}
-    return lambda name: places.get(name, -1)
 
 
 def _of_kind(kind: str, model: Dynamics, roles: Roles) -> tuple[str, ...]:

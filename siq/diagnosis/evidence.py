@@ -39,7 +39,7 @@ NUMERICAL_ERRORS = (ArithmeticError, ValueError, np.linalg.LinAlgError)
 
 
 @dataclass(frozen=True)
-class TriedMechanism:
+class FittedCandidate:
     """A candidate, fitted.
 
     Attributes
@@ -65,7 +65,7 @@ class TriedMechanism:
 
 
 @dataclass(frozen=True)
-class UntriedMechanism:
+class UnfittedCandidate:
     """A candidate that promised something, and whose fit gave nothing that could be judged.
 
     Attributes
@@ -80,19 +80,19 @@ class UntriedMechanism:
     reason: str
 
 
-def in_words(error: Exception) -> str:
+def failure_reason(error: Exception) -> str:
     """Why a candidate gave nothing, as a reader is told."""
     return str(error) if isinstance(error, NumericalFailure) else f"{type(error).__name__}: {error}"
 
 
 def judged(
     trial: Fit, before: Fit, data: Measurements, candidate: MechanismCandidate, *, blocks: int
-) -> TriedMechanism:
+) -> FittedCandidate:
     """A candidate's fit with its evidence over the fit without it."""
     extra = len(trial.model.free) - len(before.model.free)
     gained = 2 * (trial.log_likelihood - before.log_likelihood)
     count = trial.degrees_of_freedom + len(trial.model.free)
-    return TriedMechanism(
+    return FittedCandidate(
         candidate=candidate,
         fit=trial,
         delta_chi2=gained,

@@ -22,7 +22,7 @@ import numpy as np
 import scipy.stats
 
 from siq.diagnosis.mechanisms import MechanismCandidate
-from siq.diagnosis.unnamed_models import Model
+from siq.diagnosis.unnamed_models import AugmentedModel
 from siq.errors import NumericalFailure
 from siq.inference.kalman_filter import Noise
 from siq.inference.maximum_likelihood import Fit
@@ -304,7 +304,7 @@ def errors_left_out(
 
 
 def adopted_by_held_out(
-    choices: Sequence[tuple[Model, Fit]],
+    choices: Sequence[tuple[AugmentedModel, Fit]],
     without: Sequence[Fit],
     data: Measurements,
     *,
@@ -348,7 +348,7 @@ def adopted_by_held_out(
 
 
 def adopted_by_left_out(
-    choices: Sequence[tuple[Model, Fit]],
+    choices: Sequence[tuple[AugmentedModel, Fit]],
     without: Fit,
     learned: Measurements,
     *,

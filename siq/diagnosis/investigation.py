@@ -9,7 +9,7 @@ import numpy as np
 import scipy.stats
 
 from siq.diagnosis.dictionary import Mechanism, Roles, roles_of
-from siq.diagnosis.evidence import UntriedMechanism
+from siq.diagnosis.evidence import UnfittedCandidate
 from siq.diagnosis.holdout import HeldOutErrors, SimulationProtocol, adopted_by_held_out, adopted_by_left_out
 from siq.diagnosis.mechanisms import MechanismCandidate, candidates_of, generic_candidates
 from siq.diagnosis.naming import NamingDecision, decide_naming
@@ -17,13 +17,13 @@ from siq.diagnosis.residual_structure import (
     RANDOM_RESIDUALS,
     STRUCTURED,
     Remainder,
-    explained_by_rounding,
-    unsteadiness,
-    what_is_left,
+    explained_by_quantisation,
+    noise_nonstationarity,
+    remainder_of,
 )
 from siq.diagnosis.search import Search, search
 from siq.diagnosis.study import MismatchStudy, MismatchVerdict, SearchOptions
-from siq.diagnosis.unnamed_models import Material, Model, models_of_the_nameless
+from siq.diagnosis.unnamed_models import AugmentedModel, FitContext, fit_unnamed_models
 from siq.errors import NumericalFailure
 from siq.inference.budget import UNLIMITED, Account, Budget
 from siq.inference.maximum_likelihood import Fit
@@ -82,7 +82,7 @@ class Investigation:
     remarks: tuple[Remark, ...]
     candidates: tuple[MechanismCandidate, ...]
     naming: NamingDecision | None = None
-    models: tuple[Model, ...] = ()
+    models: tuple[AugmentedModel, ...] = ()
     account: Account = UNLIMITED
     withdrawn: bool = False
 
@@ -163,22 +163,22 @@ def investigate(
     by_each: list[Remainder] = []
     for place, each in enumerate(found.found):
         try:
-            by_each.append(what_is_left(model, data, recalibrated, each.best.fit, roles))
+            by_each.append(remainder_of(model, data, recalibrated, each.best.fit, roles))
         except NumericalFailure as error:
             fit = found.found[place - 1].best.fit if place else recalibrated
-            untried = (*found.untried, UntriedMechanism(each.best.candidate, str(error)))
+            untried = (*found.untried, UnfittedCandidate(each.best.candidate, str(error)))
             found = replace(found, found=found.found[:place], fit=fit, untried=untried)
             break
-    left = by_each[-1] if by_each else what_is_left(model, data, recalibrated, recalibrated, roles)
+    left = by_each[-1] if by_each else remainder_of(model, data, recalibrated, recalibrated, roles)
     exact: Fit | None = None
     naming: NamingDecision | None = None
-    models: tuple[Model, ...] = ()
+    models: tuple[AugmentedModel, ...] = ()
     verdict, remarks = MismatchVerdict.NO_MISMATCH, tuple[Remark, ...]()
-    material = Material(data, roles, study.degree, options.blocks, len(candidates), budget)
+    context = FitContext(data, roles, study.degree, options.blocks, len(candidates), budget)
     tried = bool(found.found)
     if tried:
         naming = decide_naming(
-            found, by_each, model, material, candidates,
+            found, by_each, model, context, candidates,
             options=options, generator=np.random.default_rng(seed),
         )  # fmt: skip
         models, exact, remarks = naming.models, naming.exact, naming.remarks
@@ -191,7 +191,7 @@ def investigate(
         with budget.exempt():
             # What a mechanism has found already has to be gone more clearly.
             least = RANDOM_RESIDUALS if tried else STRUCTURED
-            rounded = explained_by_rounding(model, data, least_squares, roles, least=least, budget=budget)
+            rounded = explained_by_quantisation(model, data, least_squares, roles, least=least, budget=budget)
     if rounded is not None:
         found = replace(found, recalibrated=rounded.fit, found=(), fit=rounded.fit)
         left, least_squares, naming, models, exact = rounded.left, rounded.fit, None, (), None
@@ -204,17 +204,17 @@ def investigate(
         # function instead of it nor one beside what is left of it: noise does not know where a system is, so
         # that no function of the states takes a part of it over.
         verdict = MismatchVerdict.UNEXPLAINED
-        steady = unsteadiness(found.fit, data) < 2 * options.least_log_odds
+        steady = noise_nonstationarity(found.fit, data) < 2 * options.least_log_odds
         remarks = () if steady else (Remark("diagnosis.noise_follows_motion"),)
         knows_noise = any(form.noise for mechanism in dictionary for form in mechanism.forms)
         if knows_noise and steady and not left.doubtful:
-            models = models_of_the_nameless(found, material)
+            models = fit_unnamed_models(found, context)
             if not models or models[0].log_evidence < options.least_log_odds:
                 verdict, models = MismatchVerdict.MISSING_PHYSICS, ()
     elif not tried:
         verdict = MismatchVerdict.UNEXPLAINED
     if verdict is MismatchVerdict.UNEXPLAINED and not (models or found.found):
-        models = models_of_the_nameless(found, material)
+        models = fit_unnamed_models(found, context)
     budget.says("working out how well parameters are known")
     with budget.exempt():
         covariance = covariance_with_unknown_forces(found.fit, data, budget=budget)
@@ -279,7 +279,7 @@ class HeldOutRuns:
     model: Dynamics
     errors: HeldOutErrors
     independent: bool = True
-    described: Model | None = None
+    described: AugmentedModel | None = None
     described_fit: Fit | None = None
     adopted: bool = False
 

@@ -614,7 +614,7 @@ def _added_square(candidate: MechanismCandidate) -> tuple[str, sympy.Expr] | Non
     return place, formula.diff(symbol(candidate.amplitudes[0])) ** 2
 
 
-def once_more(candidate: MechanismCandidate, found: MechanismCandidate) -> bool:
+def repeats(candidate: MechanismCandidate, found: MechanismCandidate) -> bool:
     """Whether a candidate is what was found already: the same, or in another form at the same place.
 
     A second threshold beside the first, or a second spring in the same place, is no further physics.

@@ -29,7 +29,7 @@ from siq.diagnosis.dictionary import Roles
 from siq.diagnosis.evidence import (
     NUMERICAL_ERRORS,
     SMOOTH_LENGTHS,
-    TriedMechanism,
+    FittedCandidate,
     admissible,
     averaged_evidence,
     correlation_time_left,
@@ -48,12 +48,12 @@ from siq.diagnosis.search import Search
 from siq.diagnosis.study import SearchOptions
 from siq.diagnosis.terms import linearised_with_places, places_in, products_in
 from siq.diagnosis.unnamed_models import (
-    Material,
-    Model,
-    models_beside_names,
-    models_of_the_nameless,
+    AugmentedModel,
+    FitContext,
+    fit_models_of_remainder,
+    fit_unnamed_models,
     runs_freely,
-    with_a_function,
+    with_function,
 )
 from siq.errors import NumericalFailure
 from siq.inference.kalman_filter import Grid, Noise, Whitened, solve, whiten
@@ -242,15 +242,15 @@ class _ResidualModelComparison:
     """
 
     log_odds: float
-    on_top: tuple[Model, ...]
-    instead: tuple[Model, ...]
+    on_top: tuple[AugmentedModel, ...]
+    instead: tuple[AugmentedModel, ...]
     predicts_better: bool = False
 
 
 def _residual_model_comparison(
-    trial: TriedMechanism,
+    trial: FittedCandidate,
     recalibrated: Fit,
-    material: Material,
+    context: FitContext,
     *,
     considered: Sequence[MechanismCandidate],
     unnamed: float,
@@ -259,22 +259,22 @@ def _residual_model_comparison(
     """Hold a mechanism against functions in its place, whatever else is missing being a function for both."""
     if trial.fit.has_process_noise or trial.fit.model.dimension > recalibrated.model.dimension:
         return None
-    data = material.data
+    data = context.data
     on_top = [
         each
-        for each in with_a_function((), trial.fit, material)
+        for each in with_function((), trial.fit, context)
         if not each.fit.has_process_noise
         and admissible(each.fit, trial.candidate)
         and runs_freely(each.fit, trial.fit, data)
     ]
-    instead = with_a_function((), recalibrated, material)
+    instead = with_function((), recalibrated, context)
     for one in instead[:FUNCTIONS_EXTENDED]:
-        instead = instead + with_a_function(one.parts, one.fit, material)
-    ours = [Model((), trial.fit), *on_top]
-    theirs = [Model((), recalibrated), *instead]
+        instead = instead + with_function(one.parts, one.fit, context)
+    ours = [AugmentedModel((), trial.fit), *on_top]
+    theirs = [AugmentedModel((), recalibrated), *instead]
     correlated = correlation_time_left([each.fit for each in (*ours, *theirs)], data)
 
-    def best(models: Sequence[Model]) -> float:
+    def best(models: Sequence[AugmentedModel]) -> float:
         """The largest evidence; that something without a name is missing, too, has its own probability."""
         return max(
             log_evidence_of(each.fit, data, correlated=correlated)
@@ -342,7 +342,7 @@ class NamingDecision:
     convincing: bool
     named: bool
     remarks: tuple[Remark, ...] = ()
-    models: tuple[Model, ...] = ()
+    models: tuple[AugmentedModel, ...] = ()
     exact: Fit | None = None
 
 
@@ -416,7 +416,7 @@ def decide_naming(
     whole: Search,
     left: Sequence[Remainder],
     model: Dynamics,
-    material: Material,
+    context: FitContext,
     candidates: Sequence[MechanismCandidate],
     *,
     options: SearchOptions,
@@ -430,14 +430,14 @@ def decide_naming(
         The search.
     left
         What is left with the first mechanism, the first two, and so on.
-    model, material, candidates
+    model, context, candidates
         The simulation as its author believes it, what models are made from, and what could be named.
     options
         Of the search.
     generator
         Draws effects without a name.
     """
-    data, roles = material.data, material.roles
+    data, roles = context.data, context.roles
     decision = _judge_mechanisms(
         whole, left, data, model, roles, candidates, options=options, generator=generator
     )
@@ -448,7 +448,7 @@ def decide_naming(
         _log_odds(whole, 1, [0], data, model, roles, candidates, options) > -options.least_log_odds
     ):
         beside = _residual_model_comparison(
-            whole.found[0].best, whole.recalibrated, material,
+            whole.found[0].best, whole.recalibrated, context,
             considered=candidates, unnamed=options.unnamed, least=options.least_log_odds,
         )  # fmt: skip
     if beside is not None and (beside.log_odds >= options.least_log_odds or beside.predicts_better):
@@ -460,15 +460,15 @@ def decide_naming(
     search = decision.search
     if not decision.named:
         instead = None if beside is None else beside.instead
-        return replace(decision, models=models_of_the_nameless(search, material, functions=instead))
+        return replace(decision, models=fit_unnamed_models(search, context, functions=instead))
     if len(whole.found) > len(search.found) or decision.remainder.doubtful or search.fit.has_process_noise:
         on_top = None if beside is None else beside.on_top
-        models = models_beside_names(search, whole, material, functions=on_top)
+        models = fit_models_of_remainder(search, whole, context, functions=on_top)
         decision = replace(decision, models=models)
     if search.fit.has_process_noise:
         still = replace(search.fit, noise=search.fit.noise.without_process())
-        with material.budget.exempt():
-            exact = fit_with_and_without_process_noise(search.fit.model, data, still, budget=material.budget)[
+        with context.budget.exempt():
+            exact = fit_with_and_without_process_noise(search.fit.model, data, still, budget=context.budget)[
                 1
             ]
         if exact.converged:

@@ -1,4 +1,21 @@
-"""residual_structure"""
+"""Structure in residuals, quantisation, and whether process noise is stationary.
+
+What may be missing is described without naming it: in every equation a piecewise linear function of every
+coordinate - a state, an input, the amplitude of a rotating frame, time - is let in, and the data say how
+large it would be. It tells where a mismatch sits, and whether one is left.
+
+**Quantisation.** Where the steps of a sensor are wide beside its noise, rounding errors are autocorrelated
+and look like process noise, or like physics that is missing. The steps are known: the recorded values lie on
+them. Of a reading that was rounded it is known that the value lay within its step, and a simulation says
+where: at the mean of a normal distribution that is cut off at the edges of the step. About the right
+simulation the residuals to these values are independent of each other (the generalised residuals of
+Gourieroux, Monfort, Renault and Trognon, Journal of Econometrics 34, 5, 1987), and the fit to them is that of
+highest likelihood of the readings (Dempster, Laird and Rubin's EM algorithm).
+
+**Stationarity.** Process noise drives a system alike whether it moves or rests. What a simulation lacks of a
+hidden part - a second oscillator, a memory - can pass for process noise, too, where recordings are noisy; but
+such forces fade with the motion that excites them. The likelihood tells the two apart.
+"""
 
 from __future__ import annotations
 
@@ -250,7 +267,7 @@ class Remainder:
         return self.after.p_value < DOUBTFUL
 
 
-def what_is_left(
+def remainder_of(
     model: Dynamics, data: Measurements, recalibrated: Fit, final: Fit, roles: Roles
 ) -> Remainder:
     """Structure before and after mechanisms were added, and the share of the excess that they explain.
@@ -271,24 +288,18 @@ def what_is_left(
     alone = after
     if final.has_process_noise:
         alone = _structure_of(final.model, data, final, roles, noise=final.noise.without_process())
-    return Remainder(before, after, _explained_share(before, alone))
-
-
-def _explained_share(before: Structure, after: Structure) -> float:
-    """Share of the excess over measurement noise that the final simulation explains, without process noise.
-
-    What is left is the excess that remains, or what a function of one coordinate still finds: where a fit
-    without process noise takes a misfit for noise, only the latter shows it.
-    """
     if not before.total > before.freedom:
-        return 1.0
-    best = after.curves[0] if after.curves else None
+        return Remainder(before, after, 1.0)
+    # What is left is the excess that remains, or what a function of one coordinate still finds: where a fit
+    # without process noise takes a misfit for noise, only the latter shows it.
+    best = alone.curves[0] if alone.curves else None
     systematic = 0.0 if best is None else best.gain - 2 * len(best.direction.knots)
-    left = max(after.total - after.freedom, systematic, 0.0)
-    return float(np.clip(1 - left / (before.total - before.freedom), 0.0, 1.0))
+    left = max(alone.total - alone.freedom, systematic, 0.0)
+    share = float(np.clip(1 - left / (before.total - before.freedom), 0.0, 1.0))
+    return Remainder(before, after, share)
 
 
-def something_left(current: Fit, data: Measurements) -> bool:
+def has_structure(current: Fit, data: Measurements) -> bool:
     """Whether it is worth looking for something on top of a fit."""
     model = current.model
     if current.has_process_noise:
@@ -304,7 +315,7 @@ NOISE_SETTLED = 0.01  # relative change of the noise, at which they have settled
 
 
 @dataclass(frozen=True)
-class _Unrounded:
+class _Quantised:
     """A simulation that explains recordings but for rounding.
 
     Attributes
@@ -323,7 +334,7 @@ class _Unrounded:
     outputs: tuple[str, ...]
 
 
-def explained_by_rounding(
+def explained_by_quantisation(
     model: Dynamics,
     data: Measurements,
     strict: Fit,
@@ -331,7 +342,7 @@ def explained_by_rounding(
     *,
     least: float = STRUCTURED,
     budget: Budget | None = None,
-) -> _Unrounded | None:
+) -> _Quantised | None:
     """The fit to the values that were rounded, if it leaves noise; None where it does not, or nothing rounds.
 
     Parameters
@@ -347,7 +358,7 @@ def explained_by_rounding(
     budget
         Charged for every evaluation.
     """
-    steps = _steps_of(data)
+    steps = _quantisation_steps(data)
     # What rounding does under noise half as wide as a step is white (Widrow and Kollár 2008), and fitted.
     coarse = steps > np.sqrt(strict.noise.measurement)
     if not (strict.converged and coarse.any()):
@@ -356,7 +367,10 @@ def explained_by_rounding(
     values = data
     for _ in range(QUANTISATION_ROUNDS):
         before = deviation
-        values, deviation = _unrounded(data, _simulated(fit, values), steps, before)
+        signals = Grid(values, fit.substeps).at_samples(fit.model.lags(fit.model.values))
+        states = np.ascontiguousarray(fit.x.T)
+        simulated = fit.model.functions.outputs(states, signals, fit.model.values).T
+        values, deviation = _before_quantisation(data, simulated, steps, before)
         fit = fit_by_multiple_shooting(
             fit.model, values, x=fit.x, noise=fit.noise, estimate_process=False, substeps=fit.substeps,
             budget=budget,
@@ -372,28 +386,21 @@ def explained_by_rounding(
     if forced.converged and process_noise_needed(forced, fit):
         return None
     try:
-        left = what_is_left(model, values, fit, fit, roles)
+        left = remainder_of(model, values, fit, fit, roles)
     except NumericalFailure:
         return None
     if left.after.p_value < least:
         return None
     names = tuple(name for name, wide in zip(model.output_names, coarse, strict=True) if wide)
-    return _Unrounded(replace(strict, model=fit.model, x=fit.x), left, names)
+    return _Quantised(replace(strict, model=fit.model, x=fit.x), left, names)
 
 
-def _steps_of(data: Measurements) -> np.ndarray:
+def _quantisation_steps(data: Measurements) -> np.ndarray:
     """The step on whose multiples the values of each output lie, zero where there is none; shape ``(m,)``."""
     return np.array([lattice_step(column) or 0.0 for column in data.outputs.T])
 
 
-def _simulated(fit: Fit, data: Measurements) -> np.ndarray:
-    """What a fit says of the outputs, shape ``(n, m)``."""
-    model = fit.model
-    signals = Grid(data, fit.substeps).at_samples(model.lags(model.values))
-    return model.functions.outputs(np.ascontiguousarray(fit.x.T), signals, model.values).T
-
-
-def _unrounded(
+def _before_quantisation(
     data: Measurements, simulation: np.ndarray, steps: np.ndarray, deviation: np.ndarray
 ) -> tuple[Measurements, np.ndarray]:
     """Recordings before they were rounded, as far as a simulation tells, and the deviation of their noise."""
@@ -412,8 +419,8 @@ FOLLOWING_SHARES = (0.5, 0.9, 0.99)  # of the forces that follow the motion
 NOISE_RATIOS = (1 / 8, 1 / 4, 1 / 2, 1 / 1.4, 1.0, 1.4, 2.0, 4.0, 8.0)  # of process noise, to that of the fit
 
 
-def unsteadiness(fit: Fit, data: Measurements) -> float:
-    """How much better random forces fit that follow the motion than steady ones do.
+def noise_nonstationarity(fit: Fit, data: Measurements) -> float:
+    """How much better process noise fits that follows the motion than stationary noise does.
 
     Parameters
     ----------
@@ -433,16 +440,14 @@ def unsteadiness(fit: Fit, data: Measurements) -> float:
     moved = (fit.x - fit.x.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
     motion = (moved**2).mean(axis=1)
     following = motion / motion.mean()
-    steady = max(_likelihood_of_noise(fit, data, ratio, np.ones(len(motion))) for ratio in NOISE_RATIOS)
-    fading = max(
-        _likelihood_of_noise(fit, data, ratio, 1 - share + share * following)
-        for share in FOLLOWING_SHARES
-        for ratio in NOISE_RATIOS
-    )
-    return 2 * (fading - steady)
 
+    def likelihood(weight: np.ndarray) -> float:
+        """With both kinds of noise at their best; the weight is of the process noise at every sample."""
+        noises = (Noise(fit.noise.measurement, ratio * fit.noise.process) for ratio in NOISE_RATIOS)
+        return max(
+            profile_likelihood(*likelihood_sums(fit.linearisation, data, noise, weight=weight))
+            for noise in noises
+        )
 
-def _likelihood_of_noise(fit: Fit, data: Measurements, ratio: float, weight: np.ndarray) -> float:
-    """With both kinds of noise on the best common scale; the weight is of the forces at every sample."""
-    noise = Noise(fit.noise.measurement, ratio * fit.noise.process)
-    return profile_likelihood(*likelihood_sums(fit.linearisation, data, noise, weight=weight))
+    steady = likelihood(np.ones(len(motion)))
+    return 2 * (max(likelihood(1 - share + share * following) for share in FOLLOWING_SHARES) - steady)

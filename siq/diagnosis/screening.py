@@ -15,7 +15,13 @@ from functools import cached_property
 import numpy as np
 import sympy
 
-from siq.diagnosis.evidence import BUDGET_SPENT, NUMERICAL_ERRORS, UntriedMechanism, in_words, orthonormal
+from siq.diagnosis.evidence import (
+    BUDGET_SPENT,
+    NUMERICAL_ERRORS,
+    UnfittedCandidate,
+    failure_reason,
+    orthonormal,
+)
 from siq.diagnosis.mechanisms import MechanismCandidate, along, places_of
 from siq.errors import NumericalFailure
 from siq.inference.budget import Budget, BudgetSpent, evaluation
@@ -476,7 +482,7 @@ def screen_all(
     *,
     fruitless: Collection[str] = (),
     budget: Budget | None = None,
-) -> tuple[list[tuple[Probe, Screened]], list[UntriedMechanism]]:
+) -> tuple[list[tuple[Probe, Screened]], list[UnfittedCandidate]]:
     """Screen every candidate, with its shapes at all places where they are looked for.
 
     One whose shape the recordings themselves show promises as much as the best, unless it was fitted before
@@ -495,12 +501,12 @@ def screen_all(
 
     Returns
     -------
-    list of (Probe, Screened), list of UntriedMechanism
+    list of (Probe, Screened), list of UnfittedCandidate
         What each probe would gain; and candidates of which no probe could be screened, with the reason.
     """
     budget = budget or Budget()
     substeps = current.substeps
-    untried: dict[str, UntriedMechanism] = {}
+    untried: dict[str, UnfittedCandidate] = {}
     probes = []
     for candidate in candidates:
         try:
@@ -508,7 +514,7 @@ def screen_all(
             spread = replace(candidate, model=spread_edges(candidate.model, data, current.x, substeps=sharp))
             probes += probes_of(spread, data, model, current.x)
         except NUMERICAL_ERRORS as error:
-            untried[candidate.label] = UntriedMechanism(candidate, in_words(error))
+            untried[candidate.label] = UnfittedCandidate(candidate, failure_reason(error))
     grid = Grid(data, min(substeps, PROBE_SUBSTEPS))
     screened: list[tuple[Probe, Screened]] = []
     for portion in in_portions([probe.width for probe in probes], model, data):
@@ -530,8 +536,8 @@ def screen_all(
             break
         except NUMERICAL_ERRORS as error:
             for probe in some:
-                reason = in_words(error)
-                untried[probe.candidate.label] = UntriedMechanism(probe.candidate, reason)
+                reason = failure_reason(error)
+                untried[probe.candidate.label] = UnfittedCandidate(probe.candidate, reason)
     most = max((result.gain for _, result in screened), default=0.0)
     screened = [
         (probe, replace(result, gain=max(most, result.gain)))
@@ -544,5 +550,5 @@ def screen_all(
     for candidate in (probe.candidate for probe in probes):  # some have no place where they could be
         if candidate.label not in finite:
             why = OVERFLOWS if candidate.label in seen else BUDGET_SPENT
-            untried.setdefault(candidate.label, UntriedMechanism(candidate, why))
+            untried.setdefault(candidate.label, UnfittedCandidate(candidate, why))
     return screened, [each for label, each in untried.items() if label not in finite]

@@ -18,16 +18,16 @@ import numpy as np
 from siq.diagnosis.evidence import (
     BUDGET_SPENT,
     NUMERICAL_ERRORS,
-    TriedMechanism,
-    UntriedMechanism,
+    FittedCandidate,
+    UnfittedCandidate,
     admissible,
     clustered_probability,
-    in_words,
+    failure_reason,
     judged,
     probability_by_chance,
 )
-from siq.diagnosis.mechanisms import MechanismCandidate, once_more, rebased
-from siq.diagnosis.residual_structure import something_left
+from siq.diagnosis.mechanisms import MechanismCandidate, rebased, repeats
+from siq.diagnosis.residual_structure import has_structure
 from siq.diagnosis.screening import Probe, Screened, screen_all, with_further_states
 from siq.diagnosis.study import SearchOptions
 from siq.errors import NumericalFailure
@@ -46,7 +46,7 @@ Standing = Literal["same", "needless", "less"]
 
 
 @dataclass(frozen=True)
-class _Found:
+class AcceptedMechanism:
     """A mechanism that stood the tests, and what else was fitted in its place.
 
     Attributes
@@ -61,13 +61,13 @@ class _Found:
         Those that explain less.
     """
 
-    best: TriedMechanism
-    indistinguishable: tuple[TriedMechanism, ...]
-    needless: tuple[TriedMechanism, ...] = ()
-    lesser: tuple[TriedMechanism, ...] = ()
+    best: FittedCandidate
+    indistinguishable: tuple[FittedCandidate, ...]
+    needless: tuple[FittedCandidate, ...] = ()
+    lesser: tuple[FittedCandidate, ...] = ()
 
     @property
-    def standings(self) -> dict[Standing, tuple[TriedMechanism, ...]]:
+    def standings(self) -> dict[Standing, tuple[FittedCandidate, ...]]:
         """What else was fitted, by how it stands beside the mechanism."""
         return {"same": self.indistinguishable, "needless": self.needless, "less": self.lesser}
 
@@ -96,17 +96,17 @@ class Search:
     """
 
     recalibrated: Fit
-    found: tuple[_Found, ...]
+    found: tuple[AcceptedMechanism, ...]
     fit: Fit
     screened: tuple[tuple[Probe, Screened], ...]
-    untried: tuple[UntriedMechanism, ...] = ()
+    untried: tuple[UnfittedCandidate, ...] = ()
     screened_beside: tuple[str, ...] = ()
     fruitless: frozenset[str] = frozenset()
 
 
 def _accepted(
-    trials: Sequence[TriedMechanism], probes: int, chance: float, *, options: SearchOptions
-) -> _Found | None:
+    trials: Sequence[FittedCandidate], probes: int, chance: float, *, options: SearchOptions
+) -> AcceptedMechanism | None:
     """The best of the trials that stand every test, with what cannot be told from it."""
     significant = [
         trial
@@ -124,7 +124,7 @@ def _accepted(
         best = min(equals, key=lambda each: each.p_cluster)
     least = best.delta_chi2 - options.same
 
-    def needless(other: TriedMechanism) -> bool:
+    def needless(other: FittedCandidate) -> bool:
         """Whether it needs more parameters than the best, and does not earn them.
 
         One that fits better by as much as its further parameters would bring by chance twice over (Akaike) is
@@ -135,7 +135,7 @@ def _accepted(
 
     others = [other for other in trials if other is not best]
     equals = [other for other in others if other.delta_chi2 > least]
-    return _Found(
+    return AcceptedMechanism(
         best,
         indistinguishable=tuple(other for other in equals if not needless(other)),
         needless=tuple(other for other in equals if needless(other)),
@@ -144,7 +144,7 @@ def _accepted(
 
 
 def _better_without(
-    trial: TriedMechanism,
+    trial: FittedCandidate,
     current: Fit,
     model: Dynamics,
     data: Measurements,
@@ -180,13 +180,13 @@ def _fit_most_promising(
     least_gain: float,
     blocks: int,
     budget: Budget | None = None,
-) -> tuple[list[TriedMechanism], list[UntriedMechanism]]:
+) -> tuple[list[FittedCandidate], list[UnfittedCandidate]]:
     """Fit the candidates that promise most, each from its best probe."""
     budget = budget or Budget()
     best = best_probes(screened)
     ranked = sorted(best.values(), key=lambda each: -each[1].gain)
-    trials: dict[str, TriedMechanism] = {}
-    failed: dict[str, UntriedMechanism] = {}
+    trials: dict[str, FittedCandidate] = {}
+    failed: dict[str, UnfittedCandidate] = {}
     begun: list[tuple[Probe, Screened]] = []
 
     def attempt(probe: Probe, result: Screened, begin: Fit) -> None:
@@ -209,11 +209,11 @@ def _fit_most_promising(
                 raise NumericalFailure("its best parameters have a sign that the mechanism cannot have")
             trial = judged(fit, current, data, candidate, blocks=blocks)
         except BudgetSpent:
-            failed.setdefault(candidate.label, UntriedMechanism(candidate, BUDGET_SPENT))
+            failed.setdefault(candidate.label, UnfittedCandidate(candidate, BUDGET_SPENT))
             return
         except NUMERICAL_ERRORS as error:
             LOGGER.info("%s cannot be fitted: %s", candidate.label, error)
-            failed[candidate.label] = UntriedMechanism(candidate, in_words(error))
+            failed[candidate.label] = UnfittedCandidate(candidate, failure_reason(error))
             return
         known = trials.get(candidate.label)
         if known is None or trial.fit.log_likelihood > known.fit.log_likelihood:
@@ -364,7 +364,7 @@ def _extended(
     while True:
         found, current = progress.found, progress.fit
         base = current.model
-        if found and (len(found) == options.mechanisms or not something_left(current, data)):
+        if found and (len(found) == options.mechanisms or not has_structure(current, data)):
             return progress
         if base.dimension > model.dimension:
             return progress  # nothing is sought on top of a mechanism that has states of its own
@@ -374,7 +374,7 @@ def _extended(
         remaining = [
             rebased(each, model, base) if found else each
             for each in candidates
-            if not any(once_more(each, other.best.candidate) for other in found)
+            if not any(repeats(each, other.best.candidate) for other in found)
         ]
         screened, unscreened = screen_all(
             base, data, current, remaining, fruitless=progress.fruitless, budget=budget

@@ -30,7 +30,7 @@ import sympy
 
 from siq.diagnosis.evidence import (
     NUMERICAL_ERRORS,
-    TriedMechanism,
+    FittedCandidate,
     correlation_time_of,
     evidences_by_size,
     orthonormal,
@@ -370,7 +370,7 @@ def _given(basis: np.ndarray, gram: np.ndarray, overlap: np.ndarray) -> tuple[np
 
 
 @dataclass(frozen=True)
-class Part:
+class Term:
     """A part of a description.
 
     Attributes
@@ -387,7 +387,7 @@ class Part:
         What a curve or a surface is made of: the amplitudes are the heights of its bumps.
     """
 
-    trial: TriedMechanism
+    trial: FittedCandidate
     kind: Kind
     cost: float
     place: Place | None = None
@@ -395,7 +395,7 @@ class Part:
 
 
 @dataclass(frozen=True)
-class _Told:
+class _SmoothData:
     """What a fit leaves says of a function's values, at a level of random forces.
 
     Attributes
@@ -424,9 +424,9 @@ class _Told:
     freedom: float
     likelihood: float
 
-    def over(self, correlated: float) -> _Told:
+    def over(self, correlated: float) -> _SmoothData:
         """The same where so many samples hang together."""
-        return _Told(
+        return _SmoothData(
             self.level, self.fine, correlated, self.gram / correlated, self.overlap / correlated,
             self.total / correlated, self.freedom / correlated, self.likelihood / correlated,
         )  # fmt: skip
@@ -455,14 +455,14 @@ class Smoothness:
 
     shares: tuple[float, ...]
     deviation: float
-    told: _Told
+    told: _SmoothData
     noise: float
     log_evidence: float
     considered: int
 
 
 def smoothness_of(
-    fit: Fit, data: Measurements, ground: FunctionSite, *, known: Part | None = None, alike: bool = False
+    fit: Fit, data: Measurements, ground: FunctionSite, *, known: Term | None = None, alike: bool = False
 ) -> Smoothness | None:
     """The likeliest smoothness of a function on top of a fit; None where it cannot be worked out.
 
@@ -532,14 +532,14 @@ def likeliest_product(asked: Smoothness, ground: FunctionSite, *, times: float =
     )
 
 
-def _told(fit: Fit, data: Measurements, fine: _SmoothFunction, known: Part | None) -> list[_Told]:
+def _told(fit: Fit, data: Measurements, fine: _SmoothFunction, known: Term | None) -> list[_SmoothData]:
     """What is told at each level of random forces at which it can be worked out.
 
     Errors are as correlated as the likeliest level leaves them with such a function, at all levels.
     """
     grid = Grid(data, fit.substeps if known else min(fit.substeps, PROBE_SUBSTEPS))
     response = probe_response(fit.model, grid, fit, PlaceColumns(fit.model, grid, [fine]))
-    found: list[_Told] = []
+    found: list[_SmoothData] = []
     highest, correlated = -np.inf, 1.0
     for level in levels_of(fit):
         try:
@@ -552,7 +552,7 @@ def _told(fit: Fit, data: Measurements, fine: _SmoothFunction, known: Part | Non
         total, freedom = float(left @ left), white.degrees_of_freedom - parameters
         likelihood = profile_likelihood(total, freedom, white.log_determinant)
         found.append(
-            _Told(level, fine, 1.0, columns.T @ columns, columns.T @ left, total, freedom, likelihood)
+            _SmoothData(level, fine, 1.0, columns.T @ columns, columns.T @ left, total, freedom, likelihood)
         )
         basis = orthonormal(columns)
         rest = left - basis @ (basis.T @ left)
@@ -574,7 +574,7 @@ def _finest(ground: FunctionSite, data: Measurements, model: Dynamics) -> tuple[
     return LENGTH_SCALES[-1], smooth_function(ground, (LENGTH_SCALES[-1],) * len(ground.words), most=most)
 
 
-def _without(white: Whitened, fit: Fit, known: Part | None) -> tuple[Whitened, int]:
+def _without(white: Whitened, fit: Fit, known: Term | None) -> tuple[Whitened, int]:
     """Innovations as if a part were not there, its columns left out, and the number of parameters left."""
     names = [fit.model.parameters[place].name for place in fit.model.free]
     amplitudes = () if known is None else known.trial.candidate.amplitudes

@@ -44,7 +44,7 @@ class Evidence:
     Attributes
     ----------
     delta_chi2, delta_bic
-        What it gains, see `siq.diagnosis.evidence.TriedMechanism`.
+        What it gains, see `siq.diagnosis.evidence.FittedCandidate`.
     p_white, p_cluster
         Probabilities of as much by chance: if all errors are independent, and whatever errors within a
         recording have to do with each other.

@@ -271,7 +271,7 @@ def linearised_with_places(
 
 
 @dataclass(frozen=True)
-class LikelyPlace:
+class RankedPlace:
     """A place, the logarithm of its evidence, and the level of random forces at which it is best.
 
     The evidence is that of a smooth function there over that of none, each at its best level.
@@ -282,7 +282,7 @@ class LikelyPlace:
     level: float
 
 
-def likely_places(fit: Fit, data: Measurements, roles: Roles) -> list[LikelyPlace]:
+def rank_places(fit: Fit, data: Measurements, roles: Roles) -> list[RankedPlace]:
     """All places, the one in which a smooth function is likeliest first.
 
     Functions of one coordinate are tried everywhere, and as coefficients of other coordinates in the
@@ -297,9 +297,9 @@ def likely_places(fit: Fit, data: Measurements, roles: Roles) -> list[LikelyPlac
     return sorted((*ranked, *_compared(fit, data, products)), key=lambda each: -each.log_evidence)
 
 
-def _compared(fit: Fit, data: Measurements, places: Sequence[Place]) -> list[LikelyPlace]:
+def _compared(fit: Fit, data: Measurements, places: Sequence[Place]) -> list[RankedPlace]:
     parameters = len(fit.model.free)
-    found: dict[int, LikelyPlace] = {}
+    found: dict[int, RankedPlace] = {}
     alone = -np.inf
     for response, some in linearised_with_places(fit, data, places):
         for level in levels_of(fit):
@@ -318,12 +318,12 @@ def _compared(fit: Fit, data: Measurements, places: Sequence[Place]) -> list[Lik
                 value = base + evidence_of_function(own, left, place.knots, freedom=freedom)
                 known = found.get(id(place))
                 if own.any() and (known is None or value > known.log_evidence):
-                    found[id(place)] = LikelyPlace(place, value, level)
+                    found[id(place)] = RankedPlace(place, value, level)
     ranked = sorted(found.values(), key=lambda each: -each.log_evidence)
     return [replace(each, log_evidence=each.log_evidence - alone) for each in ranked]
 
 
-def few_powers(likely: LikelyPlace, fit: Fit, data: Measurements, *, degree: int) -> tuple[_Power, ...]:
+def few_powers(likely: RankedPlace, fit: Fit, data: Measurements, *, degree: int) -> tuple[_Power, ...]:
     """The powers that a formula needs: each added as long as it earns its place (Schwarz).
 
     Errors count as correlated as all of the powers leave them (`siq.diagnosis.evidence`).

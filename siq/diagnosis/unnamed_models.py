@@ -32,14 +32,14 @@ from siq.diagnosis.evidence import (
     log_evidence_of,
 )
 from siq.diagnosis.mechanisms import MechanismCandidate, candidates_of
-from siq.diagnosis.residual_structure import something_left
+from siq.diagnosis.residual_structure import has_structure
 from siq.diagnosis.screening import screen_all, with_further_states
 from siq.diagnosis.search import Search, best_probes
 from siq.diagnosis.smooth_functions import (
     MECHANISM,
-    Part,
     Smooth,
     Smoothness,
+    Term,
     likeliest_product,
     smooth_function,
     smoothness_of,
@@ -49,11 +49,11 @@ from siq.diagnosis.terms import (
     FORMULA,
     FUNCTIONS_FITTED,
     FunctionSite,
-    LikelyPlace,
     Place,
+    RankedPlace,
     coordinates_of,
     few_powers,
-    likely_places,
+    rank_places,
     simplest,
     with_formula,
 )
@@ -84,7 +84,7 @@ MEMORIES_FITTED = 6  # the most promising ones: a choice
 
 
 @dataclass(frozen=True)
-class Material:
+class FitContext:
     """What models are made from, and by which means.
 
     Attributes
@@ -112,7 +112,7 @@ class Material:
 
 
 @dataclass(frozen=True)
-class Model:
+class AugmentedModel:
     """A simulation that describes what has no name.
 
     Attributes
@@ -127,7 +127,7 @@ class Model:
         The fit whose trajectories follow the equations, if random forces are part of `fit`.
     """
 
-    parts: tuple[Part, ...]
+    parts: tuple[Term, ...]
     fit: Fit
     log_evidence: float = float("nan")
     exact: Fit | None = None
@@ -143,7 +143,7 @@ class Model:
         return sum(part.cost for part in self.parts)
 
 
-def _weighed(models: Sequence[Model], alone: Fit, data: Measurements) -> list[Model]:
+def _weighed(models: Sequence[AugmentedModel], alone: Fit, data: Measurements) -> list[AugmentedModel]:
     """Models with their evidence over that of a simulation without their parts, the likeliest first.
 
     Errors are as correlated as the model that fits best leaves them (`correlation_time_left`), for all.
@@ -179,20 +179,20 @@ def runs_freely(fit: Fit, alone: Fit, data: Measurements) -> bool:
     return one is not None and (other is None or one < other)
 
 
-def _fitted_part(
+def _fitted_term(
     candidate: MechanismCandidate,
     level: float,
     place: Place | None,
     fit: Fit,
     cost: float,
-    material: Material,
+    context: FitContext,
     *,
     smooth: Smooth | None = None,
     begin: Fit | None = None,
-) -> list[Part]:
+) -> list[Term]:
     """A function as part of a model, or nothing where it cannot be fitted."""
     kind = FORMULA if smooth is None else smooth.kind
-    data, budget = material.data, material.budget
+    data, budget = context.data, context.budget
 
     try:
         budget.says(f"a {kind}: {candidate.label}")
@@ -228,15 +228,15 @@ def _fitted_part(
                 trial = better_of(trial, damped)
             if not trial.converged:
                 raise NumericalFailure(trial.fault or "its fit does not settle")
-            fitted = judged(trial, fit, data, candidate, blocks=material.blocks)
+            fitted = judged(trial, fit, data, candidate, blocks=context.blocks)
     except (*NUMERICAL_ERRORS, BudgetSpent) as error:
         LOGGER.info("%s as a %s cannot be fitted: %s", candidate.label, kind, error)
         return []
-    return [Part(fitted, kind, cost, place, smooth)]
+    return [Term(fitted, kind, cost, place, smooth)]
 
 
 def _asked(
-    fit: Fit, data: Measurements, ground: FunctionSite, *, known: Part | None, alike: bool = False
+    fit: Fit, data: Measurements, ground: FunctionSite, *, known: Term | None, alike: bool = False
 ) -> Smoothness | None:
     """See `smoothness_of`; what is beyond all numbers ends a function, not a case."""
     try:
@@ -246,21 +246,21 @@ def _asked(
         return None
 
 
-def _with_a_smooth_function(
-    before: tuple[Part, ...],
+def _with_smooth_term(
+    before: tuple[Term, ...],
     fit: Fit,
     ground: FunctionSite,
     cost: float,
-    material: Material,
+    context: FitContext,
     *,
-    like: Model | None = None,
+    like: AugmentedModel | None = None,
     product: bool = False,
-) -> list[Model]:
+) -> list[AugmentedModel]:
     """The likeliest model with a smooth function on a ground; none where none can be fitted."""
-    data = material.data
+    data = context.data
     if not ground.usable:
         return []
-    likeliest: Model | None = None
+    likeliest: AugmentedModel | None = None
     current, known = (fit, None) if like is None else (like.fit, like.parts[-1])
     for _ in range(SMOOTH_ROUNDS):
         here = ground.along(current.model, data, current.x)
@@ -268,7 +268,7 @@ def _with_a_smooth_function(
         if asked is None:
             break
         price = cost + float(np.log(asked.considered))
-        parts: list[Part] = []
+        parts: list[Term] = []
         # What promises to be rough and to need hardly any random forces may be what no fit can follow.
         for times, level in ((1.0, asked.told.level), (2.0, 1.0)):
             if parts:
@@ -287,12 +287,12 @@ def _with_a_smooth_function(
                 LOGGER.info("no function of %s can be worked out: %s", " and ".join(here.words), error)
                 break
             candidate = with_smooth_function(fit.model, function)
-            parts = _fitted_part(
-                candidate, level, ground.place, fit, price, material, smooth=function, begin=current
+            parts = _fitted_term(
+                candidate, level, ground.place, fit, price, context, smooth=function, begin=current
             )
         if not parts:
             break
-        found = Model((*before, parts[0]), parts[0].trial.fit)
+        found = AugmentedModel((*before, parts[0]), parts[0].trial.fit)
         LOGGER.info(
             "%s, %d bumps: log-likelihood %.1f",
             candidate.label, function.width, found.fit.log_likelihood,
@@ -307,25 +307,25 @@ def _with_a_smooth_function(
     return [] if likeliest is None else [likeliest]
 
 
-def _with_surfaces(fit: Fit, models: Sequence[Model], material: Material) -> list[Model]:
+def _with_surfaces(fit: Fit, models: Sequence[AugmentedModel], context: FitContext) -> list[AugmentedModel]:
     """Models with a smooth function of two coordinates, where the recordings tell both."""
-    material.budget.says("comparing functions of two coordinates")
-    data = material.data
+    context.budget.says("comparing functions of two coordinates")
+    data = context.data
     # Where functions of one coordinate are, or would be; not in a rotating frame, nor in a sensor.
     single = [each for each in models if len(each.parts) == 1]
-    begins: list[tuple[Place, Model | None]] = []
+    begins: list[tuple[Place, AugmentedModel | None]] = []
     for each in single[:FUNCTIONS_FITTED]:
         if (place := each.parts[0].place) is not None:
             begins.append((place, each))
     if not single:  # one of two may tell so little of either coordinate alone
         try:
-            likely = likely_places(fit, data, material.roles)
+            likely = rank_places(fit, data, context.roles)
         except NUMERICAL_ERRORS as error:
             LOGGER.info("no function can be screened: %s", error)
             likely = []
         begins = [(each.place, None) for each in likely[:FUNCTIONS_FITTED]]
     names = [name for name in coordinates_of(fit.model) if name != "t"]
-    asked: list[tuple[float, FunctionSite, Model | None]] = []
+    asked: list[tuple[float, FunctionSite, AugmentedModel | None]] = []
     done = set()
     for place, like in begins:
         if len(place.equations) != 1:
@@ -350,35 +350,35 @@ def _with_surfaces(fit: Fit, models: Sequence[Model], material: Material) -> lis
     cost = float(np.log(max(len(asked), 1)))
     ranked = sorted((each for each in asked if each[0] > cost), key=lambda each: -each[0])
     price = max((part.cost for model in models for part in model.parts), default=0.0) + cost
-    found: list[Model] = []
+    found: list[AugmentedModel] = []
     for _, ground, like in ranked[:FUNCTIONS_FITTED]:
         for product in (True, False):
-            some = _with_a_smooth_function((), fit, ground, price, material, like=like, product=product)
+            some = _with_smooth_term((), fit, ground, price, context, like=like, product=product)
             found += some
-            if some and not something_left(some[0].fit, data):
+            if some and not has_structure(some[0].fit, data):
                 return found  # nothing is left for a surface, nor for a less likely pair
     return found
 
 
-def with_a_function(before: tuple[Part, ...], fit: Fit, material: Material) -> list[Model]:
+def with_function(before: tuple[Term, ...], fit: Fit, context: FitContext) -> list[AugmentedModel]:
     """Models with one function more, in the likeliest places, that earn it.
 
     Parameters
     ----------
     before, fit
         What was added already, and the fit with it.
-    material
+    context
         What models are made from.
 
     Returns
     -------
-    list of Model
+    list of AugmentedModel
         The likeliest first, with the evidence over that of `fit`.
     """
-    data, budget = material.data, material.budget
+    data, budget = context.data, context.budget
     budget.says("comparing functions without a name")
     try:
-        ranked = likely_places(fit, data, material.roles)
+        ranked = rank_places(fit, data, context.roles)
     except NUMERICAL_ERRORS as error:
         LOGGER.info("no function can be screened: %s", error)
         return []
@@ -386,13 +386,13 @@ def with_a_function(before: tuple[Part, ...], fit: Fit, material: Material) -> l
     ranked = [each for each in ranked if each.log_evidence > cost]
     if not ranked:
         return []
-    models = _formulas(before, fit, ranked, cost, material)
+    models = _formulas(before, fit, ranked, cost, context)
     alone = (each for each in ranked if len(each.place.words) == 1)
     for likely in {
         id(each): each for each in (*ranked[:FUNCTIONS_FITTED], *itertools.islice(alone, 1))
     }.values():
         ground = FunctionSite.of(likely.place, likely.place.words[:1], fit.model, data, fit.x)
-        models += _with_a_smooth_function(before, fit, ground, cost, material)
+        models += _with_smooth_term(before, fit, ground, cost, context)
     given = sum(part.cost for part in before)
     found = [replace(each, log_evidence=each.log_evidence + given) for each in _weighed(models, fit, data)]
     for each in found:
@@ -405,14 +405,14 @@ def with_a_function(before: tuple[Part, ...], fit: Fit, material: Material) -> l
 
 
 def _formulas(
-    before: tuple[Part, ...], fit: Fit, ranked: Sequence[LikelyPlace], cost: float, material: Material
-) -> list[Model]:
+    before: tuple[Term, ...], fit: Fit, ranked: Sequence[RankedPlace], cost: float, context: FitContext
+) -> list[AugmentedModel]:
     """Formulas in the likeliest places, each once."""
     single = {(each.place.targets, each.place.words): each.place.knots for each in ranked}
     done: set[frozenset[tuple[str, sympy.Expr]]] = set()
-    models: list[Model] = []
+    models: list[AugmentedModel] = []
     for likely in ranked[:FUNCTIONS_FITTED]:
-        terms = few_powers(likely, fit, material.data, degree=material.degree)
+        terms = few_powers(likely, fit, context.data, degree=context.degree)
         if not terms:
             continue
         place, terms = simplest(likely.place, terms)
@@ -425,13 +425,13 @@ def _formulas(
             for amplitude in candidate.amplitudes
         )
         if monomials not in done:
-            parts = _fitted_part(candidate, likely.level, place, fit, cost, material)
-            models += [Model((*before, each), each.trial.fit) for each in parts]
+            parts = _fitted_term(candidate, likely.level, place, fit, cost, context)
+            models += [AugmentedModel((*before, each), each.trial.fit) for each in parts]
         done.add(monomials)
     return models
 
 
-def _memory_suspected(models: Sequence[Model], data: Measurements) -> bool:
+def _memory_suspected(models: Sequence[AugmentedModel], data: Measurements) -> bool:
     """Whether models leave room for a memory: all but a function of one coordinate that leaves nothing.
 
     The time is no such coordinate, since nothing but the time itself knows it: what seems to depend on it may
@@ -442,14 +442,14 @@ def _memory_suspected(models: Sequence[Model], data: Measurements) -> bool:
     best = models[0]
     place = best.parts[0].place
     told = len(best.parts) == 1 and place is not None and len(place.words) == 1 and place.words[0] != "t"
-    return not told or something_left(best.fit, data)
+    return not told or has_structure(best.fit, data)
 
 
-def _with_memories(fit: Fit, models: Sequence[Model], material: Material) -> list[Model]:
+def _with_memories(fit: Fit, models: Sequence[AugmentedModel], context: FitContext) -> list[AugmentedModel]:
     """Models with a hidden state that follows a coordinate late, or that it makes ring."""
     likely = {name for each in models for part in each.parts for name in part.trial.candidate.equations}
     candidates = sorted(
-        _memories_of(fit.model, material.roles), key=lambda each: not likely & set(each.equations)
+        _memories_of(fit.model, context.roles), key=lambda each: not likely & set(each.equations)
     )
     if not candidates:
         return []
@@ -460,9 +460,9 @@ def _with_memories(fit: Fit, models: Sequence[Model], material: Material) -> lis
         for one in candidates
         for each in (one, replace(one, begins=(sympy.Integer(0),) * len(one.begins)))
     ]
-    with material.budget.part(LARGEST_PART):
-        screened, _ = screen_all(fit.model, material.data, fit, begun, budget=material.budget)
-    found: list[Model] = []
+    with context.budget.part(LARGEST_PART):
+        screened, _ = screen_all(fit.model, context.data, fit, begun, budget=context.budget)
+    found: list[AugmentedModel] = []
     ranked = sorted(best_probes(screened).values(), key=lambda each: -each[1].gain)
     for probe, result in ranked[:MEMORIES_FITTED]:
         if result.gain < 2 * cost:
@@ -474,16 +474,16 @@ def _with_memories(fit: Fit, models: Sequence[Model], material: Material) -> lis
         candidate = replace(candidate, model=model.with_values(np.array(values)))
         try:
             x = with_further_states(
-                probe, fit.model, material.data, fit.x, substeps=fit.substeps, values=fit.model.values
+                probe, fit.model, context.data, fit.x, substeps=fit.substeps, values=fit.model.values
             )
         except NUMERICAL_ERRORS as error:
             LOGGER.info("%s cannot be fitted: %s", candidate.label, error)
             continue
         begin = replace(fit, x=x)
-        for part in _fitted_part(candidate, result.level, None, fit, cost, material, begin=begin):
+        for part in _fitted_term(candidate, result.level, None, fit, cost, context, begin=begin):
             LOGGER.info("%s: chi2 better by %.1f", candidate.label, part.trial.delta_chi2)
             if admissible(part.trial.fit, candidate):
-                found.append(Model((part,), part.trial.fit))
+                found.append(AugmentedModel((part,), part.trial.fit))
     return found
 
 
@@ -565,44 +565,44 @@ MEMORY_FORMS = (
 )
 
 
-def models_of_the_nameless(
-    search: Search, material: Material, *, functions: Sequence[Model] | None = None
-) -> tuple[Model, ...]:
+def fit_unnamed_models(
+    search: Search, context: FitContext, *, functions: Sequence[AugmentedModel] | None = None
+) -> tuple[AugmentedModel, ...]:
     """Models of what is missing, the likeliest first; none where none is likelier than the simulation alone.
 
     Parameters
     ----------
     search
         What was found; mechanisms among it are one of the models.
-    material
+    context
         What models are made from.
     functions
         Those without mechanisms, where they are fitted already.
     """
-    base, data = search.recalibrated, material.data
-    models = list(with_a_function((), base, material) if functions is None else functions)
+    base, data = search.recalibrated, context.data
+    models = list(with_function((), base, context) if functions is None else functions)
     if search.found and np.isfinite(search.fit.log_likelihood):
-        models.append(Model(_parts_of(search, material.considered), search.fit))
+        models.append(AugmentedModel(_terms_of(search, context.considered), search.fit))
     models = _weighed(models, base, data)
     if functions is None:
-        models = _weighed([*models, *_with_surfaces(base, models, material)], base, data)
+        models = _weighed([*models, *_with_surfaces(base, models, context)], base, data)
         if _memory_suspected(models, data):
-            models = _weighed([*models, *_with_memories(base, models, material)], base, data)
+            models = _weighed([*models, *_with_memories(base, models, context)], base, data)
     best = models[0] if models else None
     if (
         best is not None
         and best.fit.model.dimension == base.model.dimension
         and len(best.parts) < DESCRIBED_MOST
         and (functions is None or best.parts[0].kind == MECHANISM)
-        and something_left(best.fit, data)
+        and has_structure(best.fit, data)
     ):
-        models += with_a_function(best.parts, best.fit, material)
+        models += with_function(best.parts, best.fit, context)
     return likeliest(models, base, data)
 
 
-def models_beside_names(
-    named: Search, whole: Search, material: Material, *, functions: Sequence[Model] | None = None
-) -> tuple[Model, ...]:
+def fit_models_of_remainder(
+    named: Search, whole: Search, context: FitContext, *, functions: Sequence[AugmentedModel] | None = None
+) -> tuple[AugmentedModel, ...]:
     """Models of what mechanisms with a name leave, the likeliest first; none where none is likelier.
 
     They are what was found beside the names, not certain enough for one itself, and functions on top of all
@@ -612,22 +612,22 @@ def models_beside_names(
     ----------
     named, whole
         The search with what is named, and with all that was found.
-    material
+    context
         What models are made from.
     functions
         Those on top of the names alone, where they are fitted already.
     """
-    base, data = named.fit, material.data
+    base, data = named.fit, context.data
 
-    def on_top(parts: tuple[Part, ...], fit: Fit) -> list[Model]:
-        if fit.model.dimension > named.recalibrated.model.dimension or not something_left(fit, data):
+    def on_top(parts: tuple[Term, ...], fit: Fit) -> list[AugmentedModel]:
+        if fit.model.dimension > named.recalibrated.model.dimension or not has_structure(fit, data):
             return []
-        return with_a_function(parts, fit, material)
+        return with_function(parts, fit, context)
 
     models = list(functions or ())
-    parts = _parts_of(whole, material.considered)[len(named.found) :]
+    parts = _terms_of(whole, context.considered)[len(named.found) :]
     fits = [each.best.fit for each in whole.found[len(named.found) :]]
-    models += [Model(parts[: place + 1], fit) for place, fit in enumerate(fits)]
+    models += [AugmentedModel(parts[: place + 1], fit) for place, fit in enumerate(fits)]
     if parts:
         models += on_top(parts, whole.fit)
     elif functions is None:
@@ -641,13 +641,13 @@ def models_beside_names(
     return likeliest(allowed, base, data)
 
 
-def _parts_of(search: Search, considered: int) -> tuple[Part, ...]:
+def _terms_of(search: Search, considered: int) -> tuple[Term, ...]:
     """The mechanisms of a search as parts of a model, each chosen among so many."""
     cost = float(np.log(max(considered, 1)))
-    return tuple(Part(each.best, MECHANISM, cost) for each in search.found)
+    return tuple(Term(each.best, MECHANISM, cost) for each in search.found)
 
 
-def likeliest(models: Sequence[Model], alone: Fit, data: Measurements) -> tuple[Model, ...]:
+def likeliest(models: Sequence[AugmentedModel], alone: Fit, data: Measurements) -> tuple[AugmentedModel, ...]:
     """The few models that are likelier than the simulation without them, the likeliest first."""
     likelier = (
         each

@@ -14,7 +14,7 @@ from siq.diagnosis.evidence import BUDGET_SPENT, correlation_time_left, log_evid
 from siq.diagnosis.investigation import HeldOutRuns, Investigation
 from siq.diagnosis.mechanisms import PROCESS_NOISE
 from siq.diagnosis.residual_structure import Structure
-from siq.diagnosis.smooth_functions import CURVE, SURFACE, Part
+from siq.diagnosis.smooth_functions import CURVE, SURFACE, Term
 from siq.diagnosis.statement import (
     DescribedCurve,
     DescribedSurface,
@@ -32,7 +32,7 @@ from siq.diagnosis.statement import (
     UpperBound,
 )
 from siq.diagnosis.study import MismatchVerdict
-from siq.diagnosis.unnamed_models import Model
+from siq.diagnosis.unnamed_models import AugmentedModel
 from siq.inference.kalman_filter import Noise
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
@@ -236,7 +236,7 @@ def _found_mechanisms(investigation: Investigation, card: Fit | None) -> tuple[S
     return tuple(stated)
 
 
-def _stated_function(part: Part, fit: Fit, beside: tuple[str, ...]) -> StatedFunction:
+def _stated_function(part: Term, fit: Fit, beside: tuple[str, ...]) -> StatedFunction:
     """A part of the model of what has no name, with its curve or surface and their standard errors."""
     trial, candidate, place, smooth = part.trial, part.trial.candidate, part.place, part.smooth
     errors, known = _standard_errors(fit), {entry.name: entry for entry in fit.model.parameters}
@@ -313,7 +313,9 @@ def _in_coordinate(term: sympy.Expr, coordinate: sympy.Expr) -> sympy.Expr:
     return term.subs(coordinate, COORDINATE)
 
 
-def _locate(investigation: Investigation, data: Measurements, described: Model | None = None) -> Location:
+def _locate(
+    investigation: Investigation, data: Measurements, described: AugmentedModel | None = None
+) -> Location:
     """In which equation a mismatch sits, along which coordinate and where, and in which recordings.
 
     What has no name is where the model of it stands. Where nothing describes it, it is sought in all

@@ -14,7 +14,7 @@ from siq.diagnosis import naming
 from siq.diagnosis.evidence import correlation_time_of
 from siq.diagnosis.holdout import _cross_validation_folds, _first_better, errors_left_out
 from siq.diagnosis.naming import _MissingEffect, _residual_model_comparison
-from siq.diagnosis.unnamed_models import Material, Model, runs_freely
+from siq.diagnosis.unnamed_models import AugmentedModel, FitContext, runs_freely
 from siq.inference.kalman_filter import Whitened
 from siq.inference.measurements import Measurements, measurements
 from siq.inference.recalibration import recalibrate
@@ -117,19 +117,19 @@ def test_a_name_stands_beside_a_rest_where_no_function_does_as_well_in_its_place
     monkeypatch.setattr(naming, "errors_left_out", lambda fit, *_, **__: known.get(id(fit), without))
     part = SimpleNamespace(cost=1.0)
 
-    def functions(parts: tuple, fit: SimpleNamespace, _: object) -> list[Model]:
+    def functions(parts: tuple, fit: SimpleNamespace, _: object) -> list[AugmentedModel]:
         if fit is own:
-            return [Model((part,), fit_of(on_top))] if on_top else []
-        return [Model((*parts, part), fit_of(pairs if parts else instead))]
+            return [AugmentedModel((part,), fit_of(on_top))] if on_top else []
+        return [AugmentedModel((*parts, part), fit_of(pairs if parts else instead))]
 
-    monkeypatch.setattr(naming, "with_a_function", functions)
+    monkeypatch.setattr(naming, "with_function", functions)
     monkeypatch.setattr(naming, "runs_freely", lambda *_: True)
     monkeypatch.setattr(naming, "correlation_time_left", lambda *_: 5.0)
     monkeypatch.setattr(naming, "log_evidence_of", lambda fit, *_, **__: fit.evidence)
-    material = SimpleNamespace(data=None)
+    context = SimpleNamespace(data=None)
     considered = [SimpleNamespace(name=name) for name in ("overflow", "overflow", "leak")]
     found = _residual_model_comparison(
-        trial_of(own), base, material, considered=considered, unnamed=0.1, least=2.9
+        trial_of(own), base, context, considered=considered, unnamed=0.1, least=2.9
     )
     # Each function costs what it was chosen among, and the probability that something has no name.
     cost = 1.0 + np.log(10)
@@ -143,11 +143,11 @@ def test_a_name_stands_beside_a_rest_where_no_function_does_as_well_in_its_place
 
 
 def test_what_random_forces_stand_in_for_has_no_model_beside_which_a_name_could_stand() -> None:
-    material = Material(SimpleNamespace(), SimpleNamespace(), 3, 10, 5)
+    context = FitContext(SimpleNamespace(), SimpleNamespace(), 3, 10, 5)
     for fit in (fit_of(50.0, forces=True), fit_of(50.0, dimension=2)):
         assert (
             _residual_model_comparison(
-                trial_of(fit), fit_of(0.0), material, considered=(), unnamed=0.1, least=2.9
+                trial_of(fit), fit_of(0.0), context, considered=(), unnamed=0.1, least=2.9
             )
             is None
         )

@@ -16,15 +16,15 @@ import yaml
 from siq.diagnosis import holdout, investigation, search
 from siq.diagnosis.diagnosis import Diagnosis, solve_case, withdrawn
 from siq.diagnosis.dictionary import standard_dictionary
-from siq.diagnosis.evidence import TriedMechanism
+from siq.diagnosis.evidence import FittedCandidate
 from siq.diagnosis.investigation import held_out_runs
 from siq.diagnosis.naming import NamingDecision
 from siq.diagnosis.residual_structure import Remainder
 from siq.diagnosis.screening import Probe
 from siq.diagnosis.search import Search
-from siq.diagnosis.smooth_functions import MECHANISM, Part
+from siq.diagnosis.smooth_functions import MECHANISM, Term
 from siq.diagnosis.study import MismatchVerdict, read_case
-from siq.diagnosis.unnamed_models import Material, Model
+from siq.diagnosis.unnamed_models import AugmentedModel, FitContext
 from siq.errors import InputError, NumericalFailure
 from siq.inference.budget import Budget
 from siq.remarks import has_code
@@ -215,14 +215,14 @@ def test_random_forces_are_no_mechanism_with_a_formula(tmp_path: Path) -> None:
 def test_random_forces_are_no_noise_where_a_function_beside_them_is_likelier(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def models(search: Search, _: Material) -> tuple[Model, ...]:
+    def models(search: Search, _: FitContext) -> tuple[AugmentedModel, ...]:
         # A function of a sensor that leaves random forces, and is likelier than forces alone.
         assert search.recalibrated.has_process_noise
         candidate = next(each.candidate for each, _ in search.screened if not each.candidate.equations)
-        part = Part(TriedMechanism(candidate, search.recalibrated, 50.0, 40.0, 0.0, 0.0), MECHANISM, 0.0)
-        return (Model((part,), search.recalibrated, 5.0),)
+        part = Term(FittedCandidate(candidate, search.recalibrated, 50.0, 40.0, 0.0, 0.0), MECHANISM, 0.0)
+        return (AugmentedModel((part,), search.recalibrated, 5.0),)
 
-    monkeypatch.setattr(investigation, "models_of_the_nameless", models)
+    monkeypatch.setattr(investigation, "fit_unnamed_models", models)
     monkeypatch.setattr(holdout, "_first_better", lambda *_: None)
     diagnosis = solved(tmp_path, recordings_of(nothing, drive=0.05, count=4), study={"held_out": ["r2"]})
     assert said(diagnosis)["verdict"] == "unexplained" and names(diagnosis) == []

@@ -12,7 +12,7 @@ import sympy
 from siq.data.recordings import Recordings
 from siq.diagnosis import unnamed_models
 from siq.diagnosis.terms import Place, _Power, with_formula
-from siq.diagnosis.unnamed_models import Material, _fitted_part
+from siq.diagnosis.unnamed_models import FitContext, _fitted_term
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements, measurements
 from siq.inference.recalibration import recalibrate
@@ -38,10 +38,10 @@ def test_a_function_whose_fit_leads_away_begins_again(monkeypatch: pytest.Monkey
     assert not alone.has_process_noise
     place = Place((("x", sympy.Integer(1)),), (), X, ("x",), np.empty(0))
     candidate = with_formula(alone.model, place, [_Power(X**2, 2)])
-    material = Material(data, SimpleNamespace(), 3, 10, 5)
+    context = FitContext(data, SimpleNamespace(), 3, 10, 5)
 
     def fitted() -> Fit:
-        (part,) = _fitted_part(candidate, 1.0, place, alone, 0.0, material)
+        (part,) = _fitted_term(candidate, 1.0, place, alone, 0.0, context)
         return part.trial.fit
 
     right = fitted()

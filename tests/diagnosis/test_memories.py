@@ -17,12 +17,12 @@ from siq.diagnosis.dictionary import roles_of
 from siq.diagnosis.search import Search
 from siq.diagnosis.terms import Place
 from siq.diagnosis.unnamed_models import (
-    Material,
+    FitContext,
     _memories_of,
     _memory_suspected,
     _weighed,
     _with_memories,
-    models_of_the_nameless,
+    fit_unnamed_models,
 )
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements, measurements
@@ -57,12 +57,12 @@ def alone(fading: Measurements) -> Fit:
     return recalibrate(DECAY, fading)[0]
 
 
-def material(data: Measurements) -> Material:
-    return Material(data, roles_of(DECAY), 3, 10, 5)
+def context(data: Measurements) -> FitContext:
+    return FitContext(data, roles_of(DECAY), 3, 10, 5)
 
 
 def test_what_x_was_is_likelier_than_any_function(fading: Measurements, alone: Fit) -> None:
-    models = models_of_the_nameless(Search(alone, (), alone, ()), material(fading))
+    models = fit_unnamed_models(Search(alone, (), alone, ()), context(fading))
     (part,) = models[0].parts
     assert part.trial.candidate.name == "a memory of x"
     found = {each.name: each.value for each in models[0].fit.model.parameters}
@@ -83,7 +83,7 @@ def test_a_memory_whose_fit_leads_away_begins_again(
         return replace(usual(*given, **options), log_likelihood=-1e3)
 
     monkeypatch.setattr(unnamed_models, "fit_with_process_noise_as_needed", leading_away)
-    found = _with_memories(still, [], material(fading))
+    found = _with_memories(still, [], context(fading))
     kept = {each.parts[0].trial.candidate.label: each.fit.log_likelihood for each in found}
     assert kept["a memory of x in x"] > 2000 and kept["a memory of x in x, as a rate"] > -1e3
     # Nothing rings here: how much it is damped no recording tells, and such a fit may lead away once more.
@@ -91,7 +91,7 @@ def test_a_memory_whose_fit_leads_away_begins_again(
 
 
 def test_a_hidden_state_pays_for_its_beginnings(fading: Measurements, alone: Fit) -> None:
-    (model,) = _weighed(_with_memories(alone, [], material(fading))[:1], alone, fading)
+    (model,) = _weighed(_with_memories(alone, [], context(fading))[:1], alone, fading)
     gained = model.fit.log_likelihood - alone.log_likelihood
     assert model.log_evidence < gained - 0.5 * 6 * np.log(COUNT / 10)
 
@@ -123,7 +123,7 @@ def test_the_intensity_of_a_rotating_frame_has_its_own_unit() -> None:
 def test_the_time_is_suspected_of_standing_in_for_what_was(
     words: tuple[str, ...], *, suspected: bool, fading: Measurements, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("siq.diagnosis.unnamed_models.something_left", lambda *_: False)
+    monkeypatch.setattr("siq.diagnosis.unnamed_models.has_structure", lambda *_: False)
     place = Place((("x", sympy.Integer(1)),), (), X, words, np.empty(0))
     model = SimpleNamespace(parts=(SimpleNamespace(place=place),), fit=None)
     assert _memory_suspected([model], fading) is suspected

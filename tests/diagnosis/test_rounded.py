@@ -9,8 +9,13 @@ import scipy.stats
 
 from siq.diagnosis.diagnosis import diagnose
 from siq.diagnosis.dictionary import roles_of
-from siq.diagnosis.residual_structure import _steps_of, _Unrounded, _unrounded, explained_by_rounding
-from siq.diagnosis.study import MismatchVerdict, _measurements_of
+from siq.diagnosis.residual_structure import (
+    _before_quantisation,
+    _quantisation_steps,
+    _Quantised,
+    explained_by_quantisation,
+)
+from siq.diagnosis.study import MismatchVerdict, measurements_of
 from siq.inference.measurements import Measurements, with_expectations
 from siq.inference.recalibration import recalibrate
 from siq.systems.diffusion import Diffusion
@@ -40,20 +45,20 @@ def readings(*, quadratic: float, step: float = STEP) -> pd.DataFrame:
     return pd.concat(frames)
 
 
-def asked(model: Dynamics, data: Measurements) -> _Unrounded | None:
+def asked(model: Dynamics, data: Measurements) -> _Quantised | None:
     model = with_expectations(model)
     _, strict = recalibrate(model, data)
-    return explained_by_rounding(model, data, strict, roles_of(model))
+    return explained_by_quantisation(model, data, strict, roles_of(model))
 
 
 def test_values_before_rounding_are_means_of_a_normal_distribution_cut_off() -> None:
     model = decaying(quadratic=0.0)
-    data = _measurements_of(readings(quadratic=0.0), model)
-    assert _steps_of(data) == pytest.approx([STEP])
+    data = measurements_of(readings(quadratic=0.0), model)
+    assert _quantisation_steps(data) == pytest.approx([STEP])
     exact = np.concatenate(
         [b * np.exp(-0.7 * np.arange(0, 4, 0.05)) for b in (1.1, 1.43, 1.78, 2.05, 2.49, 2.9)]
     )[:, None]
-    values, deviation = _unrounded(data, exact, _steps_of(data), np.array([NOISE]))
+    values, deviation = _before_quantisation(data, exact, _quantisation_steps(data), np.array([NOISE]))
     left = (values.outputs - exact)[:, 0] / NOISE
     # Independent, about zero, and as the truth goes the noise comes out as it was.
     assert abs(left.mean()) < 4 * left.std() / np.sqrt(len(left))
@@ -67,15 +72,15 @@ def test_values_before_rounding_are_means_of_a_normal_distribution_cut_off() -> 
 
 def test_the_right_simulation_is_cleared_and_a_wrong_one_is_not() -> None:
     model = decaying(quadratic=0.0)
-    cleared = asked(model, _measurements_of(readings(quadratic=0.0), model))
+    cleared = asked(model, measurements_of(readings(quadratic=0.0), model))
     assert cleared is not None and cleared.outputs == ("x",)
     assert cleared.fit.model.values == pytest.approx([0.7], abs=0.005)
-    assert asked(model, _measurements_of(readings(quadratic=0.1), model)) is None
+    assert asked(model, measurements_of(readings(quadratic=0.1), model)) is None
 
 
 def test_without_steps_there_is_nothing_to_explain() -> None:
     model = decaying(quadratic=0.0)
-    assert asked(model, _measurements_of(readings(quadratic=0.0, step=0.0), model)) is None
+    assert asked(model, measurements_of(readings(quadratic=0.0, step=0.0), model)) is None
 
 
 def test_a_diagnosis_raises_no_alarm_where_sensors_round() -> None:

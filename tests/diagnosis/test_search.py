@@ -13,12 +13,12 @@ import sympy
 from siq.data.recordings import Recordings
 from siq.diagnosis import naming
 from siq.diagnosis.dictionary import Roles, Shape
-from siq.diagnosis.evidence import TriedMechanism, _blocks_of, _correlated_probability, _correlation_time
-from siq.diagnosis.mechanisms import once_more
+from siq.diagnosis.evidence import FittedCandidate, _blocks_of, _correlated_probability, _correlation_time
+from siq.diagnosis.mechanisms import repeats
 from siq.diagnosis.naming import NamingDecision, _judge_mechanisms
 from siq.diagnosis.residual_structure import Curve, Direction, Remainder, Structure
 from siq.diagnosis.screening import _screen
-from siq.diagnosis.search import Search, _accepted, _better_without, _Found
+from siq.diagnosis.search import AcceptedMechanism, Search, _accepted, _better_without
 from siq.diagnosis.study import SearchOptions
 from siq.diagnosis.verdict import _most_telling
 from siq.inference.budget import Budget
@@ -129,12 +129,12 @@ def test_a_mechanism_that_was_found_is_not_found_once_more_in_another_form() -> 
         )
 
     found = one("overflow", "overflow in h, g", ("h", "g"), "h")
-    assert once_more(one("overflow", "overflow in h", ("h",), "h"), found)
-    assert not once_more(one("overflow", "overflow in g", ("g",), "g"), found)
-    assert not once_more(one("leak", "leak in h", ("h",), "h"), found)
+    assert repeats(one("overflow", "overflow in h", ("h",), "h"), found)
+    assert not repeats(one("overflow", "overflow in g", ("g",), "g"), found)
+    assert not repeats(one("leak", "leak in h", ("h",), "h"), found)
     # Two parameters may drift in time, each by its own.
     drift = one("parameter drift", "parameter drift in h (a)", ("h",), "t")
-    assert not once_more(one("parameter drift", "parameter drift in h (b)", ("h",), "t"), drift)
+    assert not repeats(one("parameter drift", "parameter drift in h (b)", ("h",), "t"), drift)
 
 
 def structure(excess: float, *gains: tuple[str, str, float]) -> Structure:
@@ -153,10 +153,10 @@ def remainder(share: float, p_curves: float = 1.0) -> Remainder:
 def found_with(number: int) -> Search:
     """A search that found so many mechanisms, one after the other."""
 
-    def found(place: int) -> _Found:
+    def found(place: int) -> AcceptedMechanism:
         candidate = SimpleNamespace(name=f"mechanism {place}", label=f"mechanism {place}", number=place)
         fit = SimpleNamespace(number=place, has_process_noise=False, noise=SimpleNamespace(measurement=1.0))
-        return _Found(TriedMechanism(candidate, fit, 100.0, -90.0, 0.0, 0.0), ())
+        return AcceptedMechanism(FittedCandidate(candidate, fit, 100.0, -90.0, 0.0, 0.0), ())
 
     each = tuple(found(place) for place in range(1, number + 1))
     return Search(SimpleNamespace(number=0, x=None), each, each[-1].best.fit, ())
@@ -280,9 +280,9 @@ def test_a_name_has_to_leave_less_than_what_speaks_of_a_mismatch_by_itself() -> 
 def test_of_equals_the_one_that_all_recordings_ask_for_where_white_errors_mean_little(
     random_forces: bool, expected: str
 ) -> None:
-    def trial(name: str, gain: float, p_cluster: float) -> TriedMechanism:
+    def trial(name: str, gain: float, p_cluster: float) -> FittedCandidate:
         fit = SimpleNamespace(has_process_noise=random_forces)
-        return TriedMechanism(SimpleNamespace(name=name, new=("c",)), fit, gain, 7.0 - gain, 0.0, p_cluster)
+        return FittedCandidate(SimpleNamespace(name=name, new=("c",)), fit, gain, 7.0 - gain, 0.0, p_cluster)
 
     trials = [trial("better", 331, 1e-9), trial("steadier", 325, 1e-49), trial("worse", 276, 1e-60)]
     found = _accepted(trials, 50, 1e-4, options=SearchOptions())
@@ -299,7 +299,7 @@ def test_nothing_is_missing_where_its_fit_only_found_better_parameters(decaying:
         parameters=(*decaying.parameters, Parameter("c", 0.0)),
     )
     right, with_c = recalibrate(decaying, data)[0], recalibrate(wider, data)[0]
-    trial = TriedMechanism(SimpleNamespace(label="c"), with_c, 80.0, -70.0, 1e-9, 1e-9)
+    trial = FittedCandidate(SimpleNamespace(label="c"), with_c, 80.0, -70.0, 1e-9, 1e-9)
     missed = replace(
         right, model=right.model.with_values(np.array([9.0])), log_likelihood=right.log_likelihood - 40
     )

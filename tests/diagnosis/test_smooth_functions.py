@@ -163,13 +163,13 @@ def test_what_is_beyond_all_numbers_ends_a_function_and_not_the_case(monkeypatch
         raise np.linalg.LinAlgError("singular matrix")
 
     where = SimpleNamespace(usable=True, words=("x",), along=lambda *_: where)
-    fit, material = SimpleNamespace(model=MODEL, x=np.zeros((3, 2))), SimpleNamespace(data=None)
+    fit, context = SimpleNamespace(model=MODEL, x=np.zeros((3, 2))), SimpleNamespace(data=None)
     monkeypatch.setattr(unnamed_models, "smoothness_of", singular)
-    assert unnamed_models._with_a_smooth_function((), fit, where, 0.0, material) == []
+    assert unnamed_models._with_smooth_term((), fit, where, 0.0, context) == []
     asked = SimpleNamespace(considered=9, told=SimpleNamespace(level=1.0))
     monkeypatch.setattr(unnamed_models, "smoothness_of", lambda *_, **__: asked)
     monkeypatch.setattr(unnamed_models, "likeliest_product", singular)
-    assert unnamed_models._with_a_smooth_function((), fit, where, 0.0, material, product=True) == []
+    assert unnamed_models._with_smooth_term((), fit, where, 0.0, context, product=True) == []
 
 
 def test_the_model_of_fewest_coordinates_is_taken_that_foresees_no_worse() -> None:
