@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -29,7 +29,6 @@ from siq.diagnosis.unnamed_models import FitContext, fit_unnamed_models
 from siq.diagnosis.verdict import statement_of
 from siq.errors import InputError, NumericalFailure
 from siq.inference.budget import Budget
-from siq.inference.maximum_likelihood import Fit
 from siq.remarks import Remark
 from siq.systems.dynamics import Dynamics
 
@@ -282,51 +281,56 @@ def tables_of(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:
         ``needless`` and ``less`` (see `siq.diagnosis.statement.Rival`); screened: ``further``, on top of
         all that was found, and ``instead``, in the place of the last that was found.
         ``held_out``: recordings and their three simulations.
-        ``forces``: what the recalibrated simulation lacks at each sample, as far as random forces were
+        ``forces``: what the recalibrated simulation lacks at each sample, as far as process noise was
         admitted.
-        ``noise``: of the sensors by output, and of random forces by state.
+        ``noise``: of the sensors by output, and of process noise by state.
     """
     case, found, shown = diagnosis.case, diagnosis.investigation, diagnosis.held_out
+    recalibrated, data = found.search.recalibrated, case.kept
     curves = [
-        {
-            "equation": ", ".join(curve.direction.names),
-            "coordinate": curve.direction.coordinate,
-            "across": curve.direction.across,
-            "at": at,
-            "missing": value,
-            "standard_error": error,
-            "gain": curve.gain,
-            "p_value": curve.p_value,
-            "stage": stage,
-        }
+        (", ".join(each.direction.names), each.direction.coordinate, each.direction.across, *point,
+         each.gain, each.p_value, stage)
         for stage, structure in (("before", found.remainder.before), ("after", found.remainder.after))
-        for curve in structure.curves
-        for at, value, error in zip(curve.direction.knots, curve.values, curve.standard_errors, strict=True)
-    ]
-    candidates = _candidate_rows(found.search)
-    data = case.kept
-    rows = []
-    for place, name in enumerate(case.system.output_names):
-        rows.append(
-            pd.DataFrame(
-                {
-                    "recording": np.array(data.labels)[data.recording],
-                    "t": data.t,
-                    "output": name,
-                    "measured": data.outputs[:, place],
-                    "before": shown.before.outputs[:, place],
-                    "recalibrated": shown.recalibrated.outputs[:, place],
-                    "augmented": shown.augmented.outputs[:, place],
-                    "scored": shown.before.scored,
-                }
-            )
+        for each in structure.curves
+        for point in zip(each.direction.knots, each.values, each.standard_errors, strict=True)
+    ]  # fmt: skip
+    held_out = [
+        pd.DataFrame(
+            {
+                "recording": np.array(data.labels)[data.recording], "t": data.t, "output": name,
+                "measured": data.outputs[:, place], "before": shown.before.outputs[:, place],
+                "recalibrated": shown.recalibrated.outputs[:, place],
+                "augmented": shown.augmented.outputs[:, place], "scored": shown.before.scored,
+            }
         )
+        for place, name in enumerate(case.system.output_names)
+    ]  # fmt: skip
+    noise = [
+        (stage, kind, name, float(value))
+        for stage, fit in (("recalibrated", recalibrated), ("final", found.final))
+        for kind, names, values in (
+            ("measurement", case.system.output_names, fit.noise.measurement),
+            ("process", fit.model.states, fit.noise.process),
+        )
+        for name, value in zip(names, values, strict=False)
+    ]
+    # What must be added to f in each interval for the states to follow the recordings.
+    learn, rows = case.learn, case.learn.begins
+    step = learn.t[rows + 1] - learn.t[rows]
+    labels = np.array(learn.labels)[learn.recording[rows]]
+    forces: dict[str, np.ndarray] = {"recording": labels, "t": learn.t[rows]}
+    forces |= {name: recalibrated.x[rows, place] for place, name in enumerate(case.system.states)}
+    forces |= {
+        f"missing_in_{name}": -recalibrated.linearisation.gap[rows, place] / step
+        for place, name in enumerate(case.system.states)
+        if name in found.roles.states
+    }
     return {
         "curves": pd.DataFrame(curves, columns=CURVE_COLUMNS),
-        "candidates": pd.DataFrame(candidates, columns=CANDIDATE_COLUMNS),
-        "held_out": pd.concat(rows, ignore_index=True),
-        "forces": _forces_table(case, found),
-        "noise": _noise_table(case.system, found.search.recalibrated, found.final),
+        "candidates": pd.DataFrame(_candidate_rows(found.search), columns=CANDIDATE_COLUMNS),
+        "held_out": pd.concat(held_out, ignore_index=True),
+        "forces": pd.DataFrame(forces),
+        "noise": pd.DataFrame(noise, columns=NOISE_COLUMNS),
     }
 
 
@@ -343,70 +347,23 @@ def tables_of_failure(case: Comparison) -> dict[str, pd.DataFrame]:
     }
 
 
-def _candidate_rows(search: Search) -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = []
+def _candidate_rows(search: Search) -> list[tuple[str | float, ...]]:
+    """Every candidate that was fitted, and every probe that was only screened."""
+    rows: list[tuple[str | float, ...]] = []
     labels = [each.best.candidate.label for each in search.found]
     fitted: set[tuple[str, str]] = set()
     for place, each in enumerate(search.found):
         beside = ", ".join(labels[:place])
-        for stage, trials in (
-            ("found", (each.best,)), ("same", each.indistinguishable), ("needless", each.needless),
-            ("less", each.lesser),
-        ):  # fmt: skip
-            fitted |= {(trial.candidate.label, beside) for trial in trials}
-            rows += [
-                {
-                    "mechanism": trial.candidate.name, "label": trial.candidate.label, "shapes": "",
-                    "gain": trial.delta_chi2, "process_noise_level": 1.0, "stage": stage, "beside": beside,
-                }
-                for trial in trials
-            ]  # fmt: skip
+        for stage, trials in (("found", (each.best,)), *each.standings.items()):
+            for trial in trials:
+                name, label = trial.candidate.name, trial.candidate.label
+                fitted.add((label, beside))
+                rows.append((name, label, "", trial.delta_chi2, 1.0, stage, beside))
     beside = ", ".join(search.screened_beside)
     stage = "further" if list(search.screened_beside) == labels else "instead"
-    return rows + [
-        {
-            "mechanism": probe.candidate.name,
-            "label": probe.candidate.label,
-            "shapes": ", ".join(f"{name}={value:.4g}" for name, value in probe.shapes),
-            "gain": result.gain,
-            "process_noise_level": result.level,
-            "stage": stage,
-            "beside": beside,
-        }
-        for probe, result in search.screened
-        # Of what was fitted, what the screening had promised is of no interest.
-        if (probe.candidate.label, beside) not in fitted
-    ]
-
-
-def _noise_table(model: Dynamics, recalibrated: Fit, final: Fit) -> pd.DataFrame:
-    """Both kinds of noise, of the recalibrated simulation and of the one that the verdict stands on."""
-    return pd.DataFrame(
-        [
-            {"stage": stage, "kind": kind, "name": name, "variance": float(value)}
-            for stage, fit in (("recalibrated", recalibrated), ("final", final))
-            for kind, names, values in (
-                ("measurement", model.output_names, fit.noise.measurement),
-                ("process", fit.model.states, fit.noise.process),
-            )
-            for name, value in zip(names, values, strict=False)
-        ],
-        columns=NOISE_COLUMNS,
-    )
-
-
-def _forces_table(case: Comparison, found: Investigation) -> pd.DataFrame:
-    """What must be added to f in each interval for the states to follow the recordings."""
-    fit, data = found.search.recalibrated, case.learn
-    rows = data.begins
-    step = data.t[rows + 1] - data.t[rows]
-    frame: dict[str, Any] = {
-        "recording": np.array(data.labels)[data.recording[rows]],
-        "t": data.t[rows],
-    }
-    for place, name in enumerate(case.system.states):
-        frame[name] = fit.x[rows, place]
-    for place, name in enumerate(case.system.states):
-        if name in found.roles.states:
-            frame[f"missing_in_{name}"] = -fit.linearisation.gap[rows, place] / step
-    return pd.DataFrame(frame)
+    for probe, result in search.screened:
+        name, label = probe.candidate.name, probe.candidate.label
+        if (label, beside) not in fitted:  # of what was fitted, what had been promised is of no interest
+            shapes = ", ".join(f"{shape}={value:.4g}" for shape, value in probe.shapes)
+            rows.append((name, label, shapes, result.gain, result.level, stage, beside))
+    return rows

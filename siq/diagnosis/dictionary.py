@@ -149,7 +149,7 @@ class Form(_Part):
     states
         Further states, by name.
     noise
-        The state on which random forces act.
+        The state on which process noise acts.
     parameters
         What the mechanism's formulas need to know, by name.
     coordinate

@@ -370,7 +370,7 @@ def evidence_of_function(
 def log_evidence_of(fit: Fit, data: Measurements, *, correlated: float = 1.0) -> float:
     """Log-likelihood of a whole explanation, less what its parameters would gain by chance.
 
-    Schwarz's approximation of the marginal likelihood, -½ k log n, with random forces counted as
+    Schwarz's approximation of the marginal likelihood, -½ k log n, with process noise counted as
     parameters, so that explanations with and without them can be compared. What the recordings do not tell
     of the parameters does not count. Of parameters of which something is expected together, such as the
     heights of a smooth function, the likelihood is averaged over that (Laplace's approximation,

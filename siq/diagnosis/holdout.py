@@ -314,7 +314,7 @@ def adopted_by_held_out(
     """The place of the model that is adopted, judged by recordings held out; None where none helps.
 
     What is not certain where it was found has to be better by more than appears by chance, what is certain
-    better than the simulation fitted alike; one of fewer coordinates that foresees no worse takes its place.
+    better than the simulation fitted alike; one of fewer coordinates that predicts no worse takes its place.
 
     Parameters
     ----------
@@ -333,8 +333,8 @@ def adopted_by_held_out(
     known = [each for each in alone if each is not None]
     least = min(known, key=np.mean, default=None)
     errors = [runs.errors(fit, data) for _, fit in choices]
-    # A card whose values are right foresees well, and tells nothing of a function whose fit had to find
-    # them, too. Beside random forces a free run is off by these, and a little may be chance.
+    # A card whose values are right predicts well, and tells nothing of a function whose fit had to find
+    # them, too. Beside process noise a free run is off by it, and a little may be chance.
     fitted_alone, lowest = _mean_error(alone[-1]), _mean_error(least)
     limits = [
         0.0 if model.log_evidence < certain else lowest if model.fit.has_process_noise else fitted_alone
@@ -355,7 +355,7 @@ def adopted_by_left_out(
     noise: Noise,
     named: Sequence[MechanismCandidate] = (),
 ) -> int | None:
-    """The place of the model that foresees parts left out best, and better than without; None for none.
+    """The place of the model that predicts parts left out best, and better than without; None for none.
 
     Parameters
     ----------
@@ -398,7 +398,7 @@ def _simplest_of(errors: Sequence[float], coordinates: Sequence[int], likeliest:
 def _first_better(
     without: np.ndarray | None, models: Iterable[np.ndarray | None], limits: Iterable[float]
 ) -> int | None:
-    """The place of the first of several models that foresees better than without it; None where none does."""
+    """The place of the first of several models that predicts better than without it; None where none does."""
     before = None if without is None else in_blocks(without)
     for place, (squares, limit) in enumerate(zip(models, limits, strict=True)):
         if squares is None:

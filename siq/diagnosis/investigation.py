@@ -320,7 +320,7 @@ def held_out_runs(
         return runs.nearest([each for each in fits if each is not None], learned)
 
     card = replace(search.recalibrated, model=investigation.model)
-    # What fits best with random forces admitted need not be what runs best without.
+    # What fits best with process noise admitted need not be what runs best without.
     recalibrated = search.recalibrated
     if recalibrated.has_process_noise and np.isfinite(investigation.least_squares.sum_of_squares):
         recalibrated = best_of(investigation.least_squares, recalibrated, card)

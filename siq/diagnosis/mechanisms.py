@@ -679,8 +679,8 @@ def completed(model: Dynamics, x: np.ndarray, *, process: np.ndarray | None = No
         ones as the fit has them. A state without a domain, such as one that a mechanism brings, gets the
         range of these.
     process
-        Intensity of random forces on each state, per time, shape ``(d,)``, where they are part of what was
-        found. They become its D, with zeros for states that nothing drives.
+        Intensity of process noise on each state, per time, shape ``(d,)``, where it is part of what was
+        found. It becomes its D, with zeros for states that nothing drives.
     """
     limits = np.stack([x.min(axis=0), x.max(axis=0)], axis=1)
     limits[limits[:, 0] == limits[:, 1]] = np.nan  # of a state that rests nothing is known

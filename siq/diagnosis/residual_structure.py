@@ -282,7 +282,7 @@ def remainder_of(
         Of the simulation's states.
     """
     after = _structure_of(final.model, data, final, roles)
-    # Random forces that stand for missing physics take measurement noise with them; the final fit's is right.
+    # Process noise that stands for missing physics takes measurement noise with it; the final fit is right.
     still = Noise(final.noise.measurement, np.zeros(model.dimension))
     before = _structure_of(model, data, recalibrated, roles, noise=still)
     alone = after

@@ -337,7 +337,7 @@ class Screened:
 
 
 def levels_of(fit: Fit) -> tuple[float, ...]:
-    """The levels of random forces at which something is judged on top of a fit; one where it has none."""
+    """The levels of process noise at which something is judged on top of a fit; one where it has none."""
     return NOISE_LEVELS if fit.has_process_noise else (1.0,)
 
 
@@ -417,7 +417,7 @@ def _screen(
     for level in levels_of(fit):
         try:
             white = whiten(linearisation, data, fit.noise.scaled(level))
-        except NumericalFailure as error:  # without random forces an unstable simulation does not follow
+        except NumericalFailure as error:  # without process noise an unstable simulation does not follow
             failure = error
             continue
         finite = np.isfinite(white.columns[:, parameters:]).all(axis=0)

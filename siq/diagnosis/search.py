@@ -223,7 +223,7 @@ def _fit_most_promising(
     most_promised = ranked[0][1].gain if ranked else 0.0
     shown = sum(probe.recorded and result.gain >= most_promised for probe, result in ranked)
     for place, (probe, result) in enumerate(ranked[: shown + 2 * most], start=-shown):
-        # Against what screening foresaw of those that did gain it: some promise much and gain nothing, and
+        # Against what screening predicted of those that did gain it: some promise much and gain nothing, and
         # of others the first order shows little.
         gained = max((min(each.delta_chi2, best[name][1].gain) for name, each in trials.items()), default=0.0)
         if result.gain < max(least_gain, PROMISING_GAIN * gained):

@@ -396,12 +396,12 @@ class Term:
 
 @dataclass(frozen=True)
 class _SmoothData:
-    """What a fit leaves says of a function's values, at a level of random forces.
+    """What a fit leaves says of a function's values, at a level of process noise.
 
     Attributes
     ----------
     level
-        Relative to the random forces of the fit.
+        Relative to the process noise of the fit.
     fine
         The function, with bumps as narrow as any.
     correlated
@@ -425,7 +425,7 @@ class _SmoothData:
     likelihood: float
 
     def over(self, correlated: float) -> _SmoothData:
-        """The same where so many samples hang together."""
+        """The same where so many samples are autocorrelated."""
         return _SmoothData(
             self.level, self.fine, correlated, self.gram / correlated, self.overlap / correlated,
             self.total / correlated, self.freedom / correlated, self.likelihood / correlated,
@@ -443,7 +443,7 @@ class Smoothness:
     deviation
         Its size.
     told
-        What the recordings tell, at the level of random forces at which it is likeliest.
+        What the recordings tell, at the level of process noise at which it is likeliest.
     noise
         Variance of the innovations then, in units of what the fit takes for it.
     log_evidence
@@ -533,7 +533,7 @@ def likeliest_product(asked: Smoothness, ground: FunctionSite, *, times: float =
 
 
 def _told(fit: Fit, data: Measurements, fine: _SmoothFunction, known: Term | None) -> list[_SmoothData]:
-    """What is told at each level of random forces at which it can be worked out.
+    """What is told at each level of process noise at which it can be worked out.
 
     Errors are as correlated as the likeliest level leaves them with such a function, at all levels.
     """

@@ -218,7 +218,7 @@ class Description:
     p_residuals_random
         p-value of the test that what is left is noise: how often noise alone would look as structured.
     random_forces_admitted
-        Whether the fit needed random forces.
+        Whether the fit needed process noise.
     too_faint
         Whether the mechanisms in `by` explain enough, and are not named since a function without a name is
         nearly as likely.
@@ -226,7 +226,7 @@ class Description:
         Probability that as many mechanisms explain as much of an effect that has no name; None where nothing
         is left.
     misleading
-        Whether the mechanisms in `by` are not named since recordings held out are foreseen worse with them.
+        Whether the mechanisms in `by` are not named since recordings held out are predicted worse with them.
     """
 
     share_described: float
@@ -375,7 +375,7 @@ class Statement:
 
     @property
     def random_forces(self) -> bool:
-        """Whether random forces are all that is missing."""
+        """Whether process noise is all that is missing."""
         return [each.name for each in self.mechanisms] == [PROCESS_NOISE]
 
     @property

@@ -132,7 +132,7 @@ class MismatchStudy(BaseModel):
         one recording, the share is its last part.
     tests
         Labels of held-out recordings by which somebody else scores: they are shown, and choose nothing. Where
-        all that is held out are tests, a model of what has no name has to foresee the parts of the recordings
+        all that is held out are tests, a model of what has no name has to predict the parts of the recordings
         to learn from, each left out of its fit in turn.
     noise
         Standard deviation of the measurement noise by output, where it is known; by default it is estimated.

@@ -272,7 +272,7 @@ def linearised_with_places(
 
 @dataclass(frozen=True)
 class RankedPlace:
-    """A place, the logarithm of its evidence, and the level of random forces at which it is best.
+    """A place, the logarithm of its evidence, and the level of process noise at which it is best.
 
     The evidence is that of a smooth function there over that of none, each at its best level.
     """
@@ -306,7 +306,7 @@ def _compared(fit: Fit, data: Measurements, places: Sequence[Place]) -> list[Ran
             try:
                 white = whiten(response, data, fit.noise.scaled(level))
                 left, columns = projected(white, parameters)
-            except NumericalFailure:  # without random forces an unstable simulation does not follow
+            except NumericalFailure:  # without process noise an unstable simulation does not follow
                 continue
             freedom = white.degrees_of_freedom - parameters
             base = profile_likelihood(float(left @ left), freedom, white.log_determinant)

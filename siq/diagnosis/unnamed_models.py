@@ -124,7 +124,7 @@ class AugmentedModel:
     log_evidence
         Of the whole over that of the simulation without its parts, less the costs of these; see `_weighed`.
     exact
-        The fit whose trajectories follow the equations, if random forces are part of `fit`.
+        The fit whose trajectories follow the equations, if process noise is part of `fit`.
     """
 
     parts: tuple[Term, ...]
@@ -162,7 +162,7 @@ def _weighed(models: Sequence[AugmentedModel], alone: Fit, data: Measurements) -
 
 
 def runs_freely(fit: Fit, alone: Fit, data: Measurements) -> bool:
-    """Whether a fit without random forces runs along the recordings, and nearer to them than one without it.
+    """Whether a fit without process noise runs along the recordings, and nearer to them than one without it.
 
     A fit that holds on to every sample may not: where it is steeper than any step of an integration, it runs
     away from where it was held.
@@ -269,7 +269,7 @@ def _with_smooth_term(
             break
         price = cost + float(np.log(asked.considered))
         parts: list[Term] = []
-        # What promises to be rough and to need hardly any random forces may be what no fit can follow.
+        # What promises to be rough and to need hardly any process noise may be what no fit can follow.
         for times, level in ((1.0, asked.told.level), (2.0, 1.0)):
             if parts:
                 break
