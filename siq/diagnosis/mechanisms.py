@@ -161,15 +161,15 @@ class MechanismCandidate:
     label: str
     model: Dynamics
     amplitudes: tuple[str, ...]
-    shapes: tuple[str, ...]
-    positive: frozenset[str]
-    searches: tuple[Shape, ...]
-    scales: tuple[sympy.Expr, ...]
     equations: tuple[str, ...]
     coordinate: str
     changes: tuple[tuple[str, sympy.Expr], ...] = ()
-    generalises: tuple[str, ...] = ()
+    shapes: tuple[str, ...] = ()
+    positive: frozenset[str] = frozenset()
+    searches: tuple[Shape, ...] = ()
+    scales: tuple[sympy.Expr, ...] = ()
     begins: tuple[sympy.Expr, ...] = ()
+    generalises: tuple[str, ...] = ()
     variant: str = ""
 
     @property
@@ -589,10 +589,6 @@ def generic_candidates(
                     label=f"{GENERIC} {monomial} in {name}",
                     model=augmented,
                     amplitudes=(new,),
-                    shapes=(),
-                    positive=frozenset(),
-                    searches=(),
-                    scales=(),
                     equations=(name,),
                     coordinate=", ".join(s for s, p in zip(model.states, powers, strict=True) if p)
                     or "constant",

@@ -99,35 +99,30 @@ class ProbeColumns:
 
     def rates(self, x: np.ndarray, values: np.ndarray, node: int) -> np.ndarray:
         """See `siq.inference.kalman_filter.Columns`."""
-        result = np.zeros((self._model.dimension, self.width, x.shape[1]))
-        place = 0
-        for index, probe in enumerate(self._probes):
-            compiled = self._compiled[id(probe.candidate)]
-            if compiled.rate_entries:
-                further = self._memory(index)[node] if probe.candidate.scales else x[:0]
-                signals = self._grid.signals(node, compiled.delays_at(probe))
-                at = (*x, *further, *signals.inputs, *signals.delayed, *signals.slopes, signals.t)
-                _fill(
-                    result,
-                    place,
-                    compiled.rate_entries,
-                    compiled.rates(*at, *compiled.numbers(probe, values)),
-                )
-            place += probe.width
-        return result
+        return self._filled(x, values, node)
 
     def outputs(self, x: np.ndarray, values: np.ndarray) -> np.ndarray:
         """See `siq.inference.kalman_filter.Columns`."""
-        result = np.zeros((len(self._model.outputs), self.width, x.shape[1]))
+        return self._filled(x, values, None)
+
+    def _filled(self, x: np.ndarray, values: np.ndarray, node: int | None) -> np.ndarray:
+        """Columns of the rates at a node, or of the outputs at all samples."""
+        count = len(self._model.outputs) if node is None else self._model.dimension
+        result = np.zeros((count, self.width, x.shape[1]))
         place = 0
         for index, probe in enumerate(self._probes):
             compiled = self._compiled[id(probe.candidate)]
-            if compiled.output_entries:
-                signals = self._grid.at_samples(compiled.delays_at(probe))
-                further = self.further_states(index).T if probe.candidate.scales else x[:0]
+            entries = compiled.output_entries if node is None else compiled.rate_entries
+            if entries:
+                further, delays = x[:0], compiled.delays_at(probe)
+                if probe.candidate.scales:
+                    further = self.further_states(index).T if node is None else self._memory(index)[node]
+                signals = self._grid.at_samples(delays) if node is None else self._grid.signals(node, delays)
                 at = (*x, *further, *signals.inputs, *signals.delayed, *signals.slopes, signals.t)
-                numbers = compiled.numbers(probe, values)
-                _fill(result, place, compiled.output_entries, compiled.outputs(*at, *numbers))
+                functions = compiled.outputs if node is None else compiled.rates
+                found = functions(*at, *compiled.numbers(probe, values))
+                for (row, column), value in zip(entries, found, strict=True):
+                    result[row, place + column] = value
             place += probe.width
         return result
 
@@ -298,11 +293,6 @@ def probes_of(
         found = places_of(search, data, model, x)
         choices = [(*before, (name, float(place))) for before in choices for place in found]
     return [Probe(candidate, shapes) for shapes in choices]
-
-
-def _fill(result: np.ndarray, place: int, entries: list[tuple[int, int]], found: Sequence[object]) -> None:
-    for (row, column), value in zip(entries, found, strict=True):
-        result[row, place + column] = value
 
 
 NOISE_LEVELS = (1.0, 0.1, 1e-2, 1e-3, 1e-4, 0.0)
