@@ -1,48 +1,39 @@
 """Residence times and occupation of states as f, D and ε predict them, against the record itself.
 
-For ``dx = f dt + √ε σ dW`` in one or two states, ``L u = f·∇u + (ε/2) D:∇∇u`` on a box that nothing leaves
-becomes a Markov jump process between cells. The flux between neighbours is Scharfetter and Gummel's,
+f and D are learned from what happens within single steps. Mean residence times in the wells, and how states
+are spread about them, are other figures of the same record, which no fit saw; on recordings that were held
+out they share no sample with it either. A prediction that misses them is wrong, whatever its own tests say.
+
+**Operator.** For ``dx = f dt + √ε σ dW`` in one or two states, ``L u = f·∇u + (ε/2) D:∇∇u`` on a box that
+nothing leaves becomes a Markov jump process between cells. The flux between neighbours is Scharfetter and
+Gummel's,
 
     J = (a/h) [B(-z) p_left - B(z) p_right],    a = (ε/2) D,  z = (f - a') h/a,  B(z) = z/(eᶻ - 1),
 
 which is exact for constant coefficients, keeps densities positive, and knows no smallness of ε. Where D has
 mixed terms, diagonal neighbours take them (Kushner), in coordinates in which the mean D is the unit matrix.
 
-The time of a *visit* is what one counts on a record: from where a core is entered until another one is. With
-the invariant density π, and q the probability that of all cores this one was visited last (the solution of
-the time-reversed ``L̃ q = 0`` with q = 1 in this core and 0 in the others),
+**Which time.** A visit to a well begins where the record enters the core of an attractor, and ends where it
+enters another one's: everything between the cores is part of the visit. A core is where
+``(x - A)ᵀ M (x - A)``, which is U to the second order, stays below ε, or below half of what it is at the next
+saddle if that is less. With the invariant density π, and q the probability that of all cores this one was
+visited last (the solution of the time-reversed ``L̃ q = 0`` with q = 1 in this core and 0 in the others),
 
-    mean visit = ∫ π q dx / (flow of π q into other cores).
+    mean visit = ∫ π q dx / (flow of π q into other cores),
 
-It is exact for any barrier; see Vanden-Eijnden, *Transition path theory*, Lect. Notes Phys. 703 (2006) 453.
+exactly, for any barrier (Vanden-Eijnden, *Transition path theory*, Lect. Notes Phys. 703 (2006) 453). In more
+than two states it is predicted by the law of Eyring and Kramers. A record knows only what it saw at its
+samples, and so the cores of the prediction are smaller by what a walk oversteps (`Cores.as_sampled`).
 
-In one and two states from the Fokker–Planck operator, whatever the barriers; beyond, by the law of Eyring
-and Kramers. Errors are those of f and ε: the same is computed for draws of both from their distributions,
-with the cores where they are.
-
-f and D are learned from what happens within single steps. How long visits to a well last, and how states are
-spread about it, are other figures of the same record, which no fit saw; on recordings that were held out they
-share no sample with it either. A prediction that misses them is wrong, whatever its own tests say.
-
-*Which time.* A visit to a well begins where the record enters the core of an attractor, and ends where it
-enters another one's: well to well, with everything between the cores counted as part of the visit. A core
-is where ``(x - A)ᵀ M (x - A)``, which is U to the second order, stays below ε, or below half of what it is at
-the next saddle if that is less. What is predicted is this same time: in one and two states by the
-Fokker–Planck operator (`siq.quasipotential.occupancy`), whatever the barrier, and beyond that by the law of
-Eyring and Kramers, whose mean time is that to the neighbourhood of the next attractor.
-
-A record knows only what it saw at its samples, and so the cores of the prediction are smaller than those of
-the count by what a walk oversteps (`siq.quasipotential.occupancy.Cores.as_sampled`).
-
-*Which error.* n visits that ended in a time T were as likely as Poisson's law with the mean T/τ says, where τ
-is uncertain by what draws of f from its distribution, and of ε, make of it. The distribution of each state
-during the visits to a well is compared as Kolmogorov and Smirnov do, with as many samples as the correlation
-time leaves independent.
+**Which error.** The same is computed for draws of f and ε from their distributions, with the cores where they
+are. n visits that ended in a time T were as likely as Poisson's law with the mean T/τ says, where τ is
+uncertain by these draws. The distribution of each state during the visits to a well is compared as Kolmogorov
+and Smirnov do, with as many samples as the correlation time leaves independent.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
 
@@ -75,9 +66,25 @@ from siq.systems.phase_portrait import PhasePortrait
 
 CELLS = {1: 2000, 2: 120}  # along each state: visits of a double well are then good to 1e-4 and 1e-2
 COARSE = 1.0  # z between neighbours, in the mean over the density: beyond, wells are narrower than cells
-SELDOM = 1e-9  # of the fastest rate
-LEAST = 1e-9  # numerical: of the strongest noise; where it is weaker it is none
+RESTART_RATE = 1e-9  # of the fastest rate
+LEAST_NOISE = 1e-9  # numerical: of the strongest noise; where it is weaker it is none
 STEEP = 700.0  # of z: beyond, exp overflows, and B has its limits
+
+OVERSHOOT = 0.5826  # derived: -ζ(1/2)/√(2π)
+SMALLEST_CORE = 0.2  # of a core's radius: of steps as long as the core no such correction is known
+CORE_SHARE = 0.5  # of U at the next saddle: a core lies well within its well
+# Of the recorded box on each side, beyond which the operator lets nothing go. None where a formula of D(x),
+# continued beyond what was recorded, is no longer positive.
+MARGINS = (0.15, 0.0)
+DRAWS = {1: 24, 2: 8}  # of f, by the number of states: an error is then known to a sixth, or a quarter
+COARSER = 0.5  # as many cells along each state: enough for how much a time changes
+MOST_PLACES = 400  # cells of a sheared grid all have places of their own, and are put together
+
+NO_HOP_PROBABILITY = 0.01  # below it, no hop at all contradicts the prediction
+HERMITE_NODES = 41  # of the integral over the prediction's own error
+MIN_INDEPENDENT_SAMPLES = 20  # fewer say nothing of a distribution
+COMPARED_PLACES = 200  # at which distribution functions are compared
+MEAN_DISTANCE = 0.8687  # of Kolmogorov's statistic: √(π/2) ln 2
 
 
 @dataclass(frozen=True)
@@ -158,9 +165,10 @@ def cell_process(
     if dimension not in CELLS:
         raise NumericalFailure("the Fokker–Planck operator is solved for one and two states only")
     count = CELLS[dimension] if cells is None else cells
-    middle = box.mean(axis=1)[None]
-    matrix = dynamics.diffusion.at(middle)[0]
-    shear = _shear(matrix)
+    # A unit lower triangular change of states after which D has no mixed terms in the middle.
+    shear, matrix = np.eye(dimension), dynamics.diffusion.at(box.mean(axis=1)[None])[0]
+    if dimension == 2 and abs(matrix[0, 1]) > 1e-12 * np.sqrt(matrix[0, 0] * matrix[1, 1]):
+        shear[1, 0] = matrix[0, 1] / matrix[0, 0]
     corners = np.array(list(product(*box))) @ np.linalg.inv(shear).T
     plain = np.array_equal(shear, np.eye(dimension))
     sides = box if plain else np.stack([corners.min(axis=0), corners.max(axis=0)], axis=1)
@@ -172,10 +180,14 @@ def cell_process(
     def tensors(points: np.ndarray) -> np.ndarray:
         return np.asarray(inverse @ dynamics.diffusion.at(points @ shear.T) @ inverse.T)
 
-    floor = LEAST * float(np.linalg.eigvalsh(tensors(y)).max())
+    floor = LEAST_NOISE * float(np.linalg.eigvalsh(tensors(y)).max())
 
     def noise(points: np.ndarray) -> np.ndarray:
-        return 0.5 * intensity * _raised(tensors(points), floor)
+        matrices = tensors(points)
+        levels, vectors = np.linalg.eigh(matrices)
+        if not (levels >= floor).all():  # nothing is weaker than the floor
+            matrices = np.einsum("nik,nk,njk->nij", vectors, np.maximum(levels, floor), vectors)
+        return 0.5 * intensity * matrices
 
     def flow(points: np.ndarray) -> np.ndarray:
         return np.asarray(dynamics.drift(points @ shear.T) @ inverse.T)
@@ -183,39 +195,18 @@ def cell_process(
     usable = np.linalg.eigvalsh(tensors(y))[:, 0] > floor
     if not usable.any():
         raise NumericalFailure("the noise does not reach every state: no Fokker–Planck operator is solved")
-    rates, kept = _connected(_rates(flow, noise, y, steps, count), usable)
-    y, density = y[kept], _invariant(rates)
+    # The generator of the largest set of usable cells that are connected.
+    places = np.flatnonzero(usable)
+    inner = _rates(flow, noise, y, steps, count)[places][:, places]
+    _, piece = sparse.csgraph.connected_components(inner, directed=True, connection="strong")
+    largest = piece == np.argmax(np.bincount(piece))
+    places, inner = places[largest], inner[largest][:, largest]
+    rates = (inner - sparse.diags(np.asarray(inner.sum(axis=1)).ravel())).tocsr()
+    y, density = y[places], _invariant_density(rates)
     tensor, drift = np.diagonal(noise(y), axis1=1, axis2=2), flow(y)
     if float((density[:, None] * np.abs(drift) * steps / tensor).sum(axis=0).max()) > COARSE:
         raise NumericalFailure("the noise is too weak for a grid: the wells are narrower than its cells")
     return CellProcess(y @ shear.T, rates, density)
-
-
-def _connected(flows: sparse.csr_matrix, usable: np.ndarray) -> tuple[sparse.csr_matrix, np.ndarray]:
-    """The generator of the largest set of usable cells that hang together, and which these are."""
-    places = np.flatnonzero(usable)
-    inner = flows[places][:, places]
-    _, piece = sparse.csgraph.connected_components(inner, directed=True, connection="strong")
-    own = piece == np.argmax(np.bincount(piece))
-    places, inner = places[own], inner[own][:, own]
-    return (inner - sparse.diags(np.asarray(inner.sum(axis=1)).ravel())).tocsr(), places
-
-
-def _raised(matrices: np.ndarray, floor: float) -> np.ndarray:
-    """Symmetric matrices ``(n, d, d)`` without eigenvalues below the floor."""
-    levels, vectors = np.linalg.eigh(matrices)
-    if (levels >= floor).all():
-        return matrices
-    return np.einsum("nik,nk,njk->nij", vectors, np.maximum(levels, floor), vectors)
-
-
-def _shear(matrix: np.ndarray) -> np.ndarray:
-    """A unit lower triangular change of states after which D has no mixed terms."""
-    dimension = len(matrix)
-    shear = np.eye(dimension)
-    if dimension == 2 and abs(matrix[0, 1]) > 1e-12 * np.sqrt(matrix[0, 0] * matrix[1, 1]):
-        shear[1, 0] = matrix[0, 1] / matrix[0, 0]
-    return shear
 
 
 def _rates(
@@ -225,6 +216,7 @@ def _rates(
     steps: np.ndarray,
     count: int,
 ) -> sparse.csr_matrix:
+    """Rates between neighbouring cells, without those that lead out of a cell on the diagonal."""
     dimension = y.shape[1]
     index = np.arange(len(y)).reshape((count,) * dimension)
     rows, columns, values = [], [], []
@@ -259,10 +251,9 @@ def _rates(
             rows += [start[used], end[used]]
             columns += [end[used], start[used]]
             values += [mixed[used], mixed[used]]
-    total = sparse.csr_matrix(
+    return sparse.csr_matrix(
         (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=(len(y), len(y))
     )
-    return total
 
 
 def _bernoulli(z: np.ndarray) -> np.ndarray:
@@ -272,13 +263,13 @@ def _bernoulli(z: np.ndarray) -> np.ndarray:
         return np.where(small, 1 - z / 2, z / np.expm1(np.where(small, 1.0, z)))
 
 
-def _invariant(rates: sparse.csr_matrix) -> np.ndarray:
+def _invariant_density(rates: sparse.csr_matrix) -> np.ndarray:
     """Probabilities with ``π L = 0``: that of a busy cell set to one, the others follow from it."""
     transposed = rates.T.tocsc()
     size = transposed.shape[0]
     # A process that rarely starts anew, anywhere, says which cell is busy; of one that is not, the ratio of
     # all others to it would have to be found.
-    anew = SELDOM * float(-rates.diagonal().min())
+    anew = RESTART_RATE * float(-rates.diagonal().min())
     started = splu((transposed - anew * sparse.identity(size)).tocsc()).solve(np.full(size, -anew / size))
     fixed = int(np.argmax(started))
     free = np.delete(np.arange(size), fixed)
@@ -291,51 +282,6 @@ def _invariant(rates: sparse.csr_matrix) -> np.ndarray:
         )
     found = np.maximum(found, 0.0)
     return np.asarray(found / found.sum())
-
-
-def cores_of(
-    points: np.ndarray,
-    attractors: np.ndarray,
-    hessians: Sequence[np.ndarray] | np.ndarray,
-    levels: np.ndarray,
-) -> np.ndarray:
-    """Which core each point is in, -1 between them: shape ``(n,)``.
-
-    The core of an attractor is where ``(x - A)ᵀ M (x - A)``, which is U there to the second order, stays
-    below a level.
-
-    Parameters
-    ----------
-    points
-        Shape ``(n, d)``.
-    attractors
-        Shape ``(k, d)``.
-    hessians
-        M, the Hessian of V at each: ``(d, d)``.
-    levels
-        Of U, shape ``(k,)``.
-    """
-    found = np.full(len(points), -1)
-    lowest = np.full(len(points), np.inf)
-    for place, (attractor, hessian, level) in enumerate(zip(attractors, hessians, levels, strict=True)):
-        away = points - attractor
-        height = np.einsum("ni,ij,nj->n", away, hessian, away)
-        inside = (height <= level) & (height / level < lowest)
-        found[inside], lowest[inside] = place, (height / level)[inside]
-    return found
-
-
-OVERSHOOT = 0.5826  # derived: -ζ(1/2)/√(2π)
-SMALLEST = 0.2  # of a core's radius: of steps as long as the core no such correction is known
-SHARE = 0.5  # of U at the next saddle: a core lies well within its well
-MARGINS = (
-    0.15,
-    0.0,
-)  # of the recorded box on each side: beyond it the operator lets nothing go. None where a
-# formula of D(x), continued beyond what was recorded, is no longer positive
-DRAWS = {1: 24, 2: 8}  # of f, by the number of states: an error is then known to a sixth, or a quarter
-COARSER = 0.5  # as many cells along each state: enough for how much a time changes
-MOST_PLACES = 400  # cells of a sheared grid all have places of their own, and are put together
 
 
 @dataclass(frozen=True, eq=False)
@@ -368,21 +314,19 @@ class Cores:
         for place, hessian, level in zip(self.attractors, self.hessians, self.levels, strict=True):
             spread = np.trace(hessian @ dynamics.diffusion.at(place[None])[0]) / len(place)
             radius = np.sqrt(level) - OVERSHOOT * np.sqrt(intensity * step * max(float(spread), 0.0))
-            levels.append(max(radius, SMALLEST * np.sqrt(level)) ** 2)
+            levels.append(max(radius, SMALLEST_CORE * np.sqrt(level)) ** 2)
         return replace(self, levels=np.array(levels))
 
     def of(self, points: np.ndarray) -> np.ndarray:
         """The core of each point ``(n, d)``, -1 between them: shape ``(n,)``."""
-        return cores_of(points, self.attractors, self.hessians, self.levels)
-
-
-@dataclass(frozen=True)
-class VisitTime:
-    """Mean time of visits to a well, core to core, with its relative standard error."""
-
-    well: int
-    mean: float
-    error: float
+        found, lowest = np.full(len(points), -1), np.full(len(points), np.inf)
+        cores = zip(self.attractors, self.hessians, self.levels, strict=True)
+        for place, (attractor, hessian, level) in enumerate(cores):
+            away = points - attractor
+            height = np.einsum("ni,ij,nj->n", away, hessian, away)
+            inside = (height <= level) & (height / level < lowest)
+            found[inside], lowest[inside] = place, (height / level)[inside]
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -393,31 +337,7 @@ class CellVisits:
     last: tuple[np.ndarray, ...]
     means: np.ndarray
 
-
-@dataclass(frozen=True, eq=False)
-class PredictedVisits:
-    """What to expect of a record.
-
-    Attributes
-    ----------
-    times
-        Of the wells for which something is known.
-    method
-        ``operator`` or ``law``.
-    processes
-        The operator of f, and of draws of it; empty where the law was used.
-    notes
-        What is not known, in words.
-    """
-
-    times: tuple[VisitTime, ...]
-    method: str
-    processes: tuple[CellVisits, ...] = ()
-    notes: tuple[str, ...] = ()
-
-    def distribution(
-        self, well: int, state: int, places: np.ndarray, blur: float = 0.0, *, draw: int = 0
-    ) -> np.ndarray:
+    def distribution(self, well: int, state: int, places: np.ndarray, blur: float = 0.0) -> np.ndarray:
         """Distribution function of a state during visits to a well, at places ``(m,)``.
 
         Parameters
@@ -427,19 +347,37 @@ class PredictedVisits:
         places
             Values of the state.
         blur
-            Standard deviation of the sensor's error.
-        draw
-            Which of the processes; 0 is that of f itself.
+            Standard deviation of measurement noise.
         """
-        cells = self.processes[draw]
-        x = cells.process.points[:, state]
-        at, group = np.unique(np.round(x, 12), return_inverse=True)
-        mass = np.bincount(group, weights=cells.process.density * cells.last[well])
+        at, group = np.unique(np.round(self.process.points[:, state], 12), return_inverse=True)
+        mass = np.bincount(group, weights=self.process.density * self.last[well])
         if len(at) > MOST_PLACES:
             mass, edges = np.histogram(at, bins=MOST_PLACES, weights=mass)
             at = (edges[1:] + edges[:-1]) / 2
         spread = np.hypot(blur, float(np.median(np.diff(at))) / np.sqrt(12))  # a cell is no point
         return np.asarray(stats.norm.cdf((places[:, None] - at) / spread) @ (mass / mass.sum()))
+
+
+@dataclass(frozen=True, eq=False)
+class PredictedVisits:
+    """Mean times of visits to the wells, core to core, as f, D and ε predict them.
+
+    Attributes
+    ----------
+    times
+        Well, mean time and its relative standard error, of the wells for which something is known.
+    method
+        ``operator`` or ``law``.
+    processes
+        The operator of f, and of draws of it; empty where the law was used.
+    notes
+        What is not known, in words.
+    """
+
+    times: tuple[tuple[int, float, float], ...]
+    method: str
+    processes: tuple[CellVisits, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 def cores_about(dynamics: Dynamics, portrait: PhasePortrait, intensity: float) -> Cores:
@@ -452,7 +390,7 @@ def cores_about(dynamics: Dynamics, portrait: PhasePortrait, intensity: float) -
         away = np.array(others) - attractor
         lowest = float(np.einsum("ni,ij,nj->n", away, hessian, away).min())
         hessians.append(hessian)
-        levels.append(min(intensity, SHARE * lowest))
+        levels.append(min(intensity, CORE_SHARE * lowest))
     return Cores(attractors, np.array(hessians), np.array(levels))
 
 
@@ -464,7 +402,7 @@ def predicted_visits(
     Parameters
     ----------
     found, portrait
-        F with its uncertainty, and what follows from it.
+        f with its uncertainty, and what follows from it.
     noise
         ε with its error.
     cores
@@ -473,67 +411,43 @@ def predicted_visits(
         Decides the draws.
     """
     notes: list[str] = []
-    if found.dynamics.dimension in CELLS:
-        for margin in MARGINS:
-            try:
-                processes = _processes(found, portrait, noise, cores, margin, seed)
-            except (NumericalFailure, np.linalg.LinAlgError, RuntimeError, ValueError) as error:
-                notes.append(str(error))
-                continue
-            means = processes[0].means
-            errors = np.log([one.means for one in processes[1:]]).std(axis=0, ddof=1)
-            times = [
-                VisitTime(well, float(mean), float(error))
-                for well, (mean, error) in enumerate(zip(means, errors, strict=True))
-                if np.isfinite(mean) and np.isfinite(error)
-            ]
-            return PredictedVisits(tuple(times), "operator", processes)
-    count = len(cores.attractors)
-    ways = transitions(found, ways_out(found.dynamics, portrait), [None] * count)
+    dynamics, width = found.dynamics, portrait.box[:, 1] - portrait.box[:, 0]
+    for margin in MARGINS if dynamics.dimension in CELLS else ():
+        cells = CELLS[dynamics.dimension]
+        box = portrait.box + margin * np.stack([-width, width], axis=1)
+        try:
+            processes = [_visits(dynamics, noise.intensity, box, cores, cells)]
+            generator = np.random.default_rng(seed)
+            for _ in range(DRAWS[dynamics.dimension]):
+                drawn = _drawn_system(found, generator=generator)
+                strength = np.exp(noise.standard_error / noise.intensity * generator.standard_normal())
+                coarse = round(COARSER * cells)
+                processes.append(_visits(drawn, noise.intensity * float(strength), box, cores, coarse))
+        except (NumericalFailure, np.linalg.LinAlgError, RuntimeError, ValueError) as error:
+            notes.append(str(error))
+            continue
+        errors = np.log([one.means for one in processes[1:]]).std(axis=0, ddof=1)
+        times = [
+            (well, float(mean), float(error))
+            for well, (mean, error) in enumerate(zip(processes[0].means, errors, strict=True))
+            if np.isfinite(mean) and np.isfinite(error)
+        ]
+        return PredictedVisits(tuple(times), "operator", tuple(processes))
+    ways = transitions(found, ways_out(dynamics, portrait), [None] * len(cores.attractors))
     times, missing = [], []
     for well, one in enumerate(portrait.attractors):
-        found_time = mean_residence_time([way.exit for way in ways if way.start == well], noise)
-        if found_time is None or not found_time.complete:
+        mean_time = mean_residence_time([way.exit for way in ways if way.start == well], noise)
+        if mean_time is None or not mean_time.complete:
             missing.append(place_text(one.position))
         else:
-            times.append(VisitTime(well, found_time.value, found_time.error))
+            times.append((well, mean_time.value, mean_time.error))
     if missing:
         notes.append(f"no law says how long {' and '.join(missing)} lasts")
     return PredictedVisits(tuple(times), "law", notes=tuple(notes))
 
 
-def _processes(
-    found: IdentifiedField,
-    portrait: PhasePortrait,
-    noise: NoiseStrength,
-    cores: Cores,
-    margin: float,
-    seed: int,
-) -> tuple[CellVisits, ...]:
-    dynamics = found.dynamics
-    width = portrait.box[:, 1] - portrait.box[:, 0]
-    box = portrait.box + margin * np.stack([-width, width], axis=1)
-    cells = CELLS[dynamics.dimension]
-    main = _visits(dynamics, noise.intensity, box, cores, cells)
-    generator = np.random.default_rng(seed)
-    others = []
-    for _ in range(DRAWS[dynamics.dimension]):
-        drawn = drawn_system(found, generator=generator)
-        strength = float(np.exp(noise.standard_error / noise.intensity * generator.standard_normal()))
-        others.append(_visits(drawn, noise.intensity * strength, box, cores, round(COARSER * cells)))
-    return (main, *others)
-
-
-def drawn_system(found: IdentifiedField, *, generator: np.random.Generator) -> Dynamics:
-    """F and D drawn from their distributions, further terms of f and the terms of D(x) included.
-
-    Parameters
-    ----------
-    found
-        What is known of both.
-    generator
-        Where the draw comes from.
-    """
+def _drawn_system(found: IdentifiedField, *, generator: np.random.Generator) -> Dynamics:
+    """f and D drawn from their distributions, further terms of f and the terms of D(x) included."""
     coefficients = np.zeros_like(found.coefficients)
     own = normal_draws(found.values, found.covariance, 1, generator=generator)[0]
     coefficients[found.support[:, 1], found.support[:, 0]] = own
@@ -558,13 +472,6 @@ def _visits(dynamics: Dynamics, intensity: float, box: np.ndarray, cores: Cores,
     last = tuple(process.last_visited(core, well) for well in range(count))
     means = np.array([process.mean_visit(core, well) for well in range(count)])
     return CellVisits(process, last, means)
-
-
-NO_WONDER = 0.01  # probability of no hop at all, below which it contradicts the prediction
-NODES = 41  # of the integral over the prediction's own error
-FEWEST = 20  # independent samples: fewer say nothing of a distribution
-PLACES = 200  # at which distribution functions are compared
-MEAN_DISTANCE = 0.8687  # of Kolmogorov's statistic: √(π/2) ln 2
 
 
 @dataclass(frozen=True)
@@ -628,8 +535,8 @@ class DensityTest:
 
 
 @dataclass(frozen=True)
-class RecordTest:
-    """All of it.
+class OccupancyCheck:
+    """Visits to the wells, and the spread of states about them, against the record.
 
     Attributes
     ----------
@@ -674,21 +581,22 @@ class RecordTest:
         least = min(found)
         rarity = -float(np.log10(min(max(least * len(found), 1e-300), 1.0)))
         limit = -float(np.log10(false_alarms))
-        return Verdict(rarity, limit, rarity <= limit, "" if rarity <= limit else self._reason(least))
+        if rarity <= limit:
+            return Verdict(rarity, limit, True)
+        visits = next((one for one in self.visits if one.probability == least), None)
+        if visits is None:
+            worst = min(self.densities, key=lambda one: one.probability)
+            reason = f"states in well {worst.well + 1} are spread otherwise than what was identified says"
+        else:
+            counted = f"{visits.held_out.mean:.3g}" if visits.held_out.visits else "no end"
+            reason = (
+                f"visits to well {visits.well + 1} last {visits.predicted:.3g} by what was identified, and"
+                f" {counted} as counted on held-out recordings"
+            )
+        return Verdict(rarity, limit, False, reason)
 
-    def _reason(self, least: float) -> str:
-        for one in self.visits:
-            if one.probability == least:
-                counted = f"{one.held_out.mean:.3g}" if one.held_out.visits else "no end"
-                return (
-                    f"visits to well {one.well + 1} last {one.predicted:.3g} by what was identified, and"
-                    f" {counted} as counted on held-out recordings"
-                )
-        worst = min(self.densities, key=lambda one: one.probability)
-        return f"states in well {worst.well + 1} are spread otherwise than what was identified says"
 
-
-def record_test(
+def check_occupancy(
     found: IdentifiedField,
     portrait: PhasePortrait,
     noise: NoiseStrength | None,
@@ -697,13 +605,13 @@ def record_test(
     *,
     sensor: np.ndarray | None = None,
     seed: int = 0,
-) -> RecordTest:
+) -> OccupancyCheck:
     """Hold what was identified against the record's own hops and histogram.
 
     Parameters
     ----------
     found, portrait
-        F with its uncertainty, and what follows from it.
+        f with its uncertainty, and what follows from it.
     noise
         ε, None where the recordings show none.
     recordings
@@ -716,15 +624,15 @@ def record_test(
         Decides the draws of f.
     """
     if found.noise_free:
-        return RecordTest(missing="the recordings show no random forces, so that nothing hops")
+        return OccupancyCheck(missing="the recordings show no random forces, so that nothing hops")
     if noise is None:
-        return RecordTest(missing="the strength of the random forces is not known")
+        return OccupancyCheck(missing="the strength of the random forces is not known")
     if len(portrait.attractors) < 2:
         seen = switching(joined(recordings)) if found.dynamics.dimension == 1 else None
         if seen is None or not seen.supported:
-            return RecordTest(missing="there is one stable state, so that nothing hops")
+            return OccupancyCheck(missing="there is one stable state, so that nothing hops")
         low, high = seen.levels
-        return RecordTest(
+        return OccupancyCheck(
             missing=f"the record hops between two states, at {low:.3g} and {high:.3g}, with {seen.hops}"
             " transitions seen, and what was identified has one stable state",
             unseen=seen,
@@ -737,30 +645,45 @@ def record_test(
     whole = dwell_counts(recordings.t, visits, runs_of(joined(recordings)), states=states)
     held = dwell_counts(recordings.t, visits, apart, states=states)
     if found.dynamics.dimension not in CELLS and not any(one.visits for one in whole):
-        return RecordTest(missing="the recordings do not hop")
+        return OccupancyCheck(missing="the recordings do not hop")
     sampled = cores.as_sampled(found.dynamics, noise.intensity, usual_step(recordings))
     prediction = predicted_visits(found, portrait, noise, sampled, seed=seed)
     tested = tuple(
         VisitTest(
-            one.well, held[one.well], whole[one.well], one.mean, one.error, prediction.method,
-            probability_of(held[one.well], one.mean, one.error),
+            well, held[well], whole[well], mean, error, prediction.method,
+            probability_of(held[well], mean, error),
         )
-        for one in prediction.times
+        for well, mean, error in prediction.times
     )  # fmt: skip
     if not tested:
-        return RecordTest(missing=f"no dwell time is predicted: {'; '.join(prediction.notes)}")
+        return OccupancyCheck(missing=f"no dwell time is predicted: {'; '.join(prediction.notes)}")
     chance = min(probability_of(one.whole, one.predicted, one.error) for one in tested)
-    if not any(one.visits for one in whole) and chance > NO_WONDER:
-        return RecordTest(missing="the recordings do not hop, nor should they have in their time")
-    densities = _densities(prediction, recordings, visits, apart, sensor)
-    return RecordTest(tested, densities, notes=prediction.notes)
+    if not any(one.visits for one in whole) and chance > NO_HOP_PROBABILITY:
+        return OccupancyCheck(missing="the recordings do not hop, nor should they have in their time")
+    # Each state's distribution during the visits to each well, on the held-out runs.
+    used, densities = np.zeros(len(visits), dtype=bool), []
+    for run in apart:
+        used[run] = True
+    for well, *_ in prediction.times if prediction.processes else ():
+        rows = np.flatnonzero(used & (visits == well))
+        if len(rows) < MIN_INDEPENDENT_SAMPLES:
+            continue
+        breaks = np.flatnonzero(np.diff(rows) > 1) + 1
+        pieces = [slice(int(a), int(b)) for a, b in pairwise(np.concatenate([[0], breaks, [len(rows)]]))]
+        for state in range(len(recordings.names)):
+            x = recordings.values[rows, state]
+            blur = 0.0 if sensor is None else float(sensor[state])
+            independent = len(x) / (2 * correlated_samples(x, pieces))
+            if independent >= MIN_INDEPENDENT_SAMPLES and np.ptp(x) > 0:
+                densities.append(_density(prediction, well, state, x, float(independent), blur))
+    return OccupancyCheck(tested, tuple(densities), notes=prediction.notes)
 
 
 def probability_of(count: DwellCount, mean: float, error: float) -> float:
     """Two-sided probability of so many visits in their time, if they last `mean` within its error."""
     if count.time <= 0 or not np.isfinite(mean):
         return 1.0
-    nodes, weights = np.polynomial.hermite_e.hermegauss(NODES)
+    nodes, weights = np.polynomial.hermite_e.hermegauss(HERMITE_NODES)
     expected = count.time / mean * np.exp(np.clip(error * nodes, -50, 50))
     weights = weights / weights.sum()
     fewer = float(weights @ stats.poisson.cdf(count.visits, expected))
@@ -768,62 +691,27 @@ def probability_of(count: DwellCount, mean: float, error: float) -> float:
     return min(2 * min(fewer, more), 1.0)
 
 
-def _densities(
-    prediction: PredictedVisits,
-    recordings: Recordings,
-    visits: np.ndarray,
-    runs: list[slice],
-    sensor: np.ndarray | None,
-) -> tuple[DensityTest, ...]:
-    """Each state's distribution during the visits to each well, on the runs given."""
-    if not prediction.processes:
-        return ()
-    used = np.zeros(len(visits), dtype=bool)
-    for run in runs:
-        used[run] = True
-    tests = []
-    for one in prediction.times:
-        rows = np.flatnonzero(used & (visits == one.well))
-        if len(rows) < FEWEST:
-            continue
-        pieces = _pieces(rows)
-        for state in range(len(recordings.names)):
-            x = recordings.values[rows, state]
-            blur = 0.0 if sensor is None else float(sensor[state])
-            independent = len(x) / (2 * correlated_samples(x, pieces))
-            if independent >= FEWEST and np.ptp(x) > 0:
-                tests.append(_density(prediction, one.well, state, x, independent, blur))
-    return tuple(tests)
-
-
-def _pieces(rows: np.ndarray) -> list[slice]:
-    """Where rows follow each other: slices of the places in `rows`."""
-    breaks = np.flatnonzero(np.diff(rows) > 1) + 1
-    return [slice(int(a), int(b)) for a, b in pairwise(np.concatenate([[0], breaks, [len(rows)]]))]
-
-
 def _density(
     prediction: PredictedVisits, well: int, state: int, x: np.ndarray, independent: float, blur: float
 ) -> DensityTest:
-    places = np.quantile(x, np.linspace(0.005, 0.995, PLACES))
+    """The distribution of a state during the visits to one well, by so many independent samples."""
+    main, *others = prediction.processes
+    places = np.quantile(x, np.linspace(0.005, 0.995, COMPARED_PLACES))
     counted = np.searchsorted(np.sort(x), places, side="right") / len(x)
-    foreseen = prediction.distribution(well, state, places, blur)
+    foreseen = main.distribution(well, state, places, blur)
     distance = float(np.abs(counted - foreseen).max())
-    drawn = [
-        np.abs(prediction.distribution(well, state, places, blur, draw=draw) - foreseen).max()
-        for draw in range(1, len(prediction.processes))
-    ]
+    drawn = [np.abs(one.distribution(well, state, places, blur) - foreseen).max() for one in others]
     error = float(np.mean(drawn)) if drawn else 0.0
     # The mean distance of n samples is 0.87/√n: an error of the prediction is as if there were fewer.
     effective = 1 / (1 / independent + (error / MEAN_DISTANCE) ** 2)
     edges = np.linspace(x.min(), x.max(), BINS + 1)
-    share = np.diff(prediction.distribution(well, state, edges, blur))
+    share = np.diff(main.distribution(well, state, edges, blur))
     width = edges[1] - edges[0]
     return DensityTest(
         well,
         state,
         distance,
-        float(independent),
+        independent,
         error,
         float(stats.kstwobign.sf(distance * np.sqrt(effective))),
         edges,

@@ -69,7 +69,7 @@ from siq.quasipotential.global_formula import (
     with_circulation,
 )
 from siq.quasipotential.hamilton_jacobi import affordable_degree, potential_basis
-from siq.quasipotential.occupancy import RecordTest, record_test
+from siq.quasipotential.occupancy import OccupancyCheck, check_occupancy
 from siq.quasipotential.rates import NoiseStrength
 from siq.quasipotential.wells import Well, WellOptions, fit_well, local_well
 from siq.systems.phase_portrait import PhasePortrait, RecordedRegion, evenly_spread, phase_portrait
@@ -411,17 +411,17 @@ class RefinementContext:
             self.number,
         )  # fmt: skip
 
-    def record_test(self) -> RecordTest:
+    def record_test(self) -> OccupancyCheck:
         """Hops and histogram of the record, compared with those that f predicts."""
         strength, variance = self.record.noise_strength, self.record.sensor_variance
         noise = None if strength is None else NoiseStrength(*strength, source="estimated")
         try:
-            return record_test(
+            return check_occupancy(
                 self.found, self.portrait, noise, self.recordings, self.unseen,
                 sensor=None if variance is None else np.sqrt(variance), seed=self.number,
             )  # fmt: skip
         except (NumericalFailure, np.linalg.LinAlgError) as error:
-            return RecordTest(missing=str(error))
+            return OccupancyCheck(missing=str(error))
 
 
 def _every_well_held_out(portrait: PhasePortrait, pairs: SnapshotPairs, mask: np.ndarray) -> np.ndarray:
@@ -491,7 +491,7 @@ class Refinement:
 
     formulas: SymbolicDecomposition
     certificate: Certificate
-    record: RecordTest
+    record: OccupancyCheck
     portrait: PhasePortrait
     notes: tuple[str, ...] = ()
 

@@ -33,7 +33,7 @@ from siq.quasipotential.certificate_tests import CertificateOptions
 from siq.quasipotential.formulas import SymbolicDecomposition, decomposition_from_coefficients
 from siq.quasipotential.landscape import Landscape, LandscapeOptions, NoLandscape
 from siq.quasipotential.landscape_assembly import EquationSettings, find_landscape, landscape_from_equations
-from siq.quasipotential.occupancy import RecordTest, VisitTest
+from siq.quasipotential.occupancy import OccupancyCheck, VisitTest
 from siq.quasipotential.rates import MeanTime, NoiseStrength, mean_exit_time, mean_residence_time
 from siq.quasipotential.refinement import (
     Refinement,
@@ -282,7 +282,7 @@ class RefinedRun:
         return None if self.refinement is None else self.refinement.certificate
 
     @property
-    def record(self) -> RecordTest | None:
+    def record(self) -> OccupancyCheck | None:
         """The test of f against the hops and the histogram of the recordings."""
         return None if self.refinement is None else self.refinement.record
 
@@ -334,7 +334,7 @@ def refine_run(settings: RefineSettings, given: RunToRefine) -> RefinedRun:
     return RefinedRun(formulas, certificates, outcome, refinement, portrait, states)
 
 
-def _visit_rows(run: int, found: RecordTest | None, attractors: Sequence[np.ndarray]) -> pd.DataFrame:
+def _visit_rows(run: int, found: OccupancyCheck | None, attractors: Sequence[np.ndarray]) -> pd.DataFrame:
     """One row for each well; none where there is no test."""
     rows = []
     for one in () if found is None else found.visits:
@@ -361,7 +361,7 @@ def _visit_rows(run: int, found: RecordTest | None, attractors: Sequence[np.ndar
 
 
 def _density_rows(
-    run: int, found: RecordTest | None, attractors: Sequence[np.ndarray], states: Sequence[str]
+    run: int, found: OccupancyCheck | None, attractors: Sequence[np.ndarray], states: Sequence[str]
 ) -> pd.DataFrame:
     """One row for each bin of each histogram."""
     rows = [

@@ -11,7 +11,7 @@ from siq.data.recordings import Recordings
 from siq.data.stationarity import runs_of
 from siq.data.two_states import continued_visits, dwell_counts
 from siq.errors import NumericalFailure
-from siq.quasipotential.occupancy import cell_process, cores_of
+from siq.quasipotential.occupancy import Cores, cell_process
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 
@@ -25,7 +25,7 @@ HALF = 0.1  # width of a core
 
 
 def cores(points: np.ndarray) -> np.ndarray:
-    return cores_of(points, WELLS[:, None], np.ones((2, 1, 1)), np.full(2, HALF**2))
+    return Cores(WELLS[:, None], np.ones((2, 1, 1)), np.full(2, HALF**2)).of(points)
 
 
 @pytest.mark.parametrize("intensity", [0.05, 0.15, 0.4])
@@ -86,10 +86,10 @@ def test_two_states_against_a_simulation() -> None:
     attractors, hessians = np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([2 * np.eye(2)] * 2)
     levels = np.full(2, 0.4)
     recordings = Recordings.from_arrays(step * np.arange(steps), seen.transpose(1, 0, 2), names=["x", "y"])
-    visits = continued_visits(cores_of(recordings.values, attractors, hessians, levels), runs_of(recordings))
+    visits = continued_visits(Cores(attractors, hessians, levels).of(recordings.values), runs_of(recordings))
     counts = dwell_counts(recordings.t, visits, runs_of(recordings))
     process = cell_process(system, intensity, np.array([[-2.4, 2.4], [-2.2, 2.2]]), cells=100)
-    core = cores_of(process.points, attractors, hessians, levels)
+    core = Cores(attractors, hessians, levels).of(process.points)
     for well, count in enumerate(counts):
         error = np.hypot(count.relative_error, 0.03)  # of the simulation's own step, and of the cells
         assert process.mean_visit(core, well) == pytest.approx(count.mean, rel=3 * error)

@@ -10,7 +10,7 @@ from siq.data.recordings import Recordings
 from siq.data.two_states import LEVEL, continued_visits, dwell_counts
 from siq.inference.field_estimate import FlowMap, IdentifiedField
 from siq.inference.identification import IdentificationOptions, field_library
-from siq.quasipotential.occupancy import cell_process, cores_about, record_test
+from siq.quasipotential.occupancy import cell_process, check_occupancy, cores_about
 from siq.quasipotential.rates import NoiseStrength
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
@@ -75,13 +75,13 @@ def test_a_state_that_the_record_shows_and_f_does_not_is_noticed() -> None:
     alone = field({"1": 0.3, "x": -0.5}, 0.3)
     portrait = phase_portrait(alone.dynamics, values[::20], seed=0)
     held = np.arange(len(recordings.labels)) < 2
-    found = record_test(alone, portrait, NoiseStrength(0.3), recordings, held)
+    found = check_occupancy(alone, portrait, NoiseStrength(0.3), recordings, held)
     verdict = found.verdict(false_alarms=1e-4)
     assert verdict is not None and not verdict.passed and verdict.value > -np.log10(LEVEL)
     assert "hops between two states" in verdict.reason and found.missing == verdict.reason
     both = field({"x": 1.0, "x**3": -1.0}, 0.3)
     portrait = phase_portrait(both.dynamics, values[::20], seed=0)
-    agreed = record_test(both, portrait, NoiseStrength(0.3, 0.003), recordings, held)
+    agreed = check_occupancy(both, portrait, NoiseStrength(0.3, 0.003), recordings, held)
     verdict = agreed.verdict(false_alarms=1e-4)
     assert verdict is not None and verdict.passed and agreed.hops > 30
 
@@ -94,7 +94,7 @@ def test_a_single_state_is_no_contradiction() -> None:
     recordings = in_stretches(Recordings.from_arrays(0.1 * np.arange(len(x)), x, names=["x"]))
     alone = field({"x": -0.5}, 0.1)
     portrait = phase_portrait(alone.dynamics, x[::10], seed=0)
-    found = record_test(
+    found = check_occupancy(
         alone, portrait, NoiseStrength(0.1), recordings, np.zeros(len(recordings.labels), dtype=bool)
     )
     assert found.unseen is None and found.verdict(false_alarms=1e-4) is None

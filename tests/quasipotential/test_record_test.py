@@ -12,11 +12,11 @@ from siq.data.two_states import DwellCount
 from siq.inference.identification import FieldRecord
 from siq.quasipotential.certificate_tests import Verdict
 from siq.quasipotential.occupancy import (
-    RecordTest,
+    OccupancyCheck,
+    check_occupancy,
     cores_about,
     predicted_visits,
     probability_of,
-    record_test,
 )
 from siq.quasipotential.rates import NoiseStrength
 from siq.systems.phase_portrait import PhasePortrait, phase_portrait
@@ -46,12 +46,12 @@ def recorded() -> RECORDED:
     return recordings, found.record, portrait, held_out_recordings(recordings, generator=generator)
 
 
-def compared(recorded: RECORDED, intensity: float = INTENSITY) -> RecordTest:
+def compared(recorded: RECORDED, intensity: float = INTENSITY) -> OccupancyCheck:
     recordings, record, portrait, held_out = recorded
-    return record_test(record.found, portrait, NoiseStrength(intensity), recordings, held_out)
+    return check_occupancy(record.found, portrait, NoiseStrength(intensity), recordings, held_out)
 
 
-def verdict_of(found: RecordTest) -> Verdict:
+def verdict_of(found: OccupancyCheck) -> Verdict:
     verdict = found.verdict(false_alarms=1e-4)
     assert verdict is not None
     return verdict
@@ -76,13 +76,13 @@ def test_a_wrong_strength_of_the_noise_is_refused(recorded: RECORDED, intensity:
 def test_a_wrong_depth_is_refused(recorded: RECORDED) -> None:
     recordings, record, portrait, held_out = recorded
     deeper = replace(record.found, coefficients=2.5 * record.found.coefficients)
-    found = record_test(deeper, portrait, NoiseStrength(INTENSITY), recordings, held_out)
+    found = check_occupancy(deeper, portrait, NoiseStrength(INTENSITY), recordings, held_out)
     assert not verdict_of(found).passed
 
 
 def test_without_noise_there_is_no_test(recorded: RECORDED) -> None:
     recordings, record, portrait, held_out = recorded
-    found = record_test(record.found, portrait, None, recordings, held_out)
+    found = check_occupancy(record.found, portrait, None, recordings, held_out)
     assert found.verdict(false_alarms=1e-4) is None and "strength of the random forces" in str(found.missing)
 
 
@@ -93,7 +93,7 @@ def test_a_record_too_short_to_hop_is_no_test(recorded: RECORDED) -> None:
         recordings, labels=("0",), recording=recordings.recording[rows], t=recordings.t[rows],
         values=recordings.values[rows],
     )  # fmt: skip
-    found = record_test(record.found, portrait, NoiseStrength(INTENSITY), short, np.array([True]))
+    found = check_occupancy(record.found, portrait, NoiseStrength(INTENSITY), short, np.array([True]))
     assert found.missing is not None and "nor should they" in found.missing
 
 
@@ -109,7 +109,7 @@ def test_a_distribution_function_rises_from_nothing_to_all(recorded: RECORDED) -
     noise = NoiseStrength(INTENSITY)
     cores = cores_about(record.found.dynamics, portrait, INTENSITY)
     found = predicted_visits(record.found, portrait, noise, cores)
-    along = found.distribution(0, 0, np.linspace(-3, 3, 50), blur=0.1)
+    along = found.processes[0].distribution(0, 0, np.linspace(-3, 3, 50), blur=0.1)
     assert along[0] < 1e-6 and along[-1] > 1 - 1e-6 and (np.diff(along) >= -1e-12).all()
 
 
