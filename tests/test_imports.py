@@ -53,6 +53,7 @@ WITHIN: frozenset[tuple[str, str]] = frozenset(
     {
         ("siq.quasipotential.landscape", "siq.quasipotential.landscape_assembly"),
         ("siq.quasipotential.landscape", "siq.quasipotential.landscape_comparison"),
+        ("siq.systems.dynamics", "siq.systems.cards"),
     }
 )
 
