@@ -1,22 +1,7 @@
-"""Options of a training, and how a vector field is matched to pairs (paper, Eq. loss, first term).
-
-The loss compares ``(I_h(X0; f) - Xh)/h``, that is the integrator's mean velocity over the pair with the
-observed ``Y = (Xh - X0)/h``. A rule of order p has a bias of O(h^p) in f.
-
-===========  =====  ===========  ==========================================================
-kind         order  evaluations  when to use it
-===========  =====  ===========  ==========================================================
-explicit     2      2            the paper's rule (Runge's midpoint); noisy pairs, since only X0 enters f
-explicit     4      4            the classical Runge–Kutta rule; noisy pairs with a large h
-symmetric    2      1            implicit midpoint ``f((X0 + Xh)/2)``: cheapest, noise-free pairs only
-symmetric    4      3            Hermite–Simpson: noise-free pairs, unbiased to O(h⁴)
-===========  =====  ===========  ==========================================================
-
-The symmetric rules put Xh into f: with noise in Xh that correlates the regressor with its error and
-biases f by as much as the noise is strong.
+"""The decomposition ``f = -D∇V + g`` of one run after training, its files, and the options of a training.
 
 What comes after training needs V_θ, g and f at points and no gradient by a weight, so that it does without
-torch, which takes longer to import than such an evaluation does to run.
+torch, which takes longer to import than such an evaluation does to run. Networks are stored as plain arrays.
 """
 
 from __future__ import annotations
@@ -98,7 +83,7 @@ class TrainingOptions:
     asymmetry
         δ of w(z, δ).
     matching, matching_order
-        The pair-matching rule, see `siq.networks.decomposition`.
+        The pair-matching rule, see `siq.networks.networks.mean_velocity`.
     relative_dynamics
         Divide the first term of the loss by the mean square of the observed velocities, so that λ means
         the same for every system and in any units. The paper does not.
@@ -253,16 +238,13 @@ class TrainedNetworks:
 def shuffled(networks: TrainedNetworks, *, generator: np.random.Generator) -> TrainedNetworks:
     """The same weights in random order: a network that knows nothing, for comparison."""
 
+    def mixed(array: np.ndarray) -> np.ndarray:
+        return array.ravel()[generator.permutation(array.size)].reshape(array.shape)
+
     def layers(source: tuple[Layer, ...]) -> tuple[Layer, ...]:
-        return tuple(
-            (_shuffle(weights, generator), _shuffle(biases, generator)) for weights, biases in source
-        )
+        return tuple((mixed(weights), mixed(biases)) for weights, biases in source)
 
     return replace(networks, potential=layers(networks.potential), circulatory=layers(networks.circulatory))
-
-
-def _shuffle(array: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    return array.ravel()[generator.permutation(array.size)].reshape(array.shape)
 
 
 def _hidden(layers: tuple[Layer, ...], y: np.ndarray) -> list[np.ndarray]:

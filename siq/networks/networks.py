@@ -5,13 +5,17 @@
 Every tensor has a leading *run* axis: independent runs are trained side by side by batched products, one
 run on a CPU, many on a GPU, and never see each other. The gradient of the tanh network is written out as
 the chain of products that it is, so that training needs first-order automatic differentiation only.
+
+The loss (paper, Eq. loss) is that of the dynamics plus λ times that of orthogonality. The former compares the
+mean velocity over a pair that an integrator predicts with the observed ``(Xh - X0)/h`` (`mean_velocity`,
+`dynamics_loss`); the latter penalises the angle between ∇V and g (`orthogonality_loss`).
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -134,18 +138,26 @@ def evaluate(networks: Networks, x: Tensor) -> Components:
     )
 
 
+def _mapped(networks: Networks, function: Callable[[Tensor], Tensor]) -> Networks:
+    """Networks of which every tensor that has an axis of runs is changed by a function."""
+
+    def layers(source: tuple[Layer, ...]) -> tuple[Layer, ...]:
+        return tuple((function(weights), function(biases)) for weights, biases in source)
+
+    return replace(
+        networks,
+        potential=layers(networks.potential),
+        circulatory=layers(networks.circulatory),
+        mean=function(networks.mean),
+        scale=function(networks.scale),
+        potential_scale=function(networks.potential_scale),
+        circulatory_scale=function(networks.circulatory_scale),
+    )
+
+
 def select_run(networks: Networks, run: int) -> Networks:
     """The networks of one of the runs, as networks with a single run."""
-    pick = slice(run, run + 1)
-    return Networks(
-        potential=tuple((weights[pick], biases[pick]) for weights, biases in networks.potential),
-        circulatory=tuple((weights[pick], biases[pick]) for weights, biases in networks.circulatory),
-        mean=networks.mean[pick],
-        scale=networks.scale[pick],
-        potential_scale=networks.potential_scale[pick],
-        circulatory_scale=networks.circulatory_scale[pick],
-        diffusion=networks.diffusion,
-    )
+    return _mapped(networks, lambda tensor: tensor[run : run + 1])
 
 
 def at_rest(networks: Networks, run: int) -> TrainedNetworks:
@@ -197,15 +209,7 @@ def move(networks: Networks, device: torch.device | str) -> Networks:
     def there(tensor: Tensor) -> Tensor:
         return tensor.detach().to(device, copy=True)
 
-    return Networks(
-        potential=tuple((there(weights), there(biases)) for weights, biases in networks.potential),
-        circulatory=tuple((there(weights), there(biases)) for weights, biases in networks.circulatory),
-        mean=there(networks.mean),
-        scale=there(networks.scale),
-        potential_scale=there(networks.potential_scale),
-        circulatory_scale=there(networks.circulatory_scale),
-        diffusion=there(networks.diffusion),
-    )
+    return replace(_mapped(networks, there), diffusion=there(networks.diffusion))
 
 
 def _forward(layers: tuple[Layer, ...], y: Tensor) -> Tensor:
@@ -231,11 +235,6 @@ def _value_and_gradient(layers: tuple[Layer, ...], y: Tensor) -> tuple[Tensor, T
     for (weights, _), activation in zip(reversed(layers[:-1]), reversed(hidden), strict=True):
         delta = (delta * (1 - activation * activation)) @ weights.mT
     return value, delta
-
-
-with needs_extra("networks"):
-    import torch
-    from torch import Tensor
 
 
 def dynamics_loss(
@@ -309,6 +308,20 @@ def mean_velocity(
     order: Order,
 ) -> Tensor:
     """Mean velocity over the pair that the vector field predicts, to be compared with (Xh - X0)/h.
+
+    A rule of order p has a bias of O(h^p) in f:
+
+    ===========  =====  ===========  ==========================================================
+    kind         order  evaluations  when to use it
+    ===========  =====  ===========  ==========================================================
+    explicit     2      2            the paper's rule (Runge's midpoint); noisy pairs, since only X0 enters f
+    explicit     4      4            the classical Runge–Kutta rule; noisy pairs with a large h
+    symmetric    2      1            implicit midpoint ``f((X0 + Xh)/2)``: cheapest, noise-free pairs only
+    symmetric    4      3            Hermite–Simpson: noise-free pairs, unbiased to O(h⁴)
+    ===========  =====  ===========  ==========================================================
+
+    The symmetric rules put Xh into f: with noise in Xh that correlates the regressor with its error and
+    biases f by as much as the noise is strong.
 
     Parameters
     ----------

@@ -2,23 +2,34 @@
 
 Several runs can train side by side. All random choices of a run come from its own seed and from the
 number of the step, so that a run neither depends on its neighbours nor on interruptions: a killed
-training resumes from its checkpoint and ends with the same networks.
+training resumes from its checkpoint and ends with the same networks. A block of runs is trained until each
+has passed its check, or its attempts are spent.
 """
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import pandas as pd
 
 from siq.data.recordings import SnapshotPairs
 from siq.errors import InputError, NumericalFailure, needs_extra
-from siq.networks.decomposition import TrainingOptions, pack, read_archive, unpack, write_archive
+from siq.networks.decomposition import (
+    TrainedNetworks,
+    TrainingOptions,
+    load_networks,
+    pack,
+    read_archive,
+    save_networks,
+    unpack,
+    write_archive,
+)
 from siq.networks.networks import (
     Networks,
     at_rest,
@@ -32,6 +43,7 @@ from siq.networks.networks import (
     side_by_side,
 )
 from siq.numerics.least_squares import representative_subset
+from siq.numerics.randomness import Purpose, seed_sequence
 from siq.systems.diffusion import Diffusion
 
 with needs_extra("networks"):
@@ -213,10 +225,6 @@ def _table(pairs: SnapshotPairs) -> Tensor:
     return torch.from_numpy(np.concatenate([pairs.x0, pairs.xh, (pairs.xh - pairs.x0) / h, h], axis=1))
 
 
-with needs_extra("networks"):
-    import torch
-
-
 def initial_networks(
     data: Sequence[TrainingData],
     *,
@@ -278,10 +286,6 @@ def _descent(x: np.ndarray, gradient: np.ndarray, velocity: np.ndarray, diffusio
     size = diffusion.contract(x, gradient).sum()
     return max(float(-(gradient * velocity).sum() / size), 0.0)
 
-
-with needs_extra("networks"):
-    import torch
-    from torch import Tensor
 
 logger = logging.getLogger(__name__)
 
@@ -504,10 +508,6 @@ class _Objective:
         return dynamics, orthogonality
 
 
-with needs_extra("networks"):
-    import torch
-
-
 def save_checkpoint(path: str | Path, state: TrainingState, *, fingerprint: str) -> None:
     """Write the state of a training, with a fingerprint of the data and options that it belongs to."""
     arrays = pack([at_rest(state.networks, run) for run in range(state.networks.runs)])
@@ -541,3 +541,175 @@ def load_checkpoint(path: str | Path, *, fingerprint: str) -> TrainingState | No
         )
     except (InputError, KeyError, ValueError):
         return None
+
+
+LOGGED_LOSSES = 100  # times in a training at which its loss is logged
+MOST_STEPS_BETWEEN_CHECKPOINTS = 1000  # steps between two checkpoints, at most
+
+
+@dataclass(frozen=True)
+class Checkpoints:
+    """What a killed training leaves behind for the one that goes on from it.
+
+    Attributes
+    ----------
+    folder
+        Where its files lie; None keeps nothing.
+    mark
+        Fingerprint of the data and settings: files of another training are passed over.
+    """
+
+    folder: Path | None
+    mark: str
+
+    def _file(self, name: str) -> Path | None:
+        return None if self.folder is None else self.folder / f"kept-{self.mark[:12]}-{name}.npz"
+
+    def state(self, attempt: int) -> TrainingState | None:
+        """How far an attempt had come."""
+        file = self._file(f"attempt{attempt}")
+        return None if file is None else load_checkpoint(file, fingerprint=self.mark)
+
+    def keep_state(self, attempt: int, state: TrainingState) -> None:
+        """Keep how far an attempt has come."""
+        if (file := self._file(f"attempt{attempt}")) is not None:
+            save_checkpoint(file, state, fingerprint=self.mark)
+
+    def passed(self, attempt: int, run: int) -> TrainedNetworks | None:
+        """Networks of a run that had passed the check in an attempt."""
+        file = self._file(f"attempt{attempt}-run{run}")
+        return load_networks(file) if file is not None and file.exists() else None
+
+    def keep_passed(self, attempt: int, run: int, networks: TrainedNetworks) -> None:
+        """Keep networks that have passed the check."""
+        if (file := self._file(f"attempt{attempt}-run{run}")) is not None:
+            save_networks(file, [networks])
+
+
+class Check(Protocol):
+    """When the training of a run may end before its last step."""
+
+    def hopeless(self) -> str | None:
+        """Why no training can pass, in words; None where one can."""
+
+    def passes(self, networks: TrainedNetworks) -> bool:
+        """Whether the networks are good enough."""
+
+
+class Block:
+    """The training of a block of runs.
+
+    Parameters
+    ----------
+    data
+        Pairs by run.
+    checks
+        When the training of a run may end, for those where that is known.
+    options
+        What the networks are told.
+    diffusion
+        D.
+    seed
+        Of the study.
+    checkpoints
+        What is left behind for a job that goes on from here.
+    device
+        Where it is computed.
+    faults
+        Why some runs have no check, in words.
+    """
+
+    def __init__(
+        self,
+        data: Mapping[int, TrainingData],
+        checks: Mapping[int, Check],
+        *,
+        options: TrainingOptions,
+        diffusion: Diffusion,
+        seed: int,
+        checkpoints: Checkpoints,
+        device: torch.device,
+        faults: Mapping[int, str] | None = None,
+    ) -> None:
+        self.data, self.checks, self.options = data, checks, options
+        self.diffusion, self.seed = diffusion, seed
+        self.checkpoints, self.device, self.faults = checkpoints, device, faults or {}
+        self.passed: dict[int, TrainedNetworks] = {}
+        self.last: dict[int, TrainedNetworks] = {}
+        self.failures: dict[int, str] = {}
+        self.histories: list[pd.DataFrame] = []
+
+    @property
+    def attempts(self) -> int:
+        """How many trainings a run may have."""
+        return self.options.check.attempts if self.options.check is not None and self.checks else 1
+
+    def train(self) -> None:
+        """All attempts, as far as they are needed."""
+        for attempt in range(self.attempts):
+            # A first training needs every run; a further one, those whose check could yet pass.
+            hopeful = [run for run in self.data if run in self.checks and self.checks[run].hopeless() is None]
+            runs = [run for run in (hopeful if attempt else self.data) if run not in self.passed]
+            if runs:
+                self._attempt(attempt, runs)
+
+    def _attempt(self, attempt: int, runs: list[int]) -> None:
+        options = self.options.attempt(attempt)
+        purpose = Purpose.TRAINING if attempt == 0 else f"{Purpose.TRAINING} {attempt}"
+        seeds = [seed_sequence(self.seed, run, purpose) for run in runs]
+        data = [slowest_part(self.data[run], options.slowest_share) for run in runs]
+        state = self.checkpoints.state(attempt)
+        if state is None:
+            state = start(data, options=options, diffusion=self.diffusion, seeds=seeds)
+        early: dict[int, TrainedNetworks] = {}
+        for run in runs:  # what had passed before the job was killed
+            if (before := self.checkpoints.passed(attempt, run)) is not None:
+                early[run] = before
+
+        def finished(step: int, networks: Networks) -> bool:
+            for position, run in enumerate(runs):
+                if run in self.checks and run not in early:
+                    one = at_rest(networks, position)
+                    if self.checks[run].passes(one):
+                        early[run] = one
+                        self.checkpoints.keep_passed(attempt, run, one)
+            return len(early) == len(runs)
+
+        if len(early) < len(runs):
+            state = train(
+                state, data, options=options, seeds=seeds, device=self.device,
+                log_every=max(options.steps // LOGGED_LOSSES, 1),
+                checkpoint_every=min(MOST_STEPS_BETWEEN_CHECKPOINTS, max(options.steps // 10, 1)),
+                checkpoint=lambda state: self.checkpoints.keep_state(attempt, state),
+                finished=finished,
+            )  # fmt: skip
+        # Checkpoints until all attempts are over: a killed job must not train this one again.
+        self.checkpoints.keep_state(attempt, state)
+        self.passed |= early
+        lost = failed_runs(state)
+        for position, run in enumerate(runs):
+            self.last[run] = early.get(run, at_rest(state.networks, position))
+            self.failures.pop(run, None)
+            if run not in early and position in lost:
+                self.failures[run] = lost[position]
+        history = state.history
+        self.histories.append(history.assign(run=history["run"].map(dict(enumerate(runs)))))
+
+    def unchecked(self, run: int) -> str:
+        """Why the check of a run has not passed."""
+        if run in self.checks:
+            return self.checks[run].hopeless() or (
+                f"the check passed in none of {self.attempts} trainings of {self.options.steps} steps"
+            )
+        return self.faults.get(run, "no vector field was identified, so that nothing could be checked")
+
+    def history(self) -> pd.DataFrame:
+        """The loss of the last training of every run."""
+        latest: dict[int, pd.DataFrame] = {}
+        for table in self.histories:
+            latest |= {int(run): table[table["run"] == run] for run in table["run"].unique()}
+        return (
+            pd.concat([latest[run] for run in sorted(latest)])
+            if latest
+            else pd.DataFrame(columns=list(HISTORY))
+        )
