@@ -1,8 +1,14 @@
-"""Landscapes as plain data, to be told."""
+"""Landscapes as plain data, to be told, and the landscapes that these are of."""
 
 from __future__ import annotations
 
 from typing import Any
+
+import sympy
+
+from siq.quasipotential.landscape import Landscape
+from siq.quasipotential.landscape_files import landscape_from_data
+from siq.systems.dynamics import Dynamics
 
 NOISE = {"intensity": 0.1, "standard_error": 0.001, "source": "estimated"}
 
@@ -21,8 +27,10 @@ def landscape(
     ways = [
         {
             "start": index, "end": (index + 1) % len(places) if len(places) > 1 else None,
-            "saddle": [0.0] * d, "barrier": barrier, "error": 0.01, "standard_error": 0.01,
+            "saddle": [0.0] * d, "barrier": barrier, "standard_error": 0.01,
             "minimum_action": barrier, "prefactor": prefactor, "exponent": 0.0, "remarks": [],
+            "formula_share": None, "by_rivals": 0.0, "noise_leverage": 1.0, "path": None, "law_remarks": [],
+            "turn": None, "prefactor_error": None, "prefactor_covariance": 0.0,
         }
         for index, barrier in enumerate(barriers)
     ]  # fmt: skip
@@ -43,3 +51,9 @@ def landscape(
         "states": ["x", "y", "z"][:d], "units": [units] * d, "time_unit": time, "noise": noise,
         "equilibria": equilibria, "wells": wells, "transitions": ways, "remarks": [],
     }  # fmt: skip
+
+
+def told(data: dict[str, Any]) -> Landscape:
+    """The landscape that plain data are of; of its f nothing is asked."""
+    symbols = [sympy.Symbol(name, real=True) for name in data["states"]]
+    return landscape_from_data(data, Dynamics.of(symbols, symbols))

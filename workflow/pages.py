@@ -186,6 +186,7 @@ def page(given: Given, settings: PipelineSettings) -> Any:
     """The page of a study of trajectories."""
     from markupsafe import Markup
 
+    from siq.quasipotential.landscape_files import landscape_from_data
     from siq.report.figures import read_inspection, read_seen
     from siq.report.page import render_report
     from siq.report.study_page import StudyResults, answer_data, study_page
@@ -198,13 +199,18 @@ def page(given: Given, settings: PipelineSettings) -> Any:
     shown = shown if shown.run is not None else models.first_wells()
     overview = given.overview
     run = shown.run if shown.run is not None else (overview or {}).get("run", 0)
+    landscape = None
+    if overview is not None:
+        number = overview["run"]
+        stored = landscape_from_data(overview, given.field[number].found.dynamics)
+        landscape = summarise(stored, record=tables["record"], run=number)
     view = Path(source["drawn"]) / "interactive.html"
     folders = [source["drawn"], *source["drawn_landscape"], source["drawn_density"]]
     images, vectors = _files(folders, ".png"), _files(folders, ".svg")
     results = StudyResults(
         tables,
         Path(source["summary"]).parent,
-        landscape=None if overview is None else summarise(overview, record=tables["record"]),
+        landscape=landscape,
         models=models,
         shown=shown,
         exact=None if card is None else exact_answer(card),

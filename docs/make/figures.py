@@ -17,11 +17,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pandas as pd
+import sympy
 
 from siq.numerics.text import range_text, value_text
+from siq.quasipotential.landscape_files import landscape_from_data
 from siq.report.figures import read_seen
 from siq.report.formatting import counted_text, predicted_text
 from siq.report.summary import summarise
+from siq.systems.dynamics import Dynamics
 
 ROOT = Path(__file__).parents[2]
 FIGURES = ROOT / "docs" / "figures.json"
@@ -82,7 +85,9 @@ def greenland_ice(tables: Path) -> Found:
     noise = json.loads((tables.parent / "runs" / "000" / "vector_field.json").read_text(encoding="utf-8"))[
         "noise"
     ]
-    said = summarise(overview, record=record)
+    symbols = [sympy.Symbol(name, real=True) for name in overview["states"]]
+    stored = landscape_from_data(overview, Dynamics.of(symbols, symbols))  # nothing here asks for f
+    said = summarise(stored, record=record, run=overview["run"])
     found: Found = {}
     for name, well in zip(("warm", "cold"), sorted(said.wells, key=lambda one: one.position[0]), strict=True):
         assert well.visits is not None

@@ -40,8 +40,9 @@ from siq.numerics.text import (
     unit_text,
     value_text,
 )
+from siq.quasipotential.occupancy import VisitTest
 from siq.quasipotential.rates import MIN_BARRIER_OVER_NOISE, MeanTime
-from siq.report.summary import LandscapeSummary, VisitSummary, WellSummary
+from siq.report.summary import LandscapeSummary, WellSummary
 from siq.systems.formulas import CONSTANTS, FUNCTIONS, parse_formula
 
 COUNTS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine")
@@ -51,21 +52,21 @@ CHARACTERS_PER_LINE = 56  # a longer formula is broken between its terms: browse
 _INVISIBLE_TIMES = "\u2062"
 
 
-def counted_text(visits: VisitSummary, unit: str = "") -> str:
+def counted_text(visits: VisitTest, unit: str = "") -> str:
     """The mean of visits on the record, with its interval of 95 %; of none that ended a lower bound."""
-    if not visits.count:
-        return f"more than {value_text(visits.lowest, unit=unit, digits=2)}"
-    text = f"{value_text(visits.counted, digits=3)} ({range_text(visits.lowest, visits.highest)})"
+    lowest, highest = visits.whole.limits
+    if not visits.whole.visits:
+        return f"more than {value_text(lowest, unit=unit, digits=2)}"
+    text = f"{value_text(visits.whole.mean, digits=3)} ({range_text(lowest, highest)})"
     return f"{text}\u00a0{unit_text(unit)}" if unit_text(unit) else text
 
 
-def predicted_text(visits: VisitSummary, unit: str = "") -> str:
+def predicted_text(visits: VisitTest, unit: str = "") -> str:
     """The mean of visits as f and D predict it, with its error; a range where that is large."""
-    share = visits.error / visits.predicted
-    if share > LARGE_ERROR:
-        factor = math.exp(share)
+    if visits.error > LARGE_ERROR:
+        factor = math.exp(visits.error)
         return range_text(visits.predicted / factor, visits.predicted * factor, unit=unit)
-    return value_text(visits.predicted, visits.error, unit=unit)
+    return value_text(visits.predicted, visits.error * visits.predicted, unit=unit)
 
 
 def time_text(mean: MeanTime | None, unit: str = "") -> str:

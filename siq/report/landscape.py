@@ -20,7 +20,7 @@ from siq.numerics.text import MINUS, range_text, unit_text, value_text
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.rates import NoiseStrength, mean_exit_time
 from siq.report.formatting import counted_text, paragraphs, percent_text, predicted_text, texts, time_text
-from siq.report.summary import LandscapeSummary, VisitSummary, settled, summarise, well_name
+from siq.report.summary import LandscapeSummary, settled, summarise, visits_of, well_name
 from siq.workflow.tables import Method
 
 MOST_COLUMNS = 4  # wells that are columns of a table; more are rows
@@ -250,18 +250,16 @@ def record_table(record: pd.DataFrame, time_unit: str) -> pd.DataFrame:
     """
     words, rows = texts("tables"), []
     for one in record.to_dict("records"):
-        visits = VisitSummary(
-            int(one["visits"]), one["counted"], one["lowest"], one["highest"], one["predicted"],
-            one["predicted_error"], str(one["method"]),
-        )  # fmt: skip
+        visits = visits_of(one)
+        count, lowest = visits.whole.visits, visits.whole.limits[0]
         held_out = one["held_out_counted"]
         rows.append(
             {
                 "well about": one["attractor"],
-                "visits seen to end": visits.count,
+                "visits seen to end": count,
                 headed("mean visit, counted", time_unit): counted_text(visits)
-                if visits.count
-                else f"above {value_text(visits.lowest, digits=2)}",
+                if count
+                else f"above {value_text(lowest, digits=2)}",
                 "held out: visits": int(one["held_out_visits"]),
                 headed("held out: mean", time_unit): value_text(held_out, digits=3)
                 if math.isfinite(held_out)

@@ -19,19 +19,13 @@ import pandas as pd
 from scipy.integrate import cumulative_trapezoid
 
 from siq.data.recordings import Recordings
+from siq.data.two_states import DwellCount
 from siq.numerics.text import place_text, squared
 from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.quasipotential.landscape import Landscape, least_over_wells
-from siq.quasipotential.landscape_files import landscape_data
-from siq.quasipotential.rates import (
-    EnergyLossPerCycle,
-    EscapeRate,
-    MeanTime,
-    NoiseStrength,
-    mean_residence_time,
-)
+from siq.quasipotential.occupancy import VisitTest
+from siq.quasipotential.rates import EscapeRate, MeanTime, NoiseStrength, mean_residence_time
 from siq.quasipotential.wells import Well
-from siq.remarks import Remark
 from siq.report.remarks import sentence
 from siq.systems.cycles import Cycle
 from siq.systems.dynamics import Dynamics, symbol
@@ -40,6 +34,7 @@ from siq.systems.formulas import compile_formulas
 ZERO_POSITION = 1e-6  # of the size of a state
 MARGIN = 0.05  # of what is shown: left free around it
 BLOCK_OF_POINTS = 20_000  # evaluated at once: each has some hundred powers
+NO_ESCAPE_TIME = "quasipotential.no_escape_time"
 
 
 def well_name(index: int) -> str:
@@ -66,31 +61,6 @@ def energy_unit(units: Sequence[str], time_unit: str) -> str:
     if not length:
         return f"{time}^-1" if time else ""
     return f"{length}/{time}" if time else length
-
-
-@dataclass(frozen=True)
-class VisitSummary:
-    """How long visits to a well last, in the unit of time.
-
-    Attributes
-    ----------
-    count
-        How many were seen to end on the recordings.
-    counted, lowest, highest
-        Their mean with its interval of 95 %; NaN where it is not known.
-    predicted, error
-        The same mean as f and D say, with its standard error.
-    method
-        ``operator`` of Fokker and Planck, or ``law`` of Eyring and Kramers.
-    """
-
-    count: int
-    counted: float
-    lowest: float
-    highest: float
-    predicted: float
-    error: float
-    method: str
 
 
 @dataclass(frozen=True)
@@ -159,7 +129,7 @@ class WellSummary:
     known_up_to: float
     exits: tuple[EscapeRate, ...]
     leverage: float = 1.0
-    visits: VisitSummary | None = None
+    visits: VisitTest | None = None
     cycle: Cycle | None = None
 
     @property
@@ -431,98 +401,109 @@ def chosen_states(landscape: LandscapeSummary, states: Sequence[str] | None) -> 
 
 
 def summarise(
-    landscape: Landscape | Mapping[str, Any] | None,
+    landscape: Landscape | None,
     recordings: Recordings | np.ndarray | None = None,
     *,
     dynamics: Dynamics | None = None,
     formula: SymbolicDecomposition | None = None,
     record: pd.DataFrame | None = None,
+    run: int = 0,
 ) -> LandscapeSummary:
-    """The summary of a landscape in memory, of its file, or of its plain data.
+    """The summary of a landscape, be it in memory or read from its file.
 
     Parameters
     ----------
     landscape
-        The landscape, or the content of its file alone, without formulas; None where recordings led to none.
+        The landscape; None where recordings led to none.
     recordings
-        Recorded states, or an array ``(n, d)`` of them; by default those that a landscape was fitted to.
+        Recorded states, or an array ``(n, d)`` of them; by default those that the landscape was fitted to.
     dynamics
-        f and D, of a landscape from a file.
+        f and D, where there is no landscape.
     formula
         With one V that holds over all wells: it counts in the box of the recorded states where no well has a
         formula of its own.
-    record
-        Visits to the wells by run, the table of that name.
+    record, run
+        Visits to the wells by run, the table of that name, and the run of the landscape.
     """
     points = recordings.values if isinstance(recordings, Recordings) else recordings
-    wells: tuple[Well | None, ...] = ()
-    if isinstance(landscape, Landscape):
-        dynamics, wells = landscape.dynamics, landscape.wells
-        if points is None:
-            fitted = [well.points for well in wells if well is not None]
-            points = np.concatenate([np.zeros((0, dynamics.dimension)), *fitted])
-        data: Mapping[str, Any] = landscape_data(landscape)
-    elif landscape is None:
+    if landscape is None:
         assert isinstance(recordings, Recordings)  # which have names and units
-        data = {"states": recordings.names, "units": [unit or "1" for unit in recordings.units]}
-        data |= {"time_unit": recordings.time_unit, "wells": [], "equilibria": [], "transitions": []}
-    else:
-        data = landscape
-    if any(well is not None for well in wells) or (formula is not None and formula.potential is None):
+        units, time_unit = tuple(unit or "1" for unit in recordings.units), recordings.time_unit or "1"
+        return LandscapeSummary(
+            tuple(recordings.names), units, time_unit, (), (), (), None, points=points, dynamics=dynamics,
+            matched=False, formula=None if formula is None or formula.potential is None else formula,
+        )  # fmt: skip
+    dynamics = landscape.dynamics
+    fitted = [well.points for well in landscape.wells if well is not None]
+    if points is None:
+        points = np.concatenate([np.zeros((0, dynamics.dimension)), *fitted])
+    if fitted or not len(points) or (formula is not None and formula.potential is None):
         formula = None
-    if points is None or not len(points):
-        formula = None
-    names = tuple(data["states"])
-    units = tuple(data.get("units") or ("1",) * len(names))
-    attractors = [np.array(one["attractor"], dtype=float) for one in data["wells"]]
-    heights = np.array([_number(one.get("height")) for one in data["wells"]])
+    units, attractors = tuple(dynamics.units), landscape.attractors
+    heights = landscape.heights
     if formula is not None and attractors:
-        heights = 2 * formula.evaluate(np.ascontiguousarray(np.array(attractors).T))[0]
-        assert points is not None  # or there is no formula
+        places = np.array([one.position for one in attractors])
         low, high = points.min(axis=0), points.max(axis=0)
-        outside = [bool((place < low).any() or (place > high).any()) for place in attractors]
-        heights = np.where(outside, np.nan, heights)
+        inside = ((places >= low) & (places <= high)).all(axis=1)
+        heights = np.where(inside, 2 * formula.evaluate(np.ascontiguousarray(places.T))[0], np.nan)
         heights = heights - heights.min() if np.isfinite(heights).all() else heights
     matched = bool(len(heights)) and bool(np.isfinite(heights).all())
     heights = heights if matched else np.zeros(len(attractors))
-    ways = _ways(data, len(names))
-    places = [one["position"] for one in data["equilibria"]]
-    for one in data["wells"]:
-        cycle, of_fit = one.get("cycle") or {}, one.get("V") or {}
-        places += [one["attractor"], *cycle.get("points", ()), *of_fit.get("points", ())]
-    size = np.abs(np.array(places, dtype=float).reshape(-1, len(names))).max(axis=0, initial=0.0)
+    ways = tuple(
+        ExitSummary(
+            start=one.start,
+            end=one.end,
+            saddle=one.place,
+            barrier=one.barrier,
+            standard_error=one.error,
+            uphill=np.zeros((0, dynamics.dimension)) if one.path is None else one.path.uphill.points,
+            downhill=np.zeros((0, dynamics.dimension)) if one.path is None else one.path.downhill,
+            law=one.exit,
+            minimum_action=None if one.path is None else one.path.uphill.action,
+            remarks=one.notes,
+            no_time_reason="".join(
+                str(each.values["reason"]) for each in one.remarks if each.code == NO_ESCAPE_TIME
+            ),
+            period=one.saddle.period if isinstance(one.saddle, Cycle) else math.nan,
+        )
+        for one in landscape.transitions
+    )
+    extent = [one.position[None] for one in (*landscape.equilibria, *attractors)]
+    extent += [one.points for one in attractors if isinstance(one, Cycle)]
+    size = np.abs(np.concatenate([*extent, *fitted, np.zeros((1, dynamics.dimension))])).max(axis=0)
     # In units of the largest state where all have the same, or a state that is zero has no size.
-    size = size if len(set(units)) > 1 else np.full(len(names), size.max())
+    size = size if len(set(units)) > 1 else np.full(dynamics.dimension, size.max())
     tops: dict[tuple[float, ...], float] = {}
     for way in ways:
         key, top = tuple(way.saddle.tolist()), float(heights[way.start] + way.barrier)
         tops[key] = top if np.isnan(tops.get(key, np.nan)) else min(top, tops[key])
-    letters = {tuple(one["attractor"]): well_name(index) for index, one in enumerate(data["wells"])}
+    letters = {tuple(one.position.tolist()): well_name(index) for index, one in enumerate(attractors)}
     equilibria = tuple(
         EquilibriumSummary(
-            one["kind"], np.array(one["position"], dtype=float), tops.get(tuple(one["position"]), np.nan),
-            tuple(complex(*value) for value in one.get("eigenvalues", ())),
-            letters.get(tuple(one["position"]), ""),
+            one.kind, one.position, tops.get(place, np.nan), tuple(one.eigenvalues.tolist()),
+            letters.get(place, ""),
         )
-        for one in data["equilibria"]
+        for one in landscape.equilibria
+        for place in [tuple(one.position.tolist())]
     )  # fmt: skip
-    noise = data.get("noise")
     return LandscapeSummary(
-        names=names,
+        names=tuple(symbol.name for symbol in dynamics.symbols),
         units=units,
-        time_unit=str(data.get("time_unit") or "1"),
+        time_unit=dynamics.time_unit,
         wells=tuple(
-            _well(data, index, float(height), [way for way in ways if way.start == index], size, record)
-            for index, height in enumerate(heights)
+            _well(landscape, index, float(height), [way for way in ways if way.start == index], size, visits)
+            for index, (height, visits) in enumerate(
+                zip(heights, _visits(landscape, record, run), strict=True)
+            )
         ),
         ways=ways,
         others=tuple(one for one in equilibria if not one.label),
-        noise=None if noise is None else NoiseStrength(**noise),
-        given=bool(data.get("given")),
-        run=int(data.get("run", 0)),
-        remarks=_sentences(data.get("remarks", ())),
-        unstable_cycles=tuple(_cycle(one) for one in data.get("parting", ())),
-        formulas=tuple(wells),
+        noise=landscape.noise,
+        given=landscape.given,
+        run=run,
+        remarks=tuple(map(sentence, landscape.remarks)),
+        unstable_cycles=landscape.parting,
+        formulas=landscape.wells,
         points=points,
         dynamics=dynamics,
         matched=matched,
@@ -532,85 +513,54 @@ def summarise(
     )
 
 
+def _visits(landscape: Landscape, record: pd.DataFrame | None, run: int) -> list[VisitTest | None]:
+    """Visits to each well, from the landscape or from the table of a study."""
+    if record is None:
+        known = {one.well: one for one in landscape.visits}
+        return [known.get(index) for index in range(len(landscape.attractors))]
+    rows = {str(row["attractor"]): row for row in record[record["run"] == run].to_dict("records")}
+    found = [rows.get(place_text(one.position)) for one in landscape.attractors]
+    return [None if row is None else visits_of(row) for row in found]
+
+
+def visits_of(row: Mapping[Any, Any]) -> VisitTest:
+    """Visits to a well from a row of the table ``record``."""
+    return VisitTest(
+        -1, DwellCount(int(row["held_out_visits"]), row["held_out_time"]),
+        DwellCount(int(row["visits"]), row["time"]), row["predicted"],
+        row["predicted_error"] / row["predicted"], str(row["method"]), row["probability"],
+    )  # fmt: skip
+
+
 def _well(
-    data: Mapping[str, Any],
+    landscape: Landscape,
     index: int,
     height: float,
     ways: Sequence[ExitSummary],
     size: np.ndarray,
-    record: pd.DataFrame | None,
+    visits: VisitTest | None,
 ) -> WellSummary:
-    one = data["wells"][index]
+    attractor, formula, errors = (
+        landscape.attractors[index],
+        landscape.wells[index],
+        landscape.position_errors,
+    )
     lowest = min((w for w in ways if math.isfinite(w.barrier)), key=lambda way: way.barrier, default=None)
-    errors, formula = one.get("standard_errors"), one.get("V")
-    known = np.full(len(size), np.nan) if errors is None else np.array([_number(each) for each in errors])
-    place, known = settled(one["attractor"], known, size)
-    seen = next((each for each in data.get("visits") or () if each["well"] == index), None)
-    if record is not None:
-        mine = record[
-            (record["run"] == data["run"]) & (record["attractor"] == place_text(one["attractor"]))
-        ].to_dict("records")
-        seen = {str(key): value for key, value in mine[-1].items()} if mine else None
-        seen = None if seen is None else seen | {"error": seen["predicted_error"]}
+    place, known = settled(attractor.position, np.nan if errors is None else errors[index], size)
     return WellSummary(
         label=well_name(index),
         position=place,
         position_errors=known,
         height=height,
-        basin=float(one["basin"]),
+        basin=float(landscape.basins[index]),
         depth=math.nan if lowest is None else lowest.barrier,
         depth_error=math.nan if lowest is None else lowest.standard_error,
         beyond=None if lowest is None or lowest.end is None else well_name(lowest.end),
-        known_up_to=math.nan if formula is None else 2 * float(formula.get("depth") or formula["level"]),
+        known_up_to=math.nan if formula is None else 2 * formula.level,
         exits=tuple(way.law for way in ways),
         leverage=1.0 if lowest is None else lowest.law.leverage,
-        visits=None
-        if seen is None
-        else VisitSummary(
-            count=int(seen["visits"]),
-            counted=_number(seen["counted"]),
-            lowest=_number(seen["lowest"]),
-            highest=_number(seen["highest"]),
-            predicted=_number(seen["predicted"]),
-            error=_number(seen["error"]),
-            method=str(seen["method"]),
-        ),
-        cycle=_cycle(one["cycle"]) if "cycle" in one else None,
-    )
-
-
-def _ways(data: Mapping[str, Any], dimension: int) -> tuple[ExitSummary, ...]:
-    def path(points: Any) -> np.ndarray:
-        return np.reshape(np.array(points or [], dtype=float), (-1, dimension))
-
-    return tuple(
-        ExitSummary(
-            start=one["start"],
-            end=one["end"],
-            saddle=np.array(one["saddle"], dtype=float),
-            barrier=_number(one["barrier"]),
-            standard_error=_number(one.get("error", one["standard_error"])),
-            uphill=path(one.get("uphill")),
-            downhill=path(one.get("downhill")),
-            law=EscapeRate(
-                _number(one["barrier"]),
-                _number(one["prefactor"]),
-                turn=EnergyLossPerCycle(**one["turn"]) if one.get("turn") else None,
-                standard_error=_number(one.get("error", one["standard_error"])),
-                prefactor_error=one.get("prefactor_error"),
-                covariance=one.get("prefactor_covariance", 0.0),
-                leverage=one.get("noise_leverage", 1.0),
-            ),
-            minimum_action=one["minimum_action"],
-            remarks=_sentences(one["remarks"]),
-            no_time_reason="".join(
-                each["values"]["reason"]
-                for each in one["remarks"]
-                if each["code"] == "quasipotential.no_escape_time"
-            ),
-            period=_number(one.get("over_cycle")),
-        )
-        for one in data["transitions"]
+        visits=visits,
+        cycle=attractor if isinstance(attractor, Cycle) else None,
     )
 
 
@@ -621,18 +571,5 @@ def settled(position: Any, errors: Any, size: np.ndarray) -> tuple[np.ndarray, n
     return np.where(nothing, 0.0, position), np.where(nothing, 0.0, errors)
 
 
-def _cycle(data: Mapping[str, Any]) -> Cycle:
-    multipliers = np.array([complex(*value) for value in data["multipliers"]])
-    return Cycle(np.array(data["points"], dtype=float), float(data["period"]), multipliers)
-
-
-def _sentences(remarks: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
-    return tuple(sentence(Remark.from_data(one)) for one in remarks)
-
-
 def _closed(cycle: Cycle) -> np.ndarray:
     return np.vstack([cycle.points, cycle.points[:1]])
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else float(value)

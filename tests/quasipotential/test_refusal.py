@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from told_landscapes import landscape
+from told_landscapes import landscape, told
 
 import siq
 from siq.data.inspection import inspection_of
@@ -80,7 +80,7 @@ def test_states_of_a_record_come_back_from_plain_data() -> None:
 
 def test_nothing_is_added_to_what_is_certified() -> None:
     seen = inspection_of(telegraph()).seen
-    two = summarise(landscape([[-0.5], [0.5]], [0.25, 0.35]))
+    two = summarise(told(landscape([[-0.5], [0.5]], [0.25, 0.35])))
     (answer, *further) = answer_lines(two, seen=seen, certified=True)
     assert answer_lines(two) == [answer, *further]
     last = answer_lines(two, seen=seen)[-1]
