@@ -35,7 +35,7 @@ from known_systems import (
 )
 
 from siq.errors import NumericalFailure
-from siq.inference.field_estimate import IdentifiedField
+from siq.inference.field_estimate import FieldEstimate
 from siq.networks.decomposition import TrainedNetworks, TrainingOptions
 from siq.quasipotential.certificate import HARMLESS
 from siq.quasipotential.certificate_tests import (
@@ -79,7 +79,7 @@ def networks_of(known: KnownSystem, steps: int) -> list[TrainedNetworks]:
 
 
 def about_attractors(
-    found: IdentifiedField, portrait: PhasePortrait, network: Callable[[np.ndarray], np.ndarray] | None
+    found: FieldEstimate, portrait: PhasePortrait, network: Callable[[np.ndarray], np.ndarray] | None
 ) -> list[Candidate] | None:
     """V about every attractor by one route; None where it found none."""
     options = RefinementOptions(routes=("local",) if network is None else ("network",))
@@ -117,7 +117,7 @@ def difference(one: Candidate, other: Callable[[np.ndarray], np.ndarray], x: np.
 
 
 def judged(
-    known: KnownSystem, found: IdentifiedField, local: Sequence[Candidate], network: Sequence[Candidate]
+    known: KnownSystem, found: FieldEstimate, local: Sequence[Candidate], network: Sequence[Candidate]
 ) -> list[str]:
     """What is to be counted of one training."""
     said, agree, wrong = ["formula"], True, False

@@ -27,10 +27,11 @@ import sympy
 
 from siq.data.preparation import in_stretches, without_slow_drift
 from siq.data.recordings import Recordings
-from siq.inference.identification import FieldRecord, IdentificationOptions
+from siq.inference.field_estimate import FieldEstimate
 from siq.inference.kalman_filter import Grid, linearise, whiten
+from siq.inference.kalman_identification import of_all_states
+from siq.inference.library import IdentificationOptions
 from siq.inference.maximum_likelihood import fit_by_filter
-from siq.inference.noisy_sensor import of_all_states
 from siq.inference.observation import force_noise, seen_positions, smoothed_motion, unbroken
 from siq.numerics.files import whole_file
 from siq.quasipotential.transitions import barrier_uncertainty, ways_out
@@ -171,11 +172,11 @@ def only_barriers(particle: Particle, seed: int) -> dict[str, object]:
         return {"fault": [identified.outcome.reason], "seconds": time.process_time() - began}
     x = of_all_states(recordings, record, pair_step=None).values
     points = x[evenly_spread(x, generator=np.random.default_rng(seed))]
-    portrait = phase_portrait(record.found.dynamics, points, seed=0)
+    portrait = phase_portrait(record.dynamics, points, seed=0)
     barriers, errors = [], []
-    for way in ways_out(record.found.dynamics, portrait):
+    for way in ways_out(record.dynamics, portrait):
         if way.path is not None:
-            error, by_rivals = barrier_uncertainty(way.path, record.found)
+            error, by_rivals = barrier_uncertainty(way.path, record)
             barriers.append(way.path.uphill.action + by_rivals)
             errors.append(error)
     return {
@@ -187,12 +188,12 @@ def only_barriers(particle: Particle, seed: int) -> dict[str, object]:
     }
 
 
-def _of_field(record: FieldRecord) -> dict[str, object]:
+def _of_field(record: FieldEstimate) -> dict[str, object]:
     return {
-        "terms": [record.found.library.names[term] for _, term in record.found.support[1:]],
-        "predicts": bool(record.prediction["passed"]),
-        "intensity": record.noise["intensity"],
-        "intensity_error": record.noise["intensity_error"],
+        "terms": [record.library.names[term] for _, term in record.support[1:]],
+        "predicts": bool(record.prediction.passed),
+        "intensity": record.diagnosis.intensity,
+        "intensity_error": record.diagnosis.intensity_error,
     }
 
 

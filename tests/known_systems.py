@@ -18,7 +18,7 @@ import numpy as np
 import sympy
 from scipy.optimize import minimize
 
-from siq.inference.field_estimate import FlowMap, IdentifiedField
+from siq.inference.field_estimate import FieldEstimate, FlowMap
 from siq.inference.library import candidate_library, monomial_exponents
 from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.systems.diffusion import Diffusion
@@ -166,7 +166,7 @@ def polynomial_system(
     return _known(symbols, potential - _rational(levels.min()), diffusion, turning, attractors, domain)
 
 
-def exact_field(known: KnownSystem, degree: int, *, relative_error: float = 0.0) -> IdentifiedField:
+def exact_field(known: KnownSystem, degree: int, *, relative_error: float = 0.0) -> FieldEstimate:
     """The field as if identified: its own coefficients, each with the same relative standard error.
 
     Without an error it counts as free of noise; with one, its coefficients are still the exact ones.
@@ -180,7 +180,7 @@ def exact_field(known: KnownSystem, degree: int, *, relative_error: float = 0.0)
             coefficients[position[term], i] = float(value)
     support = np.argwhere(coefficients.T)
     errors = (relative_error or 1e-12) * coefficients[support[:, 1], support[:, 0]]
-    return IdentifiedField(
+    return FieldEstimate(
         library, coefficients, support, np.diag(errors**2), known.diffusion * relative_error**2,
         relative_error or 1e-10, FlowMap(), known.dynamics.diffusion,
     )  # fmt: skip

@@ -10,7 +10,7 @@ import pandas as pd
 import sympy
 
 from siq.errors import NumericalFailure
-from siq.inference.field_estimate import FlowMap, IdentifiedField
+from siq.inference.field_estimate import FieldEstimate, FlowMap
 from siq.inference.library import CandidateLibrary
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.landscape_assembly import find_landscape
@@ -75,7 +75,7 @@ def obstacle(models: Sequence[Dynamics]) -> str:
     return ""
 
 
-def identified(model: Dynamics) -> IdentifiedField:
+def identified(model: Dynamics) -> FieldEstimate:
     """The vector field of a model at its parameters' values; its errors are not known."""
     symbols = tuple(symbol(name) for name in model.states)
     values = {symbol(entry.name): sympy.Float(entry.value, 17) for entry in model.parameters}
@@ -94,7 +94,7 @@ def identified(model: Dynamics) -> IdentifiedField:
         model.states, symbols, terms, everywhere, everywhere,
         np.zeros((len(terms), len(symbols), len(terms))),
     )  # fmt: skip
-    return IdentifiedField(
+    return FieldEstimate(
         library, coefficients, support, np.zeros((len(support), len(support))),
         np.zeros((len(symbols), len(symbols))), 0.0, FlowMap(), model.diffusion,
     )  # fmt: skip

@@ -79,7 +79,7 @@ def _read(laboratory: Laboratory, analysis: Analysis, known: Truth) -> Answer:
     answer = Answer(*(False, [np.nan] * count, [np.nan] * count, [np.nan] * count))
     said = [one.reason for one in analysis.outcomes if one.reason]
     if analysis.identified.record is not None:
-        answer.terms = len(analysis.identified.record.found.support)
+        answer.terms = len(analysis.identified.record.support)
     certificate = analysis.refined.certificate
     if certificate is not None:
         answer.certified, answer.stated_error = certificate.certified, float(certificate.error)

@@ -26,13 +26,12 @@ from benchmarks.laboratories.models import ARCHETYPE, Laboratory, maier_stein, r
 from benchmarks.laboratories.one import read, write
 from benchmarks.laboratories.records import generator, recorded, table
 from siq.data.recordings import Recordings, snapshot_pairs
-from siq.inference.field_estimate import FlowMap, IdentifiedField
-from siq.inference.flow_regression import FlowRegression, fit_support
-from siq.inference.identification import IdentificationOptions, field_library
+from siq.inference.checks import PredictionLimits
+from siq.inference.field_estimate import FieldEstimate, FlowMap
 from siq.inference.kalman_filter import Noise
-from siq.inference.library import CandidateLibrary
-from siq.inference.observation import View, settled, unbroken
-from siq.quasipotential.certificate_tests import PredictionLimits
+from siq.inference.library import CandidateLibrary, IdentificationOptions, field_library
+from siq.inference.observation import ObservationModel, unbroken
+from siq.inference.regression import refit
 from siq.systems.diffusion import Diffusion
 from siq.workflow.identification_step import IdentifySettings, run
 from siq.workflow.study import Sampling, StateSpace
@@ -70,15 +69,13 @@ def weakest(laboratory: Laboratory, recordings: Recordings, library: CandidateLi
     unit = Diffusion.identity(laboratory.dimension)
     noise = laboratory.intensities[0] * np.ones(laboratory.dimension)
     if any(laboratory.sensor_noise):
-        view, start = View(library, unit, None), Noise(laboratory.sensor**2, noise)
-        fit = settled(view, support, unbroken(recordings), start, values=values, x=recordings.values)
+        observation, start = ObservationModel(library, unit), Noise(laboratory.sensor**2, noise)
+        fit = observation.fitted(support, values, unbroken(recordings), noise=start, x=recordings.values)
         return float((np.abs(fit.model.values) / fit.standard_errors).min())
-    coefficients = np.zeros((library.size, laboratory.dimension))
-    coefficients[support[:, 1], support[:, 0]] = values
-    known = IdentifiedField(
-        library, coefficients, support, np.eye(len(support)), np.diag(noise), 1.0, FlowMap(), unit
+    known = FieldEstimate.on_support(
+        library, support, values, np.eye(len(support)), np.diag(noise), 1.0, FlowMap(), unit
     )
-    found = fit_support(known, FlowRegression(library, snapshot_pairs(recordings), support))
+    found = refit(known, snapshot_pairs(recordings))
     return float((np.abs(found.values) / np.sqrt(np.diag(found.covariance))).min())
 
 
@@ -97,7 +94,7 @@ def identified(laboratory: Laboratory, seed: int) -> dict[str, Any]:
     began = time.process_time()
     step = run(settings, recordings, number=0)
     seconds = time.process_time() - began
-    found = set() if step.record is None else {(int(i), int(k)) for i, k in step.record.found.support}
+    found = set() if step.record is None else {(int(i), int(k)) for i, k in step.record.support}
     true = set(true_terms(laboratory, library))
     return {
         "missing": _named(true - found, library),

@@ -505,9 +505,9 @@ def candidates_of(
 ) -> list[MechanismCandidate]:
     """Every place at which a mechanism of the dictionary may be at work in a system.
 
-    Process noise is not among them: it changes no equation (`siq.inference.noise` estimates it). Nor is what
-    the simulation's own parameters can do (`siq.diagnosis.mechanisms`), which no recording could tell from
-    other values of these.
+    Process noise is not among them: it changes no equation (`siq.inference.maximum_likelihood` has it). Nor
+    is what the simulation's own parameters can do (`siq.diagnosis.mechanisms`), which no recording could tell
+    from other values of these.
 
     Raises
     ------

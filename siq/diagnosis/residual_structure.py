@@ -32,9 +32,8 @@ from siq.diagnosis.terms import PlaceColumns, coordinates_of, courses_of
 from siq.errors import NumericalFailure
 from siq.inference.budget import Budget
 from siq.inference.kalman_filter import Grid, Noise, Whitened, profile_likelihood, solve, whiten
-from siq.inference.maximum_likelihood import Fit, fit_by_multiple_shooting
+from siq.inference.maximum_likelihood import Fit, first_noise, fit_by_multiple_shooting
 from siq.inference.measurements import Measurements
-from siq.inference.noise import first_noise, likelihood_sums
 from siq.inference.recalibration import FAINT, process_noise_needed
 from siq.systems.dynamics import Dynamics, symbol
 
@@ -444,10 +443,8 @@ def noise_nonstationarity(fit: Fit, data: Measurements) -> float:
     def likelihood(weight: np.ndarray) -> float:
         """With both kinds of noise at their best; the weight is of the process noise at every sample."""
         noises = (Noise(fit.noise.measurement, ratio * fit.noise.process) for ratio in NOISE_RATIOS)
-        return max(
-            profile_likelihood(*likelihood_sums(fit.linearisation, data, noise, weight=weight))
-            for noise in noises
-        )
+        sums = (fit.linearisation.sums(data.first, weight * data.step, noise) for noise in noises)
+        return max(profile_likelihood(total, freedom, logarithm) for total, logarithm, freedom in sums)
 
     steady = likelihood(np.ones(len(motion)))
     return 2 * (max(likelihood(1 - share + share * following) for share in FOLLOWING_SHARES) - steady)

@@ -63,9 +63,9 @@ from siq.inference.kalman_filter import substeps_needed
 from siq.inference.maximum_likelihood import SUBSTEP_ERROR, Fit
 from siq.inference.measurements import Measurements
 from siq.inference.recalibration import (
-    better_of,
     fit_with_and_without_process_noise,
     fit_with_process_noise_as_needed,
+    preferred_fit,
 )
 from siq.inference.trajectories import UsualStates, fit_trajectories, free_run, normalised_rms
 from siq.systems.dynamics import Dynamics, symbol
@@ -225,7 +225,7 @@ def _fitted_term(
                     substeps=trial.substeps,
                     budget=budget,
                 )
-                trial = better_of(trial, damped)
+                trial = preferred_fit(trial, damped)
             if not trial.converged:
                 raise NumericalFailure(trial.fault or "its fit does not settle")
             fitted = judged(trial, fit, data, candidate, blocks=context.blocks)

@@ -1,22 +1,24 @@
-"""A model of the diffusion D(x) from residuals.
-
-Where the likelihood is from makes no difference: of residuals of pairs (`siq.inference.diffusion_model`), or
-of the innovations of a filter (`siq.inference.state_dependent_diffusion`).
+"""Models of the diffusion D(x) by scoring, from residuals of pairs or from the innovations of a filter.
 
 A residual r of f over a step h has the covariance ``h εD(x)``, up to what the step forgets. First it is asked
-whether a constant εD can be held: by the score of a linear change of it with functions φ of the state, which
-has the mean zero if it can,
+whether a constant εD can be held, by Rao's test: the score of the coefficients of functions of the state
+where the likelihood of a constant D is largest, less what follows of it from the other parameters,
 
-    s = Σ_n (z_i z_j - δ_ij) φ_k(x_n),    z = (εD)^(-1/2) r/√h,    sᵀ B⁻¹ s ~ χ²,
+    ``s = ∂ log L/∂S_k,    sᵀ B⁻¹ s ~ χ²``,
 
 where B is the score's own sum of squares, so that no normal law of the residuals is asked for. If it cannot,
-the formula ``εD(x) = Σ_k S_k φ_k(x)`` is the one of the largest likelihood
+the formula ``εD(x) = Σ_k S_k φ_k(x)`` is the one of the largest likelihood, of residuals
 
-    -½ Σ_n [log det εD(x_n) + rᵀ(εD(x_n))⁻¹ r/h],
+    ``-½ Σ_n [log det εD(x_n) + rᵀ(εD(x_n))⁻¹ r/h]``,
 
 which is minus infinity where D is not positive at a recorded state. Its terms are dropped one by one, as long
 as one does not differ from zero by its own standard error. Over a step φ changes, too: in its place stands
 ``φ + h/2 (f·∇φ + ½ tr εD∇²φ)``.
+
+Where the sensor is noisy, residuals of pairs would show that noise as well, and at states that are off by it.
+The likelihood of a Kalman filter separates them: what process noise adds to the covariance of the state over
+an interval is εD(x), averaged over what the filter knows of x there, and the innovations have the variance
+that follows. The variances of the sensors are then scored together with the coefficients of D.
 """
 
 from __future__ import annotations
@@ -24,123 +26,254 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
-import scipy.linalg
 import scipy.special
 import sympy
 
 from siq.data.recordings import SnapshotPairs
 from siq.errors import NumericalFailure
-from siq.inference.field_estimate import IdentifiedField, NoiseFormula
+from siq.inference.field_estimate import STANDARD_ERRORS, FieldEstimate, NoiseFormula
+from siq.inference.kalman_filter import Noise, middle_spread, solve, whiten, with_parameters_changed
 from siq.inference.library import monomial_exponents
+from siq.inference.maximum_likelihood import Fit
+from siq.inference.measurements import Measurements
+from siq.numerics.least_squares import positive
+from siq.systems.diffusion import Diffusion
+from siq.systems.dynamics import Dynamics
 from siq.systems.formulas import compile_formulas
 
 DEGREE = 2  # of the formulas: the least that can bend, and keep positive where a straight line does not
-HARMLESS = 0.02  # relative change of D over the states below which a constant one will do, see `residuals`
-FEW_STATES = 3  # of which correlations may depend on the state: sixty coefficients
-
-
-def noise_functions(symbols: Sequence[sympy.Symbol]) -> list[sympy.Expr]:
-    """The functions of the state in which D is sought, the constant first."""
-    return [
-        sympy.Mul(*(each**power for each, power in zip(symbols, powers, strict=True)))
-        for powers in monomial_exponents(len(symbols), DEGREE)
-    ]
+HARMLESS_CHANGE = 0.02  # relative change of D over the states below which a constant one will do
+MAX_STATES = 3  # of which correlations may depend on the state: sixty coefficients
+MAX_NUMBERS = 2e7  # numerical: of an array in memory, 160 MB
+MIN_RESIDUALS = 20  # for each coefficient of D: fewer do not show the sum of squares of its score
+MAX_STEPS, MAX_HALVINGS = 60, 30  # numerical: of Fisher's scoring, each step halved until it gains
+SCORING_TOLERANCE = 1e-9  # numerical: gain of the log-likelihood, per residual, with which scoring ends
+MAX_RELAXATION = 0.5  # of Jh/2: beyond that a residual hardly knows where its step began
+MAX_STEP_RELAXATION = 2.0  # of the rates of J times h: the same of the mean over pairs
+AVERAGED_PAIRS = 500  # the mean of a smooth function of the state, to a few per cent of a small term
+SERIES_TERMS = 24  # of the exponential series, which then is exact to ten digits
 
 
 def all_places(d: int, functions: int) -> np.ndarray:
     """Row, column and function of every coefficient that εD(x) may have, shape ``(p, 3)``."""
     # Of many states the correlations are constant: their formulas would be most of all coefficients.
-    whole = d <= FEW_STATES
+    whole = d <= MAX_STATES
     return np.array(
         [(i, j, k) for i in range(d) for j in range(i, d) for k in range(functions if i == j or whole else 1)]
     )
 
 
-class NoiseLikelihood(Protocol):
-    """How likely recordings are under formulas of the noise.
+class DiffusionLikelihood:
+    """How likely recordings are under ``εD(x) = Σ_k S_k φ_k(x)``, and what follows: base of both likelihoods.
+
+    A coefficient is a row ``(i, j, k)`` of places: of the entry ``i ≤ j`` of εD, and of the function φ_k.
 
     Attributes
     ----------
     symbols, terms
-        The d states, and the functions of them.
+        The d states, and the functions of them, the constant first.
+    functions
+        The functions as they act over each step, shape ``(n, q)``.
+    at_states
+        The functions at recorded states, at which D has to be positive as well.
     start
         εD where it is the same everywhere, shape ``(d, d)``.
+    sensor, free
+        Variances of the sensors, shape ``(m,)``, and which of them are estimated with the coefficients.
     """
 
-    @property
-    def symbols(self) -> Sequence[sympy.Symbol]:
-        """See above."""
+    functions: np.ndarray
+    at_states: np.ndarray
+    start: np.ndarray
+    sensor: np.ndarray
+    free: np.ndarray
 
-    @property
-    def terms(self) -> Sequence[sympy.Expr]:
-        """See above."""
+    def __init__(self, symbols: Sequence[sympy.Symbol]) -> None:
+        self.symbols = tuple(symbols)
+        self.terms = [
+            sympy.Mul(*(each**power for each, power in zip(symbols, powers, strict=True)))
+            for powers in monomial_exponents(len(symbols), DEGREE)
+        ]
 
-    @property
-    def start(self) -> np.ndarray:
-        """See above."""
+    def reached(
+        self, places: np.ndarray, values: np.ndarray, sensor: np.ndarray
+    ) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+        """The log-likelihood at coefficients ``(p,)`` and sensors ``(m,)``, and its derivatives by both.
 
-    def positive(self, chosen: np.ndarray, values: np.ndarray) -> bool:
-        """Whether D is positive definite at all recorded states."""
+        Score ``(p + m,)``, by the logarithms of the sensors' variances; Fisher's information; and the sum of
+        the outer products of single scores.
+        """
+        raise NotImplementedError
 
-    def scored(self, chosen: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Coefficients of the largest likelihood from a start at which D is positive, with covariance."""
+    def least_squares(self, places: np.ndarray) -> np.ndarray | None:
+        """Coefficients to begin with where no constant part makes D positive; None where none are known."""
 
-    def least_squares(self, chosen: np.ndarray) -> np.ndarray:
-        """Coefficients at which D is positive, where no constant part makes it so."""
+    def relative_change(self, change: np.ndarray) -> np.ndarray:
+        """Changes of εD ``(n, d, d)`` in units of its start."""
+        size = np.sqrt(np.diag(self.start))
+        return change / np.outer(size, size)
 
+    def matrices(self, places: np.ndarray, values: np.ndarray, functions: np.ndarray) -> np.ndarray:
+        """εD where functions have the given values ``(n, q)``: shape ``(n, d, d)``."""
+        d = len(self.symbols)
+        found = np.zeros((len(functions), d, d))
+        for (i, j, k), value in zip(places, values, strict=True):
+            found[:, i, j] += value * functions[:, k]
+            if i != j:
+                found[:, j, i] += value * functions[:, k]
+        return found
 
-def selected_noise(data: NoiseLikelihood, *, false_terms: float, probability: float) -> NoiseFormula:
-    """εD(x) of the largest likelihood, of the terms that differ from zero.
+    def positive(self, places: np.ndarray, values: np.ndarray) -> bool:
+        """Whether D is positive definite over every step, and at every recorded state."""
+        try:
+            for functions in (self.functions, self.at_states):
+                np.linalg.cholesky(self.matrices(places, values, functions))
+        except np.linalg.LinAlgError:
+            return False
+        return True
 
-    Parameters
-    ----------
-    data
-        The likelihood.
-    false_terms
-        Probability that chance brings any term into D.
-    probability
-        See `NoiseFormula`.
+    def scored(self, places: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Coefficients and sensors of the largest likelihood by Fisher's scoring, and their covariance.
 
-    Raises
-    ------
-    NumericalFailure
-        When no formula of this kind is positive at all recorded states.
-    """
-    start = data.start
-    chosen = all_places(len(start), len(data.terms))
-    values = np.array([start[i, j] if k == 0 else 0.0 for i, j, k in chosen])
-    critical = float(-scipy.special.ndtri(false_terms / (2 * len(chosen))))
-    while True:
-        values, covariance = data.scored(chosen, values)
-        kept, values = _eliminated(chosen, values, covariance, critical)
-        if len(kept) == len(chosen):
-            break
-        chosen = chosen[kept]
-        # What is left may not be positive: then the others begin where they are sure to be, if they can.
-        if not data.positive(chosen, values):
-            values = np.array([start[i, j] * (i == j) if k == 0 else 0.0 for i, j, k in chosen])
-        if not data.positive(chosen, values):
-            values = data.least_squares(chosen)
-    return NoiseFormula(
-        tuple(data.symbols), chosen[:, :2], tuple(data.terms[k] for k in chosen[:, 2]), values, covariance,
-        probability,
-    )  # fmt: skip
+        The covariance is the one that holds whatever the law of the residuals: ``F⁻¹ B F⁻¹`` with the
+        information F and the sum of squares B of the score; zero for a sensor that is known.
+        """
+        p, sensor = len(values), self.sensor
+        free = np.concatenate([np.ones(p, dtype=bool), self.free])
+        inside = np.ix_(free, free)
+        logarithm, score, information, squares = self.reached(places, values, sensor)
+        for _ in range(MAX_STEPS):
+            step = np.zeros(len(free))
+            step[free] = _inverse(information[inside]) @ score[free]
+            gain = 0.0
+            for _ in range(MAX_HALVINGS):
+                attempt = values + step[:p], sensor * np.exp(step[p:])
+                if self.positive(places, attempt[0]):
+                    then = self.reached(places, *attempt)
+                    if then[0] > logarithm:
+                        gain = then[0] - logarithm
+                        (values, sensor), (logarithm, score, information, squares) = attempt, then
+                        break
+                step = step / 2
+            if gain < SCORING_TOLERANCE * len(self.at_states):
+                break
+        covariance = np.zeros((len(free), len(free)))
+        inverse = _inverse(information[inside])
+        covariance[inside] = inverse @ squares[inside] @ inverse
+        return values, sensor, covariance
+
+    def formula(
+        self, places: np.ndarray, values: np.ndarray, covariance: np.ndarray, p: float
+    ) -> NoiseFormula:
+        """εD with these coefficients, of which a constant D shows as much with the probability p."""
+        count = len(values)
+        terms = tuple(self.terms[k] for k in places[:, 2])
+        return NoiseFormula(self.symbols, places[:, :2], terms, values, covariance[:count, :count], p)
+
+    @cached_property
+    def constant(self) -> tuple[NoiseFormula, np.ndarray]:
+        """εD that is the same everywhere, and the sensors with it."""
+        places = all_places(len(self.symbols), 1)
+        values, sensor, covariance = self.scored(places, np.array([self.start[i, j] for i, j, _ in places]))
+        return self.formula(places, values, covariance, 1.0), sensor
+
+    def constant_probability(self, places: np.ndarray | None = None) -> float:
+        """Probability that recordings with a constant D speak as much for one that depends on the state.
+
+        1 where the change that they speak for is harmless.
+
+        Parameters
+        ----------
+        places
+            Of the coefficients that are asked for; by default `all_places`.
+        """
+        places = all_places(len(self.symbols), len(self.terms)) if places is None else places
+        constant = places[:, 2] == 0
+        formula, sensor = self.constant
+        values = np.zeros(len(places))
+        values[constant] = formula.values
+        _, score, information, squares = self.reached(places, values, sensor)
+        free = np.concatenate([np.ones(len(places), dtype=bool), self.free])
+        null = np.concatenate([constant, np.ones(len(sensor), dtype=bool)])
+        held, asked = np.flatnonzero(null & free), np.flatnonzero(~null & free)
+        if not len(asked):
+            return 1.0
+        share = information[np.ix_(asked, held)] @ _inverse(information[np.ix_(held, held)])
+        turn = np.zeros((len(asked), len(null)))
+        turn[np.arange(len(asked)), asked] = 1.0
+        turn[:, held] = -share
+        left = information[np.ix_(asked, asked)] - share @ information[np.ix_(held, asked)]
+        score, squares = turn @ score, turn @ squares @ turn.T
+        change = np.zeros(len(places))
+        change[asked] = _inverse(left) @ score
+        changed = self.matrices(places, change, self.functions - self.functions.mean(axis=0))
+        if np.sqrt((self.relative_change(changed) ** 2).mean(axis=0)).max() < HARMLESS_CHANGE:
+            return 1.0
+        statistic = float(score @ _inverse(squares) @ score)
+        return float(scipy.special.chdtrc(np.linalg.matrix_rank(_scaled(squares)), statistic))
+
+    def selected(
+        self, *, false_terms: float, probability: float
+    ) -> tuple[NoiseFormula, np.ndarray, np.ndarray]:
+        """εD(x) of the largest likelihood, of the terms that differ from zero, with the sensors beside it.
+
+        Parameters
+        ----------
+        false_terms
+            Probability that chance brings any term into D.
+        probability
+            See `NoiseFormula`.
+
+        Returns
+        -------
+        formula, sensor, covariance
+            The covariance is that of the coefficients and of the logarithms of the sensors' variances.
+
+        Raises
+        ------
+        NumericalFailure
+            When no formula of this kind is positive at all recorded states.
+        """
+        start = self.start
+        places = all_places(len(start), len(self.terms))
+        values = np.array([start[i, j] if k == 0 else 0.0 for i, j, k in places])
+        critical = float(-scipy.special.ndtri(false_terms / (2 * len(places))))
+        while True:
+            values, sensor, covariance = self.scored(places, values)
+            kept, values = _eliminated(places, values, covariance[: len(values), : len(values)], critical)
+            if len(kept) == len(places):
+                break
+            places = places[kept]
+            # What is left may not be positive: then the others begin where they are sure to be, if they can.
+            if not self.positive(places, values):
+                values = np.array([start[i, j] * (i == j) if k == 0 else 0.0 for i, j, k in places])
+            if not self.positive(places, values):
+                begin = self.least_squares(places)
+                if begin is None or not self.positive(places, begin):
+                    raise NumericalFailure(
+                        "the noise depends on the state, and no formula of low degree for it is positive at"
+                        " all recorded states; give D as 'recordings.diffusion', in numbers or formulas"
+                    )
+                values = begin
+        formula = self.formula(places, values, covariance, probability)
+        if len(sensor):  # they were left where the search for the terms began
+            _, sensor, covariance = self.scored(places, values)
+        return formula, sensor, covariance
 
 
 def _eliminated(
-    chosen: np.ndarray, values: np.ndarray, covariance: np.ndarray, critical: float
+    places: np.ndarray, values: np.ndarray, covariance: np.ndarray, critical: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Backward elimination about the largest likelihood: the coefficients that stay, and what they become.
 
     The last term of a state's own noise stays: without it there would be none.
     """
-    kept = np.arange(len(chosen))
+    kept = np.arange(len(places))
     while len(kept):
-        own = chosen[kept, 0] == chosen[kept, 1]
-        count = np.array([(own & (chosen[kept, 0] == i)).sum() for i in chosen[kept, 0]])
+        own = places[kept, 0] == places[kept, 1]
+        count = np.array([(own & (places[kept, 0] == i)).sum() for i in places[kept, 0]])
         strength = np.abs(values) / np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
         strength[own & (count == 1)] = np.inf
         weakest = int(np.argmin(strength))
@@ -154,234 +287,137 @@ def _eliminated(
     return kept, values
 
 
-MOST_NUMBERS = 2e7  # numerical: of an array in memory, 160 MB
-FEWEST = 20  # residuals for each coefficient of D: fewer do not show its sum of squares
-STEPS, HALVINGS = 60, 30  # numerical: most steps of Fisher's scoring, each halved until it gains
-SETTLED = 1e-9  # numerical: gain of the log-likelihood, per residual, with which scoring ends
-LONGEST = 0.5  # of Jh/2: beyond that a residual hardly knows where its step began
+def _scaled(matrix: np.ndarray) -> np.ndarray:
+    size = positive(np.sqrt(np.diag(matrix)))
+    return np.asarray(matrix / np.outer(size, size))
 
 
-def constant_noise_probability(found: IdentifiedField, pairs: SnapshotPairs, rest: np.ndarray) -> float:
+def _inverse(matrix: np.ndarray) -> np.ndarray:
+    size = positive(np.sqrt(np.diag(matrix)))
+    return np.asarray(np.linalg.pinv(_scaled(matrix), hermitian=True) / np.outer(size, size))
+
+
+class ResidualLikelihood(DiffusionLikelihood):
+    """The likelihood of residuals of pairs; no sensor is noisy.
+
+    Parameters
+    ----------
+    found, pairs, rest
+        f, the pairs and their residuals ``(n, d)``, which are evenly thinned where there are more than memory
+        has room for.
+    """
+
+    def __init__(self, found: FieldEstimate, pairs: SnapshotPairs, rest: np.ndarray) -> None:
+        super().__init__(found.library.symbols)
+        (n, d), symbols, m = rest.shape, self.symbols, len(self.terms)
+        rows = np.unique(np.linspace(0, n - 1, min(n, int(MAX_NUMBERS / (m * d * (d + 1))))).astype(int))
+        if len(rows) < n:
+            pairs, rest = pairs.take(rows), rest[rows]
+        x, share = pairs.x0, _remembered(found)
+        self.rest = process_noise_increments(found, pairs, rest)
+        first = [term.diff(one) for term in self.terms for one in symbols]
+        second = [term.diff(one, other) for term in self.terms for one in symbols for other in symbols]
+        components = np.ascontiguousarray(x.T)
+        values = compile_formulas(self.terms, symbols)(components)
+        slopes = compile_formulas(first, symbols)(components).reshape(m, d, -1)
+        bends = compile_formulas(second, symbols)(components).reshape(m, d * d, -1)
+        moved = np.einsum("kin,ni->kn", slopes, found.dynamics.drift(x))
+        moved += 0.5 * np.einsum("kan,a->kn", bends, found.noise_rate.ravel())
+        self.functions, self.at_states = (values + share * pairs.h * moved).T, values.T
+        self.start = np.asarray(self.rest.T @ self.rest / len(self.rest))
+        self.sensor, self.free = np.zeros(0), np.zeros(0, dtype=bool)
+
+    def relative_change(self, change: np.ndarray) -> np.ndarray:
+        """Changes of εD ``(n, d, d)`` where its start is the unit matrix."""
+        root = np.linalg.inv(np.linalg.cholesky(self.start))
+        return np.asarray(root @ change @ root.T)
+
+    def least_squares(self, places: np.ndarray) -> np.ndarray:
+        """Coefficients by least squares of the squares of residuals."""
+        values = np.zeros(len(places))
+        for i, j in {(int(i), int(j)) for i, j, _ in places}:
+            rows = (places[:, 0] == i) & (places[:, 1] == j)
+            product = self.rest[:, i] * self.rest[:, j]
+            values[rows] = np.linalg.lstsq(self.functions[:, places[rows, 2]], product, rcond=None)[0]
+        return values
+
+    def reached(
+        self, places: np.ndarray, values: np.ndarray, sensor: np.ndarray
+    ) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+        """The log-likelihood with score, information ``½ Σ tr D⁻¹∂D D⁻¹∂D``, and squares of single scores."""
+        matrices = self.matrices(places, values, self.functions)
+        precision = np.linalg.inv(matrices)
+        pulled = (precision @ self.rest[:, :, None])[:, :, 0]
+        logarithm = -0.5 * float((np.linalg.slogdet(matrices)[1] + (pulled * self.rest).sum(axis=1)).sum())
+        score = np.empty((len(pulled), len(places)))
+        for column, (i, j, k) in enumerate(places):
+            half = 0.5 if i == j else 1.0
+            score[:, column] = half * (pulled[:, i] * pulled[:, j] - precision[:, i, j])
+            score[:, column] *= self.functions[:, k]
+        information = np.empty((len(places), len(places)))
+        entries = sorted({(int(i), int(j)) for i, j, _ in places})
+        for i, j in entries:
+            rows = np.flatnonzero((places[:, :2] == (i, j)).all(axis=1))
+            for k, m in entries:
+                columns = np.flatnonzero((places[:, :2] == (k, m)).all(axis=1))
+                weight = (
+                    (0.5 if i == j else 1.0)
+                    * (0.5 if k == m else 1.0)
+                    * (precision[:, i, k] * precision[:, j, m] + precision[:, i, m] * precision[:, j, k])
+                )
+                left = self.functions[:, places[rows, 2]] * weight[:, None]
+                information[np.ix_(rows, columns)] = left.T @ self.functions[:, places[columns, 2]]
+        return logarithm, score.sum(axis=0), information, score.T @ score
+
+
+def constant_noise_probability(found: FieldEstimate, pairs: SnapshotPairs, rest: np.ndarray) -> float:
     """The probability that residuals under a constant D speak as much for one that depends on the state.
 
     Parameters
     ----------
-    found
-        f.
-    pairs
-        X0, Xh and h.
-    rest
-        The residuals, shape ``(n, d)``; see `siq.inference.flow_regression.residuals`.
+    found, pairs, rest
+        f, and the residuals of pairs ``(n, d)``; see `siq.inference.regression.residuals`.
 
     Returns
     -------
     float
         1 where the residuals are too few to tell, or the change that they speak for is harmless.
     """
-    data = _Residuals(found, *_affordable(pairs, rest))
-    n, d = data.rest.shape
-    entries = d * (d + 1) // 2
-    if n < FEWEST * entries * data.functions.shape[1]:
+    data = ResidualLikelihood(found, pairs, rest)
+    (n, d), m = data.rest.shape, len(data.terms)
+    if n < MIN_RESIDUALS * d * (d + 1) // 2 * m:
         return 1.0
-    rate = data.rest.T @ data.rest / n
-    z = scipy.linalg.solve_triangular(np.linalg.cholesky(rate), data.rest.T, lower=True).T
-    functions = data.functions[:, 1:] - data.functions[:, 1:].mean(axis=0)
-    size = functions.std(axis=0)
-    functions = functions[:, size > 0] / size[size > 0]
-    products = np.stack([z[:, i] * z[:, j] - (i == j) for i in range(d) for j in range(i + 1)], axis=1)
-    score = (products[:, :, None] * functions[:, None, :]).reshape(n, -1)
-    change = np.linalg.lstsq(functions, products, rcond=None)[0]
-    if np.sqrt(((functions @ change) ** 2).mean(axis=0)).max() < HARMLESS:
-        return 1.0
-    total = score.sum(axis=0)
-    statistic = float(total @ np.linalg.pinv(score.T @ score, hermitian=True) @ total)
-    rank = np.linalg.matrix_rank(score.T @ score, hermitian=True)
-    return float(scipy.special.chdtrc(rank, statistic))
+    places = np.array([(i, j, k) for i in range(d) for j in range(i, d) for k in range(m)])
+    return data.constant_probability(places)
 
 
 def fitted_noise(
-    found: IdentifiedField, pairs: SnapshotPairs, rest: np.ndarray, *, false_terms: float, probability: float
+    found: FieldEstimate, pairs: SnapshotPairs, rest: np.ndarray, *, false_terms: float, probability: float
 ) -> NoiseFormula:
-    """εD(x) of the largest likelihood, of the terms that differ from zero.
-
-    Parameters
-    ----------
-    found, pairs, rest
-        As for `constant_noise_probability`.
-    false_terms
-        Probability that chance brings any term into D.
-    probability
-        See `NoiseFormula`.
-
-    Raises
-    ------
-    NumericalFailure
-        When no formula of this kind is positive at all recorded states.
-    """
-    data = _Residuals(found, *_affordable(pairs, rest))
-    return selected_noise(data, false_terms=false_terms, probability=probability)
+    """εD(x) of residuals; see `constant_noise_probability` and `DiffusionLikelihood.selected`."""
+    data = ResidualLikelihood(found, pairs, rest)
+    return data.selected(false_terms=false_terms, probability=probability)[0]
 
 
-def remembered(found: IdentifiedField) -> float:
+def _remembered(found: FieldEstimate) -> float:
     """The mean time, as a share of a step, for which the system goes on after a kick within the step."""
     return (1 - 1 / found.flow.steps) / 2 if found.flow.euler else 0.5
 
 
-def random_forces_of(found: IdentifiedField, pairs: SnapshotPairs, rest: np.ndarray) -> np.ndarray:
+def process_noise_increments(found: FieldEstimate, pairs: SnapshotPairs, rest: np.ndarray) -> np.ndarray:
     """Residuals per root of time, with what the system forgot within the step put back: shape ``(n, d)``.
 
     ``∫₀ʰ e^{Js} D e^{Jᵀs} ds`` is ``h e^{Jh/2} D e^{Jᵀh/2}`` but for the second order in Jh.
     """
-    d = rest.shape[1]
-    step = found.dynamics.jacobian(pairs.x0) * (remembered(found) * pairs.h)[:, None, None]
-    if not np.isfinite(step).all() or np.abs(step).max(initial=0.0) > LONGEST:
+    step = found.dynamics.jacobian(pairs.x0) * (_remembered(found) * pairs.h)[:, None, None]
+    if not np.isfinite(step).all() or np.abs(step).max(initial=0.0) > MAX_RELAXATION:
         step = np.zeros_like(step)
-    back = np.eye(d) - step + step @ step / 2
+    back = np.eye(rest.shape[1]) - step + step @ step / 2
     return np.asarray((back @ rest[:, :, None])[:, :, 0] / np.sqrt(pairs.h)[:, None])
 
 
-def _affordable(pairs: SnapshotPairs, rest: np.ndarray) -> tuple[SnapshotPairs, np.ndarray]:
-    """Pairs and residuals, evenly thinned where there are more than memory has room for."""
-    n, d = rest.shape
-    functions = len(monomial_exponents(d, DEGREE))
-    most = int(MOST_NUMBERS / (functions * d * (d + 1)))
-    rows = np.unique(np.linspace(0, n - 1, min(n, most)).astype(int))
-    return (pairs, rest) if len(rows) == n else (pairs.take(rows), rest[rows])
-
-
-class _Residuals:
-    """Residuals per root of time, what a step forgets put back, and the functions of D where they began."""
-
-    def __init__(self, found: IdentifiedField, pairs: SnapshotPairs, rest: np.ndarray) -> None:
-        self.found = found
-        symbols, d = found.library.symbols, found.library.dimension
-        self.symbols, self.terms = symbols, noise_functions(symbols)
-        x, h = pairs.x0, pairs.h
-        self.rest, share = random_forces_of(found, pairs, rest), remembered(found)
-        first = [term.diff(one) for term in self.terms for one in symbols]
-        second = [term.diff(one, other) for term in self.terms for one in symbols for other in symbols]
-        components, m = np.ascontiguousarray(x.T), len(self.terms)
-        values = compile_formulas(self.terms, symbols)(components)
-        slopes = compile_formulas(first, symbols)(components).reshape(m, d, -1)
-        bends = compile_formulas(second, symbols)(components).reshape(m, d * d, -1)
-        moved = np.einsum("kin,ni->kn", slopes, found.dynamics.drift(x))
-        moved += 0.5 * np.einsum("kan,a->kn", bends, found.noise_rate.ravel())
-        self.functions = (values + share * h * moved).T
-        self.plain = values.T
-
-    @cached_property
-    def start(self) -> np.ndarray:
-        """The constant εD, shape ``(d, d)``."""
-        return np.asarray(self.rest.T @ self.rest / len(self.rest))
-
-    @cached_property
-    def size(self) -> np.ndarray:
-        """Rms of each function, shape ``(m,)``."""
-        size = np.sqrt((self.functions**2).mean(axis=0))
-        return np.where(size > 0, size, 1.0)
-
-    def matrices(self, chosen: np.ndarray, values: np.ndarray, *, plain: bool = False) -> np.ndarray:
-        """ΕD at the residuals, ``(n, d, d)``."""
-        functions = self.plain if plain else self.functions
-        d = self.rest.shape[1]
-        found = np.zeros((len(functions), d, d))
-        for (i, j, k), value in zip(chosen, values, strict=True):
-            found[:, i, j] += value * functions[:, k]
-            if i != j:
-                found[:, j, i] += value * functions[:, k]
-        return found
-
-    def positive(self, chosen: np.ndarray, values: np.ndarray) -> bool:
-        """Whether D is positive definite wherever there are residuals."""
-        return np.isfinite(self.likelihood(chosen, values))
-
-    def likelihood(self, chosen: np.ndarray, values: np.ndarray) -> float:
-        """The logarithm of the likelihood, per residual and up to a constant."""
-        matrices = self.matrices(chosen, values)
-        try:
-            # Neither may D vanish at the states themselves, which are where it is going to be used.
-            np.linalg.cholesky(self.matrices(chosen, values, plain=True))
-            factor = np.linalg.cholesky(matrices)
-        except np.linalg.LinAlgError:
-            return -np.inf
-        pulled = (np.linalg.inv(matrices) @ self.rest[:, :, None])[:, :, 0]
-        logarithm = np.log(np.einsum("nii->ni", factor)).sum(axis=1)
-        return float(-(logarithm + 0.5 * (pulled * self.rest).sum(axis=1)).mean())
-
-    def least_squares(self, chosen: np.ndarray) -> np.ndarray:
-        """Coefficients by least squares of the squares of residuals: a start for the likelihood."""
-        values = np.zeros(len(chosen))
-        for i, j in {(int(i), int(j)) for i, j, _ in chosen}:
-            rows = (chosen[:, 0] == i) & (chosen[:, 1] == j)
-            product = self.rest[:, i] * self.rest[:, j]
-            values[rows] = np.linalg.lstsq(self.functions[:, chosen[rows, 2]], product, rcond=None)[0]
-        if not self.positive(chosen, values):
-            raise NumericalFailure(
-                "the noise depends on the state, and no formula of low degree for it is positive at all"
-                " recorded states; give D as 'recordings.diffusion', in numbers or formulas"
-            )
-        return values
-
-    def scored(self, chosen: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The largest likelihood from a start by Fisher's scoring, and the covariance of the coefficients.
-
-        The covariance is the one that holds whatever the law of the residuals: ``F⁻¹ B F⁻¹`` with the
-        information F and the sum of squares B of the score.
-        """
-        size, reached = self.size[chosen[:, 2]], self.likelihood(chosen, values)
-        for _ in range(STEPS):
-            precision = np.linalg.inv(self.matrices(chosen, values))
-            total = self._score(chosen, precision).sum(axis=0)
-            step = np.linalg.pinv(self._information(chosen, precision), hermitian=True) @ total / size
-            gain = 0.0
-            for _ in range(HALVINGS):
-                attempt = self.likelihood(chosen, values + step)
-                if attempt > reached:
-                    gain, values, reached = attempt - reached, values + step, attempt
-                    break
-                step = step / 2
-            if gain < SETTLED:
-                break
-        precision = np.linalg.inv(self.matrices(chosen, values))
-        score = self._score(chosen, precision)
-        inverse = np.linalg.pinv(self._information(chosen, precision), hermitian=True) / size[:, None]
-        return values, inverse @ (score.T @ score) @ inverse.T
-
-    def _score(self, chosen: np.ndarray, precision: np.ndarray) -> np.ndarray:
-        """The score of each residual, ``(n, p)``, by the coefficients times the sizes of their functions."""
-        pulled = (precision @ self.rest[:, :, None])[:, :, 0]
-        score = np.empty((len(pulled), len(chosen)))
-        for column, (i, j, k) in enumerate(chosen):
-            half = 0.5 if i == j else 1.0
-            score[:, column] = half * (pulled[:, i] * pulled[:, j] - precision[:, i, j])
-            score[:, column] *= self.functions[:, k] / self.size[k]
-        return score
-
-    def _information(self, chosen: np.ndarray, precision: np.ndarray) -> np.ndarray:
-        """Fisher's information ``½ Σ tr D⁻¹∂D D⁻¹∂D`` of the same coefficients, ``(p, p)``."""
-        information = np.empty((len(chosen), len(chosen)))
-        functions = self.functions / self.size
-        entries = sorted({(int(i), int(j)) for i, j, _ in chosen})
-        for i, j in entries:
-            rows = np.flatnonzero((chosen[:, :2] == (i, j)).all(axis=1))
-            for k, m in entries:
-                columns = np.flatnonzero((chosen[:, :2] == (k, m)).all(axis=1))
-                share = (0.5 if i == j else 1.0) * (0.5 if k == m else 1.0)
-                weight = share * (
-                    precision[:, i, k] * precision[:, j, m] + precision[:, i, m] * precision[:, j, k]
-                )
-                left = functions[:, chosen[rows, 2]] * weight[:, None]
-                information[np.ix_(rows, columns)] = left.T @ functions[:, chosen[columns, 2]]
-        return information
-
-
-PAIRS = 500  # to average over: the mean of a smooth function of the state, to a few per cent of a small term
-RANDOM_FORCES_LONGEST = 2.0  # rates of J times h: beyond that a residual hardly knows how its step began
-TERMS = 24  # of the exponential series, which then is exact to ten digits
-
-
-def with_random_forces(found: IdentifiedField, pairs: SnapshotPairs) -> IdentifiedField:
-    """The same field, its `noise_rate` that of the random forces and no longer that of the residuals.
+def with_process_noise_rate(found: FieldEstimate, pairs: SnapshotPairs) -> FieldEstimate:
+    """The same field, its `noise_rate` that of the process noise and no longer that of the residuals.
 
     Along a step the system forgets a part of what kicked it: a residual has the covariance
     ``∫₀ʰ e^{Js} εD e^{Jᵀs} ds`` with the Jacobian J of f, and not hεD. Per time that is less than εD, by the
@@ -398,48 +434,188 @@ def with_random_forces(found: IdentifiedField, pairs: SnapshotPairs) -> Identifi
     """
     if found.noise_free or not len(pairs.h):
         return found
-    every = max(len(pairs.h) // PAIRS, 1)
-    jacobian = found.dynamics.jacobian(pairs.x0[::every])
-    step = jacobian * pairs.h[::every, None, None]
-    if not np.isfinite(step).all() or np.abs(np.linalg.eigvals(step)).max() > RANDOM_FORCES_LONGEST:
+    every = max(len(pairs.h) // AVERAGED_PAIRS, 1)
+    step = found.dynamics.jacobian(pairs.x0[::every]) * pairs.h[::every, None, None]
+    if not np.isfinite(step).all() or np.abs(np.linalg.eigvals(step)).max() > MAX_STEP_RELAXATION:
         return found
-    seen = (_forgotten_by_euler(step, found.flow.steps) if found.flow.euler else _forgotten(step)).mean(
-        axis=0
-    )
-    d = len(found.noise_rate)
+    n, d, _ = step.shape
+    unit, whole = np.eye(d), np.eye(d * d)
+    if found.flow.euler:  # the mean of M^k ⊗ M^k for the steps k of the simulation, M = 1 + hJ/steps
+        steps = found.flow.steps
+        forward = unit + step / steps
+        generator = np.einsum("nij,nkl->nikjl", forward, forward).reshape(n, d * d, d * d)
+        term, total = np.broadcast_to(whole, generator.shape), np.zeros_like(generator)
+        for _ in range(steps):
+            total += term / steps
+            term = term @ generator
+    else:  # ∫₀¹ e^{As} ⊗ e^{As} ds for A = hJ, where e^{As} ⊗ e^{As} = e^{(A ⊗ 1 + 1 ⊗ A) s}
+        generator = np.einsum("nij,kl->nikjl", step, unit) + np.einsum("ij,nkl->nikjl", unit, step)
+        generator = generator.reshape(n, d * d, d * d)
+        term = np.broadcast_to(whole, generator.shape)
+        total = term.copy()
+        for order in range(1, SERIES_TERMS):
+            term = term @ generator / order
+            total += term / (order + 1)
     try:
-        rate = np.linalg.solve(seen, found.noise_rate.ravel()).reshape(d, d)
+        rate = np.linalg.solve(total.mean(axis=0), found.noise_rate.ravel()).reshape(d, d)
     except np.linalg.LinAlgError:
         return found
     rate = (rate + rate.T) / 2
     if np.linalg.eigvalsh(rate)[0] < 0:
-        return found  # of forces on a part of the states the residuals have rounding, too
+        return found  # of noise on a part of the states the residuals have rounding, too
     return replace(found, noise_rate=rate)
 
 
-def _forgotten(step: np.ndarray) -> np.ndarray:
-    """``∫₀¹ e^{As} ⊗ e^{As} ds`` for ``A = hJ``: from ``(n, d, d)`` to ``(n, d², d²)``."""
-    n, d, _ = step.shape
-    unit = np.eye(d)
-    # e^{As} ⊗ e^{As} = e^{(A ⊗ 1 + 1 ⊗ A) s}
-    generator = np.einsum("nij,kl->nikjl", step, unit) + np.einsum("ij,nkl->nikjl", unit, step)
-    generator = generator.reshape(n, d * d, d * d)
-    term = np.broadcast_to(np.eye(d * d), generator.shape)
-    total = term.copy()
-    for order in range(1, TERMS):
-        term = term @ generator / order
-        total += term / (order + 1)
-    return total
+class InnovationLikelihood(DiffusionLikelihood):
+    """The likelihood of a filter's innovations, the sensors' variances with the coefficients of D.
+
+    Parameters
+    ----------
+    symbols
+        The d states that noise may drive, the first ones of the model.
+    fit
+        Of f, whose trajectories and coefficients stay as they are.
+    data
+        What it was fitted to.
+    """
+
+    def __init__(self, symbols: tuple[sympy.Symbol, ...], fit: Fit, data: Measurements) -> None:
+        super().__init__(symbols)
+        white = whiten(fit.linearisation, data, fit.noise)
+        still = with_parameters_changed(fit.linearisation, solve(white.columns, white.innovations)[0])
+        d, rows, x = len(symbols), data.begins, fit.linearised_at
+        middle = x[:, :d].copy()
+        middle[rows] += (x[rows + 1, :d] + still.gap[rows, :d] - x[rows, :d]) / 2
+        intensity = np.broadcast_to(fit.noise.intensity, (len(x), *fit.noise.intensity.shape[1:]))[:, :d, :d]
+        spread = np.zeros_like(intensity) if fit.spread is None else fit.spread[:, :d, :d]
+        wide = middle_spread(spread, intensity, data.step)
+        second = [term.diff(one, other) for term in self.terms for one in symbols for other in symbols]
+        components = np.ascontiguousarray(middle.T)
+        bends = compile_formulas(second, symbols)(components).reshape(len(self.terms), d, d, -1)
+        plain = compile_formulas(self.terms, symbols)
+        self.all_functions = np.ascontiguousarray(
+            (plain(components) + np.einsum("kijn,nij->kn", bends, wide) / 2).T
+        )
+        self.functions = self.all_functions[rows]
+        self.at_states = plain(np.ascontiguousarray(x[:, :d].T)).T
+        self._still, self._data = still, data
+        self._begin = np.diag(x.var(axis=0))
+        self.start = intensity[rows].mean(axis=0)
+        self.sensor = fit.noise.measurement
+        self.free = ~data.known_sensors
+
+    def reached(
+        self, places: np.ndarray, values: np.ndarray, sensor: np.ndarray
+    ) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+        """By the derivatives of the filter, see `siq.inference.filter_kernels.filter_recursion`."""
+        d, data, whole = len(self.symbols), self._data, len(self._begin)
+        intensity = np.zeros((len(self.all_functions), whole, whole))
+        intensity[:, :d, :d] = self.matrices(places, values, self.all_functions)
+        found = self._still.filtered(
+            data.first, data.step, sensor, intensity, begin_covariance=self._begin,
+            functions=self.all_functions, places=places,
+        )  # fmt: skip
+        innovations, logarithm = found[0], found[3]
+        return -0.5 * (float((innovations**2).sum()) + logarithm), *found[4:7]
+
+    def parameter_covariance(
+        self, formula: NoiseFormula, sensor: np.ndarray, covariance: np.ndarray, fit: Fit
+    ) -> np.ndarray:
+        """What the errors of a formula and its sensors add to the covariance of the coefficients of f."""
+        d, whole, count = len(self.symbols), len(self._begin), len(formula.values)
+        places = np.column_stack([formula.places, [self.terms.index(term) for term in formula.terms]])
+        levels, axes = np.linalg.eigh(covariance)
+        total = np.zeros_like(fit.covariance)
+        for axis in (axes * np.sqrt(np.maximum(levels, 0.0))).T:
+            ends = []
+            for change in (axis, -axis):
+                shape = np.zeros((len(self.all_functions), whole, whole))
+                values = formula.values + change[:count]
+                shape[:, :d, :d] = self.matrices(places, values, self.all_functions)
+                noise = Noise(sensor * np.exp(change[count:]), np.ones(whole), shape)
+                white = whiten(fit.linearisation, self._data, noise)
+                ends.append(solve(white.columns, white.innovations)[0])
+            total += np.outer(ends[0] - ends[1], ends[0] - ends[1]) / 4
+        return total
 
 
-def _forgotten_by_euler(step: np.ndarray, steps: int) -> np.ndarray:
-    """The mean of ``M^k ⊗ M^k`` for the steps k of a simulation, ``M = 1 + hJ/steps``."""
-    n, d, _ = step.shape
-    forward = np.eye(d) + step / steps
-    both = np.einsum("nij,nkl->nikjl", forward, forward).reshape(n, d * d, d * d)
-    term = np.broadcast_to(np.eye(d * d), both.shape)
-    total = np.zeros_like(both)
-    for _ in range(steps):
-        total += term / steps
-        term = term @ both
-    return total
+def constant_noise(symbols: Sequence[sympy.Symbol], rate: np.ndarray, *, samples: float) -> NoiseFormula:
+    """εD that is the same everywhere, from the covariance of so many residuals per time, ``(d, d)``.
+
+    The entries of a covariance of n normal residuals have the covariance ``(R_ik R_jl + R_il R_jk)/n``.
+    """
+    d = len(symbols)
+    places = np.array([(i, j) for i in range(d) for j in range(i, d)])
+    i, j = places.T
+    straight, crossed = rate[np.ix_(i, i)] * rate[np.ix_(j, j)], rate[np.ix_(i, j)] * rate[np.ix_(j, i)]
+    values, one = rate[i, j], sympy.Integer(1)
+    covariance = (straight + crossed) / samples
+    return NoiseFormula(tuple(symbols), places, (one,) * len(places), values, covariance, 1.0)
+
+
+def estimated_diffusion(found: FieldEstimate, *, pairs: int) -> Diffusion | None:
+    """D as the residuals show it, of determinant 1; None where there is none to be shown.
+
+    States whose noises show no significant correlation have none: an entry of D from chance alone would bring
+    a term into g that nothing else asks for.
+
+    The scale of D is a matter of convention, since a factor goes into ε. The determinant, unlike the trace
+    or the largest eigenvalue, changes by a mere factor when the unit of one state does. Noise that is alike
+    in all directions has the unit matrix, but for the error of the diagonal.
+
+    Parameters
+    ----------
+    found
+        f with the covariance of its residuals.
+    pairs
+        Number of independent residuals behind it: a correlation of none has the standard error 1/√pairs.
+
+    Returns
+    -------
+    Diffusion or None
+        None without noise, where noise does not reach every state, and where a state is but the derivative
+        of another: what its residuals show is the noise of the other, and depends on the step of the pairs.
+    """
+    if found.noise_free or defined_states(found.dynamics):
+        return None
+    # To the last bit symmetric, as sums over the pairs are not.
+    rate = (found.noise_rate + found.noise_rate.T) / 2
+    size = np.sqrt(np.diag(rate))
+    correlated = np.abs(rate) > STANDARD_ERRORS / np.sqrt(pairs) * np.outer(size, size)
+    rate = np.where(correlated | np.eye(len(rate), dtype=bool), rate, 0.0)
+    try:
+        whole = Diffusion(rate)
+    except ValueError:
+        return None
+    if not whole.regular:
+        return None
+    logarithm = float(np.linalg.slogdet(rate)[1])
+    return Diffusion(rate / np.exp(logarithm / len(rate)))
+
+
+def check_units(states: Sequence[str], units: Sequence[str | None]) -> None:
+    """Refuse the unit matrix for D where states, by their names, are known to have different units.
+
+    Raises
+    ------
+    NumericalFailure
+        With both states, and how D is given.
+    """
+    known = [(name, unit.strip()) for name, unit in zip(states, units, strict=True) if unit]
+    other = next(((name, unit) for name, unit in known if unit != known[0][1]), None)
+    if other is not None:
+        (first, one), (second, two) = known[0], other
+        raise NumericalFailure(
+            f"D is not known: {first} is in {one} and {second} is in {two}, so that no unit matrix can stand"
+            " for it, and the recordings carry no white noise that shows it; give D, up to a factor, as"
+            " 'recordings.diffusion' of the study, or in Python as StateSpace(diffusion=...)"
+        )
+
+
+def defined_states(dynamics: Dynamics) -> list[str]:
+    """States whose equation is another state, but for a factor: ``dx/dt = v``, which no noise drives."""
+    return [
+        name
+        for name, own, formula in zip(dynamics.states, dynamics.symbols, dynamics.formulas, strict=True)
+        if formula.as_coeff_Mul()[1] in set(dynamics.symbols) - {own}
+    ]

@@ -1,31 +1,36 @@
-"""The estimate of a vector field and its diffusion, with covariances.
+"""The estimate of a vector field and its diffusion: one result, whatever identified it, and its file.
 
-A vector field is held against pairs over their whole step, not against a difference quotient, whose error is
-O(h). Two maps are known: the flow of the differential equation, and that of an Euler–Maruyama simulation,
-whose increments are h f exactly and which differs from the continuous process by O(h).
+Of ``dx = f(x) dt + √ε σ(x) dW`` with ``D = σσᵀ`` recordings determine ``f = Θ Ξ`` over a library, with the
+covariance of Ξ, and the product εD. How it is split is a convention: an estimated D has the determinant 1, or
+the geometric mean 1 of it over the recorded states. Without noise nothing of D is determined, and the unit
+matrix is no answer for states of different units.
 
-Recordings fix only the product εD, and without noise nothing of it. D is a matter of units: if the unit of
-one state is changed and D is not, another problem is posed. So the unit matrix is no answer for states of
-different units.
+A vector field is compared with pairs of samples over their whole step, not with a difference quotient, whose
+error is O(h). Two maps are known: the flow of the differential equation, and that of an Euler–Maruyama
+simulation, whose increments are h f exactly and which differs from the continuous process by O(h).
 
-Certificates and transitions take an `AnyField`: an identified f with its uncertainty, or this.
+Certificates and transitions take an `AnyField`: an estimated f with its uncertainty, or a given one.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 from functools import cached_property
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import sympy
 
-from siq.errors import NumericalFailure
-from siq.inference.library import CandidateLibrary
-from siq.inference.selection import RivalTerms
+from siq.errors import InputError, NumericalFailure
+from siq.inference.library import CandidateLibrary, IdentificationOptions, field_library
+from siq.inference.selection import ModelAverage
+from siq.numerics.files import whole_file
 from siq.numerics.integration import runge_kutta_step
+from siq.remarks import Remark
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, Parameter, symbol
 from siq.systems.formulas import compile_formulas, parse_formula
@@ -33,7 +38,13 @@ from siq.systems.formulas import compile_formulas, parse_formula
 Field = Callable[[np.ndarray], np.ndarray]
 """f, mapping components ``(d, n)`` to components ``(d, n)``."""
 
-LARGEST_REFINEMENT = 64  # Runge–Kutta steps within one pair
+NoiseKind = Literal["none", "process", "sensor", "measurement", "rounding", "coloured"]
+NOISE_FREE = 1e-6  # residuals below this share of the increments are the integrator's and the rounding's
+MAX_REFINEMENT = 64  # Runge–Kutta steps within one pair
+STANDARD_ERRORS = 4.0  # derived: chance passes it once in 16 000 pairs of states
+SIGNIFICANT_SCORE = 5.0  # standard errors
+HARMLESS_CORRELATION = 0.02  # a correlation, or a deviation of D, below this is harmless however significant
+HARMLESS_BIAS = 0.5  # of a standard error: with such a bias an error bar holds 0.95 - 0.02 of the time
 
 
 @dataclass(frozen=True)
@@ -79,10 +90,8 @@ def flow_map(
     ----------
     field
         An estimate of f.
-    x0
-        Some of the states, shape ``(d, n)``, and ...
-    h
-        ... the steps of their pairs, shape ``(n,)``.
+    x0, h
+        States ``(d, n)`` and the steps of their pairs ``(n,)``.
     integrator_step
         Step of the Euler–Maruyama simulation that made the data; None for everything else.
     tolerance
@@ -92,9 +101,9 @@ def flow_map(
         return FlowMap(steps=max(round(float(np.median(h)) / integrator_step), 1), euler=True)
     steps = 1
     coarse = FlowMap(steps)(field, x0, h)
-    while steps < LARGEST_REFINEMENT:
+    while steps < MAX_REFINEMENT:
         fine = FlowMap(2 * steps)(field, x0, h)
-        with np.errstate(over="ignore", invalid="ignore"):  # as above
+        with np.errstate(over="ignore", invalid="ignore"):  # a trial f may run away
             size = np.sqrt(((fine - x0) ** 2).mean(axis=1))
             error = np.sqrt(((fine - coarse) ** 2).mean(axis=1))
         # The error of the coarse result; that of the fine one is sixteen times smaller.
@@ -102,20 +111,6 @@ def flow_map(
             break
         steps, coarse = 2 * steps, fine
     return FlowMap(steps)
-
-
-def constant_noise(symbols: Sequence[sympy.Symbol], rate: np.ndarray, *, samples: float) -> NoiseFormula:
-    """εD that is the same everywhere, from the covariance of so many residuals per time, ``(d, d)``.
-
-    The entries of a covariance of n normal residuals have the covariance ``(R_ik R_jl + R_il R_jk)/n``.
-    """
-    d = len(symbols)
-    places = np.array([(i, j) for i in range(d) for j in range(i, d)])
-    i, j = places.T
-    straight, crossed = rate[np.ix_(i, i)] * rate[np.ix_(j, j)], rate[np.ix_(i, j)] * rate[np.ix_(j, i)]
-    values, one = rate[i, j], sympy.Integer(1)
-    covariance = (straight + crossed) / samples
-    return NoiseFormula(tuple(symbols), places, (one,) * len(places), values, covariance, 1.0)
 
 
 @dataclass(frozen=True)
@@ -182,22 +177,16 @@ class NoiseFormula:
     def as_data(self) -> dict[str, Any]:
         """The terms with their errors, and the covariance, as plain data."""
         names = [each.name for each in self.symbols]
+        numbers = zip(self.places, self.terms, self.values, self.standard_errors, strict=True)
         return {
             "terms": [
-                {
-                    "row": names[i],
-                    "column": names[j],
-                    "term": str(term),
-                    "coefficient": float(value),
-                    "standard_error": float(error),
-                }
-                for (i, j), term, value, error in zip(
-                    self.places, self.terms, self.values, self.standard_errors, strict=True
-                )
+                {"row": names[i], "column": names[j], "term": str(term), "coefficient": float(value),
+                 "standard_error": float(error)}
+                for (i, j), term, value, error in numbers
             ],
             "covariance": self.covariance.tolist(),
             "probability": self.probability,
-        }
+        }  # fmt: skip
 
     @classmethod
     def from_data(cls, data: Mapping[str, Any], symbols: Sequence[sympy.Symbol]) -> NoiseFormula:
@@ -215,12 +204,197 @@ class NoiseFormula:
         )
 
 
-NOISE_FREE = 1e-6  # residuals below this share of the increments are the integrator's and the rounding's
+@dataclass(frozen=True)
+class Verdict:
+    """One test: the figure, its limit, the verdict, and what it means in words."""
+
+    value: float
+    limit: float
+    passed: bool
+    reason: str = ""
+
+    def as_data(self) -> dict[str, Any]:
+        """As it is stored; a figure that is not finite becomes null."""
+        value = float(self.value) if np.isfinite(self.value) else None
+        return {
+            "value": value, "limit": float(self.limit), "passed": bool(self.passed), "reason": self.reason
+        }  # fmt: skip
+
+    @classmethod
+    def of(cls, value: float, limit: float, reason: str) -> Verdict:
+        """Passed where a figure is no larger than its limit; the reason is why it would be refused."""
+        passed = bool(value <= limit)
+        return cls(value, limit, passed, "" if passed else reason)
+
+    @classmethod
+    def refused(cls, reason: str, limit: float = 0.0) -> Verdict:
+        """A test that cannot be made, or fails without a figure."""
+        return cls(np.inf, limit, False, reason)
+
+    @staticmethod
+    def worst(verdicts: Sequence[Verdict]) -> Verdict:
+        """Of several verdicts of one test the one that decides."""
+        return max(verdicts, key=lambda one: (not one.passed, one.value / (one.limit or 1.0)))
+
+    @classmethod
+    def from_data(cls, data: Mapping[str, Any]) -> Verdict:
+        """A verdict as `as_data` stored it."""
+        return cls(**{**data, "value": np.inf if data["value"] is None else data["value"]})
+
+
+class DiffusionSource(StrEnum):
+    """Where D is from, and what has to be said of it."""
+
+    GIVEN = "given"
+    ESTIMATED = "estimated"
+    OF_VELOCITIES = "estimated of velocities"
+    UNIT = "unit"
+    UNIT_OF_VELOCITIES = "unit of velocities"
+
+    @property
+    def note(self) -> str | None:
+        """What a reader of U has to know; nothing where D was given."""
+        return {
+            DiffusionSource.GIVEN: None,
+            DiffusionSource.ESTIMATED: "D is estimated from the noise of the recordings, since none was"
+            " given, and scaled to the determinant 1: ε has the size of the noise, and U is in the unit of ε",
+            DiffusionSource.OF_VELOCITIES: "D is estimated from the recorded positions, and its part that"
+            " acts on the velocities, the only one there is, scaled to the determinant 1: ε has the size of"
+            " the process noise, and U is in the unit of ε",
+            DiffusionSource.UNIT: "D is taken as the unit matrix, since none was given and the recordings do"
+            " not show it: U, barriers and times follow from it",
+            DiffusionSource.UNIT_OF_VELOCITIES: "D is taken as the unit matrix of the velocities, since the"
+            " recordings show no process noise: U and barriers follow from it, and times need the strength of"
+            " the noise",
+        }[self]
 
 
 @dataclass(frozen=True)
-class IdentifiedField:
-    """A vector field ``f = Θ Ξ`` with its uncertainty.
+class NoiseDiagnosis:
+    """The noise in recordings about an estimated f.
+
+    Attributes
+    ----------
+    kind
+        ``none``: only the integrator's error and rounding. ``process``: white process noise. ``sensor``:
+        measurement noise alone, which the estimate allows for. ``measurement``: measurement noise that it
+        does not allow for, so that neighbouring residuals are anticorrelated. ``rounding``: the same, and no
+        more than the values were rounded by when they were written. ``coloured``: residuals of neighbours are
+        correlated though all that is known is allowed for.
+    intensity, intensity_error
+        ε of ``√ε D^(1/2) dW``, and its standard error, None where it follows from the number of pairs.
+    covariance
+        Shape ``(d, d)``: the residuals' covariance per time over the intensity; D, if D is right.
+    correlation, correlation_score
+        Of neighbouring residuals, the strongest over the states; and in standard errors.
+    measurement, measurement_error
+        Shape ``(m,)``: standard deviation of each measured state's noise, zero where none is recognised; and
+        its standard error, None where it was not estimated with f.
+    pairs
+        Number of pairs of samples, or of so many independent ones.
+    diffusion
+        Where D is from.
+    exposure
+        The time over which each sample was taken as a mean; None where as the state itself.
+    lag, lost_time
+        Number of steps from which on the recordings are Markovian, None where they are from sample to sample;
+        and by how much their correlations delay what forces do (`siq.inference.regression.lost_time`).
+    sensor_evidence
+        Twice the log-likelihood ratio to the same terms without measurement noise, where that was estimated.
+    deviation, deviation_score
+        Largest entry of ``D^(-1/2) covariance D^(-1/2) - 1``, and the same in its standard errors.
+    rounding, rounding_bias, decimals
+        How the values were written, in words, None where that is not seen; the largest bias that it brings
+        into a coefficient of f, in its standard errors; and how many decimals would leave no trace.
+    remarks
+        What a reader has to know.
+    """
+
+    kind: NoiseKind
+    intensity: float
+    covariance: np.ndarray
+    correlation: float
+    correlation_score: float
+    measurement: np.ndarray
+    measurement_error: np.ndarray | None = None
+    intensity_error: float | None = None
+    pairs: int = 0
+    diffusion: DiffusionSource = DiffusionSource.GIVEN
+    exposure: float | None = None
+    lag: int | None = None
+    lost_time: float = 0.0
+    sensor_evidence: float | None = None
+    deviation: float = 0.0
+    deviation_score: float = 0.0
+    rounding: str | None = None
+    rounding_bias: float = 0.0
+    decimals: int = 0
+    remarks: tuple[Remark, ...] = ()
+
+    @property
+    def correlated(self) -> bool:
+        """Whether neighbouring residuals are correlated, significantly and by more than is harmless."""
+        return (
+            abs(self.correlation_score) > SIGNIFICANT_SCORE and abs(self.correlation) > HARMLESS_CORRELATION
+        )
+
+    def fault(self, states: Sequence[str]) -> str | None:
+        """Why formulas from these recordings would be biased, in words; None where they are not."""
+        if self.kind == "measurement":
+            worst = int(np.argmax(self.measurement))
+            return (
+                f"the recordings carry measurement noise, of about {self.measurement[worst]:.2g} in"
+                f" {states[worst]}: residuals of neighbouring pairs are anticorrelated"
+                f" ({self.correlation:.2f}); smooth or average the recordings first"
+            )
+        if self.kind == "rounding" and self.rounding_bias > HARMLESS_BIAS:
+            return (
+                f"{self.rounding}: that is too much for the formulas, which it biases by"
+                f" {self.rounding_bias:.1f} standard errors; write at least {self.decimals} decimals"
+            )
+        if self.kind == "coloured" and self.measurement_error is None:
+            return (
+                f"the residuals of neighbouring pairs are correlated ({self.correlation:.2f}): the noise has"
+                " a memory, or a state is missing from the recordings"
+            )
+        if self.kind == "coloured":
+            return (
+                f"the innovations of neighbouring samples are correlated ({self.correlation:.2f}) though"
+                " measurement noise is allowed for: the process noise is coloured, or a state is missing;"
+                " record that state, or keep every few samples only"
+            )
+        deviates = self.deviation_score > SIGNIFICANT_SCORE and self.deviation > HARMLESS_CORRELATION
+        if self.kind == "process" and deviates:
+            shown = np.array2string(self.covariance, precision=3, separator=", ").replace("\n", "")
+            return (
+                f"the noise in the recordings has the covariance {shown} (times {self.intensity:.3g}), which"
+                " is not the D of the study; state this D"
+            )
+        return None
+
+    def as_data(self) -> dict[str, Any]:
+        """As it is stored in `vector_field.json`."""
+        data = {each.name: getattr(self, each.name) for each in fields(self)}
+        arrays = {name: value.tolist() for name, value in data.items() if isinstance(value, np.ndarray)}
+        remarks = [each.as_data() for each in self.remarks]
+        return data | arrays | {"diffusion": str(self.diffusion), "remarks": remarks}
+
+    @classmethod
+    def from_data(cls, data: Mapping[str, Any]) -> NoiseDiagnosis:
+        """A diagnosis as `as_data` stored it; older files have fewer entries."""
+        known = {each.name: data[each.name] for each in fields(cls) if data.get(each.name) is not None}
+        blank = {"covariance": [], "measurement": [], "correlation": 0.0, "correlation_score": 0.0}
+        known = {**blank, **known}
+        for name in {"covariance", "measurement", "measurement_error"} & known.keys():
+            known[name] = np.array(known[name], dtype=float)
+        known["diffusion"] = DiffusionSource(known.get("diffusion", DiffusionSource.GIVEN))
+        known["remarks"] = tuple(map(Remark.from_data, known.get("remarks", ())))
+        return cls(**known)
+
+
+@dataclass(frozen=True)
+class FieldEstimate:
+    """A vector field ``f = Θ Ξ`` and its noise, with their uncertainty: the result of an identification.
 
     Attributes
     ----------
@@ -233,7 +407,7 @@ class IdentifiedField:
     covariance
         Shape ``(p, p)``: their covariance.
     noise_rate
-        Shape ``(d, d)``: covariance of the residual per unit of time. For process noise it is ε D, once
+        Shape ``(d, d)``: covariance of the residual per unit of time. For process noise it is εD, once
         `siq.inference.diffusion_model` has put back what a step forgets.
     residual_ratio
         Rms of the residuals over rms of the increments.
@@ -241,7 +415,7 @@ class IdentifiedField:
         The map over a pair's step that was fitted.
     diffusion
         D, which recordings do not tell apart from ε: of these only the product, `noise_rate`, is identified.
-    rivals
+    alternatives
         What other terms that fit nearly as well make of f. None where nobody asked.
     stability
         Shape ``(p,)``: the share of resampled recordings in which each term would be chosen
@@ -251,6 +425,11 @@ class IdentifiedField:
         mean over the recorded states then.
     constant_noise
         εD with its errors, where D was estimated and is the same everywhere; None elsewhere.
+    diagnosis
+        The noise that the recordings show, and how samples were taken to show the states. None of an f that
+        was not asked for it.
+    prediction
+        Whether f holds for recordings that it was not fitted to; None where nobody asked.
     """
 
     library: CandidateLibrary
@@ -261,22 +440,97 @@ class IdentifiedField:
     residual_ratio: float
     flow: FlowMap
     diffusion: Diffusion
-    rivals: RivalTerms | None = None
+    alternatives: ModelAverage | None = None
     stability: np.ndarray | None = None
     noise: NoiseFormula | None = None
     constant_noise: NoiseFormula | None = None
+    diagnosis: NoiseDiagnosis | None = None
+    prediction: Verdict | None = None
 
-    def mean_change(self, slopes: np.ndarray) -> np.ndarray:
-        """By how much the mean over rival terms moves what follows from f to first order, shape ``(...)``.
+    @classmethod
+    def on_support(
+        cls, library: CandidateLibrary, support: np.ndarray, values: np.ndarray, *args: Any, **fields: Any
+    ) -> FieldEstimate:
+        """An estimate from the values of the coefficients that are not zero, shape ``(p,)``."""
+        return cls(library, _spread_out(library, support, values), support, *args, **fields)
+
+    def with_values(self, support: np.ndarray, values: np.ndarray, **changes: Any) -> FieldEstimate:
+        """The same with other coefficients, those of a support, and other changes."""
+        coefficients = _spread_out(self.library, support, values)
+        return replace(self, coefficients=coefficients, support=support, **changes)
+
+    def with_formula(self, formula: NoiseFormula, x: np.ndarray) -> FieldEstimate:
+        """The field with D of a formula, and the mean of εD over states ``(n, d)`` for its noise rate.
+
+        Raises
+        ------
+        NumericalFailure
+            Where εD is not positive at one of the states.
+        """
+        matrices = formula.diffusion(1.0).at(x)
+        signs, logarithms = np.linalg.slogdet(matrices)
+        if not (signs > 0).all():
+            raise NumericalFailure("the formula of the noise is not positive at all recorded states")
+        intensity = float(np.exp(logarithms.mean() / len(matrices[0])))
+        diffusion, mean = formula.diffusion(intensity), matrices.mean(axis=0)
+        return replace(self, diffusion=diffusion, noise_rate=mean, noise=formula, constant_noise=None)
+
+    @property
+    def diffusion_source(self) -> DiffusionSource:
+        """Where D is from."""
+        return DiffusionSource.GIVEN if self.diagnosis is None else self.diagnosis.diffusion
+
+    @property
+    def memory(self) -> tuple[int, float] | None:
+        """The lag from which on the recordings are Markovian, and the time lost; None of those that are."""
+        if self.diagnosis is None or self.diagnosis.lag is None:
+            return None
+        return self.diagnosis.lag, self.diagnosis.lost_time
+
+    @property
+    def sensor_variance(self) -> np.ndarray | None:
+        """Variance of each measured state's noise, shape ``(m,)``; None where f was found without any."""
+        noise = self.diagnosis
+        if noise is None or noise.kind not in ("process", "sensor") or not (noise.measurement > 0).any():
+            return None
+        return noise.measurement**2
+
+    @property
+    def hidden_velocities(self) -> bool:
+        """Whether half of the states are velocities that were not recorded."""
+        return self.diagnosis is not None and len(self.diagnosis.measurement) * 2 == self.library.dimension
+
+    @property
+    def exposure(self) -> float | None:
+        """The time over which each sample was taken as a mean; None where as the state itself."""
+        return None if self.diagnosis is None else self.diagnosis.exposure
+
+    @property
+    def noise_strength(self) -> tuple[float, float] | None:
+        """ε and its standard error, None where the recordings show no white noise.
+
+        The variance of n residuals of d states has the relative standard error ``√(2/nd)``. Where
+        measurement noise was estimated, too, it is larger, and stands in the diagnosis.
+        """
+        noise = self.diagnosis
+        if noise is None or noise.kind not in ("process", "sensor") or not noise.intensity > 0:
+            return None
+        if noise.intensity_error is not None:
+            return noise.intensity, noise.intensity_error
+        samples = noise.pairs * self.library.dimension
+        return noise.intensity, noise.intensity * (2 / samples) ** 0.5 if samples else 0.0
+
+    def bias(self, slopes: np.ndarray) -> np.ndarray:
+        """By how much the mean over alternative terms moves what follows from f to first order.
 
         Parameters
         ----------
         slopes
             Derivatives by all coefficients, shape ``(..., q, d)``.
         """
-        if self.rivals is None:
+        if self.alternatives is None:
             return np.zeros(slopes.shape[:-2])
-        return np.asarray(np.einsum("...qd,qd->...", slopes, self.rivals.mean_change))
+        return np.asarray(np.einsum("...qd,qd->...", slopes, self.alternatives.bias))
 
     def variance(self, slopes: np.ndarray, *, of_mean: bool = False) -> np.ndarray:
         """Variance of what follows from f to first order, by its coefficients and by which terms there are.
@@ -286,8 +540,8 @@ class IdentifiedField:
         slopes
             Derivatives by all coefficients, shape ``(..., q, d)``.
         of_mean
-            Whether what follows from f has been moved by `mean_change`. If not, the square of that is a part
-            of the result.
+            Whether what follows from f has been moved by `bias`. If not, the square of that is a part of the
+            result.
 
         Returns
         -------
@@ -297,11 +551,11 @@ class IdentifiedField:
         components, terms = self.support.T
         own = slopes[..., terms, components]
         total = np.einsum("...p,pr,...r->...", own, self.covariance, own)
-        if self.rivals is not None:
-            changes = np.tensordot(slopes, self.rivals.spread, axes=([-2, -1], [-2, -1]))
+        if self.alternatives is not None:
+            changes = np.tensordot(slopes, self.alternatives.spread, axes=([-2, -1], [-2, -1]))
             total = total + (changes**2).sum(axis=-1)
             if not of_mean:
-                total = total + self.mean_change(slopes) ** 2
+                total = total + self.bias(slopes) ** 2
         return np.asarray(np.maximum(total, 0.0))
 
     @cached_property
@@ -349,7 +603,7 @@ class IdentifiedField:
 
     @cached_property
     def dynamics(self) -> Dynamics:
-        """F and D, with the p coefficients that are not zero as parameters, and their covariance."""
+        """f and D, with the p coefficients that are not zero as parameters, and their covariance."""
         return field_dynamics(
             self.library, self.support, self.values, diffusion=self.diffusion, covariance=self.covariance
         )
@@ -362,9 +616,14 @@ class IdentifiedField:
     @property
     def standard_errors(self) -> np.ndarray:
         """Shape ``(q, d)``: standard error of each coefficient, zero where there is no term."""
-        errors = np.zeros_like(self.coefficients)
-        errors[self.support[:, 1], self.support[:, 0]] = np.sqrt(np.diag(self.covariance))
-        return errors
+        return _spread_out(self.library, self.support, np.sqrt(np.diag(self.covariance)))
+
+
+def _spread_out(library: CandidateLibrary, support: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Values on a support as a matrix of all coefficients, shape ``(q, d)``."""
+    matrix = np.zeros((library.size, library.dimension))
+    matrix[support[:, 1], support[:, 0]] = values
+    return matrix
 
 
 def field_dynamics(
@@ -406,116 +665,6 @@ def field_dynamics(
     )
 
 
-class DiffusionSource(StrEnum):
-    """Where D is from, and what has to be said of it."""
-
-    GIVEN = "given"
-    ESTIMATED = "estimated"
-    OF_VELOCITIES = "estimated of velocities"
-    UNIT = "unit"
-    UNIT_OF_VELOCITIES = "unit of velocities"
-
-    @property
-    def note(self) -> str | None:
-        """What a reader of U has to know; nothing where D was given."""
-        return {
-            DiffusionSource.GIVEN: None,
-            DiffusionSource.ESTIMATED: "D is estimated from the noise of the recordings, since none was"
-            " given, and scaled to the determinant 1: ε has the size of the noise, and U is in the unit of ε",
-            DiffusionSource.OF_VELOCITIES: "D is estimated from the recorded positions, and its part that"
-            " acts on the velocities, the only one there is, scaled to the determinant 1: ε has the size of"
-            " the random forces, and U is in the unit of ε",
-            DiffusionSource.UNIT: "D is taken as the unit matrix, since none was given and the recordings do"
-            " not show it: U, barriers and times follow from it",
-            DiffusionSource.UNIT_OF_VELOCITIES: "D is taken as the unit matrix of the velocities, since the"
-            " recordings show no random forces: U and barriers follow from it, and times need the strength of"
-            " the noise",
-        }[self]
-
-
-UNLIKE_GIVEN = (
-    "the noise is stronger at some states than at others, and the D that was given is the same everywhere:"
-    " leave it out, or give formulas of the states"
-)
-STANDARD_ERRORS = 4.0  # derived: chance passes it once in 16 000 pairs of states
-
-
-def estimated_diffusion(found: IdentifiedField, *, pairs: int) -> Diffusion | None:
-    """D as the residuals show it, of determinant 1; None where there is none to be shown.
-
-    States whose noises show no significant correlation have none: an entry of D from chance alone would bring
-    a term into g that nothing else asks for.
-
-    The scale of D is a matter of convention, since a factor goes into ε. The determinant, unlike the trace
-    or the largest eigenvalue, changes by a mere factor when the unit of one state does. Noise that is alike
-    in all directions has the unit matrix, but for the error of the diagonal.
-
-    Parameters
-    ----------
-    found
-        f with the covariance of its residuals.
-    pairs
-        Number of independent residuals behind it: a correlation of none has the standard error 1/√pairs.
-
-    Returns
-    -------
-    Diffusion or None
-        None without noise, where noise does not reach every state, and where a state is but the derivative
-        of another: what its residuals show is the noise of the other, and depends on the step of the pairs.
-    """
-    if found.noise_free or defined_states(found.dynamics):
-        return None
-    # To the last bit symmetric, as sums over the pairs are not.
-    rate = (found.noise_rate + found.noise_rate.T) / 2
-    size = np.sqrt(np.diag(rate))
-    correlated = np.abs(rate) > STANDARD_ERRORS / np.sqrt(pairs) * np.outer(size, size)
-    rate = np.where(correlated | np.eye(len(rate), dtype=bool), rate, 0.0)
-    try:
-        whole = Diffusion(rate)
-    except ValueError:
-        return None
-    if not whole.regular:
-        return None
-    logarithm = float(np.linalg.slogdet(rate)[1])
-    return Diffusion(rate / np.exp(logarithm / len(rate)))
-
-
-def check_units(states: Sequence[str], units: Sequence[str | None]) -> None:
-    """Refuse the unit matrix where states are known to have different units.
-
-    Parameters
-    ----------
-    states
-        Their names.
-    units
-        The unit of each, None where nobody said.
-
-    Raises
-    ------
-    NumericalFailure
-        With both states, and how D is given.
-    """
-    known = [(name, unit.strip()) for name, unit in zip(states, units, strict=True) if unit]
-    other = next(((name, unit) for name, unit in known if unit != known[0][1]), None)
-    if other is None:
-        return
-    (first, one), (second, two) = known[0], other
-    raise NumericalFailure(
-        f"D is not known: {first} is in {one} and {second} is in {two}, so that no unit matrix can stand for"
-        " it, and the recordings carry no white noise that shows it; give D, up to a factor, as"
-        " 'recordings.diffusion' of the study, or in Python as StateSpace(diffusion=...)"
-    )
-
-
-def defined_states(dynamics: Dynamics) -> list[str]:
-    """States whose equation is another state, but for a factor: ``dx/dt = v``, which no noise drives."""
-    return [
-        name
-        for name, own, formula in zip(dynamics.states, dynamics.symbols, dynamics.formulas, strict=True)
-        if formula.as_coeff_Mul()[1] in set(dynamics.symbols) - {own}
-    ]
-
-
 @dataclass(frozen=True, eq=False)
 class GivenField:
     """f and D as somebody gave them."""
@@ -528,5 +677,87 @@ class GivenField:
         return self.dynamics.diffusion
 
 
-AnyField = IdentifiedField | GivenField
+AnyField = FieldEstimate | GivenField
 """f with what is not known of it."""
+
+
+def write_field(path: str | Path, estimate: FieldEstimate, options: IdentificationOptions) -> None:
+    """Write an estimate whole or not at all, as `vector_field.json` is documented."""
+    library, average = estimate.library, estimate.alternatives
+    shares = [None] * len(estimate.support) if estimate.stability is None else estimate.stability.tolist()
+    data = {
+        "states": list(library.states),
+        "degree": options.degree,
+        "functions": list(options.functions),
+        "terms": [
+            {
+                "component": library.states[i],
+                "term": library.names[k],
+                "coefficient": float(estimate.coefficients[k, i]),
+                "standard_error": float(estimate.standard_errors[k, i]),
+                "stability": share,
+            }
+            for (i, k), share in zip(estimate.support, shares, strict=True)
+        ],
+        "covariance": estimate.covariance.tolist(),
+        "alternatives": average and {"bias": average.bias.tolist(), "spread": average.spread.tolist()},
+        "noise_rate": estimate.noise_rate.tolist(),
+        "residual_ratio": estimate.residual_ratio,
+        "diffusion": estimate.diffusion.rows,
+        "noise_formula": estimate.noise and estimate.noise.as_data(),
+        "constant_noise": estimate.constant_noise and estimate.constant_noise.as_data(),
+        "flow": {"steps": estimate.flow.steps, "euler": estimate.flow.euler},
+        "noise": estimate.diagnosis and estimate.diagnosis.as_data(),
+        "prediction": estimate.prediction and estimate.prediction.as_data(),
+    }
+    with whole_file(path) as partial:
+        partial.write_text(json.dumps(data, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def read_field(path: str | Path) -> FieldEstimate | None:
+    """Read what `write_field` wrote; None where the file is empty since nothing was identified.
+
+    Raises
+    ------
+    InputError
+        When the file is no such record.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+        if not text:
+            return None
+        data = json.loads(text)
+        options = IdentificationOptions(degree=data["degree"], functions=tuple(data["functions"]))
+        library, rows = field_library(data["states"], options), data["terms"]
+        support = np.array(
+            [[library.states.index(row["component"]), library.names.index(row["term"])] for row in rows]
+        )
+        shares = [row.get("stability") for row in rows]
+        average, shape = data.get("alternatives"), (library.size, library.dimension)
+        if (older := data.get("rivals")) is not None:
+            average = {"bias": older["mean_change"], "spread": older["spread"]}
+        formulas = [
+            NoiseFormula.from_data(data[key], library.symbols) if data.get(key) else None
+            for key in ("noise_formula", "constant_noise")
+        ]
+        found = FieldEstimate.on_support(
+            library, support, np.array([float(row["coefficient"]) for row in rows]),
+            np.array(data["covariance"]), np.array(data["noise_rate"]), float(data["residual_ratio"]),
+            FlowMap(**data["flow"]), Diffusion.of_rows(library.symbols, data["diffusion"]),
+            average and ModelAverage(
+                np.array(average["bias"]).reshape(shape), np.array(average["spread"]).reshape(-1, *shape)
+            ),
+            None if None in shares else np.array(shares, dtype=float), *formulas,
+            NoiseDiagnosis.from_data(data["noise"]) if data["noise"] else None,
+            Verdict.from_data(data["prediction"]) if data["prediction"] else None,
+        )  # fmt: skip
+        p, d = len(support), library.dimension
+        if found.covariance.shape != (p, p) or found.noise_rate.shape != (d, d):
+            raise ValueError("covariances do not fit the terms")
+        if found.diffusion.dimension != d:
+            raise ValueError("D does not fit the states")
+        return found
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            path, "", f"it is no vector field ({type(error).__name__})", "make it again"
+        ) from None

@@ -14,22 +14,28 @@ explains of them, the unknown initial states projected out, are all that estimat
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import sympy
 
 from siq.errors import NumericalFailure
-from siq.inference.filter_kernels import carry_linearly, whitened_innovations
+from siq.inference.filter_kernels import carry_linearly, filter_recursion, projected_sums, smooth_backwards
 from siq.inference.measurements import Measurements
 from siq.numerics.least_squares import triangle_of
-from siq.systems.dynamics import Dynamics, Input, Signals, symbol
+from siq.systems.diffusion import Diffusion
+from siq.systems.dynamics import Dynamics, Input, ParametricFunctions, Signals, symbol
+
+INTERVALS = 1 << 14  # numerical: carried together, since their derivatives at three places are much to keep
+MAX_SUBSTEPS = 16
+INSIDE = 1e-9  # share of a substep by which its ends lie inside, where an input jumps between samples
+RANK = 1e-9  # numerical: singular values below this share of the largest are rounding
 
 
 class ClosedFunctions:
-    """F with the effect of a spread, its derivatives, and the outputs.
+    """f with the effect of a spread of the state, and its derivatives.
 
     The methods are those of `siq.systems.dynamics.ParametricFunctions`, for f between samples.
 
@@ -92,28 +98,6 @@ class Columns(Protocol):
         """In the outputs, at states ``(d, n)`` of all samples: shape ``(m, q, n)``."""
 
 
-class Rates(Protocol):
-    """F and its derivatives, as `siq.systems.dynamics.ParametricFunctions` has them."""
-
-    def rates(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> np.ndarray:
-        """F at states ``(d, n)``: shape ``(d, n)``."""
-
-    def slopes(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """By states and by free parameters: ``(d, d, n)`` and ``(d, p, n)``."""
-
-
-class Drift(Rates, Protocol):
-    """The same where it differs from interval to interval."""
-
-    def at_intervals(self, chosen: np.ndarray) -> Rates:
-        """That of some of the intervals, by their places."""
-
-
-INTERVALS = 1 << 14  # numerical: carried together, since their derivatives at three places are much to keep
-MOST_SUBSTEPS = 16
-INSIDE = 1e-9  # share of a substep by which its ends lie inside, where an input jumps between samples
-
-
 @dataclass(frozen=True)
 class Grid:
     """The instants at which intervals between samples are worked on.
@@ -174,7 +158,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class Linearisation:
-    """See `siq.inference.filter_kernels.whitened_innovations` for the attributes.
+    """A model along trajectories; see `siq.inference.filter_kernels.filter_recursion` for the attributes.
 
     Where the simulated output is no number, the residual is infinite; NaN says that nothing was measured.
     """
@@ -197,6 +181,72 @@ class Linearisation:
             and not np.isinf(self.residual).any()
         )
 
+    def at_rows(self, rows: np.ndarray | slice) -> Linearisation:
+        """That of some of the samples."""
+        return Linearisation(*(getattr(self, each.name)[rows] for each in fields(self)))
+
+    def filtered(
+        self,
+        first: np.ndarray,
+        step: np.ndarray,
+        variance: np.ndarray,
+        intensity: np.ndarray,
+        *,
+        begin: np.ndarray | None = None,
+        begin_covariance: np.ndarray | None = None,
+        functions: np.ndarray | None = None,
+        places: np.ndarray | None = None,
+        kept: bool = False,
+    ) -> tuple[Any, ...]:
+        """What the filter makes of it; see `siq.inference.filter_kernels.filter_recursion`.
+
+        Parameters
+        ----------
+        first, step
+            Where recordings begin, and lengths of the intervals.
+        variance, intensity
+            Of the measurement noise, and of the process noise.
+        begin, begin_covariance
+            Of the states of recordings; by default zero.
+        functions, places
+            Of the process noise, where the likelihood is derived by it.
+        kept
+            Whether what a smoother needs is kept.
+        """
+        dimension = self.gap.shape[1]
+        begin = np.zeros((len(first) - 1, dimension)) if begin is None else begin
+        if begin_covariance is None:
+            begin_covariance = np.zeros((dimension, dimension))
+        scored = places is not None
+        return filter_recursion(
+            first, self.transition, self.response, self.gap, self.measured, self.measured_response,
+            self.residual, variance, step, intensity, begin, begin_covariance,
+            np.zeros((0, 0)) if functions is None else functions,
+            np.zeros((0, 3), dtype=np.int64) if places is None else places, scored, kept,
+        )  # fmt: skip
+
+    def smoothed(
+        self, first: np.ndarray, step: np.ndarray, noise: Noise, begin: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The most probable deviations of the states, initial ones and parameters being known.
+
+        Given all measurements, given those of the same sample and before, shape ``(n, d)`` each, and the
+        covariance of the latter ``(n, d, d)``.
+        """
+        found = self.filtered(first, step, noise.measurement, noise.intensity, begin=begin, kept=True)
+        predicted, filtered, before, after, gains, variances = found[7:]
+        smoothed = smooth_backwards(
+            first, self.transition, self.measured, self.residual, found[0], predicted, before, gains,
+            variances,
+        )  # fmt: skip
+        return smoothed, filtered, after
+
+    def sums(self, first: np.ndarray, step: np.ndarray, noise: Noise) -> tuple[float, float, int]:
+        """Sum of squared innovations, log-determinant and degrees of freedom, parameters at their best."""
+        found = self.filtered(first, step, noise.measurement, noise.intensity)
+        total, logarithm, removed = projected_sums(first, *found[:3])
+        return total, found[3] + logarithm, int((~np.isnan(self.residual)).sum()) - removed
+
 
 def integrate_intervals(model: Dynamics, grid: Grid, values: np.ndarray, x: np.ndarray) -> np.ndarray:
     """The states at the ends of all intervals: from states ``(d, k)`` at their begins to ``(d, k)``."""
@@ -215,7 +265,7 @@ def linearise(
     x: np.ndarray,
     *,
     columns: Columns | None = None,
-    drift: Drift | None = None,
+    drift: FunctionsAtSpread | None = None,
 ) -> Linearisation:
     """Integrate every interval from the state in hand, with the derivatives.
 
@@ -232,7 +282,7 @@ def linearise(
     columns
         Further right-hand sides whose response is wanted behind those of the parameters.
     drift
-        F where it is another than the model's, such as the mean of f over a spread of states.
+        The mean of f over a spread of states, where that takes the place of f.
     """
     data, compiled, delays = grid.data, model.functions, model.lags(values)
     dimension, rows, count = x.shape[1], grid.rows, len(grid.rows)
@@ -245,11 +295,9 @@ def linearise(
         chosen = np.arange(begin, min(begin + together, count))
         whole = len(chosen) == count
         part = grid if whole else grid.at_intervals(chosen)
-        along: Rates = compiled
-        if drift is not None:
-            along = drift if whole else drift.at_intervals(chosen)
+        along = drift if drift is None or whole else drift.at_intervals(chosen)
         ends, by_state, by_parameter = _carried(
-            model, part, values, np.array(x[part.rows].T), along, columns=columns
+            model, part, values, np.array(x[part.rows].T), along or compiled, columns=columns
         )
         if not begin:
             response = np.zeros((len(x), *by_parameter.shape[1:]))
@@ -278,7 +326,7 @@ def _carried(
     grid: Grid,
     values: np.ndarray,
     state: np.ndarray,
-    drift: Rates,
+    drift: ParametricFunctions | FunctionsAtSpread,
     *,
     columns: Columns | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -330,7 +378,7 @@ def substeps_needed(
     steps = 1
     scale = x.std(axis=0) + 1e-300
     coarse = integrate_intervals(model, Grid(data, 1), values, x[data.begins].T)
-    while steps < MOST_SUBSTEPS:
+    while steps < MAX_SUBSTEPS:
         fine = integrate_intervals(model, Grid(data, 2 * steps), values, x[data.begins].T)
         with np.errstate(all="ignore"):
             squares = (fine - coarse) ** 2
@@ -343,7 +391,7 @@ def substeps_needed(
 
 
 def _runge_kutta(
-    drift: Rates,
+    drift: ParametricFunctions | FunctionsAtSpread,
     grid: Grid,
     values: np.ndarray,
     x: np.ndarray,
@@ -362,27 +410,33 @@ def _runge_kutta(
     return after, k1, rates(after, end, values)
 
 
-RANK = 1e-9  # numerical: singular values below this share of the largest are rounding
+def middle_spread(spread: np.ndarray, intensity: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Covariance of the state in the middle of an interval: noise of half of it is added."""
+    return np.asarray(spread + intensity * step[:, None, None] / 2)
 
 
-class NoiseField(Protocol):
-    """How strong random forces are at the states at which a filter is."""
+def mean_intensity(noise: Diffusion, x: np.ndarray, spread: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Mean of εD(x) over intervals, and over what a filter knows of the state: shape ``(n, d, d)``.
 
-    def over(self, x: np.ndarray, spread: np.ndarray, step: np.ndarray) -> np.ndarray:
-        """Their mean intensity over intervals.
-
-        Parameters
-        ----------
-        x, spread
-            Mean state in the middle of each, ``(n, d)``, and its covariance at the begin, ``(n, d, d)``.
-        step
-            Their lengths, shape ``(n,)``.
-
-        Returns
-        -------
-        numpy.ndarray
-            Shape ``(n, d, d)``, per time.
-        """
+    Parameters
+    ----------
+    noise
+        εD, of the first states of a model; the others are not driven.
+    x, spread
+        Mean state in the middle of each interval, ``(n, d)``, and its covariance at the begin, ``(n, d, d)``.
+    step
+        Their lengths, shape ``(n,)``.
+    """
+    d = noise.dimension
+    matrices = noise.at(x[:, :d])
+    wide = middle_spread(spread[:, :d, :d], matrices, step)
+    bends = noise.derivatives(x[:, :d], 2)
+    matrices = matrices + np.einsum("nijkl,nkl->nij", bends, wide) / 2
+    # On its way a fit may come where the formula is no covariance.
+    levels, vectors = np.linalg.eigh(matrices)
+    whole = np.zeros((len(x), x.shape[1], x.shape[1]))
+    whole[:, :d, :d] = np.einsum("nik,nk,njk->nij", vectors, np.maximum(levels, 0.0), vectors)
+    return whole
 
 
 @dataclass(frozen=True)
@@ -396,23 +450,23 @@ class Noise:
     process
         Q, per time, shape ``(d,)``; zero where nothing drives the state.
     shape
-        Of the random forces, where they are no independent ones of constant strength: ``(1, d, d)``, or
-        ``(n, d, d)`` for one at each sample. The intensity is then ``√Q_i shape_ij √Q_j``.
+        Of the process noise, where its components are not independent and of constant strength:
+        ``(1, d, d)``, or ``(n, d, d)`` for one at each sample. The intensity is then ``√Q_i shape_ij √Q_j``.
     field
-        What the shape is at each sample, where it depends on the state; a fit keeps the shape up with it.
+        εD(x), whose mean at each sample is the shape; a fit keeps the shape up with it.
     """
 
     measurement: np.ndarray
     process: np.ndarray
     shape: np.ndarray | None = None
-    field: NoiseField | None = None
+    field: Diffusion | None = None
 
     def along(self, x: np.ndarray, spread: np.ndarray | None, step: np.ndarray) -> Noise:
-        """The same noise with the shape that its field has at states; see `NoiseField.over`."""
+        """The same noise with the shape that its field has at states; see `mean_intensity`."""
         if self.field is None:
             return self
         spread = np.zeros((*x.shape, x.shape[1])) if spread is None else spread
-        return replace(self, shape=self.field.over(x, spread, step))
+        return replace(self, shape=mean_intensity(self.field, x, spread, step))
 
     def without_process(self) -> Noise:
         """The same measurement noise, and states that follow their equations exactly."""
@@ -431,7 +485,7 @@ class Noise:
 
     @property
     def intensity(self) -> np.ndarray:
-        """Intensity of the random forces, per time: shape ``(1, d, d)``, or ``(n, d, d)``."""
+        """Intensity of the process noise, per time: shape ``(1, d, d)``, or ``(n, d, d)``."""
         if self.shape is None:
             return np.diag(self.process)[None]
         return self.shape * np.sqrt(np.outer(self.process, self.process))
@@ -483,20 +537,9 @@ def whiten(linearisation: Linearisation, data: Measurements, noise: Noise) -> Wh
         When the simulation, as linearised, runs away along a recording. Columns of parameters may be infinite
         all the same.
     """
-    transition = linearisation.transition
-    step = np.append(np.diff(data.t), 0.0)
-    process = process_covariance(transition, step, noise.intensity)
-    innovations, columns, initial, log_determinant = whitened_innovations(
-        data.first,
-        transition,
-        linearisation.response,
-        linearisation.gap,
-        process,
-        linearisation.measured,
-        linearisation.measured_response,
-        linearisation.residual,
-        noise.measurement,
-    )
+    innovations, columns, initial, log_determinant = linearisation.filtered(
+        data.first, data.step, noise.measurement, noise.intensity
+    )[:4]
     outputs = innovations.shape[1]
     known = ~np.isnan(linearisation.residual).ravel()
     innovations = innovations.ravel()
@@ -518,33 +561,6 @@ def whiten(linearisation: Linearisation, data: Measurements, noise: Noise) -> Wh
         degrees_of_freedom=int(known.sum()) - used,
         log_determinant=log_determinant,
     )
-
-
-def process_covariance(transition: np.ndarray, step: np.ndarray, intensity: np.ndarray) -> np.ndarray:
-    """Covariance that noise of the given intensities adds over each interval, by Simpson's rule.
-
-    Parameters
-    ----------
-    transition
-        Φ over the intervals, shape ``(n, d, d)``.
-    step
-        Their lengths, shape ``(n,)``.
-    intensity
-        Per time, shape ``(1, d, d)`` or ``(n, d, d)``.
-    """
-    total = np.zeros_like(transition)
-    dimension = transition.shape[1]
-    unit = np.eye(dimension)
-    for i in range(dimension):
-        for j in range(dimension):
-            strength = intensity[:, i, j]
-            if not strength.any():
-                continue
-            one, other = transition[:, :, i], transition[:, :, j]
-            ends = one[:, :, None] * other[:, None, :] + unit[:, i, None] * unit[None, :, j]
-            middle = (one + unit[i])[:, :, None] * (other + unit[j])[:, None, :]
-            total += strength[:, None, None] * (ends + middle)
-    return total * (step / 6)[:, None, None]
 
 
 def solve(columns: np.ndarray, target: np.ndarray, *, least: float = RANK) -> tuple[np.ndarray, np.ndarray]:

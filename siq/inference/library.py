@@ -12,9 +12,12 @@ import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 import sympy
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass as pydantic_dataclass
 
 from siq.errors import NumericalFailure
 from siq.systems.diffusion import Diffusion
@@ -275,3 +278,39 @@ def linear_combination(expression: sympy.Expr) -> dict[sympy.Expr, float]:
         if coefficient != 0:
             combination[function] = combination.get(function, 0.0) + float(coefficient)
     return combination
+
+
+@pydantic_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class IdentificationOptions:
+    """In which functions the vector field is sought, and what makes a term significant.
+
+    Attributes
+    ----------
+    degree
+        Highest degree of the monomials.
+    functions
+        Further functions of the states, as formulas: roots, fractions and whatever else.
+    false_terms
+        Probability that noise alone brings any false term into f. Each candidate is judged by its own
+        standard error, at its share of this probability, of which high degrees have less than low ones.
+    precision
+        A term that contributes less than this share of f is dropped also from data without noise, whose
+        residuals are the integrator's error and not random.
+    pairs
+        Most pairs used where the data carry no noise; with noise all are.
+    hidden_velocities
+        Whether the recorded states are positions whose velocities were not recorded. These are states then,
+        too, called ``v_x`` for a position x, and f says how forces change them.
+    """
+
+    degree: Annotated[int, Field(ge=1, le=12)] = 5
+    functions: tuple[str, ...] = ()
+    false_terms: Annotated[float, Field(gt=0, lt=0.5)] = 0.02
+    precision: Annotated[float, Field(gt=0, lt=0.1)] = 1e-7
+    pairs: Annotated[int, Field(ge=100)] = 8_000
+    hidden_velocities: bool = False
+
+
+def field_library(states: Sequence[str], options: IdentificationOptions) -> CandidateLibrary:
+    """The functions in which f is sought."""
+    return candidate_library(states, degree=options.degree, further=options.functions)

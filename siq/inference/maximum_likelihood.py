@@ -4,24 +4,24 @@ The model is fitted with noise in what is measured (variance R) and, where asked
 (intensity Q per time). With Q = 0 this is the least-squares fit of whole trajectories. With Q > 0 it is the
 extended Kalman filter, linearised at what it knows at the begin of each interval, whose likelihood is that
 of its innovations. Linearising along *smoothed* states, which know the future, would be another thing: what
-random forces did later is then in the states at which f is taken, and the coefficients of f come out too
-small, by a half where sensor and random forces do alike. Smoothed states are where the filter begins, since
+process noise did later is then in the states at which f is taken, and the coefficients of f come out too
+small, by a half where sensor and process noise do alike. Smoothed states are where the filter begins, since
 they follow the data whatever the model says, and they are what is shown of the motion.
 
 A model that lacks physics is fitted with Q > 0 too, so that a later addition is judged along the right
 trajectories. Initial states are unknown and enter as fixed effects; the variances are those of highest
-restricted likelihood, which allows for that.
+restricted likelihood, which allows for these and for the parameters.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.optimize
 
 from siq.inference.budget import Budget, evaluation
-from siq.inference.filter_kernels import smoothed_states, whitened_innovations
 from siq.inference.kalman_filter import (
     RANK,
     ClosedFunctions,
@@ -29,20 +29,269 @@ from siq.inference.kalman_filter import (
     Linearisation,
     Noise,
     linearise,
-    process_covariance,
+    middle_spread,
     solve,
     substeps_needed,
     whiten,
     with_parameters_changed,
 )
 from siq.inference.measurements import Expectations, Measurements
-from siq.inference.noise import Priors, noise_along
 from siq.systems.dynamics import Dynamics
 
-SMALLEST_STEP = 1 / 64
+PIECE = 500  # samples in one stretch, so that its unknown first state hardly matters
+MIN_ROUGHNESS_SHARE = 1e-4  # least measurement noise, as a share of what third differences show
+COARSE_SAMPLES = 8000  # whose noise is known to 2 %: enough to begin with
+LOGARITHM_STEP = 0.05  # numerical: for differences of the likelihood
+MIN_CURVATURE = 1.0  # along a logarithm, from which on its standard error is below one
+MAX_CORRECTION = 0.5  # of a logarithm, within which the likelihood is a parabola
+NO_PROCESS_NOISE = np.exp(-23.0)  # relative to where the search began; below it there is none
+SHORTEST_STEP = 1 / 64
 INEXACT = 1e-4  # numerical: of effects carried along whole trajectories, where f may jump, the rest is error
 NONLINEAR = 0.5  # share of a step's effect that may be unforeseen before the step is shortened
 HARMLESS = 0.1  # of a filter's own corrections: what is unforeseen below that is corrected as they are
+RUNS_AWAY = "the simulation runs away between two samples"
+SUBSTEP_ERROR = 3e-6  # of the spread of a state: far below what any sensor resolves
+SETTLED = 1e-4  # change of the innovations, squared and per sample, at which a fit has converged
+FINE = 1e-3  # the same of all innovations together, by the parameters: a thirtieth of a standard error
+STANDSTILL = 0.005  # change of the sum of squares over four steps, below which a fit moves to no avail
+PATIENCE = 6  # steps before that is asked
+RESTING = 1e-12  # of a state's domain, the least that its spread is taken for
+
+
+def first_noise(model: Dynamics, data: Measurements, x: np.ndarray) -> Noise:
+    """Noise to begin with: what third differences show of the outputs, and a drive as large as the motion."""
+    rows = data.begins
+    step = data.step[rows, None]
+    process = 0.01 * np.mean((x[rows + 1] - x[rows]) ** 2 / step, axis=0)
+    if not (process > 0).all():
+        spread = np.ptp(model.limits, axis=1) ** 2 / (data.t[-1] - data.t[0] + 1e-300)
+        # Of a state at rest whose domain nobody knows, what its own equation moves it by.
+        signals = data.signals(data.t, data.recording, delays=model.lags(model.values))
+        rates = model.functions.rates(x.T, signals, model.values).T
+        rates = np.where(np.isfinite(rates), rates, 0.0)
+        moved = np.mean(rates[rows] ** 2 * step, axis=0)
+        process = np.where(process > 0, process, np.where(np.isfinite(spread), 1e-4 * spread, 0.01 * moved))
+    return Noise(data.with_known_noise(data.roughness), np.where(model.kinematic, 0.0, process))
+
+
+@dataclass(frozen=True)
+class NoiseCoordinates:
+    """The parameters of a noise as one vector: logarithms of variances, then correlations of process noise.
+
+    Attributes
+    ----------
+    origin
+        The noise at zero. A process noise that is zero there stays so.
+    known
+        Which variances of the measurement are known, and stay as they are; shape ``(m,)``.
+    """
+
+    origin: Noise
+    known: np.ndarray
+
+    @property
+    def driven(self) -> np.ndarray:
+        """Places of the states that process noise drives."""
+        return np.flatnonzero(self.origin.process > 0)
+
+    @property
+    def correlates(self) -> bool:
+        """Whether a correlation of the process noise is among the parameters."""
+        return self.origin.shape is not None and len(self.origin.shape) == 1
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        count = len(self.driven)
+        pairs = count * (count - 1) // 2 if self.correlates else 0
+        return len(self.known) + count + pairs
+
+    def noise_at(self, vector: np.ndarray) -> Noise:
+        """The noise for a vector, shape ``(size,)``."""
+        outputs, driven = len(self.known), self.driven
+        process = np.zeros_like(self.origin.process)
+        process[driven] = self.origin.process[driven] * np.exp(vector[outputs : outputs + len(driven)])
+        logarithms = np.where(self.known, 0.0, vector[:outputs])
+        result = replace(
+            self.origin, measurement=self.origin.measurement * np.exp(logarithms), process=process
+        )
+        if not self.correlates or len(driven) < 2:
+            return result
+        assert self.origin.shape is not None
+        root = np.linalg.cholesky(self.origin.shape[0][np.ix_(driven, driven)])
+        change = np.eye(len(driven))
+        change[np.tril_indices(len(driven), -1)] = vector[outputs + len(driven) :]
+        root = root @ change
+        root /= np.linalg.norm(root, axis=1)[:, None]
+        shape = self.origin.shape.copy()
+        shape[0][np.ix_(driven, driven)] = root @ root.T
+        return replace(result, shape=shape)
+
+
+def estimate_noise(
+    linearisation: Linearisation,
+    data: Measurements,
+    start: Noise,
+    *,
+    expected: Expectations | None = None,
+    charge: Callable[[float], None] | None = None,
+    coarse: bool = False,
+) -> Noise:
+    """The noise of highest restricted likelihood along the trajectories in hand.
+
+    The parameters are those that are best for the noise that the search begins with: they depend little on
+    it, and a fit returns here once they have settled.
+
+    Parameters
+    ----------
+    linearisation, data
+        Along the trajectories.
+    start
+        Where the search begins. A process noise that is zero stays so.
+    expected
+        What is expected of changes of the free parameters.
+    charge
+        Called before each evaluation of the likelihood, with the share of the samples that it is for.
+    coarse
+        Whether some thousand samples are enough, where there are many more.
+    """
+    coordinates = NoiseCoordinates(start, data.known_sensors)
+    driven, outputs = coordinates.driven, len(start.measurement)
+    white = whiten(linearisation, data, start)
+    columns, innovations = (expected or Expectations.none()).beside(white.columns, white.innovations)
+    whole = with_parameters_changed(linearisation, solve(columns, innovations)[0])
+    count = len(data.t)
+    # Pieces spread over all recordings, where there are many more samples than are needed.
+    rows, first = np.arange(count), data.first
+    if count > 2 * COARSE_SAMPLES:
+        keep, kept = COARSE_SAMPLES / count, []
+        for begin, end in zip(data.first[:-1], data.first[1:], strict=True):
+            pieces = max(round((end - begin) * keep / PIECE), 1)
+            length = max(int((end - begin) * keep / pieces), 1)
+            kept += [
+                np.arange(at, at + length) for at in np.linspace(begin, end - length, pieces).astype(int)
+            ]
+        rows, first = np.concatenate(kept), np.cumsum([0, *map(len, kept)])
+
+    def cost_along(rows: np.ndarray, first: np.ndarray) -> Callable[[np.ndarray], float]:
+        part, step = whole if len(rows) == count else whole.at_rows(rows), data.step[rows]
+
+        def cost(vector: np.ndarray) -> float:
+            if charge is not None:
+                charge(len(rows) / count)
+            noise = coordinates.noise_at(vector)
+            if len(rows) < count and noise.shape is not None and len(noise.shape) > 1:
+                noise = replace(noise, shape=noise.shape[rows])
+            total, log_determinant, freedom = part.sums(first, step, noise)
+            value = 0.5 * (total + log_determinant + freedom * np.log(2 * np.pi))
+            return value if np.isfinite(value) else 1e300
+
+        return cost
+
+    cost = cost_along(rows, first)
+    begins = [np.zeros(coordinates.size)]
+    # Upwards, too: a candidate that promised to need hardly any process noise may not have kept that.
+    for factor in (1e-2, 1e-4, 1e-6, 1e2, 1e4) if len(driven) else ():
+        begins.append(np.zeros(coordinates.size))
+        begins[-1][outputs : outputs + len(driven)] = np.log(factor)
+    best = min(begins, key=cost)
+    # States that process noise drives could follow every sample; the noise of a sensor never vanishes.
+    least = np.log(MIN_ROUGHNESS_SHARE * data.roughness / start.measurement)
+    bounds = [
+        (0.0, 0.0) if coordinates.known[k] else (min(least[k], 0.0), best[k] + 12.0) for k in range(outputs)
+    ]
+    bounds += [(np.log(NO_PROCESS_NOISE), 12.0)] * len(driven)
+    bounds += [(-10.0, 10.0)] * (coordinates.size - len(bounds))
+    vector = _lowest(cost, best, bounds)
+    if len(rows) < count and not coarse:
+        everything = cost_along(np.arange(count), data.first)
+        vector = _corrected(vector, everything, cost, ratio=count / len(rows), bounds=bounds)
+    noise = coordinates.noise_at(vector)
+    gone = vector[outputs : outputs + len(driven)] <= np.log(NO_PROCESS_NOISE) + 1
+    noise.process[driven[gone]] = 0.0
+    return noise
+
+
+def _lowest(
+    cost: Callable[[np.ndarray], float], begin: np.ndarray, bounds: Sequence[tuple[float, float]]
+) -> np.ndarray:
+    found = scipy.optimize.minimize(
+        cost, begin, method="L-BFGS-B", bounds=bounds, options={"maxiter": 12, "ftol": 1e-7, "eps": 1e-3}
+    )
+    return found.x if found.fun <= cost(begin) else begin
+
+
+def _corrected(
+    vector: np.ndarray,
+    whole: Callable[[np.ndarray], float],
+    some: Callable[[np.ndarray], float],
+    *,
+    ratio: float,
+    bounds: Sequence[tuple[float, float]],
+) -> np.ndarray:
+    """The minimum of a cost from that of a part of it, by one Newton step with the curvature of the part.
+
+    What is left is of second order in the difference of the two, which many samples make small; where they
+    differ so much that the step leads upwards all is searched. The whole is larger by the ratio, and a
+    coordinate at one of its bounds stays there.
+    """
+    lower, upper = np.array(bounds).T
+    inside = np.flatnonzero((vector > lower + LOGARITHM_STEP) & (vector < upper - LOGARITHM_STEP))
+    unit = LOGARITHM_STEP * np.eye(len(vector))[inside]
+    middle, part = whole(vector), some(vector)
+    ahead = np.array([some(vector + one) for one in unit])
+    curvature = np.empty((len(inside), len(inside)))
+    for row, one in enumerate(unit):
+        curvature[row, row] = ahead[row] + some(vector - one) - 2 * part
+        for column in range(row):
+            both = some(vector + one + unit[column])
+            curvature[row, column] = curvature[column, row] = both - ahead[row] - ahead[column] + part
+    curvature *= ratio / LOGARITHM_STEP**2
+    slope = np.array([whole(vector + one) - middle for one in unit]) / LOGARITHM_STEP
+    slope = slope - LOGARITHM_STEP / 2 * np.diag(curvature)
+    values, directions = np.linalg.eigh(curvature)
+    # Where the likelihood is flat, as towards no process noise, there is nothing to correct.
+    curved = directions[:, values > MIN_CURVATURE]
+    step = -curved @ (curved.T @ slope / values[values > MIN_CURVATURE])
+    moved = vector.copy()
+    moved[inside] += np.clip(step, -MAX_CORRECTION, MAX_CORRECTION)
+    return moved if whole(moved) <= middle else _lowest(whole, vector, bounds)
+
+
+def log_likelihood(linearisation: Linearisation, data: Measurements, noise: Noise) -> float:
+    """Restricted log-likelihood along the trajectories in hand, the parameters at their best."""
+    total, log_determinant, freedom = linearisation.sums(data.first, data.step, noise)
+    return -0.5 * (total + log_determinant + freedom * np.log(2 * np.pi))
+
+
+def _noise_along(
+    linearisation: Linearisation,
+    data: Measurements,
+    noise: Noise,
+    estimate_process: bool,
+    *,
+    expected: Expectations,
+    charge: Callable[[float], None] | None = None,
+    coarse: bool = False,
+) -> Noise:
+    """The noise along the trajectories in hand, the process noise only where it is to be estimated, too."""
+    driven = bool((noise.process > 0).any())
+    if estimate_process and driven:
+        return estimate_noise(linearisation, data, noise, expected=expected, charge=charge, coarse=coarse)
+    if driven and data.sensor_noise is not None:
+        return noise
+    white = whiten(linearisation, data, noise)
+    change, covariance = solve(*expected.beside(white.columns, white.innovations))
+    determined = len(change) - float(np.einsum("rp,pq,rq->", expected.rows, covariance, expected.rows))
+    left = (white.innovations - white.columns @ change).reshape(len(data.t), -1)
+    known = white.known.reshape(left.shape)
+    # Each output has its share of the initial states and parameters.
+    share = (white.degrees_of_freedom - determined) / known.sum()
+    factor = (left**2).sum(axis=0) / np.maximum(known.sum(axis=0) * share, 1.0)
+    if driven:  # one scale for both, since only their ratio is given
+        factor = np.full_like(factor, (left**2).sum() / (known.sum() * share))
+        return replace(noise, measurement=noise.measurement * factor, process=noise.process * factor[0])
+    return replace(noise, measurement=data.with_known_noise(noise.measurement * np.maximum(factor, 1e-12)))
 
 
 @dataclass(frozen=True)
@@ -72,23 +321,6 @@ class Iterate:
 
 
 @dataclass(frozen=True)
-class StateChanges:
-    """Most probable changes of all states, given those of the parameters.
-
-    Attributes
-    ----------
-    smoothed, filtered
-        By all measurements, and by those until then, shape ``(n, d)`` each.
-    spread
-        Covariance of what is filtered, shape ``(n, d, d)``.
-    """
-
-    smoothed: np.ndarray
-    filtered: np.ndarray
-    spread: np.ndarray
-
-
-@dataclass(frozen=True)
 class Shooting:
     """What is fitted.
 
@@ -101,7 +333,7 @@ class Shooting:
     filtered
         Whether f is taken at what a filter knows, rather than at smoothed states.
     closed
-        F with the effect of the filter's spread on it, where that is wanted.
+        f with the effect of the filter's spread on it, where that is wanted.
     budget
         Charged for every evaluation; None where nobody counts.
     """
@@ -137,20 +369,17 @@ class Shooting:
         if self.closed is None or spread is None:
             return linearise(self.model, self.grid, values, x)
         rows, data = self.grid.rows, self.grid.data
-        # The random forces of half an interval are what its middle adds to the spread at its begin.
-        half = (data.t[rows + 1] - data.t[rows])[:, None, None] / 2
         intensity = noise.intensity if len(noise.intensity) == 1 else noise.intensity[rows]
-        drift = self.closed.at(spread[rows] + intensity * half)
+        drift = self.closed.at(middle_spread(spread[rows], intensity, data.step[rows]))
         return linearise(self.model, self.grid, values, x, drift=drift)
 
     def noise_at(self, now: Iterate, noise: Noise) -> Noise:
-        """The noise where a fit stands: random forces may depend on the state."""
+        """The noise where a fit stands: process noise may depend on the state."""
         if noise.field is None:
             return noise
-        rows, data = self.grid.rows, self.grid.data
-        middle, step = now.x.copy(), np.append(np.diff(data.t), 0.0)
+        rows, middle = self.grid.rows, now.x.copy()
         middle[rows] += (now.x[rows + 1] + now.along.gap[rows] - now.x[rows]) / 2
-        return noise.along(middle, now.spread, step)
+        return noise.along(middle, now.spread, self.grid.data.step)
 
     def stepped(self, now: Iterate, change: np.ndarray, noise: Noise) -> tuple[Iterate, float] | None:
         """The step that the linearisation suggests, shortened until it does about what was foreseen.
@@ -170,76 +399,48 @@ class Shooting:
             Where it leads, and the share of it that was taken; None where not even a short one does as
             foreseen.
         """
-        follow = state_changes(now.along, self.grid.data, noise, change)
-        deviation = follow.filtered if self.filtered else follow.smoothed
-        spread = follow.spread if noise.process.any() else None
+        smoothed, known, covariance = _state_changes(now.along, self.grid.data, noise, change)
+        deviation = known if self.filtered else smoothed
+        spread = covariance if noise.process.any() else None
         rows, scale = self.grid.rows, self.scale
         moved = np.einsum("kij,kj->ki", now.along.transition[rows], deviation[rows])
         moved += now.along.response[rows] @ change
         foreseen = now.along.gap[rows] + moved - deviation[rows + 1]
         effect = np.sqrt(np.mean(((np.abs(moved) + np.abs(deviation[rows + 1])) / scale) ** 2))
-        # A filter's gaps are its corrections at each sample, which random forces and sensors ask for anyway.
+        # A filter's gaps are its corrections at each sample, which both kinds of noise ask for anyway.
         usual = np.sqrt(np.mean((now.along.gap[rows] / scale) ** 2)) if self.filtered else 0.0
         length = 1.0
-        while length >= SMALLEST_STEP:
-            values = changed(now.values, self.model.free, length * change)
+        while length >= SHORTEST_STEP:
+            values = _changed(self.model, now.values, length * change)
             x = now.x + length * deviation
             along = self.linearised(values, x, spread, noise)
             if along.finite:
                 expected = (1 - length) * now.along.gap[rows] + length * foreseen
                 unforeseen = np.sqrt(np.mean(((along.gap[rows] - expected) / scale) ** 2))
                 if unforeseen <= NONLINEAR * length * effect + HARMLESS * usual + 1e-9:
-                    smoothed = now.x + length * follow.smoothed
-                    return Iterate(values, x, along, smoothed, spread), length
+                    return Iterate(values, x, along, now.x + length * smoothed, spread), length
             length /= 2
         return None
 
 
-def state_changes(
+def _state_changes(
     linearisation: Linearisation, data: Measurements, noise: Noise, change: np.ndarray
-) -> StateChanges:
-    """How the states follow a change of the free parameters, shape ``(p,)``."""
-    step = np.append(np.diff(data.t), 0.0)
-    process = process_covariance(linearisation.transition, step, noise.intensity)
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """How the most probable states follow a change of the free parameters, see `Linearisation.smoothed`."""
     still = with_parameters_changed(linearisation, change)
-    gap, residual = still.gap, still.residual
-    innovations, _, initial, _ = whitened_innovations(
-        data.first,
-        still.transition,
-        still.response,
-        gap,
-        process,
-        still.measured,
-        still.measured_response,
-        residual,
-        noise.measurement,
-    )
-    begin = np.empty((len(data.labels), gap.shape[1]))
+    innovations, _, initial = still.filtered(data.first, data.step, noise.measurement, noise.intensity)[:3]
+    begin = np.empty((len(data.labels), still.gap.shape[1]))
     for place, (start, end) in enumerate(zip(data.first[:-1], data.first[1:], strict=True)):
-        columns = initial[start:end].reshape(-1, gap.shape[1])
+        columns = initial[start:end].reshape(-1, begin.shape[1])
         begin[place] = solve(columns, innovations[start:end].ravel(), least=INEXACT)[0]
-    return StateChanges(
-        *smoothed_states(
-            data.first,
-            linearisation.transition,
-            gap,
-            process,
-            linearisation.measured,
-            residual,
-            noise.measurement,
-            begin,
-        )
-    )
+    return still.smoothed(data.first, data.step, noise, begin)
 
 
-def changed(values: np.ndarray, free: Sequence[int], change: np.ndarray) -> np.ndarray:
+def _changed(model: Dynamics, values: np.ndarray, change: np.ndarray) -> np.ndarray:
     """Parameters' values after a change of the free ones."""
     result = values.copy()
-    result[np.array(free, dtype=int)] += change
+    result[list(model.free)] += change
     return result
-
-
-RUNS_AWAY = "the simulation runs away between two samples"
 
 
 @dataclass(frozen=True)
@@ -322,18 +523,17 @@ def fit_of_states(
     """
     at = Iterate(model.values, x, linearise(model, Grid(data, substeps), model.values, x), x)
     if not at.along.finite:
-        return failed_fit(model, at, noise, substeps, RUNS_AWAY)
+        return _failed_fit(model, at, noise, substeps, RUNS_AWAY)
     try:
-        priors = Priors(Expectations.of(model), model.values[list(model.free)])
-        noise = noise_along(at.along, data, noise, estimate_process=False, priors=priors)
-        return fit_at(
+        noise = _noise_along(at.along, data, noise, False, expected=Expectations.of(model))
+        return _fit_at(
             model, data, at, noise=noise, substeps=substeps, converged=converged, resolution=INEXACT
         )
     except (ArithmeticError, np.linalg.LinAlgError) as error:
-        return failed_fit(model, at, noise, substeps, str(error))
+        return _failed_fit(model, at, noise, substeps, str(error))
 
 
-def fit_at(
+def _fit_at(
     model: Dynamics,
     data: Measurements,
     at: Iterate,
@@ -343,34 +543,16 @@ def fit_at(
     converged: bool,
     resolution: float,
 ) -> Fit:
-    """What is known of a fit whose iteration ended at parameters, states and noise.
-
-    Parameters
-    ----------
-    model, data
-        The model, and the measurements.
-    at
-        Where it ended.
-    noise, substeps, converged
-        See `Fit`.
-    resolution
-        Below which singular values tell nothing; see `siq.inference.kalman_filter.solve`.
-
-    Raises
-    ------
-    NumericalFailure
-        When what a parameter does to what is measured is not finite.
-    """
+    """What is known of a fit whose iteration ended at parameters, states and noise."""
     white = whiten(at.along, data, noise)
-    columns, innovations = Expectations.of(model).beside(
-        white.columns, white.innovations, at.values[list(model.free)]
-    )
+    expected = Expectations.of(model, at.values)
+    columns, innovations = expected.beside(white.columns, white.innovations)
     change, covariance = solve(columns, innovations, least=resolution)
     # The last change is below the errors. The likelihood is that of the states in hand, not of a forecast.
     total = float(innovations @ innovations)
     together = sum(len(each.roots) for each in model.expected_together)
     return Fit(
-        model=model.with_values(changed(at.values, model.free, change if converged else 0 * change)),
+        model=model.with_values(_changed(model, at.values, change if converged else 0 * change)),
         covariance=covariance,
         x=at.smoothed,
         linearised_at=at.x,
@@ -385,7 +567,7 @@ def fit_at(
     )
 
 
-def failed_fit(model: Dynamics, at: Iterate, noise: Noise, substeps: int, fault: str) -> Fit:
+def _failed_fit(model: Dynamics, at: Iterate, noise: Noise, substeps: int, fault: str) -> Fit:
     """A fit that has no result, and the reason; see `Fit.fault`."""
     free = len(model.free)
     return Fit(
@@ -403,14 +585,6 @@ def failed_fit(model: Dynamics, at: Iterate, noise: Noise, substeps: int, fault:
         converged=False,
         fault=fault,
     )
-
-
-SUBSTEP_ERROR = 3e-6  # of the spread of a state: far below what any sensor resolves
-SETTLED = 1e-4  # change of the innovations, squared and per sample, at which a fit has converged
-FINE = 1e-3  # the same of all innovations together, by the parameters: a thirtieth of a standard error
-STANDSTILL = 0.005  # change of the sum of squares over four steps, below which a fit moves to no avail
-PATIENCE = 6  # steps before that is asked
-RESTING = 1e-12  # of a state's domain, the least that its spread is taken for
 
 
 def fit_by_multiple_shooting(
@@ -461,13 +635,8 @@ def fit_by_multiple_shooting(
             substeps = substeps_needed(model, data, model.values, x, tolerance=SUBSTEP_ERROR)
         grid = Grid(data, substeps)
         begin = Iterate(model.values, x, linearise(model, grid, model.values, x), x)
-        if not begin.along.finite:
-            return failed_fit(model, begin, noise, substeps, RUNS_AWAY)
         shooting = Shooting(model, grid, _sizes(model, x), budget=budget)
-        try:
-            fit = _gauss_newton(shooting, begin, noise, estimate_process=estimate_process, most=iterations)
-        except (ArithmeticError, np.linalg.LinAlgError) as error:
-            return failed_fit(model, begin, noise, substeps, str(error))
+        fit = _gauss_newton(shooting, begin, noise, estimate_process=estimate_process, most=iterations)
     if not (fit.converged and fit.has_process_noise):
         return fit
     return fit_by_filter(
@@ -494,9 +663,9 @@ def fit_by_filter(
     Parameters
     ----------
     model, data, x, noise, estimate_process, substeps, iterations, budget
-        See there; random forces have to drive the states.
+        See there; process noise has to drive the states.
     estimate_sensor
-        Whether the noise of the sensors is estimated; if not, the random forces are as given, too.
+        Whether the noise of the sensors is estimated; if not, the process noise is as given, too.
     closure
         Whether the spread of what the filter knows acts on the mean of f (`siq.inference.kalman_filter`).
 
@@ -515,34 +684,37 @@ def fit_by_filter(
             model, Grid(data, substeps), _sizes(model, x), filtered=True, closed=closed, budget=budget
         )
         begin = Iterate(model.values, x, shooting.linearised(model.values, x, None, noise), x)
-        if not begin.along.finite:
-            return failed_fit(model, begin, noise, substeps, RUNS_AWAY)
-        try:
-            return _gauss_newton(shooting, begin, noise, estimate_process=estimate_process, most=iterations)
-        except (ArithmeticError, np.linalg.LinAlgError) as error:
-            return failed_fit(model, begin, noise, substeps, str(error))
+        return _gauss_newton(shooting, begin, noise, estimate_process=estimate_process, most=iterations)
 
 
 def _gauss_newton(
-    shooting: Shooting, now: Iterate, noise: Noise, *, estimate_process: bool, most: int
+    shooting: Shooting, begin: Iterate, noise: Noise, *, estimate_process: bool, most: int
 ) -> Fit:
-    data, expected = shooting.grid.data, Expectations.of(shooting.model)
+    """Gauss–Newton steps from a begin; what leads to no number is a fit with a fault."""
+    if not begin.along.finite:
+        return _failed_fit(shooting.model, begin, noise, shooting.grid.substeps, RUNS_AWAY)
+    try:
+        return _descended(shooting, begin, noise, estimate_process=estimate_process, most=most)
+    except (ArithmeticError, np.linalg.LinAlgError) as error:
+        return _failed_fit(shooting.model, begin, noise, shooting.grid.substeps, str(error))
+
+
+def _descended(shooting: Shooting, now: Iterate, noise: Noise, *, estimate_process: bool, most: int) -> Fit:
+    data, model = shooting.grid.data, shooting.model
     before: np.ndarray | None = None
     totals: list[float] = []
     converged, settled_noise, whole = False, False, False
     for iteration in range(most):
         noise = shooting.noise_at(now, noise)
+        expected = Expectations.of(model, now.values)
         if iteration in (0, 2) or settled_noise:
-            noise = noise_along(
-                now.along, data, noise, estimate_process,
-                priors=Priors(expected, now.values[list(shooting.model.free)]),
-                charge=shooting.charge, coarse=not settled_noise,
+            noise = _noise_along(
+                now.along, data, noise, estimate_process, expected=expected, charge=shooting.charge,
+                coarse=not settled_noise,
             )  # fmt: skip
         shooting.charge()
         white = whiten(now.along, data, noise)
-        columns, innovations = expected.beside(
-            white.columns, white.innovations, now.values[list(shooting.model.free)]
-        )
+        columns, innovations = expected.beside(white.columns, white.innovations)
         change, _ = solve(columns, innovations, least=shooting.resolution)
         explained = white.columns @ change
         left = white.innovations - explained
@@ -572,8 +744,8 @@ def _gauss_newton(
             break
         now, length = step
         whole = length == 1.0
-    return fit_at(
-        shooting.model, data, now, noise=noise, substeps=shooting.grid.substeps, converged=converged,
+    return _fit_at(
+        model, data, now, noise=noise, substeps=shooting.grid.substeps, converged=converged,
         resolution=shooting.resolution,
     )  # fmt: skip
 

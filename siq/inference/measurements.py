@@ -62,6 +62,18 @@ class Measurements:
         return np.setdiff1d(np.arange(len(self.t)), last, assume_unique=True)
 
     @property
+    def step(self) -> np.ndarray:
+        """Time from each sample to the next, shape ``(n,)``; zero behind the last."""
+        return np.append(np.diff(self.t), 0.0)
+
+    @property
+    def known_sensors(self) -> np.ndarray:
+        """Which outputs' noise is known, shape ``(m,)``."""
+        if self.sensor_noise is None:
+            return np.zeros(self.outputs.shape[1], dtype=bool)
+        return np.isfinite(self.sensor_noise)
+
+    @property
     def roughness(self) -> np.ndarray:
         """Variance of each output's measurement noise, from third differences, shape ``(m,)``.
 
@@ -325,24 +337,38 @@ def _filled(data: Measurements, column: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Expectations:
-    """What is expected of the free parameters of a model: combinations of them are normal, of unit width.
+    """What is expected of changes of the free parameters: combinations of them are normal, of unit width.
 
     Attributes
     ----------
     rows
         The combinations, shape ``(r, p)``.
-    middle
-        What is expected of each, shape ``(r,)``.
+    deviations
+        How far the values in hand fall short of what is expected of each, shape ``(r,)``.
     """
 
     rows: np.ndarray
-    middle: np.ndarray
+    deviations: np.ndarray
 
     @classmethod
-    def of(cls, model: Dynamics) -> Expectations:
-        """Those of a model's free parameters, each by itself, and of several together."""
+    def none(cls) -> Expectations:
+        """Of parameters of which nothing is expected."""
+        return cls(np.zeros((0, 0)), np.zeros(0))
+
+    @classmethod
+    def of(cls, model: Dynamics, values: np.ndarray | None = None) -> Expectations:
+        """Those of a model's free parameters, each by itself, and of several together.
+
+        Parameters
+        ----------
+        model
+            Says what is expected.
+        values
+            Of all parameters; by default the model's own.
+        """
+        now = (model.values if values is None else values)[list(model.free)]
         free = {model.parameters[place].name: column for column, place in enumerate(model.free)}
-        values = {each.name: each.value for each in model.parameters}
+        fixed = {each.name: each.value for each in model.parameters}
         rows, middle = [np.zeros((0, len(free)))], [np.zeros(0)]
         for column in free.values():
             expected = model.parameters[model.free[column]].expected
@@ -356,21 +382,16 @@ class Expectations:
                 rows.append(np.zeros((len(each.roots), len(free))))
                 roots = np.sqrt(each.weight) * each.roots
                 rows[-1][:, [free[each.names[place]] for place in mine]] = roots[:, mine]
-                known = [0.0 if name in free else values[name] for name in each.names]
+                known = [0.0 if name in free else fixed[name] for name in each.names]
                 middle.append(-roots @ np.array(known))
-        return cls(np.concatenate(rows), np.concatenate(middle))
+        together = np.concatenate(rows)
+        return cls(together, np.concatenate(middle) - together @ now)
 
-    def deviations(self, values: np.ndarray) -> np.ndarray:
-        """How far values ``(p,)`` of the free parameters fall short, in units of what may be, ``(r,)``."""
-        return self.middle - self.rows @ values
-
-    def beside(
-        self, columns: np.ndarray, innovations: np.ndarray, values: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def beside(self, columns: np.ndarray, innovations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Columns ``(n, p)`` and innovations ``(n,)`` with one row more for each expectation."""
         if not len(self.rows):
             return columns, innovations
-        return np.concatenate([columns, self.rows]), np.concatenate([innovations, self.deviations(values)])
+        return np.concatenate([columns, self.rows]), np.concatenate([innovations, self.deviations])
 
 
 def with_expectations(model: Dynamics) -> Dynamics:

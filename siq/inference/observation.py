@@ -1,15 +1,20 @@
 """The observation of states: measurement noise, integration time, hidden velocities.
 
-The first half of the states are positions, the other half their velocities. ``dx/dt = v`` holds by
-definition, and random forces act on velocities. What is sought is the force, ``dv/dt = f(x, v)``.
+A sample shows the state of a model with the noise of its sensor. It may be the mean of the state over an
+integration time before it, as of an exposed camera. Such means are correlated: a part of the same path may be
+in two of them. With the running mean as a state of its own, which begins anew with every exposure,
 
-A camera that is exposed shows no state, but the mean of the state over the exposure. Such means remember: a
-part of the same path may be in two of them. With the running mean as a state of its own, which begins anew
-with every exposure, the system is Markovian again, and a filter treats it like any other.
+    ``dm/dt = x/T``,
 
-An exposure that is shorter than the step begins between two samples, at an instant at which nothing is
-measured. Where it is longer, of several samples one is kept, so that no two exposures overlap: of how the
-state moves these tell nearly as much as all, as long as they are close beside the time in which it relaxes.
+the system is Markovian again. An exposure that is shorter than the step begins between two samples, at an
+instant at which nothing is measured. Where it is longer, of several samples one is kept, so that no two
+exposures overlap: of how the state moves these tell nearly as much as all, as long as they are close beside
+the time in which it relaxes.
+
+Or samples show positions, and the second half of the states are velocities of which they show nothing.
+``dx/dt = v`` holds by definition, process noise acts on velocities, and what is sought is the force in
+``dv/dt = f(x, v)``. Differences of positions are no velocities: the noise of the sensor is divided by the
+step in them, and what they leave is coloured.
 """
 
 from __future__ import annotations
@@ -23,17 +28,18 @@ import sympy
 from siq.data.recordings import Recordings
 from siq.data.stationarity import runs_of, usual_step
 from siq.errors import NumericalFailure
-from siq.inference.field_estimate import IdentifiedField, field_dynamics
+from siq.inference.field_estimate import FieldEstimate, field_dynamics
 from siq.inference.kalman_filter import Noise
 from siq.inference.library import CandidateLibrary
 from siq.inference.maximum_likelihood import Fit, fit_by_filter
 from siq.inference.measurements import Measurements
-from siq.inference.state_dependent_diffusion import formula_noise
+from siq.inference.selection import all_coefficients
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, symbol
 
-FIRST = 0.01  # of what positions move by: a force to begin with; the search goes up and down from it
-LEAST_SAMPLES = 20  # of a recording, by which its first velocity is told beside its noise
+FIRST_FORCE = 0.01  # of what positions move by: a force to begin with; the search goes up and down from it
+MIN_SAMPLES = 20  # of a recording, by which its first velocity is determined beside its noise
+INSTANT_TOLERANCE = 1e-6  # of an exposure: what rounding leaves between two instants
 
 
 def velocity_names(positions: Sequence[str]) -> tuple[str, ...]:
@@ -51,39 +57,6 @@ def velocity_names(positions: Sequence[str]) -> tuple[str, ...]:
             " 'hidden_velocities' out if the velocities are recorded, or rename the column"
         )
     return names
-
-
-def definitions(library: CandidateLibrary) -> np.ndarray:
-    """Component and term of each ``dx/dt = v``, shape ``(d/2, 2)``."""
-    half = library.dimension // 2
-    return np.array([(i, library.terms.index(library.symbols[half + i])) for i in range(half)])
-
-
-def with_definitions(
-    library: CandidateLibrary, support: np.ndarray, values: np.ndarray, covariance: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Terms of the forces with those of ``dx/dt = v`` before them, whose coefficients are exactly 1.
-
-    Parameters
-    ----------
-    library
-        Of positions and velocities.
-    support, values, covariance
-        Of the forces: shapes ``(p, 2)``, ``(p,)`` and ``(p, p)``.
-    """
-    known = definitions(library)
-    count = len(known)
-    whole = np.zeros((count + len(values),) * 2)
-    whole[count:, count:] = covariance
-    return np.concatenate([known, support]), np.concatenate([np.ones(count), values]), whole
-
-
-def without_definitions(
-    library: CandidateLibrary, support: np.ndarray, values: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """The terms of the forces alone."""
-    force = support[:, 0] >= library.dimension // 2
-    return support[force], values[force]
 
 
 def seen_positions(plain: Dynamics) -> Dynamics:
@@ -110,35 +83,15 @@ def force_noise(sensor: np.ndarray, rate: np.ndarray) -> Noise:
     return Noise(sensor, process, shape[None])
 
 
-def force_diffusion(rate: np.ndarray) -> tuple[Diffusion, float]:
-    """D and ε of forces that noise drives: the part of D that acts on velocities has the determinant 1.
-
-    Without noise it is the unit matrix there, and ε is zero.
-
-    Parameters
-    ----------
-    rate
-        What noise adds to the covariance of the velocities in a unit of time, shape ``(d/2, d/2)``.
-    """
-    half = len(rate)
-    forced = bool(rate.any())
-    intensity = float(np.exp(np.linalg.slogdet(rate)[1] / half)) if forced else 0.0
-    matrix = np.zeros((2 * half, 2 * half))
-    matrix[half:, half:] = (rate + rate.T) / 2 / intensity if forced else np.eye(half)
-    return Diffusion(matrix), intensity
-
-
 def smoothed_motion(data: Measurements, names: Sequence[str]) -> tuple[np.ndarray, Noise]:
     """Positions and velocities to begin with, and both noises, when nothing but noise drives the velocities.
 
-    That model is linear: its smoother is a spline through the measured positions whose stiffness the
-    likelihood tells, and no start matters.
+    That model is linear: its smoother is a spline through the measured positions whose stiffness follows from
+    the likelihood, and no start matters.
 
     Parameters
     ----------
-    data
-        Of positions.
-    names
+    data, names
         Of positions.
 
     Returns
@@ -151,20 +104,18 @@ def smoothed_motion(data: Measurements, names: Sequence[str]) -> tuple[np.ndarra
     NumericalFailure
         Where recordings are too short for it, or its likelihood cannot be worked out.
     """
-    if np.diff(data.first).min() < LEAST_SAMPLES:
+    if np.diff(data.first).min() < MIN_SAMPLES:
         raise NumericalFailure(
-            f"a recording has fewer than {LEAST_SAMPLES} samples, by which its velocity is not told; leave it"
+            f"a recording has fewer than {MIN_SAMPLES} samples, which do not determine its velocity; leave it"
             " out"
         )
-    half = len(names)
     states = (*names, *velocity_names(names))
-    free = seen_positions(Dynamics(states, (sympy.S.Zero,) * (2 * half), Diffusion.identity(2 * half)))
+    free = seen_positions(Dynamics(states, (sympy.S.Zero,) * len(states), Diffusion.identity(len(states))))
     begins = data.begins
-    rate = (data.outputs[begins + 1] - data.outputs[begins]) / np.diff(data.t)[begins, None]
+    rate = (data.outputs[begins + 1] - data.outputs[begins]) / data.step[begins, None]
     velocity = np.zeros_like(data.outputs)
     velocity[begins] = rate
-    step = float(np.median(np.diff(data.t)[begins]))
-    begin = FIRST * (rate**2).mean(axis=0) / step
+    begin = FIRST_FORCE * (rate**2).mean(axis=0) / float(np.median(data.step[begins]))
     fit = fit_by_filter(
         free, data, x=np.concatenate([data.outputs, velocity], axis=1),
         noise=force_noise(data.with_known_noise(data.roughness), np.diag(begin)), closure=False,
@@ -174,71 +125,9 @@ def smoothed_motion(data: Measurements, names: Sequence[str]) -> tuple[np.ndarra
     return fit.x, fit.noise
 
 
-SAME = 1e-6  # of an exposure: what rounding leaves between two instants
-
-
-def kept_samples(step: float, exposure: float) -> int:
-    """Of how many samples one is kept, so that exposures do not overlap."""
-    return max(int(np.ceil(exposure / step * (1 - SAME))), 1)
-
-
-def exposed(model: Dynamics, exposure: float) -> Dynamics:
-    """The same dynamics, of which each sample is the mean over the exposure before it.
-
-    Parameters
-    ----------
-    model
-        Of d states, all of them measured.
-    exposure
-        Its length, in the unit of time.
-
-    Returns
-    -------
-    Dynamics
-        Of 2d states: the d states, and their running means, which are what is measured.
-    """
-    names = [f"_mean_{name}" for name in model.states]
-    return Dynamics(
-        states=(*model.states, *names),
-        equations=(*model.equations, *(each / exposure for each in model.symbols)),
-        diffusion=Diffusion(np.eye(2 * model.dimension)),
-        parameters=model.parameters,
-        outputs=tuple((name, symbol(mean)) for (name, _), mean in zip(model.outputs, names, strict=True)),
-    )
-
-
-def exposed_measurements(data: Measurements, dimension: int, exposure: float) -> Measurements:
-    """The same measurements, with running means that begin anew where an exposure does.
-
-    Where that is between two samples a row without any measured value stands there.
-    """
-    restarting = tuple(range(dimension, 2 * dimension))
-    ends = data.begins + 1
-    start = data.t[ends] - exposure
-    inside = start > data.t[ends - 1] + SAME * exposure
-    at, before = ends[inside], np.searchsorted(ends[inside], data.first)
-    return replace(
-        data,
-        first=data.first + before,
-        t=np.insert(data.t, at, start[inside]),
-        outputs=np.insert(data.outputs, at, np.nan, axis=0),
-        restarting=restarting,
-    )
-
-
-def exposed_noise(noise: Noise, dimension: int) -> Noise:
-    """The same noise, of which nothing drives the running means."""
-    process = np.concatenate([noise.process, np.zeros(dimension)])
-    shape = None
-    if noise.shape is not None and noise.field is None:
-        shape = np.eye(2 * dimension)[None].copy()
-        shape[0, :dimension, :dimension] = noise.shape[0]
-    return Noise(noise.measurement, process, shape, noise.field)
-
-
 @dataclass(frozen=True)
-class View:
-    """How samples show the states: as they are, or as means over an exposure before them.
+class ObservationModel:
+    """How samples show the states of f.
 
     Attributes
     ----------
@@ -247,98 +136,174 @@ class View:
     exposure
         The time over which a sample is a mean, None where it is none.
     hidden
-        Whether the second half of the states are velocities, of which samples show nothing
-        (`siq.inference.observation`).
+        Whether the second half of the states are velocities, of which samples show nothing.
     """
 
     library: CandidateLibrary
     diffusion: Diffusion
-    exposure: float | None
+    exposure: float | None = None
     hidden: bool = False
+
+    @classmethod
+    def of(cls, found: FieldEstimate) -> ObservationModel:
+        """The one that an estimate was made with."""
+        return cls(found.library, found.diffusion, found.exposure, found.hidden_velocities)
+
+    @property
+    def measured_states(self) -> int:
+        """How many states are measured."""
+        return self.library.dimension // 2 if self.hidden else self.library.dimension
 
     @property
     def everything(self) -> np.ndarray:
         """Component and term of every coefficient that is not known beforehand, shape ``(p, 2)``."""
         d = self.library.dimension
-        return np.array(
-            [(i, k) for i in range(d // 2 if self.hidden else 0, d) for k in range(self.library.size)]
-        )
+        return all_coefficients(range(d // 2 if self.hidden else 0, d), self.library.size)
 
-    def unknown(self, found: IdentifiedField) -> tuple[np.ndarray, np.ndarray]:
-        """The terms of an identified f that are fitted, and their coefficients."""
-        if not self.hidden:
-            return found.support, found.values
-        return without_definitions(self.library, found.support, found.values)
+    @property
+    def definitions(self) -> np.ndarray:
+        """Component and term of each ``dx/dt = v``, shape ``(d/2, 2)``; none where nothing is hidden."""
+        half = self.library.dimension // 2 if self.hidden else 0
+        velocities = [self.library.terms.index(self.library.symbols[half + i]) for i in range(half)]
+        return np.array(list(enumerate(velocities)), dtype=int).reshape(-1, 2)
+
+    def unknown(self, found: FieldEstimate) -> tuple[np.ndarray, np.ndarray]:
+        """The terms of an estimated f that are fitted, and their coefficients."""
+        fitted = found.support[:, 0] >= (self.library.dimension // 2 if self.hidden else 0)
+        return found.support[fitted], found.values[fitted]
 
     def model(self, support: np.ndarray, values: np.ndarray) -> Dynamics:
         """Dynamics with the coefficients of a support as parameters, as they are measured."""
         plain = field_dynamics(self.library, support, values, diffusion=self.diffusion)
         if self.hidden:
             return seen_positions(plain)
-        return plain if self.exposure is None else exposed(plain, self.exposure)
+        if self.exposure is None:
+            return plain
+        # The states, and their running means, which are what is measured.
+        names = [f"_mean_{name}" for name in plain.states]
+        return Dynamics(
+            states=(*plain.states, *names),
+            equations=(*plain.equations, *(each / self.exposure for each in plain.symbols)),
+            diffusion=Diffusion(np.eye(2 * plain.dimension)),
+            parameters=plain.parameters,
+            outputs=tuple((name, symbol(mean)) for (name, _), mean in zip(plain.outputs, names, strict=True)),
+        )
 
     def measured(self, recordings: Recordings, pair_step: float | None) -> Measurements:
-        """The recordings as measurements, a new one behind every gap."""
+        """The recordings as measurements, a new one behind every gap.
+
+        Running means begin anew where an exposure does. Where that is between two samples a row without any
+        measured value stands there.
+        """
         data = unbroken(recordings, pair_step=pair_step, every=self.every(recordings))
         if self.exposure is None:
             return data
-        return exposed_measurements(data, self.library.dimension, self.exposure)
+        d = self.library.dimension
+        ends = data.begins + 1
+        start = data.t[ends] - self.exposure
+        inside = start > data.t[ends - 1] + INSTANT_TOLERANCE * self.exposure
+        at, before = ends[inside], np.searchsorted(ends[inside], data.first)
+        return replace(
+            data,
+            first=data.first + before,
+            t=np.insert(data.t, at, start[inside]),
+            outputs=np.insert(data.outputs, at, np.nan, axis=0),
+            restarting=tuple(range(d, 2 * d)),
+        )
 
     def every(self, recordings: Recordings) -> int:
-        """Of how many samples one is kept."""
-        return 1 if self.exposure is None else kept_samples(usual_step(recordings), self.exposure)
+        """Of how many samples one is kept, so that exposures do not overlap."""
+        if self.exposure is None:
+            return 1
+        steps = self.exposure / usual_step(recordings)
+        return max(int(np.ceil(steps * (1 - INSTANT_TOLERANCE))), 1)
 
     def noise(self, noise: Noise) -> Noise:
-        """The noise of the states, as it drives the model."""
-        return noise if self.exposure is None else exposed_noise(noise, self.library.dimension)
+        """The noise of the states, as it drives the model: nothing drives running means."""
+        if self.exposure is None:
+            return noise
+        d, shape = self.library.dimension, None
+        if noise.shape is not None and noise.field is None:
+            shape = np.eye(2 * d)[None].copy()
+            shape[0, :d, :d] = noise.shape[0]
+        return Noise(noise.measurement, np.concatenate([noise.process, np.zeros(d)]), shape, noise.field)
+
+    def noise_of(self, found: FieldEstimate) -> Noise:
+        """Both noises of an estimate, as they are in the model."""
+        assert found.diagnosis is not None
+        sensor, rate, half = found.diagnosis.measurement**2, found.noise_rate, self.measured_states
+        if found.noise is not None:
+            noise = Noise(sensor, np.ones(len(rate)), field=found.noise.diffusion(1.0))
+        elif self.hidden:
+            noise = force_noise(sensor, rate[half:, half:])
+        elif not rate.any():
+            noise = Noise(sensor, np.zeros(len(rate)))
+        else:
+            size = np.sqrt(np.diag(rate))
+            noise = Noise(sensor, np.diag(rate).copy(), (rate / np.outer(size, size))[None])
+        return self.noise(noise)
 
     def states(self, data: Measurements) -> np.ndarray:
         """States of the model to begin with, as they are measured next."""
-        unknown = np.isnan(data.outputs).any(axis=1)
-        rows = np.arange(len(unknown))
-        values = data.outputs[rows + unknown]  # never two in a row, nor at an end
         if self.hidden:
-            return smoothed_motion(data, self.library.states[: self.library.dimension // 2])[0]
+            return smoothed_motion(data, self.library.states[: self.measured_states])[0]
+        unknown = np.isnan(data.outputs).any(axis=1)
+        values = data.outputs[np.arange(len(unknown)) + unknown]  # never two in a row, nor at an end
         return values if self.exposure is None else np.column_stack([values, values])
 
+    def fitted(
+        self, support: np.ndarray, values: np.ndarray, data: Measurements, *, noise: Noise, x: np.ndarray
+    ) -> Fit:
+        """The fit of some terms, beginning with their values, states and noise.
 
-def noise_of(found: IdentifiedField, sensor: np.ndarray) -> Noise:
-    """Both noises of an identified f, with the variance of each state's sensor."""
-    if found.noise is not None:
-        return formula_noise(found.noise, sensor)
-    rate, half = found.noise_rate, len(sensor)
-    if half < len(rate):
-        return force_noise(sensor, rate[half:, half:])
-    if not rate.any():
-        return Noise(sensor, np.zeros(len(rate)))
-    size = np.sqrt(np.diag(rate))
-    return Noise(sensor, np.diag(rate).copy(), (rate / np.outer(size, size))[None])
+        Raises
+        ------
+        NumericalFailure
+            When it does not settle.
+        """
+        return settled(fit_by_filter(self.model(support, values), data, x=x, noise=noise))
 
 
-def settled(
-    view: View,
-    support: np.ndarray,
-    data: Measurements,
-    noise: Noise,
-    *,
-    values: np.ndarray,
-    x: np.ndarray,
-) -> Fit:
-    """The fit of some terms.
+def settled(fit: Fit) -> Fit:
+    """A fit of f and its noise that has converged.
 
     Raises
     ------
     NumericalFailure
-        When it does not settle.
+        When it has not.
     """
-    fit = fit_by_filter(view.model(support, values), data, x=x, noise=noise)
     if not fit.converged:
         raise NumericalFailure(
-            "the fit of f beside sensor noise does not settle"
+            "the fit of f with measurement noise does not settle"
             + (f": {fit.fault}" if fit.fault else "")
             + "; record more, or sample more often"
         )
     return fit
+
+
+def moved_by(data: Measurements) -> tuple[np.ndarray, float]:
+    """Mean square of what each output moves by from a measured sample to the next, and the mean time.
+
+    Raises
+    ------
+    NumericalFailure
+        Where no sample has a next one.
+    """
+    measured = np.flatnonzero(~np.isnan(data.outputs).all(axis=1))
+    before, after = measured[:-1], measured[1:]
+    same = data.recording[before] == data.recording[after]
+    before, after = before[same], after[same]
+    if not len(before):
+        raise NumericalFailure(
+            "no two samples are so near in time that one tells of the other; record longer"
+        )
+    moved = ((data.outputs[after] - data.outputs[before]) ** 2).mean(axis=0)
+    return moved, float((data.t[after] - data.t[before]).mean())
+
+
+def kept_rows(recordings: Recordings, *, pair_step: float | None, every: int = 1) -> list[np.ndarray]:
+    """The rows of each stretch without a gap, of every so many one; see `unbroken`."""
+    return [np.arange(run.start, run.stop, every) for run in runs_of(recordings, longest=pair_step)]
 
 
 def unbroken(recordings: Recordings, *, pair_step: float | None = None, every: int = 1) -> Measurements:
@@ -362,8 +327,3 @@ def unbroken(recordings: Recordings, *, pair_step: float | None = None, every: i
         outputs=np.ascontiguousarray(recordings.values[rows]),
         courses=((),) * len(runs),
     )
-
-
-def kept_rows(recordings: Recordings, *, pair_step: float | None, every: int) -> list[np.ndarray]:
-    """The rows of each stretch without a gap, of every so many one; see `unbroken`."""
-    return [np.arange(run.start, run.stop, every) for run in runs_of(recordings, longest=pair_step)]

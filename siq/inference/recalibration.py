@@ -1,16 +1,15 @@
-"""Recalibration: parameters with and without process noise, and what its uncertainty leaves open.
+"""Recalibration: parameters with and without process noise, and what its uncertainty adds to their errors.
 
-A filter that took a sensor for noisier than it is follows the recordings less, and takes f at other states.
-The coefficients of f depend on the noise, and the noise is an estimate.
-
-Forty samples seldom prove random forces, and a fit without them has errors that are right only if there are
-none. What the recordings do not rule out belongs to the errors: they are averaged over all strengths of the
-random forces, each with its likelihood, and so is how the parameters would change.
+A filter that took a sensor for noisier than it is follows the recordings less, and takes f at other states:
+the coefficients of f depend on the noise, and the noise is an estimate. Forty samples seldom prove process
+noise, and a fit without it has errors that are right only if there is none. What the recordings do not rule
+out belongs to the errors: they are averaged over all strengths of the process noise, each with its
+likelihood, and so is how the parameters would change.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import scipy.stats
@@ -25,41 +24,41 @@ from siq.inference.kalman_filter import (
     whiten,
     with_parameters_changed,
 )
-from siq.inference.maximum_likelihood import Fit, fit_by_multiple_shooting
+from siq.inference.maximum_likelihood import (
+    Fit,
+    NoiseCoordinates,
+    first_noise,
+    fit_by_multiple_shooting,
+    log_likelihood,
+)
 from siq.inference.measurements import Measurements, first_states
-from siq.inference.noise import first_noise, log_likelihood, noise_coordinates
 from siq.inference.trajectories import EDGE_SUBSTEPS, fit_trajectories, jumps_of, run, sharpened, spread_edges
 from siq.systems.dynamics import Dynamics
 
-STEP = 0.05  # numerical: of the logarithm of a variance, for differences of the likelihood
-UNKNOWN = (
-    1.0  # standard error of a logarithm beyond which the likelihood is no parabola: the bound is far off
+LOGARITHM_STEP = 0.05  # numerical: of the logarithm of a variance, for differences of the likelihood
+MAX_ERROR = (
+    1.0  # standard error of a logarithm beyond which the likelihood is no parabola: a bound is far off
 )
+DECADES = 14  # of strengths that are looked through, downwards from noise that would make all of the motion
+POINTS = 16  # of the average
+UNLIKELY = 8.0  # logarithm of a likelihood, relative to the largest, that adds nothing to an average
+THRESHOLD = 1e-4  # probability by chance, below which process noise is believed
+FAINT = 1e-4  # process noise, relative to the motion, from which a fit without any is loosened
+BETTER = 0.5  # of a log-likelihood: what half a parameter gains by chance, below which two fits are one
 
 
-@dataclass(frozen=True)
-class NoiseUncertainty:
-    """Errors of a noise, and of the parameters with it.
+def noise_uncertainty(fit: Fit, data: Measurements) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Errors of the noise of a fit, by the curvature of the likelihood along its trajectories.
 
-    Attributes
-    ----------
-    measurement
-        Standard errors of the logarithms of the sensors' variances, shape ``(m,)``; infinite where a
-        variance is only bounded from above, zero where it was given.
-    process
-        The same of the random forces' intensities, shape ``(d,)``.
+    Returns
+    -------
+    measurement, process
+        Standard errors of the logarithms of the sensors' variances ``(m,)``, and of the intensities of the
+        process noise ``(d,)``: infinite where one is only bounded from above, zero where it was given.
     covariance
         Of the free parameters, with what the noise leaves open in them, shape ``(p, p)``.
     """
-
-    measurement: np.ndarray
-    process: np.ndarray
-    covariance: np.ndarray
-
-
-def noise_uncertainty(fit: Fit, data: Measurements) -> NoiseUncertainty:
-    """Errors of the noise of a fit, by the curvature of the likelihood along its trajectories."""
-    coordinates = noise_coordinates(data, fit.noise)
+    coordinates = NoiseCoordinates(fit.noise, data.known_sensors)
     line = fit.linearisation
     white = whiten(line, data, fit.noise)
     still = with_parameters_changed(line, solve(white.columns, white.innovations)[0])
@@ -75,7 +74,7 @@ def noise_uncertainty(fit: Fit, data: Measurements) -> NoiseUncertainty:
     def value(*changes: tuple[int, float]) -> float:
         return log_likelihood(still, data, moved(*changes))
 
-    middle, h = value(), STEP
+    middle, h = value(), LOGARITHM_STEP
     single = {k: (value((k, h)), value((k, -h))) for k in places}
     curvature = np.diag([(2 * middle - single[k][0] - single[k][1]) / h**2 for k in places])
     for row, one in enumerate(places):
@@ -83,7 +82,7 @@ def noise_uncertainty(fit: Fit, data: Measurements) -> NoiseUncertainty:
             both = value((one, h), (other, h)) + value((one, -h), (other, -h))
             apart = value((one, h), (other, -h)) + value((one, -h), (other, h))
             curvature[row, column] = curvature[column, row] = (apart - both) / (4 * h**2)
-    told = np.diag(curvature) > 1 / UNKNOWN**2
+    told = np.diag(curvature) > 1 / MAX_ERROR**2
     errors = np.full(coordinates.size, np.inf)
     errors[:outputs][coordinates.known] = 0.0
     inside = [place for place, known in zip(places, told, strict=True) if known]
@@ -103,20 +102,15 @@ def noise_uncertainty(fit: Fit, data: Measurements) -> NoiseUncertainty:
     driven = coordinates.driven
     process = np.zeros_like(fit.noise.process)
     process[driven] = errors[outputs : outputs + len(driven)]
-    return NoiseUncertainty(errors[:outputs], process, covariance)
-
-
-DECADES = 14  # of strengths that are looked through, downwards from forces that would make all of the motion
-POINTS = 16  # of the average
-UNLIKELY = 8.0  # logarithm of a likelihood, relative to the largest, that adds nothing to an average
+    return errors[:outputs], process, covariance
 
 
 def covariance_with_unknown_forces(
     fit: Fit, data: Measurements, *, budget: Budget | None = None
 ) -> np.ndarray:
-    """Covariance of the free parameters of a fit, shape ``(p, p)``, whatever the strength of random forces.
+    """Covariance of the free parameters of a fit, shape ``(p, p)``, whatever the strength of process noise.
 
-    The strength is one factor on the random forces of the fit; on such as would make the motion of each state
+    The strength is one factor on the process noise of the fit; on such as would make the motion of each state
     where it has none. Beforehand every standard deviation of them is as probable (Gelman 2006, Bayesian
     Analysis 1, 515); the scale of all noise and the parameters are integrated out as linear. A fit without
     random forces is made once more with those of the average, since its trajectories may be far from those
@@ -135,7 +129,9 @@ def covariance_with_unknown_forces(
         return fit.covariance
     if fit.has_process_noise:
         return _average(fit, data, fit.noise.process, budget)[0]
-    process = forces_of_the_motion(fit, data)
+    rows = data.begins
+    process = np.mean((fit.x[rows + 1] - fit.x[rows]) ** 2 / data.step[rows, None], axis=0)
+    process = np.where(fit.model.kinematic, 0.0, process)
     if not (process > 0).any():
         return fit.covariance
     covariance, size = _average(fit, data, process, budget)
@@ -150,25 +146,16 @@ def covariance_with_unknown_forces(
     return _average(forced, data, forced.noise.process, budget)[0] + np.outer(apart, apart)
 
 
-@dataclass(frozen=True)
-class _Strength:
-    """What follows from one strength of random forces: its log-likelihood, change and covariance of θ."""
-
-    size: float
-    value: float
-    change: np.ndarray
-    covariance: np.ndarray
-
-
 def _average(
     fit: Fit, data: Measurements, process: np.ndarray, budget: Budget | None
 ) -> tuple[np.ndarray, float]:
-    """Covariance averaged over factors on the standard deviation of forces; and the mean of that factor."""
+    """Covariance averaged over factors on the standard deviation of a noise; and the mean of that factor."""
     known = data.sensor_noise is not None and bool(np.isfinite(data.sensor_noise).all())
     units = np.sqrt(np.diag(fit.covariance))
     units = np.where(units > 0, units, 1.0)
 
-    def at(size: float) -> _Strength | None:
+    def at(size: float) -> tuple[float, np.ndarray, np.ndarray] | None:
+        """Log-likelihood, change and covariance of the parameters for a factor."""
         if budget is not None:
             budget.charge(evaluation(fit.model, data))
         try:
@@ -185,35 +172,24 @@ def _average(
         value = profile_likelihood(total, freedom, white.log_determinant)
         if known:
             value = -0.5 * (total + white.log_determinant)
-        return _Strength(size, value + (0.5 * volume if sign > 0 else 0.0), change, covariance)
+        return value + (0.5 * volume if sign > 0 else 0.0), change, covariance
 
-    # Of forces that are estimated the strength is about one, and of others anywhere below.
+    # Of noise that is estimated the strength is about one, and of other noise anywhere below.
     sizes = np.concatenate([[0.0], 10.0 ** (np.arange(-DECADES, 5) / 2)])
-    coarse = np.array([-np.inf if (one := at(size)) is None else one.value for size in sizes])
+    coarse = np.array([-np.inf if (one := at(size)) is None else one[0] for size in sizes])
     if not np.isfinite(coarse).any():
         return fit.covariance, 0.0
     likely = np.flatnonzero(coarse > coarse.max() - UNLIKELY)
     lowest, highest = sizes[max(likely[0] - 1, 0)], sizes[min(likely[-1] + 1, len(sizes) - 1)]
-    found = [one for size in np.linspace(lowest, highest, POINTS) if (one := at(size)) is not None]
+    found = [(size, *one) for size in np.linspace(lowest, highest, POINTS) if (one := at(size)) is not None]
     if not found:
         return fit.covariance, 0.0
-    weights = np.exp(np.array([one.value for one in found]) - max(one.value for one in found))
+    weights = np.exp(np.array([one[1] for one in found]) - max(one[1] for one in found))
     weights /= weights.sum()
     covariance = np.zeros_like(fit.covariance)
-    for weight, one in zip(weights, found, strict=True):
-        covariance += weight * (one.covariance + np.outer(one.change, one.change))
-    return covariance, float(weights @ [one.size for one in found])
-
-
-def forces_of_the_motion(fit: Fit, data: Measurements) -> np.ndarray:
-    """Intensities of random forces that would make the motion of states they can drive, shape ``(d,)``."""
-    rows = data.begins
-    step = (data.t[rows + 1] - data.t[rows])[:, None]
-    process = np.mean((fit.x[rows + 1] - fit.x[rows]) ** 2 / step, axis=0)
-    return np.where(fit.model.kinematic, 0.0, process)
-
-
-THRESHOLD = 1e-4  # probability by chance, below which random forces are believed
+    for weight, (_, _, change, own) in zip(weights, found, strict=True):
+        covariance += weight * (own + np.outer(change, change))
+    return covariance, float(weights @ [one[0] for one in found])
 
 
 def fit_with_process_noise_as_needed(
@@ -227,7 +203,7 @@ def fit_with_process_noise_as_needed(
 ) -> Fit:
     """Fit with process noise estimated, and without; the simpler unless the data speak against it.
 
-    A jump that is spread too far leaves errors which random forces stand in for. Before they are believed the
+    A jump that is spread too far leaves errors which process noise stands in for. Before that is believed the
     jumps of the fit without them are followed more finely.
     """
     loose, strict = fit_with_and_without_process_noise(model, data, begin, level=level, x=x, budget=budget)
@@ -289,14 +265,9 @@ def fit_with_and_without_process_noise(
         loose = begin
     elif noise.process.any():
         loose = fit_by_multiple_shooting(
-            model,
-            data,
-            x=states,
-            noise=noise.scaled(max(level, 1e-6)),
-            estimate_process=True,
-            substeps=substeps,
-            budget=budget,
-        )
+            model, data, x=states, noise=noise.scaled(max(level, 1e-6)), estimate_process=True,
+            substeps=substeps, budget=budget,
+        )  # fmt: skip
     start = loose if loose is not None and loose.converged else None
     begun = model if start is None else start.model
     x, still = (states, noise) if start is None else (start.x, start.noise)
@@ -308,29 +279,25 @@ def fit_with_and_without_process_noise(
         )  # fmt: skip
 
     def as_trajectories() -> Fit:
-        # Where random forces led to nothing better, they led away.
+        # Where process noise led to nothing better, it led away.
         better = start is not None or (loose is not None and loose.log_likelihood > begin.log_likelihood)
         of = loose if loose is not None and better else None
         return fit_trajectories(
-            model if of is None else of.model,
-            data,
-            begin=(states if of is None else of.x)[data.first[:-1]],
-            noise=noise if of is None else of.noise,
-            substeps=substeps,
-            budget=budget,
-        )
+            model if of is None else of.model, data, begin=(states if of is None else of.x)[data.first[:-1]],
+            noise=noise if of is None else of.noise, substeps=substeps, budget=budget,
+        )  # fmt: skip
 
     # Where f jumps, steps of all samples at once go to and fro.
     ways = (as_trajectories, at_all_samples) if jumps_of(model) else (at_all_samples, as_trajectories)
     strict = ways[0]()
     if not strict.converged:
-        strict = better_of(strict, ways[1]())
-    vanished = None if start is None else without_idle_forces(start, data)
-    return loose, strict if vanished is None else better_of(vanished, strict)
+        strict = preferred_fit(strict, ways[1]())
+    vanished = None if start is None else drop_insignificant_process_noise(start, data)
+    return loose, strict if vanished is None else preferred_fit(vanished, strict)
 
 
-def without_idle_forces(fit: Fit, data: Measurements) -> Fit | None:
-    """A fit without its random forces, where these do nothing in it; None where they do something.
+def drop_insignificant_process_noise(fit: Fit, data: Measurements) -> Fit | None:
+    """A fit without its process noise, where that does nothing in it; None where it does something.
 
     Their intensities may have gone towards zero. The fit without them has then been found already, and may be
     likelier than the one that another way of fitting ends in.
@@ -343,7 +310,7 @@ def without_idle_forces(fit: Fit, data: Measurements) -> Fit | None:
     return replace(fit, noise=still, log_likelihood=fit.log_likelihood - (with_them - alone))
 
 
-def better_of(one: Fit, other: Fit) -> Fit:
+def preferred_fit(one: Fit, other: Fit) -> Fit:
     """The one that settled, and of two that did not the likelier."""
     if one.converged != other.converged:
         return one if one.converged else other
@@ -358,13 +325,9 @@ def process_noise_needed(loose: Fit, strict: Fit) -> bool:
 
 
 def least_to_believe(noise: Noise) -> float:
-    """Twice the increase of the log-likelihood from which on random forces are believed."""
+    """Twice the increase of the log-likelihood from which on process noise is believed."""
     driven = int((noise.process > 0).sum())
     return float(scipy.stats.chi2.isf(2 * THRESHOLD, driven)) if driven else np.inf
-
-
-FAINT = 1e-4  # process noise, relative to the motion, from which a fit without any is loosened
-BETTER = 0.5  # of a log-likelihood: what half a parameter gains by chance, below which two fits are one
 
 
 def recalibrate(model: Dynamics, data: Measurements, *, budget: Budget | None = None) -> tuple[Fit, Fit]:
@@ -381,7 +344,19 @@ def recalibrate(model: Dynamics, data: Measurements, *, budget: Budget | None = 
     x = first_states(model, data)
     noise = first_noise(model, data, x)
     loose = fit_by_multiple_shooting(model, data, x=x, noise=noise, estimate_process=True, budget=budget)
-    own = fit_from_card(model, data, x=x, noise=noise, substeps=max(loose.substeps, 1), budget=budget)
+    # Without process noise, beginning along the simulation as the card has it.
+    begin, substeps = x[data.first[:-1]], max(loose.substeps, 1)
+    followed = run(model, Grid(data, substeps), begin)
+    own = fit_by_multiple_shooting(
+        model, data, x=np.where(np.isfinite(followed), followed, x), noise=noise.without_process(),
+        estimate_process=False, budget=budget,
+    )  # fmt: skip
+    if not own.converged:
+        # Steps at all samples at once may lead anywhere, from where a search could explain nothing. Damped
+        # steps of whole trajectories never make a fit worse than the card's own simulation is.
+        own = preferred_fit(
+            own, fit_trajectories(model, data, begin=begin, noise=noise, substeps=substeps, budget=budget)
+        )
     known: Fit | None = None
     if loose.converged:
         known, strict = fit_with_and_without_process_noise(
@@ -389,7 +364,7 @@ def recalibrate(model: Dynamics, data: Measurements, *, budget: Budget | None = 
         )
         if not (own.converged and own.log_likelihood > strict.log_likelihood + BETTER):
             return simpler_fit(known, strict), strict
-    # Where random forces on a hidden state could explain anything, the fit has no end, or one far off. The
+    # Where process noise on a hidden state could explain anything, the fit has no end, or one far off. The
     # card's own simulation is then the better start.
     strict = own
     if not strict.converged:
@@ -398,55 +373,12 @@ def recalibrate(model: Dynamics, data: Measurements, *, budget: Budget | None = 
         return loose, strict
     small = Noise(strict.noise.measurement, noise.process * FAINT)
     again = fit_by_multiple_shooting(
-        strict.model,
-        data,
-        x=strict.x,
-        noise=small,
-        estimate_process=True,
-        substeps=strict.substeps,
+        strict.model, data, x=strict.x, noise=small, estimate_process=True, substeps=strict.substeps,
         budget=budget,
-    )
+    )  # fmt: skip
     if again.converged:
-        idle = without_idle_forces(again, data)
-        strict = strict if idle is None else better_of(idle, strict)
+        idle = drop_insignificant_process_noise(again, data)
+        strict = strict if idle is None else preferred_fit(idle, strict)
     loosened = [each for each in (known, again) if each is not None and each.converged]
     best = max(loosened, key=lambda each: each.log_likelihood, default=None)
     return simpler_fit(best, strict), strict
-
-
-def fit_from_card(
-    model: Dynamics,
-    data: Measurements,
-    *,
-    x: np.ndarray,
-    noise: Noise,
-    substeps: int,
-    budget: Budget | None = None,
-) -> Fit:
-    """Fit without process noise, beginning along the simulation as the card has it.
-
-    Parameters
-    ----------
-    model, data
-        The simulation, and the recordings.
-    x
-        States read off the recordings, shape ``(n, d)``, whose first ones the simulation begins with.
-    noise
-        Of which only that of the sensors is used.
-    substeps
-        Runge–Kutta steps between samples.
-    budget
-        Charged for every evaluation.
-    """
-    begin = x[data.first[:-1]]
-    followed = run(model, Grid(data, substeps), begin)
-    strict = fit_by_multiple_shooting(
-        model, data, x=np.where(np.isfinite(followed), followed, x), noise=noise.without_process(),
-        estimate_process=False, budget=budget,
-    )  # fmt: skip
-    if strict.converged:
-        return strict
-    # Steps at all samples at once may lead anywhere, from where a search could explain nothing. Damped
-    # steps of whole trajectories never make a fit worse than the card's own simulation is.
-    damped = fit_trajectories(model, data, begin=begin, noise=noise, substeps=substeps, budget=budget)
-    return better_of(strict, damped)

@@ -1,15 +1,13 @@
-"""Whole trajectories: least squares by multiple shooting, free runs, and jumps of f.
+"""Whole trajectories: least squares by damped steps, free runs of held-out recordings, and jumps of f.
 
 `siq.inference.maximum_likelihood.fit_by_multiple_shooting` moves the states at all samples at once and is
 fast, but where f jumps, or nearly, its linearised steps can go to and fro without end. Here only initial
-states and parameters are unknown, every trajectory follows its equations at every step, and no step makes the
-fit worse.
+states and parameters are unknown, every trajectory follows its equations at every step, and no step of
+Levenberg and Marquardt makes the fit worse.
 
-Every simulation runs from the end of a prefix of each recording. From the prefix, which is not scored, it
-estimates its own state at the begin; the prefix is the same for all.
-
-A force that takes another sign in no time, such as dry friction, is spread over a little of its argument when
-it is evaluated, so that an integrator can follow it.
+A free run simulates a recording from the end of a prefix, which is not scored and from which the state at the
+begin is estimated. A force that takes another sign in no time, such as dry friction, is spread over a little
+of its argument when it is evaluated, so that an integrator can follow it.
 """
 
 from __future__ import annotations
@@ -20,7 +18,6 @@ import numpy as np
 import sympy
 
 from siq.inference.budget import Budget, evaluation
-from siq.inference.filter_kernels import whitened_innovations
 from siq.inference.kalman_filter import Grid, Linearisation, Noise, integrate_intervals, linearise
 from siq.inference.maximum_likelihood import Fit, fit_by_multiple_shooting, fit_of_states
 from siq.inference.measurements import Expectations, Measurements, first_states
@@ -40,7 +37,7 @@ def run_tape(
     signals: np.ndarray,
     step: np.ndarray,
     states: np.ndarray,
-) -> int:
+) -> None:
     """Integrate recordings by the Runge–Kutta rule, sample after sample, into `states`.
 
     Parameters
@@ -49,20 +46,12 @@ def run_tape(
         The tape of the rates: its arguments are states, then signals, then parameters, which are filled in.
     first
         Row at which each recording begins, and the number of rows; shape ``(recordings + 1,)``.
-    begin
-        Initial states, shape ``(recordings, d)``.
-    signals
-        At begin, middle and end of every substep, shape ``(3 substeps, s, intervals)``.
-    step
-        Length of a substep of each interval, shape ``(intervals,)``.
+    begin, signals, step
+        Initial states ``(recordings, d)``; signals at begin, middle and end of every substep,
+        ``(3 substeps, s, intervals)``; and the length of a substep of each interval.
     states
         Shape ``(n, d)``, not a number to begin with: a recording in which the simulation runs away is left
         so from there on.
-
-    Returns
-    -------
-    int
-        Evaluations of the rates.
     """
     dimension = begin.shape[1]
     known = signals.shape[1]
@@ -73,7 +62,6 @@ def run_tape(
     now = np.empty(dimension)
     slope = np.empty(dimension)
     total = np.empty(dimension)
-    evaluations = 0
     interval = 0
     for recording in range(len(first) - 1):
         last = interval + first[recording + 1] - first[recording] - 1
@@ -136,7 +124,6 @@ def run_tape(
                             else:
                                 value = min(a, b)
                         registers[base + k] = value
-                    evaluations += 1
                     for i in range(dimension):
                         slope[i] = registers[results[i]]
                         total[i] += weight[stage] * slope[i]
@@ -150,7 +137,6 @@ def run_tape(
             if alive:
                 states[row] = now
         interval = last
-    return evaluations
 
 
 ACCURACY = 1e-4  # relative change of the sum of squares at which a fit has converged
@@ -182,25 +168,16 @@ def run(model: Dynamics, grid: Grid, begin: np.ndarray) -> np.ndarray:
 def run_along(
     tape: Tape, grid: Grid, signals: np.ndarray, values: np.ndarray, begin: np.ndarray
 ) -> np.ndarray:
-    """Integrate the rates on a tape, whose arguments are states, signals and parameters, in this order.
+    """Integrate the rates on a tape, whose arguments are states, signals and parameters, to ``(n, d)``.
 
     Parameters
     ----------
-    tape
-        The rates.
-    grid
-        Recordings and substeps.
+    tape, grid
+        The rates; recordings and substeps.
     signals
         What is known at all nodes, shape ``(3 substeps, s, intervals)``.
-    values
-        Of the parameters, shape ``(p,)``.
-    begin
-        Initial states, shape ``(recordings, d)``.
-
-    Returns
-    -------
-    np.ndarray
-        At all samples, shape ``(n, d)``; not a number from where they run away.
+    values, begin
+        Of the parameters, shape ``(p,)``; and initial states, shape ``(recordings, d)``.
     """
     states = np.full((len(grid.data.t), begin.shape[1]), np.nan)
     registers = tape.registers.copy()
@@ -215,7 +192,7 @@ def run_along(
 
 
 def _run_side_by_side(model: Dynamics, grid: Grid, begin: np.ndarray) -> np.ndarray:
-    """The same in numpy, all recordings side by side: for formulas that no tape can hold."""
+    """Integrate in numpy, all recordings side by side: for formulas that no tape can hold."""
     data = grid.data
     states = np.full((len(data.t), model.dimension), np.nan)
     lengths = np.diff(data.first)
@@ -272,83 +249,49 @@ def fit_trajectories(
     BudgetSpent
         When nothing is left of what is allowed.
     """
-    work = substeps * evaluation(model, data)
-    with np.errstate(all="ignore"):
-        grid = Grid(data, substeps)
-        best = _Course.of(model, grid, model.values, begin, noise)
-        converged = False
-        if np.isfinite(best.total):
-            best, converged = _descended(model, grid, best, noise, budget=budget, work=work)
-    return fit_of_states(
-        model.with_values(best.values),
-        data,
-        x=best.states,
-        noise=noise.without_process(),
-        substeps=substeps,
-        converged=converged,
-    )
+    work, free = substeps * evaluation(model, data), np.array(model.free, dtype=int)
+    count = int(np.isfinite(data.outputs).sum())
+    slightest = min(ACCURACY, SETTLED / max(count, 1))
+    grid = Grid(data, substeps)
 
-
-@dataclass(frozen=True)
-class _Course:
-    """Trajectories from parameters and initial states.
-
-    Attributes
-    ----------
-    values, begin, states
-        All parameters; the initial states, shape ``(recordings, d)``; the states at all samples.
-    total
-        Weighted sum of squared residuals, and of what is expected of parameters; not finite where the
-        simulation runs away.
-    """
-
-    values: np.ndarray
-    begin: np.ndarray
-    states: np.ndarray
-    total: float
-
-    @classmethod
-    def of(cls, model: Dynamics, grid: Grid, values: np.ndarray, begin: np.ndarray, noise: Noise) -> _Course:
+    def followed(values: np.ndarray, begin: np.ndarray) -> tuple[np.ndarray, float]:
+        """States at all samples, and the sum of squares, not finite where the simulation runs away."""
         states = run(model.with_values(values), grid, begin)
         outputs = model.functions.outputs(states.T, grid.at_samples(model.lags(values)), values).T
-        known = np.isfinite(grid.data.outputs)
-        left = ((outputs - grid.data.outputs) / np.sqrt(noise.measurement))[known]
-        expected = Expectations.of(model).deviations(values[list(model.free)])
-        return cls(values, begin, states, float(left @ left + expected @ expected))
+        left = ((outputs - data.outputs) / np.sqrt(noise.measurement))[np.isfinite(data.outputs)]
+        expected = Expectations.of(model, values).deviations
+        return states, float(left @ left + expected @ expected)
 
-
-def _descended(
-    model: Dynamics, grid: Grid, best: _Course, noise: Noise, *, budget: Budget | None, work: float
-) -> tuple[_Course, bool]:
-    """Damped steps downhill (Levenberg and Marquardt), and whether they came to an end."""
-    free = np.array(model.free, dtype=int)
-    values = int(np.isfinite(grid.data.outputs).sum())
-    slightest = min(ACCURACY, SETTLED / max(values, 1))
-    damping, normal = FIRST_DAMPING, None
-    for _ in range(max(TRIALS, WORK // max(values, 1))):
-        if budget is not None:
-            budget.charge(work * (RUN if normal is not None else 1.0 + RUN))
-        if normal is None:
-            along = linearise(model, grid, best.values, best.states)
-            normal = normal_equations(along, grid.data, noise.measurement).with_expectations(
-                Expectations.of(model), best.values[free]
-            )
-        change, begin, foreseen = normal.step(damping)
-        new = best.values.copy()
-        new[free] += change
-        tried = _Course.of(model, grid, new, best.begin + begin, noise)
-        gained = best.total - tried.total
-        if gained > 0:  # which what runs away never is
-            settled = gained < slightest * best.total and gained > NEARLY_FORESEEN * foreseen
-            best, normal = tried, None
-            damping = max(damping / EASIER, LEAST_DAMPING)
-            if settled:
-                return best, True
-        else:
-            if foreseen < slightest * best.total or damping > MOST_DAMPING:
-                return best, True
-            damping *= HARDER
-    return best, False
+    with np.errstate(all="ignore"):
+        values, converged, damping, normal = model.values, False, FIRST_DAMPING, None
+        states, total = followed(values, begin)
+        for _ in range(max(TRIALS, WORK // max(count, 1)) if np.isfinite(total) else 0):
+            if budget is not None:
+                budget.charge(work * (RUN if normal is not None else 1.0 + RUN))
+            if normal is None:
+                along = linearise(model, grid, values, states)
+                normal = normal_equations(along, data, noise.measurement, Expectations.of(model, values))
+            change, moved, foreseen = normal.step(damping)
+            new = values.copy()
+            new[free] += change
+            tried, then = followed(new, begin + moved)
+            gained = total - then
+            if gained > 0:  # which what runs away never is
+                settled = gained < slightest * total and gained > NEARLY_FORESEEN * foreseen
+                values, begin, states, total, normal = new, begin + moved, tried, then, None
+                damping = max(damping / EASIER, LEAST_DAMPING)
+                if settled:
+                    converged = True
+                    break
+            elif foreseen < slightest * total or damping > MOST_DAMPING:
+                converged = True
+                break
+            else:
+                damping *= HARDER
+    return fit_of_states(
+        model.with_values(values), data, x=states, noise=noise.without_process(), substeps=substeps,
+        converged=converged,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -372,14 +315,6 @@ class NormalEquations:
     between: np.ndarray
     shared_target: np.ndarray
     own_target: np.ndarray
-
-    def with_expectations(self, expected: Expectations, values: np.ndarray) -> NormalEquations:
-        """The same with what is expected of the parameters, which are at `values`, shape ``(p,)``."""
-        return replace(
-            self,
-            shared=self.shared + expected.rows.T @ expected.rows,
-            shared_target=self.shared_target + expected.rows.T @ expected.deviations(values),
-        )
 
     def step(self, damping: float) -> tuple[np.ndarray, np.ndarray, float]:
         """Changes of parameters ``(p,)`` and initial states ``(r, d)``, and what they gain if all is linear.
@@ -406,20 +341,15 @@ class NormalEquations:
 
 
 def normal_equations(
-    linearisation: Linearisation, data: Measurements, variance: np.ndarray
+    linearisation: Linearisation,
+    data: Measurements,
+    variance: np.ndarray,
+    expected: Expectations | None = None,
 ) -> NormalEquations:
     """The normal equations along trajectories without gaps, at the sensors' variances ``(m,)``."""
-    innovations, by_parameters, by_initial, _ = whitened_innovations(
-        data.first,
-        linearisation.transition,
-        linearisation.response,
-        np.zeros_like(linearisation.gap),
-        np.zeros_like(linearisation.transition),
-        linearisation.measured,
-        linearisation.measured_response,
-        linearisation.residual,
-        variance,
-    )
+    along = replace(linearisation, gap=np.zeros_like(linearisation.gap))
+    still = np.zeros((1, *along.transition.shape[1:]))
+    innovations, by_parameters, by_initial = along.filtered(data.first, data.step, variance, still)[:3]
     dimension, parameters = by_initial.shape[2], by_parameters.shape[2]
     recordings = len(data.labels)
     shared, shared_target = np.zeros((parameters, parameters)), np.zeros(parameters)
@@ -435,6 +365,9 @@ def normal_equations(
         shared += columns.T @ columns
         shared_target += columns.T @ left
         between[place], own[place], own_target[place] = columns.T @ states, states.T @ states, states.T @ left
+    if expected is not None:
+        shared += expected.rows.T @ expected.rows
+        shared_target += expected.rows.T @ expected.deviations
     return NormalEquations(shared, own, between, shared_target, own_target)
 
 
@@ -507,7 +440,9 @@ def free_run(
     usual
         Where the states are expected beforehand; by default nothing is.
     """
-    rows = told_rows(data, told)
+    lengths = np.diff(data.first)
+    rows = np.maximum((PREFIX * lengths).astype(int), SHORTEST_PREFIX) if told is None else told
+    rows = np.minimum(rows, lengths - 1)
     prefix = data.until(np.maximum(rows, 2))
     x = initial_states(model, prefix, noise=noise, substeps=substeps, usual=usual)
     states = run(model, Grid(data, substeps), x)
@@ -517,16 +452,6 @@ def free_run(
         outputs=model.functions.outputs(states.T, signals, model.values).T,
         scored=within >= rows[data.recording],
     )
-
-
-def told_rows(data: Measurements, told: int | None = None) -> np.ndarray:
-    """How many rows of each recording tell its initial state, shape ``(recordings,)``; see `free_run`."""
-    lengths = np.diff(data.first)
-    if told is None:
-        rows = np.maximum((PREFIX * lengths).astype(int), SHORTEST_PREFIX)
-    else:
-        rows = np.full(len(lengths), told)
-    return np.minimum(rows, lengths - 1)
 
 
 def initial_states(
@@ -543,24 +468,25 @@ def initial_states(
     process[: len(noise.process)] = noise.process
     start = first_states(still, data)
     if usual is not None:
-        still, data, noise = _with_usual_states(still, data, noise, usual)
+        # What is expected of first states, as if it were measured: once, and as inaccurately as it is known.
+        moving = np.flatnonzero(usual.width > 0)
+        names = [still.states[place] for place in moving]
+        expected = np.full((len(data.t), len(names)), np.nan)
+        expected[data.first[:-1]] = usual.mean[moving]
+        variances = np.concatenate([noise.measurement, usual.width[moving] ** 2])
+        further = ((f"usual_{name}", symbol(name)) for name in names)
+        still = replace(still, outputs=(*still.outputs, *further))
+        data = replace(data, outputs=np.hstack([data.outputs, expected]), sensor_noise=variances)
+        noise = replace(noise, measurement=variances)
     follow = fit_by_multiple_shooting(
-        still,
-        data,
-        x=start,
-        noise=Noise(noise.measurement, process),
-        estimate_process=False,
+        still, data, x=start, noise=Noise(noise.measurement, process), estimate_process=False,
         substeps=substeps,
-    )
+    )  # fmt: skip
     x = follow.x if np.isfinite(follow.sum_of_squares) else start
     strict = fit_by_multiple_shooting(
-        still,
-        data,
-        x=x,
-        noise=Noise(noise.measurement, np.zeros(model.dimension)),
-        estimate_process=False,
+        still, data, x=x, noise=Noise(noise.measurement, np.zeros(model.dimension)), estimate_process=False,
         substeps=substeps,
-    )
+    )  # fmt: skip
     if strict.converged:
         return strict.x[data.first[:-1]]
     # Where f jumps or a reading is cut off, steps of all samples at once may go to and fro. Damped steps of
@@ -568,22 +494,6 @@ def initial_states(
     damped = fit_trajectories(still, data, begin=x[data.first[:-1]], noise=noise, substeps=substeps)
     best = damped.x if np.isfinite(damped.sum_of_squares) else x
     return best[data.first[:-1]]
-
-
-def _with_usual_states(
-    model: Dynamics, data: Measurements, noise: Noise, usual: UsualStates
-) -> tuple[Dynamics, Measurements, Noise]:
-    """What is expected of first states, as if it were measured: once, and as inaccurately as it is known."""
-    moving = np.flatnonzero(usual.width > 0)
-    names = [model.states[place] for place in moving]
-    expected = np.full((len(data.t), len(names)), np.nan)
-    expected[data.first[:-1]] = usual.mean[moving]
-    variances = np.concatenate([noise.measurement, usual.width[moving] ** 2])
-    return (
-        replace(model, outputs=(*model.outputs, *((f"usual_{name}", symbol(name)) for name in names))),
-        replace(data, outputs=np.hstack([data.outputs, expected]), sensor_noise=variances),
-        replace(noise, measurement=variances),
-    )
 
 
 def normalised_rms(outputs: np.ndarray, simulated: FreeRun) -> float | None:

@@ -12,6 +12,11 @@ from scipy.spatial import cKDTree
 ROWS = 1 << 14  # numerical: worked on together, so that no second copy of all rows is in memory
 
 
+def positive(sizes: np.ndarray) -> np.ndarray:
+    """Sizes to divide by: one where they vanish."""
+    return np.where(sizes > 0, sizes, 1.0)
+
+
 def triangle_of(columns: np.ndarray, goals: np.ndarray) -> np.ndarray:
     """R of the QR decomposition of columns with their goals behind them.
 

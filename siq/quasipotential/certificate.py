@@ -23,7 +23,7 @@ from scipy.spatial import cKDTree
 
 from siq.data.recordings import SnapshotPairs
 from siq.errors import NumericalFailure
-from siq.inference.field_estimate import AnyField, GivenField
+from siq.inference.field_estimate import AnyField, GivenField, Verdict
 from siq.numerics.least_squares import representative_subset
 from siq.quasipotential.certificate_tests import (
     ERROR_POINTS,
@@ -34,7 +34,6 @@ from siq.quasipotential.certificate_tests import (
     CertificateOptions,
     Function,
     Reference,
-    Verdict,
     check_agreement,
     check_candidate,
     check_error,

@@ -32,7 +32,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import scipy.special
@@ -40,7 +40,8 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as pydantic_dataclass
 
 from siq.data.recordings import SnapshotPairs
-from siq.inference.field_estimate import AnyField, GivenField, IdentifiedField
+from siq.inference.checks import PredictionLimits
+from siq.inference.field_estimate import AnyField, FieldEstimate, GivenField, Verdict
 from siq.numerics.randomness import normal_draws
 from siq.numerics.text import percent, place_text
 from siq.quasipotential.characteristics import ascending_integrals, fastest_rate
@@ -63,33 +64,6 @@ LARGEST_FROM_FIELD = 0.5  # of V: half of it, with 95 % confidence, is more than
 STATED = 2.0  # standard errors of V from f: kept in 95 of 100 times
 DRAWS = 40  # of f from its distribution, for the error of M
 STANDARD_ERRORS = 4.0  # exceeded by chance once in 16 000 times
-UNPREDICTED = "f does not predict held-out recordings"
-
-
-@pydantic_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class PredictionLimits:
-    """Limits of the test of f.
-
-    Attributes
-    ----------
-    prediction
-        Median error of long-term prediction, for recordings without noise.
-    held_out_ratio
-        Mean square of the residuals of f on held-out recordings over that on its own, for recordings with
-        noise. The default, a tenth more, is what a systematic error of √0.1 of the noise adds.
-    false_alarms
-        Probability with which the noise alone refuses what is right; `descent` has it too. The default is
-        one in ten thousand runs.
-    """
-
-    prediction: Annotated[float, Field(gt=0)] = 0.01
-    held_out_ratio: Annotated[float, Field(gt=1)] = 1.1
-    false_alarms: Annotated[float, Field(gt=0, lt=0.5)] = 1e-4
-
-    @property
-    def of_f(self) -> PredictionLimits:
-        """These alone."""
-        return PredictionLimits(self.prediction, self.held_out_ratio, self.false_alarms)
 
 
 @pydantic_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -117,39 +91,6 @@ class CertificateOptions(PredictionLimits):
     branch: Annotated[float, Field(gt=0)] = 0.01
     descent: Annotated[float, Field(ge=0, lt=1)] = 0.01
     error: Annotated[float, Field(gt=0)] = 0.15
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """One test: the figure, its limit, the verdict, and what it means in words."""
-
-    value: float
-    limit: float
-    passed: bool
-    reason: str = ""
-
-    def as_data(self) -> dict[str, Any]:
-        """As it stands in model.json; a figure that is not finite becomes null."""
-        value = float(self.value) if np.isfinite(self.value) else None
-        return {
-            "value": value, "limit": float(self.limit), "passed": bool(self.passed), "reason": self.reason
-        }  # fmt: skip
-
-    @classmethod
-    def of(cls, value: float, limit: float, reason: str) -> Verdict:
-        """Passed where a figure is no larger than its limit; the reason is why it would be refused."""
-        passed = bool(value <= limit)
-        return cls(value, limit, passed, "" if passed else reason)
-
-    @classmethod
-    def refused(cls, reason: str, limit: float = 0.0) -> Verdict:
-        """A test that cannot be made, or fails without a figure."""
-        return cls(np.inf, limit, False, reason)
-
-    @staticmethod
-    def worst(verdicts: Sequence[Verdict]) -> Verdict:
-        """Of several verdicts of one test the one that decides."""
-        return max(verdicts, key=lambda one: (not one.passed, one.value / (one.limit or 1.0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -448,48 +389,6 @@ def check_candidate(
     return tests, error
 
 
-def check_prediction(
-    *,
-    noise_fault: str | None,
-    errors: np.ndarray | None,
-    mean_probability: float | None,
-    held_out_ratio: float,
-    limits: PredictionLimits,
-) -> Verdict:
-    """Whether f, which every V here is made from, holds for recordings that it was not fitted to.
-
-    Parameters
-    ----------
-    noise_fault
-        What `siq.inference.residuals` objects to.
-    errors
-        Errors of long-term prediction of held-out recordings, where these carry no noise.
-    mean_probability
-        Probability of the mean of the held-out residuals, where they carry noise.
-    held_out_ratio
-        Mean square of the held-out residuals over that of the others.
-    limits
-        Of the three. The figure of the verdict is the median error; or how much larger the mean square is, as
-        a share; or how many powers of ten the probability of the mean lies below 1, where that refuses.
-    """
-    if noise_fault is not None:
-        return Verdict.refused(noise_fault, limits.prediction)
-    if errors is not None:
-        return Verdict.of(float(np.median(errors)), limits.prediction, UNPREDICTED)
-    assert mean_probability is not None
-    value, limit = max(held_out_ratio - 1, 0.0), limits.held_out_ratio - 1
-    if not value <= limit:
-        return Verdict(value, limit, False, "f fits held-out recordings worse than its own")
-    rarity, rare = -float(np.log10(max(mean_probability, 1e-300))), -float(np.log10(limits.false_alarms))
-    if not rarity <= rare:
-        reason = (
-            "the residuals of f on held-out recordings have a mean, of a probability of"
-            f" {mean_probability:.1g}: f misses a term"
-        )
-        return Verdict(rarity, rare, False, reason)
-    return Verdict(value, limit, True)
-
-
 MOST_PAIRS = 10_000  # evenly taken: memory, not accuracy
 BINS = 8  # in V, of equally many pairs; a choice, by which the limit is made stricter
 LOWEST = 1e-3  # of the range of V: closer to its minimum a fall cannot be told from rounding
@@ -500,7 +399,7 @@ RISES = "V does not fall along the recordings"
 
 
 def _check_descent(
-    candidate: Candidate, found: IdentifiedField, options: CertificateOptions, *, error: float = 0.0
+    candidate: Candidate, found: FieldEstimate, options: CertificateOptions, *, error: float = 0.0
 ) -> Verdict:
     """Whether V falls along recordings that no fit saw; `error` is the relative one of V that is stated.
 
@@ -572,7 +471,7 @@ LARGEST_SHARE = 0.05  # of the draws in which an equilibrium may be lost: what i
 
 
 def _lost_shares(
-    found: IdentifiedField, equilibria: Sequence[Equilibrium], *, box: np.ndarray, seed: int = 0
+    found: FieldEstimate, equilibria: Sequence[Equilibrium], *, box: np.ndarray, seed: int = 0
 ) -> np.ndarray:
     """Share of the f that the data allow in which each equilibrium does not exist: shape ``(k,)``.
 
@@ -587,8 +486,8 @@ def _lost_shares(
     changes = np.zeros((EXISTENCE_DRAWS, library.size, library.dimension))
     own = normal_draws(np.zeros(len(found.support)), found.covariance, EXISTENCE_DRAWS, generator=generator)
     changes[:, found.support[:, 1], found.support[:, 0]] = own
-    if found.rivals is not None:
-        changes += found.rivals.drawn(EXISTENCE_DRAWS, generator=generator)
+    if found.alternatives is not None:
+        changes += found.alternatives.drawn(EXISTENCE_DRAWS, generator=generator)
     followed = [_followed(found, one, changes, width) for one in equilibria]
     places = np.array([place for place, _ in followed])
     lost = np.array([gone for _, gone in followed])
@@ -606,7 +505,7 @@ def _lost_shares(
 
 
 def _followed(
-    found: IdentifiedField, one: Equilibrium, changes: np.ndarray, width: np.ndarray
+    found: FieldEstimate, one: Equilibrium, changes: np.ndarray, width: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Where changes of f lead an equilibrium, shape ``(n, d)``, and a mask of those that lose it."""
     library, d = found.library, found.library.dimension
@@ -636,7 +535,7 @@ def _followed(
     return x, lost
 
 
-def check_existence(found: IdentifiedField, portrait: PhasePortrait, *, seed: int = 0) -> Verdict:
+def check_existence(found: FieldEstimate, portrait: PhasePortrait, *, seed: int = 0) -> Verdict:
     """Whether attractors and the saddles between them exist with the whole uncertainty of f."""
     saddles = {one.position.tobytes(): one for around in portrait.saddles for one in around}
     claimed = [*portrait.attractors, *saddles.values()]

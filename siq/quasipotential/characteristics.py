@@ -35,7 +35,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import ConvexHull, cKDTree
 
-from siq.inference.field_estimate import AnyField, GivenField, IdentifiedField
+from siq.inference.field_estimate import AnyField, FieldEstimate, GivenField
 from siq.numerics.integration import dormand_prince_step, next_step
 from siq.quasipotential.power_series import quasipotential_series
 from siq.systems.dynamics import Dynamics
@@ -593,7 +593,7 @@ def ascending_integrals(
 
 
 def _potential_slopes(
-    found: IdentifiedField, gradient: Function, attractor: np.ndarray, x: np.ndarray
+    found: FieldEstimate, gradient: Function, attractor: np.ndarray, x: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """∂V/∂Ξ at points, by every coefficient that f might have, and ∂V/∂θ by those of an estimated εD.
 

@@ -19,7 +19,7 @@ import numpy as np
 import scipy.linalg
 import scipy.special
 
-from siq.inference.field_estimate import IdentifiedField
+from siq.inference.field_estimate import FieldEstimate
 from siq.inference.library import CandidateLibrary
 from siq.quasipotential.hamilton_jacobi import (
     HamiltonJacobi,
@@ -99,7 +99,7 @@ def _least_squares(
 
 def network_starts(
     library: CandidateLibrary,
-    found: IdentifiedField,
+    found: FieldEstimate,
     points: np.ndarray,
     potential: np.ndarray,
 ) -> Iterator[np.ndarray]:
@@ -119,7 +119,7 @@ def network_starts(
 def refine_globally(
     start: np.ndarray,
     library: CandidateLibrary,
-    found: IdentifiedField,
+    found: FieldEstimate,
     points: np.ndarray,
     *,
     false_terms: float = 0.01,
@@ -173,7 +173,7 @@ def refine_globally(
     )
 
 
-def _forcing(equation: HamiltonJacobi, coefficients: np.ndarray, found: IdentifiedField) -> np.ndarray:
+def _forcing(equation: HamiltonJacobi, coefficients: np.ndarray, found: FieldEstimate) -> np.ndarray:
     """Derivative of the residual by each of the p coefficients of f, shape ``(n, p)``."""
     components, functions = found.support.T
     slopes = equation.slopes(coefficients)[:, components]
@@ -183,7 +183,7 @@ def _forcing(equation: HamiltonJacobi, coefficients: np.ndarray, found: Identifi
 def _eliminate(
     equation: HamiltonJacobi,
     coefficients: np.ndarray,
-    found: IdentifiedField,
+    found: FieldEstimate,
     *,
     critical: float,
     precision: float,
@@ -271,7 +271,7 @@ class RegionFormula:
 
 def with_circulation(
     best: GlobalPotential,
-    found: IdentifiedField,
+    found: FieldEstimate,
     points: np.ndarray,
     *,
     false_terms: float,
@@ -313,7 +313,7 @@ def with_circulation(
 
 
 def _fit_orthogonal(
-    found: IdentifiedField,
+    found: FieldEstimate,
     potential: np.ndarray,
     circulatory: np.ndarray,
     points: np.ndarray,

@@ -30,7 +30,7 @@ from pydantic.dataclasses import dataclass as pydantic_dataclass
 from siq.data.recordings import Recordings
 from siq.data.two_states import RecordStates
 from siq.errors import NumericalFailure
-from siq.inference.field_estimate import IdentifiedField
+from siq.inference.field_estimate import FieldEstimate
 from siq.quasipotential.certificate import Certificate
 from siq.quasipotential.characteristics import potential_errors
 from siq.quasipotential.occupancy import VisitTest
@@ -231,7 +231,7 @@ class Landscape:
     certificate: Certificate | None = None
     position_errors: np.ndarray | None = None
     noise: NoiseStrength | None = None
-    field_estimate: IdentifiedField | None = None
+    field_estimate: FieldEstimate | None = None
     visits: tuple[VisitTest, ...] = ()
     recorded_states: RecordStates | None = None
     given: bool = False

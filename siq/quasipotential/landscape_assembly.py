@@ -17,7 +17,7 @@ from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
 from siq.errors import InputError, NumericalFailure
-from siq.inference.field_estimate import AnyField, GivenField, IdentifiedField
+from siq.inference.field_estimate import AnyField, FieldEstimate, GivenField
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.certificate import (
     Certificate,
@@ -80,7 +80,7 @@ class EquationSettings:
 
 
 def find_landscape(
-    found: IdentifiedField,
+    found: FieldEstimate,
     portrait: PhasePortrait,
     *,
     wells: Sequence[Well] | None = None,

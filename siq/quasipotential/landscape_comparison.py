@@ -23,7 +23,7 @@ import numpy as np
 import pandas as pd
 
 from siq.errors import InputError, NumericalFailure
-from siq.inference.field_estimate import STANDARD_ERRORS, IdentifiedField
+from siq.inference.field_estimate import STANDARD_ERRORS, FieldEstimate
 from siq.numerics.files import whole_file
 from siq.numerics.text import place_text
 from siq.quasipotential.characteristics import adapted_fan, lowest_sheet, value_near
@@ -528,7 +528,7 @@ def _known(value: float | None) -> float:
 
 
 def check_same_noise(
-    equations: Dynamics, trajectories: Dynamics, x: np.ndarray, *, found: IdentifiedField | None
+    equations: Dynamics, trajectories: Dynamics, x: np.ndarray, *, found: FieldEstimate | None
 ) -> None:
     """Refuse two landscapes whose D are not the same, and U in different units with them.
 

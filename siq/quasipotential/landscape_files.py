@@ -17,9 +17,9 @@ import numpy as np
 
 from siq.data.two_states import DwellCount
 from siq.errors import InputError
+from siq.inference.field_estimate import Verdict
 from siq.numerics.files import whole_file
 from siq.quasipotential.certificate import Certificate
-from siq.quasipotential.certificate_tests import Verdict
 from siq.quasipotential.formulas import basis_from_data, powers_to_data
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.occupancy import VisitTest

@@ -54,10 +54,9 @@ from siq.data.two_states import (
     switching,
 )
 from siq.errors import NumericalFailure
-from siq.inference.field_estimate import IdentifiedField, field_dynamics
+from siq.inference.field_estimate import FieldEstimate, Verdict, field_dynamics
 from siq.numerics.randomness import normal_draws
 from siq.numerics.text import place_text
-from siq.quasipotential.certificate_tests import Verdict
 from siq.quasipotential.rates import NoiseStrength, mean_residence_time
 from siq.quasipotential.transitions import transitions, ways_out
 from siq.systems.dynamics import Dynamics
@@ -395,7 +394,7 @@ def cores_about(dynamics: Dynamics, portrait: PhasePortrait, intensity: float) -
 
 
 def predicted_visits(
-    found: IdentifiedField, portrait: PhasePortrait, noise: NoiseStrength, cores: Cores, *, seed: int = 0
+    found: FieldEstimate, portrait: PhasePortrait, noise: NoiseStrength, cores: Cores, *, seed: int = 0
 ) -> PredictedVisits:
     """Mean times of visits to every well, by the operator where it can be solved, or else by the law.
 
@@ -446,13 +445,13 @@ def predicted_visits(
     return PredictedVisits(tuple(times), "law", notes=tuple(notes))
 
 
-def _drawn_system(found: IdentifiedField, *, generator: np.random.Generator) -> Dynamics:
+def _drawn_system(found: FieldEstimate, *, generator: np.random.Generator) -> Dynamics:
     """f and D drawn from their distributions, further terms of f and the terms of D(x) included."""
     coefficients = np.zeros_like(found.coefficients)
     own = normal_draws(found.values, found.covariance, 1, generator=generator)[0]
     coefficients[found.support[:, 1], found.support[:, 0]] = own
-    if found.rivals is not None:
-        coefficients += found.rivals.drawn(1, generator=generator)[0]
+    if found.alternatives is not None:
+        coefficients += found.alternatives.drawn(1, generator=generator)[0]
     support = np.argwhere(coefficients.T != 0)
     diffusion = found.diffusion
     if found.noise is not None:
@@ -597,7 +596,7 @@ class OccupancyCheck:
 
 
 def check_occupancy(
-    found: IdentifiedField,
+    found: FieldEstimate,
     portrait: PhasePortrait,
     noise: NoiseStrength | None,
     recordings: Recordings,

@@ -28,12 +28,11 @@ from pydantic.dataclasses import dataclass as pydantic_dataclass
 
 from siq.data.recordings import Recordings, SnapshotPairs, held_out_recordings, snapshot_pairs
 from siq.errors import NumericalFailure
-from siq.inference.field_estimate import IdentifiedField
-from siq.inference.identification import FieldRecord
-from siq.inference.instrumental_variables import coarse_pairs
+from siq.inference.field_estimate import FieldEstimate, Verdict
+from siq.inference.kalman_identification import filtered_recordings
 from siq.inference.library import CandidateLibrary, joint_library, total_degree
-from siq.inference.noisy_sensor import filtered_recordings, of_all_states
-from siq.inference.selection import RivalTerms
+from siq.inference.regression import coarse_pairs
+from siq.inference.selection import ModelAverage
 from siq.networks.decomposition import CheckOptions, TrainedNetworks, shuffled
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.certificate import (
@@ -51,7 +50,6 @@ from siq.quasipotential.certificate_tests import (
     CertificateOptions,
     Function,
     Reference,
-    Verdict,
     check_agreement,
 )
 from siq.quasipotential.formulas import (
@@ -142,7 +140,7 @@ class Refined:
         V and g where one formula holds over the whole region.
     """
 
-    found: IdentifiedField
+    found: FieldEstimate
     library: CandidateLibrary
     residual: float
     wells: tuple[Well, ...]
@@ -151,7 +149,7 @@ class Refined:
     formula: RegionFormula | None = None
 
 
-def _formula_library(found: IdentifiedField, options: RefinementOptions) -> CandidateLibrary:
+def _formula_library(found: FieldEstimate, options: RefinementOptions) -> CandidateLibrary:
     """The functions in which one formula of V is sought for the whole region.
 
     No polynomial V has a higher degree than f has, and one: of ``∇V·(f + D∇V) = 0`` the highest powers would
@@ -166,7 +164,7 @@ def _formula_library(found: IdentifiedField, options: RefinementOptions) -> Cand
 
 
 def refine(
-    found: IdentifiedField,
+    found: FieldEstimate,
     portrait: PhasePortrait,
     *,
     formula: np.ndarray | None,
@@ -271,7 +269,7 @@ def refine(
     )  # fmt: skip
 
 
-def _over_library(found: IdentifiedField, library: CandidateLibrary) -> IdentifiedField:
+def _over_library(found: FieldEstimate, library: CandidateLibrary) -> FieldEstimate:
     """F over another library that holds all its functions."""
     if found.library is library:
         return found
@@ -282,18 +280,18 @@ def _over_library(found: IdentifiedField, library: CandidateLibrary) -> Identifi
         place = position[found.library.terms[term]]
         support[row] = component, place
         coefficients[place, component] = found.coefficients[term, component]
-    rivals = found.rivals
-    if rivals is not None:
+    average = found.alternatives
+    if average is not None:
         places = [position[term] for term in found.library.terms]
         mean = np.zeros_like(coefficients)
-        spread = np.zeros((len(rivals.spread), *coefficients.shape))
-        mean[places], spread[:, places] = rivals.mean_change, rivals.spread
-        rivals = RivalTerms(mean, spread)
-    return replace(found, library=library, coefficients=coefficients, support=support, rivals=rivals)
+        spread = np.zeros((len(average.spread), *coefficients.shape))
+        mean[places], spread[:, places] = average.bias, average.spread
+        average = ModelAverage(mean, spread)
+    return replace(found, library=library, coefficients=coefficients, support=support, alternatives=average)
 
 
 def local_wells(
-    found: IdentifiedField,
+    found: FieldEstimate,
     portrait: PhasePortrait,
     *,
     options: RefinementOptions,
@@ -345,7 +343,7 @@ class RefinementContext:
 
     Parameters
     ----------
-    recordings, record, networks
+    recordings, found, networks
         Trajectories, the identified f, and the trained networks, None for none.
     number, seed
         Of the run, and of the study.
@@ -367,7 +365,7 @@ class RefinementContext:
     def __init__(
         self,
         recordings: Recordings,
-        record: FieldRecord,
+        found: FieldEstimate,
         networks: TrainedNetworks | None,
         *,
         number: int,
@@ -376,23 +374,19 @@ class RefinementContext:
         refinement: RefinementOptions,
         limits: CertificateOptions,
     ) -> None:
-        self.record, self.networks, self.found = record, networks, record.found
+        self.found, self.networks = found, networks
         self.number, self.seed, self.limits = number, seed, limits
         self.options = refinement.with_routes(networks=networks is not None)
         mask = held_out_recordings(recordings, generator=generator(seed, number, Purpose.HOLD_OUT))
-        if (sensor := record.sensor_variance) is not None:
+        if found.sensor_variance is not None or found.hidden_velocities:
             # Of measured values the increments do not have the mean of f.
-            recordings = filtered_recordings(
-                self.found, sensor, recordings, pair_step=pair_step, exposure=record.exposure
-            )
-        elif record.hidden_velocities:
-            recordings = of_all_states(recordings, record, pair_step=pair_step)
+            recordings = filtered_recordings(found, recordings, pair_step=pair_step)
         pairs = snapshot_pairs(recordings, pair_step=pair_step)
         held, x = mask[pairs.recording], pairs.x0
         draw = generator(seed, number, Purpose.REFINE)
         self.points = x[~held][evenly_spread(x[~held], generator=draw)]
         self.held_out = x[held][evenly_spread(x[held], generator=draw)]
-        if (memory := record.memory) is not None:
+        if (memory := found.memory) is not None:
             pairs = coarse_pairs(recordings, memory[0], lost=memory[1])
         self.portrait: PhasePortrait = phase_portrait(self.found.dynamics, self.points, seed=number)
         if not self.found.noise_free:
@@ -403,17 +397,16 @@ class RefinementContext:
     @cached_property
     def evidence(self) -> Evidence:
         """Everything that formulas of the run are tested with."""
-        told = dict(self.record.prediction)
-        told["value"] = np.inf if told["value"] is None else told["value"]
+        assert self.found.prediction is not None
         references = references_about(self.found.dynamics, self.portrait, seed=self.number)
         return Evidence(
-            self.found, self.portrait, self.held_out, self.pairs, references, self.limits, Verdict(**told),
-            self.number,
+            self.found, self.portrait, self.held_out, self.pairs, references, self.limits,
+            self.found.prediction, self.number,
         )  # fmt: skip
 
     def record_test(self) -> OccupancyCheck:
         """Hops and histogram of the record, compared with those that f predicts."""
-        strength, variance = self.record.noise_strength, self.record.sensor_variance
+        strength, variance = self.found.noise_strength, self.found.sensor_variance
         noise = None if strength is None else NoiseStrength(*strength, source="estimated")
         try:
             return check_occupancy(
@@ -602,7 +595,7 @@ CHECK_SHARE = 0.75  # of the recorded points, the lowest in V, on which one form
 class TrainingCheck:
     """Whether refinement will succeed from networks of a run, given its f and recorded states ``(n, d)``."""
 
-    def __init__(self, found: IdentifiedField, x: np.ndarray, *, options: CheckOptions, seed: int) -> None:
+    def __init__(self, found: FieldEstimate, x: np.ndarray, *, options: CheckOptions, seed: int) -> None:
         points = x[evenly_spread(x, generator=np.random.default_rng(seed))]
         self.options, self.portrait = options, phase_portrait(found.dynamics, points, seed=seed)
         refinement = RefinementOptions(degrees=CHECK_DEGREES)

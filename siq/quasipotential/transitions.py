@@ -21,7 +21,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from siq.errors import NumericalFailure
-from siq.inference.field_estimate import AnyField, GivenField, defined_states
+from siq.inference.diffusion_model import defined_states
+from siq.inference.field_estimate import AnyField, GivenField
 from siq.quasipotential.paths import (
     MinimumActionPath,
     TransitionPath,
@@ -291,7 +292,7 @@ def barrier_uncertainty(path: TransitionPath, found: AnyField) -> tuple[float, f
     middle, force, spent = _pieces(path.uphill, found.dynamics)
     terms = found.library.evaluate(middle)
     slope = -2 * np.einsum("n,nq,nd->qd", spent, terms, force)
-    variance, by_rivals = float(found.variance(slope, of_mean=True)), float(found.mean_change(slope))
+    variance, by_rivals = float(found.variance(slope, of_mean=True)), float(found.bias(slope))
     if found.noise is not None:
         slope = -2 * (spent[:, None] * found.noise.push_slopes(middle, force)).sum(axis=0) / found.intensity
         variance += float(slope @ found.noise.covariance @ slope)

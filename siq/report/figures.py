@@ -19,7 +19,7 @@ from siq.data.inspection import inspection_of
 from siq.data.preparation import joined
 from siq.data.recordings import Recordings, snapshot_pairs
 from siq.data.two_states import RecordStates
-from siq.inference.residuals import predict
+from siq.inference.checks import predict
 from siq.networks.decomposition import TrainedNetworks
 from siq.networks.regression import highest_used, points_below
 from siq.numerics.randomness import Purpose, generator

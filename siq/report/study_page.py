@@ -22,8 +22,7 @@ import yaml
 from markupsafe import Markup
 
 from siq.data.two_states import RecordStates
-from siq.inference.field_estimate import DiffusionSource
-from siq.inference.identification import FieldRecord
+from siq.inference.field_estimate import DiffusionSource, FieldEstimate
 from siq.numerics.files import whole_file
 from siq.numerics.text import unit_text, value_text
 from siq.quasipotential.formulas import SymbolicDecomposition
@@ -112,7 +111,7 @@ class StudyResults:
     models: ModelFiles = field(default_factory=lambda: ModelFiles(()))
     shown: Shown = field(default_factory=lambda: Shown(0, Method.REFINED))
     exact: SymbolicDecomposition | None = None
-    record: FieldRecord | None = None
+    record: FieldEstimate | None = None
     interactive: Markup | None = None
     inspection: Sequence[str] | None = None
     seen: RecordStates | None = None
@@ -336,8 +335,8 @@ def _formulas(results: StudyResults) -> list[FormulaRow]:
     if record is None:
         return rows
     if not rows:
-        rows.append(FormulaRow("f", vector_mathml(record.found.dynamics.formulas), words["f"]))
-    noise, note = record.found.diffusion, words["D"][record.diffusion_source]
+        rows.append(FormulaRow("f", vector_mathml(record.dynamics.formulas), words["f"]))
+    noise, note = record.diffusion, words["D"][record.diffusion_source]
     note = note if noise.constant else f"{note} {words['by_state']}"
     return [*rows, FormulaRow("D", _diffusion_mathml(noise), note)]
 

@@ -21,7 +21,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from siq.errors import NumericalFailure
-from siq.inference.identification import read_field
+from siq.inference.field_estimate import read_field
 from siq.networks.decomposition import TrainedNetworks
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.cell_density import (
@@ -71,7 +71,7 @@ def read_stored(field: str | Path, landscape: str | Path) -> Landscape | None:
     record = read_field(field)
     if record is None:
         return None
-    return read_landscape(landscape, dynamics=record.found.dynamics)
+    return read_landscape(landscape, dynamics=record.dynamics)
 
 
 def first_stored(

@@ -60,7 +60,7 @@ def read(name: str, path: str | Path) -> Any:
 
         return read_recordings(path)
     if name == "field":
-        from siq.inference.identification import read_field
+        from siq.inference.field_estimate import read_field
 
         return read_field(path)
     if name in ("model", "regression"):
@@ -113,7 +113,7 @@ def write(name: str, path: str | Path, value: Any, settings: PipelineSettings) -
 
         write_recordings(path, value)
     elif name == "field":
-        from siq.inference.identification import write_field
+        from siq.inference.field_estimate import write_field
 
         write_field(path, value, settings.identification)
     elif name in ("model", "regression"):

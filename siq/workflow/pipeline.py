@@ -58,7 +58,7 @@ class Analysis:
     def dynamics(self) -> Dynamics | None:
         """What was identified, None where nothing was."""
         record = self.identified.record
-        return None if record is None else record.found.dynamics
+        return None if record is None else record.dynamics
 
 
 def analyse(

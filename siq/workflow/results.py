@@ -21,9 +21,9 @@ from pydantic.dataclasses import dataclass
 from siq.data.preparation import in_stretches, read_pairs, without_slow_drift
 from siq.data.recordings import Recordings, resample_recordings, snapshot_pairs
 from siq.errors import NumericalFailure
-from siq.inference.identification import FieldRecord
+from siq.inference.field_estimate import FieldEstimate
+from siq.inference.kalman_identification import of_all_states
 from siq.inference.library import candidate_library
-from siq.inference.noisy_sensor import of_all_states
 from siq.networks.decomposition import TrainedNetworks
 from siq.networks.regression import RegressionResult, points_below, sparse_decomposition
 from siq.numerics.randomness import Purpose, generator
@@ -499,7 +499,7 @@ class FoundLandscape:
     """The landscape of a run with the f that it is of, None where it could not be found."""
 
     landscape: Landscape | None
-    record: FieldRecord | None
+    record: FieldEstimate | None
     outcome: Outcome
 
     def files(self) -> dict[str, Any]:
@@ -519,7 +519,7 @@ class FoundLandscape:
 def landscape_of_run(
     settings: LandscapeSettings,
     recordings: Recordings | None,
-    record: FieldRecord | None,
+    record: FieldEstimate | None,
     *,
     number: int,
     wells: Sequence[Well] = (),
@@ -541,9 +541,9 @@ def landscape_of_run(
     draw = generator(settings.seed, number, Purpose.LANDSCAPE)
     points = x[evenly_spread(x, generator=draw)]
     try:
-        portrait = phase_portrait(record.found.dynamics, points, seed=number)
+        portrait = phase_portrait(record.dynamics, points, seed=number)
         found = find_landscape(
-            record.found, portrait, wells=wells if wells or not seek_wells else None, certificate=certificate,
+            record, portrait, wells=wells if wells or not seek_wells else None, certificate=certificate,
             options=settings.refinement, noise=noise_strength(settings, record), seed=number,
         )  # fmt: skip
     except (NumericalFailure, np.linalg.LinAlgError) as error:
@@ -563,7 +563,7 @@ def landscape_of_run(
     return FoundLandscape(found, record, outcome)
 
 
-def noise_strength(settings: LandscapeSettings, record: FieldRecord) -> NoiseStrength | None:
+def noise_strength(settings: LandscapeSettings, record: FieldEstimate) -> NoiseStrength | None:
     """The noise that the recordings show, or else the first that the study gives."""
     if (shown := record.noise_strength) is not None:
         return NoiseStrength(*shown, source="estimated")

@@ -19,9 +19,9 @@ import numpy as np
 import pandas as pd
 
 from siq.data.recordings import Recordings
-from siq.inference.identification import FieldRecord
+from siq.inference.checks import prediction_errors
+from siq.inference.field_estimate import FieldEstimate
 from siq.inference.library import candidate_library
-from siq.inference.residuals import prediction_errors
 from siq.networks.decomposition import TrainedNetworks, shuffled
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.formulas import (
@@ -471,7 +471,7 @@ class RunToShow:
 
     number: int
     recordings: Recordings | None
-    record: FieldRecord | None
+    record: FieldEstimate | None
     wells: tuple[Well, ...] = ()
 
 

@@ -20,13 +20,13 @@ from pydantic.dataclasses import dataclass as pydantic_dataclass
 
 from siq.data.layout import read_heading, usable_name
 from siq.errors import InputError, NumericalFailure, suggestion
-from siq.inference.identification import IdentificationOptions
-from siq.inference.library import candidate_library
+from siq.inference.checks import PredictionLimits
+from siq.inference.library import IdentificationOptions, candidate_library
 from siq.inference.observation import velocity_names
 from siq.networks.decomposition import TrainingOptions
 from siq.networks.regression import RegressionOptions
 from siq.numerics.files import read_document, validate
-from siq.quasipotential.certificate_tests import CertificateOptions, PredictionLimits
+from siq.quasipotential.certificate_tests import CertificateOptions
 from siq.quasipotential.landscape import LandscapeOptions
 from siq.quasipotential.landscape_assembly import fault_for_landscape
 from siq.quasipotential.refinement import RefinementOptions

@@ -19,7 +19,7 @@ import pandas as pd
 
 from siq.data.recordings import Recordings, snapshot_pairs
 from siq.errors import NumericalFailure
-from siq.inference.identification import FieldRecord
+from siq.inference.field_estimate import FieldEstimate
 from siq.networks.decomposition import TrainedNetworks
 from siq.networks.training import Block, Checkpoints, TrainingData, choose_device, prepare_data
 from siq.numerics.randomness import Purpose, generator
@@ -68,7 +68,7 @@ class RunToTrain:
     """What a run brings to its training: its trajectories and its f, None where a step before failed."""
 
     recordings: Recordings | None
-    record: FieldRecord | None
+    record: FieldEstimate | None
 
 
 @plain_dataclass(frozen=True)
@@ -169,13 +169,13 @@ def _diffusion(
     records = [record for number in data if (record := runs[number].record) is not None]
     if not records:
         return Diffusion.identity(dimension)
-    if not all(record.found.diffusion.constant for record in records):
+    if not all(record.diffusion.constant for record in records):
         # Networks only lead to the right solution, which is then found with D as it is.
         points = np.concatenate([data[number].training.x0 for number in data])
         every = max(len(points) // MOST_POINTS, 1)
-        noises = [record.found.diffusion.at(points[::every]).mean(axis=0) for record in records]
+        noises = [record.diffusion.at(points[::every]).mean(axis=0) for record in records]
         return Diffusion(np.mean(noises, axis=0))
-    return Diffusion(np.mean([record.found.diffusion.matrix for record in records], axis=0))
+    return Diffusion(np.mean([record.diffusion.matrix for record in records], axis=0))
 
 
 def _training_data(
@@ -212,7 +212,7 @@ def _checks(
             continue
         x = part.training.x0
         try:
-            ready[number] = TrainingCheck(record.found, x, options=options, seed=number)
+            ready[number] = TrainingCheck(record, x, options=options, seed=number)
         except (NumericalFailure, np.linalg.LinAlgError) as error:
             faults[number] = f"the check of the training could not be prepared: {error}"
     return Checks(ready, faults)
@@ -228,8 +228,8 @@ def _fingerprint(
         record = runs[number].record
         arrays = [part.training.x0, part.training.xh, part.training.h]
         if record is not None:
-            noise = record.found.diffusion.at(part.training.x0[:1])
-            arrays += [record.found.coefficients, record.found.covariance, noise]
+            noise = record.diffusion.at(part.training.x0[:1])
+            arrays += [record.coefficients, record.covariance, noise]
         for values in arrays:
             digest.update(np.ascontiguousarray(values).tobytes())
     return digest.hexdigest()

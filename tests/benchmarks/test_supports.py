@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from benchmarks.laboratories.supports import STRONG, SYSTEMS, WANTED, identified, row, true_terms
-from siq.inference.identification import IdentificationOptions, field_library
+from siq.inference.library import IdentificationOptions, field_library
 
 
 def test_terms_of_a_record_are_compared_with_the_true_ones() -> None:

@@ -10,15 +10,11 @@ from known_systems import as_system, linear_system
 
 from siq.data.recordings import Recordings, snapshot_pairs
 from siq.errors import NumericalFailure
-from siq.inference.field_estimate import DiffusionSource, IdentifiedField, check_units, estimated_diffusion
-from siq.inference.identification import (
-    IdentificationOptions,
-    field_library,
-    identify_vector_field,
-    read_field,
-    write_field,
-)
-from siq.quasipotential.certificate_tests import PredictionLimits
+from siq.inference.checks import PredictionLimits
+from siq.inference.diffusion_model import check_units, estimated_diffusion
+from siq.inference.field_estimate import DiffusionSource, FieldEstimate, read_field, write_field
+from siq.inference.library import IdentificationOptions, field_library
+from siq.inference.regression import identify_vector_field
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.landscape_comparison import check_same_noise
 from siq.systems.diffusion import Diffusion
@@ -65,9 +61,9 @@ def test_an_estimated_d_is_compared_within_its_errors() -> None:
             check_same_noise(learned.with_diffusion(Diffusion(other)), learned, states, found=field)
 
 
-def field_of(found: identification_step.Identified) -> IdentifiedField:
+def field_of(found: identification_step.Identified) -> FieldEstimate:
     assert found.record is not None
-    return found.record.found
+    return found.record
 
 
 def test_d_is_estimated_from_white_noise_at_determinant_one() -> None:
@@ -79,7 +75,7 @@ def test_d_is_estimated_from_white_noise_at_determinant_one() -> None:
     assert np.linalg.det(own) == pytest.approx(1, rel=1e-12)
     # 4000 pairs: a relative standard error of √(2/4000) = 2 % in each entry of the diagonal.
     np.testing.assert_allclose(own, NORMALISED, atol=0.1)
-    assert found.record.noise["intensity"] == pytest.approx(0.02 * np.sqrt(np.linalg.det(D)), rel=0.1)
+    assert found.record.diagnosis.intensity == pytest.approx(0.02 * np.sqrt(np.linalg.det(D)), rel=0.1)
 
 
 def test_noises_without_a_significant_correlation_have_none() -> None:

@@ -8,11 +8,15 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from siq.inference.filter_kernels import noise_likelihood, smoothed_states
-from siq.inference.kalman_filter import Grid, Noise, linearise, process_covariance, whiten
-from siq.inference.maximum_likelihood import Fit, fit_by_multiple_shooting
+from siq.inference.kalman_filter import Grid, Noise, linearise, whiten, with_parameters_changed
+from siq.inference.maximum_likelihood import (
+    Fit,
+    estimate_noise,
+    first_noise,
+    fit_by_multiple_shooting,
+    log_likelihood,
+)
 from siq.inference.measurements import Measurements, course_of_input, first_states
-from siq.inference.noise import estimate_noise, first_noise, log_likelihood
 from siq.numerics.files import Document, validate
 from siq.systems.cards import SystemCard, build_system
 from siq.systems.dynamics import Dynamics
@@ -102,6 +106,13 @@ def linearised() -> tuple[Measurements, object, Noise]:
     )
 
 
+def process_covariance(transition: np.ndarray, step: np.ndarray, intensity: np.ndarray) -> np.ndarray:
+    """What noise adds over each interval, by Simpson's rule from Φ at its ends."""
+    unit = np.eye(transition.shape[1])
+    ends = [one @ intensity @ one.transpose(0, 2, 1) for one in (transition, transition + unit)]
+    return (ends[0] + ends[1] + intensity) * (step / 6)[:, None, None]
+
+
 def dense(data: Measurements, line: object, noise: Noise) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Deviation of outputs, its covariance, and columns of parameters and initial states, written out."""
     rows, dimension = line.gap.shape
@@ -164,11 +175,9 @@ def test_the_likelihood_of_a_noise_is_restricted(linearised) -> None:
 def test_smoothed_states_are_the_conditional_means(linearised) -> None:
     data, line, noise = linearised
     begin = np.array([[0.1, -0.2], [0.0, 0.3]])
-    step = np.append(np.diff(data.t), 0.0)
-    process = process_covariance(line.transition, step, noise.intensity)
-    found, _, _ = smoothed_states(
-        data.first, line.transition, line.gap, process, line.measured, line.residual, noise.measurement, begin
-    )
+    process = process_covariance(line.transition, data.step, noise.intensity)
+    still = with_parameters_changed(line, np.zeros(2))
+    found, _, _ = still.smoothed(data.first, data.step, noise, begin)
     # The same minimum, written as least squares over all random forces.
     rows = len(data.t)
     for place, (first, end) in enumerate(zip(data.first[:-1], data.first[1:], strict=True)):
@@ -277,10 +286,7 @@ def test_a_band_limited_input_needs_regular_sampling() -> None:
 
 def test_the_products_of_columns_are_eliminated_as_by_projection(linearised) -> None:
     data, line, noise = linearised
-    total, _, freedom = noise_likelihood(
-        data.first, line.transition, line.response, line.gap, line.measured, line.measured_response,
-        line.residual, np.append(np.diff(data.t), 0.0), noise.measurement, noise.intensity,
-    )  # fmt: skip
+    total, _, freedom = line.sums(data.first, data.step, noise)
     white = whiten(line, data, noise)
     change = np.linalg.lstsq(white.columns, white.innovations, rcond=None)[0]
     assert total == pytest.approx(float(((white.innovations - white.columns @ change) ** 2).sum()), rel=1e-8)

@@ -71,11 +71,12 @@ def test_whole_trajectories_end_where_steps_at_all_samples_do() -> None:
 
 
 def test_nothing_is_expected_of_fixed_parameters_and_of_zeros() -> None:
-    expected = Expectations.of(with_expectations(model(b=0.0)))
+    named = with_expectations(model(b=0.0))
+    expected = Expectations.of(named, np.array([0.0, 7.0, 4.0]))
     np.testing.assert_array_equal(expected.rows, [[1.0, 0.0, 0.0], [0.0, 0.0, 0.5]])
-    np.testing.assert_array_equal(expected.deviations(np.array([0.0, 7.0, 4.0])), [1.0, -1.0])
+    np.testing.assert_array_equal(expected.deviations, [1.0, -1.0])
     columns, innovations = np.ones((5, 3)), np.ones(5)
-    assert Expectations.of(model()).beside(columns, innovations, np.ones(3)) == (columns, innovations)
+    assert Expectations.of(model()).beside(columns, innovations) == (columns, innovations)
 
 
 def test_expectations_do_not_depend_on_units() -> None:

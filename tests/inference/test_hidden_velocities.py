@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,15 +15,15 @@ from siq.data.correlation import noise_floors
 from siq.data.preparation import FEWEST_STRETCHES
 from siq.data.recordings import Recordings, write_recordings
 from siq.errors import InputError, NumericalFailure
-from siq.inference.field_estimate import DiffusionSource
-from siq.inference.hidden_velocities import HiddenMotion, identify_hidden_motion
-from siq.inference.identification import IdentificationOptions, read_field, write_field
-from siq.inference.library import candidate_library
-from siq.inference.noisy_sensor import of_all_states
-from siq.inference.observation import smoothed_motion, unbroken, velocity_names
+from siq.inference import identify
+from siq.inference.field_estimate import DiffusionSource, FieldEstimate, read_field, write_field
+from siq.inference.kalman_identification import identify_by_likelihood, of_all_states
+from siq.inference.library import IdentificationOptions, candidate_library
+from siq.inference.observation import ObservationModel, smoothed_motion, unbroken, velocity_names
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.rates import _covariance_axes
 from siq.quasipotential.transitions import barrier_uncertainty, ways_out
+from siq.systems.diffusion import Diffusion
 from siq.systems.phase_portrait import evenly_spread, phase_portrait
 from siq.workflow import identification_step, results
 from siq.workflow.pipeline import PipelineSettings
@@ -42,9 +41,11 @@ def identified() -> tuple[identification_step.Identified, Recordings, np.ndarray
     return done, recordings, velocities
 
 
-def found_by(recordings: Recordings, names: list[str], *, degree: int) -> HiddenMotion:
+def found_by(recordings: Recordings, names: list[str], *, degree: int) -> FieldEstimate:
     library = candidate_library([*names, *velocity_names(names)], degree=degree)
-    return identify_hidden_motion(library, recordings, false_terms=0.02, generator=np.random.default_rng(0))
+    observation = ObservationModel(library, Diffusion.identity(library.dimension), hidden=True)
+    generator = np.random.default_rng(0)
+    return identify_by_likelihood(observation, recordings, false_terms=0.02, generator=generator)
 
 
 @pytest.mark.portable
@@ -52,15 +53,15 @@ def test_positions_alone_show_the_force_and_both_noises() -> None:
     done, _, _ = identified()
     assert done.outcome.status == Status.OK and done.record is not None
     assert "velocities were not recorded" in done.outcome.reason
-    field = done.record.found
+    field = done.record
     assert [field.library.names[k] for _, k in field.support] == ["v_x", "x", "v_x", "x**3"]
     assert field.values[0] == 1 and not field.covariance[0].any()
     errors = np.sqrt(np.diag(field.covariance))[1:]
     assert (np.abs(field.values[1:] - [1, -FRICTION, -1]) < 3.5 * errors).all()
     np.testing.assert_allclose(field.diffusion.matrix, [[0, 0], [0, 1]], rtol=1e-12)
-    intensity, error = done.record.noise["intensity"], done.record.noise["intensity_error"]
+    intensity, error = done.record.diagnosis.intensity, done.record.diagnosis.intensity_error
     assert abs(intensity - 2 * FRICTION * TEMPERATURE) < 3.5 * error < 0.2 * intensity
-    assert done.record.noise["measurement"][0] == pytest.approx(SENSOR, rel=0.03)
+    assert done.record.diagnosis.measurement[0] == pytest.approx(SENSOR, rel=0.03)
 
 
 def test_the_filter_knows_the_velocities() -> None:
@@ -79,7 +80,7 @@ def test_barriers_of_the_identified_particle_hold() -> None:
     assert done.record is not None
     states = of_all_states(recordings, done.record, pair_step=None).values
     points = states[evenly_spread(states, generator=np.random.default_rng(0))]
-    field = done.record.found
+    field = done.record
     ways = ways_out(field.dynamics, phase_portrait(field.dynamics, points, seed=0))
     assert len(ways) == 2
     for way in ways:
@@ -96,8 +97,8 @@ def test_it_is_kept_in_a_file(tmp_path: Path) -> None:
     assert again is not None and again.hidden_velocities
     assert again.diffusion_source == DiffusionSource.OF_VELOCITIES
     assert str(DiffusionSource.OF_VELOCITIES.note) in done.outcome.reason
-    np.testing.assert_array_equal(again.found.coefficients, done.record.found.coefficients)
-    np.testing.assert_array_equal(again.found.covariance, done.record.found.covariance)
+    np.testing.assert_array_equal(again.coefficients, done.record.coefficients)
+    np.testing.assert_array_equal(again.covariance, done.record.covariance)
 
 
 def test_two_coupled_positions() -> None:
@@ -114,7 +115,7 @@ def test_two_coupled_positions() -> None:
         seen[:, row] = x[:, :2]
     seen += 0.02 * draw.standard_normal(seen.shape)
     recordings = Recordings.from_arrays(step * np.arange(1000), seen, names=["x", "y"])
-    found = found_by(recordings, ["x", "y"], degree=1).found
+    found = found_by(recordings, ["x", "y"], degree=1)
     named = {
         (found.library.states[i], found.library.names[k]): (value, error)
         for (i, k), value, error in zip(
@@ -162,8 +163,8 @@ def test_one_record_of_smooth_positions_is_enough(tmp_path: Path) -> None:
     drawn = results.draw_run(hidden, results.source_of(path, hidden), number=0).recordings
     assert drawn is not None and len(drawn.labels) >= FEWEST_STRETCHES
     done = identification_step.run(SETTINGS.of(identification_step.IdentifySettings), drawn, number=0)
-    assert done.record is not None and done.record.prediction["passed"]
-    field = done.record.found
+    assert done.record is not None and done.record.prediction.passed
+    field = done.record
     assert [field.library.names[k] for _, k in field.support] == ["v_x", "x", "v_x", "x**3"]
 
 
@@ -183,11 +184,11 @@ def ring_downs(positions: int = 1) -> Recordings:
 
 def test_ring_downs_have_no_random_forces_and_the_unit_matrix_of_the_velocities() -> None:
     done = identification_step.run(SETTINGS.of(identification_step.IdentifySettings), ring_downs(), number=0)
-    assert done.record is not None and done.record.prediction["passed"]
+    assert done.record is not None and done.record.prediction.passed
     assert done.record.diffusion_source == DiffusionSource.UNIT_OF_VELOCITIES
-    assert done.record.noise_strength is None and done.record.noise["kind"] == "sensor"
-    assert done.record.noise["measurement"][0] == pytest.approx(0.005, rel=0.05)
-    field = done.record.found
+    assert done.record.noise_strength is None and done.record.diagnosis.kind == "sensor"
+    assert done.record.diagnosis.measurement[0] == pytest.approx(0.005, rel=0.05)
+    field = done.record
     assert not field.noise_rate.any()
     np.testing.assert_array_equal(field.diffusion.matrix, [[0, 0], [0, 1]])
     errors = np.sqrt(np.diag(field.covariance))[1:]
@@ -198,10 +199,10 @@ def test_ring_downs_have_no_random_forces_and_the_unit_matrix_of_the_velocities(
 def test_ring_downs_of_positions_in_different_units_show_no_unit_matrix(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    motion = SimpleNamespace(intensity=0.0, found=SimpleNamespace(diffusion=None), sensor=np.ones(2))
-    monkeypatch.setattr(identification_step, "identify_hidden_motion", lambda *_, **__: motion)
-    monkeypatch.setattr(identification_step, "evidence", lambda *_, **__: (0.5, 1.0))
-    monkeypatch.setattr(identification_step, "_fault", lambda _: None)
+    found = identified()[0].record
+    assert found is not None
+    still = replace(found, noise_rate=0 * found.noise_rate)
+    monkeypatch.setattr(identify, "identify_by_likelihood", lambda *_, **__: still)
     several = replace(ring_downs(2), units=("m", "rad"))
     done = identification_step.run(SETTINGS.of(identification_step.IdentifySettings), several, number=0)
     assert done.record is None and "scale them to one unit" in done.outcome.reason
@@ -224,7 +225,7 @@ def test_networks_have_no_use_for_hidden_velocities() -> None:
 def test_the_errors_cover() -> None:
     deviations = []
     for seed in range(40):
-        field = found_by(particle(100 + seed)[0], ["x"], degree=3).found
+        field = found_by(particle(100 + seed)[0], ["x"], degree=3)
         if [field.library.names[k] for _, k in field.support] == ["v_x", "x", "v_x", "x**3"]:
             errors = np.sqrt(np.diag(field.covariance))[1:]
             deviations.append((field.values[1:] - [1, -FRICTION, -1]) / errors)

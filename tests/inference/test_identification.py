@@ -18,10 +18,9 @@ from known_systems import (
 
 from siq.data.recordings import Recordings, SnapshotPairs, select_recordings, snapshot_pairs
 from siq.errors import NumericalFailure
-from siq.inference.field_estimate import FlowMap, IdentifiedField
-from siq.inference.flow_regression import copies, refit, residuals
-from siq.inference.identification import IdentificationOptions, evenly, field_library, identify_vector_field
-from siq.inference.library import candidate_library
+from siq.inference.field_estimate import FieldEstimate, FlowMap
+from siq.inference.library import IdentificationOptions, candidate_library, field_library
+from siq.inference.regression import copies, evenly, identify_vector_field, refit, residuals
 from siq.numerics.integration import dormand_prince_step
 from siq.systems.dynamics import Dynamics
 from siq.systems.simulation import SimulationOptions, simulate_snapshots
@@ -61,13 +60,13 @@ def noisy(
 
 def identified(
     known: KnownSystem, data: SnapshotPairs, *, integrator_step: float | None = None, **options: object
-) -> IdentifiedField:
+) -> FieldEstimate:
     settings = IdentificationOptions(**{"degree": 3, **options})
     library = field_library([symbol.name for symbol in known.dynamics.symbols], settings)
     return identify_vector_field(library, data, options=settings, integrator_step=integrator_step)
 
 
-def terms(found: IdentifiedField) -> list[dict[str, float]]:
+def terms(found: FieldEstimate) -> list[dict[str, float]]:
     return [
         {name: float(value) for name, value in zip(found.library.names, column, strict=True) if value != 0}
         for column in found.coefficients.T
@@ -81,14 +80,14 @@ def exact_terms(known: KnownSystem) -> list[dict[str, float]]:
     ]
 
 
-def assert_same(found: IdentifiedField, known: KnownSystem, tolerance: float) -> None:
+def assert_same(found: FieldEstimate, known: KnownSystem, tolerance: float) -> None:
     for mine, wanted in zip(terms(found), exact_terms(known), strict=True):
         assert set(mine) == set(wanted)
         for name, value in wanted.items():
             assert mine[name] == pytest.approx(value, abs=tolerance), name
 
 
-def scores(found: IdentifiedField, known: KnownSystem) -> np.ndarray:
+def scores(found: FieldEstimate, known: KnownSystem) -> np.ndarray:
     """Errors of the coefficients in their standard errors; fails where terms are missing or false."""
     exact = [exact_terms(known)[i][found.library.names[k]] for i, k in found.support]
     assert len(exact) == sum(map(len, exact_terms(known)))

@@ -14,10 +14,10 @@ from siq.inference.kalman_filter import Noise
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
 from siq.inference.recalibration import (
+    drop_insignificant_process_noise,
     fit_with_and_without_process_noise,
     recalibrate,
     simpler_fit,
-    without_idle_forces,
 )
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, Parameter
@@ -50,7 +50,7 @@ def test_what_does_nothing_is_left_out() -> None:
     fit = fitted(data)
     assert not fit.has_process_noise
     idle = replace(fit, noise=Noise(fit.noise.measurement, np.array([1e-22])))
-    without = without_idle_forces(idle, data)
+    without = drop_insignificant_process_noise(idle, data)
     assert without is not None and not without.has_process_noise
     assert without.log_likelihood == pytest.approx(idle.log_likelihood, abs=1e-3)
 
@@ -58,7 +58,7 @@ def test_what_does_nothing_is_left_out() -> None:
 def test_what_drives_the_motion_is_kept() -> None:
     data = relaxations(driven=0.05)
     fit = fitted(data)
-    assert fit.has_process_noise and without_idle_forces(fit, data) is None
+    assert fit.has_process_noise and drop_insignificant_process_noise(fit, data) is None
 
 
 def test_idle_forces_are_not_believed_where_another_way_of_fitting_ends_lower() -> None:

@@ -7,19 +7,12 @@ import pytest
 from remembering import STEP, double_wells, trap
 
 from siq.data.correlation import markov_lag
-from siq.data.recordings import Recordings
+from siq.data.recordings import Recordings, select_recordings
 from siq.errors import NumericalFailure
-from siq.inference.field_estimate import IdentifiedField
-from siq.inference.identification import IdentificationOptions, field_library
-from siq.inference.instrumental_variables import (
-    coarse_pairs,
-    identify_from_earlier,
-    lagged_pairs,
-    lagged_parts,
-    lost_time,
-    mean_probability_from_earlier,
-    refit_from_earlier,
-)
+from siq.inference.checks import mean_residual_probability
+from siq.inference.field_estimate import FieldEstimate
+from siq.inference.library import IdentificationOptions, field_library
+from siq.inference.regression import coarse_pairs, identify_vector_field, lagged_pairs, lost_time, refit
 from siq.quasipotential.landscape import Landscape
 from siq.workflow.identification_step import IdentifySettings
 from siq.workflow.identification_step import run as identify_step
@@ -33,9 +26,9 @@ def recorded(values: np.ndarray) -> Recordings:
     return Recordings.from_arrays(np.arange(values.shape[1]) * STEP, values, names=names)
 
 
-def identified(recordings: Recordings, lag: int) -> IdentifiedField:
+def identified(recordings: Recordings, lag: int) -> FieldEstimate:
     library = field_library(recordings.names, OPTIONS)
-    return identify_from_earlier(library, lagged_pairs(recordings, lag), options=OPTIONS)
+    return identify_vector_field(library, lagged_pairs(recordings, lag), options=OPTIONS)
 
 
 @pytest.mark.parametrize(
@@ -85,12 +78,14 @@ def test_coarse_pairs_do_not_overlap() -> None:
 def test_held_out_residuals_have_a_mean_for_a_wrong_f_alone() -> None:
     recordings = recorded(double_wells(4, memory=3.0, samples=10_000))
     held = np.arange(8) >= 6
-    training, unseen = lagged_parts(recordings, 15, held)
-    fitted = refit_from_earlier(identified(recordings, 15), training)
-    seen = len(training.pairs.h)
-    assert mean_probability_from_earlier(fitted, unseen, seen=seen) > 1e-3
+    training, unseen = (
+        lagged_pairs(select_recordings(recordings, np.flatnonzero(some)), 15) for some in (~held, held)
+    )
+    fitted = refit(identified(recordings, 15), training)
+    seen = len(training.h)
+    assert mean_residual_probability(fitted, unseen, seen=seen) > 1e-3
     wrong = fitted.coefficients * 3
-    assert mean_probability_from_earlier(replace(fitted, coefficients=wrong), unseen, seen=seen) < 1e-4
+    assert mean_residual_probability(replace(fitted, coefficients=wrong), unseen, seen=seen) < 1e-4
 
 
 def test_gaps_everywhere_are_refused_in_a_sentence() -> None:
@@ -104,7 +99,7 @@ def test_the_step_says_that_it_looked_from_earlier() -> None:
     found = identify_step(PipelineSettings().of(IdentifySettings), recordings, number=0)
     assert found.record is not None
     assert found.record.memory is not None
-    assert found.record.prediction["passed"]
+    assert found.record.prediction.passed
     assert "the recordings are Markovian" in found.outcome.reason
     strength = found.record.noise_strength
     assert strength is not None

@@ -7,13 +7,12 @@ import pytest
 import sympy
 
 from siq.data.recordings import Recordings
-from siq.inference.diffusion_model import all_places
-from siq.inference.kalman_filter import Noise
+from siq.inference.diffusion_model import InnovationLikelihood, all_places
+from siq.inference.kalman_filter import Noise, mean_intensity
 from siq.inference.library import candidate_library
 from siq.inference.maximum_likelihood import Fit, fit_by_filter
 from siq.inference.measurements import Measurements
-from siq.inference.observation import View
-from siq.inference.state_dependent_diffusion import FilteredNoise, FormulaField, noise_by_state
+from siq.inference.observation import ObservationModel
 from siq.quasipotential.landscape import Landscape
 from siq.systems.diffusion import Diffusion
 from siq.workflow import identification_step
@@ -38,9 +37,9 @@ def records(
     return Recordings.from_arrays(STEP * np.arange(samples), measured.T[:, :, None], names=["x"])
 
 
-def followed(recordings: Recordings) -> tuple[Fit, Measurements, FilteredNoise]:
+def followed(recordings: Recordings) -> tuple[Fit, Measurements, InnovationLikelihood]:
     library = candidate_library(["x"], degree=3)
-    view = View(library, Diffusion.identity(1), None)
+    view = ObservationModel(library, Diffusion.identity(1))
     data = view.measured(recordings, None)
     support = np.array([[0, 1], [0, 3]])
     fit = fit_by_filter(
@@ -48,22 +47,22 @@ def followed(recordings: Recordings) -> tuple[Fit, Measurements, FilteredNoise]:
         noise=Noise(np.array([0.003]), np.array([0.5])), closure=False,
     )  # fmt: skip
     assert fit.converged
-    return fit, data, FilteredNoise(library.symbols, fit, data)
+    return fit, data, InnovationLikelihood(library.symbols, fit, data)
 
 
 def test_scores_are_the_derivatives_of_the_likelihood() -> None:
     _, _, seen = followed(records(1, slope=0.4, samples=200))
     chosen = all_places(1, len(seen.terms))
     values, sensor = np.array([0.3, 0.02, 0.05]), np.array([0.012])
-    now = seen._reached(chosen, values, sensor)
+    _, score, _, _ = seen.reached(chosen, values, sensor)
     for place in range(4):
         change = np.zeros(4)
         change[place] = 1e-5
         up, down = (
-            seen._reached(chosen, values + sign * change[:3], sensor * np.exp(sign * change[3])).logarithm
+            seen.reached(chosen, values + sign * change[:3], sensor * np.exp(sign * change[3]))[0]
             for sign in (1, -1)
         )
-        assert now.score[place] == pytest.approx((up - down) / 2e-5, rel=1e-4)
+        assert score[place] == pytest.approx((up - down) / 2e-5, rel=1e-4)
 
 
 def test_the_formula_is_found_with_its_errors_and_the_sensor_beside_it() -> None:
@@ -72,11 +71,11 @@ def test_the_formula_is_found_with_its_errors_and_the_sensor_beside_it() -> None
         _, _, seen = followed(records(seed, slope=0.4))
         probability = seen.constant_probability()
         assert probability < 1e-6
-        own = noise_by_state(seen, false_terms=0.01, probability=probability)
-        assert [str(term) for term in own.formula.terms] == ["1", "x"]
-        scaled.append((own.formula.values - [STRENGTH, 0.4 * STRENGTH]) / own.formula.standard_errors)
-        error = np.sqrt(own.covariance[2, 2])
-        scaled.append(np.array([np.log(own.sensor[0] / SENSOR**2) / error]))
+        formula, sensor, covariance = seen.selected(false_terms=0.01, probability=probability)
+        assert [str(term) for term in formula.terms] == ["1", "x"]
+        scaled.append((formula.values - [STRENGTH, 0.4 * STRENGTH]) / formula.standard_errors)
+        error = np.sqrt(covariance[2, 2])
+        scaled.append(np.array([np.log(sensor[0] / SENSOR**2) / error]))
     together = np.concatenate(scaled)
     assert np.abs(together).max() < 3.5 and 0.5 < np.sqrt((together**2).mean()) < 1.6
 
@@ -89,22 +88,22 @@ def test_a_constant_noise_is_given_up_as_rarely_as_asked() -> None:
 
 def test_the_field_is_the_mean_over_what_is_known_of_the_state() -> None:
     x, y = sympy.symbols("x y", real=True)
-    field = FormulaField(Diffusion.of_formulas((x, y), [[1 + x**2, x * y], [x * y, 2 + y**2]]))
+    field = Diffusion.of_formulas((x, y), [[1 + x**2, x * y], [x * y, 2 + y**2]])
     point, spread = np.array([[0.3, -0.2]]), np.array([[[0.05, 0.01], [0.01, 0.08]]])
-    found = field.over(point, spread, np.zeros(1))[0]
+    found = mean_intensity(field, point, spread, np.zeros(1))[0]
     assert found == pytest.approx(np.array([[1.09 + 0.05, -0.06 + 0.01], [-0.06 + 0.01, 2.04 + 0.08]]))
     # Forces of half an interval are a part of the spread in its middle; a third state is not driven.
     wider = np.zeros((1, 3, 3))
-    found = field.over(np.array([[0.3, -0.2, 9.0]]), wider, np.array([0.1]))[0]
+    found = mean_intensity(field, np.array([[0.3, -0.2, 9.0]]), wider, np.array([0.1]))[0]
     assert found[0, 0] == pytest.approx(1.09 + 1.09 * 0.05) and not found[2].any()
 
 
 def test_a_formula_that_is_no_covariance_somewhere_drives_nothing_there() -> None:
     x = sympy.Symbol("x", real=True)
-    field = FormulaField(Diffusion.of_formulas((x,), [[1 + x]]))
-    assert field.over(np.array([[-1.5], [1.0]]), np.zeros((2, 1, 1)), np.zeros(2)).ravel() == pytest.approx(
-        [0, 2]
-    )
+    field = Diffusion.of_formulas((x,), [[1 + x]])
+    assert mean_intensity(
+        field, np.array([[-1.5], [1.0]]), np.zeros((2, 1, 1)), np.zeros(2)
+    ).ravel() == pytest.approx([0, 2])
 
 
 def test_the_step_finds_d_of_the_state_beside_the_sensor() -> None:
@@ -113,8 +112,8 @@ def test_the_step_finds_d_of_the_state_beside_the_sensor() -> None:
         records(3, slope=0.4, samples=2500),
         number=0,
     )
-    assert done.record is not None and done.record.prediction["passed"]
-    found = done.record.found
+    assert done.record is not None and done.record.prediction.passed
+    found = done.record
     assert [found.library.names[k] for _, k in found.support] == ["x", "x**3"]
     assert (np.abs(found.values - [1, -1]) < 3 * np.sqrt(np.diag(found.covariance))).all()
     assert found.noise is not None and found.constant_noise is None

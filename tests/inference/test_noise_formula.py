@@ -8,18 +8,11 @@ import pytest
 import sympy
 
 from siq.data.recordings import SnapshotPairs
-from siq.inference.diffusion_model import constant_noise_probability, with_random_forces
-from siq.inference.field_estimate import IdentifiedField
-from siq.inference.flow_regression import residuals, with_given_noise, with_noise_formula
-from siq.inference.identification import (
-    FieldRecord,
-    IdentificationOptions,
-    identify_vector_field,
-    read_field,
-    write_field,
-)
-from siq.inference.library import candidate_library
-from siq.inference.residuals import mean_residual_probability
+from siq.inference.checks import mean_residual_probability
+from siq.inference.diffusion_model import constant_noise_probability, with_process_noise_rate
+from siq.inference.field_estimate import FieldEstimate, read_field, write_field
+from siq.inference.library import IdentificationOptions, candidate_library
+from siq.inference.regression import identify_vector_field, residuals, with_given_noise, with_noise_formula
 from siq.systems.dynamics import Dynamics
 
 X, Y = sympy.symbols("x y", real=True)
@@ -53,12 +46,12 @@ def recorded(dynamics: Dynamics, *, seed: int, records: int = 20, samples: int =
     )
 
 
-def identified(dynamics: Dynamics, pairs: SnapshotPairs) -> IdentifiedField:
+def identified(dynamics: Dynamics, pairs: SnapshotPairs) -> FieldEstimate:
     library = candidate_library(dynamics.states, degree=OPTIONS.degree)
-    return with_random_forces(identify_vector_field(library, pairs, options=OPTIONS), pairs)
+    return with_process_noise_rate(identify_vector_field(library, pairs, options=OPTIONS), pairs)
 
 
-def terms_of(found: IdentifiedField) -> set[tuple[int, str]]:
+def terms_of(found: FieldEstimate) -> set[tuple[int, str]]:
     return {(int(i), found.library.names[k]) for i, k in found.support}
 
 
@@ -68,13 +61,13 @@ def pairs() -> SnapshotPairs:
 
 
 @pytest.fixture(scope="module")
-def found(pairs: SnapshotPairs) -> IdentifiedField:
+def found(pairs: SnapshotPairs) -> FieldEstimate:
     one = with_noise_formula(identified(MULTIPLIED, pairs), pairs, false_terms=FALSE)
     assert one is not None
     return one
 
 
-def test_a_noise_that_depends_on_the_state_is_found_with_its_formula(found: IdentifiedField) -> None:
+def test_a_noise_that_depends_on_the_state_is_found_with_its_formula(found: FieldEstimate) -> None:
     assert found.noise is not None
     assert [str(term) for term in found.noise.terms] == ["1", "x"]
     expected = INTENSITY * np.array([1, 0.6])
@@ -86,34 +79,32 @@ def test_a_noise_that_depends_on_the_state_is_found_with_its_formula(found: Iden
     )
 
 
-def test_f_has_its_right_terms_with_the_weights_of_d(found: IdentifiedField) -> None:
+def test_f_has_its_right_terms_with_the_weights_of_d(found: FieldEstimate) -> None:
     assert terms_of(found) == {(0, "x"), (0, "x**3")}
     off = (found.values - np.array([1, -1])) / np.sqrt(np.diag(found.covariance))
     assert (np.abs(off) < 4).all()
 
 
-def test_the_geometric_mean_of_d_over_the_record_is_one(found: IdentifiedField, pairs: SnapshotPairs) -> None:
+def test_the_geometric_mean_of_d_over_the_record_is_one(found: FieldEstimate, pairs: SnapshotPairs) -> None:
     logarithm = np.log(found.diffusion.at(pairs.x0)[:, 0, 0]).mean()
     assert logarithm == pytest.approx(0, abs=1e-3)  # the last refit of D moves it a little
 
 
-def test_held_out_residuals_have_no_mean_left_and_a_missing_term_is_seen(found: IdentifiedField) -> None:
+def test_held_out_residuals_have_no_mean_left_and_a_missing_term_is_seen(found: FieldEstimate) -> None:
     unseen = recorded(MULTIPLIED, seed=2)
     assert mean_residual_probability(found, unseen) > 1e-3
     false = replace(found, coefficients=0.5 * found.coefficients)
     assert mean_residual_probability(false, unseen) < 1e-6
 
 
-def test_a_field_with_a_formula_of_its_noise_survives_its_file(
-    found: IdentifiedField, tmp_path: Path
-) -> None:
-    write_field(tmp_path / "field.json", FieldRecord(found, {}, {}), OPTIONS)
+def test_a_field_with_a_formula_of_its_noise_survives_its_file(found: FieldEstimate, tmp_path: Path) -> None:
+    write_field(tmp_path / "field.json", found, OPTIONS)
     record = read_field(tmp_path / "field.json")
-    assert record is not None and record.found.noise is not None and found.noise is not None
+    assert record is not None and record.noise is not None and found.noise is not None
     x = np.linspace(-1, 1, 5)[:, None]
-    np.testing.assert_array_equal(record.found.diffusion.at(x), found.diffusion.at(x))
-    np.testing.assert_array_equal(record.found.noise.covariance, found.noise.covariance)
-    assert record.found.intensity == found.intensity
+    np.testing.assert_array_equal(record.diffusion.at(x), found.diffusion.at(x))
+    np.testing.assert_array_equal(record.noise.covariance, found.noise.covariance)
+    assert record.intensity == found.intensity
 
 
 def test_a_given_formula_of_d_weighs_the_residuals(pairs: SnapshotPairs) -> None:

@@ -11,20 +11,19 @@ from remembering import double_wells
 
 from siq.data.correlation import markov_lag
 from siq.data.recordings import Recordings, select_recordings, snapshot_pairs
-from siq.inference.identification import IdentificationOptions, identify_vector_field
-from siq.inference.instrumental_variables import possible_exposures
+from siq.inference.field_estimate import FieldEstimate
+from siq.inference.identify import identify, possible_exposures
 from siq.inference.kalman_filter import Noise
-from siq.inference.library import candidate_library
-from siq.inference.noisy_sensor import (
-    FilteredField,
+from siq.inference.kalman_identification import (
     filtered_recordings,
-    held_out_evidence,
+    held_out_innovations,
     identify_by_likelihood,
 )
-from siq.inference.observation import View, unbroken
+from siq.inference.library import IdentificationOptions, candidate_library
+from siq.inference.observation import ObservationModel, unbroken
+from siq.inference.regression import identify_vector_field
 from siq.systems.diffusion import Diffusion
 from siq.workflow import identification_step
-from siq.workflow.identification_step import means_over_exposures
 from siq.workflow.pipeline import PipelineSettings
 from siq.workflow.tables import Status
 
@@ -49,53 +48,55 @@ def double_well(seed: int, *, samples: int = 3000, records: int = 6) -> tuple[Re
     return recordings, x.T.reshape(-1, 1)
 
 
-def identified(recordings: Recordings, *, degree: int) -> FilteredField:
+def identified(recordings: Recordings, *, degree: int) -> FieldEstimate:
     library = candidate_library(["x"], degree=degree)
     begin = identify_vector_field(
         library, snapshot_pairs(recordings), options=IdentificationOptions(degree=degree)
     )
     return identify_by_likelihood(
-        library, recordings, begin.diffusion, Noise(np.array([0.003]), np.array([0.5])),
+        ObservationModel(library, begin.diffusion), recordings, Noise(np.array([0.003]), np.array([0.5])),
         false_terms=0.05, generator=np.random.default_rng(0),
     )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
-def found() -> tuple[FilteredField, Recordings, np.ndarray]:
+def found() -> tuple[FieldEstimate, Recordings, np.ndarray]:
     recordings, x = double_well(1)
     return identified(recordings, degree=5), recordings, x
 
 
-def test_terms_and_noises_are_found(found: tuple[FilteredField, Recordings, np.ndarray]) -> None:
-    field = found[0].found
+def test_terms_and_noises_are_found(found: tuple[FieldEstimate, Recordings, np.ndarray]) -> None:
+    field, noise = found[0], found[0].diagnosis
+    assert noise is not None and noise.sensor_evidence is not None
     assert [field.library.names[k] for _, k in field.support] == ["x", "x**3"]
     errors = np.sqrt(np.diag(field.covariance))
     assert (np.abs(field.values - [1, -1]) < 3 * errors).all()
-    assert np.sqrt(found[0].sensor[0]) == pytest.approx(SENSOR, rel=0.03)
+    assert noise.measurement[0] == pytest.approx(SENSOR, rel=0.03)
     assert field.noise_rate[0, 0] == pytest.approx(FORCES, rel=0.1)
     assert field.stability is not None and (field.stability > 0.5).all()
-    assert found[0].gain > 100 and abs(found[0].score) < 4
+    assert noise.sensor_evidence > 100 and abs(noise.correlation_score) < 4
 
 
-def test_where_the_origin_is_does_not_matter(found: tuple[FilteredField, Recordings, np.ndarray]) -> None:
+def test_where_the_origin_is_does_not_matter(found: tuple[FieldEstimate, Recordings, np.ndarray]) -> None:
     """Five states away from its wells a cubic is four monomials that are nearly alike."""
     one, recordings, _ = found
     away = identified(replace(recordings, values=recordings.values + 5), degree=5)
-    assert [away.found.library.names[k] for _, k in away.found.support] == ["1", "x", "x**2", "x**3"]
+    assert [away.library.names[k] for _, k in away.support] == ["1", "x", "x**2", "x**3"]
     x = np.linspace(-1.3, 1.3, 14)[:, None]
-    functions = away.found.library.evaluate(x + 5)[:, away.found.support[:, 1]]
-    error = np.sqrt(np.einsum("np,pq,nq->n", functions, away.found.covariance, functions))
-    change = away.found.dynamics.drift(x + 5)[:, 0] - one.found.dynamics.drift(x)[:, 0]
+    functions = away.library.evaluate(x + 5)[:, away.support[:, 1]]
+    error = np.sqrt(np.einsum("np,pq,nq->n", functions, away.covariance, functions))
+    change = away.dynamics.drift(x + 5)[:, 0] - one.dynamics.drift(x)[:, 0]
     assert (np.abs(change) < 3 * error).all() and error.max() < 0.5
-    assert (np.abs(away.found.values) < 50 * np.sqrt(np.diag(away.found.covariance))).all()
-    assert away.sensor[0] == pytest.approx(one.sensor[0], rel=0.02)
+    assert (np.abs(away.values) < 50 * np.sqrt(np.diag(away.covariance))).all()
+    assert away.diagnosis is not None and one.diagnosis is not None
+    assert away.diagnosis.measurement[0] == pytest.approx(one.diagnosis.measurement[0], rel=0.01)
 
 
 def test_filtered_states_are_nearer_and_keep_the_mean_of_f(
-    found: tuple[FilteredField, Recordings, np.ndarray],
+    found: tuple[FieldEstimate, Recordings, np.ndarray],
 ) -> None:
     one, recordings, x = found
-    filtered = filtered_recordings(one.found, one.sensor, recordings)
+    filtered = filtered_recordings(one, recordings)
     assert np.std(filtered.values - x) < 0.75 * SENSOR
     for values, unbiased in ((filtered, True), (recordings, False)):
         pairs = snapshot_pairs(values)
@@ -105,15 +106,14 @@ def test_filtered_states_are_nearer_and_keep_the_mean_of_f(
 
 
 def test_held_out_recordings_refuse_an_f_that_lacks_a_term(
-    found: tuple[FilteredField, Recordings, np.ndarray],
+    found: tuple[FieldEstimate, Recordings, np.ndarray],
 ) -> None:
     one, recordings, _ = found
     parts = select_recordings(recordings, [0, 1, 2, 3]), select_recordings(recordings, [4, 5])
-    probability, ratio = held_out_evidence(one, *parts)
+    probability, ratio = held_out_innovations(one, *parts)
     assert probability > 1e-3 and ratio == pytest.approx(1.0, abs=0.05)
-    field = one.found
-    linear = replace(field, support=field.support[:1], covariance=field.covariance[:1, :1])
-    probability, _ = held_out_evidence(replace(one, found=linear), *parts)
+    linear = replace(one, support=one.support[:1], covariance=one.covariance[:1, :1])
+    probability, _ = held_out_innovations(linear, *parts)
     assert probability < 1e-6
 
 
@@ -127,12 +127,12 @@ def test_relaxations_without_random_forces_are_whole_trajectories() -> None:
     measured = x + 0.02 * generator.standard_normal(x.shape)
     recordings = Recordings.from_arrays(t, measured[:, :, None], names=["x"])
     one = identified(recordings, degree=5)
-    assert [one.found.library.names[k] for _, k in one.found.support] == ["x", "x**3"]
-    errors = np.sqrt(np.diag(one.found.covariance))
-    assert (np.abs(one.found.values - [1, -1]) < 3 * errors).all() and errors.max() < 0.02
-    assert not one.found.noise_rate.any()
-    assert np.sqrt(one.sensor[0]) == pytest.approx(0.02, rel=0.05)
-    filtered = filtered_recordings(one.found, one.sensor, recordings)
+    assert [one.library.names[k] for _, k in one.support] == ["x", "x**3"]
+    errors = np.sqrt(np.diag(one.covariance))
+    assert (np.abs(one.values - [1, -1]) < 3 * errors).all() and errors.max() < 0.02
+    assert not one.noise_rate.any()
+    assert one.diagnosis is not None and one.diagnosis.measurement[0] == pytest.approx(0.02, rel=0.05)
+    filtered = filtered_recordings(one, recordings)
     assert np.std(filtered.values - x.reshape(-1, 1)) < 0.2 * 0.02
 
 
@@ -153,7 +153,7 @@ def test_means_over_an_exposure_are_treated_as_such() -> None:
     settings = PipelineSettings().of(identification_step.IdentifySettings)
     done = identification_step.run(settings, recordings, number=0)
     assert done.record is not None and done.record.exposure == pytest.approx(step)
-    field = done.record.found
+    field = done.record
     assert [field.library.names[k] for _, k in field.support] == ["x", "x**3"]
     assert (np.abs(field.values - [1, -1]) < 3.5 * np.sqrt(np.diag(field.covariance))).all()
     assert field.noise_rate[0, 0] == pytest.approx(FORCES, rel=0.05)
@@ -183,7 +183,7 @@ def test_the_step_asks_the_likelihood_where_sensors_are_noisy() -> None:
 def test_exposures_do_not_overlap_and_begin_at_rows_of_their_own(steps: float, kept: int, rows: int) -> None:
     t = np.concatenate([0.1 * np.arange(101), 20 + 0.1 * np.arange(41)])
     recordings = Recordings.from_arrays(t, np.sin(t)[:, None], names=["x"])
-    view = View(candidate_library(["x"], degree=1), Diffusion.identity(1), 0.1 * steps)
+    view = ObservationModel(candidate_library(["x"], degree=1), Diffusion.identity(1), 0.1 * steps)
     data = view.measured(recordings, None)
     known = ~np.isnan(data.outputs[:, 0])
     assert view.every(recordings) == kept
@@ -200,12 +200,11 @@ def test_exposures_do_not_overlap_and_begin_at_rows_of_their_own(steps: float, k
 def test_means_over_an_exposure_of_another_length_are_treated_as_such(steps: float) -> None:
     recordings = recorded(double_wells(1, exposure=steps, samples=4_000, sensor=0.01))
     library = candidate_library(["x"], degree=3)
-    found = means_over_exposures(
-        recordings, steps * TIME, library=library, options=IdentificationOptions(degree=3), pair_step=None,
-        generator=np.random.default_rng(0),
+    field = identify(
+        recordings, library, observation=ObservationModel(library, Diffusion.identity(1), steps * TIME),
+        options=IdentificationOptions(degree=3), draw=lambda _: np.random.default_rng(0),
     )  # fmt: skip
-    assert found is not None and found.exposure == steps * TIME
-    field = found.found
+    assert field.exposure == steps * TIME
     assert [field.library.names[k] for _, k in field.support] == ["x", "x**3"]
     assert (np.abs(field.values - [1, -1]) < 3.5 * np.sqrt(np.diag(field.covariance))).all()
     assert field.noise_rate[0, 0] == pytest.approx(0.2, rel=0.06)

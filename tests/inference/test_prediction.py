@@ -15,7 +15,7 @@ from known_systems import (
 from scipy.linalg import expm
 
 from siq.data.recordings import Recordings, select_recordings
-from siq.inference.residuals import predict, prediction_errors
+from siq.inference.checks import predict, prediction_errors
 from siq.systems.dynamics import Dynamics
 from siq.systems.simulation import SimulationOptions, simulate_snapshots
 

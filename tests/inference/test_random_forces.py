@@ -9,8 +9,9 @@ from scipy.linalg import expm
 
 import siq
 from siq.data.recordings import snapshot_pairs
-from siq.inference.diffusion_model import with_random_forces
-from siq.inference.identification import IdentificationOptions, field_library, identify_vector_field
+from siq.inference.diffusion_model import with_process_noise_rate
+from siq.inference.library import IdentificationOptions, field_library
+from siq.inference.regression import identify_vector_field
 
 SYSTEMS = {
     "one state, relaxing twice a second": (np.array([[-2.0]]), np.array([[0.25]])),
@@ -58,4 +59,4 @@ def _forces(recordings: siq.Recordings, *, integrator_step: float | None = None)
     options = IdentificationOptions(degree=1)
     library = field_library(list(recordings.names), options)
     found = identify_vector_field(library, pairs, options=options, integrator_step=integrator_step)
-    return with_random_forces(found, pairs).noise_rate
+    return with_process_noise_rate(found, pairs).noise_rate

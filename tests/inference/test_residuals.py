@@ -9,9 +9,10 @@ import sympy
 from known_systems import KnownSystem, archetype, as_system, double_well, maier_stein
 
 from siq.data.recordings import Recordings, select_recordings, snapshot_pairs
-from siq.inference.field_estimate import IdentifiedField
-from siq.inference.identification import IdentificationOptions, field_library, identify_vector_field
-from siq.inference.residuals import NoiseDiagnosis, mean_residual_probability, residual_noise
+from siq.inference.checks import mean_residual_probability, residual_noise
+from siq.inference.field_estimate import FieldEstimate, NoiseDiagnosis
+from siq.inference.library import IdentificationOptions, field_library
+from siq.inference.regression import identify_vector_field
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.systems.simulation import SimulationOptions, simulate_snapshots
@@ -46,7 +47,7 @@ def with_errors(recordings: Recordings, size: float | np.ndarray, seed: int = 1)
     return replace(recordings, values=recordings.values + errors)
 
 
-def identified(recordings: Recordings, *, degree: int = 3, euler: bool = False) -> IdentifiedField:
+def identified(recordings: Recordings, *, degree: int = 3, euler: bool = False) -> FieldEstimate:
     options = IdentificationOptions(degree=degree)
     return identify_vector_field(
         field_library(recordings.names, options), snapshot_pairs(recordings, pair_step=STEP),

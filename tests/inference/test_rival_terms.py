@@ -7,36 +7,43 @@ import pytest
 
 from siq.inference.library import candidate_library
 from siq.inference.selection import (
-    Equation,
-    RivalTerms,
+    LinearProblem,
+    ModelAverage,
+    _improved_support,
+    _mean_over_supports,
+    _prices,
+    _strong_terms,
+    all_coefficients,
     critical_values,
-    improved_support,
-    mean_over_supports,
-    prices,
-    rivals_by_equation,
-    rivals_of_all,
-    strong_terms,
 )
 
 LIBRARY = candidate_library(["x"], degree=5)
 CRITICAL = critical_values(LIBRARY, false_terms=0.05)
 
 
-def equation(coefficients: np.ndarray, *, generator: np.random.Generator) -> Equation:
+def equation(
+    coefficients: np.ndarray, *, generator: np.random.Generator, component: int = 0
+) -> LinearProblem:
     """Of states in two wells, the errors of all coefficients being of the order of one."""
     states = np.linspace(-1, 1, 400)
     functions = LIBRARY.evaluate(states[:, None])
     columns = np.linalg.qr(functions, mode="r")
-    return Equation(columns, columns @ coefficients + generator.standard_normal(len(columns)), 1.0, CRITICAL)
+    return LinearProblem(
+        columns,
+        columns @ coefficients + generator.standard_normal(len(columns)),
+        1.0,
+        CRITICAL,
+        all_coefficients([component], 6),
+    )
 
 
-def chosen(one: Equation) -> tuple[int, ...]:
-    return improved_support(one, strong_terms(one))
+def chosen(one: LinearProblem) -> tuple[int, ...]:
+    return _improved_support(one, _strong_terms(one))
 
 
 def test_odds_of_terms_that_are_not_there_add_up_to_what_was_expected() -> None:
     draws = np.random.default_rng(0).standard_normal((200_000, 1))
-    price = prices(CRITICAL, further=0.7)
+    price = _prices(CRITICAL, further=0.7)
     odds = np.where(np.abs(draws) < CRITICAL, np.exp((draws**2 - price) / 2), 0.0)
     assert odds.mean(axis=0).sum() == pytest.approx(0.7, rel=0.05)
 
@@ -44,14 +51,14 @@ def test_odds_of_terms_that_are_not_there_add_up_to_what_was_expected() -> None:
 def test_the_mean_is_that_over_all_supports() -> None:
     one = equation(np.array([0.2, 2.0, 0.0, -2.0, 0.0, 0.0]), generator=np.random.default_rng(3))
     own = chosen(one)
-    mean, spread = mean_over_supports(one, own, further=1.0)
-    price = prices(CRITICAL, further=1.0)
+    mean, spread = _mean_over_supports(one, own, further=1.0)
+    price = _prices(CRITICAL, further=1.0)
     supports = [s for size in range(7) for s in itertools.combinations(range(6), size)]
     scores = np.array([one.chi_square(s) + price[list(s)].sum() for s in supports])
     odds = np.exp(-(scores - scores.min()) / 2)
     odds[odds < 0.01] = 0
     odds /= odds.sum()
-    changes = np.array([one.fitted(s) for s in supports]) - one.fitted(own)
+    changes = np.array([one.solve(s) for s in supports]) - one.solve(own)
     expected = odds @ changes
     assert mean == pytest.approx(expected, rel=1e-6, abs=1e-9)
     total = (changes - expected).T @ (odds[:, None] * (changes - expected))
@@ -65,7 +72,7 @@ def test_the_mean_is_that_over_all_supports() -> None:
 
 def test_without_doubt_there_are_no_rivals_of_any_weight() -> None:
     one = equation(np.array([0.0, 400.0, 0.0, -400.0, 0.0, 0.0]), generator=np.random.default_rng(1))
-    mean, spread = mean_over_supports(one, (1, 3), further=1e-9)
+    mean, spread = _mean_over_supports(one, (1, 3), further=1e-9)
     assert not mean.any()
     assert not len(spread)
 
@@ -82,10 +89,10 @@ def test_barriers_hold_the_truth_however_strong_a_term_is(strength: float) -> No
     for _ in range(200):
         one = equation(truth, generator=draw)
         own = chosen(one)
-        mean, spread = mean_over_supports(one, own, further=1.0)
+        mean, spread = _mean_over_supports(one, own, further=1.0)
         inverse = np.linalg.pinv(one.columns[:, list(own)])
         variance = float(((top[list(own)] @ inverse) ** 2).sum())
-        off = top @ (one.fitted(own) - truth)
+        off = top @ (one.solve(own) - truth)
         alone.append(abs(off) < 1.96 * np.sqrt(variance))
         together.append(abs(off + top @ mean) < 1.96 * np.sqrt(variance + ((spread @ top) ** 2).sum()))
     assert np.mean(together) > 0.85
@@ -94,23 +101,25 @@ def test_barriers_hold_the_truth_however_strong_a_term_is(strength: float) -> No
 
 def test_one_problem_of_two_equations_is_the_same_as_both() -> None:
     draw = np.random.default_rng(2)
-    ones = [equation(np.array([0.0, 9.0, 0.0, -9.0, 0.0, 0.0]), generator=draw) for _ in range(2)]
+    truth = np.array([0.0, 9.0, 0.0, -9.0, 0.0, 0.0])
+    ones = [equation(truth, generator=draw, component=i) for i in range(2)]
     empty = np.zeros((6, 6))
-    together = Equation(
+    together = LinearProblem(
         np.block([[ones[0].columns, empty], [empty, ones[1].columns]]),
-        np.concatenate([one.goal for one in ones]), 1.0, np.tile(CRITICAL, 2),
+        np.concatenate([one.goal for one in ones]), 1.0, np.tile(CRITICAL, 2), all_coefficients([0, 1], 6),
     )  # fmt: skip
     support = np.array([(0, 1), (0, 3), (1, 1), (1, 3)])
-    apart, joint = rivals_by_equation(ones, support), rivals_of_all(together, support, dimension=2)
+    planar = candidate_library(["x", "y"], degree=2)  # six functions, too
+    apart, joint = (ModelAverage.of(these, support, planar) for these in (ones, [together]))
     scale = np.linalg.norm(ones[0].columns, axis=0)[:, None]
     # What is cut off as unlikely is not quite the same.
-    assert joint.mean_change * scale == pytest.approx(apart.mean_change * scale, abs=0.15)
+    assert joint.bias * scale == pytest.approx(apart.bias * scale, abs=0.15)
     draws = [one.drawn(4000, generator=np.random.default_rng(0)) * scale for one in (apart, joint)]
     assert draws[0].std(axis=0) == pytest.approx(draws[1].std(axis=0), rel=0.3)
 
 
 def test_draws_have_the_mean_and_the_spread() -> None:
-    rivals = RivalTerms(np.full((6, 1), 2.0), np.eye(6)[:, :, None])
+    rivals = ModelAverage(np.full((6, 1), 2.0), np.eye(6)[:, :, None])
     draws = rivals.drawn(20_000, generator=np.random.default_rng(0))
     assert draws.mean(axis=0) == pytest.approx(np.full((6, 1), 2.0), abs=0.05)
     assert draws.std(axis=0) == pytest.approx(np.ones((6, 1)), rel=0.05)

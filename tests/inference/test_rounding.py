@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from siq.data.recordings import Recordings, snapshot_pairs
-from siq.inference.identification import IdentificationOptions, identify_vector_field
-from siq.inference.library import candidate_library
-from siq.inference.noisy_sensor import HARMLESS, decimals_needed, is_rounding, rounding_bias, rounding_errors
-from siq.inference.residuals import residual_noise
+from siq.inference.checks import is_rounding, residual_noise, rounding_bias, rounding_errors
+from siq.inference.field_estimate import HARMLESS_BIAS
+from siq.inference.library import IdentificationOptions, candidate_library
+from siq.inference.regression import identify_vector_field
+from siq.remarks import has_code
 from siq.workflow import identification_step
 from siq.workflow.pipeline import PipelineSettings
 from siq.workflow.tables import Status
@@ -42,8 +45,8 @@ def test_rounded_recordings_give_formulas_and_it_is_said(decimals: int) -> None:
     error = {3: "0.0003", 5: "3e-06"}[decimals]
     said = f"'x' and 'y' are written to {decimals} decimals, an error of {error} µm in each value"
     assert said in found.outcome.reason
-    assert found.record.noise["kind"] == "rounding" and found.record.noise["intensity"] == 0.0
-    field = found.record.found
+    assert found.record.diagnosis.kind == "rounding" and found.record.diagnosis.intensity == 0.0
+    field = found.record
     np.testing.assert_array_equal(field.support[:, 0], [0, 1])
     errors = np.sqrt(np.diag(field.covariance))
     assert (np.abs(field.values - [-1, -2]) < 3 * errors).all()
@@ -72,18 +75,21 @@ def test_the_bias_of_rounding_is_the_one_that_is_foreseen() -> None:
         foreseen.append(rounding_bias(found, snapshot_pairs(noisy), rounding))
     measured = np.abs(np.mean(biases, axis=0) / np.mean(errors, axis=0)).max()
     assert np.mean(foreseen) == pytest.approx(measured, rel=0.25)
-    assert np.mean(foreseen) > HARMLESS
+    assert np.mean(foreseen) > HARMLESS_BIAS
 
 
 def test_rounding_that_is_too_coarse_is_refused_with_the_decimals_that_it_takes() -> None:
     coarse = settling(4)
-    found, pairs = identified(coarse), snapshot_pairs(coarse)
-    noise = residual_noise(found, coarse, pair_step=None)
-    assert noise.kind == "rounding" and noise.fault(("x", "y")) is None and noise.note is not None
-    needed = decimals_needed(coarse, pairs)
+    noise = residual_noise(identified(coarse), coarse, pair_step=None)
+    assert (
+        noise.kind == "rounding"
+        and noise.fault(("x", "y")) is None
+        and has_code(noise.remarks, "inference.rounding")
+    )
+    needed = noise.decimals
     assert identified(settling(needed)).noise_free and not identified(settling(needed - 2)).noise_free
-    worse = type(noise)(**{**vars(noise), "rounding_bias": 2.0})
-    assert "2.0 standard errors; write at least" in str(worse.fault(("x", "y"))) and worse.note is None
+    worse = replace(noise, rounding_bias=2.0)
+    assert "2.0 standard errors; write at least" in str(worse.fault(("x", "y")))
 
 
 def test_what_was_not_rounded_has_no_rounding_error() -> None:

@@ -5,7 +5,13 @@ import pytest
 from scipy.special import ndtr
 
 from siq.inference.library import CandidateLibrary, candidate_library
-from siq.inference.selection import Equation, best_support, critical_values, improved_support, lacks_terms
+from siq.inference.selection import (
+    LinearProblem,
+    _improved_support,
+    _lacks_terms,
+    best_support,
+    critical_values,
+)
 
 pytestmark = pytest.mark.portable
 
@@ -13,7 +19,7 @@ LIBRARY = candidate_library(["x", "y"], degree=5)
 NAMES = list(LIBRARY.names)
 
 
-def equation(seed: int, terms: dict[str, float], *, library: CandidateLibrary = LIBRARY) -> Equation:
+def equation(seed: int, terms: dict[str, float], *, library: CandidateLibrary = LIBRARY) -> LinearProblem:
     """States about x = ±1, as in two wells, with one unit of noise on what the terms make."""
     draw = np.random.default_rng(seed)
     count = 4000
@@ -26,10 +32,11 @@ def equation(seed: int, terms: dict[str, float], *, library: CandidateLibrary = 
     return of_rows(np.column_stack([functions, goal]), library)
 
 
-def of_rows(rows: np.ndarray, library: CandidateLibrary) -> Equation:
+def of_rows(rows: np.ndarray, library: CandidateLibrary) -> LinearProblem:
     """The equation of functions and, in the last column, what they are to explain."""
     critical = critical_values(library, false_terms=0.05)
-    return Equation.of_triangle(np.linalg.qr(rows, mode="r"), 0, samples=len(rows), critical=critical)
+    triangle = np.linalg.qr(rows, mode="r")
+    return LinearProblem.of_components(triangle, samples=len(rows), critical=critical)[0]
 
 
 def named(support: tuple[int, ...]) -> set[str]:
@@ -52,7 +59,7 @@ def _exponents() -> list[tuple[int, ...]]:
 def test_a_term_that_elimination_mistook_is_exchanged(seed: int) -> None:
     made = equation(seed, {"y": -2.0, "x**2*y": -2.0})
     start = [NAMES.index("y"), NAMES.index("x**4*y")]
-    assert named(improved_support(made, start)) == {"y", "x**2*y"}
+    assert named(_improved_support(made, start)) == {"y", "x**2*y"}
 
 
 def test_many_terms_that_make_up_a_few_are_left_for_these() -> None:
@@ -75,7 +82,7 @@ def test_states_far_from_the_origin_hide_no_better_support(seed: int) -> None:
 ONE_STATE = candidate_library(["x"], degree=5)
 
 
-def away_from_the_origin(seed: int, *, bend: float) -> Equation:
+def away_from_the_origin(seed: int, *, bend: float) -> LinearProblem:
     draw = np.random.default_rng(seed)
     x = draw.uniform(3.0, 6.3, 4800)
     goal = -(x - 4.6) + bend * (x - 3.8) * (x - 4.6) * (x - 5.5) + 8 * draw.standard_normal(len(x))
@@ -85,18 +92,18 @@ def away_from_the_origin(seed: int, *, bend: float) -> Equation:
 def test_terms_that_are_needed_together_are_taken_together() -> None:
     """None of the four monomials of a cubic far from the origin does much without the others."""
     made = [away_from_the_origin(seed, bend=1.5) for seed in range(10)]
-    assert all(lacks_terms(one, (0, 1)) for one in made)
+    assert all(_lacks_terms(one, (0, 1)) for one in made)
     assert all(len(best_support(one)) >= 3 for one in made)
-    assert not any(lacks_terms(one, best_support(one)) for one in made)
+    assert not any(_lacks_terms(one, best_support(one)) for one in made)
 
 
 def test_a_straight_line_lacks_nothing() -> None:
-    lacking = [lacks_terms(away_from_the_origin(seed, bend=0.0), (0, 1)) for seed in range(100)]
+    lacking = [_lacks_terms(away_from_the_origin(seed, bend=0.0), (0, 1)) for seed in range(100)]
     assert sum(lacking) <= 9  # 5 expected at most
 
 
 def test_noise_alone_brings_few_terms() -> None:
-    false = [improved_support(equation(seed, {}), ()) for seed in range(60)]
+    false = [_improved_support(equation(seed, {}), ()) for seed in range(60)]
     # One equation of two: 2.5 % of the seeds are expected to have one.
     assert sum(map(bool, false)) <= 4
 

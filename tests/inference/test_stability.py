@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from siq.inference.selection import (
-    FEWEST_RECORDINGS,
-    MOST_BLOCKS,
+    MAX_BLOCKS,
+    MIN_RECORDINGS,
     PARTS,
-    Equation,
+    LinearProblem,
+    all_coefficients,
     blocks_of,
     stability,
     triangles,
@@ -18,8 +19,8 @@ from siq.inference.selection import (
 
 def test_blocks_are_recordings_or_parts_of_few() -> None:
     np.testing.assert_array_equal(blocks_of(np.repeat(np.arange(5), 3)), np.repeat(np.arange(5), 3))
-    assert blocks_of(np.repeat(np.arange(50), 3)).max() == MOST_BLOCKS - 1
-    few = blocks_of(np.repeat(np.arange(FEWEST_RECORDINGS - 1), 40))
+    assert blocks_of(np.repeat(np.arange(50), 3)).max() == MAX_BLOCKS - 1
+    few = blocks_of(np.repeat(np.arange(MIN_RECORDINGS - 1), 40))
     assert few.max() == PARTS - 1 and (np.diff(few) >= 0).all()
 
 
@@ -31,9 +32,10 @@ def test_what_one_recording_alone_asks_for_is_not_stable() -> None:
     goal[block == 3] += 2.0 * columns[block == 3, 2]
     parts = triangles(columns, goal, block)
     critical = np.full(4, 3.0)
-    (shares,) = stability(
-        parts, lambda drawn: [Equation(drawn[:, :-1], drawn[:, -1], 1.0, critical)], [[0, 2]],
-        generator=generator,
+    labels = all_coefficients([0], 4)
+    shares = stability(
+        parts, lambda drawn: [LinearProblem(drawn[:, :-1], drawn[:, -1], 1.0, critical, labels)],
+        labels[[0, 2]], generator=generator,
     )  # fmt: skip
     assert shares[0] == 1.0
     # A bootstrap sample lacks a recording with the probability 1/e.

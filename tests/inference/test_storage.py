@@ -1,41 +1,53 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import sympy
 
 from siq.errors import InputError
-from siq.inference.field_estimate import FlowMap, IdentifiedField
-from siq.inference.identification import (
-    FieldRecord,
-    IdentificationOptions,
-    field_library,
+from siq.inference.field_estimate import (
+    DiffusionSource,
+    FieldEstimate,
+    FlowMap,
+    NoiseDiagnosis,
+    NoiseFormula,
+    Verdict,
     read_field,
     write_field,
 )
+from siq.inference.library import IdentificationOptions, field_library
+from siq.inference.selection import ModelAverage
+from siq.remarks import Remark
 from siq.systems.diffusion import Diffusion
 
 OPTIONS = IdentificationOptions(degree=2, functions=("x/(1+y**2)", "sqrt(1+x**2)"))
 
 
-def record() -> FieldRecord:
+def record() -> FieldEstimate:
     draw = np.random.default_rng(0)
     library = field_library(("x", "y"), OPTIONS)
     support = np.array([[0, 1], [0, 6], [1, 2], [1, 7]])
     coefficients = np.zeros((library.size, 2))
     coefficients[support[:, 1], support[:, 0]] = draw.normal(size=4) * [1e-17, 1, 1e9, 1 / 3]
     factor = draw.normal(size=(4, 4))
-    found = IdentifiedField(
+    places, one = np.zeros((1, 2), dtype=int), (sympy.Integer(1),)
+    formula = NoiseFormula(library.symbols, places, one, np.array([0.2]), np.array([[1 / 7]]), 0.5)
+    return FieldEstimate(
         library, coefficients, support, factor @ factor.T, np.diag([0.1, 1 / 3]), 1e-7 / 3,
         FlowMap(steps=3, euler=True), Diffusion(np.array([[2.0, 0.3], [0.3, 1 / 3]])),
+        ModelAverage(draw.normal(size=coefficients.shape), draw.normal(size=(3, *coefficients.shape))),
+        draw.uniform(size=4), formula,
+        diagnosis=NoiseDiagnosis(
+            "measurement", 0.1, np.eye(2), 1 / 3, -7.0, np.array([0.1, 0.0]), np.array([0.01, 0.0]), pairs=7,
+            diffusion=DiffusionSource.UNIT, lag=3, lost_time=0.1,
+            remarks=(Remark("inference.rounding", {"written": "so"}),),
+        ),
+        prediction=Verdict(np.inf, 0.01, False, "measurement noise"),
     )  # fmt: skip
-    return FieldRecord(
-        found,
-        {"value": None, "limit": 0.01, "passed": False, "reason": "measurement noise"},
-        {"kind": "measurement", "intensity": 0.1, "measurement": [0.1, 0.0]},
-    )
 
 
 @pytest.fixture
@@ -49,16 +61,21 @@ def test_a_field_comes_back_to_the_last_bit(written: Path) -> None:
     original, copy = record(), read_field(written)
     assert copy is not None
     for name in ("coefficients", "support", "covariance", "noise_rate", "values", "standard_errors"):
-        np.testing.assert_array_equal(getattr(copy.found, name), getattr(original.found, name))
-    np.testing.assert_array_equal(copy.found.diffusion.matrix, original.found.diffusion.matrix)
-    assert copy.found.residual_ratio == original.found.residual_ratio
-    assert copy.found.flow == original.found.flow
-    assert copy.found.library.names == original.found.library.names
-    assert copy.found.noise_free
+        np.testing.assert_array_equal(getattr(copy, name), getattr(original, name))
+    np.testing.assert_array_equal(copy.diffusion.matrix, original.diffusion.matrix)
+    assert copy.residual_ratio == original.residual_ratio
+    assert copy.flow == original.flow
+    assert copy.library.names == original.library.names
+    assert copy.noise_free
     assert copy.prediction == original.prediction
-    assert copy.noise == original.noise
+    assert copy.diagnosis is not None and original.diagnosis is not None
+    assert copy.diagnosis.as_data() == original.diagnosis.as_data()
+    assert copy.noise is not None and original.noise is not None and copy.alternatives is not None
+    assert copy.noise.as_data() == original.noise.as_data()
+    np.testing.assert_array_equal(copy.alternatives.spread, original.alternatives.spread)
+    np.testing.assert_array_equal(copy.stability, original.stability)
     x = np.random.default_rng(1).normal(size=(5, 2))
-    np.testing.assert_array_equal(copy.found.dynamics.drift(x), original.found.dynamics.drift(x))
+    np.testing.assert_array_equal(copy.dynamics.drift(x), original.dynamics.drift(x))
 
 
 def test_writing_again_gives_the_same_bytes(written: Path, tmp_path: Path) -> None:
@@ -71,7 +88,7 @@ def test_writing_again_gives_the_same_bytes(written: Path, tmp_path: Path) -> No
 def test_anybody_can_read_it(written: Path) -> None:
     data = json.loads(written.read_text())
     assert data["states"] == ["x", "y"]
-    assert {row["term"] for row in data["terms"]} <= set(record().found.library.names)
+    assert {row["term"] for row in data["terms"]} <= set(record().library.names)
     assert all(row["standard_error"] > 0 for row in data["terms"])
 
 
@@ -137,7 +154,7 @@ def test_bytes_that_are_no_text_are_refused(written: Path) -> None:
 
 def test_a_number_that_is_not_finite_is_never_written(tmp_path: Path) -> None:
     original = record()
-    broken = FieldRecord(original.found, {"value": float("inf")}, original.noise)
+    broken = replace(original, residual_ratio=float("inf"))
     with pytest.raises(ValueError, match="not JSON compliant"):
         write_field(tmp_path / "field.json", broken, OPTIONS)
     assert not (tmp_path / "field.json").exists()

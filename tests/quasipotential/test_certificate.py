@@ -31,9 +31,9 @@ from known_systems import (
 )
 
 from siq.data.recordings import Recordings, SnapshotPairs
-from siq.inference.field_estimate import GivenField, IdentifiedField
+from siq.inference.checks import PredictionLimits, check_prediction, prediction_errors
+from siq.inference.field_estimate import FieldEstimate, GivenField, Verdict
 from siq.inference.library import candidate_library, monomial_exponents
-from siq.inference.residuals import prediction_errors
 from siq.networks.decomposition import shuffled
 from siq.networks.networks import Networks, at_rest, initial_layers
 from siq.numerics.least_squares import representative_subset
@@ -49,14 +49,11 @@ from siq.quasipotential.certificate_tests import (
     FEWEST,
     Candidate,
     CertificateOptions,
-    PredictionLimits,
     Reference,
-    Verdict,
     _check_branch,
     _check_characteristics,
     check_agreement,
     check_hamilton_jacobi,
-    check_prediction,
     stated_error,
 )
 from siq.quasipotential.characteristics import Fan, adapted_fan, lowest_sheet
@@ -82,7 +79,7 @@ def certified(
     known: KnownSystem,
     potential: sympy.Expr,
     *,
-    found: IdentifiedField | None = None,
+    found: FieldEstimate | None = None,
     wells: tuple[Well, ...] = (),
     prediction: Verdict = PASSED,
     circulatory: tuple[sympy.Expr, ...] | None = None,
@@ -100,7 +97,7 @@ def certified(
 
 def evidence_of(
     known: KnownSystem,
-    found: IdentifiedField | None = None,
+    found: FieldEstimate | None = None,
     *,
     prediction: Verdict = PASSED,
     share: float = 0.6,
@@ -137,7 +134,7 @@ def references_of(known: KnownSystem, *, share: float = 0.6, count: int = 300) -
 _REFERENCES: dict[tuple[object, ...], tuple[Reference, ...]] = {}
 
 
-def over_terms(found: IdentifiedField, coefficients: np.ndarray) -> sympy.Expr:
+def over_terms(found: FieldEstimate, coefficients: np.ndarray) -> sympy.Expr:
     """V as a formula, from its coefficients over the library of f."""
     terms = zip(found.library.terms, coefficients, strict=True)
     return sympy.Add(*(sympy.Float(float(value)) * term for term, value in terms))

@@ -24,8 +24,8 @@ from known_systems import (
 from scipy.special import ndtr
 
 from siq.data.recordings import SnapshotPairs
-from siq.inference.field_estimate import IdentifiedField
-from siq.inference.selection import RivalTerms
+from siq.inference.field_estimate import FieldEstimate, Verdict
+from siq.inference.selection import ModelAverage
 from siq.quasipotential.certificate import Certificate, _follow_well
 from siq.quasipotential.certificate_tests import (
     FEWEST,
@@ -34,7 +34,6 @@ from siq.quasipotential.certificate_tests import (
     Candidate,
     CertificateOptions,
     Reference,
-    Verdict,
     _check_characteristics,
     _check_descent,
     _lost_shares,
@@ -237,7 +236,7 @@ X, Y = sympy.symbols("x y", real=True)
 CHANCE = 4 / np.sqrt(4 * 200)  # four standard deviations of a share of 200 draws, at most
 
 
-def two_wells(height: float, error: float) -> tuple[IdentifiedField, PhasePortrait]:
+def two_wells(height: float, error: float) -> tuple[FieldEstimate, PhasePortrait]:
     """f = (a x - x³, -y) with a = `height` ± `error`: two wells for a > 0 and one for a < 0."""
     dynamics = Dynamics.of((X, Y), (height * X - X**3, -Y))
     known = KnownSystem(dynamics, None, np.zeros((2, 2)), np.array([[-1.0, 1.0], [-1.0, 1.0]]))
@@ -274,7 +273,7 @@ def test_rivals_of_the_terms_count() -> None:
     doubt = np.zeros((1, found.library.size, 2))
     doubt[0, list(found.library.terms).index(X), 0] = 0.2
     shares = _lost_shares(
-        replace(found, rivals=RivalTerms(0 * doubt[0], doubt)), portrait.attractors, box=portrait.box
+        replace(found, alternatives=ModelAverage(0 * doubt[0], doubt)), portrait.attractors, box=portrait.box
     )
     assert shares == pytest.approx(np.full(2, ndtr(-1.0)), abs=CHANCE / 2)
 

@@ -21,8 +21,9 @@ from known_systems import (
 )
 from scipy.integrate import solve_ivp
 
-from siq.inference.field_estimate import IdentifiedField, NoiseFormula, constant_noise
-from siq.inference.selection import RivalTerms
+from siq.inference.diffusion_model import constant_noise
+from siq.inference.field_estimate import FieldEstimate, NoiseFormula
+from siq.inference.selection import ModelAverage
 from siq.quasipotential.characteristics import (
     End,
     Fan,
@@ -298,7 +299,7 @@ STABLE = np.array([1.0, 0.0])
 POINTS = np.random.default_rng(1).uniform([0.3, -0.6], [1.4, 0.6], (40, 2))
 
 
-def field(equations: tuple[sympy.Expr, ...], noise: np.ndarray, *, degree: int = 3) -> IdentifiedField:
+def field(equations: tuple[sympy.Expr, ...], noise: np.ndarray, *, degree: int = 3) -> FieldEstimate:
     dynamics = Dynamics.of((X, Y), equations, diffusion=noise)
     known = KnownSystem(dynamics, None, STABLE[None], np.array([[-2.0, 2.0], [-1.0, 1.0]]))
     return exact_field(known, degree=degree, relative_error=0.03)
@@ -347,11 +348,13 @@ def test_what_rivals_would_change_adds_to_the_error() -> None:
     doubt[0, list(found.library.names).index("x"), 0] = 0.1
     plain = potential_errors(found, gradient, STABLE, POINTS)
     doubted = potential_errors(
-        replace(found, rivals=RivalTerms(0 * doubt[0], doubt)), gradient, STABLE, POINTS
+        replace(found, alternatives=ModelAverage(0 * doubt[0], doubt)), gradient, STABLE, POINTS
     )
     expected = np.hypot(plain, 0.1 * np.abs(POINTS[:, 0] ** 2 - 1) / 2)
     assert doubted == pytest.approx(expected, rel=0.03, abs=1e-5)
-    moved = potential_errors(replace(found, rivals=RivalTerms(doubt[0], 0 * doubt)), gradient, STABLE, POINTS)
+    moved = potential_errors(
+        replace(found, alternatives=ModelAverage(doubt[0], 0 * doubt)), gradient, STABLE, POINTS
+    )
     assert moved == pytest.approx(expected, rel=0.03, abs=1e-5)
 
 

@@ -20,7 +20,7 @@ from known_systems import (
     uniform_points,
 )
 
-from siq.inference.field_estimate import IdentifiedField
+from siq.inference.field_estimate import FieldEstimate
 from siq.inference.library import CandidateLibrary
 from siq.quasipotential.global_formula import (
     GlobalPotential,
@@ -65,7 +65,7 @@ def rough_start(
 
 
 def refined(
-    known: KnownSystem, start: np.ndarray, found: IdentifiedField, x: np.ndarray, **options: float
+    known: KnownSystem, start: np.ndarray, found: FieldEstimate, x: np.ndarray, **options: float
 ) -> GlobalPotential:
     return refine_globally(start, found.library, found, x, **options)
 
@@ -195,7 +195,7 @@ POLYNOMIALS = {
 }
 
 
-def over_library(found: IdentifiedField, expression: sympy.Expr) -> np.ndarray:
+def over_library(found: FieldEstimate, expression: sympy.Expr) -> np.ndarray:
     position = {term: k for k, term in enumerate(found.library.terms)}
     coefficients = np.zeros(found.library.size)
     for powers, value in sympy.Poly(expression, *found.library.symbols).terms():
@@ -204,7 +204,7 @@ def over_library(found: IdentifiedField, expression: sympy.Expr) -> np.ndarray:
     return coefficients
 
 
-def decomposition(known: KnownSystem, found: IdentifiedField) -> tuple[np.ndarray, np.ndarray]:
+def decomposition(known: KnownSystem, found: FieldEstimate) -> tuple[np.ndarray, np.ndarray]:
     """Coefficients of the true V, without its constant, and of g = f + D∇V."""
     potential = over_library(found, known.potential)
     potential[found.library.constant] = 0
@@ -216,7 +216,7 @@ def decomposition(known: KnownSystem, found: IdentifiedField) -> tuple[np.ndarra
     return potential, circulatory
 
 
-def uncertain(known: KnownSystem, size: float) -> IdentifiedField:
+def uncertain(known: KnownSystem, size: float) -> FieldEstimate:
     """The exact f, claimed to be known with correlated errors."""
     found = exact_field(known, 4, relative_error=size)
     draw = np.random.default_rng(3).normal(size=(len(found.values),) * 2)
@@ -224,7 +224,7 @@ def uncertain(known: KnownSystem, size: float) -> IdentifiedField:
     return replace(found, covariance=factor @ factor.T)
 
 
-def drawn(found: IdentifiedField, seed: int) -> IdentifiedField:
+def drawn(found: FieldEstimate, seed: int) -> FieldEstimate:
     values = np.random.default_rng(seed).multivariate_normal(found.values, found.covariance)
     coefficients = found.coefficients.copy()
     coefficients[found.support[:, 1], found.support[:, 0]] = values
@@ -232,7 +232,7 @@ def drawn(found: IdentifiedField, seed: int) -> IdentifiedField:
 
 
 def fitted(
-    known: KnownSystem, found: IdentifiedField, potential: np.ndarray, circulatory: np.ndarray
+    known: KnownSystem, found: FieldEstimate, potential: np.ndarray, circulatory: np.ndarray
 ) -> RegionFormula | None:
     x = uniform_points(known, 300, share=0.6)
     return _fit_orthogonal(found, potential, circulatory, x)

@@ -20,8 +20,8 @@ from known_systems import (
 from matplotlib.figure import Figure
 
 from siq.errors import NumericalFailure
+from siq.inference.field_estimate import Verdict
 from siq.quasipotential.certificate import Certificate
-from siq.quasipotential.certificate_tests import Verdict
 from siq.quasipotential.formulas import model_to_data, read_model, write_model
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.landscape_assembly import find_landscape

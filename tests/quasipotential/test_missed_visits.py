@@ -8,8 +8,8 @@ import pytest
 from siq.data.preparation import in_stretches
 from siq.data.recordings import Recordings
 from siq.data.two_states import LEVEL, continued_visits, dwell_counts
-from siq.inference.field_estimate import FlowMap, IdentifiedField
-from siq.inference.identification import IdentificationOptions, field_library
+from siq.inference.field_estimate import FieldEstimate, FlowMap
+from siq.inference.library import IdentificationOptions, field_library
 from siq.quasipotential.occupancy import cell_process, check_occupancy, cores_about
 from siq.quasipotential.rates import NoiseStrength
 from siq.systems.diffusion import Diffusion
@@ -19,12 +19,12 @@ from siq.systems.phase_portrait import phase_portrait
 LIBRARY = field_library(["x"], IdentificationOptions(degree=3))
 
 
-def field(values: dict[str, float], intensity: float) -> IdentifiedField:
+def field(values: dict[str, float], intensity: float) -> FieldEstimate:
     """An f of one state, as if it had been identified."""
     support = np.array([[0, LIBRARY.names.index(name)] for name in values])
     coefficients = np.zeros((LIBRARY.size, 1))
     coefficients[support[:, 1], 0] = list(values.values())
-    return IdentifiedField(
+    return FieldEstimate(
         LIBRARY, coefficients, support, 1e-4 * np.eye(len(support)), np.array([[intensity]]), 0.1,
         FlowMap(1), Diffusion.identity(1),
     )  # fmt: skip

@@ -7,7 +7,7 @@ import pytest
 import sympy
 from known_systems import KnownSystem, exact_field
 
-from siq.inference.field_estimate import IdentifiedField
+from siq.inference.field_estimate import FieldEstimate
 from siq.quasipotential.paths import MinimumActionPath, minimum_action_path
 from siq.quasipotential.rates import (
     MAX_COVARIANCE_AXES,
@@ -25,7 +25,7 @@ ERROR = 0.02
 
 
 @pytest.fixture(scope="module")
-def well() -> tuple[IdentifiedField, MinimumActionPath]:
+def well() -> tuple[FieldEstimate, MinimumActionPath]:
     """f = (ax - bx³, -cy), each coefficient 1 ± 0.02."""
     dynamics = Dynamics.of((X, Y), (X - X**3, -Y))
     known = KnownSystem(dynamics, None, np.zeros((1, 2)), np.array([[-2.0, 2.0], [-1.0, 1.0]]))
@@ -33,14 +33,14 @@ def well() -> tuple[IdentifiedField, MinimumActionPath]:
     return exact_field(known, degree=3, relative_error=ERROR), path
 
 
-def test_the_error_is_that_of_the_law(well: tuple[IdentifiedField, MinimumActionPath]) -> None:
+def test_the_error_is_that_of_the_law(well: tuple[FieldEstimate, MinimumActionPath]) -> None:
     # K = 2π/(a √2) and ΔU = a²/2b: ln K errs as ln a does, and against ΔU.
     error, covariance = prefactor_error(*well)
     assert error == pytest.approx(ERROR, rel=0.05)
     assert covariance == pytest.approx(-(ERROR**2), rel=0.05)
 
 
-def test_without_noise_there_is_none(well: tuple[IdentifiedField, MinimumActionPath]) -> None:
+def test_without_noise_there_is_none(well: tuple[FieldEstimate, MinimumActionPath]) -> None:
     found, path = well
     assert prefactor_error(replace(found, residual_ratio=1e-9), path) == (0, 0)
 
@@ -69,7 +69,7 @@ def test_barrier_and_prefactor_err_together() -> None:
 
 
 def test_an_estimated_noise_counts_by_the_states_that_the_path_takes(
-    well: tuple[IdentifiedField, MinimumActionPath],
+    well: tuple[FieldEstimate, MinimumActionPath],
 ) -> None:
     found, path = well
     assert noise_leverage(path, found.dynamics) == pytest.approx(np.sqrt(2), rel=1e-3)

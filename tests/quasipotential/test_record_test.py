@@ -9,8 +9,7 @@ import pytest
 
 from siq.data.recordings import Recordings, held_out_recordings
 from siq.data.two_states import DwellCount
-from siq.inference.identification import FieldRecord
-from siq.quasipotential.certificate_tests import Verdict
+from siq.inference.field_estimate import FieldEstimate, Verdict
 from siq.quasipotential.occupancy import (
     OccupancyCheck,
     check_occupancy,
@@ -24,7 +23,7 @@ from siq.workflow import identification_step
 from siq.workflow.pipeline import PipelineSettings
 
 STEP, WITHIN, SAMPLES, RECORDS, INTENSITY = 0.05, 5, 4000, 10, 0.25
-RECORDED = tuple[Recordings, FieldRecord, PhasePortrait, np.ndarray]
+RECORDED = tuple[Recordings, FieldEstimate, PhasePortrait, np.ndarray]
 
 
 @pytest.fixture(scope="module")
@@ -42,13 +41,13 @@ def recorded() -> RECORDED:
         PipelineSettings().of(identification_step.IdentifySettings), recordings, number=0
     )
     assert found.record is not None
-    portrait = phase_portrait(found.record.found.dynamics, recordings.values[::40], seed=0)
+    portrait = phase_portrait(found.record.dynamics, recordings.values[::40], seed=0)
     return recordings, found.record, portrait, held_out_recordings(recordings, generator=generator)
 
 
 def compared(recorded: RECORDED, intensity: float = INTENSITY) -> OccupancyCheck:
     recordings, record, portrait, held_out = recorded
-    return check_occupancy(record.found, portrait, NoiseStrength(intensity), recordings, held_out)
+    return check_occupancy(record, portrait, NoiseStrength(intensity), recordings, held_out)
 
 
 def verdict_of(found: OccupancyCheck) -> Verdict:
@@ -75,14 +74,14 @@ def test_a_wrong_strength_of_the_noise_is_refused(recorded: RECORDED, intensity:
 
 def test_a_wrong_depth_is_refused(recorded: RECORDED) -> None:
     recordings, record, portrait, held_out = recorded
-    deeper = replace(record.found, coefficients=2.5 * record.found.coefficients)
+    deeper = replace(record, coefficients=2.5 * record.coefficients)
     found = check_occupancy(deeper, portrait, NoiseStrength(INTENSITY), recordings, held_out)
     assert not verdict_of(found).passed
 
 
 def test_without_noise_there_is_no_test(recorded: RECORDED) -> None:
     recordings, record, portrait, held_out = recorded
-    found = check_occupancy(record.found, portrait, None, recordings, held_out)
+    found = check_occupancy(record, portrait, None, recordings, held_out)
     assert found.verdict(false_alarms=1e-4) is None and "strength of the random forces" in str(found.missing)
 
 
@@ -93,13 +92,13 @@ def test_a_record_too_short_to_hop_is_no_test(recorded: RECORDED) -> None:
         recordings, labels=("0",), recording=recordings.recording[rows], t=recordings.t[rows],
         values=recordings.values[rows],
     )  # fmt: skip
-    found = check_occupancy(record.found, portrait, NoiseStrength(INTENSITY), short, np.array([True]))
+    found = check_occupancy(record, portrait, NoiseStrength(INTENSITY), short, np.array([True]))
     assert found.missing is not None and "nor should they" in found.missing
 
 
 def test_cores_keep_clear_of_the_saddle(recorded: RECORDED) -> None:
     _, record, portrait, _ = recorded
-    cores = cores_about(record.found.dynamics, portrait, 10.0)
+    cores = cores_about(record.dynamics, portrait, 10.0)
     places = np.array([[0.0], [-1.0], [1.0], [-0.7]])
     assert cores.of(places).tolist()[0] == -1 and set(cores.of(places[1:3]).tolist()) == {0, 1}
 
@@ -107,8 +106,8 @@ def test_cores_keep_clear_of_the_saddle(recorded: RECORDED) -> None:
 def test_a_distribution_function_rises_from_nothing_to_all(recorded: RECORDED) -> None:
     _, record, portrait, _ = recorded
     noise = NoiseStrength(INTENSITY)
-    cores = cores_about(record.found.dynamics, portrait, INTENSITY)
-    found = predicted_visits(record.found, portrait, noise, cores)
+    cores = cores_about(record.dynamics, portrait, INTENSITY)
+    found = predicted_visits(record, portrait, noise, cores)
     along = found.processes[0].distribution(0, 0, np.linspace(-3, 3, 50), blur=0.1)
     assert along[0] < 1e-6 and along[-1] > 1 - 1e-6 and (np.diff(along) >= -1e-12).all()
 

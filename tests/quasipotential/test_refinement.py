@@ -11,10 +11,10 @@ import sympy
 from known_systems import KnownSystem, archetype, exact_field, limit_cycle, linear_system, potential_values
 
 from siq.data.recordings import SnapshotPairs
+from siq.inference.field_estimate import Verdict
 from siq.networks.decomposition import CheckOptions
 from siq.quasipotential import refinement
 from siq.quasipotential.certificate import Certificate
-from siq.quasipotential.certificate_tests import Verdict
 from siq.quasipotential.global_formula import RegionFormula
 from siq.quasipotential.refinement import Refined, RefinementOptions, TrainingCheck, _every_well_held_out
 from siq.systems.dynamics import Dynamics

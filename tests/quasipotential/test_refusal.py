@@ -12,7 +12,7 @@ import siq
 from siq.data.inspection import inspection_of
 from siq.data.recordings import Recordings
 from siq.data.two_states import RecordStates
-from siq.inference.identification import IdentificationOptions
+from siq.inference.library import IdentificationOptions
 from siq.quasipotential.landscape import Landscape, NoLandscape
 from siq.report.landscape import answer_lines
 from siq.report.summary import summarise

@@ -18,7 +18,7 @@ from known_systems import (
 )
 
 from siq.errors import NumericalFailure
-from siq.inference.field_estimate import IdentifiedField
+from siq.inference.field_estimate import FieldEstimate
 from siq.quasipotential.paths import TransitionPath, minimum_action_path
 from siq.quasipotential.transitions import (
     Transition,
@@ -170,7 +170,7 @@ def test_standard_errors_follow_from_small_changes_of_f(name: str) -> None:
     assert spread == pytest.approx(np.linalg.norm(slope @ root), rel=5e-3)
 
 
-def barrier_slope(found: IdentifiedField, way: Transition, attractor: np.ndarray, k: int) -> float:
+def barrier_slope(found: FieldEstimate, way: Transition, attractor: np.ndarray, k: int) -> float:
     """The derivative of a barrier with respect to a coefficient of f, by its own paths on both sides."""
     step = 1e-3 * abs(found.values[k])
     assert way.path is not None

@@ -14,7 +14,7 @@ from known_systems import KnownSystem, limit_cycle, maier_stein, potential_value
 from untuned_systems import SYSTEMS, error_beside_mesh, simulated
 
 from siq.data.recordings import snapshot_pairs
-from siq.inference.identification import IdentificationOptions
+from siq.inference.library import IdentificationOptions
 from siq.networks.decomposition import CheckOptions, TrainingOptions
 from siq.networks.regression import RegressionOptions
 from siq.workflow.pipeline import Analysis, PipelineSettings, analyse

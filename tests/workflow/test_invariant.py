@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from two_lines import analysed
 
-from siq.inference.identification import IdentificationOptions, write_field
+from siq.inference.field_estimate import write_field
+from siq.inference.library import IdentificationOptions
 from siq.quasipotential.landscape import LandscapeOptions
 from siq.quasipotential.landscape_files import write_landscape
 from siq.systems.cards import load_system

@@ -142,7 +142,7 @@ def test_networks_are_trained_with_the_d_that_the_noise_shows() -> None:
     runs = {0: training.RunToTrain(found, record)}
     networks = training.train_block(settings, runs, device="cpu").networks[0]
     assert record is not None and networks is not None
-    np.testing.assert_allclose(networks.diffusion, record.found.diffusion.matrix, rtol=1e-6)
+    np.testing.assert_allclose(networks.diffusion, record.diffusion.matrix, rtol=1e-6)
     shape = KNOWN.diffusion / np.sqrt(np.linalg.det(KNOWN.diffusion))
     np.testing.assert_allclose(networks.diffusion, shape, atol=0.2)
 

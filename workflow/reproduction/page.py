@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from siq.inference.identification import read_field
+from siq.inference.field_estimate import read_field
 from siq.networks.regression import points_below
 from siq.numerics.randomness import Purpose, generator
 from siq.numerics.text import number_text
@@ -124,7 +124,7 @@ class Results:
         further = summary_table(gradient, self.table("rrmse"), as_table("prediction", []), self.figures)
         further = further[further["quantity"].str.startswith("dV_")]
         records = map(read_field, sorted(self.folder.glob("runs/*/vector_field.json")))
-        fields = [record.found.dynamics for record in records if record is not None]
+        fields = [record.dynamics for record in records if record is not None]
         rows = [*attractor_rows(self.figures, fields, self.system), *self._counts(), *self._constants()]
         return pd.concat([self.table("summary"), further, as_table("summary", rows)], ignore_index=True)
 

@@ -20,7 +20,7 @@ from siq.data.correlation import markov_lag
 from siq.data.recordings import Recordings, snapshot_pairs
 from siq.data.stationarity import lagged_covariances, long_run_covariance
 from siq.inference.field_estimate import NOISE_FREE
-from siq.inference.instrumental_variables import lagged_pairs
+from siq.inference.regression import lagged_pairs
 from siq.numerics.integration import runge_kutta_step
 from siq.numerics.text import unit_text
 from siq.quasipotential.landscape import Landscape
@@ -303,7 +303,7 @@ def binned_residuals(dynamics: Dynamics, recordings: Recordings, place: int) -> 
         along = pairs.x0[some, place]
     else:
         given = lagged_pairs(recordings, lag)
-        pairs, some = given.pairs, slice(0, PAIRS)  # one after the other, as their noise is correlated
+        pairs, some = given, slice(0, PAIRS)  # one after the other, as their noise is correlated
         along = given.earlier[some, place]
     x0, xh, h = pairs.x0[some], pairs.xh[some], pairs.h[some]
     width = np.where((span := np.ptp(x0, axis=0)) > 0, span, 1.0)

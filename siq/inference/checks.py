@@ -1,0 +1,450 @@
+"""Checks of an estimated f: noise of its residuals, rounding, prediction, test on held-out recordings.
+
+Process noise is white: the residuals of neighbouring pairs are independent, and their variance grows with the
+time between samples. Measurement noise is shared by the two pairs that a sample belongs to, which makes their
+residuals anticorrelated; it enters X0 as well, and biases every regression on X0. A value that was written to
+three decimals is off by up to half of the last one, evenly: a measurement noise of known strength. Where the
+bias that follows from it is well below the standard errors it does no harm, and they contain what rounding
+adds to the scatter.
+
+What f leaves of recordings that it was not fitted to has no mean that any function of the library explains,
+
+    ``F = (‖P r‖²/q) / (‖r - P r‖²/(n - q))``,
+
+P being the projection on the q functions, if f misses no term. Without noise recordings are predicted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Annotated
+
+import numpy as np
+import scipy.special
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass as pydantic_dataclass
+
+from siq.data.correlation import decimals_of, resolution_step, rounding_error
+from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
+from siq.inference.diffusion_model import process_noise_increments
+from siq.inference.field_estimate import (
+    HARMLESS_BIAS,
+    HARMLESS_CORRELATION,
+    NOISE_FREE,
+    SIGNIFICANT_SCORE,
+    FieldEstimate,
+    NoiseDiagnosis,
+    NoiseKind,
+    Verdict,
+)
+from siq.inference.regression import LaggedPairs, copies, instruments, refit, residuals, weighted_triangle
+from siq.numerics.integration import runge_kutta_step
+from siq.numerics.least_squares import positive
+from siq.remarks import Remark
+from siq.systems.diffusion import Diffusion
+from siq.systems.dynamics import Dynamics
+from siq.systems.formulas import compile_formulas
+
+MAX_GAP = 10.0  # steps of a pair: samples farther apart say little of noise
+MAX_PAIRS = 60_000  # numerical: their correlations are known to 1/√60000 = 0.004, a fifth of what is harmless
+OUTLIER = 20.0  # times the median residual: what an inaccurate f carries far away
+ROUNDING_RANGE = 0.3, 1.5  # measured noise over that of rounding; less where steps are as small as that
+COARSE_ROUNDING = 0.05  # of the rms step of a state: rounding to less than that stops no identification
+STEP_ACCURACY = 0.05  # step times the norm of the Jacobian, per step of the integrator
+MAX_STEPS = 5000  # between two samples; what is faster than that between samples is not what was recorded
+RUNAWAY_WIDTHS = 1e3  # widths of the recorded states: so far off a prediction has run away
+UNPREDICTED = "f does not predict held-out recordings"
+
+
+@pydantic_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class PredictionLimits:
+    """Limits of the test of f.
+
+    Attributes
+    ----------
+    prediction
+        Median error of long-term prediction, for recordings without noise.
+    held_out_ratio
+        Mean square of the residuals of f on held-out recordings over that on its own, for recordings with
+        noise. The default, a tenth more, is what a systematic error of √0.1 of the noise adds.
+    false_alarms
+        Probability with which the noise alone refuses what is right; `descent` has it too. The default is
+        one in ten thousand runs.
+    """
+
+    prediction: Annotated[float, Field(gt=0)] = 0.01
+    held_out_ratio: Annotated[float, Field(gt=1)] = 1.1
+    false_alarms: Annotated[float, Field(gt=0, lt=0.5)] = 1e-4
+
+    @property
+    def of_f(self) -> PredictionLimits:
+        """These alone."""
+        return PredictionLimits(self.prediction, self.held_out_ratio, self.false_alarms)
+
+
+def residual_noise(
+    found: FieldEstimate, recordings: Recordings, *, pair_step: float | None
+) -> NoiseDiagnosis:
+    """Kind, strength and correlations of the noise in recordings, by the residuals of pairs.
+
+    Parameters
+    ----------
+    found
+        The identified f.
+    recordings
+        The trajectories, whose samples also serve between the pairs.
+    pair_step
+        Longest step of a pair.
+    """
+    d, diffusion = found.library.dimension, found.diffusion
+    unit = np.eye(d)
+    pairs = snapshot_pairs(recordings, pair_step=pair_step)
+    sample = snapshot_pairs(recordings, pair_step=MAX_GAP * float(pairs.h.max()))
+    if len(sample.h) > MAX_PAIRS:  # whole stretches, so that neighbours stay neighbours
+        sample = sample.take(np.arange(MAX_PAIRS))
+    if found.noise_free:
+        covariance = diffusion.matrix if diffusion.constant else unit
+        return NoiseDiagnosis("none", 0.0, covariance, 0.0, 0.0, np.zeros(d))
+    if diffusion.constant:
+        intensity = diffusion.intensity(found.noise_rate)
+        covariance = found.noise_rate / intensity if intensity > 0 else diffusion.matrix
+        excess = np.abs(diffusion.whitening @ covariance @ diffusion.whitening.T - unit)
+    else:
+        forces = _whitened(found, pairs, residuals(found, pairs))
+        whole = forces.T @ forces / len(forces)
+        intensity = float(np.trace(whole)) / d
+        excess = np.abs(whole / intensity - unit)
+        if found.noise is not None:  # its own formula says ε without the chance of the residuals
+            intensity = found.intensity
+        covariance = found.noise_rate / intensity
+    correlations, scores = neighbour_correlations(found, sample)
+    worst = int(np.argmax(np.abs(scores)))
+    correlation, score = float(correlations[worst]), float(scores[worst])
+    kind: NoiseKind = "process"
+    measurement = np.zeros(d)
+    if abs(score) > SIGNIFICANT_SCORE and abs(correlation) > HARMLESS_CORRELATION:
+        kind = "measurement" if score < 0 else "coloured"
+    if kind == "measurement":
+        measurement = _measurement_errors(found, sample)
+        rounding = rounding_errors(recordings)
+        if is_rounding(measurement, rounding, correlation=correlation):
+            bias, text = rounding_bias(found, pairs, rounding), rounding_text(recordings)
+            remark = Remark("inference.rounding", {"written": text})
+            # How many decimals leave rounding below everything else: that of a recording without noise.
+            moves = np.sqrt(((pairs.xh - pairs.x0) ** 2).mean(axis=0))
+            step = NOISE_FREE * np.sqrt(6.0) * float(moves[moves > 0].min(initial=1.0))
+            return NoiseDiagnosis(
+                "rounding", 0.0, covariance, correlation, score, measurement, rounding=text,
+                rounding_bias=bias, decimals=max(int(np.ceil(-np.log10(step))), 1),
+                remarks=(remark,) if bias <= HARMLESS_BIAS else (),
+            )  # fmt: skip
+    return NoiseDiagnosis(
+        kind, intensity, covariance, correlation, score, measurement, deviation=float(excess.max()),
+        deviation_score=float((excess / np.sqrt((1 + unit) / len(pairs.h))).max()),
+    )  # fmt: skip
+
+
+def neighbour_correlations(found: FieldEstimate, sample: SnapshotPairs) -> tuple[np.ndarray, np.ndarray]:
+    """Correlation of neighbouring residuals, state by state, and in standard errors.
+
+    Negative where the sensor is noisy, since the sample in the middle is the later one of the first pair and
+    the earlier one of the second.
+    """
+    rest = residuals(found, sample)
+    if not found.diffusion.constant:
+        rest = _whitened(found, sample, rest)
+    joined = _joined(sample, rest)
+    if not joined.any():  # every recording has two samples
+        return np.zeros(rest.shape[1]), np.zeros(rest.shape[1])
+    first, second = rest[:-1][joined], rest[1:][joined]
+    product = first * second
+    size = np.sqrt((first**2).mean(axis=0) * (second**2).mean(axis=0))
+    scores = product.sum(axis=0) / np.sqrt((product**2).sum(axis=0))
+    return product.mean(axis=0) / size, scores
+
+
+def _whitened(found: FieldEstimate, pairs: SnapshotPairs, rest: np.ndarray) -> np.ndarray:
+    """Residuals as noise ``σ(x)⁻¹ r/√h``, of the variance ε everywhere: shape ``(n, d)``."""
+    forces = process_noise_increments(found, pairs, rest)
+    return np.asarray((found.diffusion.whitening_at(pairs.x0) @ forces[:, :, None])[:, :, 0])
+
+
+def _joined(sample: SnapshotPairs, rest: np.ndarray) -> np.ndarray:
+    """Which pairs share a sample with the next: the later state of one is the earlier one of the other.
+
+    Without the few that an inaccurate f carries far away, by which everything else would be hidden.
+    """
+    usual = (np.abs(rest) < OUTLIER * np.median(np.abs(rest), axis=0)).all(axis=1)
+    same = (sample.recording[1:] == sample.recording[:-1]) & (sample.xh[:-1] == sample.x0[1:]).all(axis=1)
+    return np.asarray(same & usual[1:] & usual[:-1])
+
+
+def _measurement_errors(found: FieldEstimate, sample: SnapshotPairs) -> np.ndarray:
+    """Standard deviations of measurement noise, from the covariance of neighbouring residuals.
+
+    Errors of X0 bias f by the inverse of the step, so that f is fitted to the long steps as well. An error
+    of the sample that two pairs share is carried on by the flow of the second.
+    """
+    found = refit(replace(found, diffusion=Diffusion.identity(found.library.dimension)), sample)
+    rest = residuals(found, sample)
+    joined = _joined(sample, rest)
+    covariance = (rest[:-1][joined] * rest[1:][joined]).mean(axis=0)
+    rates = np.einsum("nii->ni", found.dynamics.jacobian(sample.x0[1:][joined]))
+    carried = np.exp(np.minimum(rates * sample.h[1:][joined, None], 1.0)).mean(axis=0)
+    return np.sqrt(np.maximum(-covariance / carried, 0.0))
+
+
+def rounding_errors(recordings: Recordings) -> np.ndarray:
+    """Standard deviation of what rounding did to each state, 0 where none is recognised: shape ``(d,)``."""
+    steps = [resolution_step(values) for values in recordings.values.T]
+    return np.array([0.0 if step is None else rounding_error(step) for step in steps])
+
+
+def is_rounding(measured: np.ndarray, rounding: np.ndarray, *, correlation: float) -> bool:
+    """Whether the noise of a measurement is that of rounding, and no other.
+
+    Parameters
+    ----------
+    measured
+        Shape ``(d,)``: standard deviations of the noise that the residuals show.
+    rounding
+        Shape ``(d,)``: of rounding.
+    correlation
+        Of neighbouring residuals: -1/2 where nothing but the measurement is noisy.
+    """
+    low, high = ROUNDING_RANGE
+    own = rounding > 0
+    known = (measured <= high * rounding) & ((measured >= low * rounding) | (rounding < rounding.max()))
+    return bool(
+        own.any() and known[own].all() and (measured[~own] <= rounding.max()).all() and correlation < -0.3
+    )
+
+
+def rounding_bias(found: FieldEstimate, pairs: SnapshotPairs, rounding: np.ndarray) -> float:
+    """The largest bias that rounding brings into a coefficient of f, in its standard errors.
+
+    The error e of X0 stands in the velocity as ``-e/h``, and in a function θ as ``e ∂θ/∂x``: their product
+    does not average out. To first order the coefficients of an equation are off by
+    ``-(Σ h θθᵀ)⁻¹ Σ ∂θ/∂x R``, R the variance of the rounding.
+    """
+    errors = np.sqrt(np.diag(found.covariance))
+    largest = 0.0
+    for state in range(found.library.dimension):
+        own = found.support[:, 0] == state
+        terms = [found.library.terms[k] for k in found.support[own, 1]]
+        symbol = found.library.symbols[state]
+        x = np.ascontiguousarray(pairs.x0.T)
+        values = compile_formulas(terms, found.library.symbols)(x)
+        slopes = compile_formulas([term.diff(symbol) for term in terms], found.library.symbols)(x)
+        scale = np.sqrt((values**2 * pairs.h).sum(axis=1))
+        scaled = values / scale[:, None]
+        bias = (
+            np.linalg.lstsq((scaled * pairs.h) @ scaled.T, slopes.sum(axis=1) / scale, rcond=None)[0] / scale
+        )
+        largest = max(largest, float((np.abs(bias) * rounding[state] ** 2 / errors[own]).max()))
+    return largest
+
+
+def rounding_text(recordings: Recordings, *, coarse: bool = False) -> str | None:
+    """How the recordings were written and what error that means, in words; None where no rounding is seen.
+
+    Parameters
+    ----------
+    recordings
+        Trajectories.
+    coarse
+        Whether only rounding counts that is not small beside the steps from sample to sample.
+    """
+    alike: dict[tuple[float, str | None], list[str]] = {}
+    for name, unit, values in zip(recordings.titles, recordings.units, recordings.values.T, strict=True):
+        step = resolution_step(values)
+        if step is None:
+            continue
+        if coarse and rounding_error(step) < COARSE_ROUNDING * np.sqrt(np.mean(np.diff(values) ** 2)):
+            continue
+        alike.setdefault((step, unit), []).append(f"'{name}'")
+    said = []
+    for (step, unit), names in alike.items():
+        decimals, behind = decimals_of(step), f" {unit}" if unit else ""
+        how = f"to {decimals} decimal{'s' if decimals > 1 else ''}" if decimals else None
+        how = how or f"in steps of {step:.3g}{behind}"
+        them = f"{', '.join(names[:-1])} and {names[-1]} are" if len(names) > 1 else f"{names[0]} is"
+        said.append(f"{them} written {how}, an error of {rounding_error(step):.1g}{behind} in each value")
+    return ", and ".join(said) or None
+
+
+def unexplained_probability(
+    columns: np.ndarray,
+    rest: np.ndarray,
+    *,
+    freedom: int | None = None,
+    variance: np.ndarray | None = None,
+) -> float:
+    """Probability of residuals having no part left that columns explain: tiny where f misses a term.
+
+    An F test of the regression of the residuals on the columns, or a χ² test where their variance is known.
+
+    Parameters
+    ----------
+    columns, rest
+        Shapes ``(n, q)`` and ``(n, r)``, of white residuals.
+    freedom
+        Degrees of freedom of the residuals, n by default.
+    variance
+        Of each of the r residuals, shape ``(r,)``, where it is known.
+
+    Returns
+    -------
+    float
+        The smallest of the r residuals, corrected for their number.
+    """
+    basis = np.linalg.qr(columns / positive(np.linalg.norm(columns, axis=0)))[0]
+    explained = ((basis.T @ rest) ** 2).sum(axis=0)
+    count = columns.shape[1]
+    if variance is not None:
+        probability = scipy.special.chdtrc(count, explained / variance)
+    else:
+        left = (len(rest) if freedom is None else freedom) - count
+        ratio = (explained / count) / (((rest**2).sum(axis=0) - explained) / left)
+        probability = scipy.special.fdtrc(count, left, ratio)
+    return float(min(probability.min() * rest.shape[1], 1.0))
+
+
+def mean_residual_probability(found: FieldEstimate, pairs: SnapshotPairs, *, seen: int = 0) -> float:
+    """Probability of held-out residuals having no mean left that f's library could express.
+
+    Parameters
+    ----------
+    found
+        f, without the held-out pairs.
+    pairs
+        These.
+    seen
+        Number of pairs that f was fitted to, for `LaggedPairs`: its own error adds the share
+        ``len(pairs.h)/seen`` to their residuals at most.
+    """
+    library = found.library
+    if isinstance(pairs, LaggedPairs):
+        rest = residuals(found, pairs)
+        spread = np.diag(found.noise_rate) * float(np.median(pairs.h)) * copies(pairs)
+        directions = instruments(library, pairs)
+        return unexplained_probability(directions, rest, variance=spread * (1 + len(rest) / seen))
+    # Copies of resampled recordings would count as evidence that there is not.
+    _, single = np.unique(np.column_stack([pairs.x0, pairs.xh]), axis=0, return_index=True)
+    pairs = pairs.take(single)
+    if not found.diffusion.constant:
+        triangle = weighted_triangle(found, pairs, None, of_rest=True)[0]
+        freedom = len(pairs.h) * library.dimension
+        return unexplained_probability(triangle[:, :-1], triangle[:, -1:], freedom=freedom)
+    weight = np.sqrt(pairs.h)[:, None]
+    return unexplained_probability(library.evaluate(pairs.x0) * weight, residuals(found, pairs) / weight)
+
+
+def predict(dynamics: Dynamics, recordings: Recordings) -> np.ndarray:
+    """Follow f from the first sample of every recording through all its times.
+
+    Parameters
+    ----------
+    dynamics
+        f and D.
+    recordings
+        The trajectories; each keeps its own times.
+
+    Returns
+    -------
+    numpy.ndarray
+        Predicted states in the order of ``recordings.values``, shape ``(n, d)``; not finite where the
+        prediction runs away, or f is too fast to be followed from sample to sample.
+    """
+    starts = np.flatnonzero(np.diff(recordings.recording, prepend=-1))
+    lengths = np.diff(np.append(starts, len(recordings.t)))
+    width = np.ptp(recordings.values, axis=0)
+    width = np.where(width > 0, width, 1.0)
+    center = recordings.values.mean(axis=0)
+    jacobian = dynamics.jacobian(recordings.values) * width / width[:, None]
+    rate = float(np.quantile(np.linalg.norm(jacobian, axis=(1, 2)), 0.999))
+    predicted = np.full_like(recordings.values, np.nan)
+    predicted[starts] = recordings.values[starts]
+    x = recordings.values[starts].T.copy()
+
+    def velocity(components: np.ndarray) -> np.ndarray:
+        return dynamics.drift(components.T).T
+
+    with np.errstate(over="ignore", invalid="ignore"):
+        for place in range(1, int(lengths.max())):
+            near = (np.abs(x - center[:, None]) < RUNAWAY_WIDTHS * width[:, None]).all(axis=0)
+            going = (lengths > place) & near
+            if not going.any():
+                break
+            rows = starts[going] + place
+            gap = recordings.t[rows] - recordings.t[rows - 1]
+            steps = max(int(np.ceil(gap.max() * rate / STEP_ACCURACY)), 1)
+            if steps > MAX_STEPS:
+                break
+            part = x[:, going]
+            for _ in range(steps):
+                part = runge_kutta_step(velocity, part, gap / steps)
+            x[:, going] = part
+            predicted[rows] = part.T
+    return predicted
+
+
+def prediction_errors(dynamics: Dynamics, recordings: Recordings) -> np.ndarray:
+    """``E_k = ‖X_predicted(t) - X_k(t)‖ / ‖X_k(t)‖`` of every recording k (paper, Eq. error), shape ``(K,)``.
+
+    The norms are over all samples of a recording and all states. A prediction that runs away has an
+    infinite error.
+    """
+    difference = ((predict(dynamics, recordings) - recordings.values) ** 2).sum(axis=1)
+    size = (recordings.values**2).sum(axis=1)
+    count = len(recordings.labels)
+    difference = np.where(np.isfinite(difference), difference, np.inf)
+    total = np.bincount(recordings.recording, weights=difference, minlength=count)
+    return np.sqrt(total / np.bincount(recordings.recording, weights=size, minlength=count))
+
+
+def check_prediction(
+    *,
+    noise_fault: str | None,
+    errors: np.ndarray | None,
+    mean_probability: float | None,
+    held_out_ratio: float,
+    limits: PredictionLimits,
+) -> Verdict:
+    """Whether f, which every V here is made from, holds for recordings that it was not fitted to.
+
+    Parameters
+    ----------
+    noise_fault
+        What speaks against the noise, see `NoiseDiagnosis.fault`.
+    errors
+        Errors of long-term prediction of held-out recordings, where these carry no noise.
+    mean_probability
+        Probability of the mean of the held-out residuals, where they carry noise.
+    held_out_ratio
+        Mean square of the held-out residuals over that of the others.
+    limits
+        Of the three.
+
+    Returns
+    -------
+    Verdict
+        Its figure is the median error; or how much larger the mean square is, as a share; or, where the mean
+        of the residuals refuses, how many powers of ten its probability lies below 1.
+    """
+    if noise_fault is not None:
+        return Verdict.refused(noise_fault, limits.prediction)
+    if errors is not None:
+        return Verdict.of(float(np.median(errors)), limits.prediction, UNPREDICTED)
+    assert mean_probability is not None
+    value, limit = max(held_out_ratio - 1, 0.0), limits.held_out_ratio - 1
+    if not value <= limit:
+        return Verdict(value, limit, False, "f fits held-out recordings worse than its own")
+    rarity, rare = -float(np.log10(max(mean_probability, 1e-300))), -float(np.log10(limits.false_alarms))
+    if not rarity <= rare:
+        reason = (
+            "the residuals of f on held-out recordings have a mean, of a probability of"
+            f" {mean_probability:.1g}: f misses a term"
+        )
+        return Verdict(rarity, rare, False, reason)
+    return Verdict(value, limit, True)

@@ -1,0 +1,494 @@
+"""Identification: f and D of recordings, by the method that their noise asks for.
+
+Recordings without noise, and those with white process noise alone, are a regression of pairs of samples
+(`siq.inference.regression`). Where the sensors are noisy, samples are means over an exposure, or velocities
+were not recorded, f is that of the largest likelihood of whole recordings
+(`siq.inference.kalman_identification`). Where they are correlated for another reason, states some steps
+earlier are the instruments of the regression. Which of it is the case the residuals of a first f show, and
+from which lag on the recordings are Markovian.
+
+D is as given; else as the process noise shows it, of the determinant 1, as a formula of the state where a
+constant one cannot be held; else the unit matrix. Last, f is tested on held-out recordings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Literal
+
+import numpy as np
+
+from siq.data.correlation import MarkovLag, markov_lag
+from siq.data.preparation import joined
+from siq.data.recordings import Recordings, held_out_recordings, select_recordings, snapshot_pairs
+from siq.errors import NumericalFailure
+from siq.inference.checks import (
+    PredictionLimits,
+    check_prediction,
+    is_rounding,
+    mean_residual_probability,
+    neighbour_correlations,
+    prediction_errors,
+    residual_noise,
+    rounding_bias,
+    rounding_errors,
+    rounding_text,
+)
+from siq.inference.diffusion_model import (
+    check_units,
+    constant_noise,
+    constant_noise_probability,
+    estimated_diffusion,
+    with_process_noise_rate,
+)
+from siq.inference.field_estimate import (
+    HARMLESS_BIAS,
+    HARMLESS_CORRELATION,
+    SIGNIFICANT_SCORE,
+    DiffusionSource,
+    FieldEstimate,
+    NoiseDiagnosis,
+    Verdict,
+)
+from siq.inference.inertia import inertia_test, seen_inertia
+from siq.inference.kalman_filter import Noise
+from siq.inference.kalman_identification import (
+    filtered_recordings,
+    held_out_innovations,
+    identify_by_likelihood,
+)
+from siq.inference.library import CandidateLibrary, IdentificationOptions, check_origin, field_library
+from siq.inference.observation import ObservationModel, moved_by, velocity_names
+from siq.inference.regression import (
+    carries_noise,
+    identify_vector_field,
+    lagged_pairs,
+    lost_time,
+    refit,
+    residuals,
+    with_given_noise,
+    with_noise_formula,
+    with_stability,
+)
+from siq.numerics.randomness import Purpose
+from siq.remarks import Remark
+from siq.systems.diffusion import Diffusion
+
+SUSPECT_SCORE = -1.0  # standard errors of the correlation of neighbouring residuals
+SENSOR_SHARE = (
+    0.1  # of what means move by: a search finds its way down to no sensor noise, but not up from it
+)
+MIN_SHARE, MAX_SHARE = 1e-3, 0.45  # of the residuals' variance: a sensor's share that a fit begins with
+WHOLE_STEP_TOLERANCE = 0.05  # of an exposure, as exactly as residuals show it of some thousand samples
+PREDICTED_RECORDINGS = 200  # held-out ones that are predicted: enough for a median
+
+
+def identify(
+    recordings: Recordings,
+    library: CandidateLibrary | None = None,
+    *,
+    observation: ObservationModel | Literal["auto"] = "auto",
+    options: IdentificationOptions,
+    draw: Callable[[Purpose], np.random.Generator],
+    diffusion: Diffusion | None = None,
+    units: Sequence[str | None] = (),
+    pair_step: float | None = None,
+    integrator_step: float | None = None,
+    limits: PredictionLimits | None = None,
+) -> FieldEstimate:
+    """f and D of recordings, with their errors, the noise that is in the recordings, and the test of f.
+
+    Parameters
+    ----------
+    recordings
+        Whole trajectories.
+    library
+        The candidate functions of f; by default those of the options.
+    observation
+        How samples show the states. By default as measurement noise and correlations in the recordings say;
+        with hidden velocities where the options ask for them.
+    options
+        In which functions f is sought, and what makes a term significant.
+    draw
+        Gives the generator for a purpose: for held-out recordings, and for resampling.
+    diffusion
+        D, where it is given.
+    units
+        Of the states, None of one that nobody knows; by default those of the recordings.
+    pair_step
+        Longest time between samples that still belong together.
+    integrator_step
+        Step of the Euler–Maruyama simulation that made the recordings, None for everything else.
+    limits
+        Of the test of f.
+
+    Raises
+    ------
+    NumericalFailure
+        When there is no f, with the reason, and what would help.
+    """
+    hidden = options.hidden_velocities if observation == "auto" else observation.hidden
+    if library is None:
+        names = recordings.names
+        library = field_library((*names, *velocity_names(names)) if hidden else names, options)
+    if observation == "auto" and hidden:
+        observation = ObservationModel(library, Diffusion.identity(library.dimension), hidden=True)
+    case = _Case(
+        recordings, library, options, draw, diffusion, units or recordings.units, pair_step, integrator_step,
+        limits or PredictionLimits(),
+    )  # fmt: skip
+    try:
+        if observation == "auto":
+            found = case.identified()
+        elif hidden:
+            found = case.with_hidden_velocities(observation)
+        else:
+            seen = case.by_exposure(observation)
+            if seen is None:
+                raise NumericalFailure("the recordings are no means over that exposure")
+            found = seen
+        assert found.prediction is not None
+        if not hidden and (found.memory is not None or not found.prediction.passed):
+            # A position alone is refused where its recordings are correlated since it has inertia.
+            advice = case.advice(hidden=False)
+            if advice is not None:
+                reason = "; ".join(one for one in (found.prediction.reason, advice) if one)
+                found = replace(found, prediction=replace(found.prediction, passed=False, reason=reason))
+        return found
+    except (NumericalFailure, np.linalg.LinAlgError) as error:
+        rounding = rounding_text(recordings, coarse=True)
+        reason = str(error) if rounding is None else f"{error}; mind that {rounding}"
+        advice = case.advice(hidden=hidden)
+        raise NumericalFailure(reason if advice is None else f"{reason}; {advice}") from error
+
+
+class _Case:
+    """What an identification is of; the arguments are those of `identify`."""
+
+    def __init__(
+        self,
+        recordings: Recordings,
+        library: CandidateLibrary,
+        options: IdentificationOptions,
+        draw: Callable[[Purpose], np.random.Generator],
+        given: Diffusion | None,
+        units: Sequence[str | None],
+        pair_step: float | None,
+        integrator_step: float | None,
+        limits: PredictionLimits,
+    ) -> None:
+        self.recordings, self.library, self.options, self.draw = recordings, library, options, draw
+        self.given, self.units, self.limits = given, units, limits
+        self.pair_step, self.integrator_step = pair_step, integrator_step
+        held = held_out_recordings(recordings, generator=draw(Purpose.HOLD_OUT))
+        self.training = select_recordings(recordings, np.flatnonzero(~held))
+        self.held_out = select_recordings(recordings, np.flatnonzero(held))
+
+    def identified(self) -> FieldEstimate:
+        """By the method that noise and correlations of the recordings ask for."""
+        check_origin(self.library, self.recordings.values, names=self.recordings.titles)
+        training = snapshot_pairs(self.training, pair_step=self.pair_step)
+        step = self.integrator_step
+        regress = partial(identify_vector_field, self.library, options=self.options, integrator_step=step)
+        if not carries_noise(self.library, training, options=self.options, integrator_step=step):
+            return self._finished_by_pairs(regress(training))
+        if step is None and (memory := markov_lag(joined(self.recordings))).remembers:
+            for exposure in possible_exposures(memory):
+                unit = Diffusion.identity(self.library.dimension)
+                found = self.by_exposure(ObservationModel(self.library, unit, exposure))
+                if found is not None:
+                    return found
+            return self.by_instruments(memory)
+        # Under noise every recording counts: all give the result, a part of them its test.
+        pairs = snapshot_pairs(self.recordings, pair_step=self.pair_step)
+        found = with_process_noise_rate(regress(pairs), pairs)
+        return self.with_sensor_noise(found) or self._finished_by_pairs(found)
+
+    def with_sensor_noise(self, found: FieldEstimate) -> FieldEstimate | None:
+        """By likelihood, where the sensors are noisy; None where they are not.
+
+        What could be sensor noise is asked of the likelihood from one standard error on: it would bias f long
+        before it is significant.
+        """
+        pairs = snapshot_pairs(self.recordings, pair_step=self.pair_step)
+        correlation, score = neighbour_correlations(found, pairs)
+        if not (score < SUSPECT_SCORE).any():
+            return None
+        rate = np.diag(found.noise_rate)
+        variance, rounding = rate * float(np.median(pairs.h)), rounding_errors(self.recordings)
+        measured = np.sqrt(np.maximum(-correlation, 0.0) * variance)
+        rounded = is_rounding(measured, rounding, correlation=float(correlation.min()))
+        if rounded and rounding_bias(found, pairs, rounding) <= HARMLESS_BIAS:
+            return None
+        share = np.clip(-correlation, MIN_SHARE, MAX_SHARE)
+        try:
+            by_likelihood = identify_by_likelihood(
+                ObservationModel(self.library, found.diffusion), self.recordings,
+                Noise(share * variance, rate * (1 - 2 * share)), false_terms=self.options.false_terms,
+                generator=self.draw(Purpose.STABILITY), pair_step=self.pair_step,
+            )  # fmt: skip
+        except (NumericalFailure, np.linalg.LinAlgError) as error:
+            if ((score < -SIGNIFICANT_SCORE) & (correlation < -HARMLESS_CORRELATION)).any():
+                raise NumericalFailure(f"the sensor is noisy, and f with it is not found: {error}") from None
+            return None
+        assert by_likelihood.diagnosis is not None and by_likelihood.diagnosis.sensor_evidence is not None
+        return self._finished(by_likelihood) if by_likelihood.diagnosis.sensor_evidence > 1 else None
+
+    def by_exposure(self, observation: ObservationModel) -> FieldEstimate | None:
+        """By the likelihood of samples that are means over an exposure; None where they are no such means.
+
+        They are such means if nothing is left in the innovations that neighbours share.
+        """
+        try:
+            moved, step = moved_by(observation.measured(self.recordings, self.pair_step))
+            found = identify_by_likelihood(
+                observation, self.recordings, Noise(SENSOR_SHARE * moved, moved / step),
+                false_terms=self.options.false_terms, generator=self.draw(Purpose.STABILITY),
+                pair_step=self.pair_step,
+            )  # fmt: skip
+        except (NumericalFailure, np.linalg.LinAlgError):
+            return None
+        assert found.diagnosis is not None
+        return None if found.diagnosis.correlated or not found.noise_rate.any() else self._finished(found)
+
+    def with_hidden_velocities(self, observation: ObservationModel) -> FieldEstimate:
+        """By the likelihood of positions, whose velocities are states that were not recorded."""
+        if self.given is not None:
+            raise NumericalFailure(
+                "D is given for the positions, and noise drives the hidden velocities; leave the diffusion"
+                " out, it is found"
+            )
+        found = identify_by_likelihood(
+            observation, self.recordings, false_terms=self.options.false_terms,
+            generator=self.draw(Purpose.STABILITY), pair_step=self.pair_step,
+        )  # fmt: skip
+        return self._finished(found)
+
+    def _finished(self, found: FieldEstimate) -> FieldEstimate:
+        """An estimate by likelihood with its D, its strength, and its test."""
+        noise, pairs = found.diagnosis, len(snapshot_pairs(self.recordings, pair_step=self.pair_step).h)
+        assert noise is not None and noise.measurement_error is not None
+        forced = bool(found.noise_rate.any())
+        remarks = []
+        if found.hidden_velocities:
+            source = DiffusionSource.OF_VELOCITIES if forced else DiffusionSource.UNIT_OF_VELOCITIES
+            if not forced:
+                check_velocity_units(self.units)
+        else:
+            first = found
+            found, source = self._with_diffusion(found, pairs)
+            strength = found.intensity if found.noise is not None else self._strength(first, found.diffusion)
+            error = noise.intensity_error
+            if error is not None and noise.intensity > 0:
+                error *= strength / noise.intensity
+            covariance = found.noise_rate / strength if forced else noise.covariance
+            noise = replace(noise, intensity=strength, intensity_error=error, covariance=covariance)
+            if noise.exposure is not None:
+                every = ObservationModel.of(first).every(self.recordings)
+                values = {"exposure": noise.exposure, "unit": self.recordings.time_unit or "", "every": every}
+                remarks.append(Remark("inference.exposure", values))
+            if first.noise is not None and self.given is not None and self.given.constant:
+                remarks.append(Remark("inference.noise_depends_on_state"))
+        remarks = [self._sensor_remark(noise, forced), *remarks]
+        noise = replace(noise, diffusion=source, pairs=pairs, remarks=tuple(remarks))
+        found = replace(found, diagnosis=noise)
+        probability, ratio = held_out_innovations(
+            found, self.training, self.held_out, pair_step=self.pair_step
+        )
+        return self._tested(found, mean_probability=probability, held_out_ratio=ratio)
+
+    def _sensor_remark(self, noise: NoiseDiagnosis, forced: bool) -> Remark:
+        sizes = zip(noise.measurement, self.recordings.titles, strict=True)
+        sensors = [{"size": float(size), "state": name} for size, name in sizes]
+        if len(noise.measurement) < self.library.dimension:
+            return Remark("inference.hidden_velocities", {"sensors": sensors, "process_noise": forced})
+        return Remark("inference.measurement_noise", {"sensors": sensors})
+
+    def _strength(self, found: FieldEstimate, diffusion: Diffusion) -> float:
+        """ε of another D than was found: the mean of ``tr D⁻¹(x) εD(x) / d`` over the states."""
+        if diffusion.constant:
+            return diffusion.intensity(found.noise_rate)
+        states = filtered_recordings(found, self.recordings, pair_step=self.pair_step).values
+        forces = found.noise_rate if found.noise is None else found.noise.diffusion(1.0).at(states)
+        products = diffusion.precision_at(states) * forces
+        return float(products.sum(axis=(1, 2)).mean() / states.shape[1])
+
+    def _with_diffusion(self, found: FieldEstimate, samples: int) -> tuple[FieldEstimate, DiffusionSource]:
+        """The estimate with D, and where that is from: given, estimated of so many samples, or the unit."""
+        if self.given is not None:
+            return replace(
+                found, diffusion=self.given, noise=None, constant_noise=None
+            ), DiffusionSource.GIVEN
+        if found.noise is not None:
+            return found, DiffusionSource.ESTIMATED
+        estimated = estimated_diffusion(found, pairs=samples) if found.noise_rate.any() else None
+        if estimated is None:
+            check_units(self.recordings.names, self.units)
+            return replace(found, constant_noise=None), DiffusionSource.UNIT
+        own = found.constant_noise
+        if own is None:
+            own = constant_noise(self.library.symbols, found.noise_rate, samples=samples)
+        return replace(found, diffusion=estimated, constant_noise=own), DiffusionSource.ESTIMATED
+
+    def by_instruments(self, memory: MarkovLag) -> FieldEstimate:
+        """By instruments, of recordings that are Markovian from a lag on."""
+        assert memory.lag is not None
+        if self.given is not None and not self.given.constant:
+            raise NumericalFailure(
+                "the recordings are correlated, and D is given as a function of the state: how strong"
+                " correlated noise is here and there is not known; give a constant D, or leave it out"
+            )
+        pairs, training, unseen = (
+            lagged_pairs(part, memory.lag) for part in (self.recordings, self.training, self.held_out)
+        )
+        found = identify_vector_field(self.library, pairs, options=self.options)
+        fitted, independent = refit(found, training), int(pairs.independent)
+        found, source = self._with_diffusion(with_process_noise_rate(found, pairs), independent)
+        diffusion, unit = found.diffusion, np.eye(self.library.dimension)
+        intensity = diffusion.intensity(found.noise_rate)
+        covariance = found.noise_rate / intensity
+        excess = np.abs(diffusion.whitening @ covariance @ diffusion.whitening.T - unit)
+        state = int(np.argmax(np.abs(memory.correlations[0])))
+        correlation = float(memory.correlations[0, state])
+        values = {
+            "kind": memory.kind, "memory": float(memory.memory), "lag": int(memory.lag),
+            "time": float(memory.time), "unit": self.recordings.time_unit or "",
+        }  # fmt: skip
+        noise = NoiseDiagnosis(
+            "process", intensity, covariance, correlation, correlation / float(memory.errors[0, state]),
+            np.zeros(len(unit)), pairs=independent, diffusion=source, lag=memory.lag,
+            lost_time=lost_time(found, pairs), deviation=float(excess.max()),
+            deviation_score=float((excess / np.sqrt((1 + unit) / independent)).max()),
+            remarks=(Remark("inference.correlated", values),),
+        )  # fmt: skip
+        squares = [
+            float((residuals(fitted, part) ** 2 / part.h[:, None]).mean()) for part in (unseen, training)
+        ]
+        return self._tested(
+            replace(found, diagnosis=noise), held_out_ratio=squares[0] / squares[1],
+            mean_probability=mean_residual_probability(fitted, unseen, seen=len(training.h)),
+        )  # fmt: skip
+
+    def _finished_by_pairs(self, found: FieldEstimate) -> FieldEstimate:
+        """An estimate by pairs with its D, the noise of its residuals, and its test.
+
+        f does not depend on D, and whether noise is white does not either: so D can come last.
+        """
+        training, unseen = (
+            snapshot_pairs(part, pair_step=self.pair_step) for part in (self.training, self.held_out)
+        )
+        everything, count = snapshot_pairs(self.recordings, pair_step=self.pair_step), len(training.h)
+        count += len(unseen.h)
+        false_terms, source = self.options.false_terms, DiffusionSource.GIVEN
+        if self.given is not None:
+            found = with_given_noise(found, everything, self.given, false_terms=false_terms)
+            noise = residual_noise(found, self.recordings, pair_step=self.pair_step)
+        else:
+            first = found
+            estimated = None if found.noise_free else estimated_diffusion(found, pairs=count)
+            if estimated is not None:
+                found, source = self._with_diffusion(found, count)
+                noise = residual_noise(found, self.recordings, pair_step=self.pair_step)
+            if estimated is None or noise.kind != "process":
+                check_units(self.recordings.names, self.units)
+                found, source = first, DiffusionSource.UNIT
+                noise = residual_noise(found, self.recordings, pair_step=self.pair_step)
+            elif (by_state := with_noise_formula(found, everything, false_terms=false_terms)) is not None:
+                found = by_state
+                noise = residual_noise(found, self.recordings, pair_step=self.pair_step)
+        remarks = noise.remarks
+        if source == DiffusionSource.GIVEN and noise.kind == "process" and found.diffusion.constant:
+            # A constant D that was given, where the recordings speak for another.
+            rest = residuals(found, everything)
+            if constant_noise_probability(found, everything, rest) < false_terms:
+                remarks = (*remarks, Remark("inference.noise_depends_on_state"))
+        noise = replace(noise, diffusion=source, pairs=count, remarks=remarks)
+        if found.noise_free:
+            chosen = np.arange(min(len(self.held_out.labels), PREDICTED_RECORDINGS))
+            errors = prediction_errors(found.dynamics, select_recordings(self.held_out, chosen))
+            return self._tested(replace(found, diagnosis=noise), errors=errors)
+        if found.diffusion.constant:
+            generator = self.draw(Purpose.STABILITY)
+            found = with_stability(found, everything, options=self.options, generator=generator)
+        fitted, squares = refit(found, training), []
+        for pairs in (unseen, training):
+            rest = residuals(fitted, pairs)
+            if fitted.diffusion.constant:
+                squares.append(float((rest**2 / pairs.h[:, None]).mean()))
+            else:
+                speeds = rest / np.sqrt(pairs.h)[:, None]
+                squares.append(float(fitted.diffusion.squared_speed(pairs.x0, speeds).mean()))
+        return self._tested(
+            replace(found, diagnosis=noise), held_out_ratio=squares[0] / squares[1],
+            mean_probability=mean_residual_probability(fitted, unseen),
+        )  # fmt: skip
+
+    def _tested(
+        self,
+        found: FieldEstimate,
+        *,
+        errors: np.ndarray | None = None,
+        mean_probability: float | None = None,
+        held_out_ratio: float = 1.0,
+    ) -> FieldEstimate:
+        """The estimate with the verdict of `check_prediction` on it."""
+        assert found.diagnosis is not None
+        verdict: Verdict = check_prediction(
+            noise_fault=found.diagnosis.fault(self.recordings.names), errors=errors,
+            mean_probability=mean_probability, held_out_ratio=held_out_ratio, limits=self.limits,
+        )  # fmt: skip
+        return replace(found, prediction=verdict)
+
+    def advice(self, *, hidden: bool) -> str | None:
+        """What to do where a recorded position has inertia, or hidden velocities are not needed."""
+        if len(self.recordings.names) != 1:
+            return None
+        try:
+            test = (inertia_test if hidden else seen_inertia)(self.recordings, pair_step=self.pair_step)
+        except (NumericalFailure, np.linalg.LinAlgError):
+            return None
+        if test is None or test.needs_velocity == hidden:
+            return None
+        said = test.sentence(self.recordings.time_unit or "")
+        if not hidden:
+            return (
+                f"{said}: set 'identification.hidden_velocities: true', in Python hidden_velocities=True, and"
+                " the velocity is a state that was not recorded"
+            )
+        if test.undecided:
+            return said
+        return f"{said}: leave 'identification.hidden_velocities' out, the position alone is the state"
+
+
+def check_velocity_units(units: Sequence[str | None]) -> None:
+    """Refuse the unit matrix for D of hidden velocities where positions have different units.
+
+    Raises
+    ------
+    NumericalFailure
+        Where they have.
+    """
+    if len({unit for unit in units if unit}) > 1:
+        raise NumericalFailure(
+            "no process noise is seen that would show D, and the positions have different units, so that no"
+            " unit matrix can stand for it; scale them to one unit"
+        )
+
+
+def possible_exposures(found: MarkovLag) -> list[float]:
+    """Exposures that samples may be means over, the likeliest first; none where they are no such means.
+
+    A camera is mostly exposed for a whole number of steps: where the correlation time is near one, that is
+    tried first. One that may be as well that of coloured noise says no more than that; only a whole step is
+    tried then.
+    """
+    if found.kind == "either":
+        return [found.step]
+    if found.kind != "blur":
+        return []
+    steps = found.memory / found.step
+    whole = round(steps)
+    near = [whole * found.step] if abs(steps - whole) < WHOLE_STEP_TOLERANCE * steps else []
+    return [*near, found.memory]

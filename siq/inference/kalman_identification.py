@@ -1,0 +1,402 @@
+"""Identification of f by the likelihood of a Kalman filter: of noisy sensors, exposures, hidden velocities.
+
+The noise of a sensor is in both samples of a pair, and a regression of one on the other is biased by it. What
+is not biased is the likelihood of whole recordings under f, process noise and measurement noise together
+(`siq.inference.maximum_likelihood`), of the states as samples show them (`siq.inference.observation`).
+
+All functions of a library are fitted first, beginning with f = 0, whose filter is linear; coefficients enter
+linearly, so that the first step of Gauss and Newton is already the weighted regression on what the filter
+knows of the state. Along that fit everything is linear: the innovations are a regression problem like any
+other (`siq.inference.selection`), all equations at once since a filter couples them. What is chosen is fitted
+again, and terms leave as long as one is not significant after all. Where the innovations show that the
+process noise depends on the state, f and D are fitted in turn (`siq.inference.diffusion_model`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from siq.data.recordings import Recordings, parent_recordings
+from siq.errors import NumericalFailure
+from siq.inference.checks import unexplained_probability
+from siq.inference.diffusion_model import InnovationLikelihood
+from siq.inference.field_estimate import FieldEstimate, FlowMap, NoiseDiagnosis
+from siq.inference.kalman_filter import Grid, Noise, Whitened, linearise, solve, whiten
+from siq.inference.maximum_likelihood import Fit, fit_by_filter, log_likelihood
+from siq.inference.measurements import Measurements
+from siq.inference.observation import ObservationModel, kept_rows, moved_by, settled, smoothed_motion
+from siq.inference.recalibration import (
+    drop_insignificant_process_noise,
+    noise_uncertainty,
+    process_noise_needed,
+)
+from siq.inference.selection import (
+    LinearProblem,
+    ModelAverage,
+    best_support,
+    blocks_of,
+    critical_values,
+    fit_significant,
+    stability,
+    triangles,
+)
+from siq.numerics.least_squares import positive
+from siq.systems.diffusion import Diffusion
+from siq.systems.dynamics import Dynamics
+
+LAGS = (1, 2, 3)  # steps over which innovations are compared: what is correlated at all is so over these
+DIFFUSION_ROUNDS = 2  # of D by the trajectories of f, and f by the weights of D
+LIBRARY_ROUNDS = 8  # of the fit of a whole library, which only chooses terms
+NO_SENSOR_NOISE = 1e-6  # of a sensor's variance: as good as none
+MAX_NUMBERS = 4e8  # of the derivatives by all coefficients at all samples: 3 GB
+KNOWN_EQUATIONS = 2.0  # with hidden velocities half hold by definition: no false term comes into them
+
+
+def identify_by_likelihood(
+    observation: ObservationModel,
+    recordings: Recordings,
+    noise: Noise | None = None,
+    *,
+    false_terms: float,
+    generator: np.random.Generator,
+    pair_step: float | None = None,
+) -> FieldEstimate:
+    """f, the process noise and the noise of the sensors together.
+
+    Parameters
+    ----------
+    observation
+        The candidate functions, and how samples show the states; its D does not matter for f.
+    recordings
+        Whole trajectories of the measured states.
+    noise
+        To begin with; not needed with hidden velocities.
+    false_terms
+        Probability that a constant D is given up by chance; and that chance brings any false term into f, or
+        into D.
+    generator
+        Draws recordings again, see `siq.inference.selection`.
+    pair_step
+        Longest time between samples that still belong together.
+
+    Returns
+    -------
+    FieldEstimate
+        With its diagnosis. D is that of the observation, unless it depends on the state, or acts on hidden
+        velocities: there it is the unit matrix if no process noise is seen.
+
+    Raises
+    ------
+    NumericalFailure
+        When the fit does not settle, or a library is too large for the recordings.
+    """
+    library, d, hidden = observation.library, observation.library.dimension, observation.hidden
+    data, everything = observation.measured(recordings, pair_step), observation.everything
+    if data.outputs.size * len(everything) > MAX_NUMBERS:
+        raise NumericalFailure(
+            f"{len(everything)} coefficients and {len(data.t)} samples with measurement noise are too much"
+            " for the memory; lower identification.degree, or name the functions of f"
+        )
+    if hidden:
+        x, noise = smoothed_motion(data, library.states[: d // 2])
+        if not noise.process.any():
+            raise NumericalFailure("no force is seen: the positions move evenly; record longer")
+    else:
+        assert noise is not None
+        x, noise = observation.states(data), observation.noise(replace(noise, shape=np.eye(d)[None]))
+    whole = _fit_library(observation.model(everything, np.zeros(len(everything))), data, x, noise)
+    by_state, chance, likelihood = False, 1.0, None
+    if not hidden:
+        likelihood = InnovationLikelihood(library.symbols, whole, data)
+        chance = likelihood.constant_probability()
+        by_state = chance < false_terms and bool(whole.noise.process.any())
+    if likelihood is not None and by_state:
+        # Weights that are wrong everywhere would choose wrong terms.
+        formula, sensor, _ = likelihood.selected(false_terms=false_terms, probability=chance)
+        noise = observation.noise(Noise(sensor, np.ones(d), field=formula.diffusion(1.0)))
+        whole = _fit_library(whole.model, data, whole.linearised_at, noise)
+    share = min(KNOWN_EQUATIONS * false_terms, 0.5) if hidden else false_terms
+    critical = np.tile(critical_values(library, false_terms=share), len(everything) // library.size)
+    white = whiten(whole.linearisation, data, whole.noise)
+    last = solve(white.columns, white.innovations)[0] if whole.converged else 0.0
+    goal = white.innovations + white.columns @ (whole.model.values - last)
+    # Whitened values stand one behind the other, all outputs of a sample together.
+    blocks = np.repeat(blocks_of(parent_recordings(data.labels)[data.recording]), data.outputs.shape[1])
+    parts = triangles(white.columns, goal, blocks)
+
+    def problem_of(triangle: np.ndarray) -> LinearProblem:
+        return LinearProblem(triangle[:, :-1], triangle[:, -1], 1.0, critical, everything)
+
+    problem = problem_of(np.asarray(np.linalg.qr(np.concatenate(parts), mode="r")))
+    support = everything[list(best_support(problem))]
+    for component in np.unique(everything[:, 0]):
+        if component not in support[:, 0]:
+            name = library.states[component]
+            raise NumericalFailure(f"no term of the equation of {name} is significant; record longer")
+    fit = whole
+
+    def fit_terms(support: np.ndarray) -> tuple[Fit, np.ndarray]:
+        nonlocal fit
+        places = problem.places(support)
+        # Where functions are nearly alike, those that stay take over what the others did: all begin anew.
+        values = problem.solve(places)[places]
+        fit = observation.fitted(support, values, data, noise=fit.noise, x=fit.linearised_at)
+        return fit, np.abs(fit.model.values) / fit.standard_errors / critical[places]
+
+    fit, support = fit_significant(fit_terms, support)
+    if by_state:
+        found = _with_formula(observation, support, fit, data, false_terms=false_terms, probability=chance)
+    else:
+        if hidden:  # the search for intensities ends at the least that it tries; of ring-downs there are none
+            fit = drop_insignificant_process_noise(fit, data) or fit
+        else:
+            strict = fit_by_filter(
+                fit.model, data, x=fit.x, noise=fit.noise.without_process(), estimate_process=False,
+                substeps=fit.substeps,
+            )  # fmt: skip
+            fit = fit if process_noise_needed(fit, strict) else strict
+        found = _estimate(observation, support, fit, data, *noise_uncertainty(fit, data))
+        if likelihood is not None and found.noise_rate.any():
+            found = replace(found, constant_noise=likelihood.constant[0])
+    shares = stability(parts, lambda triangle: [problem_of(triangle)], support, generator=generator)
+    return replace(
+        found,
+        alternatives=ModelAverage.of([problem], support, library),
+        stability=np.concatenate([np.ones(len(observation.definitions)), shares]),
+    )
+
+
+def _fit_library(model: Dynamics, data: Measurements, x: np.ndarray, noise: Noise) -> Fit:
+    fit = fit_by_filter(model, data, x=x, noise=noise, iterations=LIBRARY_ROUNDS, closure=False)
+    if fit.fault:
+        raise NumericalFailure(f"the likelihood of the recordings cannot be worked out: {fit.fault}")
+    return fit
+
+
+def _estimate(
+    observation: ObservationModel,
+    support: np.ndarray,
+    fit: Fit,
+    data: Measurements,
+    sensor_error: np.ndarray,
+    process_error: np.ndarray,
+    covariance: np.ndarray,
+) -> FieldEstimate:
+    """The estimate of a fit whose noise has known errors; see `noise_uncertainty`."""
+    library, diffusion, d = observation.library, observation.diffusion, observation.library.dimension
+    intensity, sensor = fit.noise.intensity, fit.noise.measurement
+    rate = (intensity[0] if len(intensity) == 1 else intensity[data.begins].mean(axis=0))[:d, :d]
+    moved, step = moved_by(data)
+    strength, evidence, driven = 0.0, None, slice(d // 2 if observation.hidden else 0, d)
+    if observation.hidden:
+        # The part of D that acts on velocities has the determinant 1.
+        force, matrix = rate[driven, driven], np.zeros((d, d))
+        strength = float(np.exp(np.linalg.slogdet(force)[1] / len(force))) if force.any() else 0.0
+        matrix[driven, driven] = (force + force.T) / 2 / strength if force.any() else np.eye(len(force))
+        diffusion = Diffusion(matrix)
+        # What is not foreseen from a sample to the next: twice the sensor's noise, and what noise makes of v.
+        ratio = float(np.sqrt(((2 * sensor + np.diag(force) * step**3 / 3) / moved).mean()))
+    else:
+        strength = diffusion.intensity(rate) if diffusion.constant else 0.0
+        ratio = float(np.sqrt(((np.diag(rate) * step + 2 * sensor) / positive(moved)).mean()))
+        without = replace(fit.noise, measurement=sensor * NO_SENSOR_NOISE)
+        alone = replace(data, sensor_noise=None)
+        factors = 1 + np.linspace(0, 2, 21) * sensor.max() / max(rate.max() * step, 1e-300)
+        base = max(log_likelihood(fit.linearisation, alone, without.scaled(factor)) for factor in factors)
+        evidence = 2 * (log_likelihood(fit.linearisation, alone, fit.noise) - base)
+    known = observation.definitions
+    whole = np.zeros((len(known) + len(support),) * 2)
+    whole[len(known) :, len(known) :] = covariance
+    correlation, score = _strongest_correlation(whiten(fit.linearisation, data, fit.noise), data)
+    error = strength * float(np.sqrt((process_error[driven] ** 2).sum())) / len(process_error[driven])
+    deviation = np.sqrt(sensor)
+    unit = diffusion.matrix if observation.hidden else np.eye(d)
+    diagnosis = NoiseDiagnosis(
+        "process" if rate.any() else "sensor", strength, rate / strength if strength else unit, correlation,
+        score, deviation, deviation * sensor_error / 2,
+        intensity_error=error if np.isfinite(error) else None, exposure=observation.exposure,
+        sensor_evidence=evidence,
+    )  # fmt: skip
+    if diagnosis.correlated:
+        diagnosis = replace(diagnosis, kind="coloured")
+    return FieldEstimate.on_support(
+        library, np.concatenate([known, support]), np.append(np.ones(len(known)), fit.model.values), whole,
+        rate, ratio, FlowMap(fit.substeps), diffusion, diagnosis=diagnosis,
+    )  # fmt: skip
+
+
+def _with_formula(
+    observation: ObservationModel,
+    support: np.ndarray,
+    fit: Fit,
+    data: Measurements,
+    *,
+    false_terms: float,
+    probability: float,
+) -> FieldEstimate:
+    """The estimate of a fit whose process noise depends on the state, once f and D know of each other."""
+    symbols = observation.library.symbols
+    for _ in range(DIFFUSION_ROUNDS):
+        likelihood = InnovationLikelihood(symbols, fit, data)
+        formula, sensor, covariance = likelihood.selected(false_terms=false_terms, probability=probability)
+        noise = observation.noise(Noise(sensor, np.ones(len(symbols)), field=formula.diffusion(1.0)))
+        fit = settled(
+            fit_by_filter(
+                fit.model, data, x=fit.linearised_at, noise=noise, estimate_process=False,
+                estimate_sensor=False, substeps=fit.substeps,
+            )
+        )  # fmt: skip
+    found = _estimate(
+        observation, support, fit, data, np.sqrt(np.diag(covariance)[len(formula.values) :]),
+        np.zeros(len(symbols)),
+        fit.covariance + likelihood.parameter_covariance(formula, sensor, covariance, fit),
+    )  # fmt: skip
+    states = fit.linearised_at[:, : len(symbols)]
+    slopes = formula.strength_slopes(states)
+    found = found.with_formula(formula, states)
+    assert found.diagnosis is not None
+    error = found.intensity * float(np.sqrt(slopes @ formula.covariance @ slopes))
+    return replace(
+        found, diagnosis=replace(found.diagnosis, intensity=found.intensity, intensity_error=error)
+    )
+
+
+def _strongest_correlation(white: Whitened, data: Measurements) -> tuple[float, float]:
+    """Strongest correlation of near innovations over outputs and lags, and in standard errors."""
+    measured = white.known.reshape(len(data.t), -1).any(axis=1)
+    innovations, recording = white.innovations.reshape(len(data.t), -1)[measured], data.recording[measured]
+    found: list[tuple[float, float, float]] = []
+    for lag in LAGS:
+        rows = np.flatnonzero(recording[lag:] == recording[:-lag])
+        first, second = innovations[rows], innovations[rows + lag]
+        product = first * second
+        size = np.sqrt((first**2).mean(axis=0) * (second**2).mean(axis=0))
+        scores = product.sum(axis=0) / np.sqrt((product**2).sum(axis=0))
+        found += zip(np.abs(scores), product.mean(axis=0) / size, scores, strict=True)
+    _, correlation, score = max(found)
+    return float(correlation), float(score)
+
+
+def _follow(
+    observation: ObservationModel,
+    data: Measurements,
+    *,
+    noise: Noise,
+    support: np.ndarray,
+    values: np.ndarray,
+    substeps: int,
+) -> Fit:
+    """The filter along recordings, with f and both noises as they are."""
+    model = observation.model(support, values)
+    still = replace(model, parameters=tuple(replace(each, fixed=True) for each in model.parameters))
+    return fit_by_filter(
+        still, data, x=observation.states(data), noise=noise, estimate_process=False, estimate_sensor=False,
+        substeps=substeps,
+    )  # fmt: skip
+
+
+def held_out_innovations(
+    found: FieldEstimate, training: Recordings, unseen: Recordings, *, pair_step: float | None = None
+) -> tuple[float, float]:
+    """Whether f holds for recordings that it was not fitted to, by the innovations of the filter.
+
+    Parameters
+    ----------
+    found
+        Fitted to all recordings by likelihood; its terms are fitted to the training recordings again.
+    training, unseen
+        The two parts.
+    pair_step
+        As for `identify_by_likelihood`.
+
+    Returns
+    -------
+    probability, ratio
+        Of the unseen innovations having no part left that any function of the library explains, see
+        `siq.inference.checks.unexplained_probability`; and of their mean square to that of the training
+        recordings.
+    """
+    observation = ObservationModel.of(found)
+    support, values = observation.unknown(found)
+    own = observation.measured(training, pair_step)
+    fit = observation.fitted(
+        support, values, own, noise=observation.noise_of(found), x=observation.states(own)
+    )
+    other = observation.measured(unseen, pair_step)
+    follow = _follow(
+        observation, other, noise=fit.noise, support=support, values=fit.model.values,
+        substeps=fit.substeps,
+    )  # fmt: skip
+    everything = observation.everything
+    values = np.zeros(len(everything))
+    values[[everything.tolist().index(one) for one in support.tolist()]] = fit.model.values
+    whole = observation.model(everything, values)
+    along = linearise(whole, Grid(other, fit.substeps), values, follow.linearised_at)
+    # The innovations are those of the filter itself; the library's columns are along the same states.
+    white = whiten(replace(along, gap=follow.linearisation.gap), other, follow.noise)
+    if white.degrees_of_freedom <= white.columns.shape[1]:
+        return 1.0, 1.0
+    probability = unexplained_probability(
+        white.columns, white.innovations[:, None], freedom=white.degrees_of_freedom
+    )
+    total = float(white.innovations @ white.innovations)
+    usual = fit.sum_of_squares / fit.degrees_of_freedom
+    return probability, total / white.degrees_of_freedom / usual
+
+
+def of_all_states(
+    recordings: Recordings, found: FieldEstimate, *, pair_step: float | None = None
+) -> Recordings:
+    """The recordings, with the velocities of an estimate that were not recorded among their states."""
+    if not found.hidden_velocities:
+        return recordings
+    return filtered_recordings(found, recordings, pair_step=pair_step)
+
+
+def filtered_recordings(
+    found: FieldEstimate, recordings: Recordings, *, pair_step: float | None = None
+) -> Recordings:
+    """The states as a filter knows them at each sample that it uses, from that and the earlier ones.
+
+    Velocities that nobody measured are among them. Their increments have the mean of f, as those of the
+    states do; those of the measured values do not.
+
+    Parameters
+    ----------
+    found
+        f and its noises, found by likelihood.
+    recordings, pair_step
+        As for `identify_by_likelihood`.
+    """
+    observation = ObservationModel.of(found)
+    data, count = observation.measured(recordings, pair_step), observation.measured_states
+    support, values = observation.unknown(found)
+    follow = _follow(
+        observation, data, noise=observation.noise_of(found), support=support, values=values,
+        substeps=found.flow.steps,
+    )  # fmt: skip
+    kept = kept_rows(recordings, pair_step=pair_step, every=observation.every(recordings))
+    rows, measured = np.concatenate(kept), ~np.isnan(data.outputs).all(axis=1)
+    seen = replace(
+        recordings,
+        recording=recordings.recording[rows],
+        t=recordings.t[rows],
+        values=follow.linearised_at[measured, :count].copy(),
+    )
+    if not observation.hidden:
+        return seen
+
+    def bracketed(unit: str) -> str:
+        return unit if unit.replace("²", "").isalnum() else f"({unit})"
+
+    time = bracketed(seen.time_unit or "1")
+    per_time = [None if unit is None else f"{bracketed(unit)}/{time}" for unit in seen.units]
+    return replace(
+        seen,
+        names=found.library.states,
+        units=(*seen.units, *per_time),
+        headings=(*seen.titles, *found.library.states[count:]) if seen.headings else (),
+        values=follow.linearised_at.copy(),
+    )

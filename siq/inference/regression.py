@@ -1,0 +1,720 @@
+"""Regression of f on pairs of samples: weighted, by instruments, sparse.
+
+A pair has ``Xh = Φ_h(X0; f) + noise`` with ``f = Θ Ξ`` and the flow Φ. Deferred correction makes this a
+linear problem: with the current f the difference between the flow and ``X0 + h f(X0)`` is subtracted from the
+data, and a few rounds reach the exact answer. All functions of a library are fitted first. Terms are dropped
+by their own uncertainty, and under noise exchanged as long as that helps (`siq.inference.selection`). What
+remains is fitted by generalised least squares with the covariance that the residuals show, which attains the
+Cramér–Rao bound. Where D depends on the state each pair has weights of its own: with one weight for all,
+coefficients are right on average, but their standard errors are not.
+
+The increment from one sample to the next is not determined by the present sample alone where neighbouring
+errors are correlated, and the regression of it on functions of that sample is biased. But a sample L steps
+earlier knows nothing of them, once L is the lag from which on the record is Markovian
+(`siq.data.correlation`). Then
+
+    ``Σ_t θ(x(t-L)) ⊗ (x(t+h) - Φ_h(x(t); f)) = 0``
+
+holds in the mean for the true f and no other: the functions of the earlier state are instruments. Every
+sample begins such a pair, so that they overlap, and their residuals are correlated up to the lag L. Sums of
+them have the long-run covariance ``Ω = C_0 + Σ_{k≤L} (C_k + C_kᵀ)``, from which standard errors follow, and
+the strength of the process noise: over longer times it acts as white noise of the covariance Ω/h per time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.linalg
+
+from siq.data.recordings import Recordings, SnapshotPairs, parent_recordings
+from siq.data.stationarity import even_stretches, lagged_covariances, long_run_covariance
+from siq.errors import NumericalFailure
+from siq.inference.diffusion_model import constant_noise_probability, fitted_noise
+from siq.inference.field_estimate import NOISE_FREE, FieldEstimate, FlowMap, flow_map
+from siq.inference.library import CandidateLibrary, IdentificationOptions
+from siq.inference.selection import (
+    LinearProblem,
+    ModelAverage,
+    all_coefficients,
+    best_support,
+    blocks_of,
+    critical_values,
+    fit_significant,
+    stability,
+    triangles,
+)
+from siq.numerics.least_squares import positive
+from siq.systems.diffusion import Diffusion
+from siq.systems.formulas import compile_formulas
+
+CORRECTION_ROUNDS = 25  # of deferred correction, each of which gains a factor of about h times the Jacobian
+INSTRUMENT_ROUNDS = 6  # the same with instruments
+WEIGHT_ROUNDS = 2  # of D by the residuals of f, and f by the weights of D: each changes the other by little
+CHUNK, WEIGHTED_CHUNK = 4096, 20_000  # pairs worked on together
+MIN_INSTRUMENT_CORRELATION = 0.1  # of a function that its instrument tells less well nothing is known
+FLOW_SAMPLE = 500  # pairs by which the accuracy of the flow is judged
+
+
+@dataclass(frozen=True)
+class LaggedPairs(SnapshotPairs):
+    """Neighbouring samples, each pair with the sample some steps earlier.
+
+    Attributes
+    ----------
+    earlier
+        Shape ``(n, d)``: the states L steps before the pairs begin.
+    number
+        Shape ``(n,)``: the stretch that a pair is from; pairs of a stretch follow each other.
+    lag
+        L.
+    """
+
+    earlier: np.ndarray
+    number: np.ndarray
+    lag: int
+
+    @property
+    def independent(self) -> float:
+        """Number of pairs that tell as much as all of these, whose residuals are correlated."""
+        return len(self.h) / (2 * self.lag + 1)
+
+    def long_run(self, rest: np.ndarray) -> np.ndarray:
+        """Ω of residuals ``(n, d)``: positive definite."""
+        covariances = lagged_covariances(rest - rest.mean(axis=0), self.number, self.lag)
+        found = long_run_covariance(covariances, self.lag)
+        found = (found + found.T) / 2
+        if not np.linalg.eigvalsh(found)[0] > 0:
+            raise NumericalFailure(
+                f"beyond the {self.lag} steps over which the recordings are correlated no process noise is"
+                " left; record longer, or sample more often"
+            )
+        return np.asarray(found)
+
+
+def lagged_pairs(recordings: Recordings, lag: int) -> LaggedPairs:
+    """All pairs of neighbouring samples that a sample `lag` steps earlier is known of.
+
+    Raises
+    ------
+    NumericalFailure
+        When there is none.
+    """
+    stretches = even_stretches(recordings)
+    at = stretches.within(lag)
+    if not len(at):
+        raise NumericalFailure(
+            f"the recordings are correlated over {lag} steps, and none has as many even steps in a row;"
+            " record longer without gaps"
+        )
+    now = at + lag
+    x, t = recordings.values, recordings.t
+    recording = parent_recordings(recordings.labels)[recordings.recording[now]]
+    return LaggedPairs(x[now], x[now + 1], t[now + 1] - t[now], recording, x[at], stretches.number[now], lag)
+
+
+def coarse_pairs(recordings: Recordings, lag: int, *, lost: float) -> SnapshotPairs:
+    """Pairs so far apart that each begins where the last one ends, and none knows of the noise of the other.
+
+    Parameters
+    ----------
+    recordings
+        Trajectories that are not Markovian from sample to sample.
+    lag
+        Number of steps from which on they are.
+    lost
+        See `lost_time`. By so much less than the pairs are apart is their `h`: given where a pair begins, its
+        mean and its variance are those of white noise in that shorter time, but for what circulates.
+    """
+    stretches = even_stretches(recordings)
+    at = stretches.within(lag - 1)
+    # The first of each stretch, and every one that is a whole number of lags later.
+    _, begins, which = np.unique(stretches.number[at], return_index=True, return_inverse=True)
+    at = at[(np.arange(len(at)) - begins[which]) % lag == 0]
+    x, t = recordings.values, recordings.t
+    h = np.maximum(t[at + lag] - t[at] - lost, 0.5 * stretches.step)
+    return SnapshotPairs(
+        x[at], x[at + lag], h, parent_recordings(recordings.labels)[recordings.recording[at]]
+    )
+
+
+def lost_time(found: FieldEstimate, given: LaggedPairs) -> float:
+    """By how much correlations delay what noise does: the time that a displacement lags behind a white one's.
+
+    Over k steps the residuals add up to the variance ``kΩ - 2Σ_j j C_j``, as if ``2Σ_j j C_j / Ω`` steps were
+    missing: the correlation time of coloured noise, a third of an integration time.
+    """
+    rest = residuals(found, given)
+    covariances = lagged_covariances(rest - rest.mean(axis=0), given.number, given.lag)
+    weighted = 2 * np.einsum("k,kij->ij", np.arange(len(covariances), dtype=float), covariances)
+    whole = long_run_covariance(covariances, given.lag)
+    share = float(np.trace(np.linalg.solve(whole, weighted))) / len(whole)
+    return share * float(np.median(given.h))
+
+
+class PairRegression:
+    """Pairs with the active library functions at X0, and what the current f makes of them.
+
+    Parameters
+    ----------
+    library, pairs
+        The q functions, and n pairs.
+    support
+        Component and function of each coefficient, shape ``(p, 2)``; by default all.
+
+    Raises
+    ------
+    NumericalFailure
+        When a function is not finite on some pairs.
+    """
+
+    def __init__(
+        self, library: CandidateLibrary, pairs: SnapshotPairs, support: np.ndarray | None = None
+    ) -> None:
+        self.library, self.pairs = library, pairs
+        everything = all_coefficients(range(library.dimension), library.size)
+        self.support = everything if support is None else support
+        self.active, self.position = np.unique(self.support[:, 1], return_inverse=True)
+        self._terms = compile_formulas([library.terms[k] for k in self.active], library.symbols)
+        self._second: Callable[[np.ndarray], np.ndarray] | None = None
+        self.x0, self.xh, self.h = np.ascontiguousarray(pairs.x0.T), pairs.xh.T, pairs.h
+        self.theta = self._terms(self.x0)
+        if not np.isfinite(self.theta).all():
+            raise NumericalFailure("a library function of the vector field is not finite on some pairs")
+
+    def matrix(self, values: np.ndarray) -> np.ndarray:
+        """Coefficients as a matrix ``(d, active)``."""
+        matrix = np.zeros((self.library.dimension, len(self.active)))
+        matrix[self.support[:, 0], self.position] = values
+        return matrix
+
+    def predicted(self, values: np.ndarray) -> np.ndarray:
+        """f(X0), shape ``(n, d)``."""
+        return (self.matrix(values) @ self.theta).T
+
+    def flow(self, values: np.ndarray, *, tolerance: float, integrator_step: float | None = None) -> FlowMap:
+        """The map over a step that is accurate enough, see `siq.inference.field_estimate.flow_map`."""
+        matrix, some = self.matrix(values), slice(None, None, max(len(self.h) // FLOW_SAMPLE, 1))
+        return flow_map(
+            lambda x: matrix @ self._terms(x), self.x0[:, some], self.h[some],
+            integrator_step=integrator_step, tolerance=tolerance,
+        )  # fmt: skip
+
+    def corrected(
+        self, values: np.ndarray, flow: FlowMap | None, noise_rate: np.ndarray | None
+    ) -> np.ndarray:
+        """``(Xh - X0)/h`` less what the flow, and noise, add to f(X0): shape ``(n, d)``."""
+        quotient = (self.xh - self.x0) / self.h
+        if flow is None:
+            return quotient.T
+        matrix = self.matrix(values)
+        most = 10 * np.abs(quotient).max(axis=1, keepdims=True)
+        for begin in range(0, len(self.h), CHUNK):  # small enough to stay in the processor's cache
+            part = slice(begin, begin + CHUNK)
+            x0, h = self.x0[:, part], self.h[part]
+            moved = flow(lambda x: matrix @ self._terms(x), x0, h) - x0
+            correction = moved / h - matrix @ self.theta[:, part]
+            if noise_rate is not None and np.any(noise_rate):
+                curvature = self._curvature(x0, noise_rate)
+                correction += flow.curvature_weight * h / 4 * (matrix @ curvature)
+            # A trial f may run away on a few pairs; one round without their correction does no harm.
+            correction[:, ~(np.abs(correction) <= most).all(axis=0)] = 0.0
+            quotient[:, part] -= correction
+        return quotient.T
+
+    def _curvature(self, x0: np.ndarray, noise_rate: np.ndarray) -> np.ndarray:
+        """Σ_jk (εD)_jk ∂²θ/∂x_j∂x_k of the active functions, shape ``(active, n)``."""
+        symbols = self.library.symbols
+        d = len(symbols)
+        if self._second is None:
+            second = [self.library.terms[k].diff(a, b) for a in symbols for b in symbols for k in self.active]
+            self._second = compile_formulas(second, symbols)
+        values = self._second(x0).reshape(d, d, len(self.active), -1)
+        return np.einsum("ij,ijkn->kn", noise_rate, values)
+
+    def triangle(self, velocity: np.ndarray) -> np.ndarray:
+        """R of the QR decomposition of √h [Θ, velocity], on which every fit with one weight depends."""
+        stacked = np.concatenate([self.theta.T, velocity], axis=1) * np.sqrt(self.h)[:, None]
+        return np.asarray(np.linalg.qr(stacked, mode="r"))
+
+    def residual_ratio(self, rate: np.ndarray) -> float:
+        """Rms of residuals of a covariance per time over rms of the increments, each component by its own."""
+        size = ((self.pairs.xh - self.pairs.x0) ** 2 / self.h[:, None]).mean(axis=0)
+        return float(np.sqrt((np.diag(rate) / positive(size)).mean()))
+
+    def generalised(
+        self, columns: np.ndarray, goals: np.ndarray, spread: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Generalised least squares of all components: values ``(p,)``, pseudoinverse, and sizes of columns.
+
+        Parameters
+        ----------
+        columns, goals
+            Of the active functions ``(m, active)``, and of what they explain ``(m, d)``.
+        spread
+            Covariance of a row of residuals, ``(d, d)``.
+        """
+        whiten = scipy.linalg.solve_triangular(np.linalg.cholesky(spread), np.eye(len(spread)), lower=True)
+        design = np.stack(
+            [
+                np.outer(whiten[:, i], columns[:, k]).ravel()
+                for i, k in zip(self.support[:, 0], self.position, strict=True)
+            ],
+            axis=1,
+        )
+        # Scaled columns, for functions may differ by many orders of magnitude.
+        scale = positive(np.linalg.norm(design, axis=0))
+        inverse = np.linalg.pinv(design / scale) / scale[:, None]
+        return inverse @ (whiten @ goals.T).ravel(), inverse, scale
+
+
+def copies(pairs: SnapshotPairs) -> float:
+    """Factor by which copies of resampled recordings make pairs look more than they are: 1 without any.
+
+    A pair that stands m times counts with weight m, but has only one residual: variances grow by Σm²/Σm,
+    which is about 2 for a bootstrap sample.
+    """
+    _, counts = np.unique(np.column_stack([pairs.x0, pairs.xh]), axis=0, return_counts=True)
+    return float((counts**2).sum() / counts.sum())
+
+
+def _fit_everything(
+    regression: PairRegression, *, integrator_step: float | None
+) -> tuple[np.ndarray, np.ndarray, float, FlowMap]:
+    """Least squares over all functions, each round with the correction by the last f.
+
+    Its triangle, the covariance of the residuals per time, their ratio to the increments, and the flow.
+    """
+    q, d, n = regression.library.size, regression.library.dimension, len(regression.h)
+    flow, rate, values = None, None, np.zeros(d * q)
+    for done in range(CORRECTION_ROUNDS):
+        triangle = regression.triangle(regression.corrected(values, flow, rate))
+        # Scaled columns, for functions differ by many orders of magnitude where units are small or large.
+        scale = positive(np.linalg.norm(triangle[:q, :q], axis=0))
+        solution = np.linalg.lstsq(triangle[:q, :q] / scale, triangle[:q, q:], rcond=1e-14)[0]
+        change = np.abs(solution - values.reshape(d, q).T * scale[:, None])
+        settled = np.all(change <= 1e-13 * np.abs(solution).max(axis=0))
+        values = (solution / scale[:, None]).T.ravel()
+        leftover = triangle[q:, q:]
+        rate = leftover.T @ leftover / n
+        ratio = regression.residual_ratio(rate)
+        if flow is None or ratio > NOISE_FREE:
+            tolerance = 1e-10 if ratio < 1e-2 else 1e-6
+            flow = regression.flow(values, integrator_step=integrator_step, tolerance=tolerance)
+        elif settled:
+            break
+        if ratio > 0.1 and done >= 3:
+            break  # noise hides what further rounds would change
+    assert flow is not None and rate is not None
+    return triangle, rate, ratio, flow
+
+
+def evenly(count: int, most: int) -> np.ndarray:
+    """At most so many of `count` rows, evenly spread."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))
+
+
+def carries_noise(
+    library: CandidateLibrary,
+    pairs: SnapshotPairs,
+    *,
+    options: IdentificationOptions,
+    integrator_step: float | None = None,
+) -> bool:
+    """Whether pairs are more than an integrator's error away from any f in the library.
+
+    The arguments are those of `identify_vector_field`.
+    """
+    if len(pairs.h) < 2 * library.size:
+        raise NumericalFailure(
+            f"only {len(pairs.h)} pairs for {library.size} candidate functions of f;"
+            " lower identification.degree or record more"
+        )
+    some = pairs.take(evenly(len(pairs.h), max(options.pairs // 4, 4 * library.size)))
+    return _fit_everything(PairRegression(library, some), integrator_step=integrator_step)[2] >= NOISE_FREE
+
+
+def identify_vector_field(
+    library: CandidateLibrary,
+    pairs: SnapshotPairs,
+    *,
+    options: IdentificationOptions,
+    diffusion: Diffusion | None = None,
+    integrator_step: float | None = None,
+) -> FieldEstimate:
+    """f of pairs.
+
+    Parameters
+    ----------
+    library
+        The candidate functions; those of the earlier states are the instruments of `LaggedPairs`.
+    pairs
+        X0, Xh and h.
+    options
+        What makes a term significant.
+    diffusion
+        D, by default the unit matrix; f does not depend on it.
+    integrator_step
+        Step of the Euler–Maruyama simulation that made the pairs, None for everything else. Then the
+        increment of each step is h f exactly, and f is that of the continuous process.
+
+    Raises
+    ------
+    NumericalFailure
+        When there are fewer pairs than functions, a function is not finite on them, or no term of an equation
+        is significant.
+
+    Notes
+    -----
+    The residuals of noisy pairs are independent, so that the standard errors fall with the number of
+    pairs. Those of noise-free pairs are the error of integrators, the same in neighbouring pairs: their
+    standard errors are given without that gain, as a bound.
+    """
+    noise = Diffusion.identity(library.dimension) if diffusion is None else diffusion
+    if isinstance(pairs, LaggedPairs):
+        return _identify_by_instruments(library, pairs, options, noise)
+    if not carries_noise(library, pairs, options=options, integrator_step=integrator_step):
+        pairs = pairs.take(evenly(len(pairs.h), options.pairs))
+    n = len(pairs.h)
+    triangle, rate, ratio, flow = _fit_everything(
+        PairRegression(library, pairs), integrator_step=integrator_step
+    )
+    noise_free = ratio < NOISE_FREE
+    critical = critical_values(library, false_terms=options.false_terms)
+    repeated = 1.0 if noise_free else copies(pairs)
+    problems = LinearProblem.of_components(triangle, samples=n / repeated, critical=critical)
+    chosen = []
+    for i, problem in enumerate(problems):
+        kept = _contributing(problem, options.precision) if noise_free else best_support(problem)
+        _check_significant(library, i, kept)
+        chosen += [(i, k) for k in kept]
+    found = FieldEstimate.on_support(
+        library, np.array(chosen), np.zeros(len(chosen)), np.eye(len(chosen)), rate, ratio, flow, noise
+    )
+
+    def fit(support: np.ndarray) -> tuple[FieldEstimate, np.ndarray]:
+        nonlocal found
+        regression = PairRegression(library, pairs, support)
+        values = np.array([problems[i].solve(support[support[:, 0] == i, 1])[k] for i, k in support])
+        found = _fit_support(found.with_values(support, values), regression)
+        if noise_free:
+            terms = np.sqrt(regression.theta**2 @ regression.h)[regression.position]
+            sizes = positive(np.sqrt(regression.h @ regression.predicted(found.values) ** 2))
+            return found, np.abs(found.values) * terms / sizes[support[:, 0]] / options.precision
+        return found, np.abs(found.values) / np.sqrt(np.diag(found.covariance)) / critical[support[:, 1]]
+
+    # With the final support and flow a term may turn out to be superfluous after all.
+    found, support = fit_significant(fit, np.array(chosen))
+    return found if noise_free else replace(found, alternatives=ModelAverage.of(problems, support, library))
+
+
+def _check_significant(library: CandidateLibrary, component: int, kept: tuple[int, ...]) -> None:
+    if not kept:
+        raise NumericalFailure(
+            f"no term of the equation of {library.states[component]} is significant; record longer"
+        )
+
+
+def _contributing(problem: LinearProblem, precision: float) -> tuple[int, ...]:
+    """Backward elimination of one equation without noise: the least contribution leaves, until all count."""
+    goal = problem.goal
+    size = np.linalg.norm(goal)
+    active = np.arange(problem.columns.shape[1])
+    while len(active):
+        columns = problem.columns[:, active]
+        orthogonal, upper = np.linalg.qr(columns)
+        coefficients = scipy.linalg.solve_triangular(upper, orthogonal.T @ goal)
+        contribution = np.abs(coefficients) * np.linalg.norm(columns, axis=0) / (size or 1.0)
+        weakest = int(np.argmin(contribution))
+        if contribution[weakest] >= precision:
+            break
+        active = np.delete(active, weakest)
+    return tuple(active.tolist())
+
+
+def _fit_support(found: FieldEstimate, regression: PairRegression) -> FieldEstimate:
+    """Generalised least squares on a support, with flow, noise and covariance brought up to date."""
+    d, n, active = found.library.dimension, len(regression.h), len(regression.active)
+    values, rate, flow = found.values, found.noise_rate, found.flow
+    if not flow.euler:
+        flow = regression.flow(values, tolerance=1e-11 if found.noise_free else 1e-6)
+    for _ in range(CORRECTION_ROUNDS):
+        velocity = regression.corrected(values, flow, rate)
+        triangle = regression.triangle(velocity)
+        # Where there is no noise only the relative weight of the components matters.
+        spread = rate if not found.noise_free else np.diag((velocity**2).mean(axis=0))
+        solution, inverse, scale = regression.generalised(triangle[:, :active], triangle[:, active:], spread)
+        change = (np.abs(solution - values) * scale).max() / (np.abs(solution) * scale).max()
+        values = solution
+        misfit = triangle[:, active:] - triangle[:, :active] @ regression.matrix(values).T
+        rate = misfit.T @ misfit / n
+        if change < (1e-14 if found.noise_free else 1e-9):
+            break
+    covariance = inverse @ inverse.T
+    if found.noise_free:
+        # Columns were whitened by the size of the velocities: bring in the size of the residuals. They are
+        # alike in neighbouring pairs and do not average out, hence the number of pairs.
+        covariance = covariance * (float(np.trace(np.linalg.solve(spread, rate))) / d) * n
+    else:
+        covariance = covariance * copies(regression.pairs)
+    return found.with_values(
+        found.support, values, covariance=covariance, noise_rate=rate,
+        residual_ratio=regression.residual_ratio(rate), flow=flow,
+    )  # fmt: skip
+
+
+def refit(found: FieldEstimate, pairs: SnapshotPairs) -> FieldEstimate:
+    """The same terms fitted to other pairs, such as those of the training recordings alone.
+
+    With the weights of a D that depends on the state the noise stays as it is.
+    """
+    regression = PairRegression(found.library, pairs, found.support)
+    if isinstance(pairs, LaggedPairs):
+        return _fit_by_instruments(regression, instruments(found.library, pairs), found.diffusion)
+    if found.diffusion.constant:
+        return _fit_support(found, regression)
+    for _ in range(WEIGHT_ROUNDS + 1):  # each brings the flow up to date
+        triangle, intensity = weighted_triangle(found, pairs, found.support)
+        scale = np.linalg.norm(triangle[:, :-1], axis=0)
+        values = np.linalg.lstsq(triangle[:, :-1] / scale, triangle[:, -1], rcond=None)[0] / scale
+        found = found.with_values(found.support, values)
+    inverse = np.linalg.pinv(triangle[:, :-1] / scale) / scale[:, None]
+    return replace(found, covariance=intensity * copies(pairs) * inverse @ inverse.T)
+
+
+def residuals(found: FieldEstimate, pairs: SnapshotPairs) -> np.ndarray:
+    """``Xh - E[Xh | X0]`` of pairs, shape ``(n, d)``; correlated noise shifts no mean within a step."""
+    regression = PairRegression(found.library, pairs, found.support)
+    rate = None if isinstance(pairs, LaggedPairs) else found.noise_rate
+    velocity = regression.corrected(found.values, found.flow, rate)
+    return (velocity - regression.predicted(found.values)) * pairs.h[:, None]
+
+
+def with_stability(
+    found: FieldEstimate,
+    pairs: SnapshotPairs,
+    *,
+    options: IdentificationOptions,
+    generator: np.random.Generator,
+) -> FieldEstimate:
+    """The same field, with the share of resampled recordings in which each of its terms is chosen.
+
+    Parameters
+    ----------
+    found
+        f from noisy pairs.
+    pairs
+        Those that it was fitted to.
+    options
+        What makes a term significant.
+    generator
+        Draws the recordings.
+    """
+    regression = PairRegression(found.library, pairs)
+    velocity = regression.corrected(found.coefficients.T.ravel(), found.flow, found.noise_rate)
+    weight = np.sqrt(pairs.h)[:, None]
+    order = np.argsort(pairs.recording, kind="stable")
+    parts = triangles(
+        (regression.theta.T * weight)[order], (velocity * weight)[order], blocks_of(pairs.recording[order])
+    )
+    critical = critical_values(found.library, false_terms=options.false_terms)
+    samples = len(pairs.h) / copies(pairs)
+    shares = stability(
+        parts, lambda one: LinearProblem.of_components(one, samples=samples, critical=critical),
+        found.support, generator=generator,
+    )  # fmt: skip
+    return replace(found, stability=shares)
+
+
+def with_noise_formula(
+    found: FieldEstimate, pairs: SnapshotPairs, *, false_terms: float
+) -> FieldEstimate | None:
+    """The same identification for a noise that depends on the state; None where a constant one can be held.
+
+    Parameters
+    ----------
+    found
+        f as it was found with one weight for all.
+    pairs
+        The pairs that it was fitted to.
+    false_terms
+        Probability that a constant D is given up by chance; and that chance brings any false term into f, or
+        into D.
+
+    Returns
+    -------
+    FieldEstimate or None
+        f with its D, of which the geometric mean of the determinant over the recorded states is one, and εD.
+
+    Raises
+    ------
+    NumericalFailure
+        When D depends on the state, and no formula for it is positive at all recorded states; or when an
+        equation of f has no significant term.
+    """
+    if found.noise_free:
+        return None
+    rest = residuals(found, pairs)
+    probability = constant_noise_probability(found, pairs, rest)
+    if probability >= false_terms:
+        return None
+    formula = fitted_noise(found, pairs, rest, false_terms=false_terms, probability=probability)
+    for _ in range(WEIGHT_ROUNDS):
+        found = _identify_weighted(found.with_formula(formula, pairs.x0), pairs, false_terms=false_terms)
+        formula = fitted_noise(
+            found, pairs, residuals(found, pairs), false_terms=false_terms, probability=probability
+        )
+    return refit(found.with_formula(formula, pairs.x0), pairs)
+
+
+def with_given_noise(
+    found: FieldEstimate, pairs: SnapshotPairs, diffusion: Diffusion, *, false_terms: float
+) -> FieldEstimate:
+    """The same identification with the weights of a given D; see `with_noise_formula`."""
+    found = replace(found, diffusion=diffusion)
+    if found.noise_free or diffusion.constant:
+        return found
+    return _identify_weighted(found, pairs, false_terms=false_terms)
+
+
+def _identify_weighted(found: FieldEstimate, pairs: SnapshotPairs, *, false_terms: float) -> FieldEstimate:
+    """The significant terms of f, sought anew among all of its library with the weights of its D."""
+    library = found.library
+    everything = all_coefficients(range(library.dimension), library.size)
+    triangle, intensity = weighted_triangle(found, pairs, None)
+    critical = np.tile(critical_values(library, false_terms=false_terms), library.dimension)
+    problem = LinearProblem(
+        triangle[:, :-1], triangle[:, -1], intensity * copies(pairs), critical, everything
+    )
+    kept = list(best_support(problem))
+    support = everything[kept]
+    for i in range(library.dimension):
+        _check_significant(library, i, tuple(support[support[:, 0] == i, 1]))
+    start = np.linalg.lstsq(triangle[:, kept], triangle[:, -1], rcond=None)[0]
+    found = refit(found.with_values(support, start, covariance=np.eye(len(support))), pairs)
+    return replace(found, alternatives=ModelAverage.of([problem], support, library))
+
+
+def weighted_triangle(
+    found: FieldEstimate, pairs: SnapshotPairs, places: np.ndarray | None, *, of_rest: bool = False
+) -> tuple[np.ndarray, float]:
+    """R of the design with the weights of D and its goal as the last column; and ε.
+
+    Parameters
+    ----------
+    found
+        Whose f says how the flow differs from a straight step, and whose D says the weights.
+    pairs
+        The pairs.
+    places
+        Component and function of each column, shape ``(p, 2)``; None for all of them.
+    of_rest
+        Whether the goal is what f leaves of the velocities, rather than these.
+    """
+    regression = PairRegression(found.library, pairs, found.support)
+    velocity = regression.corrected(found.values, found.flow, found.noise_rate)
+    left = velocity - regression.predicted(found.values)
+    if places is None:
+        places = all_coefficients(range(found.library.dimension), found.library.size)
+    p, d = len(places), found.library.dimension
+    triangle, squares = np.zeros((0, p + 1)), 0.0
+    for begin in range(0, len(pairs.h), WEIGHTED_CHUNK):
+        part = slice(begin, begin + WEIGHTED_CHUNK)
+        x, h = pairs.x0[part], pairs.h[part]
+        whitening = found.diffusion.whitening_at(x) * np.sqrt(h)[:, None, None]
+        terms = found.library.evaluate(x)[:, places[:, 1]]
+        block = np.empty((len(x), d, p + 1))
+        block[:, :, :-1] = whitening[:, :, places[:, 0]] * terms[:, None, :]
+        goal = left if of_rest else velocity
+        block[:, :, -1] = (whitening @ goal[part][:, :, None])[:, :, 0]
+        squares += float(((whitening @ left[part][:, :, None]) ** 2).sum())
+        stacked = np.concatenate([triangle, block.reshape(-1, p + 1)])
+        triangle = np.asarray(np.linalg.qr(stacked, mode="r"))
+    return triangle, squares / (len(pairs.h) * d)
+
+
+def instruments(library: CandidateLibrary, pairs: LaggedPairs) -> np.ndarray:
+    """An orthonormal basis of the functions of earlier states, shape ``(n, q)``."""
+    values = library.evaluate(pairs.earlier)
+    if not np.isfinite(values).all():
+        raise NumericalFailure("a library function of the vector field is not finite on some pairs")
+    return np.linalg.qr(values / positive(np.linalg.norm(values, axis=0)))[0]
+
+
+def _identify_by_instruments(
+    library: CandidateLibrary, pairs: LaggedPairs, options: IdentificationOptions, diffusion: Diffusion
+) -> FieldEstimate:
+    """Two-stage least squares: functions and increments are projected on the instruments, and fitted there.
+
+    The terms of each equation are chosen there (`siq.inference.selection`).
+    """
+    q, h = library.size, pairs.h[:, None]
+    if pairs.independent < 2 * q:
+        raise NumericalFailure(
+            f"only {pairs.independent:.0f} independent pairs for {q} candidate functions of f;"
+            " lower identification.degree or record more"
+        )
+    regression = PairRegression(library, pairs)
+    directions = instruments(library, pairs)
+    # Of some function nothing may be known from an earlier state. Its coefficient would be chance, as large
+    # as the error of its own instrument is small, and so would be all that is said of what is left.
+    orthogonal, upper = np.linalg.qr(regression.theta.T * h)
+    known = np.linalg.pinv(directions.T @ orthogonal, rcond=MIN_INSTRUMENT_CORRELATION)
+    solution = np.linalg.lstsq(upper, known, rcond=1e-12)[0]
+    values, flow = np.zeros(len(regression.support)), None
+    for _ in range(2):
+        moved = regression.corrected(values, flow, None) * h
+        values = (solution @ (directions.T @ moved)).T.ravel()
+        flow = regression.flow(values, tolerance=1e-6)
+    rest = moved - regression.predicted(values) * h
+    variances = np.diag(pairs.long_run(rest) * copies(pairs))
+    columns, goals = directions.T @ (regression.theta * pairs.h).T, directions.T @ moved
+    critical = critical_values(library, false_terms=options.false_terms)
+    problems = [
+        LinearProblem(columns, goals[:, i], float(variance), critical, all_coefficients([i], q))
+        for i, variance in enumerate(variances)
+    ]
+    chosen = [(i, k) for i, problem in enumerate(problems) for k in best_support(problem)]
+    if missing := sorted(set(range(library.dimension)) - {i for i, _ in chosen}):
+        raise NumericalFailure(
+            f"no term of the equation of {library.states[missing[0]]} is significant: the recordings are"
+            f" correlated over {pairs.lag} steps, and states so much earlier tell too little of its motion;"
+            " record longer, or a quantity that fluctuates less"
+        )
+
+    def fit(support: np.ndarray) -> tuple[FieldEstimate, np.ndarray]:
+        found = _fit_by_instruments(PairRegression(library, pairs, support), directions, diffusion)
+        return found, np.abs(found.values) / np.sqrt(np.diag(found.covariance)) / critical[support[:, 1]]
+
+    found, support = fit_significant(fit, np.array(chosen))
+    return replace(found, alternatives=ModelAverage.of(problems, support, library))
+
+
+def _fit_by_instruments(
+    regression: PairRegression, directions: np.ndarray, diffusion: Diffusion
+) -> FieldEstimate:
+    """Generalised least squares of the projected problem on a support."""
+    pairs = regression.pairs
+    assert isinstance(pairs, LaggedPairs)
+    h = pairs.h[:, None]
+    columns = directions.T @ (regression.theta.T * h)
+    spread, values, flow = np.eye(regression.library.dimension), np.zeros(len(regression.support)), None
+    for _ in range(INSTRUMENT_ROUNDS):
+        moved = regression.corrected(values, flow, None) * h
+        previous = values
+        values, inverse, _ = regression.generalised(columns, directions.T @ moved, spread)
+        rest = moved - regression.predicted(values) * h
+        spread = pairs.long_run(rest)
+        settled = flow is not None and (np.abs(values - previous) <= 1e-6 * np.abs(values)).all()
+        flow = regression.flow(values, tolerance=1e-6)
+        if settled:
+            break
+    assert flow is not None
+    size = positive(((pairs.xh - pairs.x0) ** 2).mean(axis=0))
+    return FieldEstimate.on_support(
+        regression.library, regression.support, values, inverse @ inverse.T * copies(pairs),
+        spread / float(np.median(pairs.h)), float(np.sqrt(((rest**2).mean(axis=0) / size).mean())), flow,
+        diffusion,
+    )  # fmt: skip
