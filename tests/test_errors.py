@@ -72,7 +72,7 @@ def test_the_mathematics_needs_no_extra() -> None:
     [
         ("import siq; siq.train", "torch", "networks"),
         ("import siq.networks.training", "torch", "networks"),
-        ("import siq.report.plots.errors", "matplotlib", "plots"),
+        ("import siq.report.plots.style", "matplotlib", "plots"),
     ],
 )
 def test_what_an_extra_is_for_names_it(statement: str, package: str, extra: str) -> None:

@@ -67,12 +67,13 @@ def figures(given: Given, settings: PipelineSettings) -> Any:
     from dataclasses import replace
 
     from siq.quasipotential.landscape_files import read_landscape
-    from siq.report import figures as report
+    from siq.report.figures import inspection_drawn
     from siq.report.page import interactive_view
     from siq.report.summary import summarise
     from siq.workflow.results import read_states
     from siq.workflow.scoring import exact_answer, shown_formula
     from siq.workflow.tables import Method
+    from workflow.figures import study as report
 
     source, models = given.files, _models(given)
     tables = {name: getattr(given, name) for name in report.DRAWN_TABLES}
@@ -102,7 +103,7 @@ def figures(given: Given, settings: PipelineSettings) -> Any:
             drawn["interactive.html"] = interactive_view(summary)
     if settings.simulation is None and recorded is not None:
         folder.mkdir(parents=True, exist_ok=True)
-        drawn |= report.inspection_drawn(recorded, folder=folder)
+        drawn |= inspection_drawn(recorded, folder=folder)
     return {"drawn": drawn}
 
 
@@ -115,7 +116,7 @@ def landscape_figures(given: Given, settings: PipelineSettings) -> Any:
     """The figures of a landscape."""
     import pandas as pd
 
-    from siq.report import figures as report
+    from workflow.figures import study as report
 
     found, formulas, networks = _first_stored(given), None, None
     if found is not None:
@@ -141,8 +142,8 @@ def landscape_figures(given: Given, settings: PipelineSettings) -> Any:
 )  # fmt: skip
 def invariant(given: Given, settings: PipelineSettings) -> Any:
     """The invariant distribution of the formula that is shown, or of the landscape where none holds."""
-    from siq.report.plots import plot_invariant_distribution
     from siq.workflow import comparison
+    from workflow.figures.density import plot_invariant_distribution
 
     shown = _what_it_follows_from(given) if settings.invariant and given.card is not None else None
     own = settings.of(comparison.InvariantSettings)
@@ -239,11 +240,11 @@ def equations_page(given: Given, settings: PipelineSettings) -> Any:
     import numpy as np
 
     from siq.quasipotential.landscape_files import read_landscape
-    from siq.report.figures import equations_figures
     from siq.report.page import interactive_view, render_report
-    from siq.report.plots import save_figure
+    from siq.report.plots.style import save_figure
     from siq.report.study_page import StudyResults, answer_data, study_page
     from siq.report.summary import summarise
+    from workflow.figures.study import equations_figures
 
     study, system, tables = _study(given), given.card, _tables(given)
     stored = read_landscape(given.files["quasipotential"], dynamics=system)

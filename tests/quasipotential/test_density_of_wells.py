@@ -22,8 +22,8 @@ from siq.quasipotential.cell_density import (
     shares_by_rates,
     walk,
 )
-from siq.report.figures import _project_landscape
 from siq.systems.dynamics import Dynamics
+from workflow.figures.study import _project_landscape
 
 KNOWN, POTENTIAL = matched("double well")
 BOX = KNOWN.domain

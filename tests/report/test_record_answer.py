@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from siq.report.plots.prediction import plot_record
 from siq.workflow.tables import as_table
+from workflow.figures.prediction import plot_record
 
 
 def well(**change: Any) -> dict[str, object]:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import sympy
 
-from siq.report.figures import _sweep_figure
 from siq.report.page import ReportSection
 from siq.report.plots.sweep import plot_sweep
 from siq.report.study_page import StudyResults, study_page
@@ -14,6 +13,7 @@ from siq.systems.dynamics import Dynamics
 from siq.workflow.study import Study, SweepOptions
 from siq.workflow.sweep import Sweep, sweep
 from siq.workflow.tables import as_table
+from workflow.figures.study import _sweep_figure
 
 h, a, x = sympy.symbols("h a x", real=True)
 CUSP = Dynamics.of((x,), (h + a * x - x**3,), domain=[(-2, 2)], parameters={h: 0.0, a: 1.0})

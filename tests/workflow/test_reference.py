@@ -13,13 +13,13 @@ from known_systems import as_system, limit_cycle
 
 from siq.quasipotential.landscape import LandscapeOptions
 from siq.quasipotential.landscape_comparison import read_reference, write_reference
-from siq.report.figures import landscape_figures
 from siq.report.study_page import _without_landscape
 from siq.systems.dynamics import Dynamics
 from siq.workflow import comparison
 from siq.workflow.comparison import LandscapeErrorsSettings
 from siq.workflow.study import StateSpace
 from siq.workflow.tables import COLUMNS, Status, Step, as_table
+from workflow.figures.study import landscape_figures
 
 X, Y = sympy.symbols("x y", real=True)
 SETTINGS = comparison.ReferenceSettings(seed=1)

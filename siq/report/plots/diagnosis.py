@@ -15,7 +15,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from siq.report.plots.errors import scaled_label
 from siq.report.plots.quasipotential import add_legend, new_axes
 from siq.report.plots.style import (
     BLACK,
@@ -30,6 +29,7 @@ from siq.report.plots.style import (
     drawn_to_be_read,
     name_label,
     rate_unit,
+    scaled_label,
 )
 
 

@@ -8,13 +8,16 @@ import re
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import matplotlib as mpl
 import matplotlib.style
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 from matplotlib.rcsetup import cycler
+from matplotlib.ticker import FuncFormatter
 
 from siq.numerics.files import whole_file
 from siq.numerics.text import unit_text
@@ -268,3 +271,46 @@ def rate_unit(unit: str, time_unit: str) -> str:
     if power := re.fullmatch(rf"(.+)/{re.escape(time_unit)}(?:\*\*(\d+))?", unit):
         return f"{power[1]}/{time_unit}**{int(power[2] or 1) + 1}"
     return f"{unit}/{time_unit}" if "/" not in unit else f"({unit})/{time_unit}"
+
+
+CURVE_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, BLACK)
+MARKERS = ("o", "s", "^", "D", "v", "P")
+LINE_STYLES = ("-", "--", "-.", ":")
+
+
+def power_of_ten(largest: float) -> int:
+    """The power that is written once at an axis and not at every tick: zero for numbers that are handy."""
+    if not math.isfinite(largest) or largest == 0 or 0.1 <= abs(largest) < 1e4:
+        return 0
+    return math.floor(math.log10(abs(largest)))
+
+
+def scaled_label(axis: Axis, symbol: str, unit: str, largest: float) -> str:
+    """The label of an axis with its unit, and with the power of ten that its ticks leave out from now on.
+
+    Parameters
+    ----------
+    axis
+        The axis; its label is left to the caller.
+    symbol
+        What is shown, typeset.
+    unit
+        Its unit; ``1`` and the empty text mean a plain number.
+    largest
+        The largest number that occurs.
+    """
+    power = power_of_ten(largest)
+    plain = unit in ("1", "")
+    if not power:
+        return symbol if plain else f"{symbol} {unit_label(unit)}"
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value / 10.0**power:.6g}".replace("-", "−")))
+    factor = rf"$10^{{{power}}}$"
+    return f"{symbol} ({factor})" if plain else f"{symbol} ({factor} {unit_text(unit)})"
+
+
+UNKNOWN: dict[str, Any] = {"facecolor": "#F0F0F0", "edgecolor": "#C8C8C8", "hatch": "////", "linewidth": 0}
+
+
+def hatch_unknown(axes: Axes, zorder: float = -1) -> None:
+    """Hatch a whole panel, for what is drawn over it to leave out where nothing is known."""
+    axes.add_patch(Rectangle((0, 0), 1, 1, transform=axes.transAxes, zorder=zorder, **UNKNOWN))

@@ -13,11 +13,13 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 
-from siq.report.plots.errors import CURVE_COLOURS, LINE_STYLES, MARKERS
 from siq.report.plots.style import (
     BLACK,
     COLUMN_WIDTH,
+    CURVE_COLOURS,
     GREY,
+    LINE_STYLES,
+    MARKERS,
     axis_label,
     drawn_in_style,
     energy_label,

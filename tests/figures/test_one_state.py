@@ -18,10 +18,11 @@ from siq.quasipotential.landscape_assembly import find_landscape
 from siq.quasipotential.landscape_comparison import reference_landscape
 from siq.quasipotential.landscape_files import read_landscape, write_landscape
 from siq.quasipotential.wells import WellOptions
-from siq.report.figures import _project_landscape, landscape_figures
-from siq.report.plots import plot_components, plot_invariant_distribution
 from siq.workflow.study import StateSpace
 from siq.workflow.tables import as_table
+from workflow.figures.density import plot_invariant_distribution
+from workflow.figures.recorded import plot_components
+from workflow.figures.study import _project_landscape, landscape_figures
 
 KNOWN = double_well(1)
 

@@ -1,4 +1,4 @@
-"""Where noise leaves a system in the long run: the invariant distribution (paper, fig1b, fig2c: b to d)."""
+"""Figures of the stationary density exp(-U/ε)/Z beside a long simulation (paper, fig1b, fig2c: b to d)."""
 
 from __future__ import annotations
 
@@ -8,29 +8,44 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
 from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from siq.report.plots.quasipotential import plot_invariant_curves
+from siq.report.plots.style import (
+    BLUE,
+    ORANGE,
+    PAGE_WIDTH,
+    UNKNOWN,
+    VERMILLION,
+    drawn_in_style,
+    hatch_unknown,
+    magnitude_label,
+    name_label,
+    scaled_label,
+    unit_label,
+)
+
+if TYPE_CHECKING:  # to draw takes none of what it takes to compute
+    from siq.quasipotential.invariant_density import StationaryDensity
+from typing import TYPE_CHECKING
+
+from matplotlib.cm import ScalarMappable
+
 from siq.report.plots.style import (
     COLUMN_WIDTH,
-    PAGE_WIDTH,
-    VERMILLION,
     axis_label,
-    drawn_in_style,
-    magnitude_label,
 )
 
 if TYPE_CHECKING:  # to draw a density takes none of what it takes to compute one
     from siq.quasipotential.invariant_density import StationaryDensity
 
+
 COLOUR_MAP = "viridis"
 LEVELS = 13  # filled, from zero to the peak
 MARGIN = 0.08  # of what is known: shown around it
-UNKNOWN: dict[str, Any] = {"facecolor": "#F0F0F0", "edgecolor": "#C8C8C8", "hatch": "////", "linewidth": 0}
 LINES = (0.1, 0.5, 0.9)  # shares of the peak at which the density's lines lie over the histogram
 
 
@@ -121,11 +136,6 @@ def _limit(axes: Axes, densities: Sequence[StationaryDensity]) -> None:
         limit(low - MARGIN * (high - low), high + MARGIN * (high - low))
 
 
-def _draw_unknown(axes: Axes, density: StationaryDensity) -> None:
-    if not np.isfinite(density.values).all():
-        axes.add_patch(Rectangle((0, 0), 1, 1, transform=axes.transAxes, zorder=0, **UNKNOWN))
-
-
 def _density_unit(first: str, second: str) -> str:
     parts = [unit for unit in (first, second) if unit not in ("1", "")]
     if not parts:
@@ -136,7 +146,8 @@ def _density_unit(first: str, second: str) -> str:
 
 
 def _draw_density(axes: Axes, density: StationaryDensity, colours: dict[str, Any]) -> str:
-    _draw_unknown(axes, density)
+    if np.isnan(density.values).any():
+        hatch_unknown(axes, zorder=0)
     axes.contourf(
         density.x1, density.x2, density.values, levels=_levels(density), extend="max", **colours
     )  # fmt: skip
@@ -153,7 +164,8 @@ def _draw_density(axes: Axes, density: StationaryDensity, colours: dict[str, Any
 def _draw_histogram(axes: Axes, density: StationaryDensity, colours: dict[str, Any]) -> str:
     comparison = density.comparison
     assert comparison is not None
-    _draw_unknown(axes, density)
+    if np.isnan(density.values).any():
+        hatch_unknown(axes, zorder=0)
     empty = np.isnan(density.values).any() & (comparison.histogram == 0)
     # As an image: thousands of small rectangles would make a megabyte of vector graphics.
     axes.pcolormesh(
@@ -166,3 +178,47 @@ def _draw_histogram(axes: Axes, density: StationaryDensity, colours: dict[str, A
     if np.isfinite(comparison.sampling_floor):
         title += f"\n(sampling alone: {comparison.sampling_floor:.2g})"
     return title
+
+
+@drawn_in_style
+def plot_invariant_curves(panels: Sequence[StationaryDensity], *, state: str, unit: str) -> Figure:
+    """Draw the invariant density of one state, with a long simulation's histogram: a panel for each ε."""
+    rows = -(-len(panels) // 2)
+    figure = Figure(figsize=(PAGE_WIDTH, 3.1 * rows + 0.4))
+    every = figure.subplots(rows, min(len(panels), 2), squeeze=False).ravel()
+    for axes in every[len(panels) :]:
+        axes.remove()
+    for place, (axes, panel) in enumerate(zip(every[: len(panels)], panels, strict=True)):
+        comparison = panel.comparison
+        if comparison is not None:
+            axes.stairs(comparison.histogram[0], comparison.x1_edges, color=ORANGE, fill=True, alpha=0.5)
+        axes.plot(panel.x1, panel.values[0], color=BLUE, linewidth=1.2)
+        _hatch_stretches(axes, panel.x1, panel.values[0])
+        axes.set_ylim(bottom=0)
+        axes.set_xlabel(
+            scaled_label(axes.xaxis, f"${name_label(state)}$", unit, float(np.abs(panel.x1).max()))
+        )
+        title = f"({ascii_lowercase[place % 26]}) " + r"$\varepsilon$ = " + magnitude_label(panel.intensity)
+        if panel.normalisation is not None:
+            title += "\n$Z$ = " + magnitude_label(panel.normalisation, digits=4)
+        if panel.unknown is not None:
+            title += f"\nhatched: at most {100 * panel.unknown:.2g} %"
+        if comparison is not None:
+            title += f"\ntotal variation {comparison.total_variation:.2g}"
+            if np.isfinite(comparison.sampling_floor):
+                title += f"\n(sampling alone: {comparison.sampling_floor:.2g})"
+        axes.set_title(title, loc="left")
+        if place % 2 == 0:
+            axes.set_ylabel(f"density {'' if unit in ('1', '') else unit_label(f'per {unit}')}")
+    handles: list[Any] = [Line2D([], [], color=BLUE, label=r"$Z^{-1}\exp(-U/\varepsilon)$")]
+    if any(panel.comparison is not None for panel in panels):
+        handles.append(Patch(color=ORANGE, alpha=0.5, label="a long simulation"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=2)
+    return figure
+
+
+def _hatch_stretches(axes: Axes, x: np.ndarray, values: np.ndarray) -> list[Any]:
+    edges = np.flatnonzero(np.diff(np.r_[False, np.isnan(values), False].astype(int)))
+    for begin, end in edges.reshape(-1, 2):
+        axes.axvspan(x[begin], x[min(end, len(x) - 1)], zorder=-1, **UNKNOWN)
+    return [Patch(label="$U$ is not known", **UNKNOWN)] if len(edges) else []

@@ -1,4 +1,4 @@
-"""Figures of all runs: coefficients, terms, errors, training."""
+"""Figures of all runs of a study: coefficients, terms, errors, training (paper, Figs. 2 and 3)."""
 
 from __future__ import annotations
 

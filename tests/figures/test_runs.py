@@ -8,20 +8,16 @@ import pytest
 from matplotlib.figure import Figure
 
 from siq.quasipotential.invariant_density import DensityComparison, StationaryDensity
-from siq.report.plots import (
-    ComponentFields,
-    Dataset,
+from siq.report.plots.style import mean_and_spread, name_label, save_figure, sorted_terms, term_label
+from workflow.figures.density import plot_invariant_distribution
+from workflow.figures.prediction import plot_prediction
+from workflow.figures.recorded import ComponentFields, Dataset, plot_components, plot_dataset
+from workflow.figures.runs import (
     plot_coefficient_distributions,
-    plot_components,
-    plot_dataset,
     plot_error_distribution,
     plot_inclusion,
-    plot_invariant_distribution,
-    plot_prediction,
     plot_training,
-    save_figure,
 )
-from siq.report.plots.style import mean_and_spread, name_label, sorted_terms, term_label
 
 EXACT = {
     "U": {"1": 1.0, "x**2": -2.0, "y**2": 1.0, "z**2": 1.0, "x**4": 1.0},

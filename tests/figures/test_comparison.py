@@ -7,8 +7,8 @@ import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
-from siq.report.plots.errors import plot_degrees, plot_error_maps, plot_escape, power_of_ten
-from siq.report.plots.style import save_figure
+from siq.report.plots.style import power_of_ten, save_figure
+from workflow.figures.comparison import plot_degrees, plot_error_maps, plot_escape
 
 X, Y = np.linspace(-2, 2, 41), np.linspace(-1.5, 1.5, 31)
 

@@ -1,46 +1,101 @@
-"""Figures of the error of U, and of escape times."""
+"""Figures of U by several sources, of formulas by degree, and of escape times (paper, fig2b, Appendix E)."""
 
 from __future__ import annotations
 
-import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import BoundaryNorm, LogNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch, Rectangle
+from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import FuncFormatter, MaxNLocator
+from matplotlib.ticker import MaxNLocator
 
 from siq.numerics.text import unit_text
 from siq.report.plots.style import (
     BLACK,
-    BLUE,
     COLUMN_WIDTH,
-    GREEN,
+    CURVE_COLOURS,
     GREY,
-    ORANGE,
+    LINE_STYLES,
+    MARKERS,
     PAGE_WIDTH,
-    PURPLE,
-    VERMILLION,
+    UNKNOWN,
     counted,
     drawn_in_style,
+    hatch_unknown,
     magnitude_label,
     name_label,
-    unit_label,
+    power_of_ten,
+    say,
+    scaled_label,
 )
 from siq.report.summary import well_name
 
-CURVE_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, BLACK)
-MARKERS = ("o", "s", "^", "D", "v", "P")
-LINE_STYLES = ("-", "--", "-.", ":")
+ENERGY = "unit of ε"
+DECADES = {1: 6, 2: 4}  # of differences, below the largest one, by the number of states
+
+
+@drawn_in_style
+def plot_error_curves(
+    x: np.ndarray, curves: Mapping[str, np.ndarray], *, name: str, unit: str, energy_unit: str = ""
+) -> Figure | None:
+    """Draw U of one state by several sources, and how far each is from the first one.
+
+    Parameters
+    ----------
+    x
+        States in ascending order, shape ``(n,)``.
+    curves
+        U by each source, shape ``(n,)``, NaN where it says nothing. The first one is the reference.
+    name, unit
+        Of the state.
+    energy_unit
+        Unit of U; empty where it is that of ε.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Above U; below the absolute difference as a share of the reference's highest value, on a
+        logarithmic axis.
+    """
+    (reference_name, reference), *others = [
+        (key, one) for key, one in curves.items() if np.isfinite(one).any()
+    ] or [("the reference", np.zeros(0))]
+    if not reference.size or not others:
+        return None
+    highest = float(np.nanmax(np.abs(reference))) or 1.0
+    figure = Figure(figsize=(COLUMN_WIDTH, 5.4))
+    left, right = figure.subplots(2, 1, sharex=True)
+    left.plot(x, reference, color=BLACK, linewidth=2.4, alpha=0.4, label=reference_name)
+    right.set_yscale("log")
+    shares = []
+    for place, (key, values) in enumerate(others):
+        look: dict[str, Any] = {
+            "color": CURVE_COLOURS[place % len(CURVE_COLOURS)],
+            "linestyle": LINE_STYLES[place % len(LINE_STYLES)],
+        }  # fmt: skip
+        left.plot(x, values, linewidth=1.2, label=key, **look)
+        difference = np.abs(values - reference) / highest
+        shares.append(float(np.nanmax(difference, initial=0.0)))
+        right.plot(x, np.where(difference > 0, difference, np.nan), linewidth=1.0, **look)
+    largest = max(shares)
+    if largest > 0:
+        right.set_ylim(largest / 10 ** DECADES[1], 2 * largest)
+    else:
+        say(right, "no difference at all")
+    left.set_ylabel(scaled_label(left.yaxis, "$U$", energy_unit or ENERGY, highest))
+    right.set_ylabel(f"difference from\n{reference_name} / highest $U$")
+    for axes in (left, right):
+        axes.set_xlabel(scaled_label(axes.xaxis, f"${name_label(name)}$", unit, float(np.abs(x).max())))
+    figure.legend(loc="outside upper center", ncols=2)
+    return figure
 
 
 @drawn_in_style
@@ -222,50 +277,11 @@ def by_letters(name: str) -> str:
     return re.sub(r"\bA(\d+)\b", lambda found: well_name(int(found[1]) - 1), name)
 
 
-def power_of_ten(largest: float) -> int:
-    """The power that is written once at an axis and not at every tick: zero for numbers that are handy."""
-    if not math.isfinite(largest) or largest == 0 or 0.1 <= abs(largest) < 1e4:
-        return 0
-    return math.floor(math.log10(abs(largest)))
-
-
-def scaled_label(axis: Axis, symbol: str, unit: str, largest: float) -> str:
-    """The label of an axis with its unit, and with the power of ten that its ticks leave out from now on.
-
-    Parameters
-    ----------
-    axis
-        The axis; its label is left to the caller.
-    symbol
-        What is shown, typeset.
-    unit
-        Its unit; ``1`` and the empty text mean a plain number.
-    largest
-        The largest number that occurs.
-    """
-    power = power_of_ten(largest)
-    plain = unit in ("1", "")
-    if not power:
-        return symbol if plain else f"{symbol} {unit_label(unit)}"
-    axis.set_major_formatter(FuncFormatter(_without(power)))
-    factor = rf"$10^{{{power}}}$"
-    return f"{symbol} ({factor})" if plain else f"{symbol} ({factor} {unit_text(unit)})"
-
-
-def _without(power: int) -> Callable[[float, object], str]:
-    return lambda value, _: f"{value / 10.0**power:.6g}".replace("-", "−")
-
-
-__all__ = ["plot_degrees", "plot_error_maps", "plot_escape"]
-
 Extend = Literal["neither", "both", "min", "max"]
-
 COLOUR_MAP = "viridis"
 DIFFERENCE_MAP = "magma"
 LEVELS = 14
-DECADES = 4  # of differences, below the largest one
 MARGIN = 0.06  # of what is known: shown around it
-UNKNOWN: dict[str, Any] = {"facecolor": "#F0F0F0", "edgecolor": "#C8C8C8", "hatch": "////", "linewidth": 0}
 RIM: dict[str, Any] = {"path_effects": [withStroke(linewidth=2.0, foreground="white")]}
 
 
@@ -289,7 +305,7 @@ def _draw_values(
     *,
     as_image: bool = False,
 ) -> None:
-    _draw_unknown(axes)
+    hatch_unknown(axes)
     heights = values.T if shades["extend"] == "both" else np.maximum(values, shades["levels"][0]).T
     drawn = [
         axes.contourf(*axes_values, heights, **shades),
@@ -297,10 +313,6 @@ def _draw_values(
     ]
     for one in drawn:
         one.set_rasterized(as_image)
-
-
-def _draw_unknown(axes: Axes) -> None:
-    axes.add_patch(Rectangle((0, 0), 1, 1, transform=axes.transAxes, zorder=-1, **UNKNOWN))
 
 
 def _limit_landscape(
@@ -403,7 +415,7 @@ def plot_error_maps(
 
 
 def _draw_nothing(axes: Axes) -> None:
-    _draw_unknown(axes)
+    hatch_unknown(axes)
     axes.text(0.5, 0.5, "not known", transform=axes.transAxes, ha="center", va="center", **RIM)
 
 
@@ -416,16 +428,17 @@ def _draw_differences(
 ) -> None:
     known = [one[np.isfinite(one)] for one in differences]
     largest = max((float(one.max(initial=0.0)) for one in known), default=0.0) or 1.0
-    norm = LogNorm(largest / 10**DECADES, largest)
+    lowest = largest / 10 ** DECADES[2]
+    norm = LogNorm(lowest, largest)
     for axes, difference, found in zip(panels[1:], differences, known, strict=True):
         if not found.size:
             _draw_nothing(axes)
             continue
-        _draw_unknown(axes)
+        hatch_unknown(axes)
         # As an image: thousands of small rectangles would make a megabyte of vector graphics. What is less
         # than the scale shows, zero included, has its lowest colour.
         axes.pcolormesh(
-            *axes_values, np.maximum(difference, largest / 10**DECADES).T, norm=norm, cmap=DIFFERENCE_MAP,
+            *axes_values, np.maximum(difference, lowest).T, norm=norm, cmap=DIFFERENCE_MAP,
             shading="nearest", rasterized=True,
         )  # fmt: skip
         title = f"rms {magnitude_label(float(np.sqrt((found**2).mean())))}"
