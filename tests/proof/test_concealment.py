@@ -19,15 +19,12 @@ from scipy.integrate import solve_ivp
 
 from siq.systems.cards import check_name
 from siq.systems.formulas import compile_formulas, parse_formula
+from workflow.proof.batches import digests_of
 from workflow.proof.concealment import cases as concealment_cases
 from workflow.proof.concealment.cases import (
-    PROOF,
-    PROOF_FULL,
     CaseDesign,
     draw_cases,
     make_case,
-    publish_digests,
-    write_case,
 )
 from workflow.proof.concealment.catalogue import CATALOGUES
 from workflow.proof.concealment.designs import KINDS
@@ -41,8 +38,13 @@ from workflow.proof.concealment.mechanics import (
 from workflow.proof.concealment.model import Drive, TrueSystem
 from workflow.proof.concealment.simulation import simulate
 from workflow.proof.concealment.systems import SYSTEMS, PhysicalSystem
+from workflow.proof.sets import load_proofs
 
 POINTS = 40
+PROOF, PROOF_FULL = (
+    load_proofs(Path(__file__).parents[2] / "config/proof.yaml")[name].shares
+    for name in ("proof", "proof_full")
+)
 
 
 def builders() -> Iterator[tuple[str, str, str]]:
@@ -329,7 +331,8 @@ def test_wrong_shares_are_refused() -> None:
 def test_files_are_complete_and_the_key_stays_apart(tmp_path: Path) -> None:
     conceals = design("oscillator", "mechanism", "cubic stiffness", shifted=True, without=("hysteresis",))
     for folder in ("one", "two"):
-        write_case(conceals, cases=tmp_path / folder / "cases", keys=tmp_path / folder / "keys")
+        case = make_case(conceals)
+        case.write(conceals.name, cases=tmp_path / folder / "cases", keys=tmp_path / folder / "keys")
     files = sorted(path.relative_to(tmp_path / "one") for path in (tmp_path / "one").rglob("*.*"))
     assert [str(file) for file in files] == [
         "cases/case-0001/recordings.parquet",
@@ -381,7 +384,7 @@ def test_files_are_complete_and_the_key_stays_apart(tmp_path: Path) -> None:
         np.testing.assert_allclose(difference, -c * truth["states"][:, 0] ** 3, atol=1e-9)
         strength = np.sqrt(np.mean(difference**2) / np.mean(truth["derivative_without"][:, 1] ** 2))
     assert strength == pytest.approx(key["strength"], rel=0.1)
-    digests = publish_digests(keys)
+    digests = digests_of(keys)
     assert list(digests) == ["case-0001"]
     assert re.fullmatch("[0-9a-f]{64}", digests["case-0001"])
 
@@ -457,7 +460,8 @@ def test_forces_between_masses_are_equal_and_opposite() -> None:
 
 
 def test_the_generator_knows_nothing_of_the_diagnosis() -> None:
-    files = sorted(Path(str(concealment_cases.__file__)).parent.glob("*.py"))
+    folder = Path(str(concealment_cases.__file__)).parent
+    files = [*sorted(folder.glob("*.py")), folder.parent / "cases.py"]
     assert len(files) > 4
     for file in files:
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
@@ -470,7 +474,8 @@ def test_the_generator_knows_nothing_of_the_diagnosis() -> None:
             assert not [m for m in modules if m.split(".")[0] == "siq"], file.name
             assert not isinstance(node, ast.Name) or node.id not in ("eval", "exec", "__import__"), file.name
             if any(m.startswith("workflow") for m in modules):
-                assert all(m.startswith("workflow.proof.concealment") for m in modules), file.name
+                own = ("workflow.proof.concealment", "workflow.proof.cases")
+                assert all(m.startswith(own) for m in modules), file.name
 
 
 def test_designs_are_small() -> None:

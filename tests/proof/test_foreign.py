@@ -23,7 +23,7 @@ from siq.systems.dynamics import Dynamics, Parameter, Signals, symbol
 from workflow.proof.batches import write_batch
 from workflow.proof.concealment.designs import draw_cases as draw_others
 from workflow.proof.foreign import cases as generator
-from workflow.proof.foreign.cases import write_case
+from workflow.proof.foreign.cases import make_case
 from workflow.proof.foreign.designs import KINDS, ForeignDesign, draw_cases
 from workflow.proof.foreign.effects import LAWS, draw_effect
 from workflow.proof.foreign.formulas import evaluator
@@ -35,14 +35,14 @@ from workflow.proof.foreign_scores.integrator import Integrator
 from workflow.proof.foreign_scores.oracle import TrueSimulation, true_simulation
 from workflow.proof.foreign_scores.places import told_places
 from workflow.proof.foreign_scores.rulers import name_error, said_place, unreal_names
-from workflow.proof.foreign_scores.scores import COLUMNS, foreign_score_table, said, score_foreign_case
-from workflow.proof.foreign_scores.targets import foreign_failures, foreign_targets
+from workflow.proof.foreign_scores.scores import COLUMNS, said, score_foreign_case
 from workflow.proof.keys import CaseKey, read_key, read_truth
 from workflow.proof.keys import Truth as KeyTruth
 from workflow.proof.oracle import true_model
 from workflow.proof.plots import plot_foreign_proof
-from workflow.proof.scoring import Answer
+from workflow.proof.scoring import Answer, score_table
 from workflow.proof.sets import FOREIGN, load_proofs
+from workflow.proof.targets import foreign_failures, foreign_targets
 
 ROOT = Path(__file__).parents[2]
 SHARES = {"null": 0.17, "shift": 0.17, "withheld": 0.66}
@@ -58,7 +58,7 @@ def design(**other: Any) -> ForeignDesign:
 
 
 def written(tmp: Path) -> tuple[Comparison, CaseKey, KeyTruth, np.ndarray]:
-    write_case(design(), cases=tmp / "cases", keys=tmp / "keys")
+    make_case(design()).write(design().name, cases=tmp / "cases", keys=tmp / "keys")
     folder, keys = tmp / "cases/case-0001", tmp / "keys"
     case = read_case(folder / "system.yaml", folder / "recordings.parquet", folder / "study.yaml")
     truth = read_truth(keys / "case-0001.npz")
@@ -90,7 +90,7 @@ def oracle(stepped: Written) -> TrueSimulation:
 # --- The generator
 
 
-def test_the_generator_shares_nothing_with_the_first_nor_with_the_library() -> None:
+def test_the_generator_shares_what_a_case_is_with_the_first_and_nothing_with_the_library() -> None:
     files = sorted((ROOT / "workflow/proof/foreign").glob("*.py"))
     assert len(files) > 6
     for file in files:
@@ -102,7 +102,8 @@ def test_the_generator_shares_nothing_with_the_first_nor_with_the_library() -> N
                 modules = [node.module or ""]
             assert not [m for m in modules if m.split(".")[0] == "siq"], file.name
             ours = [m for m in modules if m.startswith("workflow")]
-            assert all(m.startswith("workflow.proof.foreign.") for m in ours), file.name
+            own = ("workflow.proof.foreign.", "workflow.proof.cases")
+            assert all(m.startswith(own) for m in ours), file.name
 
 
 def test_scores_import_nothing_of_the_search_and_the_verdict_that_they_test() -> None:
@@ -418,7 +419,7 @@ def test_a_case_is_scored_as_a_whole(
     assert row["place_asked"] and row["place_right"] and row["note"] == "" and row["right"]
     row = scored("no mismatch", [], None, case.system.to_card())
     assert row["gain_asked"] and not row["gain_had"] and not row["place_right"] and not row["detected"]
-    assert list(foreign_score_table([row]).columns) == list(COLUMNS)
+    assert list(score_table([row], COLUMNS).columns) == list(COLUMNS)
 
 
 def table() -> pd.DataFrame:
@@ -435,7 +436,7 @@ def table() -> pd.DataFrame:
         }
         for k in range(20)
     ]  # fmt: skip
-    return foreign_score_table(rows)
+    return score_table(rows, COLUMNS)
 
 
 def test_targets_and_what_counts_against_them() -> None:

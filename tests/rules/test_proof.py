@@ -5,7 +5,7 @@ import json
 import pandas as pd
 import pytest
 
-from workflow.proof.concealment.cases import CaseDesign, write_case
+from workflow.proof.concealment.cases import CaseDesign, make_case
 from workflow.proof.scoring import COLUMNS
 
 pytestmark = [pytest.mark.workflow, pytest.mark.slow]
@@ -60,7 +60,7 @@ def test_other_keys_than_those_published_are_refused(proven):
 def test_cases_of_somebody_else_are_scored(proven):
     cases, keys = proven.path("theirs"), proven.path("their-keys")
     design = CaseDesign("mine", "oscillator", "mechanism", "cubic stiffness", True, 0.15, 40.0, (), 8)
-    write_case(design, cases=cases, keys=keys)
+    make_case(design).write(design.name, cases=cases, keys=keys)
     (keys / "mine.npz").unlink()  # arrays are welcome, not asked for
     proven.make("blind_test", "--config", f"cases={cases}", f"keys={keys}", study="config/config.yaml")
     table = pd.read_parquet(proven.path("results/blind-test/tables/score.parquet"))

@@ -10,18 +10,19 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from siq.errors import InputError
+from workflow.proof.cases import ProofCase
 
 LOGGER = logging.getLogger(__name__)
 
 
 class Generator(Protocol):
-    """What draws and writes cases: a module such as `workflow.proof.concealment.cases`."""
+    """What draws and makes cases: a module such as `workflow.proof.concealment.cases`."""
 
     def draw_cases(self, *, count: int, seed: int, shares: Mapping[str, float]) -> Sequence[Any]:
         """Decide which cases there are."""
 
-    def write_case(self, design: Any, *, cases: Path, keys: Path) -> None:
-        """Make a case and write it, and its key, to two folders."""
+    def make_case(self, design: Any) -> ProofCase:
+        """Make a case; the same design makes the same case."""
 
 
 def write_batch(
@@ -51,9 +52,14 @@ def write_batch(
         folder.mkdir(parents=True, exist_ok=True)
     for design in designs[batch * size : (batch + 1) * size]:
         try:
-            generator.write_case(design, cases=cases, keys=keys)
+            generator.make_case(design).write(design.name, cases=cases, keys=keys)
         except RuntimeError as error:
             LOGGER.warning("left out: %s", error)
+    return digests_of(keys)
+
+
+def digests_of(keys: Path) -> dict[str, str]:
+    """SHA-256 of every key file by name of the case: published before any case is diagnosed."""
     return {path.stem: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(keys.glob("*.json"))}
 
 

@@ -158,12 +158,12 @@ def study_of(folder: Path) -> Path | None:
     return study if study.is_file() else None
 
 
-def score_table(rows: list[dict[str, Any]]) -> pd.DataFrame:
+def score_table(rows: list[dict[str, Any]], columns: Mapping[str, str] = COLUMNS) -> pd.DataFrame:
     """Rows as a table with all columns; what a row does not say is missing, not counted or no."""
     empty: dict[str, Any] = {"str": "", "bool": False, "int64": 0, "float64": np.nan}
-    whole = [{name: row.get(name, empty[kind]) for name, kind in COLUMNS.items()} for row in rows]
-    frame = pd.DataFrame(whole, columns=list(COLUMNS))
-    return frame.astype(dict(COLUMNS)).sort_values("case", ignore_index=True)
+    whole = [{name: row.get(name, empty[kind]) for name, kind in columns.items()} for row in rows]
+    frame = pd.DataFrame(whole, columns=list(columns))
+    return frame.astype(dict(columns)).sort_values("case", ignore_index=True)
 
 
 def judgement(key: CaseKey, answer: Answer) -> dict[str, Any]:

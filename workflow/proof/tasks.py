@@ -145,13 +145,10 @@ def collect_scores(given: Given, settings: PipelineSettings) -> Any:
 
 
 def _score_table(rows: list[dict[str, Any]], given: Given) -> pd.DataFrame:
-    if given.options["foreign"]:
-        from workflow.proof.foreign_scores.scores import foreign_score_table
+    from workflow.proof import scoring
+    from workflow.proof.foreign_scores import scores
 
-        return foreign_score_table(rows)
-    from workflow.proof.scoring import score_table
-
-    return score_table(rows)
+    return scoring.score_table(rows, scores.COLUMNS if given.options["foreign"] else scoring.COLUMNS)
 
 
 @task("scores")
@@ -193,8 +190,8 @@ def score_foreign(given: Given, settings: PipelineSettings) -> Any:
     """The page of the proof on random systems."""
     from workflow.proof.foreign_scores.rulers import NEAR
     from workflow.proof.foreign_scores.scores import ENOUGH
-    from workflow.proof.foreign_scores.targets import foreign_failures, foreign_targets
     from workflow.proof.plots import plot_foreign_proof
+    from workflow.proof.targets import foreign_failures, foreign_targets
 
     scores = given.scores
     asked = [

@@ -6,67 +6,27 @@ the key.
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import yaml
-from pyarrow import parquet
 
+from workflow.proof.cases import HELD_OUT, ProofCase, thinned, wrong_parameters
 from workflow.proof.concealment.catalogue import CATALOGUES
-from workflow.proof.concealment.designs import PROOF, PROOF_FULL, CaseDesign, draw_cases, log_uniform
+from workflow.proof.concealment.designs import CaseDesign, draw_cases, log_uniform
 from workflow.proof.concealment.effects import Effect
 from workflow.proof.concealment.model import Trajectories, TrueSystem, derivatives
-from workflow.proof.concealment.physics import PhysicalSystem
 from workflow.proof.concealment.simulation import RanAway, simulate
 from workflow.proof.concealment.strengths import STRONGEST, WEAKEST, calibrate, effect_strength
 from workflow.proof.concealment.systems import SYSTEMS
 
-__all__ = [
-    "PROOF",
-    "PROOF_FULL",
-    "CaseDesign",
-    "ConcealedCase",
-    "draw_cases",
-    "make_case",
-    "publish_digests",
-    "write_case",
-]
+__all__ = ["CaseDesign", "draw_cases", "make_case"]
 
-HELD_OUT = 0.25
-KEY_ROWS = 500
+SHIFT = (0.03, 0.25)  # relative, by which a parameter of a card is wrong
 ATTEMPTS = 40
 
 
-@dataclass(frozen=True)
-class ConcealedCase:
-    """A case as it is written, and its key.
-
-    Attributes
-    ----------
-    card, study
-        What the YAML files say.
-    recordings
-        Columns of the table of recordings.
-    key
-        What the JSON file says.
-    truth
-        The arrays that go with it.
-    """
-
-    card: Mapping[str, Any]
-    study: Mapping[str, Any]
-    recordings: Mapping[str, Any]
-    key: Mapping[str, Any]
-    truth: Mapping[str, Any]
-
-
-def make_case(design: CaseDesign) -> ConcealedCase:
+def make_case(design: CaseDesign) -> ProofCase:
     """Simulate a case. The same design makes the same case.
 
     Parameters
@@ -76,7 +36,7 @@ def make_case(design: CaseDesign) -> ConcealedCase:
 
     Returns
     -------
-    ConcealedCase
+    ProofCase
         With an effect that is as strong as wanted; weaker, where the motion did not stay bounded.
     """
     rng = np.random.default_rng(design.seed)
@@ -113,29 +73,16 @@ def _draw_effect(design: CaseDesign, rng: np.random.Generator) -> Effect | None:
     return (catalogue.mechanisms if design.kind == "mechanism" else catalogue.withheld)[design.mechanism](rng)
 
 
-def _shifts(
-    system: PhysicalSystem, true: Mapping[str, float], rng: np.random.Generator
-) -> dict[str, dict[str, float]]:
-    """One to three parameters that are wrong in the card by 3 to 25 %."""
-    free = list(system.free())
-    chosen = rng.choice(free, size=int(rng.integers(1, min(3, len(free)) + 1)), replace=False)
-    shifts = {}
-    for name in map(str, chosen):
-        factor = 1 + float(rng.choice([-1, 1])) * rng.uniform(0.03, 0.25)
-        shifts[name] = {"card": float(f"{true[name] * factor:.4g}"), "true": true[name]}
-    return shifts
-
-
 def _assemble(
     design: CaseDesign,
     model: TrueSystem,
     path: Trajectories,
     reached: float | None,
     rng: np.random.Generator,
-) -> ConcealedCase:
+) -> ProofCase:
     """Everything of a case that follows from what the system did."""
     system, effect = model.system, model.effect
-    shifts = _shifts(system, model.parameters, rng) if design.shifted else {}
+    shifts = wrong_parameters(list(system.free()), model.parameters, *SHIFT, rng) if design.shifted else {}
     table = _recordings(model, path, design.noise_db, rng)
     labels = sorted(set(table["recording"]))
     held_out = rng.choice(labels, size=round(HELD_OUT * len(labels)), replace=False)
@@ -155,7 +102,7 @@ def _assemble(
         "shifts": shifts,
         "effect": effect.formulas() if effect else {},
     }
-    return ConcealedCase(_card(model, shifts), study, table, key, _truth(model, path))
+    return ProofCase(_card(model, shifts), study, table, key, _truth(model, path))
 
 
 def _card(model: TrueSystem, shifts: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
@@ -194,7 +141,7 @@ def _truth(model: TrueSystem, path: Trajectories) -> dict[str, np.ndarray]:
     """Arrays of the key: noise-free states and their derivatives, thinned evenly over all recordings."""
     states = len(model.system.states)
     columns = path.states[:states].reshape(states, -1)
-    rows = np.unique(np.linspace(0, columns.shape[1] - 1, min(KEY_ROWS, columns.shape[1])).astype(int))
+    rows = thinned(columns.shape[1])
     return {
         "t": np.tile(path.times, path.states.shape[1])[rows],
         "states": columns[:, rows].T,
@@ -202,37 +149,3 @@ def _truth(model: TrueSystem, path: Trajectories) -> dict[str, np.ndarray]:
         "derivative_true": derivatives(model, path, model.effect)[:states, rows].T,
         "derivative_without": derivatives(model, path, None)[:, rows].T,
     }
-
-
-def write_case(design: CaseDesign, *, cases: Path, keys: Path) -> None:
-    """Make a case and write it, and its key, to two folders.
-
-    Parameters
-    ----------
-    design
-        What has been decided of it.
-    cases
-        Gets the folder of the case, with ``system.yaml``, ``recordings.parquet`` and ``study.yaml``.
-    keys
-        Gets ``CASE.json`` and ``CASE.npz``.
-    """
-    case = make_case(design)
-    folder = cases / design.name
-    folder.mkdir(parents=True, exist_ok=True)
-    keys.mkdir(parents=True, exist_ok=True)
-    _write_yaml(folder / "system.yaml", case.card)
-    _write_yaml(folder / "study.yaml", case.study)
-    parquet.write_table(pa.table(dict(case.recordings)), folder / "recordings.parquet")
-    text = json.dumps(case.key, indent=1, ensure_ascii=False) + "\n"
-    (keys / f"{design.name}.json").write_text(text, encoding="utf-8")
-    np.savez_compressed(keys / f"{design.name}.npz", **case.truth)
-
-
-def _write_yaml(path: Path, content: Mapping[str, Any]) -> None:
-    text = yaml.safe_dump(dict(content), sort_keys=False, allow_unicode=True)
-    path.write_text(text, encoding="utf-8")
-
-
-def publish_digests(keys: Path) -> dict[str, str]:
-    """SHA-256 of every key file by name of the case: published before any case is diagnosed."""
-    return {path.stem: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(keys.glob("*.json"))}

@@ -11,25 +11,12 @@ from typing import Any
 
 import numpy as np
 
+from workflow.proof.cases import turns
 from workflow.proof.concealment.catalogue import CATALOGUES
 from workflow.proof.concealment.strengths import STRONGEST, WEAKEST
 from workflow.proof.concealment.systems import SYSTEMS
 
 KINDS = ("null", "shift", "mechanism", "process noise", "withheld")
-PROOF: Mapping[str, float] = {
-    "null": 0.20,
-    "shift": 0.15,
-    "mechanism": 0.45,
-    "process noise": 0.08,
-    "withheld": 0.12,
-}
-PROOF_FULL: Mapping[str, float] = {
-    "null": 0.25,
-    "shift": 0.25,
-    "mechanism": 0.34,
-    "process noise": 0.06,
-    "withheld": 0.10,
-}
 NOISE_LEVELS = (40.0, 30.0, 20.0)
 ALWAYS_WITHHELD: Mapping[str, tuple[str, ...]] = {
     "predator_prey": ("Allee effect", "delayed response"),
@@ -88,7 +75,7 @@ def draw_cases(*, count: int, seed: int, shares: Mapping[str, float]) -> list[Ca
     seed
         The same seed draws the same cases.
     shares
-        Share of each kind, such as `PROOF`; they are respected to within one case.
+        Share of each kind, as in ``config/proof.yaml``; they are respected to within one case.
 
     Returns
     -------
@@ -100,10 +87,10 @@ def draw_cases(*, count: int, seed: int, shares: Mapping[str, float]) -> list[Ca
         raise ValueError(f"shares {dict(shares)} are not shares of {', '.join(KINDS)} that sum to 1")
     rng = np.random.default_rng(seed)
     kinds = np.repeat(list(shares), _whole_numbers(list(shares.values()), count))
-    systems = {kind: _turns(list(SYSTEMS), rng) for kind in shares}
+    systems = {kind: turns(list(SYSTEMS), rng) for kind in shares}
     effects: dict[tuple[str, str], Iterator[str]] = {}
-    noise = _turns(list(NOISE_LEVELS), rng)
-    shifted = _turns([True, False], rng)
+    noise = turns(list(NOISE_LEVELS), rng)
+    shifted = turns([True, False], rng)
     drawn: list[dict[str, Any]] = []
     for kind in map(str, kinds):
         system = next(systems[kind])
@@ -114,7 +101,7 @@ def draw_cases(*, count: int, seed: int, shares: Mapping[str, float]) -> list[Ca
                 "process noise": ["process noise"],
                 "withheld": list(CATALOGUES[system].withheld),
             }[kind]
-            mechanism = next(effects.setdefault((kind, system), _turns(choices, rng)))
+            mechanism = next(effects.setdefault((kind, system), turns(choices, rng)))
         drawn.append(
             {
                 "system": system,
@@ -138,13 +125,6 @@ def _whole_numbers(shares: Sequence[float], count: int) -> list[int]:
     largest = np.argsort(numbers - wanted, kind="stable")[: count - numbers.sum()]
     numbers[largest] += 1
     return [int(number) for number in numbers]
-
-
-def _turns(choices: Sequence[Any], rng: np.random.Generator) -> Iterator[Any]:
-    """All choices in random order, again and again."""
-    while True:
-        for index in rng.permutation(len(choices)):
-            yield choices[index]
 
 
 def log_uniform(low: float, high: float, rng: np.random.Generator) -> float:

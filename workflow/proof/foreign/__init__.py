@@ -1,8 +1,9 @@
 """A second generator of concealed cases: random systems that lack random functions, and coarse sensors.
 
 The first generator, `workflow.proof.concealment`, conceals what the dictionary of the diagnosis has names
-for. Here no list is shared, no formula and no code: neither with the dictionary, nor with `siq`, nor with the
-first generator. Systems and functions are drawn; sensors round, lose samples, and have clocks that jitter.
+for. Here no list and no formula is shared, and no code with `siq`; with the first generator only how a case
+is written (`workflow.proof.cases`). Systems and functions are drawn; sensors round, lose samples, and have
+clocks that jitter.
 
 ============  ===========================================================================
 `formulas`    how is a formula evaluated?

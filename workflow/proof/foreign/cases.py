@@ -2,58 +2,28 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import yaml
-from pyarrow import parquet
 
+from workflow.proof.cases import HELD_OUT, ProofCase, thinned, wrong_parameters
 from workflow.proof.foreign.designs import IN_SENSOR, STRENGTHS, ForeignDesign, draw_cases
 from workflow.proof.foreign.effects import draw_effect
-from workflow.proof.foreign.formulas import evaluator, rounded
+from workflow.proof.foreign.formulas import evaluator
 from workflow.proof.foreign.motion import PILOT, Motion, RanAway, Truth, move
 from workflow.proof.foreign.sensors import Sensors, draw_sensors, reader, recorded
-from workflow.proof.foreign.systems import FAMILIES, Experiment, RandomSystem, draw_experiment
+from workflow.proof.foreign.systems import FAMILIES, Experiment, draw_experiment
 
-__all__ = ["ForeignCase", "ForeignDesign", "draw_cases", "make_case", "write_case"]
+__all__ = ["ForeignDesign", "draw_cases", "make_case"]
 
 ATTEMPTS = 60
 ROUNDS = 4  # in which the amplitude of an effect is found
 CLOSE = 1.25  # factor by which its strength may miss what was wanted
-KEY_ROWS = 500
 SHIFT = (0.05, 0.25)  # relative, by which a parameter of a card is wrong
-HELD_OUT = 0.25
 
 
-@dataclass(frozen=True)
-class ForeignCase:
-    """A case as it is written, and its key.
-
-    Attributes
-    ----------
-    card, study
-        What the YAML files say.
-    recordings
-        Columns of the table of recordings.
-    key
-        What the JSON file says.
-    truth
-        The arrays that go with it.
-    """
-
-    card: Mapping[str, Any]
-    study: Mapping[str, Any]
-    recordings: Mapping[str, Any]
-    key: Mapping[str, Any]
-    truth: Mapping[str, Any]
-
-
-def make_case(design: ForeignDesign) -> ForeignCase:
+def make_case(design: ForeignDesign) -> ProofCase:
     """Draw and simulate a case. The same design makes the same case.
 
     Raises
@@ -153,19 +123,6 @@ def strength_of(truth: Truth, motion: Motion, experiment: Experiment) -> float:
     return strength
 
 
-def _shifts(
-    system: RandomSystem, true: Mapping[str, float], rng: np.random.Generator
-) -> dict[str, dict[str, float]]:
-    """One to three free parameters that the card has wrong."""
-    count = int(rng.integers(1, min(3, len(system.free)) + 1))
-    chosen = map(str, rng.choice(system.free, size=count, replace=False))
-    shifts = {}
-    for name in chosen:
-        factor = 1 + float(rng.choice([-1, 1])) * rng.uniform(*SHIFT)
-        shifts[name] = {"card": rounded(true[name] * factor), "true": true[name]}
-    return shifts
-
-
 def _assembled(
     design: ForeignDesign,
     truth: Truth,
@@ -174,9 +131,9 @@ def _assembled(
     strength: float | None,
     sensors: Sensors,
     rng: np.random.Generator,
-) -> ForeignCase:
+) -> ProofCase:
     system, effect = truth.system, truth.effect
-    shifts = _shifts(system, truth.parameters, rng) if design.shifted else {}
+    shifts = wrong_parameters(system.free, truth.parameters, *SHIFT, rng) if design.shifted else {}
     table = recorded(truth, motion, experiment, sensors, rng)
     believed = {name: shift["card"] for name, shift in shifts.items()}
     key: dict[str, Any] = {
@@ -198,7 +155,7 @@ def _assembled(
             "jitter": sensors.jitter,
         },
     }
-    return ForeignCase(
+    return ProofCase(
         system.card({**truth.parameters, **believed}),
         _study(table.columns, rng),
         table.columns,
@@ -219,7 +176,7 @@ def _study(table: Mapping[str, np.ndarray], rng: np.random.Generator) -> dict[st
 def _rows(truth: Truth, motion: Motion, experiment: Experiment) -> dict[str, np.ndarray]:
     """Arrays of the key: noise-free states and their derivatives, thinned evenly."""
     states, drive = _within(motion, experiment)
-    rows = np.unique(np.linspace(0, len(drive) - 1, min(KEY_ROWS, len(drive))).astype(int))
+    rows = thinned(len(drive))
     states, drive = states[:, rows], drive[rows]
     inputs = drive[None] if truth.system.driven else np.zeros((0, len(rows)))
     return {
@@ -229,28 +186,3 @@ def _rows(truth: Truth, motion: Motion, experiment: Experiment) -> dict[str, np.
         "derivative_true": truth.rates(states, drive).T,
         "derivative_without": Truth(truth.system, truth.parameters).rates(states, drive).T,
     }
-
-
-def write_case(design: ForeignDesign, *, cases: Path, keys: Path) -> None:
-    """Make a case and write it, and its key, to two folders.
-
-    Parameters
-    ----------
-    design
-        What has been decided of it.
-    cases
-        Gets the folder of the case, with ``system.yaml``, ``recordings.parquet`` and ``study.yaml``.
-    keys
-        Gets ``CASE.json`` and ``CASE.npz``.
-    """
-    case = make_case(design)
-    folder = cases / design.name
-    folder.mkdir(parents=True, exist_ok=True)
-    keys.mkdir(parents=True, exist_ok=True)
-    for name, content in (("system", case.card), ("study", case.study)):
-        text = yaml.safe_dump(dict(content), sort_keys=False, allow_unicode=True)
-        (folder / f"{name}.yaml").write_text(text, encoding="utf-8")
-    parquet.write_table(pa.table(dict(case.recordings)), folder / "recordings.parquet")
-    text = json.dumps(case.key, indent=1, ensure_ascii=False) + "\n"
-    (keys / f"{design.name}.json").write_text(text, encoding="utf-8")
-    np.savez_compressed(keys / f"{design.name}.npz", **case.truth)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from workflow.proof.cases import turns
 from workflow.proof.foreign.effects import LAWS
 from workflow.proof.foreign.systems import FAMILIES
 
@@ -73,9 +74,9 @@ def draw_cases(*, count: int, seed: int, shares: Mapping[str, float]) -> list[Fo
     rng = np.random.default_rng(seed)
     edges = np.round(count * np.cumsum(list(shares.values()))).astype(int)
     kinds = np.repeat(list(shares), np.diff(edges, prepend=0))
-    families = {kind: _turns(list(FAMILIES), rng) for kind in shares}
-    noise = {kind: _turns(list(NOISE_LEVELS), rng) for kind in shares}
-    laws, shifted = _turns(list(LAWS), rng), _turns([True, False], rng)
+    families = {kind: turns(list(FAMILIES), rng) for kind in shares}
+    noise = {kind: turns(list(NOISE_LEVELS), rng) for kind in shares}
+    laws, shifted = turns(list(LAWS), rng), turns([True, False], rng)
     drawn: list[dict[str, Any]] = []
     for kind in map(str, kinds):
         concealed = kind == "withheld"
@@ -92,10 +93,3 @@ def draw_cases(*, count: int, seed: int, shares: Mapping[str, float]) -> list[Fo
         )
     order = rng.permutation(len(drawn))
     return [ForeignDesign(name=f"case-{number:04d}", **drawn[i]) for number, i in enumerate(order, start=1)]
-
-
-def _turns(choices: Sequence[Any], rng: np.random.Generator) -> Iterator[Any]:
-    """All choices in random order, again and again."""
-    while True:
-        for index in rng.permutation(len(choices)):
-            yield choices[index]

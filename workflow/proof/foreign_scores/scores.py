@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from siq.diagnosis.study import Comparison, read_case
 from workflow.proof.foreign_scores.oracle import TrueSimulation, free_errors, true_simulation
@@ -194,11 +193,3 @@ def places(key: CaseKey, told: Told, answer: Answer) -> dict[str, Any]:
         "place_asked": asked,
         "place_right": asked and equation and (coordinate or not along_too),
     }
-
-
-def foreign_score_table(rows: list[dict[str, Any]]) -> pd.DataFrame:
-    """Rows as a table with all columns; what a row does not say is missing, not counted or no."""
-    empty: dict[str, Any] = {"str": "", "bool": False, "int64": 0, "float64": np.nan}
-    whole = [{name: row.get(name, empty[kind]) for name, kind in COLUMNS.items()} for row in rows]
-    frame = pd.DataFrame(whole, columns=list(COLUMNS))
-    return frame.astype(dict(COLUMNS)).sort_values("case", ignore_index=True)
