@@ -12,11 +12,9 @@ from __future__ import annotations
 
 import base64
 import datetime
-import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal
 
@@ -348,6 +346,7 @@ def render_template(name: str, content: object, *, folder: Path | None = None) -
         "unbroken": lambda text: text.replace(" × 10", "\u00a0×\u00a010"),
         "records": lambda frame: list(frame.itertuples(index=False, name=None)),
     }
+    environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
     return environment.get_template(name).render(content=content)
 
 
@@ -407,21 +406,20 @@ def _page_width(figure: Any) -> int:
 
 def _wide_for(frame: pd.DataFrame, rows: int) -> str:
     """For which screens a table is about too wide: ``page phone``, ``phone``, or none."""
+
+    def longest_word(text: str) -> int:  # headings wrap, figures do not
+        return max((len(word) for word in text.split()), default=0)
+
+    def least_width(text: str) -> int:  # characters on the narrowest line: long texts wrap
+        if len(text) <= SHORT_TEXT:
+            return len(text)
+        return min(LINE, max(longest_word(text), SHORT_TEXT // 2))
+
     width = 0.0
     for name in frame.columns:
-        cells = [_least_width(_cell_text(value)) for value in frame[name].head(rows)]
-        width += CELL + CHARACTER * max([_longest_word(str(name)), *cells])
+        cells = [least_width(_cell_text(value)) for value in frame[name].head(rows)]
+        width += CELL + CHARACTER * max([longest_word(str(name)), *cells])
     return "page phone" if width > PAGE else "phone" if width > PHONE else ""
-
-
-def _least_width(text: str) -> int:
-    """Characters on the narrowest line that a cell can be set in: long texts wrap."""
-    return len(text) if len(text) <= SHORT_TEXT else min(LINE, max(_longest_word(text), SHORT_TEXT // 2))
-
-
-def _longest_word(text: str) -> int:
-    """Characters of the longest word: headings wrap, figures do not."""
-    return max((len(word) for word in text.split()), default=0)
 
 
 def _is_number_column(column: pd.Series) -> bool:
@@ -437,15 +435,13 @@ def _cell_text(value: object) -> str:
     if isinstance(value, int | np.integer):
         return str(value).replace("-", "−")
     if isinstance(value, float | np.floating):
-        return str(int(value)).replace("-", "−") if _is_whole(float(value)) else number_text(float(value))
+        number = float(value)
+        # Counts become floating-point numbers as soon as one of their column is missing.
+        whole = number.is_integer() and abs(number) < 1e5
+        return str(int(number)).replace("-", "−") if whole else number_text(number)
     if isinstance(value, datetime.datetime):
         return value.isoformat(sep=" ", timespec="seconds")
     return str(value)
-
-
-def _is_whole(value: float) -> bool:
-    # Counts become floating-point numbers as soon as one of their column is missing.
-    return value.is_integer() and abs(value) < 1e5
 
 
 NODES = 64_000  # of the grid: 85 kB in the page
@@ -472,127 +468,78 @@ def interactive_view(landscape: LandscapeSummary) -> Markup | None:
     markupsafe.Markup or None
         A ``<section>`` with its style, controls, data and script, to be put into a page once.
     """
-    if len(landscape.names) < 2:
-        return None
-    shown = _shown(landscape)
-    values = _on_a_grid(landscape, shown)
-    known = values[np.isfinite(values)]
-    if not len(known):
-        return None
-    low, top = float(known.min()), landscape.top
-    high = float(known.max()) if top is None or not top > low else top + ROOM * (top - low)
-    high = high if high > low else low + 1.0
-    low = 0.0 if abs(low) < 1e-3 * (high - low) else low  # the bottom is zero, but for the grid
-    data = _data(landscape, shown, values, (low, high))
-    lowest = _lowest_pass(landscape)
-    share = 0.5 if lowest is None or not low < lowest < high else SURFACE * (lowest - low) / (high - low)
-    plane = [shown.index(state) for state in chosen_states(landscape, None)]
-    environment = Environment(
-        loader=PackageLoader("siq.report"), autoescape=True, undefined=StrictUndefined, trim_blocks=True
-    )
-    names = data["names"]
-    return Markup(
-        environment.get_template("interactive.html.j2").render(
-            held=[
-                f"{landscape.names[k]} = {landscape.lowest_pass[k]:.3g}"
-                for k in range(len(landscape.names))
-                if k not in shown
-            ],
-            flat=len(shown) == 2,
-            level=round(1000 * share),
-            names=names,
-            plane=plane,
-            wells=[one.label for one in landscape.wells],
-            ways=bool(landscape.ways),
-            solid=f"U over {', '.join(names[:3])}, in three dimensions; the controls below turn it",
-            section="A map of U over two of the states; the controls below choose them",
-            data=Markup(_safe(data)),
-            script=Markup(_script()),
-        )
-    )
-
-
-def _script() -> str:
-    """The script of the view."""
-    return (files("siq.report") / "templates" / "interactive.js").read_text(encoding="utf-8")
-
-
-def _safe(data: dict[str, Any]) -> str:
-    """JSON that ends no element of a page, whatever a state is called."""
-    text = json.dumps(data, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
-    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
-
-
-def _shown(landscape: LandscapeSummary) -> list[int]:
-    """Places of the states that are shown, the two of the picture among them."""
     count = len(landscape.names)
-    first = list(chosen_states(landscape, None))
-    return sorted([*first, *(place for place in range(count) if place not in first)][:MOST_STATES])
-
-
-def _on_a_grid(landscape: LandscapeSummary, shown: Sequence[int]) -> np.ndarray:
-    """U on a grid of the states that are shown."""
-    count = min(int(NODES ** (1 / len(shown)) + 1e-9), MOST_NODES)
-    axes = [landscape.along(place, count) for place in shown]
+    if count < 2:
+        return None
+    first, lowest = list(chosen_states(landscape, None)), landscape.lowest_pass
+    shown = sorted([*first, *(place for place in range(count) if place not in first)][:MOST_STATES])
+    nodes = min(int(NODES ** (1 / len(shown)) + 1e-9), MOST_NODES)
+    axes = [landscape.along(place, nodes) for place in shown]
     mesh = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(shown))
-    values = []
+    parts = []
     for start in range(0, len(mesh), BLOCK_OF_POINTS):
         part = mesh[start : start + BLOCK_OF_POINTS]
-        points = np.tile(landscape.lowest_pass, (len(part), 1))
-        points[:, list(shown)] = part
-        values.append(landscape.potential(points))
-    return np.concatenate(values).reshape((count,) * len(shown))
-
-
-def _data(
-    landscape: LandscapeSummary, shown: Sequence[int], values: np.ndarray, limits: tuple[float, float]
-) -> dict[str, Any]:
-    """What the script draws, as plain data."""
-    low, high = limits
-    steps = np.full(values.shape, UNKNOWN)
+        points = np.tile(lowest, (len(part), 1))
+        points[:, shown] = part
+        parts.append(landscape.potential(points))
+    values = np.concatenate(parts).reshape((nodes,) * len(shown))
     known = np.isfinite(values)
+    if not known.any():
+        return None
+    low, top = float(values[known].min()), landscape.top
+    high = float(values[known].max()) if top is None or not top > low else top + ROOM * (top - low)
+    high = high if high > low else low + 1.0
+    low = 0.0 if abs(low) < 1e-3 * (high - low) else low  # the bottom is zero, but for the grid
+    steps = np.full(values.shape, UNKNOWN)
     steps[known] = np.clip(np.round(253 * (values[known] - low) / (high - low)), 0, ABOVE)
-    units = [unit_text(landscape.units[place]) for place in shown]
+    tops = [landscape.wells[way.start].height + way.barrier for way in landscape.ways]
+    saddle = min((top for top in tops if np.isfinite(top)), default=np.inf)
+    share = SURFACE * (saddle - low) / (high - low) if low < saddle < high else 0.5
     names = [landscape.names[place] for place in shown]
-    unit = unit_text(landscape.energy_unit)
+    units, unit = [unit_text(landscape.units[place]) for place in shown], unit_text(landscape.energy_unit)
 
-    def thinned(path: np.ndarray) -> list[list[float]]:
+    def short(numbers: Any) -> Any:
+        return [short(one) for one in numbers] if np.ndim(numbers) else float(f"{numbers:.6g}")
+
+    def thinned(path: np.ndarray) -> Any:
         rows = np.unique(np.linspace(0, len(path) - 1, min(PATH_POINTS, len(path))).astype(int))
-        return [[_short(value) for value in row] for row in path[rows][:, list(shown)]]
+        return short(path[rows][:, shown])
 
     def marks(points: Sequence[Any]) -> list[dict[str, Any]]:
+        heights = [one.height if np.isfinite(one.height) else low for one in points]
         return [
-            {"label": one.label, "position": [_short(value) for value in one.position[list(shown)]],
-             "U": _short(one.height if np.isfinite(one.height) else low)}
-            for one in points
-        ]  # fmt: skip
+            {"label": one.label, "position": short(one.position[shown]), "U": short(height)}
+            for one, height in zip(points, heights, strict=True)
+        ]
 
-    return {
+    data = {
         "names": names,
         "units": units,
         "labels": [f"{name} ({each})" if each else name for name, each in zip(names, units, strict=True)],
         "unit": unit,
         "energy": f"U ({unit})" if unit else "U (unit of ε)",
-        "box": [[_short(value) for value in landscape.box[place]] for place in shown],
+        "box": short(landscape.box[shown]),
         "shape": list(values.shape),
         "grid": base64.b64encode(steps.astype(np.uint8).tobytes()).decode("ascii"),
-        "low": _short(low),
-        "high": _short(high),
+        "low": short(low),
+        "high": short(high),
         "bands": BANDS,
         "wells": marks(landscape.wells),
         "saddles": marks(landscape.saddles),
         "ways": [
             {"uphill": thinned(way.uphill), "downhill": thinned(way.downhill)} for way in landscape.ways
         ],
-        "pass": [_short(value) for value in landscape.lowest_pass[list(shown)]],
+        "pass": short(lowest[shown]),
     }
-
-
-def _short(value: float) -> float:
-    return float(f"{value:.6g}")
-
-
-def _lowest_pass(landscape: LandscapeSummary) -> float | None:
-    tops = [landscape.wells[way.start].height + way.barrier for way in landscape.ways]
-    known = [top for top in tops if np.isfinite(top)]
-    return min(known) if known else None
+    rest = [place for place in range(count) if place not in shown]
+    view = {
+        "names": names,
+        "data": data,
+        "held": [f"{landscape.names[place]} = {lowest[place]:.3g}" for place in rest],
+        "flat": len(shown) == 2,
+        "level": round(1000 * share),
+        "plane": [shown.index(state) for state in first],
+        "wells": [one.label for one in landscape.wells],
+        "ways": bool(landscape.ways),
+    }
+    return Markup(render_template("interactive.html.j2", view))
