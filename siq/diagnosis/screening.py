@@ -37,8 +37,8 @@ from siq.inference.kalman_filter import (
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
 from siq.inference.trajectories import EDGE_SUBSTEPS, run_along, spread_edges
-from siq.systems.dynamics import Dynamics, arguments_of, evaluable, symbol
-from siq.systems.formulas import compile_values, tape_of
+from siq.systems.dynamics import Dynamics, arguments_of, evaluable, symbol, tape_of
+from siq.systems.formulas import compile_values
 
 
 @dataclass(frozen=True)

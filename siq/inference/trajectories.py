@@ -22,8 +22,8 @@ from siq.inference.kalman_filter import Grid, Linearisation, Noise, integrate_in
 from siq.inference.maximum_likelihood import Fit, fit_by_multiple_shooting, fit_of_states
 from siq.inference.measurements import Expectations, Measurements, first_states
 from siq.numerics.integration import machine_code
-from siq.systems.dynamics import Dynamics, arguments_of, evaluable, symbol
-from siq.systems.formulas import Tape, compile_values
+from siq.systems.dynamics import Dynamics, Tape, arguments_of, evaluable, symbol
+from siq.systems.formulas import compile_values
 
 
 @machine_code

@@ -67,7 +67,7 @@ class Networks:
 
 
 @dataclass(frozen=True)
-class Components:
+class _Components:
     """The decomposition at points, shapes ``(runs, n)`` for V and ``(runs, n, d)`` for the vectors."""
 
     potential: Tensor
@@ -75,11 +75,11 @@ class Components:
     circulatory: Tensor
     vector_field: Tensor
 
-    def split(self, count: int) -> tuple[Components, Components]:
+    def split(self, count: int) -> tuple[_Components, _Components]:
         """The first `count` points, and the others."""
         return (
-            Components(*(tensor[:, :count] for tensor in self._tensors())),
-            Components(*(tensor[:, count:] for tensor in self._tensors())),
+            _Components(*(tensor[:, :count] for tensor in self._tensors())),
+            _Components(*(tensor[:, count:] for tensor in self._tensors())),
         )
 
     def _tensors(self) -> tuple[Tensor, ...]:
@@ -109,7 +109,7 @@ def initial_layers(
     return tuple(layers)
 
 
-def evaluate(networks: Networks, x: Tensor) -> Components:
+def evaluate(networks: Networks, x: Tensor) -> _Components:
     """Evaluate V, ∇V, g and f = -D∇V + g.
 
     Parameters
@@ -130,7 +130,7 @@ def evaluate(networks: Networks, x: Tensor) -> Components:
     gradient = networks.potential_scale / networks.scale * (gradient + 2 * y)
     circulatory = networks.circulatory_scale * _forward(networks.circulatory, y)
     downhill = gradient @ networks.diffusion
-    return Components(
+    return _Components(
         potential=potential.squeeze(-1),
         gradient=gradient,
         circulatory=circulatory,
@@ -265,7 +265,7 @@ def dynamics_loss(
 
 
 def orthogonality_loss(
-    components: Components, diffusion: Tensor, precision: Tensor, *, asymmetry: float
+    components: _Components, diffusion: Tensor, precision: Tensor, *, asymmetry: float
 ) -> Tensor:
     """Mean of w(z, δ), z being the cosine of the angle between ∇V and g.
 

@@ -140,7 +140,7 @@ def slowest_part(data: TrainingData, share: float) -> TrainingData:
     return replace(data, representative_rows=np.sort(data.representative_rows[np.argsort(speed)[:count]]))
 
 
-class Batches:
+class _Batches:
     """Random batches of every run, drawn from its seed and the number of the step.
 
     All runs stand in one table, so that one look-up serves them all. A batch depends on the seed and on
@@ -202,7 +202,7 @@ class Batches:
         """Rows of a chunk of steps, shape ``(runs, steps, pairs + points)``."""
         drawn, offset = [], 0
         for seed, run in zip(self.seeds, self.data, strict=True):
-            generator = np.random.default_rng(child_seed(seed, 1 + chunk))
+            generator = np.random.default_rng(_child_seed(seed, 1 + chunk))
             pairs = generator.integers(
                 len(run.training.h), size=(CHUNK, self.size - self.representative_size)
             )
@@ -214,7 +214,7 @@ class Batches:
         return torch.from_numpy(np.stack(drawn)).to(self.device)
 
 
-def child_seed(seed: np.random.SeedSequence, key: int) -> np.random.SeedSequence:
+def _child_seed(seed: np.random.SeedSequence, key: int) -> np.random.SeedSequence:
     """A child seed by its number, without counting how many were taken before."""
     return np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, key))
 
@@ -225,7 +225,7 @@ def _table(pairs: SnapshotPairs) -> Tensor:
     return torch.from_numpy(np.concatenate([pairs.x0, pairs.xh, (pairs.xh - pairs.x0) / h, h], axis=1))
 
 
-def initial_networks(
+def _initial_networks(
     data: Sequence[TrainingData],
     *,
     options: TrainingOptions,
@@ -330,8 +330,8 @@ def start(
     seeds: Sequence[np.random.SeedSequence],
 ) -> TrainingState:
     """The state of a training before its first step."""
-    generators = [np.random.default_rng(child_seed(seed, 0)) for seed in seeds]
-    networks = initial_networks(data, options=options, diffusion=diffusion, generators=generators)
+    generators = [np.random.default_rng(_child_seed(seed, 0)) for seed in seeds]
+    networks = _initial_networks(data, options=options, diffusion=diffusion, generators=generators)
     zeros = tuple(torch.zeros_like(tensor) for tensor in networks.parameters())
     return TrainingState(0, networks, zeros, zeros, pd.DataFrame(columns=list(HISTORY)))
 
@@ -400,7 +400,7 @@ def train(
             "exp_avg": first.detach().clone().to(device),
             "exp_avg_sq": second.detach().clone().to(device),
         }
-    batches = Batches(data, options=options, seeds=seeds, device=device, dtype=dtype)
+    batches = _Batches(data, options=options, seeds=seeds, device=device, dtype=dtype)
     held_out = batches.held_out()
     objective = _Objective(data, options=options, diffusion=networks.diffusion, device=device, dtype=dtype)
     rows = [state.history] if len(state.history) else []

@@ -27,15 +27,15 @@ from siq.quasipotential.path_chains import (
     MOST_NODES,
     NO_ACTION,
     DiscretisedPath,
+    MinimumActionPath,
     PathProblem,
+    TransitionPath,
     descended,
     evenly,
     first_chains,
     products,
     spaced,
 )
-from siq.quasipotential.path_chains import MinimumActionPath as MinimumActionPath
-from siq.quasipotential.path_chains import TransitionPath as TransitionPath
 from siq.systems.basins import ends_of
 from siq.systems.cycles import Cycle, hessians_along, unstable_direction
 from siq.systems.dynamics import Dynamics

@@ -6,20 +6,23 @@ simulation, landscape and references take it.
 
 Two ways lead to numbers. Without inputs, `Dynamics.drift` and its derivatives take points as rows, with the
 parameters' values inserted. Where parameters are fitted and inputs drive the system, `Dynamics.functions`
-takes components, signals (inputs, their delays, the time) and the values of the parameters.
+takes components, signals (inputs, their delays, the time) and the values of the parameters. A trajectory is
+a long chain of small steps, for which numpy is slow, and to compile the formulas of every candidate would take
+seconds: a tape is made in no time, and one compiled loop runs all tapes (`siq.inference.trajectories`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from enum import IntEnum
 from functools import cached_property
 
 import numpy as np
 import sympy
 
 from siq.systems.diffusion import Diffusion
-from siq.systems.formulas import Tape, compile_formulas, compile_values, delay, exact_number, tape_of
+from siq.systems.formulas import compile_formulas, compile_values, delay, exact_number
 
 TIME = sympy.Symbol("t", real=True)
 Compiled = Callable[..., Sequence[np.ndarray | float]]
@@ -49,6 +52,128 @@ class Signals:
     delayed: np.ndarray
     slopes: np.ndarray
     t: np.ndarray
+
+
+class _Operation(IntEnum):
+    """What a step of a tape does with one register, or two."""
+
+    ADD = 0
+    MULTIPLY = 1
+    INVERT = 2
+    WHOLE_POWER = 3
+    POWER = 4
+    SQRT = 5
+    SIN = 6
+    COS = 7
+    TAN = 8
+    EXP = 9
+    LOG = 10
+    TANH = 11
+    ATAN = 12
+    ABS = 13
+    SIGN = 14
+    MAX = 15
+    MIN = 16
+
+
+_FUNCTIONS = {
+    sympy.sin: _Operation.SIN,
+    sympy.cos: _Operation.COS,
+    sympy.tan: _Operation.TAN,
+    sympy.exp: _Operation.EXP,
+    sympy.log: _Operation.LOG,
+    sympy.tanh: _Operation.TANH,
+    sympy.atan: _Operation.ATAN,
+    sympy.Abs: _Operation.ABS,
+    sympy.sign: _Operation.SIGN,
+}
+_CHAINS = {
+    sympy.Add: _Operation.ADD,
+    sympy.Mul: _Operation.MULTIPLY,
+    sympy.Max: _Operation.MAX,
+    sympy.Min: _Operation.MIN,
+}
+
+
+@dataclass(frozen=True)
+class Tape:
+    """Formulas as operations on registers.
+
+    Attributes
+    ----------
+    operations
+        Shape ``(k, 3)``: an operation, and the registers of its arguments; the second is the exponent
+        itself of a whole power. The result goes to the register ``base + k``.
+    registers
+        To begin with, shape ``(base + k,)``: arguments, which are to be filled in, then constants.
+    base
+        How many arguments and constants there are.
+    results
+        Registers that hold the values of the formulas in the end.
+    """
+
+    operations: np.ndarray
+    registers: np.ndarray
+    base: int
+    results: np.ndarray
+
+
+def tape_of(formulas: Sequence[sympy.Expr], arguments: Sequence[sympy.Symbol]) -> Tape | None:
+    """The tape of formulas in some arguments; None where a formula has a function that no tape knows.
+
+    What occurs twice is worked out once.
+    """
+    formulas = [sympy.sympify(formula) for formula in formulas]
+    constants: dict[sympy.Expr, float] = {}
+    for formula in formulas:
+        for part in sympy.preorder_traversal(formula):
+            if part.is_number and not part.free_symbols:
+                constants.setdefault(part, float(part) if part.is_real else np.nan)
+    known = {each: place for place, each in enumerate((*arguments, *constants))}
+    start = np.concatenate([np.zeros(len(arguments)), list(constants.values())])
+    operations: list[tuple[int, int, int]] = []
+
+    def add(operation: _Operation, one: int, other: int) -> int:
+        operations.append((int(operation), one, other))
+        return len(start) + len(operations) - 1
+
+    def register(formula: sympy.Expr) -> int:
+        """Where the value of a formula is, once the tape has run so far."""
+        if formula not in known:
+            known[formula] = written(formula)
+        return known[formula]
+
+    def written(formula: sympy.Expr) -> int:
+        if formula.func in _CHAINS:
+            place = register(formula.args[0])
+            for other in formula.args[1:]:
+                place = add(_CHAINS[formula.func], place, register(other))
+            return place
+        if formula.func in _FUNCTIONS:
+            return add(_FUNCTIONS[formula.func], register(formula.args[0]), 0)
+        if not isinstance(formula, sympy.Pow):
+            raise NotImplementedError(str(formula.func))
+        base, exponent = formula.args
+        place = register(base)
+        if exponent.is_Integer:
+            if abs(int(exponent)) > 1:
+                place = add(_Operation.WHOLE_POWER, place, abs(int(exponent)))
+        elif abs(exponent) == sympy.S.Half:
+            place = add(_Operation.SQRT, place, 0)
+        else:
+            return add(_Operation.POWER, place, register(exponent))
+        return place if exponent > 0 else add(_Operation.INVERT, place, 0)
+
+    try:
+        results = [register(formula) for formula in formulas]
+    except NotImplementedError:
+        return None
+    return Tape(
+        operations=np.array(operations, dtype=np.int64).reshape(-1, 3),
+        registers=np.concatenate([start, np.zeros(len(operations))]),
+        base=len(start),
+        results=np.array(results, dtype=np.int64),
+    )
 
 
 class ParametricFunctions:

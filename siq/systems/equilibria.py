@@ -86,7 +86,7 @@ def find_equilibria(dynamics: Dynamics, points: np.ndarray) -> list[Equilibrium]
     """
     box = np.stack([points.min(axis=0), points.max(axis=0)], axis=1)
     found = distinct_roots(dynamics, points, box=box, margin=BOX_MARGIN)
-    return classified(dynamics, found, box=box, rate=rate_of(dynamics, points))
+    return classified(dynamics, found, box=box, rate=_rate_of(dynamics, points))
 
 
 def distinct_roots(
@@ -175,7 +175,7 @@ def classified(
     return [classify(dynamics, position, rate=rate) for position in ordered]
 
 
-def rate_of(dynamics: Dynamics, points: np.ndarray) -> float:
+def _rate_of(dynamics: Dynamics, points: np.ndarray) -> float:
     """At which f crosses the box of some points ``(n, d)``, per unit of time: the median over them."""
     width = np.ptp(points, axis=0)
     speed = np.linalg.norm(dynamics.drift(points) / np.where(width > 0, width, 1.0), axis=1)
@@ -373,7 +373,7 @@ def all_equilibria(
         found += new
     rate = float(np.median(np.linalg.norm(dynamics.drift(starts) / width, axis=1)))
     equilibria = tuple(classified(dynamics, found, box=box, rate=rate))
-    degree = boundary_degree(dynamics, equilibria)
+    degree = _boundary_degree(dynamics, equilibria)
     indices = [np.sign(np.linalg.det(dynamics.jacobian(one.position[None])[0])) for one in equilibria]
     if degree is None or degree == int(sum(indices)):
         return equilibria, ()
@@ -384,7 +384,7 @@ def all_equilibria(
     return equilibria, (note,)
 
 
-def boundary_degree(dynamics: Dynamics, equilibria: tuple[Equilibrium, ...]) -> int | None:
+def _boundary_degree(dynamics: Dynamics, equilibria: tuple[Equilibrium, ...]) -> int | None:
     """How often f turns along the boundary of the domain: the sum of the indices of all roots within.
 
     None in more than two dimensions, and where a root on the boundary, or a degenerate one, leaves it open.

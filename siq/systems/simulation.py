@@ -61,7 +61,7 @@ class SimulationOptions:
     noise_intensity: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
 
 
-def sampling_stride(options: SimulationOptions) -> int:
+def _sampling_stride(options: SimulationOptions) -> int:
     """Number of integrator steps between the starts of two pairs.
 
     Raises
@@ -144,7 +144,7 @@ def simulate_snapshots(
         When trajectories run to infinity.
     """
     step = options.pair_step / options.substeps
-    stride = sampling_stride(options)
+    stride = _sampling_stride(options)
     lower, upper = dynamics.box.T
     count = options.trajectories
     x = generator.uniform(lower[:, None], upper[:, None], size=(dynamics.dimension, count))
@@ -302,7 +302,7 @@ class SimulationEntry:
         options = SimulationOptions(
             self.trajectories, self.pairs, self.pair_step, self.interval, self.substeps, self.noise_intensity
         )
-        sampling_stride(options)
+        _sampling_stride(options)
         return options
 
 
@@ -318,10 +318,10 @@ def complete(entry: SimulationEntry, dynamics: Dynamics) -> SimulationEntry:
     """
     if entry.pair_step is not None and entry.interval is not None:
         return entry
-    fastest, slowest = rates(dynamics)
+    fastest, slowest = _rates(dynamics)
     step = entry.pair_step
     if step is None:
-        step = round_down(TURNED / fastest)
+        step = _round_down(TURNED / fastest)
         if entry.interval is not None:
             step = entry.interval / max(math.ceil(entry.interval / step), 2)
     interval = entry.interval
@@ -331,7 +331,7 @@ def complete(entry: SimulationEntry, dynamics: Dynamics) -> SimulationEntry:
     return replace(entry, pair_step=step, interval=interval)
 
 
-def rates(dynamics: Dynamics) -> tuple[float, float]:
+def _rates(dynamics: Dynamics) -> tuple[float, float]:
     """The fastest rate over the domain, and the slowest relaxation to an attractor, per unit of time.
 
     Eigenvalues of the Jacobian, which no choice of the states' units can alter. Where there is no attractor
@@ -369,7 +369,7 @@ def fault_over_domain(dynamics: Dynamics) -> tuple[str, str] | None:
     return None
 
 
-def round_down(value: float) -> float:
+def _round_down(value: float) -> float:
     """The largest of 1, 2 and 5 times a power of ten that is not above a value: numbers that people read."""
     power = 10.0 ** math.floor(math.log10(value))
     return float(f"{max(one for one in (1, 2, 5) if one * power <= value * (1 + 1e-9)) * power:.1g}")

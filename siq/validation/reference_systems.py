@@ -54,7 +54,7 @@ class KnownBarrier:
     how: str
 
 
-def barrier_of(
+def _barrier_of(
     dynamics: Dynamics, quasipotential: sympy.Expr, start: np.ndarray, saddle: np.ndarray, end: np.ndarray
 ) -> KnownBarrier:
     """The barrier of a system whose U is a formula, with the law of Eyring and Kramers.
@@ -197,7 +197,7 @@ def _exact(
 ) -> ReferenceSystem:
     """A system whose U is a formula; ways are attractor, saddle and the attractor behind it, about where."""
     barriers = tuple(
-        barrier_of(dynamics, quasipotential, *(_settled(dynamics, place) for place in way)) for way in ways
+        _barrier_of(dynamics, quasipotential, *(_settled(dynamics, place) for place in way)) for way in ways
     )
     return ReferenceSystem(name, about, source, dynamics, quasipotential, barriers)
 

@@ -10,7 +10,7 @@ from known_settings import PAPER
 from siq.data.recordings import SnapshotPairs
 from siq.errors import NumericalFailure
 from siq.networks.networks import Networks, at_rest, evaluate, initial_layers, move, select_run, side_by_side
-from siq.networks.training import initial_networks, prepare_data
+from siq.networks.training import _initial_networks, prepare_data
 from siq.numerics.randomness import generator
 from siq.systems.diffusion import Diffusion
 
@@ -163,7 +163,7 @@ def some_pairs(count: int = 400) -> SnapshotPairs:
 def test_normalisation_and_rescaling_are_those_of_the_paper(gain: float) -> None:
     options = replace(PAPER, widths=(6, 5), thinning_distance=1.0, potential_gain=gain)
     data = prepare_data(some_pairs(), options=options, generator=generator(0))
-    nets = initial_networks(
+    nets = _initial_networks(
         [data], options=options, diffusion=Diffusion.identity(2), generators=[generator(1)]
     )
     x0, xh, h = data.training.x0, data.training.xh, data.training.h
@@ -199,7 +199,7 @@ def test_the_initial_potential_may_be_as_steep_as_the_descent_within_a_fast_rota
     for source in ("speed", "descent"):
         options = replace(PAPER, widths=(6, 5), thinning_distance=0.1, potential_from=source)
         data = prepare_data(pairs, options=options, generator=generator(0))
-        nets = initial_networks(
+        nets = _initial_networks(
             [data], options=options, diffusion=Diffusion.identity(2), generators=[generator(1)]
         )
         gradient = evaluate(nets, torch.from_numpy(x0)[None]).gradient[0].numpy()

@@ -13,12 +13,12 @@ from known_settings import PAPER
 from siq.data.recordings import Recordings, SnapshotPairs, resample_recordings, snapshot_pairs
 from siq.errors import InputError, NumericalFailure
 from siq.networks.decomposition import TrainingOptions, load_networks, pack, save_networks
-from siq.networks.networks import Components, at_rest, dynamics_loss, orthogonality_loss
+from siq.networks.networks import _Components, at_rest, dynamics_loss, orthogonality_loss
 from siq.networks.training import (
     HISTORY,
-    Batches,
     TrainingData,
     TrainingState,
+    _Batches,
     failed_runs,
     load_checkpoint,
     prepare_data,
@@ -255,7 +255,7 @@ def test_copies_of_a_resampled_recording_do_not_both_train_and_measure() -> None
 def test_batches_hold_training_pairs_only_and_points_are_representative(share: float) -> None:
     options = dataclasses.replace(OPTIONS, representative_share=share)
     parts = [data(run, options) for run in range(2)]
-    batches = Batches(
+    batches = _Batches(
         parts, options=options, seeds=SEEDS[:2], device=torch.device("cpu"), dtype=torch.float64
     )
     for step in (0, 1, 99, 100, 250):
@@ -275,7 +275,7 @@ def test_batches_hold_training_pairs_only_and_points_are_representative(share: f
 
 def test_the_held_out_batch_holds_held_out_pairs_only() -> None:
     part = data(0)
-    batches = Batches(
+    batches = _Batches(
         [part], options=OPTIONS, seeds=SEEDS[:1], device=torch.device("cpu"), dtype=torch.float64
     )
     pairs, _ = batches.held_out()
@@ -285,8 +285,8 @@ def test_the_held_out_batch_holds_held_out_pairs_only() -> None:
 def test_a_batch_depends_on_the_seed_and_the_step_alone() -> None:
     parts = [data(run) for run in range(2)]
 
-    def batches(order: list[int]) -> Batches:
-        return Batches(
+    def batches(order: list[int]) -> _Batches:
+        return _Batches(
             [parts[run] for run in order], options=OPTIONS, seeds=[SEEDS[run] for run in order],
             device=torch.device("cpu"), dtype=torch.float64,
         )  # fmt: skip
@@ -307,8 +307,8 @@ def test_a_single_recording_is_a_numerical_failure() -> None:
 # Loss
 
 
-def components(gradient: torch.Tensor, circulatory: torch.Tensor) -> Components:
-    return Components(gradient[..., 0], gradient, circulatory, circulatory - gradient)
+def components(gradient: torch.Tensor, circulatory: torch.Tensor) -> _Components:
+    return _Components(gradient[..., 0], gradient, circulatory, circulatory - gradient)
 
 
 def vectors(seed: int) -> torch.Tensor:

@@ -9,7 +9,7 @@ import pytest
 import sympy
 
 from siq.systems.dynamics import Dynamics
-from siq.systems.equilibria import all_equilibria, boundary_degree, distinct_roots
+from siq.systems.equilibria import _boundary_degree, all_equilibria, distinct_roots
 from siq.systems.phase_portrait import phase_portrait
 
 X, Y = sympy.symbols("x y", real=True)
@@ -24,7 +24,7 @@ def test_all_of_a_lattice_are_found() -> None:
     equilibria, notes = found(LATTICE)
     kinds = [one.kind for one in equilibria]
     assert len(kinds) == 25 and kinds.count("attractor") == 9 and not notes
-    assert boundary_degree(LATTICE, equilibria) == 1  # nine wells, four tops, twelve saddles
+    assert _boundary_degree(LATTICE, equilibria) == 1  # nine wells, four tops, twelve saddles
 
 
 @pytest.mark.parametrize("apart", [1e-2, 1e-4])
@@ -48,9 +48,9 @@ def test_deflation_leads_from_a_known_root_to_others() -> None:
 
 def test_a_missed_root_is_noticed() -> None:
     equilibria, _ = found(LATTICE)
-    assert boundary_degree(LATTICE, equilibria) is not None
+    assert _boundary_degree(LATTICE, equilibria) is not None
     one_state = Dynamics.of((X,), (X - X**3,), domain=[(-2, 2)])
-    assert boundary_degree(one_state, found(one_state)[0]) == -1
+    assert _boundary_degree(one_state, found(one_state)[0]) == -1
 
 
 def test_a_root_outside_the_domain_is_none_of_it() -> None:

@@ -9,7 +9,7 @@ from known_systems import limit_cycle
 
 from siq.systems.cycles import Recurrence, recurrence_of
 from siq.systems.dynamics import Dynamics
-from siq.systems.equilibria import rate_of
+from siq.systems.equilibria import _rate_of
 from siq.systems.phase_portrait import phase_portrait
 
 x, y, z = (sympy.Symbol(name, real=True) for name in "xyz")
@@ -23,7 +23,7 @@ ROOM = np.array([[-20.0, 20.0], [-25.0, 25.0], [0.0, 50.0]])
 
 def found_of(dynamics: Dynamics, start: np.ndarray, box: np.ndarray) -> Recurrence:
     points = np.random.default_rng(0).uniform(*box.T, (200, len(box)))
-    return recurrence_of(dynamics, start, box=box, rate=rate_of(dynamics, points))
+    return recurrence_of(dynamics, start, box=box, rate=_rate_of(dynamics, points))
 
 
 def settled(dynamics: Dynamics, start: list[float], time: float, step: float = 0.01) -> np.ndarray:

@@ -10,7 +10,7 @@ import sympy
 from known_systems import archetype, as_system, limit_cycle
 
 from siq.systems.dynamics import Dynamics
-from siq.systems.simulation import MOST_STEPS, SimulationEntry, complete, rates, round_down
+from siq.systems.simulation import MOST_STEPS, SimulationEntry, _rates, _round_down, complete
 
 X, Y = sympy.symbols("x y", real=True)
 
@@ -22,8 +22,8 @@ def two_rates(fast: float, slow: float, *, length: float = 1.0) -> Dynamics:
 
 
 def test_the_rates_of_a_linear_system_are_its_eigenvalues_in_any_unit() -> None:
-    assert rates(two_rates(8.0, 0.5)) == pytest.approx((8.0, 0.5))
-    assert rates(two_rates(8.0, 0.5, length=1e-9)) == pytest.approx((8.0, 0.5))
+    assert _rates(two_rates(8.0, 0.5)) == pytest.approx((8.0, 0.5))
+    assert _rates(two_rates(8.0, 0.5, length=1e-9)) == pytest.approx((8.0, 0.5))
 
 
 def test_step_and_length_follow_from_the_rates() -> None:
@@ -60,7 +60,7 @@ def test_every_system_can_be_sampled(known) -> None:
 
 
 def test_numbers_are_rounded_down_to_what_people_read() -> None:
-    assert [round_down(value) for value in (0.0123, 0.0099, 0.05, 7.3, 2.0)] == [0.01, 0.005, 0.05, 5.0, 2.0]
+    assert [_round_down(value) for value in (0.0123, 0.0099, 0.05, 7.3, 2.0)] == [0.01, 0.005, 0.05, 5.0, 2.0]
 
 
 def test_without_a_system_a_step_left_out_is_not_known() -> None:

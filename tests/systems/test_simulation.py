@@ -16,8 +16,8 @@ from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.systems.simulation import (
     SimulationOptions,
+    _sampling_stride,
     noise_source,
-    sampling_stride,
     simulate_snapshots,
     simulate_stationary,
 )
@@ -142,7 +142,7 @@ def test_without_noise_the_snapshots_are_those_of_the_runge_kutta_rule_to_the_la
     x = source.uniform(lower[:, None], upper[:, None], size=(3, SMALL.trajectories))
     expected = []
     for pair in range(SMALL.pairs):
-        for _ in range(sampling_stride(SMALL) - (SMALL.substeps if pair else 0)):
+        for _ in range(_sampling_stride(SMALL) - (SMALL.substeps if pair else 0)):
             x = runge_kutta_step(archetype.drift_of_components, x, SMALL.pair_step / SMALL.substeps)
         expected.append(x)
         for _ in range(SMALL.substeps):
