@@ -46,7 +46,7 @@ class _CardPart(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class _StateEntry(_CardPart):
+class StateEntry(_CardPart):
     """One state of a card: its unit, and the interval in which initial states are drawn.
 
     Attributes
@@ -87,7 +87,7 @@ class ParameterEntry(_CardPart):
     fixed: bool = False
 
 
-class _InputEntry(_CardPart):
+class InputEntry(_CardPart):
     """An exogenous signal u(t), a column of the recordings.
 
     Attributes
@@ -103,7 +103,7 @@ class _InputEntry(_CardPart):
     interpolation: Literal["zero_order", "linear", "band_limited"] = "linear"
 
 
-class _ExactEntry(_CardPart):
+class ExactEntry(_CardPart):
     """Exact answers, where known. They serve scoring only; no method reads them.
 
     Attributes
@@ -153,13 +153,13 @@ class SystemCard(_CardPart):
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
     title: str = ""
     time_unit: str = "1"
-    states: dict[Name, _StateEntry] = Field(min_length=1)
-    inputs: dict[Name, _InputEntry] = {}
+    states: dict[Name, StateEntry] = Field(min_length=1)
+    inputs: dict[Name, InputEntry] = {}
     parameters: dict[Name, ParameterEntry] = {}
     equations: dict[str, Formula]
     outputs: Annotated[dict[Name, Formula], Field(min_length=1)] | None = None
     diffusion: DiffusionEntry = "identity"
-    exact: _ExactEntry = _ExactEntry()
+    exact: ExactEntry = ExactEntry()
 
     @model_validator(mode="after")
     def _consistent(self) -> SystemCard:

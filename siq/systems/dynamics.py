@@ -6,9 +6,9 @@ simulation, landscape and references take it.
 
 Two ways lead to numbers. Without inputs, `Dynamics.drift` and its derivatives take points as rows, with the
 parameters' values inserted. Where parameters are fitted and inputs drive the system, `Dynamics.functions`
-takes components, signals (inputs, their delays, the time) and the values of the parameters. A trajectory is
-a long chain of small steps, for which numpy is slow, and to compile the formulas of every candidate would take
-seconds: a tape is made in no time, and one compiled loop runs all tapes (`siq.inference.trajectories`).
+takes components, signals (inputs, their delays, the time) and the values of the parameters. Numpy is slow for
+the many small steps of a trajectory, and to compile the formulas of every candidate would take seconds: a
+tape is made in no time, and one compiled loop runs all tapes (`siq.inference.trajectories`).
 """
 
 from __future__ import annotations
