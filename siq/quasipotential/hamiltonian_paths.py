@@ -74,14 +74,14 @@ GAUSS = np.polynomial.legendre.leggauss(3)  # exact to the order of collocation
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
+class _Solution:
     """A solution over backward times, from -T to 0: positions and momenta, and its mesh."""
 
     at: Callable[[np.ndarray], np.ndarray]
     times: np.ndarray
 
 
-class HamiltonianProblem:
+class _HamiltonianProblem:
     """Hamilton's equations in units in which M is the unit matrix and the end is at the distance one."""
 
     def __init__(self, dynamics: Dynamics, attractor: np.ndarray, end: np.ndarray) -> None:
@@ -156,7 +156,7 @@ class HamiltonianProblem:
         """The condition that y ends at a point, as a matrix before (y, q) and what it gives."""
         return np.eye(self.dimension, 2 * self.dimension), last
 
-    def at_saddle(self, solution: Solution) -> tuple[np.ndarray, np.ndarray]:
+    def at_saddle(self, solution: _Solution) -> tuple[np.ndarray, np.ndarray]:
         """The conditions at the saddle, as close to it as a solution ends: one more than unknowns."""
         d, rate = self.dimension, self.unstable
         assert rate is not None
@@ -169,8 +169,8 @@ class HamiltonianProblem:
         return matrix, right
 
     def solved(
-        self, guess: Solution, last: tuple[np.ndarray, np.ndarray], tolerance: float
-    ) -> Solution | None:
+        self, guess: _Solution, last: tuple[np.ndarray, np.ndarray], tolerance: float
+    ) -> _Solution | None:
         """The solution with a condition at its end, None where Newton's method does not come to one.
 
         As H is conserved, a condition at the saddle is one too many. A further unknown k makes up for it,
@@ -210,13 +210,13 @@ class HamiltonianProblem:
                 )  # fmt: skip
             except (ValueError, np.linalg.LinAlgError):  # not finite, where a trial has run away
                 return None
-        return Solution(found.sol, found.x) if found.success else None
+        return _Solution(found.sol, found.x) if found.success else None
 
 
-def _interpolated(times: np.ndarray, states: np.ndarray) -> Solution:
+def _interpolated(times: np.ndarray, states: np.ndarray) -> _Solution:
     """States ``(n, 2d)`` at times, as a first guess."""
     curve = Akima1DInterpolator(times, states)
-    return Solution(lambda t: np.asarray(curve(t)).T, times)
+    return _Solution(lambda t: np.asarray(curve(t)).T, times)
 
 
 def hamiltonian_paths(
@@ -254,15 +254,15 @@ def hamiltonian_paths(
             f"{attractor.tolist()} is no stable equilibrium; where noise acts on some states only, paths are"
             " sought from stable equilibria alone"
         )
-    problem = HamiltonianProblem(dynamics, attractor, end)
+    problem = _HamiltonianProblem(dynamics, attractor, end)
     found: list[MinimumActionPath] = []
-    known: list[Solution] = []
+    known: list[_Solution] = []
 
-    def finished(solution: Solution | None) -> None:
+    def finished(solution: _Solution | None) -> None:
         path = None if solution is None else _finished(problem, solution, tolerance)
         found.extend([] if path is None else [path])
 
-    def apart(one: Solution, two: Solution) -> bool:
+    def apart(one: _Solution, two: _Solution) -> bool:
         """Whether two solutions that end at one state come from different sides."""
         times = np.linspace(max(one.times[0], two.times[0]), 0.0, COMPARED_TIMES)
         difference = one.at(times)[: problem.dimension] - two.at(times)[: problem.dimension]
@@ -301,7 +301,7 @@ def hamiltonian_paths(
     return sorted(found, key=lambda path: (not path.smooth, path.action))
 
 
-def _last_states(problem: HamiltonianProblem, beside: np.ndarray | None) -> list[np.ndarray]:
+def _last_states(problem: _HamiltonianProblem, beside: np.ndarray | None) -> list[np.ndarray]:
     """Where the end is moved to: itself, or states before the saddle on the side of A."""
     if problem.unstable is None:
         return [problem.end]
@@ -313,7 +313,7 @@ def _last_states(problem: HamiltonianProblem, beside: np.ndarray | None) -> list
     return [problem.end + side * APPROACH * one / np.linalg.norm(one) for one in problem.arrivals]
 
 
-def _followed(problem: HamiltonianProblem, curve: np.ndarray) -> Solution | None:
+def _followed(problem: _HamiltonianProblem, curve: np.ndarray) -> _Solution | None:
     """The solution at the end of a curve, None where one of the steps fails."""
     outside = np.linalg.norm(curve, axis=1) >= FIRST_END
     curve = curve[int(np.flatnonzero(~outside).max(initial=0)) + 1 :]
@@ -322,7 +322,7 @@ def _followed(problem: HamiltonianProblem, curve: np.ndarray) -> Solution | None
     def at(place: float) -> np.ndarray:
         return np.array([np.interp(place, along, column) for column in curve.T])
 
-    def moved_on(guess: Solution, before: Solution, share: float) -> Solution:
+    def moved_on(guess: _Solution, before: _Solution, share: float) -> _Solution:
         """Moved on by a share of what it has moved from the one before, as far as both go back."""
 
         def states(times: np.ndarray) -> np.ndarray:
@@ -330,10 +330,10 @@ def _followed(problem: HamiltonianProblem, curve: np.ndarray) -> Solution | None
             own[:, common] += share * (own[:, common] - before.at(times[common]))
             return own
 
-        return Solution(states, guess.times)
+        return _Solution(states, guess.times)
 
     solution = problem.solved(_linear(problem, at(0.0)), problem.fixed(at(0.0)), ROUGH)
-    before: tuple[Solution, float] | None = None
+    before: tuple[_Solution, float] | None = None
     place, step, failed = 0.0, LONGEST_STEP, False
     while solution is not None and place < along[-1]:
         ahead = min(place + step, along[-1])
@@ -352,7 +352,7 @@ def _followed(problem: HamiltonianProblem, curve: np.ndarray) -> Solution | None
     return solution
 
 
-def _linear(problem: HamiltonianProblem, last: np.ndarray) -> Solution:
+def _linear(problem: _HamiltonianProblem, last: np.ndarray) -> _Solution:
     """The way to a point close to A, were f linear: q = y there."""
     back = scipy.linalg.expm(-SPIRAL_STEP / problem.fastest * problem.growth)
     y = [last]
@@ -363,7 +363,7 @@ def _linear(problem: HamiltonianProblem, last: np.ndarray) -> Solution:
     return _interpolated(times, np.concatenate([states, states], axis=1))
 
 
-def _longer(problem: HamiltonianProblem, solution: Solution) -> Solution:
+def _longer(problem: _HamiltonianProblem, solution: _Solution) -> _Solution:
     """A solution at evenly spaced times, begun so close to A as the power series asks for."""
     first = solution.at(solution.times[:1])[: problem.dimension, 0]
     if np.linalg.norm(first) > START:
@@ -372,10 +372,10 @@ def _longer(problem: HamiltonianProblem, solution: Solution) -> Solution:
         states = np.concatenate([before.at(before.times[:-1]), solution.at(solution.times)], axis=1)
         solution = _interpolated(times, states.T)
     count = int(-solution.times[0] * problem.fastest / SPIRAL_STEP) + 2
-    return Solution(solution.at, np.linspace(solution.times[0], 0.0, count))
+    return _Solution(solution.at, np.linspace(solution.times[0], 0.0, count))
 
 
-def _onward(problem: HamiltonianProblem, solution: Solution, distance: float) -> Solution:
+def _onward(problem: _HamiltonianProblem, solution: _Solution, distance: float) -> _Solution:
     """A solution continued by the linear equations to a distance from the saddle."""
     d, rate = problem.dimension, problem.unstable
     assert rate is not None
@@ -399,7 +399,7 @@ def _onward(problem: HamiltonianProblem, solution: Solution, distance: float) ->
     return _interpolated(times - times[-1], rows)
 
 
-def _reversed_motion(problem: HamiltonianProblem, beside: np.ndarray | None) -> Solution | None:
+def _reversed_motion(problem: _HamiltonianProblem, beside: np.ndarray | None) -> _Solution | None:
     """A first guess of the path to a saddle, which ends before it: the way down with velocities reversed.
 
     `beside` is a trajectory of f from the saddle to the attractor, shape ``(k, d)``. There is none where
@@ -448,7 +448,7 @@ def _reversed_motion(problem: HamiltonianProblem, beside: np.ndarray | None) -> 
     q = momenta @ flow.units / (2 * flow.level)
     times = step * np.arange(1 - len(x), 1)
     guess = _interpolated(times, np.concatenate([y, q], axis=1))
-    return Solution(guess.at, times[::-REVERSED_PACE][::-1])
+    return _Solution(guess.at, times[::-REVERSED_PACE][::-1])
 
 
 def _velocities_of(dynamics: Dynamics) -> tuple[np.ndarray, np.ndarray] | None:
@@ -469,10 +469,12 @@ def _velocities_of(dynamics: Dynamics) -> tuple[np.ndarray, np.ndarray] | None:
     return None if any(noise[place][place] != 0 for place in positions) else (positions, velocities)
 
 
-def _finished(problem: HamiltonianProblem, solution: Solution, tolerance: float) -> MinimumActionPath | None:
+def _finished(
+    problem: _HamiltonianProblem, solution: _Solution, tolerance: float
+) -> MinimumActionPath | None:
     """The path of a solution that ends close to the end: on to it, and solved as finely as is asked."""
     if problem.unstable is None:
-        ended: Solution | None = solution
+        ended: _Solution | None = solution
         last = problem.fixed(problem.end)
     else:
         # What winds has to be known better than on the way, or H is not zero where the condition changes.
@@ -493,7 +495,7 @@ def _finished(problem: HamiltonianProblem, solution: Solution, tolerance: float)
     rough = None if ended is None else problem.solved(_longer(problem, ended), last, ROUGH / 10)
     if rough is None:
         return None
-    fine: Solution | None = None
+    fine: _Solution | None = None
     value = _values(problem, rough)[-1]
     for fineness in (FINE, FINE / 10, FINE / 100):
         fine = problem.solved(rough, last, fineness)
@@ -505,7 +507,7 @@ def _finished(problem: HamiltonianProblem, solution: Solution, tolerance: float)
     return _path(problem, rough, abs(value - before), tolerance)
 
 
-def _as_at_saddle(problem: HamiltonianProblem, solution: Solution) -> Solution | None:
+def _as_at_saddle(problem: _HamiltonianProblem, solution: _Solution) -> _Solution | None:
     """A solution that ends somewhere before the saddle, moved to where those end that come to it.
 
     In steps as long as Newton's method follows: of what other directions have gathered on the way the ends
@@ -526,7 +528,7 @@ def _as_at_saddle(problem: HamiltonianProblem, solution: Solution) -> Solution |
     return moved
 
 
-def _values(problem: HamiltonianProblem, solution: Solution) -> np.ndarray:
+def _values(problem: _HamiltonianProblem, solution: _Solution) -> np.ndarray:
     """V at the nodes of the mesh, and at the end: the last one twice if that is where the mesh ends."""
     length = np.diff(solution.times)
     total = np.zeros(len(length))
@@ -547,7 +549,7 @@ def _values(problem: HamiltonianProblem, solution: Solution) -> np.ndarray:
 
 
 def _path(
-    problem: HamiltonianProblem, solution: Solution, error: float, tolerance: float
+    problem: _HamiltonianProblem, solution: _Solution, error: float, tolerance: float
 ) -> MinimumActionPath:
     d, flow = problem.dimension, problem.flow
     z = solution.at(solution.times).T
@@ -560,7 +562,7 @@ def _path(
     times[0], times[-1] = solution.times[0], 0.0
     z = solution.at(times).T
     places = np.union1d(times, solution.times)
-    whole = _values(problem, Solution(solution.at, places))
+    whole = _values(problem, _Solution(solution.at, places))
     values = np.append(whole[np.searchsorted(places, times)], whole[-1])
     y, q = z[:, :d], z[:, d:]
     force = flow.dynamics.drift(flow.points(y)) @ flow.inverse.T
@@ -580,7 +582,7 @@ def _path(
     )  # fmt: skip
 
 
-def _smooth(problem: HamiltonianProblem, solution: Solution) -> bool:
+def _smooth(problem: _HamiltonianProblem, solution: _Solution) -> bool:
     """Whether no neighbour crosses the path, by the tangents of those that leave A beside it."""
     d, times = problem.dimension, solution.times
     middles = (times[1:] + times[:-1]) / 2

@@ -247,15 +247,10 @@ class ErrorInRegion:
     error_everywhere: float = float("nan")
 
 
-def compare_wells(reference: ReferenceLandscape, wells: Mapping[int, Well]) -> list[ErrorInRegion]:
+def _compare_wells(reference: ReferenceLandscape, wells: Mapping[int, Well]) -> list[ErrorInRegion]:
     """Formulas of wells against characteristics, each below a share of its barrier.
 
-    Parameters
-    ----------
-    reference
-        The references.
-    wells
-        Formulas by the index of the reference's attractor; a well without one counts as not covered.
+    They have the index of the reference's attractor. A well without a formula counts as not covered.
     """
     rows = []
     for index in range(len(reference.attractors)):
@@ -265,7 +260,7 @@ def compare_wells(reference: ReferenceLandscape, wells: Mapping[int, Well]) -> l
         if index in wells:
             x = reference.points[inside]
             values = 2 * wells[index].known_values(x)
-            everywhere = relative_l2(2 * wells[index].values(x), exact)
+            everywhere = _relative_l2(2 * wells[index].values(x), exact)
         rows.append(_compared(_well_region(index), values, exact, everywhere))
     return rows
 
@@ -285,11 +280,11 @@ def compare_estimate(
         at = float(potential(attractor[None])[0])
         exact = reference.characteristics[index][inside]
         rows.append(_compared(_well_region(index), values[inside] - at, exact))
-    rows.append(compare_overall(reference, values, below=below, shifted=True))
+    rows.append(_compare_overall(reference, values, below=below, shifted=True))
     return rows
 
 
-def compare_overall(
+def _compare_overall(
     reference: ReferenceLandscape, values: np.ndarray, *, below: float | None, shifted: bool = False
 ) -> ErrorInRegion:
     """Values of U at the reference's points, over all wells below a level."""
@@ -312,9 +307,9 @@ def compare_landscape(
         if distance.min() < ATTRACTOR_MATCH_TOLERANCE:
             pairs[int(np.argmin(distance))] = place
     local = {index: well for index, place in pairs.items() if (well := landscape.wells[place]) is not None}
-    rows = compare_wells(reference, local)
+    rows = _compare_wells(reference, local)
     if (whole := landscape.global_quasipotential) is not None:
-        rows.append(compare_overall(reference, whole(reference.points), below=below))
+        rows.append(_compare_overall(reference, whole(reference.points), below=below))
     for index, place in pairs.items():
         barriers = [way.barrier for way in landscape.transitions if way.start == place]
         lowest = min((one for one in barriers if np.isfinite(one) and one), default=np.nan)
@@ -327,7 +322,7 @@ def compare_mesh(reference: ReferenceLandscape, *, below: float | None) -> list[
     """The reference's own mesh against its characteristics, and its barriers against the least action."""
     errors = np.abs(reference.mesh_barriers / reference.barriers - 1)
     return [
-        compare_overall(reference, reference.mesh_values, below=below),
+        _compare_overall(reference, reference.mesh_values, below=below),
         *(
             ErrorInRegion(f"barrier from A{index + 1}", 1, 1.0, float(one))
             for index, one in enumerate(errors)
@@ -340,7 +335,7 @@ def compare_with_mesh(values: np.ndarray, mesh: np.ndarray, *, below: float) -> 
     exact = mesh - np.nanmin(mesh)
     inside = np.nan_to_num(exact, nan=np.inf) < below
     own, exact = values[inside], exact[inside]
-    error = relative_l2(own - np.median(own - exact), exact)
+    error = _relative_l2(own - np.median(own - exact), exact)
     return ErrorInRegion(f"U < {below:.4g}", int(inside.sum()), 1.0, error)
 
 
@@ -350,7 +345,7 @@ def overall_level(reference: ReferenceLandscape) -> float:
     return float(OVERALL_LEVEL * tops[np.isfinite(tops)].max(initial=0.0))
 
 
-def relative_l2(values: np.ndarray, exact: np.ndarray) -> float:
+def _relative_l2(values: np.ndarray, exact: np.ndarray) -> float:
     """``‖u - u*‖ / ‖u*‖``, NaN for no points."""
     size = float(np.linalg.norm(exact))
     return float(np.linalg.norm(values - exact)) / size if size > 0 else float("nan")
@@ -365,7 +360,7 @@ def _compared(
 ) -> ErrorInRegion:
     known = np.isfinite(values)
     covered = float(known.mean()) if len(values) else 0.0
-    return ErrorInRegion(region, len(exact), covered, relative_l2(values[known], exact[known]), everywhere)
+    return ErrorInRegion(region, len(exact), covered, _relative_l2(values[known], exact[known]), everywhere)
 
 
 COLUMNS = (
@@ -394,7 +389,7 @@ def compare_with(equations: Landscape, learned: Landscape, *, noise: float | Non
         differences(equations, learned, noises=() if noise is None else (noise,)), columns=list(COLUMNS)
     )
     places = np.array([one.position for one in (*equations.attractors, *equations.equilibria)])
-    check_same_noise(equations.dynamics, learned.dynamics, places, found=learned.field_estimate)
+    _check_same_noise(equations.dynamics, learned.dynamics, places, found=learned.field_estimate)
     return table.fillna({"note": ""})
 
 
@@ -527,24 +522,12 @@ def _known(value: float | None) -> float:
     return np.nan if value is None else float(value)
 
 
-def check_same_noise(
+def _check_same_noise(
     equations: Dynamics, trajectories: Dynamics, x: np.ndarray, *, found: FieldEstimate | None
 ) -> None:
-    """Refuse two landscapes whose D are not the same, and U in different units with them.
+    """Refuse two landscapes whose D are not the same at states ``(n, d)``, and U with them.
 
-    Parameters
-    ----------
-    equations, trajectories
-        Of the same states.
-    x
-        States at which D is compared, shape ``(n, d)``.
-    found
-        The identified f, whose D may have been estimated and has errors then; None where f is given.
-
-    Raises
-    ------
-    ValueError
-        With both D and the remedy.
+    The D of `found`, an identified f, may have been estimated and has errors then.
     """
     one, other, d = equations.diffusion, trajectories.diffusion, equations.dimension
     # Unit vectors and their sums tell a symmetric matrix; in the unit of the noise, or states would differ.

@@ -23,7 +23,7 @@ visited last (the solution of the time-reversed ``L̃ q = 0`` with q = 1 in this
 
 exactly, for any barrier (Vanden-Eijnden, *Transition path theory*, Lect. Notes Phys. 703 (2006) 453). In more
 than two states it is predicted by the law of Eyring and Kramers. A record knows only what it saw at its
-samples, and so the cores of the prediction are smaller by what a walk oversteps (`Cores.as_sampled`).
+samples, and so the cores of the prediction are smaller by what a walk oversteps (`_Cores.as_sampled`).
 
 **Which error.** The same is computed for draws of f and ε from their distributions, with the cores where they
 are. n visits that ended in a time T were as likely as Poisson's law with the mean T/τ says, where τ is
@@ -87,7 +87,7 @@ MEAN_DISTANCE = 0.8687  # of Kolmogorov's statistic: √(π/2) ln 2
 
 
 @dataclass(frozen=True)
-class CellProcess:
+class _CellProcess:
     """The Markov jump process between the cells of a box.
 
     Attributes
@@ -107,12 +107,7 @@ class CellProcess:
     def last_visited(self, cores: np.ndarray, which: int) -> np.ndarray:
         """Probability that core `which` was the last of all that was visited: shape ``(n,)``.
 
-        Parameters
-        ----------
-        cores
-            Shape ``(n,)``: the core that each cell belongs to, -1 between them.
-        which
-            One of them.
+        `cores`, shape ``(n,)``, has the core that each cell belongs to, -1 between them.
         """
         found = (cores == which).astype(float)
         free = np.flatnonzero(cores < 0)
@@ -133,32 +128,15 @@ class CellProcess:
         return float(own.sum() / flow) if flow > 0 else float("inf")
 
 
-def cell_process(
+def _cell_process(
     dynamics: Dynamics, intensity: float, box: np.ndarray, *, cells: int | None = None
-) -> CellProcess:
-    """The process between cells of a box, with its invariant density.
+) -> _CellProcess:
+    """The process between cells of a box that nothing leaves, with its invariant density.
 
-    Parameters
-    ----------
-    dynamics
-        f and D of one or two states; noise has to reach each of them.
-    intensity
-        ε.
-    box
-        Shape ``(d, 2)``, which nothing leaves. In two states with mixed terms of D it is the parallelogram's
-        hull that is covered.
-    cells
-        Along each state.
-
-    Raises
-    ------
-    NumericalFailure
-        With more than two states, or where the noise is too weak for so few cells or does not reach a state.
-
-    Notes
-    -----
-    A formula of D that was learned from recordings may be no covariance far from them. Cells where that is so
-    are left out, and nothing goes there.
+    In two states with mixed terms of D it is the parallelogram's hull that is covered. A formula of D that
+    was learned from recordings may be no covariance far from them: cells where that is so are left out. It
+    is refused (`NumericalFailure`) with more than two states, and where the noise is too weak for so few
+    cells along each state, or does not reach a state.
     """
     dimension = dynamics.dimension
     if dimension not in CELLS:
@@ -205,7 +183,7 @@ def cell_process(
     tensor, drift = np.diagonal(noise(y), axis1=1, axis2=2), flow(y)
     if float((density[:, None] * np.abs(drift) * steps / tensor).sum(axis=0).max()) > COARSE:
         raise NumericalFailure("the noise is too weak for a grid: the wells are narrower than its cells")
-    return CellProcess(y @ shear.T, rates, density)
+    return _CellProcess(y @ shear.T, rates, density)
 
 
 def _rates(
@@ -284,7 +262,7 @@ def _invariant_density(rates: sparse.csr_matrix) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class Cores:
+class _Cores:
     """The cores of wells: where ``(x - A)ᵀ M (x - A)``, U to the second order, is below a level.
 
     Attributes
@@ -301,8 +279,8 @@ class Cores:
     hessians: np.ndarray
     levels: np.ndarray
 
-    def as_sampled(self, dynamics: Dynamics, intensity: float, step: float) -> Cores:
-        """Cores that a state meets all the time as often as it is seen in these at samples a step apart.
+    def as_sampled(self, dynamics: Dynamics, intensity: float, step: float) -> _Cores:
+        """_Cores that a state meets all the time as often as it is seen in these at samples a step apart.
 
         Between two samples a state may come into a core and leave it unseen. A random walk meets a boundary
         as Brownian motion meets one that lies `OVERSHOOT` standard deviations of a step farther on (Chernoff;
@@ -329,24 +307,17 @@ class Cores:
 
 
 @dataclass(frozen=True, eq=False)
-class CellVisits:
+class _CellVisits:
     """The operator of one f, with the probability of each cell to belong to a visit of each well."""
 
-    process: CellProcess
+    process: _CellProcess
     last: tuple[np.ndarray, ...]
     means: np.ndarray
 
     def distribution(self, well: int, state: int, places: np.ndarray, blur: float = 0.0) -> np.ndarray:
-        """Distribution function of a state during visits to a well, at places ``(m,)``.
+        """Distribution function of a state at places ``(m,)`` during visits to a well.
 
-        Parameters
-        ----------
-        well, state
-            Their indices.
-        places
-            Values of the state.
-        blur
-            Standard deviation of measurement noise.
+        `blur` is the standard deviation of measurement noise.
         """
         at, group = np.unique(np.round(self.process.points[:, state], 12), return_inverse=True)
         mass = np.bincount(group, weights=self.process.density * self.last[well])
@@ -358,7 +329,7 @@ class CellVisits:
 
 
 @dataclass(frozen=True, eq=False)
-class PredictedVisits:
+class _PredictedVisits:
     """Mean times of visits to the wells, core to core, as f, D and ε predict them.
 
     Attributes
@@ -375,11 +346,11 @@ class PredictedVisits:
 
     times: tuple[tuple[int, float, float], ...]
     method: str
-    processes: tuple[CellVisits, ...] = ()
+    processes: tuple[_CellVisits, ...] = ()
     notes: tuple[str, ...] = ()
 
 
-def cores_about(dynamics: Dynamics, portrait: PhasePortrait, intensity: float) -> Cores:
+def _cores_about(dynamics: Dynamics, portrait: PhasePortrait, intensity: float) -> _Cores:
     """The core of each attractor: U below ε, or below half of what it is at the next saddle or attractor."""
     attractors = np.array([one.position for one in portrait.attractors])
     hessians, levels = [], []
@@ -390,24 +361,15 @@ def cores_about(dynamics: Dynamics, portrait: PhasePortrait, intensity: float) -
         lowest = float(np.einsum("ni,ij,nj->n", away, hessian, away).min())
         hessians.append(hessian)
         levels.append(min(intensity, CORE_SHARE * lowest))
-    return Cores(attractors, np.array(hessians), np.array(levels))
+    return _Cores(attractors, np.array(hessians), np.array(levels))
 
 
-def predicted_visits(
-    found: FieldEstimate, portrait: PhasePortrait, noise: NoiseStrength, cores: Cores, *, seed: int = 0
-) -> PredictedVisits:
+def _predicted_visits(
+    found: FieldEstimate, portrait: PhasePortrait, noise: NoiseStrength, cores: _Cores, *, seed: int = 0
+) -> _PredictedVisits:
     """Mean times of visits to every well, by the operator where it can be solved, or else by the law.
 
-    Parameters
-    ----------
-    found, portrait
-        f with its uncertainty, and what follows from it.
-    noise
-        ε with its error.
-    cores
-        See `cores_about`.
-    seed
-        Decides the draws.
+    Errors are those of f and ε, drawn from their distributions by the seed.
     """
     notes: list[str] = []
     dynamics, width = found.dynamics, portrait.box[:, 1] - portrait.box[:, 0]
@@ -431,7 +393,7 @@ def predicted_visits(
             for well, (mean, error) in enumerate(zip(processes[0].means, errors, strict=True))
             if np.isfinite(mean) and np.isfinite(error)
         ]
-        return PredictedVisits(tuple(times), "operator", tuple(processes))
+        return _PredictedVisits(tuple(times), "operator", tuple(processes))
     ways = transitions(found, ways_out(dynamics, portrait), [None] * len(cores.attractors))
     times, missing = [], []
     for well, one in enumerate(portrait.attractors):
@@ -442,7 +404,7 @@ def predicted_visits(
             times.append((well, mean_time.value, mean_time.error))
     if missing:
         notes.append(f"no law says how long {' and '.join(missing)} lasts")
-    return PredictedVisits(tuple(times), "law", notes=tuple(notes))
+    return _PredictedVisits(tuple(times), "law", notes=tuple(notes))
 
 
 def _drawn_system(found: FieldEstimate, *, generator: np.random.Generator) -> Dynamics:
@@ -462,15 +424,15 @@ def _drawn_system(found: FieldEstimate, *, generator: np.random.Generator) -> Dy
     return field_dynamics(found.library, support, values, diffusion=diffusion)
 
 
-def _visits(dynamics: Dynamics, intensity: float, box: np.ndarray, cores: Cores, cells: int) -> CellVisits:
-    process = cell_process(dynamics, intensity, box, cells=cells)
+def _visits(dynamics: Dynamics, intensity: float, box: np.ndarray, cores: _Cores, cells: int) -> _CellVisits:
+    process = _cell_process(dynamics, intensity, box, cells=cells)
     core = cores.of(process.points)
     count = len(cores.attractors)
     if len(np.unique(core[core >= 0])) < count:
         raise NumericalFailure("the core of a well is smaller than a cell of the grid")
     last = tuple(process.last_visited(core, well) for well in range(count))
     means = np.array([process.mean_visit(core, well) for well in range(count)])
-    return CellVisits(process, last, means)
+    return _CellVisits(process, last, means)
 
 
 @dataclass(frozen=True)
@@ -636,7 +598,7 @@ def check_occupancy(
             " transitions seen, and what was identified has one stable state",
             unseen=seen,
         )
-    cores = cores_about(found.dynamics, portrait, noise.intensity)
+    cores = _cores_about(found.dynamics, portrait, noise.intensity)
     runs = runs_of(recordings)
     visits = continued_visits(cores.of(recordings.values), runs_of(joined(recordings)))
     apart = [run for run in runs if held_out[recordings.recording[run.start]]]
@@ -646,17 +608,17 @@ def check_occupancy(
     if found.dynamics.dimension not in CELLS and not any(one.visits for one in whole):
         return OccupancyCheck(missing="the recordings do not hop")
     sampled = cores.as_sampled(found.dynamics, noise.intensity, usual_step(recordings))
-    prediction = predicted_visits(found, portrait, noise, sampled, seed=seed)
+    prediction = _predicted_visits(found, portrait, noise, sampled, seed=seed)
     tested = tuple(
         VisitTest(
             well, held[well], whole[well], mean, error, prediction.method,
-            probability_of(held[well], mean, error),
+            _probability_of(held[well], mean, error),
         )
         for well, mean, error in prediction.times
     )  # fmt: skip
     if not tested:
         return OccupancyCheck(missing=f"no dwell time is predicted: {'; '.join(prediction.notes)}")
-    chance = min(probability_of(one.whole, one.predicted, one.error) for one in tested)
+    chance = min(_probability_of(one.whole, one.predicted, one.error) for one in tested)
     if not any(one.visits for one in whole) and chance > NO_HOP_PROBABILITY:
         return OccupancyCheck(missing="the recordings do not hop, nor should they have in their time")
     # Each state's distribution during the visits to each well, on the held-out runs.
@@ -678,7 +640,7 @@ def check_occupancy(
     return OccupancyCheck(tested, tuple(densities), notes=prediction.notes)
 
 
-def probability_of(count: DwellCount, mean: float, error: float) -> float:
+def _probability_of(count: DwellCount, mean: float, error: float) -> float:
     """Two-sided probability of so many visits in their time, if they last `mean` within its error."""
     if count.time <= 0 or not np.isfinite(mean):
         return 1.0
@@ -691,7 +653,7 @@ def probability_of(count: DwellCount, mean: float, error: float) -> float:
 
 
 def _density(
-    prediction: PredictedVisits, well: int, state: int, x: np.ndarray, independent: float, blur: float
+    prediction: _PredictedVisits, well: int, state: int, x: np.ndarray, independent: float, blur: float
 ) -> DensityTest:
     """The distribution of a state during the visits to one well, by so many independent samples."""
     main, *others = prediction.processes

@@ -126,7 +126,7 @@ class TransitionPath:
         return np.vstack([self.uphill.points, self.downhill[1:]])
 
 
-class Tube:
+class _Tube:
     """The quadratic cost about a cycle, in the units of a problem.
 
     Parameters
@@ -190,7 +190,7 @@ class Tube:
 
 
 @dataclass(frozen=True)
-class Bowl:
+class _Bowl:
     """The quadratic cost about a point attractor at the origin, ``y·My``, with the methods of a tube."""
 
     hessian: np.ndarray
@@ -289,12 +289,12 @@ class PathProblem:
         self.unit = distance**2 * self.rate  # of the action
         self.end = self.inverse @ (last - first)
         self.hessian: np.ndarray | None = None
-        self.begin: Bowl | Tube | None = None
-        self.finish: Tube | None = None
+        self.begin: _Bowl | _Tube | None = None
+        self.finish: _Tube | None = None
 
-        def tube(cycle: Cycle, hessians: np.ndarray) -> Tube:
+        def tube(cycle: Cycle, hessians: np.ndarray) -> _Tube:
             points = (cycle.points - self.start) @ self.inverse.T
-            return Tube(points, self.units.T @ hessians @ self.units / self.unit, cycle.period * self.rate)
+            return _Tube(points, self.units.T @ hessians @ self.units / self.unit, cycle.period * self.rate)
 
         if onto is not None:
             self.finish = tube(onto, hessians_along(dynamics, onto, reaching=True))
@@ -302,10 +302,10 @@ class PathProblem:
             self.begin = tube(around, hessians_along(dynamics, around))
         elif self.rests(np.zeros(len(first))) and classify(dynamics, first).kind == "attractor":
             self.hessian = self.units.T @ hessian_at(dynamics, first) @ self.units / self.unit
-            self.begin = Bowl(self.hessian)
+            self.begin = _Bowl(self.hessian)
         # By how much of the upper bound S may fail to curve upwards at a minimum: about cycles any phase may
         # be as good as any other.
-        self.flat = CYCLE_SHIFT if isinstance(self.begin, Tube) or self.finish is not None else 0.0
+        self.flat = CYCLE_SHIFT if isinstance(self.begin, _Tube) or self.finish is not None else 0.0
 
     def rests(self, y: np.ndarray) -> bool:
         """Whether f vanishes at a state, to rounding."""
@@ -314,7 +314,7 @@ class PathProblem:
     def scaled(self, x: np.ndarray) -> np.ndarray:
         """Points in the units of the problem, from its start to its end."""
         y = (x - self.start) @ self.inverse.T
-        if not isinstance(self.begin, Tube):
+        if not isinstance(self.begin, _Tube):
             y[0] = 0.0
         if self.finish is None:
             y[-1] = self.end
@@ -383,8 +383,8 @@ def spaced(problem: PathProblem, y: np.ndarray, count: int, level: float) -> np.
     path may wind.
     """
     if problem.hessian is not None and problem.level(y[:1])[0] > level > 0:
-        y = np.vstack([spiral(problem, y[0], level / problem.level(y[:1])[0]), y])
-    if level > 0 and isinstance(problem.begin, Tube):
+        y = np.vstack([_spiral(problem, y[0], level / problem.level(y[:1])[0]), y])
+    if level > 0 and isinstance(problem.begin, _Tube):
         y = np.vstack([_winding(problem, problem.begin, y[0], level, -1.0)[::-1], y])
     if level > 0 and problem.finish is not None:
         y = np.vstack([y, _winding(problem, problem.finish, y[-1], level, 1.0)])
@@ -400,11 +400,11 @@ def spaced(problem: PathProblem, y: np.ndarray, count: int, level: float) -> np.
     if problem.finish is not None:
         beyond = np.flatnonzero(problem.finish.level(y) > level).max(initial=len(y) - 3) + 2
         dense, y = dense[:beyond], y[:beyond]
-    measure = np.r_[0, np.cumsum(relative_lengths(problem, y))]
+    measure = np.r_[0, np.cumsum(_relative_lengths(problem, y))]
     return curve(np.interp(np.linspace(0, measure[-1], count), measure, dense))
 
 
-def relative_lengths(problem: PathProblem, y: np.ndarray) -> np.ndarray:
+def _relative_lengths(problem: PathProblem, y: np.ndarray) -> np.ndarray:
     """Lengths of the segments, relative to what they should be."""
     forward, middles = np.diff(y, axis=0), (y[1:] + y[:-1]) / 2
     if problem.hessian is None:
@@ -413,7 +413,7 @@ def relative_lengths(problem: PathProblem, y: np.ndarray) -> np.ndarray:
     return np.sqrt(problem.level(forward)) / near
 
 
-def spiral(problem: PathProblem, last: np.ndarray, share: float) -> np.ndarray:
+def _spiral(problem: PathProblem, last: np.ndarray, share: float) -> np.ndarray:
     """The way that linear dynamics takes to a point from where its level is a share of the one there."""
     assert problem.hessian is not None
     flow = problem.jacobian(np.zeros((1, len(last))))[0] + 2 * problem.hessian
@@ -425,7 +425,7 @@ def spiral(problem: PathProblem, last: np.ndarray, share: float) -> np.ndarray:
     return np.array(y[::-1])
 
 
-def _winding(problem: PathProblem, tube: Tube, last: np.ndarray, level: float, sense: float) -> np.ndarray:
+def _winding(problem: PathProblem, tube: _Tube, last: np.ndarray, level: float, sense: float) -> np.ndarray:
     """The way by linear dynamics from a point onwards to a tube, or back to where it left one.
 
     ``ẏ = F + 2Dp`` with ``p`` as the quadratic cost has it, with or against time.
@@ -504,7 +504,7 @@ def descended(
         if expected > resting:
             shift *= 0.2 if gained > GOOD_GAIN * expected else 1.0
             shift = max(shift if shift > 1e-8 else 0.0, problem.flat)
-            measure = relative_lengths(problem, y)
+            measure = _relative_lengths(problem, y)
             if first and spacings < MOST_RESPACINGS and measure.max() > UNEVEN * measure.min():
                 y = spaced(problem, y, count, level)
                 action, spacings = problem.action(y), spacings + 1
@@ -576,7 +576,7 @@ class Across:
         self.problem = problem
         # Orthonormal directions across the chain at its points, shape (n, d, d - 1).
         normal = np.linalg.svd(np.gradient(y, axis=0)[:, None, :])[2][:, 1:].transpose(0, 2, 1)
-        if isinstance(problem.begin, Tube):  # along the tube, on which the chain begins, and ends
+        if isinstance(problem.begin, _Tube):  # along the tube, on which the chain begins, and ends
             normal[0] = np.linalg.svd(problem.begin.slope(y[0])[None])[2][1:].T
         if problem.finish is not None:
             normal[-1] = np.linalg.svd(problem.finish.slope(y[-1])[None])[2][1:].T
@@ -599,7 +599,7 @@ class Across:
         """The chain after a step."""
         y = self.y.copy()
         y[self.range] += np.einsum("nij,nj->ni", self.normal, step.reshape(len(self.normal), -1))
-        if isinstance(begin := self.problem.begin, Tube):
+        if isinstance(begin := self.problem.begin, _Tube):
             y[0] = begin.onto(y[0], float(begin.level(self.y[:1])[0]))
         if (finish := self.problem.finish) is not None:
             y[-1] = finish.onto(y[-1], float(finish.level(self.y[-1:])[0]))
@@ -660,7 +660,7 @@ def first_chains(problem: PathProblem) -> tuple[list[np.ndarray], float]:
     chains += [line + BEND * side * np.sin(np.pi * share) * way for way in across for side in (1, -1)]
     if problem.hessian is None:
         return chains, 0.0
-    linear = np.vstack([spiral(problem, problem.end, START_LEVEL), problem.end])
+    linear = np.vstack([_spiral(problem, problem.end, START_LEVEL), problem.end])
     forward = np.diff(linear @ np.linalg.cholesky(problem.hessian), axis=0)
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
     turns = np.arccos(np.clip(np.sum(forward[1:] * forward[:-1], axis=1), -1, 1))

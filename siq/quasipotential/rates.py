@@ -121,16 +121,16 @@ class EnergyLossPerCycle:
         >>> round(EnergyLossPerCycle(1.0, 1.0, exact=True).factor(1.0), 3)
         0.306
         """
-        own = depopulation_factor(self.own / intensity)
+        own = _depopulation_factor(self.own / intensity)
         if not self.exact:
             return 1.0 if own >= LEAST_DEPOPULATION else np.nan
         if self.beyond is None:
             return own
-        both = depopulation_factor((self.own + self.beyond) / intensity)
-        return own * depopulation_factor(self.beyond / intensity) / both
+        both = _depopulation_factor((self.own + self.beyond) / intensity)
+        return own * _depopulation_factor(self.beyond / intensity) / both
 
 
-def depopulation_factor(loss: float) -> float:
+def _depopulation_factor(loss: float) -> float:
     """Υ of Mel'nikov and Meshkov for a loss in units of ε: the loss itself, where it is small, up to 1."""
 
     def integrand(y: float) -> float:
@@ -139,19 +139,12 @@ def depopulation_factor(loss: float) -> float:
     return float(np.exp(quad(integrand, 0, np.inf, limit=200)[0] / np.pi))
 
 
-def energy_loss_per_cycle(
+def _energy_loss_per_cycle(
     dynamics: Dynamics, path: MinimumActionPath, *, beyond: bool
 ) -> EnergyLossPerCycle | None:
     """The loss of U in one cycle, None where nothing turns, or noise acts on every state.
 
-    Parameters
-    ----------
-    dynamics
-        f and D.
-    path
-        From the attractor to the saddle.
-    beyond
-        Whether beyond the saddle lies a well, from which states may come back.
+    `beyond` says whether beyond the saddle lies a well, from which states may come back.
     """
     if dynamics.diffusion.regular:
         return None
@@ -343,7 +336,7 @@ def escape_rate(
     at_saddle = frame.continued(curvatures) if frame.at_saddle is None else frame.at_saddle
     ratio = abs(np.linalg.det(at_saddle)) / np.linalg.det(frame.at_attractor)
     prefactor = 2 * np.pi / (frame.unstable * frame.problem.rate) * np.sqrt(ratio) * np.exp(exponent)
-    turn = energy_loss_per_cycle(dynamics, path, beyond=beyond)
+    turn = _energy_loss_per_cycle(dynamics, path, beyond=beyond)
     if turn is not None and not turn.exact:
         remarks.append(Remark("quasipotential.law_limited_by_turning", {"loss": turn.own}))
     elif turn is not None and turn.own < path.action:
@@ -520,22 +513,10 @@ def _imposed(m: np.ndarray, velocity: np.ndarray, force: np.ndarray) -> np.ndarr
 
 
 def prefactor_error(found: AnyField, path: MinimumActionPath, *, seed: int = 0) -> tuple[float | None, float]:
-    """The uncertainty of the prefactor K of a way out, from that of f and D.
+    """Standard error of ln K of a way out from that of f and D, and its covariance with ΔU.
 
-    Parameters
-    ----------
-    found
-        f with the covariance of its coefficients.
-    path
-        Of least action from the attractor to the saddle.
-    seed
-        Of the axes, where there are more than `MAX_COVARIANCE_AXES`.
-
-    Returns
-    -------
-    tuple of float or None and float
-        Standard error of ln K, and its covariance with ΔU, in the unit of ε. Zero where f carries no noise;
-        the first is None where the law holds for too few of the changed f.
+    Both are zero where f carries no noise; the first is None where the law holds for too few of the changed
+    f. The seed is that of the axes, where there are more than `MAX_COVARIANCE_AXES`.
     """
     if isinstance(found, GivenField) or found.noise_free:
         return 0.0, 0.0

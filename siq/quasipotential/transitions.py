@@ -251,7 +251,7 @@ def transitions(
             remarks.append(Remark("quasipotential.no_escape_time", {"reason": str(failure)}))
         barrier, share = path.uphill.action, 0.0
         if well is not None:
-            barrier, share = barrier_by_formula(path, well)
+            barrier, share = _barrier_by_formula(path, well)
             if abs(barrier / path.uphill.action - 1) > NOTEWORTHY_DIFFERENCE:
                 remarks.append(Remark("quasipotential.formula_differs_from_path"))
             if isinstance(found, GivenField) and path.uphill.converged:  # nothing about f is to be averaged
@@ -273,7 +273,7 @@ def transitions(
     return found_ways
 
 
-def barrier_by_formula(path: TransitionPath, well: Well) -> tuple[float, float]:
+def _barrier_by_formula(path: TransitionPath, well: Well) -> tuple[float, float]:
     """The barrier of U by a formula and the end of the path, and the share that the formula accounts for."""
     points, action = path.uphill.points, path.uphill.values
     formula = 2 * well.known_values(points)

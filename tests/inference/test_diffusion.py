@@ -16,7 +16,7 @@ from siq.inference.field_estimate import DiffusionSource, FieldEstimate, read_fi
 from siq.inference.library import IdentificationOptions, field_library
 from siq.inference.regression import identify_vector_field
 from siq.quasipotential.landscape import Landscape
-from siq.quasipotential.landscape_comparison import check_same_noise
+from siq.quasipotential.landscape_comparison import _check_same_noise
 from siq.systems.diffusion import Diffusion
 from siq.systems.simulation import SimulationOptions, simulate_snapshots
 from siq.workflow import identification_step, results
@@ -55,10 +55,10 @@ def test_an_estimated_d_is_compared_within_its_errors() -> None:
     field, states = field_of(identified(recorded(noise=0.02))), np.zeros((1, 2))
     learned = field.dynamics
     assert np.abs(field.diffusion.matrix - NORMALISED).max() > 1e-3  # by far more than rounding
-    check_same_noise(learned.with_diffusion(Diffusion(NORMALISED)), learned, states, found=field)
+    _check_same_noise(learned.with_diffusion(Diffusion(NORMALISED)), learned, states, found=field)
     for other in (D, 1.2 * NORMALISED, np.eye(2)):
         with pytest.raises(ValueError, match="D is not the same"):
-            check_same_noise(learned.with_diffusion(Diffusion(other)), learned, states, found=field)
+            _check_same_noise(learned.with_diffusion(Diffusion(other)), learned, states, found=field)
 
 
 def field_of(found: identification_step.Identified) -> FieldEstimate:

@@ -10,7 +10,7 @@ import sympy
 from siq.data.recordings import Recordings
 from siq.quasipotential.landscape import Landscape, LandscapeOptions
 from siq.quasipotential.landscape_assembly import EquationSettings, landscape_from_equations
-from siq.quasipotential.landscape_comparison import check_same_noise, differences
+from siq.quasipotential.landscape_comparison import _check_same_noise, differences
 from siq.quasipotential.landscape_files import landscape_data
 from siq.remarks import Remark
 from siq.report.landscape import comparison_table
@@ -93,10 +93,10 @@ def test_noise_in_two_states_is_compared_in_its_own_unit() -> None:
     """An entry that is not on the diagonal counts, however small a state's noise is; rounding does not."""
     matrix, states = np.array([[1.0, 3e-5], [3e-5, 1e-8]]), np.zeros((1, 2))
     one = Dynamics.of((X, Y), (-X, -Y), diffusion=matrix)
-    check_same_noise(one, one.with_diffusion(Diffusion(matrix * (1 + 1e-12))), states, found=None)
+    _check_same_noise(one, one.with_diffusion(Diffusion(matrix * (1 + 1e-12))), states, found=None)
     for changed in (np.diag(np.diag(matrix)), np.diag([0.0, 1e-8]), np.eye(2)):
         with pytest.raises(ValueError, match="D is not the same"):
-            check_same_noise(one, one.with_diffusion(Diffusion(changed)), states, found=None)
+            _check_same_noise(one, one.with_diffusion(Diffusion(changed)), states, found=None)
 
 
 def test_a_limit_cycle_is_named_and_not_compared():

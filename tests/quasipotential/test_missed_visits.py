@@ -7,10 +7,10 @@ import pytest
 
 from siq.data.preparation import in_stretches
 from siq.data.recordings import Recordings
-from siq.data.two_states import LEVEL, continued_visits, dwell_counts
+from siq.data.two_states import SIGNIFICANCE, continued_visits, dwell_counts
 from siq.inference.field_estimate import FieldEstimate, FlowMap
 from siq.inference.library import IdentificationOptions, field_library
-from siq.quasipotential.occupancy import cell_process, check_occupancy, cores_about
+from siq.quasipotential.occupancy import _cell_process, _cores_about, check_occupancy
 from siq.quasipotential.rates import NoiseStrength
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
@@ -53,13 +53,13 @@ def record(
 def test_visits_are_foreseen_as_samples_show_them(intensity: float, step: float) -> None:
     dynamics = wells()
     portrait = phase_portrait(dynamics, np.linspace(-1.6, 1.6, 100)[:, None], seed=0)
-    cores = cores_about(dynamics, portrait, intensity)
+    cores = _cores_about(dynamics, portrait, intensity)
     values = record(intensity, step, 800, recordings=400, substeps=10)
     runs = [slice(start, start + 800) for start in range(0, values.size, 800)]
     visits = continued_visits(cores.of(values.reshape(-1, 1)), runs)
     counts = dwell_counts(np.tile(step * np.arange(800), 400), visits, runs)
     counted = sum(one.time for one in counts) / sum(one.visits for one in counts)
-    process = cell_process(dynamics, intensity, np.array([[-3.5, 3.5]]))
+    process = _cell_process(dynamics, intensity, np.array([[-3.5, 3.5]]))
     always, sampled = (
         process.mean_visit(one.of(process.points), 0)
         for one in (cores, cores.as_sampled(dynamics, intensity, step))
@@ -77,7 +77,7 @@ def test_a_state_that_the_record_shows_and_f_does_not_is_noticed() -> None:
     held = np.arange(len(recordings.labels)) < 2
     found = check_occupancy(alone, portrait, NoiseStrength(0.3), recordings, held)
     verdict = found.verdict(false_alarms=1e-4)
-    assert verdict is not None and not verdict.passed and verdict.value > -np.log10(LEVEL)
+    assert verdict is not None and not verdict.passed and verdict.value > -np.log10(SIGNIFICANCE)
     assert "hops between two states" in verdict.reason and found.missing == verdict.reason
     both = field({"x": 1.0, "x**3": -1.0}, 0.3)
     portrait = phase_portrait(both.dynamics, values[::20], seed=0)

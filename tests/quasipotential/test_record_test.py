@@ -12,10 +12,10 @@ from siq.data.two_states import DwellCount
 from siq.inference.field_estimate import FieldEstimate, Verdict
 from siq.quasipotential.occupancy import (
     OccupancyCheck,
+    _cores_about,
+    _predicted_visits,
+    _probability_of,
     check_occupancy,
-    cores_about,
-    predicted_visits,
-    probability_of,
 )
 from siq.quasipotential.rates import NoiseStrength
 from siq.systems.phase_portrait import PhasePortrait, phase_portrait
@@ -98,7 +98,7 @@ def test_a_record_too_short_to_hop_is_no_test(recorded: RECORDED) -> None:
 
 def test_cores_keep_clear_of_the_saddle(recorded: RECORDED) -> None:
     _, record, portrait, _ = recorded
-    cores = cores_about(record.dynamics, portrait, 10.0)
+    cores = _cores_about(record.dynamics, portrait, 10.0)
     places = np.array([[0.0], [-1.0], [1.0], [-0.7]])
     assert cores.of(places).tolist()[0] == -1 and set(cores.of(places[1:3]).tolist()) == {0, 1}
 
@@ -106,8 +106,8 @@ def test_cores_keep_clear_of_the_saddle(recorded: RECORDED) -> None:
 def test_a_distribution_function_rises_from_nothing_to_all(recorded: RECORDED) -> None:
     _, record, portrait, _ = recorded
     noise = NoiseStrength(INTENSITY)
-    cores = cores_about(record.dynamics, portrait, INTENSITY)
-    found = predicted_visits(record, portrait, noise, cores)
+    cores = _cores_about(record.dynamics, portrait, INTENSITY)
+    found = _predicted_visits(record, portrait, noise, cores)
     along = found.processes[0].distribution(0, 0, np.linspace(-3, 3, 50), blur=0.1)
     assert along[0] < 1e-6 and along[-1] > 1 - 1e-6 and (np.diff(along) >= -1e-12).all()
 
@@ -116,7 +116,7 @@ def test_probabilities_of_counts_are_those_of_chance() -> None:
     generator = np.random.default_rng(1)
     true = np.exp(0.2 * generator.standard_normal(1000))
     counts = generator.poisson(15 / true)
-    found = [probability_of(DwellCount(int(n), 15.0), 1.0, 0.2) for n in counts]
+    found = [_probability_of(DwellCount(int(n), 15.0), 1.0, 0.2) for n in counts]
     assert np.mean(np.array(found) < 0.05) < 0.06
-    assert probability_of(DwellCount(0, 15.0), 1.0, 0.0) < 1e-5
-    assert probability_of(DwellCount(0, 0.0), 1.0, 0.1) == 1.0
+    assert _probability_of(DwellCount(0, 15.0), 1.0, 0.0) < 1e-5
+    assert _probability_of(DwellCount(0, 0.0), 1.0, 0.1) == 1.0

@@ -13,11 +13,11 @@ from scipy.interpolate import RegularGridInterpolator
 from siq.errors import InputError, NumericalFailure
 from siq.quasipotential.landscape_comparison import (
     ReferenceLandscape,
-    compare_overall,
-    compare_wells,
+    _compare_overall,
+    _compare_wells,
+    _relative_l2,
     read_reference,
     reference_landscape,
-    relative_l2,
     write_reference,
 )
 from siq.systems.cards import load_system
@@ -47,8 +47,8 @@ def test_both_references_are_the_exact_quasipotential(smooth) -> None:
         own = exact - 2 * potential_values(maier_stein(1), attractor[None])
         inside = smooth.below(index, 0.9)
         assert inside.sum() > 500
-        assert relative_l2(smooth.characteristics[index][inside], own[inside]) < 1e-3
-        assert relative_l2(smooth.mesh[index][inside], own[inside]) < 1e-3
+        assert _relative_l2(smooth.characteristics[index][inside], own[inside]) < 1e-3
+        assert _relative_l2(smooth.mesh[index][inside], own[inside]) < 1e-3
     np.testing.assert_allclose(smooth.barriers, 0.5, rtol=1e-5)
     np.testing.assert_allclose(smooth.mesh_barriers, 0.5, rtol=1e-3)
     np.testing.assert_allclose(smooth.heights, 0, atol=1e-6)
@@ -62,8 +62,8 @@ def test_both_references_are_exact_where_the_noise_depends_on_the_state() -> Non
         own = exact - 2 * potential_values(known, attractor[None])
         inside = found.below(index, 0.9)
         assert inside.sum() > 500
-        assert relative_l2(found.characteristics[index][inside], own[inside]) < 1e-3
-        assert relative_l2(found.mesh[index][inside], own[inside]) < 1e-3
+        assert _relative_l2(found.characteristics[index][inside], own[inside]) < 1e-3
+        assert _relative_l2(found.mesh[index][inside], own[inside]) < 1e-3
     np.testing.assert_allclose(found.mesh_barriers, 0.5, rtol=1e-3)
 
 
@@ -78,14 +78,14 @@ def test_a_reference_comes_back_from_its_file(smooth, tmp_path) -> None:
 
 
 def test_a_well_without_a_formula_counts_as_not_covered(smooth) -> None:
-    rows = compare_wells(smooth, {})
+    rows = _compare_wells(smooth, {})
     assert [row.covered for row in rows] == [0.0, 0.0] and all(np.isnan(row.error) for row in rows)
 
 
 def test_the_reference_has_no_difference_from_itself(smooth) -> None:
-    row = compare_overall(smooth, smooth.values, below=0.4)
+    row = _compare_overall(smooth, smooth.values, below=0.4)
     assert row.points > 500 and row.covered == 1 and row.error == 0
-    shifted = compare_overall(smooth, smooth.values + 3.0, below=0.4, shifted=True)
+    shifted = _compare_overall(smooth, smooth.values + 3.0, below=0.4, shifted=True)
     assert shifted.error < 1e-12
 
 
@@ -113,8 +113,8 @@ def test_three_methods_agree_on_the_resonator(resonator) -> None:
     for index in (0, 1):
         inside = resonator.below(index, 0.9)
         on_mesh, exact = resonator.mesh[index][inside], resonator.characteristics[index][inside]
-        assert relative_l2(on_mesh, exact) < 2e-3
-    assert compare_overall(resonator, resonator.mesh_values, below=1.2e-8).error < 2e-3
+        assert _relative_l2(on_mesh, exact) < 2e-3
+    assert _compare_overall(resonator, resonator.mesh_values, below=1.2e-8).error < 2e-3
 
 
 @pytest.mark.slow
@@ -126,7 +126,7 @@ def test_the_published_mesh_is_as_far_off_as_was_found(resonator) -> None:
     at = RegularGridInterpolator(axes, 2 * values, bounds_error=False)
     published = at(resonator.points)
     published = published - at(resonator.attractors[:1])
-    row = compare_overall(resonator, published, below=1.2e-8)
+    row = _compare_overall(resonator, published, below=1.2e-8)
     print(row)
     assert row.covered > 0.95
     assert 0.02 < row.error < 0.06

@@ -22,7 +22,7 @@ from siq.inference.field_estimate import FieldEstimate
 from siq.quasipotential.paths import TransitionPath, minimum_action_path
 from siq.quasipotential.transitions import (
     Transition,
-    barrier_by_formula,
+    _barrier_by_formula,
     barrier_uncertainty,
     missing_diffusion,
     transitions,
@@ -136,7 +136,7 @@ def test_a_formula_that_is_believed_nowhere_leaves_the_path() -> None:
     (way, _), (local, _) = ways("double well", with_formulas=True), formulas("double well")
     assert way.path is not None
     nowhere = replace(local, tolerance=-1.0)
-    assert barrier_by_formula(way.path, nowhere) == (way.path.uphill.action, 0.0)
+    assert _barrier_by_formula(way.path, nowhere) == (way.path.uphill.action, 0.0)
 
 
 def test_a_barrier_is_put_together_where_the_formula_ends() -> None:
@@ -144,7 +144,7 @@ def test_a_barrier_is_put_together_where_the_formula_ends() -> None:
     assert way.path is not None
     # A formula that is a tenth too high, up to a level of a third, and the path from there on.
     well = replace(local, coefficients=1.1 * local.coefficients, reach=0.11, tolerance=0.2)
-    barrier, share = barrier_by_formula(way.path, well)
+    barrier, share = _barrier_by_formula(way.path, well)
     assert 0.2 < share * barrier <= 0.22  # the last node of the path below the level
     exact = way.path.uphill.action
     assert barrier == pytest.approx(exact + share * barrier * (1 - 1 / 1.1), rel=1e-3)

@@ -10,8 +10,8 @@ from siq.quasipotential.rates import (
     EnergyLossPerCycle,
     EscapeRate,
     NoiseStrength,
-    depopulation_factor,
-    energy_loss_per_cycle,
+    _depopulation_factor,
+    _energy_loss_per_cycle,
     escape_rate,
     mean_exit_time,
 )
@@ -22,8 +22,8 @@ X, V, Y, W = sympy.symbols("x v y w", real=True)
 
 
 def test_strong_losses_leave_the_law_as_it_is_and_weak_ones_limit_the_rate() -> None:
-    assert depopulation_factor(100.0) == pytest.approx(1, abs=1e-9)
-    assert depopulation_factor(1e-4) == pytest.approx(1e-4, rel=0.01)  # the rate of energy diffusion
+    assert _depopulation_factor(100.0) == pytest.approx(1, abs=1e-9)
+    assert _depopulation_factor(1e-4) == pytest.approx(1e-4, rel=0.01)  # the rate of energy diffusion
     assert EnergyLossPerCycle(100.0, 100.0, exact=True).factor(1.0) == pytest.approx(1, abs=1e-9)
     # Of two wells half of what crosses comes back.
     assert EnergyLossPerCycle(1e-4, 1e-4, exact=True).factor(1.0) == pytest.approx(0.5e-4, rel=0.01)
@@ -37,7 +37,7 @@ def test_the_loss_of_a_cubic_well_is_exact(speed: float) -> None:
         (X, V), (speed * V, -friction * V - (X - X**2) / speed), diffusion=np.diag([0.0, noise])
     )
     path = minimum_action_path(system, np.zeros(2), np.array([1.0, 0.0]))
-    loss = energy_loss_per_cycle(system, path, beyond=False)
+    loss = _energy_loss_per_cycle(system, path, beyond=False)
     assert loss is not None and loss.exact and loss.beyond is None
     assert loss.own == pytest.approx(2 * friction**2 / noise * 1.2 / speed**2, rel=1e-4)
 
