@@ -22,7 +22,6 @@ import numpy as np
 import scipy.stats
 
 from siq.diagnosis.mechanisms import MechanismCandidate
-from siq.diagnosis.unnamed_models import AugmentedModel
 from siq.errors import NumericalFailure
 from siq.inference.kalman_filter import Noise
 from siq.inference.maximum_likelihood import Fit
@@ -66,10 +65,10 @@ class SimulationProtocol:
 
     def nearest(self, fits: list[Fit], data: Measurements) -> Fit:
         """The fit that runs nearest to recordings; the first of those that are as near, or run away."""
-        return fits[0] if len(fits) == 1 else min(fits, key=lambda fit: _mean_error(self.errors(fit, data)))
+        return fits[0] if len(fits) == 1 else min(fits, key=lambda fit: mean_error(self.errors(fit, data)))
 
 
-def _mean_error(squares: np.ndarray | None) -> float:
+def mean_error(squares: np.ndarray | None) -> float:
     """The mean of squared errors, infinite where a simulation ran away."""
     return float("inf") if squares is None else float(squares.mean())
 
@@ -303,90 +302,7 @@ def errors_left_out(
     return np.concatenate(squares)
 
 
-def adopted_by_held_out(
-    choices: Sequence[tuple[AugmentedModel, Fit]],
-    without: Sequence[Fit],
-    data: Measurements,
-    *,
-    runs: SimulationProtocol,
-    certain: float,
-) -> int | None:
-    """The place of the model that is adopted, judged by recordings held out; None where none helps.
-
-    What is not certain where it was found has to be better by more than appears by chance, what is certain
-    better than the simulation fitted alike; one of fewer coordinates that predicts no worse takes its place.
-
-    Parameters
-    ----------
-    choices
-        Models, the likeliest first, each with the estimates that are run.
-    without
-        The simulation without any of them: as it may be, and last as it was fitted to the same recordings.
-    data
-        The recordings held out that may choose.
-    runs
-        How all are run.
-    certain
-        Logarithm of the odds from which on a model is certain where it was found.
-    """
-    alone = [runs.errors(each, data) for each in without]
-    known = [each for each in alone if each is not None]
-    least = min(known, key=np.mean, default=None)
-    errors = [runs.errors(fit, data) for _, fit in choices]
-    # A card whose values are right predicts well, and tells nothing of a function whose fit had to find
-    # them, too. Beside process noise a free run is off by it, and a little may be chance.
-    fitted_alone, lowest = _mean_error(alone[-1]), _mean_error(least)
-    limits = [
-        0.0 if model.log_evidence < certain else lowest if model.fit.has_process_noise else fitted_alone
-        for model, _ in choices
-    ]
-    likeliest = _first_better(least, errors, limits)
-    if likeliest is None:
-        return None
-    sizes = [_mean_error(each) for each in errors]
-    return _simplest_of(sizes, [model.coordinates for model, _ in choices], likeliest)
-
-
-def adopted_by_left_out(
-    choices: Sequence[tuple[AugmentedModel, Fit]],
-    without: Fit,
-    learned: Measurements,
-    *,
-    noise: Noise,
-    named: Sequence[MechanismCandidate] = (),
-) -> int | None:
-    """The place of the model that predicts parts left out best, and better than without; None for none.
-
-    Parameters
-    ----------
-    choices
-        See `adopted_by_held_out`.
-    without
-        The simulation without any of them, fitted.
-    learned
-        The recordings that all of them were fitted to.
-    noise
-        See `siq.inference.trajectories.free_run`.
-    named
-        The mechanisms in all of them.
-    """
-    alone = errors_left_out(without, learned, noise=noise, candidates=named)
-    errors = [
-        errors_left_out(
-            fit,
-            learned,
-            noise=noise,
-            candidates=[*named, *(part.trial.candidate for part in model.parts)],
-        )
-        for model, fit in choices
-    ]
-    sizes = [_mean_error(each) for each in errors]
-    LOGGER.info("parts left out: mean squared errors %s with models of what has no name", sizes)
-    best = int(np.argmin(sizes))
-    return best if _first_better(alone, [errors[best]], [0.0]) == 0 else None
-
-
-def _simplest_of(errors: Sequence[float], coordinates: Sequence[int], likeliest: int) -> int:
+def simplest_of(errors: Sequence[float], coordinates: Sequence[int], likeliest: int) -> int:
     """The place of the model of fewest coordinates that predicts no worse than the likeliest one.
 
     Errors of a sensor's clock, for one, grow with the motion, and look like functions of more than there is.
@@ -395,7 +311,7 @@ def _simplest_of(errors: Sequence[float], coordinates: Sequence[int], likeliest:
     return min(known, key=lambda place: (coordinates[place], place != likeliest, place))
 
 
-def _first_better(
+def first_better(
     without: np.ndarray | None, models: Iterable[np.ndarray | None], limits: Iterable[float]
 ) -> int | None:
     """The place of the first of several models that predicts better than without it; None where none does."""

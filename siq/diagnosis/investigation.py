@@ -10,7 +10,14 @@ import scipy.stats
 
 from siq.diagnosis.dictionary import Mechanism, Roles, roles_of
 from siq.diagnosis.evidence import UnfittedCandidate
-from siq.diagnosis.holdout import HeldOutErrors, SimulationProtocol, adopted_by_held_out, adopted_by_left_out
+from siq.diagnosis.holdout import (
+    HeldOutErrors,
+    SimulationProtocol,
+    errors_left_out,
+    first_better,
+    mean_error,
+    simplest_of,
+)
 from siq.diagnosis.mechanisms import MechanismCandidate, candidates_of, generic_candidates
 from siq.diagnosis.naming import NamingDecision, decide_naming
 from siq.diagnosis.residual_structure import (
@@ -328,14 +335,39 @@ def held_out_runs(
     choices = [(model, best_of(model.fit, model.exact)) for model in investigation.models]
     named = investigation.verdict.names
     judges = [place for place, label in enumerate(data.labels) if label not in tests]
-    adopted = None
+    adopted: int | None = None
     if choices and judges:
-        without = (plain,) if named else (card, recalibrated)
-        adopted = adopted_by_held_out(choices, without, data.select(judges), runs=runs, certain=certain)
-    elif choices:
+        # What is not certain where it was found has to be better by more than appears by chance, what is
+        # certain better than the simulation fitted alike. A card whose values are right predicts well, and
+        # tells nothing of a function whose fit had to find them, too. Beside process noise a free run is off
+        # by it, and a little may be chance.
+        may_choose = data.select(judges)
+        alone = [runs.errors(each, may_choose) for each in ((plain,) if named else (card, recalibrated))]
+        least = min((each for each in alone if each is not None), key=np.mean, default=None)
+        errors = [runs.errors(fit, may_choose) for _, fit in choices]
+        limits = [
+            0.0
+            if model.log_evidence < certain
+            else mean_error(least if model.fit.has_process_noise else alone[-1])
+            for model, _ in choices
+        ]
+        adopted = first_better(least, errors, limits)
+        if adopted is not None:  # one of fewer coordinates that predicts no worse takes its place
+            coordinates = [model.coordinates for model, _ in choices]
+            adopted = simplest_of([mean_error(each) for each in errors], coordinates, adopted)
+    elif choices:  # parts of the recordings that were learned from, each left out in turn, choose
         names = [each.best.candidate for each in search.found] if named else []
-        alone = plain if named else search.recalibrated
-        adopted = adopted_by_left_out(choices, alone, learned, noise=noise, named=names)
+        without = plain if named else search.recalibrated
+        errors = [
+            errors_left_out(
+                fit, learned, noise=noise,
+                candidates=[*names, *(part.trial.candidate for part in model.parts)],
+            )
+            for model, fit in choices
+        ]  # fmt: skip
+        best = int(np.argmin([mean_error(each) for each in errors]))
+        left_out = errors_left_out(without, learned, noise=noise, candidates=names)
+        adopted = best if first_better(left_out, [errors[best]], [0.0]) == 0 else None
     described, fit = (None, plain) if named or not choices else choices[0]
     if adopted is not None:
         described, fit = choices[adopted]

@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 import yaml
 
-from siq.diagnosis import holdout, investigation, search
+from siq.diagnosis import investigation, search
 from siq.diagnosis.diagnosis import Diagnosis, solve_case, withdrawn
 from siq.diagnosis.dictionary import standard_dictionary
 from siq.diagnosis.evidence import FittedCandidate
@@ -223,7 +223,7 @@ def test_random_forces_are_no_noise_where_a_function_beside_them_is_likelier(
         return (AugmentedModel((part,), search.recalibrated, 5.0),)
 
     monkeypatch.setattr(investigation, "fit_unnamed_models", models)
-    monkeypatch.setattr(holdout, "_first_better", lambda *_: None)
+    monkeypatch.setattr(investigation, "first_better", lambda *_: None)
     diagnosis = solved(tmp_path, recordings_of(nothing, drive=0.05, count=4), study={"held_out": ["r2"]})
     assert said(diagnosis)["verdict"] == "unexplained" and names(diagnosis) == []
     # It is located where the likeliest function stands.

@@ -12,7 +12,7 @@ import pytest
 from siq.data.recordings import Recordings
 from siq.diagnosis import naming
 from siq.diagnosis.evidence import correlation_time_of
-from siq.diagnosis.holdout import _cross_validation_folds, _first_better, errors_left_out
+from siq.diagnosis.holdout import _cross_validation_folds, errors_left_out, first_better
 from siq.diagnosis.naming import _MissingEffect, _residual_model_comparison
 from siq.diagnosis.unnamed_models import AugmentedModel, FitContext, runs_freely
 from siq.inference.kalman_filter import Whitened
@@ -254,4 +254,4 @@ def test_the_likeliest_model_that_foresees_better_is_adopted(
 ) -> None:
     draw = np.random.default_rng(1)
     runs = [None if size is None else squares(draw, size) for size in (without, *models)]
-    assert _first_better(runs[0], runs[1:], [runs[0].mean() if certain else 0.0] * len(models)) == place
+    assert first_better(runs[0], runs[1:], [runs[0].mean() if certain else 0.0] * len(models)) == place

@@ -14,7 +14,7 @@ import sympy
 from siq.diagnosis import unnamed_models
 from siq.diagnosis.diagnosis import solve_case
 from siq.diagnosis.evidence import evidences_by_size, log_evidence_of
-from siq.diagnosis.holdout import _simplest_of
+from siq.diagnosis.holdout import simplest_of
 from siq.diagnosis.smooth_functions import (
     LENGTH_SCALES,
     Smooth,
@@ -173,9 +173,9 @@ def test_what_is_beyond_all_numbers_ends_a_function_and_not_the_case(monkeypatch
 
 
 def test_the_model_of_fewest_coordinates_is_taken_that_foresees_no_worse() -> None:
-    assert _simplest_of([1.0, 0.9, 1.1], [2, 1, 1], 0) == 1
-    assert _simplest_of([1.0, 1.1, 1.2], [2, 1, 1], 0) == 0
-    assert _simplest_of([1.0, 0.5], [1, 1], 0) == 0  # the likeliest of as many
+    assert simplest_of([1.0, 0.9, 1.1], [2, 1, 1], 0) == 1
+    assert simplest_of([1.0, 1.1, 1.2], [2, 1, 1], 0) == 0
+    assert simplest_of([1.0, 0.5], [1, 1], 0) == 0  # the likeliest of as many
 
 
 def test_a_fit_takes_no_more_than_its_part_of_the_budget() -> None:
