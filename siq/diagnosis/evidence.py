@@ -65,24 +65,19 @@ class FittedCandidate:
 
 
 @dataclass(frozen=True)
-class UnfittedCandidate:
-    """A candidate that promised something, and whose fit gave nothing that could be judged.
+class NotFitted:
+    """A candidate that promised something and could not be judged, with the reason in words."""
 
-    Attributes
-    ----------
-    candidate
-        The mechanism.
-    reason
-        Why, in words.
-    """
-
-    candidate: MechanismCandidate
+    mechanism: str
+    label: str
     reason: str
 
-
-def failure_reason(error: Exception) -> str:
-    """Why a candidate gave nothing, as a reader is told."""
-    return str(error) if isinstance(error, NumericalFailure) else f"{type(error).__name__}: {error}"
+    @classmethod
+    def of(cls, candidate: MechanismCandidate, why: str | Exception) -> NotFitted:
+        """Of a candidate, with the reason or what ended its fit."""
+        if isinstance(why, Exception):
+            why = str(why) if isinstance(why, NumericalFailure) else f"{type(why).__name__}: {why}"
+        return cls(candidate.name, candidate.label, why)
 
 
 def judged(

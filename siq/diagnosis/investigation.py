@@ -9,7 +9,7 @@ import numpy as np
 import scipy.stats
 
 from siq.diagnosis.dictionary import Mechanism, Roles, roles_of
-from siq.diagnosis.evidence import UnfittedCandidate
+from siq.diagnosis.evidence import NotFitted
 from siq.diagnosis.holdout import (
     HeldOutErrors,
     SimulationProtocol,
@@ -173,7 +173,7 @@ def investigate(
             by_each.append(remainder_of(model, data, recalibrated, each.best.fit, roles))
         except NumericalFailure as error:
             fit = found.found[place - 1].best.fit if place else recalibrated
-            untried = (*found.untried, UnfittedCandidate(each.best.candidate, str(error)))
+            untried = (*found.untried, NotFitted.of(each.best.candidate, error))
             found = replace(found, found=found.found[:place], fit=fit, untried=untried)
             break
     left = by_each[-1] if by_each else remainder_of(model, data, recalibrated, recalibrated, roles)
@@ -200,9 +200,10 @@ def investigate(
             least = RANDOM_RESIDUALS if tried else STRUCTURED
             rounded = explained_by_quantisation(model, data, least_squares, roles, least=least, budget=budget)
     if rounded is not None:
-        found = replace(found, recalibrated=rounded.fit, found=(), fit=rounded.fit)
-        left, least_squares, naming, models, exact = rounded.left, rounded.fit, None, (), None
-        remarks = (Remark("diagnosis.quantised", {"outputs": ", ".join(rounded.outputs)}),)
+        least_squares, left, outputs = rounded
+        found = replace(found, recalibrated=least_squares, found=(), fit=least_squares)
+        naming, models, exact = None, (), None
+        remarks = (Remark("diagnosis.quantised", {"outputs": ", ".join(outputs)}),)
     p_shift = _shift_probability(model, found.recalibrated)
     if rounded is not None or not (tried or doubtful):
         verdict = quiet_verdict(p_shift, options)

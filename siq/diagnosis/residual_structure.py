@@ -313,26 +313,6 @@ QUANTISATION_ROUNDS = 30  # of fits at most
 NOISE_SETTLED = 0.01  # relative change of the noise, at which they have settled
 
 
-@dataclass(frozen=True)
-class _Quantised:
-    """A simulation that explains recordings but for rounding.
-
-    Attributes
-    ----------
-    fit
-        Its parameters and states are those that the values which were rounded are fitted by; its errors are
-        those of the fit to the readings, which rounding makes wider.
-    left
-        What is left of the values that were rounded, which is noise.
-    outputs
-        Names of the outputs that are rounded.
-    """
-
-    fit: Fit
-    left: Remainder
-    outputs: tuple[str, ...]
-
-
 def explained_by_quantisation(
     model: Dynamics,
     data: Measurements,
@@ -341,7 +321,7 @@ def explained_by_quantisation(
     *,
     least: float = STRUCTURED,
     budget: Budget | None = None,
-) -> _Quantised | None:
+) -> tuple[Fit, Remainder, tuple[str, ...]] | None:
     """The fit to the values that were rounded, if it leaves noise; None where it does not, or nothing rounds.
 
     Parameters
@@ -356,6 +336,13 @@ def explained_by_quantisation(
         Probability of structure by chance, below which it is no noise.
     budget
         Charged for every evaluation.
+
+    Returns
+    -------
+    (Fit, Remainder, tuple of str) or None
+        Its parameters and states are those that the values which were rounded are fitted by; its errors are
+        those of the fit to the readings, which rounding makes wider. What is left of the values, which is
+        noise; and the names of the outputs that are rounded.
     """
     steps = _quantisation_steps(data)
     # What rounding does under noise half as wide as a step is white (Widrow and Kollár 2008), and fitted.
@@ -391,7 +378,7 @@ def explained_by_quantisation(
     if left.after.p_value < least:
         return None
     names = tuple(name for name, wide in zip(model.output_names, coarse, strict=True) if wide)
-    return _Quantised(replace(strict, model=fit.model, x=fit.x), left, names)
+    return replace(strict, model=fit.model, x=fit.x), left, names
 
 
 def _quantisation_steps(data: Measurements) -> np.ndarray:

@@ -18,8 +18,7 @@ import sympy
 from siq.diagnosis.evidence import (
     BUDGET_SPENT,
     NUMERICAL_ERRORS,
-    UnfittedCandidate,
-    failure_reason,
+    NotFitted,
     orthonormal,
 )
 from siq.diagnosis.mechanisms import MechanismCandidate, along, places_of
@@ -472,7 +471,7 @@ def screen_all(
     *,
     fruitless: Collection[str] = (),
     budget: Budget | None = None,
-) -> tuple[list[tuple[Probe, Screened]], list[UnfittedCandidate]]:
+) -> tuple[list[tuple[Probe, Screened]], list[NotFitted]]:
     """Screen every candidate, with its shapes at all places where they are looked for.
 
     One whose shape the recordings themselves show promises as much as the best, unless it was fitted before
@@ -491,12 +490,12 @@ def screen_all(
 
     Returns
     -------
-    list of (Probe, Screened), list of UnfittedCandidate
+    list of (Probe, Screened), list of NotFitted
         What each probe would gain; and candidates of which no probe could be screened, with the reason.
     """
     budget = budget or Budget()
     substeps = current.substeps
-    untried: dict[str, UnfittedCandidate] = {}
+    untried: dict[str, NotFitted] = {}
     probes = []
     for candidate in candidates:
         try:
@@ -504,7 +503,7 @@ def screen_all(
             spread = replace(candidate, model=spread_edges(candidate.model, data, current.x, substeps=sharp))
             probes += probes_of(spread, data, model, current.x)
         except NUMERICAL_ERRORS as error:
-            untried[candidate.label] = UnfittedCandidate(candidate, failure_reason(error))
+            untried[candidate.label] = NotFitted.of(candidate, error)
     grid = Grid(data, min(substeps, PROBE_SUBSTEPS))
     screened: list[tuple[Probe, Screened]] = []
     for portion in in_portions([probe.width for probe in probes], model, data):
@@ -526,8 +525,7 @@ def screen_all(
             break
         except NUMERICAL_ERRORS as error:
             for probe in some:
-                reason = failure_reason(error)
-                untried[probe.candidate.label] = UnfittedCandidate(probe.candidate, reason)
+                untried[probe.candidate.label] = NotFitted.of(probe.candidate, error)
     most = max((result.gain for _, result in screened), default=0.0)
     screened = [
         (probe, replace(result, gain=max(most, result.gain)))
@@ -540,5 +538,5 @@ def screen_all(
     for candidate in (probe.candidate for probe in probes):  # some have no place where they could be
         if candidate.label not in finite:
             why = OVERFLOWS if candidate.label in seen else BUDGET_SPENT
-            untried.setdefault(candidate.label, UnfittedCandidate(candidate, why))
+            untried.setdefault(candidate.label, NotFitted.of(candidate, why))
     return screened, [each for label, each in untried.items() if label not in finite]

@@ -19,10 +19,9 @@ from siq.diagnosis.evidence import (
     BUDGET_SPENT,
     NUMERICAL_ERRORS,
     FittedCandidate,
-    UnfittedCandidate,
+    NotFitted,
     admissible,
     clustered_probability,
-    failure_reason,
     judged,
     probability_by_chance,
 )
@@ -99,7 +98,7 @@ class Search:
     found: tuple[AcceptedMechanism, ...]
     fit: Fit
     screened: tuple[tuple[Probe, Screened], ...]
-    untried: tuple[UnfittedCandidate, ...] = ()
+    untried: tuple[NotFitted, ...] = ()
     screened_beside: tuple[str, ...] = ()
     fruitless: frozenset[str] = frozenset()
 
@@ -180,13 +179,13 @@ def _fit_most_promising(
     least_gain: float,
     blocks: int,
     budget: Budget | None = None,
-) -> tuple[list[FittedCandidate], list[UnfittedCandidate]]:
+) -> tuple[list[FittedCandidate], list[NotFitted]]:
     """Fit the candidates that promise most, each from its best probe."""
     budget = budget or Budget()
     best = best_probes(screened)
     ranked = sorted(best.values(), key=lambda each: -each[1].gain)
     trials: dict[str, FittedCandidate] = {}
-    failed: dict[str, UnfittedCandidate] = {}
+    failed: dict[str, NotFitted] = {}
     begun: list[tuple[Probe, Screened]] = []
 
     def attempt(probe: Probe, result: Screened, begin: Fit) -> None:
@@ -209,11 +208,11 @@ def _fit_most_promising(
                 raise NumericalFailure("its best parameters have a sign that the mechanism cannot have")
             trial = judged(fit, current, data, candidate, blocks=blocks)
         except BudgetSpent:
-            failed.setdefault(candidate.label, UnfittedCandidate(candidate, BUDGET_SPENT))
+            failed.setdefault(candidate.label, NotFitted.of(candidate, BUDGET_SPENT))
             return
         except NUMERICAL_ERRORS as error:
             LOGGER.info("%s cannot be fitted: %s", candidate.label, error)
-            failed[candidate.label] = UnfittedCandidate(candidate, failure_reason(error))
+            failed[candidate.label] = NotFitted.of(candidate, error)
             return
         known = trials.get(candidate.label)
         if known is None or trial.fit.log_likelihood > known.fit.log_likelihood:
@@ -385,7 +384,7 @@ def _extended(
             budget=budget,
         )  # fmt: skip
         # All that could never be judged, each once, with the last reason.
-        reasons = {each.candidate.label: each for each in (*progress.untried, *unscreened, *failed)}
+        reasons = {each.label: each for each in (*progress.untried, *unscreened, *failed)}
         judged_ones = {each.candidate.label for each in trials}
         untried = tuple(each for label, each in reasons.items() if label not in judged_ones)
         fruitless = {each.candidate.label for each in trials if each.delta_chi2 < options.same}

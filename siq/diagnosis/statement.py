@@ -14,7 +14,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, TypeAdapter
 from pydantic_core import to_jsonable_python
 
-from siq.diagnosis.evidence import BUDGET_SPENT
+from siq.diagnosis.evidence import BUDGET_SPENT, NotFitted
 from siq.diagnosis.holdout import HeldOutErrors
 from siq.diagnosis.mechanisms import GENERIC, PROCESS_NOISE
 from siq.diagnosis.search import Standing
@@ -256,15 +256,6 @@ class UpperBound:
     unit: str
     parameter: str
     label: str
-
-
-@dataclass(frozen=True)
-class NotFitted:
-    """A mechanism of the dictionary that could not be judged, with the reason."""
-
-    mechanism: str
-    label: str
-    reason: str
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,6 @@ from siq.diagnosis.statement import (
     Evidence,
     Explanation,
     Location,
-    NotFitted,
     Recalibrated,
     Rival,
     StatedFunction,
@@ -120,9 +119,7 @@ def statement_of(investigation: Investigation, data: Measurements, shown: HeldOu
         excluded={} if verdict.mismatch else _excluded(investigation),
         explanations=_explanations(investigation, names, data),
         remarks=tuple(remarks),
-        not_fitted=tuple(
-            NotFitted(each.candidate.name, each.candidate.label, each.reason) for each in search.untried
-        ),
+        not_fitted=search.untried,
         account=investigation.account,
     )
 
