@@ -129,44 +129,6 @@ LINEAR_RANGE = 1e-3  # of the starting ellipse: where f counts as linear
 DIRECTIONS = 360  # numerical: of the starting ellipse, a degree apart
 
 
-def _check_arguments(
-    attractor: np.ndarray,
-    hessian: np.ndarray,
-    box: np.ndarray,
-    shape: tuple[int, int],
-    diffusion: Diffusion,
-    reach: int | None,
-    level: float | None,
-) -> None:
-    """Refuse arguments of the wrong shape or sign."""
-    for name, array, wanted in (
-        ("attractor", attractor, (2,)),
-        ("hessian", hessian, (2, 2)),
-        ("box", box, (2, 2)),
-    ):
-        if array.shape != wanted or not np.isfinite(array).all():
-            raise ValueError(f"the {name} must be finite numbers of shape {wanted}: the mesh has two states")
-    if diffusion.dimension != 2:  # asked before D is evaluated, which takes a state of its own dimension
-        raise ValueError(f"the diffusion is one of {diffusion.dimension} states: the mesh has two")
-    if len(shape) != 2 or min(shape) < MIN_NODES:
-        raise ValueError(f"a mesh of {shape} nodes is too coarse; give at least {MIN_NODES} along each state")
-    scale = np.sqrt(np.abs(np.diag(hessian)))
-    ratio = hessian / np.maximum(np.outer(scale, scale), np.finfo(float).tiny)
-    if not np.allclose(ratio, ratio.T) or np.diag(hessian).min() <= 0 or np.linalg.eigvalsh(ratio)[0] <= 0:
-        raise ValueError(f"the hessian {hessian.tolist()} is not symmetric and positive definite")
-    noise = diffusion.frozen(attractor)
-    if not noise.regular:
-        raise ValueError(f"the diffusion {noise.matrix.tolist()} at the attractor is not positive definite")
-    if np.any(box[:, 0] >= box[:, 1]):
-        raise ValueError(f"the box {box.tolist()} needs a lower and an upper end for each state")
-    if np.any((attractor <= box[:, 0]) | (attractor >= box[:, 1])):
-        raise ValueError(f"the attractor {attractor.tolist()} is not inside the box {box.tolist()}")
-    if reach is not None and reach < 2:
-        raise ValueError(f"a reach of {reach} mesh widths is too short; give at least 2")
-    if level is not None and not level > 0:
-        raise ValueError(f"the level {level} must be positive: V is zero at the attractor")
-
-
 def _turning_near(
     drift: Callable[[np.ndarray], np.ndarray],
     attractor: np.ndarray,
@@ -611,7 +573,32 @@ def mesh_quasipotential(
     all compiles, which takes seconds; the code is kept for later sessions.
     """
     attractor, hessian, box = (np.asarray(one, dtype=float) for one in (attractor, hessian, box))
-    _check_arguments(attractor, hessian, box, shape, diffusion, reach, level)
+    for name, array, wanted in (
+        ("attractor", attractor, (2,)),
+        ("hessian", hessian, (2, 2)),
+        ("box", box, (2, 2)),
+    ):
+        if array.shape != wanted or not np.isfinite(array).all():
+            raise ValueError(f"the {name} must be finite numbers of shape {wanted}: the mesh has two states")
+    if diffusion.dimension != 2:  # asked before D is evaluated, which takes a state of its own dimension
+        raise ValueError(f"the diffusion is one of {diffusion.dimension} states: the mesh has two")
+    if len(shape) != 2 or min(shape) < MIN_NODES:
+        raise ValueError(f"a mesh of {shape} nodes is too coarse; give at least {MIN_NODES} along each state")
+    scale = np.sqrt(np.abs(np.diag(hessian)))
+    ratio = hessian / np.maximum(np.outer(scale, scale), np.finfo(float).tiny)
+    if not np.allclose(ratio, ratio.T) or np.diag(hessian).min() <= 0 or np.linalg.eigvalsh(ratio)[0] <= 0:
+        raise ValueError(f"the hessian {hessian.tolist()} is not symmetric and positive definite")
+    noise = diffusion.frozen(attractor)
+    if not noise.regular:
+        raise ValueError(f"the diffusion {noise.matrix.tolist()} at the attractor is not positive definite")
+    if np.any(box[:, 0] >= box[:, 1]):
+        raise ValueError(f"the box {box.tolist()} needs a lower and an upper end for each state")
+    if np.any((attractor <= box[:, 0]) | (attractor >= box[:, 1])):
+        raise ValueError(f"the attractor {attractor.tolist()} is not inside the box {box.tolist()}")
+    if reach is not None and reach < 2:
+        raise ValueError(f"a reach of {reach} mesh widths is too short; give at least 2")
+    if level is not None and not level > 0:
+        raise ValueError(f"the level {level} must be positive: V is zero at the attractor")
     axes = tuple(np.linspace(low, high, count) for (low, high), count in zip(box, shape, strict=True))
     widths = (box[:, 1] - box[:, 0]) / (np.array(shape) - 1)
     form = hessian * np.outer(widths, widths)  # M, of displacements in mesh widths

@@ -13,7 +13,7 @@ U/2.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -138,7 +138,6 @@ DOUBLY_COMPUTED: Mapping[str, tuple[KnownBarrier, ...]] = {
 
 
 X, Y, Z, V = sympy.symbols("x y z v", real=True)
-HALF, TENTH = sympy.Rational(1, 2), sympy.Rational(1, 10)
 
 
 @dataclass(frozen=True)
@@ -184,7 +183,133 @@ def reference_systems() -> dict[str, ReferenceSystem]:
     >>> systems["maier-stein"].barriers[0].value
     0.5
     """
-    return {name: build(name) for name, build in _BUILDERS.items()}
+    half, tenth, nothing = sympy.Rational(1, 2), sympy.Rational(1, 10), sympy.S.Zero
+    over_and_back = ((-1,), (0,), (1,)), ((1,), (0,), (-1,))
+    hessian = sympy.Matrix([[2, 1], [1, 3]]) / 2
+    noise, turning = sympy.Matrix([[2, half], [half, 1]]), sympy.Matrix([[0, -3], [3, 0]])
+    plane = sympy.Matrix([X, Y])
+    archetype = (X**2 - 1) ** 2 + Y**2 + Z**2
+    slope = [archetype.diff(each) / 2 for each in (X, Y, Z)]
+    alpha, beta, gamma, mu = (
+        sympy.Rational(*each) for each in ((154, 100), (1014, 100), (476, 1000), (112509, 1000000))
+    )
+    eaten = X**2 * Y / (1 + X**2)
+    place, friction = (X**2 - 1) ** 2 / 4 - X / 10, half
+    units = sympy.symbols("x:10", real=True)
+    wells = sum(((s**2 - 1) ** 2 / 4 for s in units), nothing)
+    wells += sum((half * (a - b) ** 2 for a, b in itertools.pairwise(units)), nothing)
+    falls = [0, *(wells.diff(s) for s in units), 0]
+    maier_and_stein = "Maier and Stein, Phys. Rev. Lett. 71, 1783 (1993)"
+
+    def of_maier_and_stein(strength: int) -> Dynamics:
+        field = (X - X**3 - strength * X * Y**2, -(1 + X**2) * Y)
+        return Dynamics.of((X, Y), field, domain=[(-2, 2), (-1, 1)])
+
+    systems = [
+        _exact(
+            "linear",
+            "A linear system that turns, with a full D.",
+            "Lyapunov's equation",
+            Dynamics.of(
+                (X, Y),
+                tuple(map(sympy.expand, (turning - noise) * hessian * plane)),
+                diffusion=np.array(noise.tolist(), dtype=float),
+                domain=[(-2, 2)] * 2,
+            ),
+            sympy.expand((plane.T * hessian * plane)[0]),
+        ),
+        _exact(
+            "double-well",
+            "A tilted double well of one state.",
+            "Kramers, Physica 7, 284 (1940)",
+            Dynamics.of((X,), (X - X**3 + tenth,), domain=[(-2, 2)]),
+            (X**2 - 1) ** 2 / 2 - X / 5,
+            over_and_back,
+        ),
+        _exact(
+            "growing-noise",
+            "A double well whose noise grows with the state.",
+            "U' = -2f/D",
+            Dynamics.of((X,), (X - X**3,), diffusion=[[1 + X**2]], domain=[(-2, 2)]),
+            X**2 - 2 * sympy.log(1 + X**2),
+            over_and_back[:1],
+        ),
+        _exact(
+            "archetype",
+            "Two wells of three states with a circulation.",
+            "the archetype of the paper that siq implements",
+            Dynamics.of(
+                (X, Y, Z),
+                tuple(map(sympy.expand, (-sum(slope, nothing), slope[0] - slope[1], slope[0] - slope[2]))),
+                domain=[(-2, 2), (-1.5, 1.5), (-1.5, 1.5)],
+            ),
+            archetype,
+            (((-1, 0, 0), (0, 0, 0), (1, 0, 0)),),
+        ),
+        _exact(
+            "maier-stein",
+            "Maier and Stein's system with β = 1, where its drift has a potential.",
+            maier_and_stein,
+            of_maier_and_stein(1),
+            X**4 / 2 - X**2 + (1 + X**2) * Y**2 + half,
+            (((-1, 0), (0, 0), (1, 0)),),
+        ),
+        *(
+            _computed_twice(
+                f"maier-stein-{strength}",
+                f"Maier and Stein's system with β = {strength}: paths leave the axis, where U has a kink.",
+                maier_and_stein,
+                of_maier_and_stein(strength),
+            )
+            for strength in (5, 10)
+        ),
+        _computed_twice(
+            "consumer-resource",
+            "A consumer with a resource; predation levels off (Holling's type III).",
+            "Collie and Spencer (1994), as Moore et al., The R Journal 8, 19 (2016) take it, with D = 1",
+            Dynamics.of(
+                (X, Y), (alpha * X * (1 - X / beta) - eaten, gamma * eaten - mu * Y**2), domain=[(0, 8)] * 2
+            ),
+        ),
+        _computed_twice(
+            "toggle",
+            "Two genes that switch each other off, with D = 1.",
+            "Gardner, Cantor and Collins, Nature 403, 339 (2000)",
+            Dynamics.of((X, Y), (3 / (1 + Y**2) - X, 3 / (1 + X**2) - Y), domain=[(0, 4)] * 2),
+        ),
+        _computed_twice(
+            "fitzhugh-nagumo",
+            "FitzHugh and Nagumo's system where it is bistable, with D = 1.",
+            "FitzHugh, Biophysical Journal 1, 445 (1961)",
+            Dynamics.of((X, Y), (X - X**3 - Y, X - 3 * Y), domain=[(-1.5, 1.5), (-0.8, 0.8)]),
+        ),
+        _exact(
+            "chain",
+            "Ten bistable units in a row that turn about each other: f = (A - 1)∇Φ, U = 2Φ.",
+            "any f = (A - 1)∇Φ with A constant and antisymmetric",
+            Dynamics.of(
+                units,
+                [sympy.expand(falls[k + 1] - falls[k] - falls[k - 1]) for k in range(1, 11)],
+                domain=[(-2, 2)] * 10,
+            ),
+            2 * wells,
+        ),
+        _exact(
+            "particle",
+            "A damped particle in a tilted double well, with noise on its velocity alone.",
+            "Kramers, Physica 7, 284 (1940)",
+            Dynamics.of(
+                (X, V),
+                (V, sympy.expand(-place.diff(X) - friction * V)),
+                diffusion=[[0, 0], [0, 1]],
+                domain=[(-2, 2)] * 2,
+            ),
+            2 * friction * (V**2 / 2 + place),
+            tuple(tuple((*each, 0) for each in way) for way in over_and_back),
+        ),
+        _point_and_cycle(),
+    ]
+    return {each.name: each for each in systems}
 
 
 def _exact(
@@ -193,182 +318,35 @@ def _exact(
     source: str,
     dynamics: Dynamics,
     quasipotential: sympy.Expr,
-    ways: tuple[tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]], ...] = (),
+    ways: Sequence[Sequence[Sequence[float]]] = (),
 ) -> ReferenceSystem:
     """A system whose U is a formula; ways are attractor, saddle and the attractor behind it, about where."""
-    barriers = tuple(
-        _barrier_of(dynamics, quasipotential, *(_settled(dynamics, place) for place in way)) for way in ways
-    )
-    return ReferenceSystem(name, about, source, dynamics, quasipotential, barriers)
+    barriers = []
+    for way in ways:
+        places = [
+            scipy.optimize.root(
+                lambda x: dynamics.drift(x[None])[0], np.array(place, dtype=float),
+                jac=lambda x: dynamics.jacobian(x[None])[0], tol=1e-14,
+            ).x
+            for place in way
+        ]  # fmt: skip
+        barriers.append(_barrier_of(dynamics, quasipotential, *places))
+    return ReferenceSystem(name, about, source, dynamics, quasipotential, tuple(barriers))
 
 
-def _computed_systems(name: str, about: str, source: str, dynamics: Dynamics) -> ReferenceSystem:
+def _computed_twice(name: str, about: str, source: str, dynamics: Dynamics) -> ReferenceSystem:
     """A system of which nobody knows a formula of U, and two methods the barriers."""
     return ReferenceSystem(name, about, source, dynamics, None, DOUBLY_COMPUTED[name])
 
 
-def _settled(dynamics: Dynamics, place: tuple[float, ...]) -> np.ndarray:
-    """The equilibrium near a place, shape ``(d,)``, to rounding."""
-    found = scipy.optimize.root(
-        lambda x: dynamics.drift(x[None])[0],
-        np.array(place, dtype=float),
-        jac=lambda x: dynamics.jacobian(x[None])[0],
-        tol=1e-14,
-    )
-    return np.asarray(found.x)
-
-
-def _linear(name: str) -> ReferenceSystem:
-    hessian = sympy.Matrix([[2, 1], [1, 3]]) / 2
-    noise = sympy.Matrix([[2, HALF], [HALF, 1]])
-    turning = sympy.Matrix([[0, -3], [3, 0]])
-    states = sympy.Matrix([X, Y])
-    field = (turning - noise) * hessian * states
-    dynamics = Dynamics.of(
-        (X, Y), tuple(map(sympy.expand, field)), diffusion=_numbers(noise), domain=[(-2, 2)] * 2
-    )
-    potential = sympy.expand((states.T * hessian * states)[0])
-    return _exact(
-        name, "A linear system that turns, with a full D.", "Lyapunov's equation", dynamics, potential
-    )
-
-
-def _double_well(name: str) -> ReferenceSystem:
-    potential = (X**2 - 1) ** 2 / 2 - X / 5
-    dynamics = Dynamics.of((X,), (X - X**3 + TENTH,), domain=[(-2, 2)])
-    ways = (((-1.0,), (0.0,), (1.0,)), ((1.0,), (0.0,), (-1.0,)))
-    return _exact(
-        name,
-        "A tilted double well of one state.",
-        "Kramers, Physica 7, 284 (1940)",
-        dynamics,
-        potential,
-        ways,
-    )
-
-
-def _growing_noise(name: str) -> ReferenceSystem:
-    potential = X**2 - 2 * sympy.log(1 + X**2)
-    dynamics = Dynamics.of((X,), (X - X**3,), diffusion=[[1 + X**2]], domain=[(-2, 2)])
-    ways = (((-1.0,), (0.0,), (1.0,)),)
-    return _exact(
-        name, "A double well whose noise grows with the state.", "U' = -2f/D", dynamics, potential, ways
-    )
-
-
-def _archetype(name: str) -> ReferenceSystem:
-    potential = (X**2 - 1) ** 2 + Y**2 + Z**2
-    slope = [potential.diff(each) / 2 for each in (X, Y, Z)]
-    field = (-slope[0] - slope[1] - slope[2], -slope[1] + slope[0], -slope[2] + slope[0])
-    dynamics = Dynamics.of(
-        (X, Y, Z), tuple(map(sympy.expand, field)), domain=[(-2, 2), (-1.5, 1.5), (-1.5, 1.5)]
-    )
-    ways = (((-1.0, 0.0, 0.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0)),)
-    return _exact(
-        name, "Two wells of three states with a circulation.",
-        "the archetype of the paper that siq implements", dynamics, potential, ways,
-    )  # fmt: skip
-
-
-def _maier_stein(beta: int) -> Dynamics:
-    return Dynamics.of((X, Y), (X - X**3 - beta * X * Y**2, -(1 + X**2) * Y), domain=[(-2, 2), (-1, 1)])
-
-
-def _maier_stein_exact(name: str) -> ReferenceSystem:
-    potential = X**4 / 2 - X**2 + (1 + X**2) * Y**2 + HALF
-    ways = (((-1.0, 0.0), (0.0, 0.0), (1.0, 0.0)),)
-    return _exact(
-        name, "Maier and Stein's system with β = 1, where its drift has a potential.",
-        "Maier and Stein, Phys. Rev. Lett. 71, 1783 (1993)", _maier_stein(1), potential, ways,
-    )  # fmt: skip
-
-
-def _maier_stein_computed(beta: int) -> Callable[[str], ReferenceSystem]:
-    def build(name: str) -> ReferenceSystem:
-        return _computed_systems(
-            name,
-            f"Maier and Stein's system with β = {beta}: paths leave the axis, and U has a kink on it.",
-            "Maier and Stein, Phys. Rev. Lett. 71, 1783 (1993)",
-            _maier_stein(beta),
-        )
-
-    return build
-
-
-def _consumer_resource(name: str) -> ReferenceSystem:
-    alpha, beta, gamma, mu = (
-        sympy.Rational(*each) for each in ((154, 100), (1014, 100), (476, 1000), (112509, 1000000))
-    )
-    eaten = X**2 * Y / (1 + X**2)
-    return _computed_systems(
-        name,
-        "A consumer with a resource; predation levels off (Holling's type III).",
-        "Collie and Spencer (1994), as Moore et al., The R Journal 8, 19 (2016) take it, with D = 1",
-        Dynamics.of(
-            (X, Y), (alpha * X * (1 - X / beta) - eaten, gamma * eaten - mu * Y**2), domain=[(0, 8)] * 2
-        ),
-    )
-
-
-def _toggle(name: str) -> ReferenceSystem:
-    return _computed_systems(
-        name,
-        "Two genes that switch each other off, with D = 1.",
-        "Gardner, Cantor and Collins, Nature 403, 339 (2000)",
-        Dynamics.of((X, Y), (3 / (1 + Y**2) - X, 3 / (1 + X**2) - Y), domain=[(0, 4)] * 2),
-    )
-
-
-def _fitzhugh_nagumo(name: str) -> ReferenceSystem:
-    return _computed_systems(
-        name,
-        "FitzHugh and Nagumo's system where it is bistable, with D = 1.",
-        "FitzHugh, Biophysical Journal 1, 445 (1961)",
-        Dynamics.of((X, Y), (X - X**3 - Y, X - 3 * Y), domain=[(-1.5, 1.5), (-0.8, 0.8)]),
-    )
-
-
-def _chain(name: str) -> ReferenceSystem:
-    count = 10
-    states = sympy.symbols(f"x:{count}", real=True)
-    well = sum(((s**2 - 1) ** 2 / 4 for s in states), sympy.S.Zero)
-    potential = well + sum((HALF * (a - b) ** 2 for a, b in itertools.pairwise(states)), sympy.S.Zero)
-    slope = [potential.diff(s) for s in states]
-    field = [-each for each in slope]
-    for place in range(count - 1):
-        field[place] += slope[place + 1]
-        field[place + 1] -= slope[place]
-    dynamics = Dynamics.of(states, tuple(map(sympy.expand, field)), domain=[(-2, 2)] * count)
-    return _exact(
-        name, "Ten bistable units in a row that turn about each other: f = (A - 1)∇Φ, U = 2Φ.",
-        "any f = (A - 1)∇Φ with A constant and antisymmetric", dynamics, 2 * potential,
-    )  # fmt: skip
-
-
-def _particle(name: str) -> ReferenceSystem:
-    place = (X**2 - 1) ** 2 / 4 - X / 10
-    friction = HALF
-    dynamics = Dynamics.of(
-        (X, V),
-        (V, sympy.expand(-place.diff(X) - friction * V)),
-        diffusion=[[0, 0], [0, 1]],
-        domain=[(-2, 2)] * 2,
-    )
-    ways = (((-1.0, 0.0), (0.0, 0.0), (1.0, 0.0)), ((1.0, 0.0), (0.0, 0.0), (-1.0, 0.0)))
-    potential = 2 * friction * (V**2 / 2 + place)
-    return _exact(
-        name, "A damped particle in a tilted double well, with noise on its velocity alone.",
-        "Kramers, Physica 7, 284 (1940)", dynamics, potential, ways,
-    )  # fmt: skip
-
-
-def _point_and_cycle(name: str) -> ReferenceSystem:
+def _point_and_cycle() -> ReferenceSystem:
+    """Rings about a stable point: V' = r(r² - a²)(r² - b²) with a turn."""
     inner, outer, turns = sympy.Rational(1, 4), sympy.S.One, 2
     square = X**2 + Y**2
     half = square**3 / 6 - (inner + outer) * square**2 / 4 + inner * outer * square / 2
     field = (-half.diff(X) - turns * Y, -half.diff(Y) + turns * X)
     dynamics = Dynamics.of((X, Y), tuple(map(sympy.expand, field)), domain=[(-1.5, 1.5)] * 2)
-    value = float(2 * half.subs({X: HALF, Y: 0}))
+    value = float(2 * half.subs({X: sympy.Rational(1, 2), Y: 0}))
     beyond = value - float(2 * half.subs({X: 1, Y: 0}))
     origin, edge, circle = np.zeros(2), np.array([0.5, 0.0]), np.array([1.0, 0.0])
     how = "exact; any point of the circles"
@@ -377,30 +355,9 @@ def _point_and_cycle(name: str) -> ReferenceSystem:
         KnownBarrier(circle, edge, origin, beyond, 0.0, np.nan, how),
     )
     return ReferenceSystem(
-        name, "A stable point within a stable limit cycle, and an unstable cycle between them.",
+        "point-and-cycle", "A stable point within a stable limit cycle, and an unstable cycle between them.",
         "V' = r(r² - a²)(r² - b²) with a turn", dynamics, 2 * half, barriers,
     )  # fmt: skip
-
-
-_BUILDERS: Mapping[str, Callable[[str], ReferenceSystem]] = {
-    "linear": _linear,
-    "double-well": _double_well,
-    "growing-noise": _growing_noise,
-    "archetype": _archetype,
-    "maier-stein": _maier_stein_exact,
-    "maier-stein-5": _maier_stein_computed(5),
-    "maier-stein-10": _maier_stein_computed(10),
-    "consumer-resource": _consumer_resource,
-    "toggle": _toggle,
-    "fitzhugh-nagumo": _fitzhugh_nagumo,
-    "chain": _chain,
-    "particle": _particle,
-    "point-and-cycle": _point_and_cycle,
-}
-
-
-def _numbers(matrix: sympy.Matrix) -> np.ndarray:
-    return np.array(matrix.tolist(), dtype=float)
 
 
 def reference_table(*, points: int = 100) -> pd.DataFrame:
