@@ -67,8 +67,7 @@ def figures(given: Given, settings: PipelineSettings) -> Any:
     from dataclasses import replace
 
     from siq.quasipotential.landscape_files import read_landscape
-    from siq.report.figures import inspection_drawn
-    from siq.report.page import interactive_view
+    from siq.report.page import inspection_drawn, interactive_view
     from siq.report.summary import summarise
     from siq.workflow.results import read_states
     from siq.workflow.scoring import exact_answer, shown_formula
@@ -188,8 +187,7 @@ def page(given: Given, settings: PipelineSettings) -> Any:
     from markupsafe import Markup
 
     from siq.quasipotential.landscape_files import landscape_from_data
-    from siq.report.figures import read_inspection, read_seen
-    from siq.report.page import render_report
+    from siq.report.page import read_inspection, read_seen, render_report
     from siq.report.study_page import StudyResults, answer_data, study_page
     from siq.report.summary import summarise
     from siq.workflow.scoring import exact_answer, shown_formula

@@ -21,8 +21,8 @@ import sympy
 
 from siq.numerics.text import range_text, value_text
 from siq.quasipotential.landscape_files import landscape_from_data
-from siq.report.figures import read_seen
 from siq.report.formatting import counted_text, predicted_text
+from siq.report.page import read_seen
 from siq.report.summary import summarise
 from siq.systems.dynamics import Dynamics
 

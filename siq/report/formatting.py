@@ -229,43 +229,40 @@ def formula_mathml(expression: sympy.Expr, *, decimals: int = 3) -> Markup:
     markupsafe.Markup
         One ``<math>`` element, well-formed XML, safe to put in a page; long sums stand on several lines.
     """
-    printer = _MathMLPrinter(decimals)
-    spoken = formula_text(expression, decimals=decimals)
-    return _math(printer, printer.lines(_with_integer_exponents(expression)), spoken)
+    return _typeset([[expression]], decimals, brackets=False)
 
 
 def vector_mathml(expressions: Sequence[sympy.Expr], *, decimals: int = 3) -> Markup:
     """Typeset the components of a vector as a column in brackets, as `formula_mathml` does."""
-    printer = _MathMLPrinter(decimals)
-    table = printer.table([[printer.lines(_with_integer_exponents(entry))] for entry in expressions])
-    spoken = "; ".join(formula_text(entry, decimals=decimals) for entry in expressions)
-    return _math(printer, printer.bracketed(table), spoken)
+    return _typeset([[entry] for entry in expressions], decimals, flush=True)
 
 
 def matrix_mathml(rows: Sequence[Sequence[sympy.Expr | float]], *, decimals: int = 3) -> Markup:
     """Typeset a matrix of numbers or formulas in brackets; an entry that stands alone without them."""
+    return _typeset(rows, decimals, brackets=len(rows) > 1)
+
+
+def _typeset(
+    rows: Sequence[Sequence[sympy.Expr | float]], decimals: int, *, brackets: bool = True, flush: bool = False
+) -> Markup:
+    """A table of formulas and numbers, in brackets, or the one entry; `flush` sets columns to the left."""
     printer = _MathMLPrinter(decimals)
-
-    def text(entry: sympy.Expr | float) -> str:
-        if isinstance(entry, sympy.Expr):
-            return formula_text(entry, decimals=decimals)
-        return str(int(entry)).replace("-", MINUS) if float(entry).is_integer() else value_text(entry)
-
-    def node(entry: sympy.Expr | float) -> Any:
-        if isinstance(entry, sympy.Expr):
-            return printer.lines(_with_integer_exponents(entry))
-        return printer.leaf("mn", text(entry))
-
-    spoken = "; ".join(", ".join(map(text, row)) for row in rows)
-    nodes = [list(map(node, row)) for row in rows]
-    if len(nodes) == 1:
-        return _math(printer, nodes[0][0], spoken)
-    return _math(printer, printer.bracketed(printer.table(nodes, flush=False)), spoken)
-
-
-def _math(printer: _MathMLPrinter, content: Any, spoken: str) -> Markup:
+    spoken: list[list[str]] = []
+    nodes: list[list[Any]] = []
+    for row in rows:
+        spoken.append([])
+        nodes.append([])
+        for entry in row:
+            if isinstance(entry, sympy.Basic):
+                spoken[-1].append(formula_text(entry, decimals=decimals))
+                nodes[-1].append(printer.lines(_with_integer_exponents(entry)))
+            else:
+                whole = float(entry).is_integer()
+                spoken[-1].append(str(int(entry)).replace("-", MINUS) if whole else value_text(entry))
+                nodes[-1].append(printer.leaf("mn", spoken[-1][-1]))
+    content = printer.bracketed(printer.table(nodes, flush=flush)) if brackets else nodes[0][0]
     element = printer.element("math", content)
-    element.setAttribute("aria-label", spoken)
+    element.setAttribute("aria-label", "; ".join(", ".join(row) for row in spoken))
     # The only place where markup is declared safe: minidom has escaped every text and attribute in it.
     return Markup(element.toxml())
 

@@ -28,7 +28,6 @@ from siq.numerics.text import unit_text, value_text
 from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.quasipotential.landscape import sentences_without_landscape
 from siq.quasipotential.wells import Well
-from siq.report.figures import LEADING, figure_of, figures_of, shown_figures
 from siq.report.formatting import (
     formula_mathml,
     matrix_mathml,
@@ -51,7 +50,16 @@ from siq.report.landscape import (
     times_table,
     wells_table,
 )
-from siq.report.page import FormulaRow, ReportContent, ReportFigure, compose
+from siq.report.page import (
+    LEADING,
+    FormulaRow,
+    ReportContent,
+    ReportFigure,
+    compose,
+    figure_of,
+    figures_of,
+    shown_figures,
+)
 from siq.report.summary import LandscapeSummary, well_name
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics

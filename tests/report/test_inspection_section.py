@@ -6,8 +6,8 @@ import numpy as np
 from remembering import STEP, double_wells
 
 from siq.data.recordings import Recordings
-from siq.report.figures import inspection_drawn, read_inspection
 from siq.report.formatting import texts
+from siq.report.page import inspection_drawn, read_inspection
 
 
 def test_an_inspection_leaves_its_lines_and_three_figures(tmp_path: Path) -> None:

@@ -13,9 +13,8 @@ import sympy
 from told_landscapes import NOISE, landscape, told
 
 from siq.quasipotential.formulas import SymbolicDecomposition, exact_decomposition, model_to_data, write_model
-from siq.report.figures import LEADING, OF_NETWORKS, OF_RUNS
 from siq.report.formatting import texts
-from siq.report.page import ReportContent, ReportSection, render_report
+from siq.report.page import LEADING, OF_NETWORKS, OF_RUNS, ReportContent, ReportSection, render_report
 from siq.report.study_page import StudyResults, study_page
 from siq.report.summary import summarise
 from siq.systems.dynamics import Dynamics
