@@ -38,7 +38,7 @@ from siq.quasipotential.transitions import barrier_uncertainty, ways_out
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, Parameter, symbol
 from siq.systems.phase_portrait import evenly_spread, phase_portrait
-from siq.workflow import identification_step
+from siq.workflow import results
 from siq.workflow.pipeline import PipelineSettings, analyse
 
 RECORDS, SAMPLES, STEP, WITHIN = 8, 20_000, 0.01, 10
@@ -164,9 +164,7 @@ def only_barriers(particle: Particle, seed: int) -> dict[str, object]:
     settings = PipelineSettings(identification=IdentificationOptions(hidden_velocities=True))
     recordings = in_stretches(without_slow_drift(recorded(particle, seed)))
     began = time.process_time()
-    identified = identification_step.run(
-        settings.of(identification_step.IdentifySettings), recordings, number=0
-    )
+    identified = results.identify_run(settings, recordings, number=0)
     record = identified.record
     if record is None:
         return {"fault": [identified.outcome.reason], "seconds": time.process_time() - began}

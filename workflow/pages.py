@@ -92,7 +92,7 @@ def figures(given: Given, settings: PipelineSettings) -> Any:
     record, recorded = given.field[first], given.recordings[first]
     folder = Path(given.outputs["drawn"])
     if record is not None and recorded is not None:
-        dynamics = record.found.dynamics
+        dynamics = record.dynamics
         stored = read_landscape(source["overview"], dynamics=dynamics)
         states = read_states(source["recordings"][first], source["field"][first]) or recorded
         refined = models.formulas(first).get(Method.REFINED)
@@ -145,8 +145,7 @@ def invariant(given: Given, settings: PipelineSettings) -> Any:
     from workflow.figures.density import plot_invariant_distribution
 
     shown = _what_it_follows_from(given) if settings.invariant and given.card is not None else None
-    own = settings.of(comparison.InvariantSettings)
-    found = comparison.compare_invariant(own, given.card, shown, _published(given))
+    found = comparison.compare_invariant(settings, given.card, shown, _published(given))
     drawn = {}
     if found.densities:
         names = settings.space.names or ()
@@ -201,7 +200,7 @@ def page(given: Given, settings: PipelineSettings) -> Any:
     landscape = None
     if overview is not None:
         number = overview["run"]
-        stored = landscape_from_data(overview, given.field[number].found.dynamics)
+        stored = landscape_from_data(overview, given.field[number].dynamics)
         landscape = summarise(stored, record=tables["record"], run=number)
     view = Path(source["drawn"]) / "interactive.html"
     folders = [source["drawn"], *source["drawn_landscape"], source["drawn_density"]]

@@ -26,15 +26,14 @@ from benchmarks.laboratories.models import ARCHETYPE, Laboratory, maier_stein, r
 from benchmarks.laboratories.one import read, write
 from benchmarks.laboratories.records import generator, recorded, table
 from siq.data.recordings import Recordings, snapshot_pairs
-from siq.inference.checks import PredictionLimits
 from siq.inference.field_estimate import FieldEstimate, FlowMap
 from siq.inference.kalman_filter import Noise
 from siq.inference.library import CandidateLibrary, IdentificationOptions, field_library
 from siq.inference.observation import ObservationModel, unbroken
 from siq.inference.regression import refit
 from siq.systems.diffusion import Diffusion
-from siq.workflow.identification_step import IdentifySettings, run
-from siq.workflow.study import Sampling, StateSpace
+from siq.workflow.results import identify_run
+from siq.workflow.study import PipelineSettings, Sampling, StateSpace
 
 STRONG = 5.0  # standard errors of the weakest true term of a record that counts
 WANTED = 0.93
@@ -84,15 +83,14 @@ def identified(laboratory: Laboratory, seed: int) -> dict[str, Any]:
     seen = recorded(laboratory, generator(laboratory, seed))
     recordings, options = Recordings.from_frame(table(laboratory, seen)), IdentificationOptions()
     library = field_library(recordings.names, options)
-    settings = IdentifySettings(
+    settings = PipelineSettings(
         seed=seed,
         space=StateSpace(diffusion="identity"),
         sampling=Sampling(),
         identification=options,
-        prediction=PredictionLimits(),
     )
     began = time.process_time()
-    step = run(settings, recordings, number=0)
+    step = identify_run(settings, recordings, number=0)
     seconds = time.process_time() - began
     found = set() if step.record is None else {(int(i), int(k)) for i, k in step.record.support}
     true = set(true_terms(laboratory, library))

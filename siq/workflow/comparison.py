@@ -12,13 +12,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from dataclasses import dataclass as plain_dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import sympy
-from pydantic import Field
-from pydantic.dataclasses import dataclass
 
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import read_field
@@ -39,7 +37,7 @@ from siq.quasipotential.invariant_density import (
     normalisation_bessel,
     normalisation_quadrature,
 )
-from siq.quasipotential.landscape import Landscape, LandscapeOptions, NoLandscape
+from siq.quasipotential.landscape import Landscape, NoLandscape
 from siq.quasipotential.landscape_assembly import EquationSettings, landscape_from_equations
 from siq.quasipotential.landscape_comparison import (
     ErrorInRegion,
@@ -62,7 +60,7 @@ from siq.systems.simulation import simulate_stationary
 from siq.validation.escapes import Neighbourhood, neighbourhood, simulate_escapes
 from siq.validation.mesh import mesh_potential
 from siq.workflow.published import PublishedFigure, published_formula, published_potentials
-from siq.workflow.study import STRICT, StateSpace
+from siq.workflow.study import PipelineSettings
 from siq.workflow.tables import as_table, concatenate
 
 
@@ -89,14 +87,7 @@ STARTS = 4000  # states over the domain, from which those are taken that cover i
 REACH = 1.2  # of the lowest barrier out of a well: landscapes are compared up to 1.1 of it
 
 
-@dataclass(frozen=True, config=STRICT)
-class ReferenceSettings:
-    """What a reference depends on beside the card."""
-
-    seed: int
-
-
-def reference_of_card(settings: ReferenceSettings, system: Dynamics) -> ReferenceLandscape:
+def reference_of_card(settings: PipelineSettings, system: Dynamics) -> ReferenceLandscape:
     """The reference for the landscape of a card; an empty one that says why where there is none."""
     draw = generator(settings.seed, Purpose.REFERENCE)
     low, high = system.box.T
@@ -119,15 +110,6 @@ NONE_OF_OURS = -1  # the run of what was published, or of a mesh
 TABLE = "landscape_errors"
 
 
-@dataclass(frozen=True, config=STRICT)
-class LandscapeErrorsSettings:
-    """What the comparison depends on."""
-
-    seed: int
-    space: StateSpace
-    landscape: LandscapeOptions
-
-
 @plain_dataclass(frozen=True)
 class RunToCompare:
     """What a run says of U: its landscape, its formulas by method, its networks, as far as there are any."""
@@ -147,7 +129,7 @@ class PublishedAnswers:
 
 
 def run_landscape_errors(
-    settings: LandscapeErrorsSettings,
+    settings: PipelineSettings,
     reference: ReferenceLandscape,
     runs: Sequence[RunToCompare],
     published: PublishedAnswers | None,
@@ -155,7 +137,7 @@ def run_landscape_errors(
     """The table `landscape_errors`; without a reference it has no rows."""
     if reference.reason:
         return as_table(TABLE, [])
-    below = settings.landscape.compare_below
+    below = None if settings.landscape is None else settings.landscape.compare_below
     tables = []
     for one in runs:
         if one.landscape is not None:
@@ -190,10 +172,10 @@ def _of_networks(one: TrainedNetworks) -> Potential:
 
 
 def _of_published(
-    settings: LandscapeErrorsSettings, published: PublishedAnswers, reference: ReferenceLandscape
+    settings: PipelineSettings, published: PublishedAnswers, reference: ReferenceLandscape
 ) -> list[pd.DataFrame]:
     """The published formula, as printed and with what its rounding leaves open, and the published mesh."""
-    below = settings.landscape.compare_below
+    below = None if settings.landscape is None else settings.landscape.compare_below
     formulas = published_potentials(
         published.figures, [sympy.Symbol(name, real=True) for name in settings.space.names or ()],
         draws=DRAWS, generator=generator(settings.seed, Purpose.ROUNDING),
@@ -219,16 +201,8 @@ FOLLOWED = 1.5  # predicted mean times, after which who is left counts as censor
 NEIGHBOURHOOD = 0.2  # of the barrier out of the well that is reached
 
 
-@dataclass(frozen=True, config=STRICT)
-class EscapesSettings:
-    """What the simulations of escapes depend on beside the card."""
-
-    seed: int
-    landscape: LandscapeOptions
-
-
 def run_escapes(
-    settings: EscapesSettings, system: Dynamics, landscapes: Sequence[Mapping[str, Any] | None]
+    settings: PipelineSettings, system: Dynamics, landscapes: Sequence[Mapping[str, Any] | None]
 ) -> pd.DataFrame:
     """The table `escape`, of the first run that knows the height of all its wells.
 
@@ -249,7 +223,7 @@ def run_escapes(
     for way in complete.transitions:
         if way.rate is None or not np.isfinite(way.barrier) or way.end is None:
             continue
-        for number, intensity in enumerate(settings.landscape.noise_intensities):
+        for number, intensity in enumerate(settings.noises):
             draw = generator(settings.seed, Purpose.ESCAPE, str(way.start), str(number))
             row = _simulated(system, complete, way, intensity, draw)
             name = f"A{way.start + 1} to A{way.end + 1}"
@@ -287,16 +261,8 @@ BESIDE_EQUATIONS_TABLE = "beside_equations"
 NO_RUN = -1  # the run of a row that is of the equations alone
 
 
-@dataclass(frozen=True, config=STRICT)
-class BesideEquationsSettings:
-    """What the comparison depends on beside the card."""
-
-    seed: int
-    landscape: LandscapeOptions
-
-
 def run_beside_equations(
-    settings: BesideEquationsSettings, system: Dynamics, runs: Sequence[Mapping[str, Any] | None]
+    settings: PipelineSettings, system: Dynamics, runs: Sequence[Mapping[str, Any] | None]
 ) -> pd.DataFrame:
     """The table `beside_equations`.
 
@@ -330,7 +296,7 @@ def run_beside_equations(
         try:
             one = landscape_from_data(data, system)
             shown = () if one.noise is None else (one.noise.intensity,)
-            noises = settings.landscape.noise_intensities or shown
+            noises = settings.noises or shown
             compared = differences(found, one, noises=noises)
         except ValueError as error:
             rows.append({"run": number, "note": str(error)})
@@ -345,15 +311,6 @@ DENSITY_WALKERS = 4000
 STEPS = 20_000  # of the simulation, after a fifth of them to settle
 KEPT = 50  # samples of every walker
 ACCURACY = 0.025  # step times the norm of the Jacobian where the walkers are
-
-
-@dataclass(frozen=True, config=STRICT)
-class InvariantSettings:
-    """What the invariant distribution depends on; `invariant` has the intensities ε."""
-
-    seed: int
-    space: StateSpace
-    invariant: tuple[Annotated[float, Field(gt=0)], ...]
 
 
 @plain_dataclass(frozen=True)
@@ -386,7 +343,7 @@ Shown = FormulaShown | LandscapeShown
 
 
 def compare_invariant(
-    settings: InvariantSettings,
+    settings: PipelineSettings,
     system: Dynamics | None,
     shown: Shown | None,
     published: Mapping[str, PublishedFigure],

@@ -17,7 +17,7 @@ from siq.data.preparation import in_stretches, joined, without_slow_drift
 from siq.data.recordings import Recordings, recordings_of
 from siq.quasipotential.landscape import Landscape, NoLandscape
 from siq.systems.dynamics import Dynamics
-from siq.workflow import identification_step, results, steps
+from siq.workflow import results, steps
 from siq.workflow.study import PipelineSettings
 from siq.workflow.tables import Outcome, why_no_landscape
 from siq.workflow.tasks import Given, outputs_of
@@ -42,7 +42,7 @@ class Analysis:
         Wells, barriers, ways; None where not asked for.
     """
 
-    identified: identification_step.Identified
+    identified: results.Identified
     trained: TrainedRun
     regressed: results.Regressed | None
     refined: results.RefinedRun

@@ -1,4 +1,4 @@
-"""Results of the steps of a run: what was drawn, regressed, refined, and its landscape.
+"""Results of the steps of a run: what was drawn, identified, regressed, refined, and its landscape.
 
 Each result has its object, None where a step failed, and an outcome that says why; ``files()`` gives what
 is written, by the names of the rule's outputs. The formulas of the regression are certified beside the
@@ -11,17 +11,18 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass as plain_dataclass
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from pydantic.dataclasses import dataclass
 
 from siq.data.preparation import in_stretches, read_pairs, without_slow_drift
 from siq.data.recordings import Recordings, resample_recordings, snapshot_pairs
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import FieldEstimate
+from siq.inference.identify import identify
 from siq.inference.kalman_identification import of_all_states
 from siq.inference.library import candidate_library
 from siq.networks.decomposition import TrainedNetworks
@@ -29,21 +30,20 @@ from siq.networks.regression import RegressionResult, points_below, sparse_decom
 from siq.numerics.randomness import Purpose, generator
 from siq.numerics.text import place_text
 from siq.quasipotential.certificate import Certificate, certify, uncertified
-from siq.quasipotential.certificate_tests import CertificateOptions
 from siq.quasipotential.formulas import SymbolicDecomposition, decomposition_from_coefficients
-from siq.quasipotential.landscape import Landscape, LandscapeOptions, NoLandscape
+from siq.quasipotential.landscape import Landscape, NoLandscape
 from siq.quasipotential.landscape_assembly import EquationSettings, find_landscape, landscape_from_equations
 from siq.quasipotential.occupancy import OccupancyCheck, VisitTest
 from siq.quasipotential.rates import MeanTime, NoiseStrength, mean_exit_time, mean_residence_time
 from siq.quasipotential.refinement import (
     Refinement,
     RefinementContext,
-    RefinementOptions,
     control,
     refine_and_certify,
 )
 from siq.quasipotential.wells import Well, best_trial
 from siq.remarks import Remark
+from siq.report.remarks import sentence
 from siq.systems.cards import load_system
 from siq.systems.cycles import Cycle
 from siq.systems.diffusion import Diffusion
@@ -51,10 +51,46 @@ from siq.systems.dynamics import Dynamics
 from siq.systems.phase_portrait import PhasePortrait, evenly_spread, phase_portrait
 from siq.systems.simulation import simulate_snapshots
 from siq.workflow.files import read
-from siq.workflow.identification_step import Identified
-from siq.workflow.study import STRICT, PipelineSettings, Sampling, StateSpace
+from siq.workflow.study import PipelineSettings, StateSpace
 from siq.workflow.tables import Method, Outcome, Status, Step, as_table
 from siq.workflow.training import TrainedRun
+
+
+@plain_dataclass(frozen=True)
+class Identified:
+    """The identified f of a run with the test of its predictions, None where none was found."""
+
+    record: FieldEstimate | None
+    outcome: Outcome
+
+    def files(self) -> dict[str, Any]:
+        """By the names of the rule."""
+        return {"field": self.record, "identify_outcome": [self.outcome]}
+
+
+def identify_run(settings: PipelineSettings, recordings: Recordings | None, *, number: int) -> Identified:
+    """f of run `number`, from its recordings; None where drawing them failed."""
+    if recordings is None:
+        reason = "the run has no trajectories"
+        return Identified(None, Outcome(number, Step.IDENTIFY, Status.SKIPPED, reason))
+    named = zip(recordings.names, recordings.units, strict=True)
+    try:
+        found = identify(
+            recordings, options=settings.identification, limits=settings.prediction,
+            draw=partial(generator, settings.seed, number), diffusion=settings.space.noise(recordings.names),
+            units=[unit or settings.space.unit(name) or None for name, unit in named],
+            pair_step=settings.sampling.pair_step, integrator_step=settings.sampling.integrator_step,
+        )  # fmt: skip
+    except (NumericalFailure, np.linalg.LinAlgError) as error:
+        return Identified(None, Outcome(number, Step.IDENTIFY, Status.FAILED, str(error)))
+    assert found.diagnosis is not None and found.prediction is not None
+    remarks = [sentence(remark) for remark in found.diagnosis.remarks]
+    if found.prediction.passed:
+        status, first = Status.OK, found.diffusion_source.note
+    else:
+        status, first = Status.WARNING, found.prediction.reason
+    reasons = "; ".join(one for one in (first, *remarks) if one)
+    return Identified(found, Outcome(number, Step.IDENTIFY, status, reasons))
 
 
 def read_states(path: str | Path, field: str | Path) -> Recordings | None:
@@ -212,16 +248,6 @@ def _quality(result: RegressionResult) -> dict[str, Any]:
     }
 
 
-@dataclass(frozen=True, config=STRICT)
-class RefineSettings:
-    """What refinement and certificate depend on."""
-
-    seed: int
-    sampling: Sampling
-    refinement: RefinementOptions
-    certificate: CertificateOptions
-
-
 @plain_dataclass(frozen=True)
 class RunToRefine:
     """What the steps before have left of a run.
@@ -287,7 +313,7 @@ class RefinedRun:
         return None if self.refinement is None else self.refinement.record
 
 
-def refine_run(settings: RefineSettings, given: RunToRefine) -> RefinedRun:
+def refine_run(settings: PipelineSettings, given: RunToRefine) -> RefinedRun:
     """V about every attractor of the identified f, or over the region, with its certificate."""
     identified, trained = given.identified, given.trained
     number, networks = identified.outcome.run, trained.networks
@@ -483,17 +509,6 @@ def degree_rows(run: int, found: Landscape) -> pd.DataFrame:
     return as_table("degrees", rows)
 
 
-@dataclass(frozen=True, config=STRICT)
-class LandscapeSettings:
-    """What a landscape depends on."""
-
-    seed: int
-    space: StateSpace
-    sampling: Sampling
-    refinement: RefinementOptions
-    landscape: LandscapeOptions | None
-
-
 @plain_dataclass(frozen=True)
 class FoundLandscape:
     """The landscape of a run with the f that it is of, None where it could not be found."""
@@ -517,7 +532,7 @@ class FoundLandscape:
 
 
 def landscape_of_run(
-    settings: LandscapeSettings,
+    settings: PipelineSettings,
     recordings: Recordings | None,
     record: FieldEstimate | None,
     *,
@@ -563,7 +578,7 @@ def landscape_of_run(
     return FoundLandscape(found, record, outcome)
 
 
-def noise_strength(settings: LandscapeSettings, record: FieldEstimate) -> NoiseStrength | None:
+def noise_strength(settings: PipelineSettings, record: FieldEstimate) -> NoiseStrength | None:
     """The noise that the recordings show, or else the first that the study gives."""
     if (shown := record.noise_strength) is not None:
         return NoiseStrength(*shown, source="estimated")

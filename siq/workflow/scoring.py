@@ -38,7 +38,6 @@ from siq.systems.formulas import compile_formulas
 from siq.systems.simulation import SimulationOptions, simulate_snapshots
 from siq.workflow import results
 from siq.workflow.published import PublishedFigure
-from siq.workflow.results import LandscapeSettings
 from siq.workflow.study import PipelineSettings
 from siq.workflow.tables import METHODS, Method, Outcome, Status, Step, as_table, concatenate
 from siq.workflow.training import TrainedRun
@@ -493,7 +492,7 @@ def _has_wells(data: Mapping[str, Any] | None) -> bool:
     return bool(data) and bool((data or {}).get("wells"))
 
 
-def overview_of_run(settings: LandscapeSettings, given: RunToShow) -> dict[str, Any] | None:
+def overview_of_run(settings: PipelineSettings, given: RunToShow) -> dict[str, Any] | None:
     """The overview of a run whose landscape nobody asked for; None where it has none."""
     found = results.landscape_of_run(
         settings, given.recordings, given.record,

@@ -39,10 +39,9 @@ def draw(given: Given, settings: PipelineSettings) -> Any:
 @task("recordings", options=("seed", "space", "sampling", "identification", "certificate"))
 def identify(given: Given, settings: PipelineSettings) -> Any:
     """The vector field f from pairs of samples, with the test of its predictions."""
-    from siq.workflow import identification_step
+    from siq.workflow import results
 
-    own = settings.of(identification_step.IdentifySettings)
-    return identification_step.run(own, given.recordings, number=given.number)
+    return results.identify_run(settings, given.recordings, number=given.number)
 
 
 @task("recordings", "field", options=("seed", "space", "sampling", "training"))
@@ -81,17 +80,17 @@ def regress(given: Given, settings: PipelineSettings) -> Any:
 )  # fmt: skip
 def refine(given: Given, settings: PipelineSettings) -> Any:
     """V and g refined on the Hamilton–Jacobi equation, and the certificate of every formula."""
-    from siq.workflow import identification_step, results
+    from siq.workflow import results
     from siq.workflow.tables import Method
 
     regressed = {} if given.regression is None else given.regression[0]
     run = results.RunToRefine(
         given.recordings,
-        identification_step.Identified(given.field, given.identify_outcome[0]),
+        results.Identified(given.field, given.identify_outcome[0]),
         _trained(given),
         regressed.get(Method.REGRESSION),
     )
-    return results.refine_run(settings.of(results.RefineSettings), run)
+    return results.refine_run(settings, run)
 
 
 @task(
@@ -135,9 +134,9 @@ def landscape(given: Given, settings: PipelineSettings) -> Any:
     """Equilibria of the identified f, a formula for each well, barriers, paths and times."""
     from siq.workflow import results
 
-    own, refined = settings.of(results.LandscapeSettings), given.refined  # known in memory alone
+    refined = given.refined  # known in memory alone
     return results.landscape_of_run(
-        own, given.recordings, given.field, wells=_wells(given.model), number=given.number,
+        settings, given.recordings, given.field, wells=_wells(given.model), number=given.number,
         certificate=None if refined is None else refined.certificate,
         visits=() if refined is None or refined.record is None else refined.record.visits,
     )  # fmt: skip
@@ -150,7 +149,6 @@ def landscape(given: Given, settings: PipelineSettings) -> Any:
 def overview(given: Given, settings: PipelineSettings) -> Any:
     """The landscape that the page opens with, found for this run alone where the study asks for none."""
     from siq.workflow import scoring
-    from siq.workflow.results import LandscapeSettings
 
     models = _models(given)
     shown = scoring.shown_formula(given.rrmse, models)
@@ -166,17 +164,16 @@ def overview(given: Given, settings: PipelineSettings) -> Any:
         run = scoring.RunToShow(
             number, given.recordings[number], given.field[number], _wells(given.model[number])
         )
-        found = scoring.overview_of_run(settings.of(LandscapeSettings), run)
+        found = scoring.overview_of_run(settings, run)
     return {"overview": found}
 
 
 @task("card", options=("seed", "card"))
 def reference(given: Given, settings: PipelineSettings) -> Any:
-    """What methods say of the card's own vector field that share no code with ours."""
+    """What methods say of the card's settings vector field that share no code with ours."""
     from siq.workflow import comparison
 
-    own = settings.of(comparison.ReferenceSettings)
-    return {"reference": comparison.reference_of_card(own, given.card)}
+    return {"reference": comparison.reference_of_card(settings, given.card)}
 
 
 @task(
@@ -199,17 +196,15 @@ def landscape_errors(given: Given, settings: PipelineSettings) -> Any:
     published = None
     if given.published is not None:
         published = comparison.PublishedAnswers(given.published.figures, published_mesh(given))
-    own = settings.of(comparison.LandscapeErrorsSettings)
-    return {"table": comparison.run_landscape_errors(own, given.reference, runs, published)}
+    return {"table": comparison.run_landscape_errors(settings, given.reference, runs, published)}
 
 
 @task("quasipotential", "card", options=("seed", "landscape", "card"))
 def beside_equations(given: Given, settings: PipelineSettings) -> Any:
-    """The landscape of the card's own equations beside those of the runs: scoring alone."""
+    """The landscape of the card's settings equations beside those of the runs: scoring alone."""
     from siq.workflow import comparison
 
-    own = settings.of(comparison.BesideEquationsSettings)
-    table = comparison.run_beside_equations(own, given.card, list(given.quasipotential))
+    table = comparison.run_beside_equations(settings, given.card, list(given.quasipotential))
     return {"table": table}
 
 
@@ -218,8 +213,7 @@ def escapes(given: Given, settings: PipelineSettings) -> Any:
     """Simulated escapes beside the law."""
     from siq.workflow import comparison
 
-    own = settings.of(comparison.EscapesSettings)
-    return {"table": comparison.run_escapes(own, given.card, list(given.quasipotential))}
+    return {"table": comparison.run_escapes(settings, given.card, list(given.quasipotential))}
 
 
 # Landscapes of equations.
@@ -228,10 +222,14 @@ def escapes(given: Given, settings: PipelineSettings) -> Any:
 @task("card", options=("seed", "refinement", "certificate", "landscape", "card"))
 def equations(given: Given, settings: PipelineSettings) -> Any:
     """The landscape of equations."""
+    from siq.quasipotential.landscape import LandscapeOptions
     from siq.quasipotential.landscape_assembly import EquationSettings
     from siq.workflow import results
 
-    return results.landscape_of_equations(settings.of(EquationSettings), given.card)
+    own = EquationSettings(
+        settings.seed, settings.refinement, settings.certificate, settings.landscape or LandscapeOptions()
+    )
+    return results.landscape_of_equations(own, given.card)
 
 
 @task("card", options=("seed", "card_but_for_swept"))

@@ -8,11 +8,10 @@ and its card.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from decimal import Decimal
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, field_validator, model_validator
@@ -517,9 +516,6 @@ class StateSpace:
         return (self.units or {}).get(name, unknown)
 
 
-Settings = TypeVar("Settings")
-
-
 @pydantic_dataclass(frozen=True, config=STRICT)
 class PipelineSettings:
     """What the analysis of recordings depends on; the defaults need no networks.
@@ -578,10 +574,10 @@ class PipelineSettings:
         """Whose formulas a run has: without networks there is nothing to regress."""
         return METHODS if self.published_method else (Method.REFINED,)
 
-    def of(self, cls: type[Settings]) -> Settings:
-        """The settings of one step that has a class of its own for them."""
-        fields = dataclasses.fields(cls)  # type: ignore[arg-type]
-        return cls(**{field.name: getattr(self, field.name) for field in fields})
+    @property
+    def noises(self) -> tuple[float, ...]:
+        """Noise intensities ε of escape times, none where no landscape is asked for."""
+        return () if self.landscape is None else self.landscape.noise_intensities
 
     def parts(self, names: Sequence[str]) -> dict[str, Any]:
         """Some parts as plain data, from which `PipelineSettings` is made again; ``a.b`` is b of a alone."""

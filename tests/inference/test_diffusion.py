@@ -10,7 +10,6 @@ from known_systems import as_system, linear_system
 
 from siq.data.recordings import Recordings, snapshot_pairs
 from siq.errors import NumericalFailure
-from siq.inference.checks import PredictionLimits
 from siq.inference.diffusion_model import check_units, estimated_diffusion
 from siq.inference.field_estimate import DiffusionSource, FieldEstimate, read_field, write_field
 from siq.inference.library import IdentificationOptions, field_library
@@ -19,7 +18,7 @@ from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.landscape_comparison import _check_same_noise
 from siq.systems.diffusion import Diffusion
 from siq.systems.simulation import SimulationOptions, simulate_snapshots
-from siq.workflow import identification_step, results
+from siq.workflow import results
 from siq.workflow.pipeline import PipelineSettings
 from siq.workflow.study import Sampling, StateSpace
 from siq.workflow.tables import Status
@@ -42,12 +41,10 @@ def recorded(
     return replace(found, units=units)
 
 
-def identified(recordings: Recordings, space: StateSpace | None = None) -> identification_step.Identified:
+def identified(recordings: Recordings, space: StateSpace | None = None) -> results.Identified:
     sampling = Sampling(integrator_step=0.002)
-    settings = identification_step.IdentifySettings(
-        0, space or StateSpace(), sampling, LINEAR, PredictionLimits()
-    )
-    return identification_step.run(settings, recordings, number=0)
+    settings = PipelineSettings(space=space or StateSpace(), sampling=sampling, identification=LINEAR)
+    return results.identify_run(settings, recordings, number=0)
 
 
 def test_an_estimated_d_is_compared_within_its_errors() -> None:
@@ -61,7 +58,7 @@ def test_an_estimated_d_is_compared_within_its_errors() -> None:
             _check_same_noise(learned.with_diffusion(Diffusion(other)), learned, states, found=field)
 
 
-def field_of(found: identification_step.Identified) -> FieldEstimate:
+def field_of(found: results.Identified) -> FieldEstimate:
     assert found.record is not None
     return found.record
 
@@ -146,7 +143,7 @@ def test_where_d_is_from_is_kept_with_the_field_and_said_of_the_landscape(tmp_pa
     write_field(tmp_path / "vector_field.json", found.record, LINEAR)
     kept = read_field(tmp_path / "vector_field.json")
     assert kept is not None and kept.diffusion_source == DiffusionSource.UNIT
-    settings = PipelineSettings(identification=LINEAR).of(results.LandscapeSettings)
+    settings = PipelineSettings(identification=LINEAR)
     seen = results.landscape_of_run(settings, recordings, kept, number=0)
     assert seen.landscape is not None and seen.outcome.status == Status.OK
     assert DiffusionSource.UNIT.note in seen.landscape.notes

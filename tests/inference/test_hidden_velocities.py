@@ -25,7 +25,7 @@ from siq.quasipotential.rates import _covariance_axes
 from siq.quasipotential.transitions import barrier_uncertainty, ways_out
 from siq.systems.diffusion import Diffusion
 from siq.systems.phase_portrait import evenly_spread, phase_portrait
-from siq.workflow import identification_step, results
+from siq.workflow import results
 from siq.workflow.pipeline import PipelineSettings
 from siq.workflow.study import StateSpace
 from siq.workflow.tables import Status
@@ -35,9 +35,9 @@ SETTINGS = PipelineSettings(identification=IdentificationOptions(degree=3, hidde
 
 
 @cache
-def identified() -> tuple[identification_step.Identified, Recordings, np.ndarray]:
+def identified() -> tuple[results.Identified, Recordings, np.ndarray]:
     recordings, velocities = particle(1)
-    done = identification_step.run(SETTINGS.of(identification_step.IdentifySettings), recordings, number=0)
+    done = results.identify_run(SETTINGS, recordings, number=0)
     return done, recordings, velocities
 
 
@@ -144,7 +144,7 @@ def test_what_cannot_be_done_is_said() -> None:
     with pytest.raises(NumericalFailure, match="v_x is recorded"):
         velocity_names(["x", "v_x"])
     given = replace(SETTINGS, space=StateSpace(diffusion="identity"))
-    done = identification_step.run(given.of(identification_step.IdentifySettings), identified()[1], number=0)
+    done = results.identify_run(given, identified()[1], number=0)
     assert done.record is None and "leave the diffusion out" in done.outcome.reason
 
 
@@ -162,7 +162,7 @@ def test_one_record_of_smooth_positions_is_enough(tmp_path: Path) -> None:
         results.source_of(path, alone)
     drawn = results.draw_run(hidden, results.source_of(path, hidden), number=0).recordings
     assert drawn is not None and len(drawn.labels) >= FEWEST_STRETCHES
-    done = identification_step.run(SETTINGS.of(identification_step.IdentifySettings), drawn, number=0)
+    done = results.identify_run(SETTINGS, drawn, number=0)
     assert done.record is not None and done.record.prediction.passed
     field = done.record
     assert [field.library.names[k] for _, k in field.support] == ["v_x", "x", "v_x", "x**3"]
@@ -183,7 +183,7 @@ def ring_downs(positions: int = 1) -> Recordings:
 
 
 def test_ring_downs_have_no_random_forces_and_the_unit_matrix_of_the_velocities() -> None:
-    done = identification_step.run(SETTINGS.of(identification_step.IdentifySettings), ring_downs(), number=0)
+    done = results.identify_run(SETTINGS, ring_downs(), number=0)
     assert done.record is not None and done.record.prediction.passed
     assert done.record.diffusion_source == DiffusionSource.UNIT_OF_VELOCITIES
     assert done.record.noise_strength is None and done.record.diagnosis.kind == "sensor"
@@ -204,7 +204,7 @@ def test_ring_downs_of_positions_in_different_units_show_no_unit_matrix(
     still = replace(found, noise_rate=0 * found.noise_rate)
     monkeypatch.setattr(identify, "identify_by_likelihood", lambda *_, **__: still)
     several = replace(ring_downs(2), units=("m", "rad"))
-    done = identification_step.run(SETTINGS.of(identification_step.IdentifySettings), several, number=0)
+    done = results.identify_run(SETTINGS, several, number=0)
     assert done.record is None and "scale them to one unit" in done.outcome.reason
 
 

@@ -10,7 +10,7 @@ from siq.data.recordings import Recordings
 from siq.errors import NumericalFailure
 from siq.inference.inertia import inertia_test
 from siq.inference.library import IdentificationOptions
-from siq.workflow import identification_step
+from siq.workflow import results
 from siq.workflow.pipeline import PipelineSettings
 from siq.workflow.tables import Status
 
@@ -64,9 +64,7 @@ def test_it_is_of_one_position() -> None:
 
 def test_a_position_alone_is_refused_and_the_option_named() -> None:
     settings = PipelineSettings(identification=IdentificationOptions(degree=3))
-    done = identification_step.run(
-        settings.of(identification_step.IdentifySettings), particle(1, records=4)[0], number=0
-    )
+    done = results.identify_run(settings, particle(1, records=4)[0], number=0)
     assert done.outcome.status in (Status.WARNING, Status.FAILED)
     assert "identification.hidden_velocities: true" in done.outcome.reason
     assert "has inertia" in done.outcome.reason
@@ -74,9 +72,7 @@ def test_a_position_alone_is_refused_and_the_option_named() -> None:
 
 def test_velocities_of_a_position_without_inertia_are_refused_and_the_option_named() -> None:
     settings = PipelineSettings(identification=IdentificationOptions(degree=3, hidden_velocities=True))
-    done = identification_step.run(
-        settings.of(identification_step.IdentifySettings), overdamped(3, step=0.02), number=0
-    )
+    done = results.identify_run(settings, overdamped(3, step=0.02), number=0)
     assert done.record is None
     assert "leave 'identification.hidden_velocities' out" in done.outcome.reason
 

@@ -14,9 +14,8 @@ from siq.inference.field_estimate import FieldEstimate
 from siq.inference.library import IdentificationOptions, field_library
 from siq.inference.regression import coarse_pairs, identify_vector_field, lagged_pairs, lost_time, refit
 from siq.quasipotential.landscape import Landscape
-from siq.workflow.identification_step import IdentifySettings
-from siq.workflow.identification_step import run as identify_step
 from siq.workflow.pipeline import PipelineSettings
+from siq.workflow.results import identify_run as identify_step
 
 OPTIONS = IdentificationOptions(degree=3)
 
@@ -96,7 +95,7 @@ def test_gaps_everywhere_are_refused_in_a_sentence() -> None:
 
 def test_the_step_says_that_it_looked_from_earlier() -> None:
     recordings = recorded(double_wells(1, memory=3.0, samples=10_000))
-    found = identify_step(PipelineSettings().of(IdentifySettings), recordings, number=0)
+    found = identify_step(PipelineSettings(), recordings, number=0)
     assert found.record is not None
     assert found.record.memory is not None
     assert found.record.prediction.passed

@@ -15,7 +15,7 @@ from siq.inference.measurements import Measurements
 from siq.inference.observation import ObservationModel
 from siq.quasipotential.landscape import Landscape
 from siq.systems.diffusion import Diffusion
-from siq.workflow import identification_step
+from siq.workflow import results
 from siq.workflow.pipeline import PipelineSettings
 
 STEP, STRENGTH, SENSOR = 0.02, 0.3, 0.1
@@ -107,8 +107,8 @@ def test_a_formula_that_is_no_covariance_somewhere_drives_nothing_there() -> Non
 
 
 def test_the_step_finds_d_of_the_state_beside_the_sensor() -> None:
-    done = identification_step.run(
-        PipelineSettings().of(identification_step.IdentifySettings),
+    done = results.identify_run(
+        PipelineSettings(),
         records(3, slope=0.4, samples=2500),
         number=0,
     )

@@ -23,7 +23,7 @@ from siq.inference.library import IdentificationOptions, candidate_library
 from siq.inference.observation import ObservationModel, unbroken
 from siq.inference.regression import identify_vector_field
 from siq.systems.diffusion import Diffusion
-from siq.workflow import identification_step
+from siq.workflow import results
 from siq.workflow.pipeline import PipelineSettings
 from siq.workflow.tables import Status
 
@@ -150,8 +150,8 @@ def test_means_over_an_exposure_are_treated_as_such() -> None:
         means[row] = total / within
     means += 0.03 * generator.standard_normal(means.shape)
     recordings = Recordings.from_arrays(step * np.arange(samples), means.T[:, :, None], names=["x"])
-    settings = PipelineSettings().of(identification_step.IdentifySettings)
-    done = identification_step.run(settings, recordings, number=0)
+    settings = PipelineSettings()
+    done = results.identify_run(settings, recordings, number=0)
     assert done.record is not None and done.record.exposure == pytest.approx(step)
     field = done.record
     assert [field.library.names[k] for _, k in field.support] == ["x", "x**3"]
@@ -171,8 +171,8 @@ def test_a_gap_begins_another_recording() -> None:
 
 def test_the_step_asks_the_likelihood_where_sensors_are_noisy() -> None:
     recordings, _ = double_well(2, samples=2000)
-    settings = PipelineSettings().of(identification_step.IdentifySettings)
-    done = identification_step.run(settings, recordings, number=0)
+    settings = PipelineSettings()
+    done = results.identify_run(settings, recordings, number=0)
     assert done.record is not None and done.outcome.status == Status.OK
     assert done.record.sensor_variance is not None
     assert np.sqrt(done.record.sensor_variance[0]) == pytest.approx(SENSOR, rel=0.1)

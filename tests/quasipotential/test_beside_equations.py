@@ -18,7 +18,7 @@ from siq.report.remarks import sentence
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.workflow import comparison
-from siq.workflow.comparison import BesideEquationsSettings
+from siq.workflow.study import PipelineSettings
 from siq.workflow.tables import COLUMNS
 
 X, Y = sympy.symbols("x y", real=True)
@@ -116,7 +116,7 @@ def test_what_was_learned_is_within_its_errors_and_what_it_states_is_taken():
 
 
 def test_the_step_names_the_run_and_says_why_there_is_nothing_to_compare():
-    settings = BesideEquationsSettings(seed=0, landscape=LandscapeOptions(noise_intensities=(NOISE,)))
+    settings = PipelineSettings(seed=0, landscape=LandscapeOptions(noise_intensities=(NOISE,)))
     found = wells()
     data = landscape_data(wells(1.1))
     table = comparison.run_beside_equations(settings, found.dynamics, [data, None, data])
@@ -129,7 +129,7 @@ def test_the_step_names_the_run_and_says_why_there_is_nothing_to_compare():
 
 
 def test_the_page_says_the_largest_difference():
-    settings = BesideEquationsSettings(seed=0, landscape=LandscapeOptions(noise_intensities=(NOISE,)))
+    settings = PipelineSettings(seed=0, landscape=LandscapeOptions(noise_intensities=(NOISE,)))
     found = wells()
     near = landscape_data(wells(1.01))
     far = landscape_data(wells(1.1))

@@ -18,7 +18,7 @@ from siq.systems.dynamics import Dynamics
 from siq.workflow import comparison
 from siq.workflow.comparison import first_stored
 from siq.workflow.pipeline import Analysis
-from siq.workflow.study import StateSpace
+from siq.workflow.study import PipelineSettings
 from siq.workflow.tables import Method
 
 CARD = Path(__file__).parents[2] / "config" / "systems" / "maier-stein.yaml"
@@ -50,8 +50,8 @@ def system(monkeypatch: pytest.MonkeyPatch) -> Dynamics:
     return load_system(CARD)
 
 
-def asked(*intensities: float) -> comparison.InvariantSettings:
-    return comparison.InvariantSettings(1, StateSpace(), intensities)
+def asked(*intensities: float) -> PipelineSettings:
+    return PipelineSettings(seed=1, invariant=intensities)
 
 
 def test_the_first_landscape_with_heights_is_read_and_gives_the_same_u(
@@ -101,7 +101,7 @@ def test_nothing_is_simulated_where_nothing_was_asked(found: Analysis, system: D
 
 def test_escapes_are_simulated_beside_the_law(files: tuple[Path, Path], system: Dynamics) -> None:
     landscape = json.loads(files[1].read_text(encoding="utf-8"))
-    settings = comparison.EscapesSettings(2, LandscapeOptions(noise_intensities=(INTENSITY,)))
+    settings = PipelineSettings(seed=2, landscape=LandscapeOptions(noise_intensities=(INTENSITY,)))
     table = comparison.run_escapes(settings, system, [None, landscape])
     assert list(table["transition"]) == ["A1 to A2", "A2 to A1"]
     for way, row in zip(landscape["transitions"], table.to_dict("records"), strict=True):

@@ -16,7 +16,7 @@ from siq.networks.regression import RegressionOptions
 from siq.quasipotential.formulas import exact_decomposition, model_to_data
 from siq.quasipotential.refinement import RefinementOptions
 from siq.systems.simulation import SimulationOptions
-from siq.workflow import identification_step, results, scoring, training
+from siq.workflow import results, scoring, training
 from siq.workflow.pipeline import Analysis, PipelineSettings, analyse
 from siq.workflow.study import Sampling, StateSpace
 from siq.workflow.tables import COLUMNS, Method, Outcome, Status, Step
@@ -136,9 +136,7 @@ def test_networks_are_trained_with_the_d_that_the_noise_shows() -> None:
     settings = PipelineSettings(
         sampling=Sampling(0.01, 0.002), training=replace(BRIEF, matching="explicit", steps=2)
     )
-    record = identification_step.run(
-        settings.of(identification_step.IdentifySettings), found, number=0
-    ).record
+    record = results.identify_run(settings, found, number=0).record
     runs = {0: training.RunToTrain(found, record)}
     networks = training.train_block(settings, runs, device="cpu").networks[0]
     assert record is not None and networks is not None
@@ -148,8 +146,8 @@ def test_networks_are_trained_with_the_d_that_the_noise_shows() -> None:
 
 
 def test_a_run_without_trajectories_is_skipped_by_every_step_after() -> None:
-    settings = SETTINGS.of(identification_step.IdentifySettings)
-    nothing = identification_step.run(settings, None, number=5)
+    settings = SETTINGS
+    nothing = results.identify_run(settings, None, number=5)
     assert (nothing.outcome.run, nothing.outcome.status) == (5, Status.SKIPPED)
     told = replace(SETTINGS, training=BRIEF)
     trained = training.train_block(told, {5: training.RunToTrain(None, None)})
@@ -198,7 +196,7 @@ def test_why_a_training_failed_is_what_refinement_says_first(
     failed = TrainedRun(None, Outcome(0, Step.TRAIN, Status.FAILED, "the loss became infinite"))
     options = replace(SETTINGS, refinement=RefinementOptions(routes=routes, degrees=(2,)))
     found = results.refine_run(
-        options.of(results.RefineSettings),
+        options,
         results.RunToRefine(recordings, analysis.identified, failed),
     )
     assert found.outcome.status != Status.OK
@@ -210,7 +208,7 @@ def test_where_refinement_needs_no_networks_their_failure_is_a_note(
 ) -> None:
     failed = TrainedRun(None, Outcome(0, Step.TRAIN, Status.FAILED, "the loss became infinite"))
     found = results.refine_run(
-        SETTINGS.of(results.RefineSettings),
+        SETTINGS,
         results.RunToRefine(recordings, analysis.identified, failed),
     )
     assert found.outcome.status == Status.OK

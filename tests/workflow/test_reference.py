@@ -11,18 +11,16 @@ import pytest
 import sympy
 from known_systems import as_system, limit_cycle
 
-from siq.quasipotential.landscape import LandscapeOptions
 from siq.quasipotential.landscape_comparison import read_reference, write_reference
 from siq.report.study_page import _without_landscape
 from siq.systems.dynamics import Dynamics
 from siq.workflow import comparison
-from siq.workflow.comparison import LandscapeErrorsSettings
-from siq.workflow.study import StateSpace
+from siq.workflow.study import PipelineSettings, StateSpace
 from siq.workflow.tables import COLUMNS, Status, Step, as_table
 from workflow.figures.study import landscape_figures
 
 X, Y = sympy.symbols("x y", real=True)
-SETTINGS = comparison.ReferenceSettings(seed=1)
+SETTINGS = PipelineSettings(seed=1)
 
 
 def system(formulas: tuple[sympy.Expr, ...], domain: list[list[float]]) -> Dynamics:
@@ -48,7 +46,7 @@ def test_without_wells_there_is_a_reason_and_no_rows(card: Dynamics, reason: str
     write_reference(tmp_path / "reference.npz", comparison.reference_of_card(SETTINGS, card))
     found = read_reference(tmp_path / "reference.npz")
     assert reason in found.reason and found.attractors.shape == (0, 2)
-    settings = LandscapeErrorsSettings(seed=1, space=StateSpace(), landscape=LandscapeOptions())
+    settings = PipelineSettings(seed=1)
     table = comparison.run_landscape_errors(settings, found, [], None)
     assert list(table.columns) == list(COLUMNS["landscape_errors"]) and table.empty
     drawn = landscape_figures(
