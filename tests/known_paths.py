@@ -14,7 +14,8 @@ from known_systems import (
 )
 from scipy.integrate import solve_ivp
 
-from siq.quasipotential.paths import MinimumActionPath, minimum_action_path
+from siq.quasipotential.path_chains import MinimumActionPath
+from siq.quasipotential.paths import minimum_action_path
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import find_equilibria, hessian_at
 

@@ -20,7 +20,8 @@ from scipy.optimize import root
 from benchmarks.laboratories.models import Laboratory
 from benchmarks.laboratories.polynomials import drift, intensity, jacobian, monomial, polynomials
 from siq.errors import NumericalFailure
-from siq.quasipotential.paths import MinimumActionPath, minimum_action_path
+from siq.quasipotential.path_chains import MinimumActionPath
+from siq.quasipotential.paths import minimum_action_path
 from siq.systems.dynamics import Dynamics
 
 TOLERANCE = 1e-6  # of an action: far below what a record can say

@@ -32,7 +32,7 @@ from siq.quasipotential.invariant_density import (
 )
 from siq.quasipotential.landscape import GlobalQuasipotential
 from siq.systems.dynamics import Dynamics
-from siq.systems.simulation import noise_source
+from siq.systems.simulation import simulate_stationary
 
 CELLS = {1: 4000, 2: 400, 3: 80}  # along each state, by the number of states; multiples of the bins
 CELL_TOLERANCE = 0.02  # relative: by how much Z may change if cells are twice as wide
@@ -437,20 +437,10 @@ def walk(
         When walkers run to infinity.
     """
     rate = np.linalg.norm(dynamics.jacobian(start.T), axis=(1, 2))
-    step = WALK_STEP / float(np.median(rate))
-    function = dynamics.drift_of_components
-    noise = noise_source(dynamics.diffusion, intensity=intensity, step=step, generator=generator)
-    x = np.array(start, dtype=float)
-    samples = np.empty((len(x), steps // thin, x.shape[1]))
-    with np.errstate(over="ignore", invalid="ignore"):  # told below
-        for index in range(1 - burn_in, samples.shape[1] * thin + 1):
-            x = heun_step(function, x, step, noise(x))
-            if index > 0 and index % thin == 0:
-                samples[:, index // thin - 1] = x
-    lost = int((~np.isfinite(x).all(axis=0)).sum())  # what once is not finite stays so
-    if lost:
-        raise NumericalFailure(f"{lost} of {x.shape[1]} walkers run to infinity; take a smaller step")
-    return samples
+    return simulate_stationary(
+        dynamics, intensity=intensity, start=start, step=WALK_STEP / float(np.median(rate)),
+        burn_in=burn_in, steps=steps, thin=thin, generator=generator, rule=heun_step,
+    )  # fmt: skip
 
 
 def shares_by_rates(

@@ -23,7 +23,7 @@ from siq.quasipotential.certificate import Certificate
 from siq.quasipotential.formulas import basis_from_data, powers_to_data
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.occupancy import VisitTest
-from siq.quasipotential.paths import MinimumActionPath, TransitionPath
+from siq.quasipotential.path_chains import MinimumActionPath, TransitionPath
 from siq.quasipotential.rates import EnergyLossPerCycle, EscapeRate, NoiseStrength
 from siq.quasipotential.transitions import Transition
 from siq.quasipotential.wells import Well

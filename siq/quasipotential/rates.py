@@ -60,8 +60,8 @@ from scipy.optimize import brentq
 
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import AnyField, GivenField
-from siq.quasipotential.path_chains import PathProblem
-from siq.quasipotential.paths import MinimumActionPath, minimum_action_path
+from siq.quasipotential.path_chains import MinimumActionPath, PathProblem
+from siq.quasipotential.paths import minimum_action_path
 from siq.quasipotential.power_series import cubic_series, quasipotential_series
 from siq.remarks import Remark
 from siq.systems.dynamics import Dynamics

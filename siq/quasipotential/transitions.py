@@ -23,9 +23,8 @@ import numpy as np
 from siq.errors import NumericalFailure
 from siq.inference.diffusion_model import defined_states
 from siq.inference.field_estimate import AnyField, GivenField
+from siq.quasipotential.path_chains import MinimumActionPath, TransitionPath
 from siq.quasipotential.paths import (
-    MinimumActionPath,
-    TransitionPath,
     both_sides,
     descent,
     minimum_action_path,

@@ -196,6 +196,7 @@ def simulate_stationary(
     steps: int,
     thin: int = 1,
     generator: np.random.Generator,
+    rule: Callable[..., np.ndarray] = euler_maruyama_step,
 ) -> np.ndarray:
     """Simulate walkers in noise for a long time, to compare with the invariant distribution.
 
@@ -212,7 +213,7 @@ def simulate_stationary(
     start
         Initial states, shape ``(d, walkers)``.
     step
-        Step of the Euler–Maruyama rule; the samples' distribution is biased by O(step).
+        Step of the rule; by that of Euler and Maruyama the samples' distribution is biased by O(step).
     burn_in
         Number of steps before the first sample.
     steps
@@ -221,6 +222,8 @@ def simulate_stationary(
         Every how many steps a sample is kept.
     generator
         Source of the noise.
+    rule
+        The next state from f, the state, the step and the kicks of the noise (`siq.numerics.integration`).
 
     Returns
     -------
@@ -241,7 +244,7 @@ def simulate_stationary(
     samples = np.empty((len(x), steps // thin, x.shape[1]))
     with np.errstate(over="ignore", invalid="ignore"):  # told below
         for index in range(1 - burn_in, samples.shape[1] * thin + 1):
-            x = euler_maruyama_step(dynamics.drift_of_components, x, step, noise(x))
+            x = rule(dynamics.drift_of_components, x, step, noise(x))
             if index > 0 and index % thin == 0:
                 samples[:, index // thin - 1] = x
     lost = int((~np.isfinite(x).all(axis=0)).sum())  # what once is not finite stays so

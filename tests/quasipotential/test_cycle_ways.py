@@ -10,7 +10,8 @@ from scipy.interpolate import CubicSpline
 
 from siq.errors import NumericalFailure
 from siq.quasipotential.landscape import Landscape
-from siq.quasipotential.paths import MinimumActionPath, minimum_action_path
+from siq.quasipotential.path_chains import MinimumActionPath
+from siq.quasipotential.paths import minimum_action_path
 from siq.systems.cycles import Cycle, closed_orbit, hessians_along
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import hessian_at

@@ -16,7 +16,8 @@ from known_systems import (
 from scipy.integrate import solve_ivp
 
 from siq.errors import NumericalFailure
-from siq.quasipotential.paths import MinimumActionPath, minimum_action_path, transition_path
+from siq.quasipotential.path_chains import MinimumActionPath
+from siq.quasipotential.paths import minimum_action_path, transition_path
 from siq.systems.equilibria import find_equilibria
 
 pytestmark = pytest.mark.portable

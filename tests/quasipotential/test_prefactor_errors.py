@@ -8,7 +8,8 @@ import sympy
 from known_systems import KnownSystem, exact_field
 
 from siq.inference.field_estimate import FieldEstimate
-from siq.quasipotential.paths import MinimumActionPath, minimum_action_path
+from siq.quasipotential.path_chains import MinimumActionPath
+from siq.quasipotential.paths import minimum_action_path
 from siq.quasipotential.rates import (
     MAX_COVARIANCE_AXES,
     EscapeRate,

@@ -21,7 +21,7 @@ from known_systems import (
 from scipy.integrate import solve_ivp
 
 from siq.errors import NumericalFailure
-from siq.quasipotential.paths import MinimumActionPath
+from siq.quasipotential.path_chains import MinimumActionPath
 from siq.quasipotential.rates import EscapeRate, NoiseStrength, escape_rate, mean_residence_time
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import find_equilibria, hessian_at

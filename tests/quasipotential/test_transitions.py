@@ -19,7 +19,8 @@ from known_systems import (
 
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import FieldEstimate
-from siq.quasipotential.paths import TransitionPath, minimum_action_path
+from siq.quasipotential.path_chains import TransitionPath
+from siq.quasipotential.paths import minimum_action_path
 from siq.quasipotential.transitions import (
     Transition,
     _barrier_by_formula,
