@@ -335,7 +335,7 @@ class _Shape(NamedTuple):
         return self.misfit - MIN_CHI2_GAIN * self.freedom
 
 
-def exposure_displacement(lags: np.ndarray, exposure: float) -> np.ndarray:
+def _exposure_displacement(lags: np.ndarray, exposure: float) -> np.ndarray:
     """M(k)/σ²h of means over an exposure of so many steps."""
     k = np.abs(np.asarray(lags, dtype=float))
     if exposure <= 0:
@@ -343,13 +343,13 @@ def exposure_displacement(lags: np.ndarray, exposure: float) -> np.ndarray:
     return np.where(k >= exposure, k - exposure / 3, k**2 / exposure - k**3 / (3 * exposure**2))
 
 
-def coloured_displacement(lags: np.ndarray, memory: float) -> np.ndarray:
+def _coloured_displacement(lags: np.ndarray, memory: float) -> np.ndarray:
     """M(k)/σ²h of forces with a memory of so many steps."""
     k = np.abs(np.asarray(lags, dtype=float))
     return k if memory <= 0 else k + memory * np.expm1(-k / memory)
 
 
-def increment_covariances(displacement: np.ndarray) -> np.ndarray:
+def _increment_covariances(displacement: np.ndarray) -> np.ndarray:
     """C(k), k = 0 ... K, from M(0) ... M(K + 1)."""
     before = np.concatenate([displacement[1:2], displacement[:-2]])
     return np.asarray((displacement[1:] - 2 * displacement[:-1] + before) / 2)
@@ -375,11 +375,11 @@ def _fitted_shape(covariances: np.ndarray, count: float, *, seen: int) -> _Shape
     eigenvalues = np.maximum(eigenvalues, EIGENVALUE_FLOOR * eigenvalues.max())
     root = np.asarray((vectors / np.sqrt(eigenvalues)) @ vectors.T)
     goal = root @ covariances
-    of_sensor = increment_covariances(np.where(lags > 0, 2.0, 0.0))
+    of_sensor = _increment_covariances(np.where(lags > 0, 2.0, 0.0))
 
     def own(memory: float, kind: Kind) -> np.ndarray:
-        move = exposure_displacement if kind == "blur" else coloured_displacement
-        return increment_covariances(move(lags, memory))
+        move = _exposure_displacement if kind == "blur" else _coloured_displacement
+        return _increment_covariances(move(lags, memory))
 
     def misfit(memory: float, kind: Kind, sensor: bool) -> tuple[float, np.ndarray]:
         design = np.stack([root @ own(memory, kind), root @ of_sensor], axis=1)

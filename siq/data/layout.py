@@ -59,7 +59,7 @@ _FACTOR = rf"(?:(?:{_ALONE}|{_PREFIX}(?:{_PREFIXED})){_POWER})"
 _UNIT = re.compile(rf"\(?{_FACTOR}(?:\s*(?:[·*⋅×/]|\s)\s*\(?{_FACTOR}\)?)*\)?")
 
 
-class Heading(NamedTuple):
+class _Heading(NamedTuple):
     """A heading, taken apart: what people call the column, and its unit where it says one."""
 
     title: str
@@ -77,7 +77,7 @@ def is_unit(text: str) -> bool:
     return _UNIT.fullmatch(text.strip()) is not None
 
 
-def read_heading(heading: str) -> Heading:
+def read_heading(heading: str) -> _Heading:
     """Take a heading apart.
 
     Examples
@@ -87,21 +87,21 @@ def read_heading(heading: str) -> Heading:
     """
     text = heading.strip()
     if match := re.fullmatch(r"(.*?)\s*\[\s*(.*?)\s*\]", text):
-        return Heading(_without_time(match[1]), match[2] or None)
+        return _Heading(_without_time(match[1]), match[2] or None)
     if match := re.fullmatch(r"(.*?\S)\s*\(\s*(.*?)\s*\)", text):
         if is_unit(match[2]):
-            return Heading(_without_time(match[1]), match[2])
-        return Heading(_without_time(text), None)
+            return _Heading(_without_time(match[1]), match[2])
+        return _Heading(_without_time(text), None)
     for pattern in (r"(.*?\S)\s+/\s*(\S.*)", r"(.*?\S)\s+in\s+(\S.*)", r"(.*?\S)\s*,\s*(\S.*)"):
         if (match := re.fullmatch(pattern, text)) and is_unit(match[2]):
-            return Heading(match[1], match[2])
+            return _Heading(match[1], match[2])
     if (
         (match := re.fullmatch(r"(.+?)[\s_./]+([^\s_./]+)", text))
         and match[2] in TIME_UNITS
-        and is_time(match[1])
+        and _is_time(match[1])
     ):
-        return Heading(match[1], match[2])
-    return Heading(text, None)
+        return _Heading(match[1], match[2])
+    return _Heading(text, None)
 
 
 def _without_time(title: str) -> str:
@@ -125,7 +125,7 @@ def usable_name(title: str) -> str:
     return f"{name}_" if keyword.iskeyword(name) or name in RESERVED else name
 
 
-def is_time(title: str) -> bool:
+def _is_time(title: str) -> bool:
     """Whether a column of this title is the time."""
     return _plain(title) in TIME_NAMES
 
@@ -135,7 +135,7 @@ def is_label(title: str) -> bool:
     return _plain(title) in LABEL_NAMES
 
 
-def is_index(title: str) -> bool:
+def _is_index(title: str) -> bool:
     """Whether a column of this title may count the rows, as tables that pandas wrote do."""
     return (
         title == ""
@@ -148,7 +148,7 @@ def _plain(title: str) -> str:
     return re.sub(r"[\W_]+", "", title).casefold()
 
 
-class Layout(NamedTuple):
+class _Layout(NamedTuple):
     """The columns of a table by what they mean.
 
     Attributes
@@ -176,7 +176,7 @@ class Layout(NamedTuple):
     notes: tuple[str, ...]
 
 
-def layout_of(file: str, source: ColumnFile, columns: Sequence[str] | None) -> Layout:
+def layout_of(file: str, source: ColumnFile, columns: Sequence[str] | None) -> _Layout:
     """Find the time, the labels and the measured columns.
 
     Parameters
@@ -209,7 +209,7 @@ def layout_of(file: str, source: ColumnFile, columns: Sequence[str] | None) -> L
     free = [place for place in range(len(parts)) if columns is None or plain[place] not in columns]
     dropped = set()
     for place in free:  # columns that only count the rows, as pandas writes them, and empty ones at the end
-        values = _numbers(source, place) if is_index(plain[place]) else None
+        values = _numbers(source, place) if _is_index(plain[place]) else None
         if values is None:
             continue
         if np.isnan(values).all():
@@ -248,7 +248,7 @@ def layout_of(file: str, source: ColumnFile, columns: Sequence[str] | None) -> L
         {"name": part.unit, "metadata": unit} for part, unit in zip(parts, source.units, strict=True)
     )
     shown = tuple(titles[place] for place in states)
-    return Layout(recording, time, tuple(states), tuple(names), shown, units, tuple(notes))
+    return _Layout(recording, time, tuple(states), tuple(names), shown, units, tuple(notes))
 
 
 def _counts_rows(values: np.ndarray) -> bool:
@@ -268,13 +268,13 @@ def _numbers(source: ColumnFile, place: int) -> np.ndarray | None:
         return None
 
 
-def _may_be_time(part: Heading) -> bool:
-    return is_time(part.title) and (
+def _may_be_time(part: _Heading) -> bool:
+    return _is_time(part.title) and (
         part.unit is None or part.unit.casefold() in {unit.casefold() for unit in TIME_UNITS}
     )
 
 
-def _is_second_time(source: ColumnFile, parts: list[Heading], place: int) -> bool:
+def _is_second_time(source: ColumnFile, parts: list[_Heading], place: int) -> bool:
     """Whether a column is another clock: called so, and ever increasing but where recordings begin."""
     if not _may_be_time(parts[place]) or parts[place].title == "T":
         return False
@@ -283,7 +283,7 @@ def _is_second_time(source: ColumnFile, parts: list[Heading], place: int) -> boo
 
 
 def _time_column(
-    file: str, headings: Sequence[str], parts: list[Heading], free: list[int], notes: list[str]
+    file: str, headings: Sequence[str], parts: list[_Heading], free: list[int], notes: list[str]
 ) -> int:
     for place in free:
         if parts[place].title == "t":

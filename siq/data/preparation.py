@@ -64,7 +64,7 @@ def read_pairs(
         close enough to be a pair.
     """
     recordings = read_recordings(path, columns=states, units=units)
-    recordings = checked_for_learning(
+    recordings = _checked_for_learning(
         recordings, file=str(path), chosen=states is not None, hidden_velocities=hidden_velocities
     )
     try:
@@ -82,7 +82,7 @@ def read_pairs(
     return recordings, pairs
 
 
-def checked_for_learning(
+def _checked_for_learning(
     recordings: Recordings, *, file: str, chosen: bool, hidden_velocities: bool = False
 ) -> Recordings:
     """Refuse what nothing can be learned from; leave out columns that never change.

@@ -53,7 +53,7 @@ AVERAGING_TIME = (
 MOST_ITERATIONS = 200  # of its estimation, at most
 
 
-def two_levels(
+def _two_levels(
     recordings: Recordings, values: np.ndarray, runs: list[slice], relaxation: float
 ) -> tuple[Background, tuple[float, float], tuple[float, float]]:
     """Two levels over a common background: each in turn, until neither changes."""
@@ -189,7 +189,7 @@ class DwellCount:
         return float(2 * self.time / upper), float(2 * self.time / lower) if lower > 0 else float("inf")
 
 
-def counted_visits(values: np.ndarray, runs: list[slice], levels: tuple[float, float]) -> np.ndarray:
+def _counted_visits(values: np.ndarray, runs: list[slice], levels: tuple[float, float]) -> np.ndarray:
     """0 from where the lower level is reached, 1 from where the upper one is, -1 before: shape ``(n,)``."""
     core = np.full(len(values), -1)
     core[values <= levels[0]] = 0
@@ -247,7 +247,7 @@ PLACES_COMPARED = 25  # at which f is compared with itself, between the quantile
 INNER_QUANTILE = 0.02  # the quantile from which on f is known well enough
 
 
-def pushed_apart(values: np.ndarray, runs: list[slice], relaxation: float) -> tuple[float, float] | None:
+def _pushed_apart(values: np.ndarray, runs: list[slice], relaxation: float) -> tuple[float, float] | None:
     """By how many standard errors f rises somewhere, and how probable that is where a single state attracts.
 
     Parameters
@@ -313,7 +313,7 @@ def pushed_apart(values: np.ndarray, runs: list[slice], relaxation: float) -> tu
     return largest, float(stats.f.sf(max(largest, 0.0) ** 2 / DEGREE, DEGREE, freedom))
 
 
-def valley_between(
+def _valley_between(
     values: np.ndarray,
     runs: list[slice],
     relaxation: float,
@@ -467,20 +467,20 @@ def switching(recordings: Recordings, *, generator: np.random.Generator | None =
         relaxation = relaxation_samples(column, runs)
         if relaxation is None:  # too short, or a column that runs on like a clock
             continue
-        pushed = pushed_apart(column, runs, relaxation) or (float("nan"), 1.0)
+        pushed = _pushed_apart(column, runs, relaxation) or (float("nan"), 1.0)
         if pushed[0] < PULLED_TOGETHER or pushed[1] < DECISIVE_P:
-            valley = (valley_between(column, runs, relaxation, generator=None)[0], 1.0)
+            valley = (_valley_between(column, runs, relaxation, generator=None)[0], 1.0)
         else:
             number = SURROGATES * recordings.values.shape[1]
-            valley = valley_between(column, runs, relaxation, generator=generator, surrogates=number)
+            valley = _valley_between(column, runs, relaxation, generator=generator, surrogates=number)
         tests[place] = (min(pushed[1], valley[1]), pushed[0], valley[0], relaxation)
     if not tests:
         return None
     state = min(tests, key=lambda place: (tests[place][0], -tests[place][2]))
     probability, push, depth, relaxation = tests[state]
     values = recordings.values[:, state]
-    background, levels, spreads = two_levels(recordings, values, runs, relaxation)
-    visits = counted_visits(values - background.values, runs, levels)
+    background, levels, spreads = _two_levels(recordings, values, runs, relaxation)
+    visits = _counted_visits(values - background.values, runs, levels)
     lower, upper = dwell_counts(recordings.t, visits, runs)
     return Switching(
         state,

@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 from siq.data.preparation import in_stretches, without_slow_drift
 from siq.data.recordings import Recordings
 from siq.data.stationarity import background_of, correlated_samples, relaxation_samples, runs_of, usual_step
-from siq.data.two_states import DwellCount, counted_visits, dwell_counts, switching
+from siq.data.two_states import DwellCount, _counted_visits, dwell_counts, switching
 
 STEP, COUNT = 0.05, 20_000
 TIME = STEP * np.arange(COUNT)
@@ -68,7 +68,7 @@ def test_visits_go_from_level_to_level() -> None:
     x = np.array([0.0, -1.0, 0.5, -0.5, 1.0, 0.0, 1.2, -1.0, 0.9])
     recordings = Recordings.from_arrays(np.arange(9.0), x[:, None], names=["x"])
     runs = runs_of(recordings)
-    visits = counted_visits(x, runs, (-1.0, 1.0))
+    visits = _counted_visits(x, runs, (-1.0, 1.0))
     assert visits.tolist() == [-1, 0, 0, 0, 1, 1, 1, 0, 0]
     low, high = dwell_counts(recordings.t, visits, runs)
     assert (low, high) == (DwellCount(1, 4.0), DwellCount(1, 3.0))
@@ -79,7 +79,7 @@ def test_a_gap_in_time_ends_no_visit() -> None:
     x = np.array([-1.0, -1.0, -1.0, 1.0, 1.0, -1.0])
     recordings = Recordings.from_arrays(t, x[:, None], names=["x"])
     runs = runs_of(recordings)
-    low, high = dwell_counts(t, counted_visits(x, runs, (-1.0, 1.0)), runs)
+    low, high = dwell_counts(t, _counted_visits(x, runs, (-1.0, 1.0)), runs)
     assert (low, high) == (DwellCount(0, 2.0), DwellCount(1, 2.0))
 
 

@@ -14,7 +14,7 @@ import pytest
 from siq.data.correlation import decimals_of, noise_floors, resolution_step, rounding_error
 from siq.data.inspection import inspect as inspect_recordings
 from siq.data.layout import RESERVED, is_unit, read_heading, usable_name
-from siq.data.preparation import FEWEST_STRETCHES, checked_for_learning, in_stretches, read_pairs
+from siq.data.preparation import FEWEST_STRETCHES, _checked_for_learning, in_stretches, read_pairs
 from siq.data.recordings import Recordings, read_recordings, write_recordings
 from siq.errors import InputError
 from siq.systems.cards import check_name
@@ -375,11 +375,11 @@ def test_what_looks_odd_is_said() -> None:
     t = np.arange(200) * 0.1
     angle = np.mod(t * 2, 2 * np.pi)
     turning = Recordings.from_arrays([t, t[:1]], [angle[:, None], angle[:1, None]], names=["phi"])
-    said = checked_for_learning(turning, file="a.csv", chosen=False).notes
+    said = _checked_for_learning(turning, file="a.csv", chosen=False).notes
     assert any("'phi' jumps by 2π 6 times" in note for note in said)
     assert any("a single sample" in note for note in said)
     swinging_only = Recordings.from_arrays([t, t], np.stack([np.sin(t), np.cos(t)])[..., None], names=["phi"])
-    assert checked_for_learning(swinging_only, file="a.csv", chosen=False).notes == ()
+    assert _checked_for_learning(swinging_only, file="a.csv", chosen=False).notes == ()
 
 
 def test_recordings_with_longer_steps_that_give_no_pairs_are_named(tmp_path: Path) -> None:

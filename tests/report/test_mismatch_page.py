@@ -18,8 +18,8 @@ from siq.diagnosis.verdict import statement_of_failure
 from siq.report.diagnosis_page import Findings, mismatch_answer, mismatch_page
 from siq.report.formatting import texts
 from siq.report.plots.diagnosis import (
+    _limits_of,
     largest_difference,
-    limits_of,
     plot_before_after,
     plot_candidates,
     plot_curves,
@@ -343,10 +343,10 @@ def test_a_wide_band_does_not_hide_the_curve(error):
     at = np.linspace(-1, 1, 9)
     errors = np.where(np.abs(at) > 0.9, error, 0.05)
     table = pd.DataFrame({"missing": 8 * at, "standard_error": errors})
-    low, high = limits_of([table])
+    low, high = _limits_of([table])
     assert -15 < low < -6 and 6 < high < 15
     # Even if no knot is known well, the axis is that of the values.
-    low, high = limits_of([table.assign(standard_error=250.0)])
+    low, high = _limits_of([table.assign(standard_error=250.0)])
     assert -15 < low <= -8 and 8 <= high < 15
 
 

@@ -24,8 +24,8 @@ from siq.quasipotential.rates import EscapeRate
 from siq.quasipotential.transitions import barrier_uncertainty
 from siq.quasipotential.wells import WellOptions
 from siq.report.plots import prediction
-from siq.report.plots.quasipotential import plane_of, quasipotential_figure
-from siq.report.plots.wells import joined
+from siq.report.plots.quasipotential import _plane_of, quasipotential_figure
+from siq.report.plots.wells import _joined
 from siq.report.summary import ExitSummary, LandscapeSummary, summarise
 
 NONE = np.zeros((0, 1))
@@ -80,13 +80,13 @@ def test_the_states_of_the_plane_and_the_view_can_be_chosen() -> None:
     with pytest.raises(ValueError, match="name two of x, y, z"):
         siq.plot_quasipotential(landscape(3), states=("x", "w"), ax=Figure().add_subplot())
     with pytest.raises(ValueError, match="'projection' or 'section'"):
-        plane_of(summarise(landscape(3)), view="shadow")  # type: ignore[arg-type]
+        _plane_of(summarise(landscape(3)), view="shadow")  # type: ignore[arg-type]
 
 
 def test_a_projection_keeps_wells_and_passes_at_their_heights() -> None:
     """The lowest U over z is U of the double well of x and y, since z only adds to it."""
     shown = summarise(landscape(3))
-    plane = plane_of(shown, states=("x", "y"))
+    plane = _plane_of(shown, states=("x", "y"))
     known = np.isfinite(plane.values)
     assert known.mean() > 0.1
     grid = np.stack(np.meshgrid(plane.x1, plane.x2, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -172,7 +172,7 @@ def test_wells_join_from_the_lowest_pass_to_the_highest_and_no_lines_cross() -> 
     six = of_heights(
         [0.0, 0.3, 0.1, 0.5, 0.2, 0.4], {(0, 3): 1.0, (1, 2): 0.8, (2, 3): 1.5, (4, 5): 0.9, (5, 0): 2.0}
     )
-    tree = joined(six, [one.height for one in six.wells])
+    tree = _joined(six, [one.height for one in six.wells])
     assert [one.height for one in tree] == pytest.approx([0.8, 0.9, 1.0, 1.5, 2.0])
     assert [(set(one.left), set(one.right)) for one in tree][3] in (
         ({1, 2}, {0, 3}), ({0, 3}, {1, 2}),
@@ -206,11 +206,11 @@ def test_residuals_of_the_right_field_lie_within_the_band_and_a_missing_term_bey
         x = x + 0.01 * known.dynamics.drift(x) + 0.03 * rng.normal(size=x.shape)
         path.append(x)
     noisy = siq.Recordings.from_arrays(0.01 * np.arange(401), np.stack(path, axis=1), names=["x"])
-    right = prediction.binned_residuals(known.dynamics, noisy, 0)
+    right = prediction._binned_residuals(known.dynamics, noisy, 0)
     far = np.abs(right.mean) / right.standard_error
     assert (far < 2).mean() > 0.75 and far.max() < 5
     missing = known.dynamics.of(known.dynamics.symbols, [known.dynamics.formulas[0] + 0.5])
-    wrong = prediction.binned_residuals(missing, noisy, 0)
+    wrong = prediction._binned_residuals(missing, noisy, 0)
     assert (np.abs(wrong.mean) > 2 * wrong.standard_error).mean() > 0.7
     assert np.average(wrong.mean, weights=wrong.standard_error**-2) == pytest.approx(-0.5, abs=0.05)
 

@@ -34,10 +34,7 @@ from typing import TYPE_CHECKING
 
 from matplotlib.cm import ScalarMappable
 
-from siq.report.plots.style import (
-    COLUMN_WIDTH,
-    axis_label,
-)
+from siq.report.plots.style import COLUMN_WIDTH, axis_label
 
 if TYPE_CHECKING:  # to draw a density takes none of what it takes to compute one
     from siq.quasipotential.invariant_density import StationaryDensity

@@ -34,7 +34,7 @@ from siq.report.plots.style import (
 
 
 @dataclass(frozen=True)
-class LargestDifference:
+class _LargestDifference:
     """The recording and the output in which a simulation is off the furthest.
 
     Attributes
@@ -55,7 +55,7 @@ class LargestDifference:
     recordings: int
 
 
-def largest_difference(table: pd.DataFrame, *, after: str) -> LargestDifference | None:
+def largest_difference(table: pd.DataFrame, *, after: str) -> _LargestDifference | None:
     """The held-out recording to begin with; None where nothing was held out.
 
     The output is the one in which the simulation as given is off the furthest, in units of its spread, in
@@ -82,7 +82,7 @@ def largest_difference(table: pd.DataFrame, *, after: str) -> LargestDifference 
     middle = errors["before"].groupby(level="output", sort=False).median()
     output = str((middle / spread.where(spread > 0, 1.0)).idxmax())
     recording = str(errors["before"].loc[output].idxmax())
-    return LargestDifference(
+    return _LargestDifference(
         recording,
         output,
         before=float(np.sqrt(errors["before"].loc[output, recording])),
@@ -554,7 +554,7 @@ def plot_curves(
 
 def _draw_curves(axes: Axes, stages: Mapping[str, pd.DataFrame]) -> None:
     """Both curves, with an axis on which the values can be seen, however wide the bands are."""
-    low, high = limits_of(stages.values())
+    low, high = _limits_of(stages.values())
     looks = {"before": (BLUE, "-", "o"), "after": (VERMILLION, "--", "s")}
     for stage, (colour, style, marker) in looks.items():
         at, value, error = (
@@ -572,7 +572,7 @@ def _draw_curves(axes: Axes, stages: Mapping[str, pd.DataFrame]) -> None:
     axes.set_ylim(low, high)
 
 
-def limits_of(curves: Iterable[pd.DataFrame]) -> tuple[float, float]:
+def _limits_of(curves: Iterable[pd.DataFrame]) -> tuple[float, float]:
     """Limits of an axis by the values of curves where these are supported by data, and zero.
 
     Parameters
@@ -681,7 +681,7 @@ def plot_candidates(table: pd.DataFrame) -> Figure | None:
     axes = figure.add_subplot()
     places = np.arange(len(best))
     axes.barh(places, best["gain"], color=[STAGES[stage][1] for stage in best["stage"]], height=0.7)
-    axes.set_yticks(places, [shortened(text).replace("$", r"\$") for text in best["label"]])
+    axes.set_yticks(places, [_shortened(text).replace("$", r"\$") for text in best["label"]])
     axes.set_xscale("log")
     axes.set_xlim(left=min(1.0, float(best["gain"].min()) / 2))
     axes.set_xlabel(r"gain in $\chi^2$")
@@ -691,7 +691,7 @@ def plot_candidates(table: pd.DataFrame) -> Figure | None:
     return figure
 
 
-def shortened(label: str, most: int = 30) -> str:
+def _shortened(label: str, most: int = 30) -> str:
     """A label that leaves room for its bar."""
     return label if len(label) <= most else f"{label[: most - 1]}…"
 

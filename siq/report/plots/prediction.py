@@ -42,7 +42,7 @@ ACCURACY = 0.01  # of an integrator's step, times the norm of the Jacobian
 
 
 @dataclass(frozen=True)
-class BinnedResiduals:
+class _BinnedResiduals:
     """What f leaves of one state's increments, per time, in bins along that state.
 
     Attributes
@@ -122,7 +122,7 @@ def plot_residuals(
     place = 0 if state is None else dynamics.states.index(state)
     axes = new_axes() if ax is None else ax
     time_unit = recordings.time_unit or dynamics.time_unit
-    handles = _draw(axes, binned_residuals(dynamics, recordings, place), dynamics.states[place],
+    handles = _draw(axes, _binned_residuals(dynamics, recordings, place), dynamics.states[place],
                     (dynamics.units[place], time_unit))  # fmt: skip
     if legend:
         add_legend(axes, handles)
@@ -137,7 +137,7 @@ def residuals_figure(
 
     None of recordings without noise, where nothing is left but rounding.
     """
-    every = [binned_residuals(dynamics, recordings, place) for place in range(dynamics.dimension)]
+    every = [_binned_residuals(dynamics, recordings, place) for place in range(dynamics.dimension)]
     if all(one.share < NOISE_FREE for one in every):
         return None
     figure = Figure(figsize=(COLUMN_WIDTH, 2.3 * len(every) + 0.5))
@@ -149,7 +149,7 @@ def residuals_figure(
     return figure
 
 
-def rate_unit(unit: str, time_unit: str) -> str:
+def _rate_unit(unit: str, time_unit: str) -> str:
     """The unit of a state per time, empty where both are plain numbers."""
     plain, timeless = unit in ("", "1"), time_unit in ("", "1")
     if timeless:
@@ -157,7 +157,7 @@ def rate_unit(unit: str, time_unit: str) -> str:
     return f"1/{time_unit}" if plain else f"{unit}/{time_unit}"
 
 
-def binned_residuals(dynamics: Dynamics, recordings: Recordings, place: int) -> BinnedResiduals:
+def _binned_residuals(dynamics: Dynamics, recordings: Recordings, place: int) -> _BinnedResiduals:
     """What f leaves of the increments of one state, in bins along it.
 
     Where recordings remember, the present state tells which way their noise pushes: bins are then along the
@@ -192,7 +192,7 @@ def binned_residuals(dynamics: Dynamics, recordings: Recordings, place: int) -> 
     )
     rows = [which == one for one in np.unique(which) if (which == one).sum() >= FEWEST]
     rows = rows or [np.ones(len(along), dtype=bool)]
-    return BinnedResiduals(
+    return _BinnedResiduals(
         np.array([along[one].mean() for one in rows]),
         np.array([left[one].mean() for one in rows]),
         np.array([together * left[one].std(ddof=1) / np.sqrt(one.sum()) for one in rows]),
@@ -208,7 +208,7 @@ def _together(left: np.ndarray, number: np.ndarray, lag: int) -> float:
     return float(np.sqrt(max(share, 1.0)))
 
 
-def _draw(axes: Axes, binned: BinnedResiduals, name: str, units: tuple[str, str]) -> list[Any]:
+def _draw(axes: Axes, binned: _BinnedResiduals, name: str, units: tuple[str, str]) -> list[Any]:
     """Draw residuals of a state on axes, with the units of the state and of time."""
     quiet = binned.share < NOISE_FREE  # rounding and the integrator are left, which no band is the measure of
     if not quiet:
@@ -220,7 +220,7 @@ def _draw(axes: Axes, binned: BinnedResiduals, name: str, units: tuple[str, str]
     axes.set_xlabel(scaled_label(axes.xaxis, f"${name_label(name)}$", units[0], largest))
     largest = max(abs(limit) for limit in axes.get_ylim())
     what = f"left of d${name_label(name)}$/d$t$"
-    axes.set_ylabel(scaled_label(axes.yaxis, what, rate_unit(*units), largest))
+    axes.set_ylabel(scaled_label(axes.yaxis, what, _rate_unit(*units), largest))
     within = int((np.abs(binned.mean) <= 2 * binned.standard_error).sum())
     title = f"{within} of {len(binned.at)} bins within the band"
     if quiet:

@@ -44,7 +44,7 @@ SWEEPS = 3  # after which the lowest of them moves by less than a pixel
 
 
 @dataclass(frozen=True)
-class Plane:
+class _Plane:
     """U on a plane of two states.
 
     Attributes
@@ -66,9 +66,9 @@ class Plane:
     sentence: str
 
 
-def plane_of(
+def _plane_of(
     landscape: LandscapeSummary, *, states: Sequence[str] | None = None, view: View = "projection"
-) -> Plane:
+) -> _Plane:
     """U on the plane of two states.
 
     Parameters
@@ -99,7 +99,7 @@ def plane_of(
     else:
         values = _lowest_behind(landscape, grid, rest)
         sentence = f"projection: the lowest $U$ over {', '.join(landscape.names[place] for place in rest)}"
-    return Plane(shown, x1, x2, values.reshape(count, count), sentence)
+    return _Plane(shown, x1, x2, values.reshape(count, count), sentence)
 
 
 def in_blocks(potential: Potential, x: np.ndarray) -> np.ndarray:
@@ -262,7 +262,7 @@ def plot_quasipotential(
     """
     shown = as_drawn(landscape, recordings)
     axes = new_axes() if ax is None else ax
-    handles = draw_quasipotential(axes, shown, states=states, view=view)
+    handles = _draw_quasipotential(axes, shown, states=states, view=view)
     if legend:
         add_legend(axes, handles)
     return axes
@@ -286,7 +286,7 @@ def quasipotential_figure(
     one = len(landscape.names) == 1
     figure = Figure(figsize=(WIDTH, 3.6 if one else 4.5))
     axes = figure.add_subplot()
-    handles = draw_quasipotential(axes, landscape, states=states, view=view)
+    handles = _draw_quasipotential(axes, landscape, states=states, view=view)
     if not any(np.isfinite(_values_in(landscape))) and not landscape.cycles:
         return None
     figure.legend(handles=handles, loc="outside lower center", ncols=2)
@@ -325,16 +325,16 @@ def add_legend(axes: Axes, handles: Sequence[Any]) -> None:
     )  # fmt: skip
 
 
-def draw_quasipotential(
+def _draw_quasipotential(
     axes: Axes, landscape: LandscapeSummary, *, states: Sequence[str] | None = None, view: View = "projection"
 ) -> list[Any]:
     """Draw U on axes; what is returned belongs into their legend."""
     if len(landscape.names) == 1:
         return _draw_curve(axes, landscape)
-    plane = plane_of(landscape, states=states, view=view)
+    plane = _plane_of(landscape, states=states, view=view)
     handles = _draw_map(axes, landscape, plane)
-    handles += draw_points(axes, landscape, plane.shown)
-    handles += draw_ways(axes, landscape, plane.shown)
+    handles += _draw_points(axes, landscape, plane.shown)
+    handles += _draw_ways(axes, landscape, plane.shown)
     handles += draw_equilibria(axes, landscape, plane.shown)
     name_axes(axes, landscape, plane.shown)
     if plane.sentence:
@@ -418,7 +418,7 @@ def _draw_depth(axes: Axes, well: float, saddle: float, bottom: float, barrier: 
     )  # fmt: skip
 
 
-def _draw_map(axes: Axes, landscape: LandscapeSummary, plane: Plane) -> list[Any]:
+def _draw_map(axes: Axes, landscape: LandscapeSummary, plane: _Plane) -> list[Any]:
     handles: list[Any] = []
     values = plane.values.T
     if np.isfinite(values).any():
@@ -447,7 +447,7 @@ def _draw_map(axes: Axes, landscape: LandscapeSummary, plane: Plane) -> list[Any
     return handles
 
 
-def draw_points(axes: Axes, landscape: LandscapeSummary, shown: tuple[int, int]) -> list[Any]:
+def _draw_points(axes: Axes, landscape: LandscapeSummary, shown: tuple[int, int]) -> list[Any]:
     """Draw some of the recorded states, faintly."""
     points = landscape.points
     if points is None or not len(points):
@@ -458,7 +458,7 @@ def draw_points(axes: Axes, landscape: LandscapeSummary, shown: tuple[int, int])
     return [Line2D([], [], label="recorded states", **(RECORDED | {"markersize": 5, "alpha": 0.8}))]
 
 
-def draw_ways(axes: Axes, landscape: LandscapeSummary, shown: tuple[int, int]) -> list[Any]:
+def _draw_ways(axes: Axes, landscape: LandscapeSummary, shown: tuple[int, int]) -> list[Any]:
     """Draw the paths: uphill those of least action, downhill those of f without noise."""
     handles = []
     for part, style, text in (

@@ -52,14 +52,14 @@ def plot_inspection(found: Inspection) -> Figure:
 def inspection_figures(found: Inspection) -> dict[str, Figure]:
     """The figures of a page by name: ``record``, ``visited``, ``memory``."""
     return {
-        "record": record_figure(found),
-        "visited": visited_figure(found),
-        "memory": memory_figure(found),
+        "record": _record_figure(found),
+        "visited": _visited_figure(found),
+        "memory": _memory_figure(found),
     }
 
 
 @drawn_in_style
-def record_figure(found: Inspection) -> Figure:
+def _record_figure(found: Inspection) -> Figure:
     """The states in the course of time, a panel for each."""
     count = min(len(found.states), STATES)
     figure = Figure(figsize=(COLUMN_WIDTH, 1.7 * count + 0.5))
@@ -73,7 +73,7 @@ def record_figure(found: Inspection) -> Figure:
 
 
 @drawn_in_style
-def visited_figure(found: Inspection) -> Figure:
+def _visited_figure(found: Inspection) -> Figure:
     """How often each state was visited, on the plane of the first two."""
     figure = Figure(figsize=(COLUMN_WIDTH, 2.9))
     _draw_visits(figure.add_subplot(), found)
@@ -81,7 +81,7 @@ def visited_figure(found: Inspection) -> Figure:
 
 
 @drawn_in_style
-def memory_figure(found: Inspection) -> Figure:
+def _memory_figure(found: Inspection) -> Figure:
     """How residuals of increments go together over lags."""
     figure = Figure(figsize=(COLUMN_WIDTH, 2.7))
     _draw_memory(figure.add_subplot(), found)

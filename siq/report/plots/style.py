@@ -72,7 +72,7 @@ Parameters = ParamSpec("Parameters")
 Drawn = TypeVar("Drawn", Figure, Figure | None)
 
 
-def drawing_style() -> AbstractContextManager[None]:
+def _drawing_style() -> AbstractContextManager[None]:
     """Make matplotlib's defaults and the settings of this module hold for a ``with`` block only."""
     context: AbstractContextManager[None] = matplotlib.style.context(["default", _SETTINGS])
     return context
@@ -86,7 +86,7 @@ def drawn_in_style(function: Callable[Parameters, Drawn]) -> Callable[Parameters
 
     @functools.wraps(function)
     def draw(*arguments: Parameters.args, **options: Parameters.kwargs) -> Drawn:
-        with drawing_style():
+        with _drawing_style():
             figure = function(*arguments, **options)
             if figure is None:
                 return figure
@@ -133,7 +133,7 @@ def term_label(term: str) -> str:
     return "$" + r"\,".join(typeset) + "$"
 
 
-def degree(term: str) -> int:
+def _degree(term: str) -> int:
     """Count the factors of a monomial; a term that is none comes after all monomials."""
     powers = _powers(term)
     return 1000 if powers is None else sum(power for name, power in powers if name != "1")
@@ -151,7 +151,7 @@ def _powers(term: str) -> list[tuple[str, int]] | None:
 
 def sorted_terms(terms: Iterable[str]) -> list[str]:
     """Order different terms by degree, otherwise as they first appear in the table."""
-    return sorted(dict.fromkeys(terms), key=degree)
+    return sorted(dict.fromkeys(terms), key=_degree)
 
 
 def unit_label(unit: str) -> str:
@@ -221,7 +221,7 @@ def save_figure(figure: Figure, path_without_suffix: str | Path) -> tuple[Path, 
 
 def _save(figure: Figure, stem: Path, suffix: str, metadata: dict[str, None]) -> Path:
     path = stem.with_name(stem.name + suffix)
-    with whole_file(path) as partial, drawing_style():
+    with whole_file(path) as partial, _drawing_style():
         figure.savefig(partial, dpi=DOTS_PER_INCH[suffix], metadata=metadata)
     return path
 
@@ -244,7 +244,7 @@ def drawn_to_be_read(function: Callable[Parameters, Figure | None]) -> Callable[
 
     @functools.wraps(function)
     def draw(*arguments: Parameters.args, **options: Parameters.kwargs) -> Figure | None:
-        with drawing_style():
+        with _drawing_style():
             mpl.rcParams.update(_LARGE)  # which the context undoes
             figure = function(*arguments, **options)
             if figure is not None:

@@ -322,7 +322,7 @@ OPEN = 0.14  # of the height of the picture: how far a way out of the recorded r
 
 
 @dataclass(frozen=True)
-class Join:
+class _Join:
     """Two groups of wells that join at a height.
 
     Attributes
@@ -376,7 +376,7 @@ def plot_barriers(landscape: Landscape | LandscapeSummary, *, ax: Axes | None = 
         raise ValueError("no barrier of this landscape is known: there is nothing to draw")
     axes = new_axes() if ax is None else ax
     heights = [one.height if shown.matched else 0.0 for one in shown.wells]
-    joins = joined(shown, heights) if shown.matched else []
+    joins = _joined(shown, heights) if shown.matched else []
     places = _columns(len(heights), joins)
     tops = _draw_joins(axes, joins, places)
     lowest_ways = [_lowest_way(shown, well) for well in range(len(heights))]
@@ -424,7 +424,7 @@ def _with_error(value: float, error: float, *, broken: bool) -> str:
     return text.replace(r" \pm ", "$\n$\\pm$ $") if broken and "(" not in text else text
 
 
-def joined(landscape: LandscapeSummary, heights: list[float]) -> list[Join]:
+def _joined(landscape: LandscapeSummary, heights: list[float]) -> list[_Join]:
     """The passes by which wells join into one, from the lowest to the highest."""
     passes = sorted(
         (heights[way.start] + way.barrier, way.start, way.end)
@@ -436,12 +436,12 @@ def joined(landscape: LandscapeSummary, heights: list[float]) -> list[Join]:
     for height, start, end in passes:
         left, right = groups[start], groups[end]
         if left != right:
-            joins.append(Join(left, right, height))
+            joins.append(_Join(left, right, height))
             groups |= dict.fromkeys((*left, *right), (*left, *right))
     return joins
 
 
-def _columns(count: int, joins: list[Join]) -> dict[int, float]:
+def _columns(count: int, joins: list[_Join]) -> dict[int, float]:
     """Where each well stands, so that no two lines of the tree cross."""
     groups: dict[int, tuple[int, ...]] = {well: (well,) for well in range(count)}
     for join in joins:
@@ -452,7 +452,7 @@ def _columns(count: int, joins: list[Join]) -> dict[int, float]:
     return {well: float(place) for place, well in enumerate(order)}
 
 
-def _draw_joins(axes: Axes, joins: list[Join], places: dict[int, float]) -> dict[int, float]:
+def _draw_joins(axes: Axes, joins: list[_Join], places: dict[int, float]) -> dict[int, float]:
     """Draw the tree above its columns; what is returned is the height at which each well first joins."""
     tops: dict[int, float] = {}
     stems: dict[int, tuple[float, float]] = {}  # of the group of a well: where its stem stands, and begins
