@@ -149,30 +149,14 @@ def _plain(title: str) -> str:
 
 
 class _Layout(NamedTuple):
-    """The columns of a table by what they mean.
+    """The columns of a table by what they mean, as positions."""
 
-    Attributes
-    ----------
-    recording
-        Position of the labels, None where all rows are one recording.
-    time
-        Position of the time.
-    states
-        Positions of the measured columns.
-    names, titles
-        Of the measured columns, in formulas and to people.
-    units
-        By position: what the heading says, and what stands elsewhere, by the place.
-    notes
-        What was assumed.
-    """
-
-    recording: int | None
+    recording: int | None  # None where all rows are one recording
     time: int
     states: tuple[int, ...]
-    names: tuple[str, ...]
-    titles: tuple[str, ...]
-    units: tuple[dict[str, str | None], ...]
+    names: tuple[str, ...]  # of the states, in formulas, ...
+    titles: tuple[str, ...]  # ... and to people
+    units: tuple[dict[str, str | None], ...]  # of all columns: what each place says
     notes: tuple[str, ...]
 
 

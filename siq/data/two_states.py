@@ -248,22 +248,9 @@ INNER_QUANTILE = 0.02  # the quantile from which on f is known well enough
 
 
 def _pushed_apart(values: np.ndarray, runs: list[slice], relaxation: float) -> tuple[float, float] | None:
-    """By how many standard errors f rises somewhere, and how probable that is where a single state attracts.
+    """The largest ``(f(b) - f(a)) / error`` with a < b, and its probability where a single state attracts.
 
-    Parameters
-    ----------
-    values
-        Shape ``(n,)``.
-    runs
-        See `siq.data.stationarity.runs_of`.
-    relaxation
-        The local relaxation time in samples.
-
-    Returns
-    -------
-    tuple or None
-        The largest ``(f(b) - f(a)) / error`` with a < b, and its probability by Scheffé's bound; None where
-        there are too few stretches.
+    `relaxation` is the local relaxation time in samples; None where there are too few stretches.
     """
     lag = max(int(LAG_SHARE * relaxation), 1)
     longest = sum(run.stop - run.start for run in runs) / (lag * FEWEST_STRETCHES) - 2
@@ -321,22 +308,10 @@ def _valley_between(
     generator: np.random.Generator | None,
     surrogates: int = SURROGATES,
 ) -> tuple[float, float]:
-    """How much of the record lies in the lesser peak of its histogram, and how probable that is.
+    """Share of the samples in the lesser peak of the histogram, and its probability among surrogates.
 
-    Parameters
-    ----------
-    values, runs, relaxation
-        As of `pushed_apart`.
-    generator
-        Where the phases of the surrogates come from; None makes none.
-    surrogates
-        How many, unless `ENOUGH_DEEPER` of them are as deep before: then it is not rare (Besag, Clifford,
-        Biometrika 78 (1991) 301).
-
-    Returns
-    -------
-    tuple
-        The share of the samples, and its probability among surrogates with random phases.
+    Surrogates have random phases from `generator`; None makes none. No more are drawn once `ENOUGH_DEEPER` of
+    them are as deep: then it is not rare (Besag and Clifford, Biometrika 78 (1991) 301).
     """
     every = max(int(relaxation / 4), -(-len(values) // MOST_POINTS), 1)
     levelled = values.copy()

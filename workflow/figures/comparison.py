@@ -24,12 +24,12 @@ from siq.report.plots.style import (
     CURVE_COLOURS,
     GREY,
     LINE_STYLES,
-    MARKERS,
     PAGE_WIDTH,
     UNKNOWN,
     counted,
     drawn_in_style,
     hatch_unknown,
+    look,
     magnitude_label,
     name_label,
     power_of_ten,
@@ -150,7 +150,7 @@ def plot_degrees(table: pd.DataFrame) -> Figure | None:
             linewidth=1.6,
             label=by_letters(name),
         )
-        for name, (colour, style, marker) in zip(names, map(_look, range(len(names))), strict=True)
+        for name, (colour, style, marker) in zip(names, map(look, range(len(names))), strict=True)
     ]
     handles.append(_ring(GREY, label="chosen" if runs == 1 else "chosen most often"))
     if runs > 1:
@@ -159,14 +159,6 @@ def plot_degrees(table: pd.DataFrame) -> Figure | None:
         handles.append(Line2D([], [], color=GREY, linewidth=1.6, label="their median"))
     figure.legend(handles=handles, loc="outside upper center", ncols=2)
     return figure
-
-
-def _look(place: int) -> tuple[str, str, str]:
-    return (
-        CURVE_COLOURS[place % len(CURVE_COLOURS)],
-        LINE_STYLES[place % len(LINE_STYLES)],
-        MARKERS[place % len(MARKERS)],
-    )
 
 
 def _ring(colour: str, **options: Any) -> Line2D:
@@ -180,7 +172,7 @@ def _draw_runs(axes: Axes, rows: pd.DataFrame, column: str, place: int) -> None:
     rows = rows[np.isfinite(rows[column])]
     if rows.empty:
         return
-    colour, style, marker = _look(place)
+    colour, style, marker = look(place)
     courses = rows.pivot_table(index="terms", columns="run", values=column)
     chosen = rows[rows["chosen"].astype(bool)]
     if courses.shape[1] > 1:
@@ -231,7 +223,7 @@ def plot_escape(table: pd.DataFrame, *, time_unit: str = "1", energy_unit: str =
     handles, missing = [], 0
     for place, (name, unsorted) in enumerate(rows.groupby("transition", sort=False)):
         ways = unsorted.sort_values("intensity", ascending=False)
-        colour, style, marker = _look(place)
+        colour, style, marker = look(place)
         inverse = 1 / ways["intensity"].to_numpy(float)
         axes.plot(inverse, ways["predicted"].to_numpy(float), color=colour, linestyle=style, linewidth=1.2)
         times, errors = (ways[column].to_numpy(float) for column in ("simulated", "simulated_error"))

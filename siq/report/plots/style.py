@@ -78,7 +78,7 @@ def _drawing_style() -> AbstractContextManager[None]:
     return context
 
 
-def drawn_in_style(function: Callable[Parameters, Drawn]) -> Callable[Parameters, Drawn]:
+def drawn_in_style(function: Callable[Parameters, Drawn], **settings: object) -> Callable[Parameters, Drawn]:
     """Decorate a plot function: common style while it draws, fixed layout afterwards.
 
     A function gives None where there is nothing to draw: a figure that says so is none.
@@ -87,6 +87,7 @@ def drawn_in_style(function: Callable[Parameters, Drawn]) -> Callable[Parameters
     @functools.wraps(function)
     def draw(*arguments: Parameters.args, **options: Parameters.kwargs) -> Drawn:
         with _drawing_style():
+            mpl.rcParams.update(settings)  # which the context undoes
             figure = function(*arguments, **options)
             if figure is None:
                 return figure
@@ -196,7 +197,7 @@ def mean_and_spread(mean: float, spread: float, *, digits: int = 2) -> str:
     return rf"${bracketed} \times 10^{{{exponent}}}$"
 
 
-DOTS_PER_INCH = {".png": 200, ".svg": 300}  # in an SVG, of the parts drawn as an image
+DOTS_PER_INCH = {".svg": 300, ".png": 200}  # in an SVG, of the parts drawn as an image
 
 
 def save_figure(figure: Figure, path_without_suffix: str | Path) -> tuple[Path, Path]:
@@ -215,15 +216,12 @@ def save_figure(figure: Figure, path_without_suffix: str | Path) -> tuple[Path, 
         The SVG file and the PNG file.
     """
     stem = Path(path_without_suffix)
+    vector, image = (stem.with_name(stem.name + suffix) for suffix in DOTS_PER_INCH)
     # Date and Software would make the same figure differ between days and versions.
-    return _save(figure, stem, ".svg", {"Date": None}), _save(figure, stem, ".png", {"Software": None})
-
-
-def _save(figure: Figure, stem: Path, suffix: str, metadata: dict[str, None]) -> Path:
-    path = stem.with_name(stem.name + suffix)
-    with whole_file(path) as partial, _drawing_style():
-        figure.savefig(partial, dpi=DOTS_PER_INCH[suffix], metadata=metadata)
-    return path
+    for path, metadata in ((vector, {"Date": None}), (image, {"Software": None})):
+        with whole_file(path) as partial, _drawing_style():
+            figure.savefig(partial, dpi=DOTS_PER_INCH[path.suffix], metadata=metadata)
+    return vector, image
 
 
 WIDTH = 5.0  # inches; on a phone of 400 pixels a point of text is then one pixel high
@@ -239,21 +237,9 @@ _LARGE = {
 }
 
 
-def drawn_to_be_read(function: Callable[Parameters, Figure | None]) -> Callable[Parameters, Figure | None]:
-    """Decorate a plot function that returns None where there is nothing to draw."""
-
-    @functools.wraps(function)
-    def draw(*arguments: Parameters.args, **options: Parameters.kwargs) -> Figure | None:
-        with _drawing_style():
-            mpl.rcParams.update(_LARGE)  # which the context undoes
-            figure = function(*arguments, **options)
-            if figure is not None:
-                # Worked out once and then frozen, the same figure gives the same file.
-                figure.draw_without_rendering()
-                figure.set_layout_engine("none")
-        return figure
-
-    return draw
+def drawn_to_be_read(function: Callable[Parameters, Drawn]) -> Callable[Parameters, Drawn]:
+    """Decorate a plot function as `drawn_in_style` does, for figures of `WIDTH` with thicker lines."""
+    return drawn_in_style(function, **_LARGE)
 
 
 def axis_unit(unit: str) -> str:
@@ -276,6 +262,13 @@ def rate_unit(unit: str, time_unit: str) -> str:
 CURVE_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, BLACK)
 MARKERS = ("o", "s", "^", "D", "v", "P")
 LINE_STYLES = ("-", "--", "-.", ":")
+
+
+def look(place: int) -> tuple[str, str, str]:
+    """Colour, style of line and marker of the curve at a place, told apart without colour too."""
+    looks = (CURVE_COLOURS, LINE_STYLES, MARKERS)
+    colour, style, marker = (each[place % len(each)] for each in looks)
+    return colour, style, marker
 
 
 def power_of_ten(largest: float) -> int:

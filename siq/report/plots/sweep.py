@@ -16,13 +16,11 @@ from matplotlib.patheffects import withStroke
 from siq.report.plots.style import (
     BLACK,
     COLUMN_WIDTH,
-    CURVE_COLOURS,
     GREY,
-    LINE_STYLES,
-    MARKERS,
     axis_label,
     drawn_in_style,
     energy_label,
+    look,
     unit_label,
 )
 from siq.report.summary import well_name
@@ -98,14 +96,6 @@ def plot_sweep(
     return figure
 
 
-def _look(well: int) -> tuple[str, str, str]:
-    return (
-        CURVE_COLOURS[well % len(CURVE_COLOURS)],
-        MARKERS[well % len(MARKERS)],
-        LINE_STYLES[well % len(LINE_STYLES)],
-    )
-
-
 def _draw_branches(axes: Axes, branches: pd.DataFrame, bifurcations: pd.DataFrame, place: int) -> None:
     positions = np.array([ast.literal_eval(text)[place] for text in branches["position"]], dtype=float)
     for _, rows in branches.assign(state=positions).groupby("branch"):
@@ -115,7 +105,7 @@ def _draw_branches(axes: Axes, branches: pd.DataFrame, bifurcations: pd.DataFram
         for first, last in pairwise(ends):
             some = rows.iloc[first : last + 1]
             well = int(rows["well"].iloc[first])
-            colour, line, width = (_look(well)[0], "-", 1.6) if well >= 0 else (GREY, "--", 0.8)
+            colour, line, width = (look(well)[0], "-", 1.6) if well >= 0 else (GREY, "--", 0.8)
             axes.plot(some["value"], some["state"], color=colour, linestyle=line, linewidth=width)
     for kind, marker in BIFURCATIONS.items():
         rows = bifurcations[bifurcations["kind"] == kind]
@@ -126,7 +116,7 @@ def _draw_branches(axes: Axes, branches: pd.DataFrame, bifurcations: pd.DataFram
 def _draw_wells(axes: Axes, table: pd.DataFrame, name: str) -> None:
     for well in sorted({int(one) for one in table["well"] if one >= 0}):
         rows = table[table["well"] == well]
-        colour, marker, style = _look(well)
+        colour, style, marker = look(well)
         axes.plot(
             rows["value"], rows[name], color=colour, linestyle=style, marker=marker, markersize=3,
             linewidth=1.2,
@@ -137,7 +127,7 @@ def _handles(table: pd.DataFrame, branches: pd.DataFrame, bifurcations: pd.DataF
     wells = sorted({int(well) for well in table["well"] if well >= 0})
     handles = []
     for well in wells:
-        colour, marker, style = _look(well)
+        colour, style, marker = look(well)
         handles.append(
             Line2D([], [], color=colour, marker=marker, linestyle=style, markersize=3, label=well_name(well))
         )

@@ -33,6 +33,8 @@ from siq.report.plots.style import (
     BLUE,
     GREEN,
     GREY,
+    LINE_STYLES,
+    MARKERS,
     ORANGE,
     PURPLE,
     SKY_BLUE,
@@ -46,8 +48,6 @@ if TYPE_CHECKING:
     from siq.data.recordings import Recordings
 
 COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY_BLUE)
-LINE_STYLES = ("-", "--", "-.", ":")
-MARKERS = ("o", "s", "^", "D", "v", "P")
 
 
 def plot_wells(
